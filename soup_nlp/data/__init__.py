@@ -1,0 +1,1 @@
+"""Files in, a checked `Pair` out: readers, flow sources, datasets, rendered scenes."""

@@ -1,0 +1,189 @@
+"""The record that enters the house: two images, two cameras, a flow and, where known, the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import DataError
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Flow:
+    """A dense flow from the reference to the next image.
+
+    Attributes:
+        uv: (H, W, 2) float32, displacement in pixels (u right, v down); 0 where unknown.
+        confidence: (H, W) float32 in [0, 1]; 0 drops the pixel from every term.
+        source: Where it comes from, for reports ("dis", "truth", a file name ...).
+    """
+
+    uv: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    source: str = "unknown"
+
+    def __post_init__(self) -> None:
+        if self.uv.ndim != 3 or self.uv.shape[2] != 2:
+            raise DataError(
+                "flow has the wrong shape",
+                where=self.source,
+                found=self.uv.shape,
+                expected="(H, W, 2)",
+            )
+        if self.confidence.shape != self.uv.shape[:2]:
+            raise DataError(
+                "flow confidence does not fit the flow",
+                where=self.source,
+                found=self.confidence.shape,
+                expected=self.uv.shape[:2],
+            )
+        if not np.isfinite(self.uv[self.confidence > 0]).all():
+            raise DataError(
+                "flow has NaN or infinite values where its confidence is positive",
+                where=self.source,
+                found=f"{int((~np.isfinite(self.uv)).any(-1).sum())} such pixels",
+                expected="finite displacements, or confidence 0",
+                hint="mark unknown pixels as invalid in the flow file",
+            )
+
+    def __str__(self) -> str:
+        h, w = self.confidence.shape
+        return f"Flow({self.source}, {w}x{h}, {np.mean(self.confidence > 0):.1%} usable)"
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known of the scene, for measuring only; any part may be None.
+
+    Attributes:
+        depth_ref: (H, W) z of the reference frame in `unit`; NaN where unknown.
+        depth_next: (H', W') z of the next frame; NaN where unknown.
+        flow: (H, W, 2) exact flow, NaN where unknown.
+        occluded: (H, W) bool, True where a reference pixel is not visible in the next frame.
+        bodies: (H, W) int body label of a reference pixel, -1 for none.
+        motions: (B, 4, 4) next_from_ref of each body, in `unit`.
+        points: (M, 3) sparse truth (u, v, z) of the reference frame, sub-pixel.
+        scene_flow: (H, W, 3) X' - X in each frame's own camera coordinates, NaN where unknown.
+        unit: Name of the length unit ("m", "mm", "scene").
+    """
+
+    depth_ref: Float | None = None
+    depth_next: Float | None = None
+    flow: Float | None = None
+    occluded: NDArray[np.bool_] | None = None
+    bodies: NDArray[np.int32] | None = None
+    motions: Float | None = None
+    points: Float | None = None
+    scene_flow: Float | None = None
+    unit: str = "m"
+
+    def __str__(self) -> str:
+        known = [k for k, v in self.__dict__.items() if v is not None and k != "unit"]
+        return f"Truth({', '.join(known) or 'nothing'}; {self.unit})"
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two consecutive frames with cameras, flow and truth.
+
+    Attributes:
+        image_ref: (H, W, 3) uint8 RGB reference image, indexed [v, u].
+        image_next: (H', W', 3) uint8 RGB next image.
+        K_ref: (3, 3) intrinsics of the reference frame, pixels; (0, 0) is the centre of the
+            top-left pixel.
+        K_next: (3, 3) intrinsics of the next frame.
+        flow: The flow from reference to next, or None when it is still to be estimated.
+        truth: What is known, or None.
+        name: For titles and folders.
+
+    Raises:
+        DataError: images of the wrong shape or type, an invalid camera, sizes that do not fit.
+    """
+
+    image_ref: NDArray[np.uint8]
+    image_next: NDArray[np.uint8]
+    K_ref: Float
+    K_next: Float
+    flow: Flow | None = None
+    truth: Truth | None = field(default=None)
+    name: str = "pair"
+
+    def __post_init__(self) -> None:
+        for what in ("image_ref", "image_next"):
+            image = getattr(self, what)
+            if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+                raise DataError(
+                    "image must be 8-bit RGB",
+                    where=what,
+                    found=f"{image.dtype} {image.shape}",
+                    expected="uint8 (H, W, 3)",
+                )
+        for what in ("K_ref", "K_next"):
+            check_intrinsics(getattr(self, what), what)
+        if self.flow is not None and self.flow.uv.shape[:2] != self.image_ref.shape[:2]:
+            raise DataError(
+                "flow and reference image differ in size",
+                where=self.flow.source,
+                found=f"flow {self.flow.uv.shape[:2]}",
+                expected=f"image {self.image_ref.shape[:2]} (height, width)",
+            )
+        if self.truth is not None:
+            self._check_truth(self.truth)
+
+    def _check_truth(self, truth: Truth) -> None:
+        for what in ("depth_ref", "flow", "occluded", "bodies", "scene_flow"):
+            value = getattr(truth, what)
+            if value is not None and value.shape[:2] != self.image_ref.shape[:2]:
+                raise DataError(
+                    "truth and reference image differ in size",
+                    where=f"truth.{what}",
+                    found=value.shape[:2],
+                    expected=self.image_ref.shape[:2],
+                )
+        if truth.depth_next is not None and truth.depth_next.shape != self.image_next.shape[:2]:
+            raise DataError(
+                "truth and next image differ in size",
+                where="truth.depth_next",
+                found=truth.depth_next.shape,
+                expected=self.image_next.shape[:2],
+            )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the reference image."""
+        return self.image_ref.shape[0], self.image_ref.shape[1]
+
+    def with_flow(self, flow: Flow) -> Pair:
+        """The same pair with another flow."""
+        return replace(self, flow=flow)
+
+    def __str__(self) -> str:
+        h, w = self.size
+        return f"Pair({self.name}, {w}x{h}, {self.flow or 'no flow'}, {self.truth or 'no truth'})"
+
+
+def check_intrinsics(K: Float, where: str) -> None:
+    """Raise DataError unless K is a finite, upper-triangular 3x3 with positive focal lengths."""
+    if np.shape(K) != (3, 3):
+        raise DataError("intrinsics must be 3x3", where=where, found=np.shape(K), expected="(3, 3)")
+    if not np.isfinite(K).all():
+        raise DataError("intrinsics are not finite", where=where, found=K.tolist())
+    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        raise DataError(
+            "focal lengths must be positive",
+            where=where,
+            found=f"fx {K[0, 0]:g}, fy {K[1, 1]:g}",
+            expected="fx > 0 and fy > 0, in pixels",
+        )
+    lower = [K[1, 0], K[2, 0], K[2, 1]]
+    if np.any(lower) or K[2, 2] != 1:
+        raise DataError(
+            "intrinsics must be upper triangular with K[2, 2] = 1",
+            where=where,
+            found=K.tolist(),
+            expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]]",
+        )

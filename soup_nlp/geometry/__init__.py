@@ -1,0 +1,1 @@
+"""Cameras, planes, rotations, superpixels, graphs and the soup: pure numpy."""

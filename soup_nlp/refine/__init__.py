@@ -1,0 +1,1 @@
+"""Discrete refinement: particles and TRW-S."""

@@ -1,0 +1,1 @@
+"""Metrics, pictures, point clouds and the result folder."""

@@ -1,0 +1,1 @@
+"""Ipopt stages and residuals recomputed from raw data."""

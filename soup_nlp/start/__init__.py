@@ -1,0 +1,1 @@
+"""Initial proposals: candidate motions of every superpixel and the choice among them."""
