@@ -1,0 +1,221 @@
+"""The segmentation record: anchors, shared boundaries, K-NN and adjacency graphs, weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from soup_nlp.errors import DataError
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """Superpixels and the two graphs over them (N superpixels, E edges, P neighbour pairs).
+
+    Attributes:
+        labels: (H, W) int32 superpixel of every pixel.
+        anchors: (N, 2) centroid (u, v) of every superpixel, pixels.
+        sizes: (N,) pixels of every superpixel.
+        radius: (N,) root mean square distance of its pixels from the anchor, pixels.
+        knn: (N, K) the K nearest anchors of every anchor, nearest first (directed).
+        edges: (E, 2) undirected edges i < k of the K-NN graph.
+        edge_multiplicity: (E,) 1 or 2: directions in which the edge occurs.
+        edge_weight: (E,) w1 = w2 of paper Eq. 2, summed over the directions that occur.
+        pairs: (P, 2) 4-connected neighbours i < k that share boundary.
+        boundary: (P, B, 2) sampled shared boundary points (u, v), midway between two pixels.
+        boundary_length: (P,) number of shared boundary pixels before sampling.
+        pair_weight: (P,) w4 of paper Eq. 5, summed over both directions.
+        rim: (N, V, 2) extreme pixels of every superpixel in V directions (visibility, report).
+    """
+
+    labels: NDArray[np.int32]
+    anchors: Float
+    sizes: Int
+    radius: Float
+    knn: Int
+    edges: Int
+    edge_multiplicity: Int
+    edge_weight: Float
+    pairs: Int
+    boundary: Float
+    boundary_length: Int
+    pair_weight: Float
+    rim: Float
+
+    def __len__(self) -> int:
+        return len(self.anchors)
+
+    def __str__(self) -> str:
+        height, width = self.labels.shape
+        return (
+            f"Segmentation({len(self)} superpixels of {width}x{height}, K = {self.knn.shape[1]},"
+            f" {len(self.edges)} K-NN edges, {len(self.pairs)} neighbour pairs)"
+        )
+
+
+def build_segmentation(
+    labels: NDArray[np.int32],
+    image: NDArray[np.uint8],
+    neighbours: int = 15,
+    beta: float = 0.02,
+    beta_colour: float = 1.0,
+    boundary_samples: int | None = 3,
+) -> Segmentation:
+    """Graphs and weights of a segmentation.
+
+    Args:
+        labels: (H, W) superpixel labels 0..N-1.
+        image: (H, W, 3) uint8 RGB.
+        neighbours: K of the K-NN graph; at most N - 1 (a larger K is an error).
+        beta: Fall-off of w1, w2 with anchor distance, 1/pixel (Eq. 2).
+        beta_colour: Fall-off of w4 with colour difference, colours in [0, 1] (Eq. 5).
+        boundary_samples: Boundary points kept per pair, None for all (padded by repetition of
+            the pairs' own points to the longest boundary, with weights corrected by the model).
+
+    Raises:
+        DataError: K >= N.
+    """
+    n = int(labels.max()) + 1
+    if n > 1 and not 1 <= neighbours < n:
+        raise DataError(
+            "K-NN graph needs 1 <= K < number of superpixels",
+            where="segmentation.neighbours",
+            found=f"K = {neighbours}, {n} superpixels",
+            hint="lower segmentation.neighbours or raise segmentation.superpixels",
+        )
+    height, width = labels.shape
+    flat = labels.ravel()
+    sizes = np.bincount(flat, minlength=n)
+    v, u = (x.ravel().astype(float) for x in np.mgrid[0:height, 0:width])
+    anchors = np.stack([np.bincount(flat, w, n) / sizes for w in (u, v)], axis=1)
+    moment = np.bincount(flat, (u - anchors[flat, 0]) ** 2 + (v - anchors[flat, 1]) ** 2, n)
+    knn = _nearest(anchors, neighbours)
+    edges, multiplicity = _fold(knn)
+    distance = np.linalg.norm(anchors[edges[:, 0]] - anchors[edges[:, 1]], axis=1)
+    pairs, boundary, length, weight = _shared_boundaries(
+        labels, image, beta_colour, boundary_samples
+    )
+    return Segmentation(
+        labels=labels,
+        anchors=anchors,
+        sizes=sizes,
+        radius=np.sqrt(moment / sizes).clip(0.5),
+        knn=knn,
+        edges=edges,
+        edge_multiplicity=multiplicity,
+        edge_weight=multiplicity * np.exp(-beta * distance),
+        pairs=pairs,
+        boundary=boundary,
+        boundary_length=length,
+        pair_weight=weight,
+        rim=_rim(labels, u, v, n),
+    )
+
+
+def _nearest(anchors: Float, k: int) -> Int:
+    n = len(anchors)
+    if n == 1:
+        return np.zeros((1, 0), np.int64)
+    _, index = cKDTree(anchors).query(anchors, k=k + 1)
+    index = index.reshape(n, k + 1)
+    # coincident anchors can displace the point itself from the first place
+    own = index == np.arange(n)[:, None]
+    own[~own.any(1), -1] = True
+    return index[~own].reshape(n, k).astype(np.int64)
+
+
+def _fold(knn: Int) -> tuple[Int, Int]:
+    n, k = knn.shape
+    directed = np.stack([np.repeat(np.arange(n), k), knn.ravel()], axis=1)
+    directed.sort(axis=1)
+    edges, count = np.unique(directed, axis=0, return_counts=True)
+    return edges.reshape(-1, 2), count
+
+
+def _shared_boundaries(
+    labels: NDArray[np.int32],
+    image: NDArray[np.uint8],
+    beta_colour: float,
+    samples: int | None,
+) -> tuple[Int, Float, Int, Float]:
+    height, width = labels.shape
+    n = int(labels.max()) + 1
+    index = np.arange(labels.size).reshape(labels.shape)
+    first, second = [], []
+    for a, b in (
+        (index[:, :-1], index[:, 1:]),
+        (index[:-1], index[1:]),
+    ):
+        differ = labels.ravel()[a] != labels.ravel()[b]
+        first.append(a[differ])
+        second.append(b[differ])
+    p, q = np.concatenate(first), np.concatenate(second)
+    if not len(p):
+        empty = np.zeros(0, np.int64)
+        return np.zeros((0, 2), np.int64), np.zeros((0, samples or 1, 2)), empty, np.zeros(0)
+    i, k = labels.ravel()[p].astype(np.int64), labels.ravel()[q].astype(np.int64)
+    swap = i > k
+    p, q = np.where(swap, q, p), np.where(swap, p, q)
+    i, k = np.where(swap, k, i), np.where(swap, i, k)
+    key, which = np.unique(i * n + k, return_inverse=True)
+    pairs = np.stack([key // n, key % n], axis=1)
+    count = np.bincount(which)
+    weight = _colour_weight(image, p, which, len(key), beta_colour)
+    weight += _colour_weight(image, q, which, len(key), beta_colour)
+    middle = np.stack([(p % width + q % width) / 2, (p // width + q // width) / 2], axis=1)
+    return pairs, _sample_along(middle, which, count, samples), count, weight
+
+
+def _colour_weight(
+    image: NDArray[np.uint8], pixel: Int, which: Int, n_pairs: int, beta: float
+) -> Float:
+    """Sum over the four neighbours of `exp(-beta |I(X_b) - I(zeta_j)|_F)`, paper Eq. 5."""
+    height, width = image.shape[:2]
+    # a pixel that touches the other superpixel twice counts once
+    unique = np.unique(which * (height * width) + pixel)
+    which, pixel = unique // (height * width), unique % (height * width)
+    colour = image.astype(float) / 255.0
+    v, u = pixel // width, pixel % width
+    total = np.zeros(n_pairs)
+    for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        other = colour[np.clip(v + dv, 0, height - 1), np.clip(u + du, 0, width - 1)]
+        gap2 = np.sum((colour[v, u] - other) ** 2, axis=1)
+        total += np.exp(-beta * np.sqrt(np.bincount(which, gap2, n_pairs)))
+    return total
+
+
+def _sample_along(points: Float, which: Int, count: Int, samples: int | None) -> Float:
+    """Evenly spaced points (P, B, 2) along each shared boundary, ordered along its main axis."""
+    n_pairs = len(count)
+    mean = np.stack([np.bincount(which, points[:, c]) / count for c in (0, 1)], axis=1)
+    off = points - mean[which]
+    sxx, syy, sxy = (
+        np.bincount(which, off[:, a] * off[:, b]) for a, b in ((0, 0), (1, 1), (0, 1))
+    )
+    angle = 0.5 * np.arctan2(2 * sxy, sxx - syy)
+    along = off[:, 0] * np.cos(angle)[which] + off[:, 1] * np.sin(angle)[which]
+    order = np.lexsort((along, which))
+    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    b = int(count.max()) if samples is None else samples
+    # midpoints of b equal parts: b = 1 is the middle, large b tends to the whole boundary
+    place = (np.arange(b) + 0.5) / b
+    inside = np.minimum((place[None] * count[:, None]).astype(np.int64), count[:, None] - 1)
+    return points[order[start[:, None] + inside]].reshape(n_pairs, b, 2)
+
+
+def _rim(labels: NDArray[np.int32], u: Float, v: Float, n: int, directions: int = 8) -> Float:
+    flat = labels.ravel()
+    out = np.empty((n, directions, 2))
+    for k in range(directions):
+        angle = 2 * np.pi * k / directions
+        reach = u * np.cos(angle) + v * np.sin(angle)
+        order = np.lexsort((reach, flat))
+        last = order[np.cumsum(np.bincount(flat, minlength=n)) - 1]
+        out[:, k] = np.stack([u[last], v[last]], axis=1)
+    return out

@@ -1,0 +1,168 @@
+"""The soup: scale, plane and rigid motion of every superpixel, and what follows from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.camera import pixel_grid, project, rays
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Soup:
+    """State of N superpixels: what every stage takes and returns.
+
+    Plane i is `n_i . X + D_i = 0` with `D_i = lam_i d_i` and n facing the camera; motion i is
+    `X' = R_i X + lam_i t_i` (next_from_ref). Lengths are free up to one global scale.
+
+    Attributes:
+        lam: (N,) scales, positive.
+        n: (N, 3) unit normals.
+        d: (N,) plane offsets before scaling, positive.
+        R: (N, 3, 3) rotations.
+        t: (N, 3) translations before scaling.
+    """
+
+    lam: Float
+    n: Float
+    d: Float
+    R: Float
+    t: Float
+
+    def __len__(self) -> int:
+        return len(self.lam)
+
+    def __str__(self) -> str:
+        D, T = self.distance, np.linalg.norm(self.translation, axis=1)
+        return (
+            f"Soup({len(self)} superpixels, plane distance {D.min():.3g}..{D.max():.3g},"
+            f" translation {T.min():.3g}..{T.max():.3g})"
+        )
+
+    @property
+    def distance(self) -> Float:
+        """(N,) distance of the plane from the reference camera, `lam d`."""
+        return self.lam * self.d
+
+    @property
+    def translation(self) -> Float:
+        """(N, 3) scaled translation, `lam t`."""
+        return self.lam[:, None] * self.t
+
+    def depth_at(self, ray: Float) -> Float:
+        """z (N, ...) of rays (N, ..., 3) on their own superpixel's plane (FORMULATION)."""
+        facing = -np.einsum("nc,n...c->n...", self.n, ray)
+        return self.distance.reshape(-1, *[1] * (ray.ndim - 2)) / facing
+
+    def points(self, ray: Float) -> Float:
+        """Reference-frame points (N, ..., 3) of rays (N, ..., 3)."""
+        return self.depth_at(ray)[..., None] * ray
+
+    def moved(self, points: Float) -> Float:
+        """Next-frame points of reference points, both (N, ..., 3)."""
+        T = self.translation.reshape(-1, *[1] * (points.ndim - 2), 3)
+        return np.einsum("nij,n...j->n...i", self.R, points) + T
+
+    def normalised(self, share: Float | None = None) -> Soup:
+        """Same geometry with sum(lam) = 1, where lam_i = share_i x plane distance.
+
+        Args:
+            share: (N,) positive; default 1/N, then the mean plane distance becomes 1.
+        """
+        n = len(self)
+        c = np.full(n, 1.0 / n) if share is None else share
+        unit = float(np.sum(c * self.distance))
+        D, T = self.distance / unit, self.translation / unit
+        lam = c * D
+        return Soup(lam, self.n, 1.0 / c, self.R, T / lam[:, None])
+
+    def homographies(self, K_ref: Float, K_next: Float) -> Float:
+        """(N, 3, 3) `K_next (R - t n^T / d) K_ref^-1`, paper Eq. 3."""
+        H = self.R - self.t[:, :, None] * self.n[:, None, :] / self.d[:, None, None]
+        return K_next @ H @ np.linalg.inv(K_ref)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Dense 3D of both frames, in the soup's length unit.
+
+    Attributes:
+        depth_ref: (H, W) z of the reference frame, NaN where a plane does not face the pixel.
+        points_ref: (H, W, 3) reference-frame points.
+        points_next: (H, W, 3) the same material points in the next frame.
+        flow: (H, W, 2) flow that the soup induces, pixels.
+        depth_next: (H', W') z of the next frame (nearest surface wins), NaN where nothing lands.
+    """
+
+    depth_ref: Float
+    points_ref: Float
+    points_next: Float
+    flow: Float
+    depth_next: Float
+
+    def __str__(self) -> str:
+        z = self.depth_ref[np.isfinite(self.depth_ref)]
+        seen = np.isfinite(self.depth_next).mean()
+        return f"Reconstruction(depth {z.min():.3g}..{z.max():.3g}, next frame {seen:.0%} covered)"
+
+
+def reconstruct(
+    soup: Soup,
+    labels: NDArray[np.int32],
+    K_ref: Float,
+    K_next: Float,
+    size_next: tuple[int, int] | None = None,
+    min_facing: float = 1e-6,
+) -> Reconstruction:
+    """Dense reconstruction of both frames.
+
+    Args:
+        soup: State of N superpixels.
+        labels: (H, W) superpixel of every pixel, 0..N-1.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        K_next: (3, 3) intrinsics of the next frame.
+        size_next: (height, width) of the next frame; default as the reference.
+        min_facing: A pixel with `-n . ray` below this has no depth (NaN).
+    """
+    height, width = labels.shape
+    uv = pixel_grid(height, width)
+    r = rays(K_ref, uv)
+    facing = -np.einsum("hwc,hwc->hw", soup.n[labels], r)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.where(facing > min_facing, soup.distance[labels] / facing, np.nan)
+    points = z[..., None] * r
+    moved = np.einsum("hwij,hwj->hwi", soup.R[labels], points) + soup.translation[labels]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        target = project(K_next, moved)
+    depth_next = splat_depth(target, moved[..., 2], size_next or (height, width))
+    return Reconstruction(z, points, moved, target - uv, depth_next)
+
+
+def splat_depth(target: Float, z: Float, size: tuple[int, int]) -> Float:
+    """Forward-warped depth map: nearest surface wins, one-pixel cracks are closed.
+
+    Args:
+        target: (H, W, 2) pixel in the next frame of every reference pixel.
+        z: (H, W) its depth there.
+        size: (height, width) of the next frame.
+
+    Returns:
+        (height, width) depth, NaN where nothing lands.
+    """
+    height, width = size
+    ok = np.isfinite(target).all(-1) & (z > 0)
+    out = np.full(height * width, np.inf)
+    base = np.floor(target[ok])
+    # each source pixel covers its 2 x 2 footprint, so that cracks of a stretched surface close
+    for du in (0, 1):
+        for dv in (0, 1):
+            u, v = base[:, 0] + du, base[:, 1] + dv
+            inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+            index = (v[inside] * width + u[inside]).astype(np.int64)
+            np.minimum.at(out, index, z[ok][inside])
+    out[np.isinf(out)] = np.nan
+    return out.reshape(height, width)

@@ -1,0 +1,164 @@
+"""Kernel and table: the pattern that carries every nonlinear program of this package.
+
+A kernel is the symbolic objective and constraints of ONE element; a table says, for every element,
+which variables it reads, which rows of g it adds to, and its data. Nothing here knows the soup.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import ModelError
+
+HESSIANS = ("exact", "gauss-newton", "gauss-newton+constraints")
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """Symbolic element of an NLP.
+
+    Attributes:
+        name: Identifier, also of the generated functions.
+        x: (nx,) local variables.
+        row: (np,) data of one element.
+        theta: (nt,) parameters that all elements and kernels share.
+        objective: Scalar added to f, or None.
+        constraints: (nc,) added to rows of g, or None.
+        curvature: (nx, nx) positive semidefinite stand-in for the objective's Hessian, or None
+            for none (then "gauss-newton" uses the exact one).
+        exact: Scalar: the element's exact, nonsmooth energy (for comparing), or None.
+    """
+
+    name: str
+    x: ca.SX
+    row: ca.SX
+    theta: ca.SX
+    objective: ca.SX | None = None
+    constraints: ca.SX | None = None
+    curvature: ca.SX | None = None
+    exact: ca.SX | None = None
+
+    def __str__(self) -> str:
+        return f"Kernel({self.name}, {self.nx} variables, {self.row.numel()} data, {self.nc} rows)"
+
+    @property
+    def nx(self) -> int:
+        """Local variables."""
+        return int(self.x.numel())
+
+    @property
+    def nc(self) -> int:
+        """Local constraint rows."""
+        return 0 if self.constraints is None else int(self.constraints.numel())
+
+    def _hessian(self, kind: str, lam_f: ca.SX, lam_c: ca.SX) -> ca.SX:
+        H = ca.SX(self.nx, self.nx)
+        if self.objective is not None:
+            if kind == "exact" or self.curvature is None:
+                H += lam_f * ca.hessian(self.objective, self.x)[0]
+            else:
+                H += lam_f * self.curvature
+        if self.constraints is not None and kind != "gauss-newton":
+            H += ca.hessian(ca.dot(lam_c, self.constraints), self.x)[0]
+        return ca.sparsify(ca.triu(H))
+
+    def functions(self, hessian: str) -> dict[str, ca.Function]:
+        """Value, gradient, Jacobian nonzeros and triu-Hessian nonzeros of one element.
+
+        Args:
+            hessian: One of HESSIANS.
+
+        Returns:
+            Functions "f" and "grad" (x, row, theta), "con" and "jac" (same), "hess"
+            (x, row, theta, lam_f, lam_c); absent where there is nothing to compute.
+        """
+        args = [self.x, self.row, self.theta]
+        lam_f, lam_c = ca.SX.sym("lam_f"), ca.SX.sym("lam_c", self.nc)
+        out: dict[str, list[ca.SX]] = {}
+        if self.objective is not None:
+            out["f"] = [self.objective]
+            out["grad"] = [ca.densify(ca.gradient(self.objective, self.x))]
+        if self.constraints is not None:
+            out["con"] = [ca.densify(self.constraints)]
+            out["jac"] = [_nonzeros(ca.jacobian(self.constraints, self.x))]
+        H = self._hessian(hessian, lam_f, lam_c)
+        if H.nnz():
+            out["hess"] = [_nonzeros(H)]
+        made = {}
+        for key, value in out.items():
+            inputs = [*args, lam_f, lam_c] if key == "hess" else args
+            made[key] = ca.Function(f"{self.name}_{key}", inputs, ca.cse(value))
+        return made
+
+    def jacobian_pattern(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(row, column) of every nonzero of the local Jacobian, in storage order."""
+        return _triplet(ca.jacobian(self.constraints, self.x).sparsity())
+
+    def hessian_pattern(self, hessian: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(row, column) of every nonzero of the local triu-Hessian, in storage order."""
+        lam_f, lam_c = ca.SX.sym("lam_f"), ca.SX.sym("lam_c", self.nc)
+        return _triplet(self._hessian(hessian, lam_f, lam_c).sparsity())
+
+
+def _nonzeros(matrix: ca.SX) -> ca.SX:
+    nz = matrix.nonzeros()
+    return ca.vertcat(*nz) if nz else ca.SX(0, 1)
+
+
+def _triplet(sparsity: ca.Sparsity) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    row, column = sparsity.get_triplet()
+    return np.asarray(row, np.int64), np.asarray(column, np.int64)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Elements of one kernel.
+
+    Attributes:
+        index: (E, nx) global variable of every local one.
+        data: (E, np) data rows.
+        rows: (E, nc) global constraint row of every local one; rows may repeat (sums).
+    """
+
+    index: NDArray[np.int64]
+    data: NDArray[np.float64]
+    rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+@dataclass(frozen=True)
+class Group:
+    """A kernel with its table.
+
+    Raises:
+        ModelError: table and kernel do not fit, or data is not finite.
+    """
+
+    kernel: Kernel
+    table: Table
+
+    def __post_init__(self) -> None:
+        k, t = self.kernel, self.table
+        expected = ((len(t), k.nx), (len(t), k.row.numel()))
+        found = (t.index.shape, t.data.shape)
+        if found != expected or (k.nc and t.rows.shape != (len(t), k.nc)):
+            raise ModelError(
+                "table does not fit its kernel",
+                where=k.name,
+                found=f"index, data {found}, rows {t.rows.shape}",
+                expected=f"index, data {expected}, rows {(len(t), k.nc)}",
+            )
+        if not np.isfinite(t.data).all():
+            raise ModelError("table has NaN or infinite data", where=k.name)
+
+    @cached_property
+    def size(self) -> int:
+        """Number of elements."""
+        return len(self.table)

@@ -1,0 +1,175 @@
+"""Where every number of the soup lives in the solver's vector: packing, unpacking, names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry import rotation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy import EnergyData
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Gauge = Literal["unit-offset", "unit-translation", "free"]
+GAUGES: tuple[Gauge, ...] = ("unit-offset", "unit-translation", "free")
+
+
+@dataclass(frozen=True)
+class MatrixLayout:
+    """Variables of the constrained NLP.
+
+    Per superpixel, contiguous: scale `N lam`, normal, offset `d / N` (not in gauge
+    "unit-offset", where it is a constant), R by columns, translation `t / N`. Gauge
+    "unit-translation" has one more global variable at the end, the common length tau of all
+    translations: the length unit stays sum_i c_i D_i = 1, so that the gauges describe one and
+    the same problem.
+
+    Attributes:
+        share: (N,) weights c of the length unit.
+        gauge: One of GAUGES.
+    """
+
+    share: Float
+    gauge: Gauge
+
+    @property
+    def count(self) -> int:
+        """Superpixels."""
+        return len(self.share)
+
+    @property
+    def offset(self) -> Float:
+        """(N,) d / N of gauge "unit-offset"."""
+        return 1.0 / (self.count * self.share)
+
+    @property
+    def stride(self) -> int:
+        """Variables per superpixel."""
+        return 16 if self.gauge == "unit-offset" else 17
+
+    @property
+    def size(self) -> int:
+        """Superpixel variables, tau included."""
+        return self.count * self.stride + (self.gauge == "unit-translation")
+
+    @property
+    def tau(self) -> int:
+        """Index of tau (gauge "unit-translation")."""
+        return self.count * self.stride
+
+    def of(self, superpixel: Int) -> Int:
+        """(E, stride) variable indices of superpixels (E,)."""
+        return superpixel[:, None] * self.stride + np.arange(self.stride)
+
+    def pack(self, soup: Soup) -> Float:
+        """Solver vector (size,) of a soup, brought to this gauge and length unit."""
+        s = soup.normalised(self.share)
+        D, T = s.distance, s.translation
+        lam = self.count * s.lam
+        x = np.empty((self.count, self.stride))
+        R = s.R.transpose(0, 2, 1).reshape(-1, 9)
+        if self.gauge == "unit-offset":
+            x[:] = np.column_stack([lam, s.n, R, T / lam[:, None]])
+            return x.ravel()
+        if self.gauge == "free":
+            x[:] = np.column_stack([lam, s.n, self.offset, R, T / lam[:, None]])
+            return x.ravel()
+        length = np.linalg.norm(T, axis=1)
+        # a superpixel at rest has no direction in this gauge: give it a tiny one
+        floor = 1e-3 * max(float(np.median(length)), 1e-6)
+        T = np.where((length < floor)[:, None], T + [floor, 0.0, 0.0], T)
+        length = np.linalg.norm(T, axis=1)
+        tau = float(length.mean())
+        lam = length / tau
+        x[:] = np.column_stack([lam, s.n, D / lam, R, T / lam[:, None]])
+        return np.append(x.ravel(), tau)
+
+    def unpack(self, x: Float) -> Soup:
+        """Soup of a solver vector, sum(lam) as the vector has it (1 at a feasible point)."""
+        a = np.asarray(x, float)[: self.count * self.stride].reshape(self.count, self.stride)
+        n = self.count
+        rest = a[:, 4:] if self.gauge == "unit-offset" else a[:, 5:]
+        d = self.offset * n if self.gauge == "unit-offset" else a[:, 4] * n
+        R = rest[:, :9].reshape(-1, 3, 3).transpose(0, 2, 1)
+        return Soup(a[:, 0] / n, a[:, 1:4].copy(), d, R, rest[:, 9:] * n)
+
+    def names(self) -> list[str]:
+        """Readable names in order: `lam[17]`, `n[17,2]`, `R[17,2,1]` (row, column from 1)."""
+        own = ["lam[{i}]", *(f"n[{{i}},{c}]" for c in (1, 2, 3))]
+        if self.gauge != "unit-offset":
+            own.append("d[{i}]")
+        own += [f"R[{{i}},{r},{c}]" for c in (1, 2, 3) for r in (1, 2, 3)]
+        own += [f"t[{{i}},{c}]" for c in (1, 2, 3)]
+        out = [s.format(i=i) for i in range(self.count) for s in own]
+        return out + (["tau"] if self.gauge == "unit-translation" else [])
+
+
+@dataclass(frozen=True)
+class TangentLayout:
+    """Variables of the presolve about a base soup: `lam s w t` per superpixel.
+
+    Attributes:
+        anchor: (N, 3) anchor rays.
+        radius: (N,) reach of every superpixel, ray units.
+        share: (N,) weights c of the length unit.
+        depth: (N,) Z0, depth of the anchors in the base, in that unit.
+        R0: (N, 3, 3) base rotations.
+    """
+
+    anchor: Float
+    radius: Float
+    share: Float
+    depth: Float
+    R0: Float
+
+    @classmethod
+    def about(cls, soup: Soup, data: EnergyData) -> TangentLayout:
+        """Layout whose base is the soup, its rotations made exactly orthogonal."""
+        depth = soup.normalised(data.share).depth_at(data.anchor_ray)
+        R0 = rotation.nearest(soup.R)
+        return cls(data.anchor_ray, data.radius, data.share, depth, R0)
+
+    @property
+    def count(self) -> int:
+        """Superpixels."""
+        return len(self.radius)
+
+    def of(self, superpixel: Int) -> Int:
+        """(E, 9) variable indices of superpixels (E,)."""
+        return superpixel[:, None] * 9 + np.arange(9)
+
+    def pack(self, soup: Soup) -> Float:
+        """Vector (9 N,) of a soup in this length unit; slopes are not clipped here."""
+        s = soup.normalised(self.share)
+        depth = s.depth_at(self.anchor)
+        m = -s.n / s.distance[:, None]
+        slope = m[:, :2] * depth[:, None] * self.radius[:, None]
+        turn = np.swapaxes(self.R0, 1, 2) @ s.R
+        w = rotation.log(turn)
+        angle = np.linalg.norm(w, axis=1, keepdims=True)
+        # Cayley vector of the same rotation: 2 tan(angle / 2) along the axis
+        w = w * np.where(angle > 1e-12, 2 * np.tan(angle / 2) / np.maximum(angle, 1e-12), 1.0)
+        t = s.translation / depth[:, None]
+        return np.column_stack([depth / self.depth, slope, w, t]).ravel()
+
+    def unpack(self, x: Float) -> Soup:
+        """Feasible soup (SO(3), unit normals, simplex) of a vector."""
+        a = np.asarray(x, float).reshape(-1, 9)
+        s = a[:, 1:3] / self.radius[:, None]
+        m = np.column_stack([s, 1 - np.sum(s * self.anchor[:, :2], axis=1)])
+        length = np.linalg.norm(m, axis=1)
+        depth = a[:, 0] * self.depth
+        D = depth / length
+        R = rotation.nearest(self.R0 @ rotation.cayley(a[:, 3:6]))
+        T = depth[:, None] * a[:, 6:9]
+        raw = Soup(D, -m / length[:, None], np.ones(len(D)), R, T / D[:, None])
+        return raw.normalised(self.share)
+
+    def names(self) -> list[str]:
+        """Readable names in order."""
+        own = ["lam", "s1", "s2", "w1", "w2", "w3", "t1", "t2", "t3"]
+        return [f"{s}[{i}]" for i in range(self.count) for s in own]

@@ -1,0 +1,318 @@
+"""The NLP record and its assembly from kernels and tables."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from soup_nlp.errors import ModelError
+from soup_nlp.model.compile import compile_functions
+from soup_nlp.model.kernel import HESSIANS, Group
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NLP:
+    """min f(x, p) subject to lbg <= g(x, p) <= ubg, lbx <= x <= ubx.
+
+    Attributes:
+        name: For reports.
+        groups: Kernels and tables that f and g are the sums of.
+        x0, lbx, ubx: (nx,) start and bounds.
+        lbg, ubg: (ng,) constraint bounds.
+        p: (np,) parameter values: theta, then the data of every group, element by element.
+        theta: Names of the leading entries of p.
+        oracle: (x, p) -> f, g.
+        grad_f: (x, p) -> f, gradient.
+        jac_g: (x, p) -> g, Jacobian (ng x nx sparse).
+        hess_lag: (x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian.
+        hessian: Kind of that Hessian (kernel.HESSIANS).
+        x_names, g_names: Functions that make the readable names, on demand.
+        build_seconds: Time to assemble, compile_seconds of which in the C compiler.
+    """
+
+    name: str
+    groups: tuple[Group, ...]
+    x0: Float
+    lbx: Float
+    ubx: Float
+    lbg: Float
+    ubg: Float
+    p: Float
+    theta: tuple[str, ...]
+    oracle: ca.Function
+    grad_f: ca.Function
+    jac_g: ca.Function
+    hess_lag: ca.Function
+    hessian: str
+    x_names: Callable[[], list[str]]
+    g_names: Callable[[], list[str]]
+    build_seconds: float
+    compile_seconds: float
+
+    @property
+    def nx(self) -> int:
+        """Variables."""
+        return len(self.x0)
+
+    @property
+    def ng(self) -> int:
+        """Constraints."""
+        return len(self.lbg)
+
+    @property
+    def nnzj(self) -> int:
+        """Nonzeros of the Jacobian."""
+        return int(self.jac_g.nnz_out(1))
+
+    @property
+    def nnzh(self) -> int:
+        """Nonzeros of the Hessian's upper triangle."""
+        return int(self.hess_lag.nnz_out(0))
+
+    def with_theta(self, **values: float) -> Float:
+        """p with other theta entries."""
+        p = self.p.copy()
+        for name, value in values.items():
+            if name not in self.theta:
+                raise ModelError("unknown parameter", found=name, expected=", ".join(self.theta))
+            p[self.theta.index(name)] = value
+        return p
+
+    def sizes(self) -> dict[str, int]:
+        """Sizes with stable keys."""
+        eq = int(np.sum(self.lbg == self.ubg))
+        return {
+            "variables": self.nx,
+            "constraints": self.ng,
+            "equalities": eq,
+            "inequalities": self.ng - eq,
+            "jacobian_nonzeros": self.nnzj,
+            "hessian_nonzeros": self.nnzh,
+        }
+
+    def __str__(self) -> str:
+        lines = [f"NLP {self.name}: {self.nx} variables, {self.ng} constraints"]
+        lines += _bound_bars("variables", self.lbx, self.ubx)
+        lines += _bound_bars("constraints", self.lbg, self.ubg)
+        for label, nnz, cells in (
+            ("Jacobian", self.nnzj, self.nx * self.ng),
+            ("Hessian", self.nnzh, self.nx * (self.nx + 1) // 2),
+        ):
+            share = nnz / cells if cells else 0.0
+            lines.append(f"  {label:<11} {nnz:>9} nonzeros, {share:.3%} of {cells}")
+        lines.append(f"  Hessian kind: {self.hessian}; built in {self.build_seconds:.2f} s")
+        lines += [f"  {g.kernel.name:<12} {g.size:>7} x {g.kernel}" for g in self.groups]
+        return "\n".join(lines)
+
+
+def _bound_bars(label: str, lower: Float, upper: Float) -> list[str]:
+    lo, up = np.isfinite(lower), np.isfinite(upper)
+    fixed = lo & up & (lower == upper)
+    kinds = {
+        "free": ~lo & ~up,
+        "lower": lo & ~up,
+        "upper": ~lo & up,
+        "range": lo & up & ~fixed,
+        "fixed": fixed,
+    }
+    total = max(1, len(lower))
+    out = []
+    for kind, mask in kinds.items():
+        count = int(mask.sum())
+        if count:
+            bar = "#" * max(1, round(20 * count / total))
+            out.append(f"  {label:<11} {kind:<6} {bar:<20} {count}")
+    return out
+
+
+@dataclass(frozen=True)
+class _Scatter:
+    """Sum of local nonzeros into the nonzeros of one global sparse matrix."""
+
+    sparsity: ca.Sparsity
+    maps: tuple[ca.DM, ...]
+
+
+def _scatter(
+    shape: tuple[int, int], rows: list[NDArray[np.int64]], columns: list[NDArray[np.int64]]
+) -> _Scatter:
+    """Global pattern of triplets and, for each group, the constant 0/1 matrix that fills it."""
+    key = [c * shape[0] + r for r, c in zip(rows, columns)]
+    unique, place = np.unique(np.concatenate(key), return_inverse=True)
+    column_start = np.searchsorted(unique, np.arange(shape[1] + 1) * shape[0])
+    pattern = ca.Sparsity(
+        shape[0], shape[1], column_start.tolist(), (unique % shape[0]).tolist(), True
+    )
+    maps = []
+    offset = 0
+    for k in key:
+        target = place[offset : offset + len(k)]
+        offset += len(k)
+        # one nonzero a column: column j of the map is local nonzero j
+        maps.append(
+            ca.DM(
+                ca.Sparsity(len(unique), len(k), list(range(len(k) + 1)), target.tolist()),
+                np.ones(len(k)),
+            )
+        )
+    return _Scatter(pattern, tuple(maps))
+
+
+def _constant(index: NDArray[np.int64]) -> list[int]:
+    return index.astype(np.int64).ravel().tolist()
+
+
+def assemble(
+    name: str,
+    groups: tuple[Group, ...],
+    *,
+    x0: Float,
+    lbx: Float,
+    ubx: Float,
+    lbg: Float,
+    ubg: Float,
+    theta: Mapping[str, float],
+    hessian: str,
+    x_names: Callable[[], list[str]],
+    g_names: Callable[[], list[str]],
+    compiled: bool = True,
+) -> NLP:
+    """Build the NLP's functions: map every kernel over its table, scatter by constant matrices.
+
+    Args:
+        name: For reports.
+        groups: Kernels and tables.
+        x0: (nx,) start.
+        lbx: (nx,) lower bounds of x.
+        ubx: (nx,) upper bounds of x.
+        lbg: (ng,) lower bounds of g.
+        ubg: (ng,) upper bounds of g.
+        theta: Values of the shared parameters, in the kernels' order.
+        hessian: "exact", "gauss-newton" (positive semidefinite objective part, no constraint
+            curvature) or "gauss-newton+constraints".
+        x_names: Makes the variables' names.
+        g_names: Makes the constraints' names.
+        compiled: Use the C compiler where there is one.
+    """
+    if hessian not in HESSIANS:
+        raise ModelError("unknown Hessian", found=hessian, expected=", ".join(HESSIANS))
+    begin = time.perf_counter()
+    groups = tuple(g for g in groups if g.size)
+    nx, ng = len(x0), len(lbg)
+    made = [g.kernel.functions(hessian) for g in groups]
+    every = [f for functions in made for f in functions.values()]
+    compile_begin = time.perf_counter()
+    fast = compile_functions(every) if compiled else {f.name(): f for f in every}
+    compile_seconds = time.perf_counter() - compile_begin
+
+    x = ca.MX.sym("x", nx)
+    p = ca.MX.sym("p", len(theta) + sum(g.table.data.size for g in groups))
+    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", ng)
+    th = p[: len(theta)]
+    local: list[dict[str, ca.MX]] = []
+    offset = len(theta)
+    for group, functions in zip(groups, made):
+        size, np_ = group.table.data.shape
+        xe = ca.reshape(x[_constant(group.table.index)], group.kernel.nx, size)
+        pe = ca.reshape(p[offset : offset + size * np_], np_, size)
+        offset += size * np_
+        args = [xe, pe, ca.repmat(th, 1, size)]
+        values = {}
+        for key, function in functions.items():
+            extra = []
+            if key == "hess":
+                nc = group.kernel.nc
+                lam_c = (
+                    ca.reshape(lam_g[_constant(group.table.rows)], nc, size)
+                    if nc
+                    else ca.MX(0, size)
+                )
+                extra = [ca.repmat(lam_f, 1, size), lam_c]
+            mapped = fast[function.name()].map(size)
+            values[key] = ca.vec(mapped(*args, *extra))
+        local.append(values)
+
+    f = ca.MX(0.0)
+    grad = ca.MX.zeros(nx)
+    g = ca.MX.zeros(ng)
+    objective = [(grp, v) for grp, v in zip(groups, local) if "f" in v]
+    constrained = [(grp, v) for grp, v in zip(groups, local) if "con" in v]
+    for group, values in objective:
+        f += ca.sum1(values["f"])
+        grad += _sum_into(nx, group.table.index) @ values["grad"]
+    for group, values in constrained:
+        g += _sum_into(ng, group.table.rows) @ values["con"]
+
+    jac = ca.MX(ng, nx)
+    if constrained:
+        rows, columns = [], []
+        for group, _ in constrained:
+            r, c = group.kernel.jacobian_pattern()
+            rows.append(group.table.rows[:, r].ravel())
+            columns.append(group.table.index[:, c].ravel())
+        scatter = _scatter((ng, nx), rows, columns)
+        nz = sum((m @ v["jac"] for m, (_, v) in zip(scatter.maps, constrained)), ca.MX(0))
+        jac = ca.MX(scatter.sparsity, nz)
+
+    hess = ca.MX(nx, nx)
+    curved = [(grp, v) for grp, v in zip(groups, local) if "hess" in v]
+    if curved:
+        rows, columns = [], []
+        for group, _ in curved:
+            r, c = group.kernel.hessian_pattern(hessian)
+            a, b = group.table.index[:, r].ravel(), group.table.index[:, c].ravel()
+            rows.append(np.minimum(a, b))
+            columns.append(np.maximum(a, b))
+        scatter = _scatter((nx, nx), rows, columns)
+        nz = sum((m @ v["hess"] for m, (_, v) in zip(scatter.maps, curved)), ca.MX(0))
+        hess = ca.MX(scatter.sparsity, nz)
+
+    data = [grp.table.data.ravel() for grp in groups]
+    return NLP(
+        name=name,
+        groups=groups,
+        x0=x0,
+        lbx=lbx,
+        ubx=ubx,
+        lbg=lbg,
+        ubg=ubg,
+        p=np.concatenate([np.array(list(theta.values()), float), *data]),
+        theta=tuple(theta),
+        oracle=ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]),
+        grad_f=ca.Function("nlp_grad_f", [x, p], [f, grad], ["x", "p"], ["f", "grad_f_x"]),
+        jac_g=ca.Function("nlp_jac_g", [x, p], [g, jac], ["x", "p"], ["g", "jac_g_x"]),
+        hess_lag=ca.Function(
+            "nlp_hess_l",
+            [x, p, lam_f, lam_g],
+            [hess],
+            ["x", "p", "lam_f", "lam_g"],
+            ["triu_hess_gamma_x_x"],
+        ),
+        hessian=hessian,
+        x_names=x_names,
+        g_names=g_names,
+        build_seconds=time.perf_counter() - begin,
+        compile_seconds=compile_seconds,
+    )
+
+
+def _sum_into(size: int, index: NDArray[np.int64]) -> ca.DM:
+    """Constant 0/1 matrix that sums local entries (element by element) into a global vector."""
+    flat = index.ravel()
+    return ca.DM(
+        ca.Sparsity(size, len(flat), list(range(len(flat) + 1)), flat.tolist()),
+        np.ones(len(flat)),
+    )
+
+
+def to_scipy(matrix: ca.DM) -> sparse.csc_matrix:
+    """scipy's CSC matrix of a CasADi one."""
+    return matrix.sparse()

@@ -1,0 +1,112 @@
+"""Un-squared norms and truncations in the forms that a solver can take.
+
+A term of the energy is a sum of `weight * min(|vector|, sigma)`. The exact sum is the energy that
+is reported; a solver gets a smooth, an epigraph or a lifted form of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import casadi as ca
+
+NormForm = Literal["smooth", "epigraph"]
+TruncationForm = Literal["smooth", "lifted"]
+Kind = Literal["norm", "half_square"]
+
+
+@dataclass(frozen=True)
+class Norm:
+    """One robust norm `weight * min(|vector|, sigma)` of a kernel.
+
+    Attributes:
+        name: For the names of its slack variables and constraints.
+        weight: Scalar expression.
+        vector: Column expression.
+        eps: Smoothing length of |.| in the vector's unit (a parameter of the NLP).
+        sigma: Truncation, or None when there is none.
+        kind: "norm" for |v|; "half_square" for |v|^2 / 2, smooth as it is.
+    """
+
+    name: str
+    weight: ca.SX
+    vector: ca.SX
+    eps: ca.SX
+    sigma: ca.SX | None = None
+    kind: Kind = "norm"
+
+    def exact(self) -> ca.SX:
+        """The value in the energy that is reported."""
+        square = ca.dot(self.vector, self.vector)
+        y = square / 2 if self.kind == "half_square" else ca.sqrt(square)
+        return self.weight * (y if self.sigma is None else ca.fmin(y, self.sigma))
+
+
+@dataclass(frozen=True)
+class Form:
+    """A norm in solver form.
+
+    Attributes:
+        objective: Its contribution to the objective.
+        curvature: Positive semidefinite stand-in for the objective's Hessian, of the same
+            size as the kernel's variables.
+        constraint: Epigraph constraint `>= 0` (scalar), or None.
+    """
+
+    objective: ca.SX
+    curvature: ca.SX
+    constraint: ca.SX | None = None
+
+
+def smooth_min(y: ca.SX, sigma: ca.SX, width: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Smooth `min(y, sigma)` that is 0 at y = 0, and its derivative in (0, 1).
+
+    `(y + sigma - sqrt((y - sigma)^2 + width^2)) / 2`, shifted by its value at 0.
+    """
+    root = ca.sqrt((y - sigma) ** 2 + width**2)
+    at_zero = (sigma - ca.sqrt(sigma**2 + width**2)) / 2
+    return (y + sigma - root) / 2 - at_zero, (1 - (y - sigma) / root) / 2
+
+
+def solver_form(
+    norm: Norm,
+    x: ca.SX,
+    theta: ca.SX,
+    slack: ca.SX | None,
+    switch: ca.SX | None,
+) -> Form:
+    """The norm as a solver sees it.
+
+    Args:
+        norm: The robust norm.
+        x: All local variables of the kernel (slack and switch among them).
+        theta: Share of the curvature along the residual that is removed (0: reweighted least
+            squares, 1: Newton's; SOLVING measured 0.9 best).
+        slack: Variable s >= 0 of the epigraph form, None for the smooth form.
+        switch: Variable z in [0, 1] of the lifted truncation, None for the smooth one.
+    """
+    v = norm.vector
+    J = ca.jacobian(v, x)
+    square = ca.dot(v, v)
+    constraint = None
+    if norm.kind == "half_square":
+        y, dy = square / 2, ca.SX(1.0)
+        outer = ca.mtimes(J.T, J)
+    elif slack is not None:
+        y, dy = slack, ca.SX(1.0)
+        outer = ca.SX(x.numel(), x.numel())
+        constraint = slack**2 - square
+    else:
+        root = ca.sqrt(square + norm.eps**2)
+        y, dy = root - norm.eps, 1 / root
+        along = ca.mtimes(J.T, v / root)
+        outer = ca.mtimes(J.T, J) - theta * ca.mtimes(along, along.T)
+    if norm.sigma is None:
+        value, slope = y, ca.SX(1.0)
+    elif switch is not None:
+        value, slope = switch * y + (1 - switch) * norm.sigma, switch
+    else:
+        width = norm.eps if norm.kind == "norm" else 0.2 * norm.sigma
+        value, slope = smooth_min(y, norm.sigma, width)
+    return Form(norm.weight * value, norm.weight * slope * dy * outer, constraint)

@@ -1,0 +1,96 @@
+"""The four energy terms and every constraint, each written once for one element.
+
+A term takes the views of its superpixels and its row of data, and returns its robust norms; see
+`energy.EnergyData` for the columns and `plain` for the same in numpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import casadi as ca
+
+from soup_nlp.model.norms import Norm
+from soup_nlp.model.views import View
+
+Row = Mapping[str, ca.SX]
+
+
+def arap(
+    a: View, b: View, row: Row, eps: ca.SX, truncated: bool, at_anchors: bool
+) -> list[Norm]:
+    """E_arap of an edge, Eq. 1: rotation, translation and distance of the anchors."""
+    sigma = row["sigma"] if truncated else None
+    weight, unit = row["weight"], row["unit"]
+    Xa, Xb = a.point(row["ray_i"]), b.point(row["ray_k"])
+    Ya, Yb = a.move(Xa), b.move(Xb)
+    gap = a.lam * a.t - b.lam * b.t
+    if at_anchors:
+        gap = gap + (a.R - b.R) @ ((Xa + Xb) / 2)
+    # |Xa - Xb| is smooth wherever two anchors differ, so it needs no slack of its own
+    stretch = ca.sqrt(ca.sumsqr(Xa - Xb) + 1e-12) - ca.sqrt(ca.sumsqr(Ya - Yb) + 1e-12)
+    return [
+        Norm("rotation", weight, row["turn"] * ca.vec(a.R - b.R), eps, sigma),
+        Norm("translation", weight, gap / unit, eps, sigma),
+        Norm("distance", weight, stretch / unit, eps, sigma),
+    ]
+
+
+def reprojection(a: View, row: Row, eps: ca.SX, K_next: ca.DM, truncated: bool) -> list[Norm]:
+    """E_proj of one pixel, Eq. 3: distance of homography and flow target, pixels."""
+    y = ca.SX(K_next) @ a.transfer(row["ray"])
+    error = y[0:2] / y[2] - row["target"]
+    return [Norm("reprojection", row["weight"], error, eps, row["sigma"] if truncated else None)]
+
+
+def continuity(
+    a: View, b: View, row: Row, eps: ca.SX, samples: int, ref_truncated: bool, truncated: bool
+) -> list[Norm]:
+    """E_cont of a neighbour pair, Eq. 4: boundary gaps in both frames."""
+    before, after = [], []
+    for j in range(samples):
+        ray = row["rays"][3 * j : 3 * j + 3]
+        Xa, Xb = a.point(ray), b.point(ray)
+        before.append(Xa - Xb)
+        after.append(a.move(Xa) - b.move(Xb))
+    f = row["factor"]
+    return [
+        Norm(
+            "gap_ref",
+            row["weight"],
+            f * ca.vertcat(*before),
+            eps,
+            row["sigma_ref"] if ref_truncated else None,
+        ),
+        Norm(
+            "gap_next",
+            row["weight"],
+            f * ca.vertcat(*after),
+            eps,
+            row["sigma"] if truncated else None,
+        ),
+    ]
+
+
+def orientation(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
+    """E_orient of a neighbour pair.
+
+    `1 - n_i . n_k = |n_i - n_k|^2 / 2` on the unit sphere; the square is convex off it too.
+    """
+    return [Norm("turn", row["weight"], a.n - b.n, eps, row["sigma"], kind="half_square")]
+
+
+def so3(a: View) -> ca.SX:
+    """(6x1) upper triangle of `R^T R - I`; det = 1 is left to the start (LICQ)."""
+    gram = a.R.T @ a.R
+    return ca.vertcat(*[gram[r, c] - (1 if r == c else 0) for c in range(3) for r in range(c + 1)])
+
+
+def unit_normal(a: View) -> ca.SX:
+    """(1x1) `|n|^2 - 1`."""
+    return ca.sumsqr(a.n) - 1
+
+
+def visibility(a: View, rays: ca.SX, count: int) -> ca.SX:
+    """(count x 1) `-n . r` at the anchor and rim rays; bounded below by c > 0."""
+    return ca.vertcat(*[-ca.dot(a.n, rays[3 * j : 3 * j + 3]) for j in range(count)])

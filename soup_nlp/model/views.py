@@ -1,0 +1,83 @@
+"""A superpixel in symbols: the same five expressions whatever variables stand behind them.
+
+The energy terms are written once against `View`; a parametrisation (matrix rotations in one of
+three gauges, or tangent coordinates about a base) says how its variables make one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+
+@dataclass(frozen=True)
+class View:
+    """Symbolic superpixel.
+
+    Attributes:
+        lam: Scale (1x1): reference point of ray r is `lam r / (m . r)`.
+        m: (3x1) inverse-depth plane of unit scale, `m = -n / d`.
+        n: (3x1) unit normal that faces the camera.
+        R: (3x3) rotation.
+        t: (3x1) translation of unit scale: `X' = R X + lam t`.
+    """
+
+    lam: ca.SX
+    m: ca.SX
+    n: ca.SX
+    R: ca.SX
+    t: ca.SX
+
+    def point(self, ray: ca.SX) -> ca.SX:
+        """Reference-frame point (3x1) of a ray (3x1)."""
+        return self.lam / ca.dot(self.m, ray) * ray
+
+    def move(self, point: ca.SX) -> ca.SX:
+        """Next-frame point of a reference-frame point."""
+        return self.R @ point + self.lam * self.t
+
+    def transfer(self, ray: ca.SX) -> ca.SX:
+        """Next-frame ray (3x1, free length) of a reference ray: the homography without K."""
+        return self.R @ ray + self.t * ca.dot(self.m, ray)
+
+
+def matrix_view(x: ca.SX, gauge: str, offset: ca.SX) -> View:
+    """View of the constrained NLP's variables of one superpixel.
+
+    Args:
+        x: (16x1) `lam n R t` for gauge "unit-offset", else (17x1) `lam n d R t`; R by
+            columns; lam, d and t scaled by N, 1/N and 1/N so that numbers are near 1.
+        gauge: "unit-offset", "unit-translation" or "free".
+        offset: d of gauge "unit-offset", a constant of the superpixel.
+    """
+    lam, n = x[0], x[1:4]
+    if gauge == "unit-offset":
+        d, rest = offset, x[4:]
+    else:
+        d, rest = x[4], x[5:]
+    return View(lam=lam, m=-n / d, n=n, R=ca.reshape(rest[0:9], 3, 3), t=rest[9:12])
+
+
+TANGENT_SIZE = 9
+
+
+def tangent_view(x: ca.SX, anchor: ca.SX, radius: ca.SX, depth: ca.SX, R0: ca.SX) -> View:
+    """View of the presolve's variables of one superpixel.
+
+    `1 / Z(r) = (1 + s . (r - r_a) / h) / Z`, Z = lam Z0 the depth of the anchor; rotation
+    `R0 Cayley(w)`, `X' = R X + Z t`.
+
+    Args:
+        x: (9x1) `lam s w t`: relative scale, slopes (2), rotation (3), translation / Z (3).
+        anchor: (3x1) anchor ray r_a.
+        radius: h, ray units.
+        depth: Z0, depth of the anchor in the base.
+        R0: (9x1) base rotation by columns.
+    """
+    lam, s, w, t = x[0], x[1:3], x[3:6], x[6:9]
+    m = ca.vertcat(s / radius, 1 - ca.dot(s, anchor[0:2]) / radius)
+    h = w / 2
+    W = ca.skew(h)
+    C = ca.SX.eye(3) + (2 / (1 + ca.dot(h, h))) * (W + W @ W)
+    return View(lam=lam * depth, m=m, n=-m / ca.norm_2(m), R=ca.reshape(R0, 3, 3) @ C, t=t)

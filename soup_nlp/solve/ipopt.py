@@ -1,0 +1,328 @@
+"""Ipopt on an `NLP`: options, progress, interruption, and the best iterate whatever happens."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import SolverError
+from soup_nlp.model.nlp import NLP
+
+Float = NDArray[np.float64]
+
+# what SOLVING measured: few bounds are active, so mu starts near its end
+DEFAULTS: Mapping[str, Any] = {
+    "linear_solver": "mumps",
+    "mu_strategy": "monotone",
+    "mu_init": 1e-5,
+    "nlp_scaling_method": "none",
+    "bound_push": 1e-6,
+    "bound_frac": 1e-6,
+    "mumps_permuting_scaling": 0,
+    "watchdog_shortened_iter_trigger": 0,
+}
+GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One iteration as it happens.
+
+    Attributes:
+        stage: Name of the stage.
+        iteration: Counted from 0 in the stage.
+        objective: f of the solver's form.
+        infeasibility: Largest violation of a constraint.
+        seconds: Since the stage began.
+    """
+
+    stage: str
+    iteration: int
+    objective: float
+    infeasibility: float
+    seconds: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.stage:<16} it {self.iteration:>3}  f {self.objective:12.6g}"
+            f"  infeasibility {self.infeasibility:8.1e}  {self.seconds:6.1f} s"
+        )
+
+
+Listener = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One call of Ipopt and how it ended.
+
+    Attributes:
+        name: Stage.
+        status: Ipopt's return status, or "Interrupted", "Time_Limit", "Stagnated".
+        converged: Ipopt's own claim.
+        x: Best iterate: the last one when converged, else the lowest objective among the most
+            feasible.
+        lam_x: Multipliers of the bounds at the last iterate.
+        lam_g: Multipliers of the constraints at the last iterate.
+        objective: f at x.
+        iterations: Count.
+        seconds: Wall time, set-up included.
+        history: objective, inf_pr, inf_du, mu, alpha_pr, regularization by iteration.
+        calls: Seconds in f, grad_f, g, jac_g, hess_lag.
+    """
+
+    name: str
+    status: str
+    converged: bool
+    x: Float
+    lam_x: Float
+    lam_g: Float
+    objective: float
+    iterations: int
+    seconds: float
+    history: Mapping[str, Float] = field(repr=False)
+    calls: Mapping[str, float] = field(repr=False)
+
+    def __str__(self) -> str:
+        return (
+            f"{self.name}: {self.status}, {self.iterations} iterations, f {self.objective:.6g},"
+            f" {self.seconds:.1f} s"
+        )
+
+
+class _Watch(ca.Callback):  # type: ignore[misc]
+    """CasADi's iteration callback: progress, limits, the best iterate."""
+
+    def __init__(
+        self,
+        nlp: NLP,
+        stage: str,
+        listener: Listener | None,
+        deadline: float,
+        stagnation: float | None,
+        stop: threading.Event,
+    ) -> None:
+        ca.Callback.__init__(self)
+        self.nlp, self.stage, self.listener = nlp, stage, listener
+        self.deadline, self.stagnation, self.stop = deadline, stagnation, stop
+        self.begin = time.perf_counter()
+        self.count = 0
+        self.small = 0
+        self.last = np.inf
+        self.best: tuple[float, float] = (np.inf, np.inf)
+        self.best_x = nlp.x0
+        self.reason = ""
+        self.construct(f"watch_{nlp.name}", {})
+
+    def get_n_in(self) -> int:
+        return int(ca.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_name_in(self, i: int) -> str:
+        return str(ca.nlpsol_out(i))
+
+    def get_name_out(self, i: int) -> str:
+        return "ret"
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        name = ca.nlpsol_out(i)
+        size = {
+            "f": 1,
+            "x": self.nlp.nx,
+            "lam_x": self.nlp.nx,
+            "g": self.nlp.ng,
+            "lam_g": self.nlp.ng,
+            "lam_p": len(self.nlp.p),
+        }[name]
+        return ca.Sparsity.dense(size) if size else ca.Sparsity(0, 1)
+
+    def eval(self, arg: list[ca.DM]) -> list[int]:
+        try:
+            return [self._step(arg)]
+        except Exception as error:
+            self.reason = f"Callback_Failed: {error}"
+            return [1]
+
+    def _step(self, arg: list[ca.DM]) -> int:
+        nlp = self.nlp
+        x, f = np.asarray(arg[0]).ravel(), float(arg[1])
+        g = np.asarray(arg[2]).ravel()
+        outside = np.maximum(nlp.lbg - g, g - nlp.ubg)
+        infeasible = float(max(outside.max(initial=0.0), 0.0))
+        # feasible to 1e-5 counts as feasible: then the objective decides
+        rank = (max(infeasible, 1e-5), f)
+        if np.isfinite(f) and rank < self.best:
+            self.best, self.best_x = rank, x
+        now = time.perf_counter()
+        if self.listener:
+            self.listener(Progress(self.stage, self.count, f, infeasible, now - self.begin))
+        self.count += 1
+        if self.stop.is_set():
+            self.reason = "Interrupted"
+        elif now > self.deadline:
+            self.reason = "Time_Limit"
+        elif self.stagnation is not None:
+            still = abs(self.last - f) <= self.stagnation * max(abs(f), 1e-9)
+            self.small = self.small + 1 if still else 0
+            if self.small >= 2:
+                self.reason = "Stagnated"
+        self.last = f
+        return int(bool(self.reason))
+
+
+class interruptible:  # noqa: N801
+    """Context in which Ctrl-C sets an event instead of raising (main thread only)."""
+
+    def __init__(self) -> None:
+        self.event = threading.Event()
+        self._old: Any = None
+
+    def __enter__(self) -> threading.Event:
+        if threading.current_thread() is threading.main_thread():
+            self._old = signal.signal(signal.SIGINT, self._set)
+        return self.event
+
+    def _set(self, number: int, frame: FrameType | None) -> None:
+        self.event.set()
+
+    def __exit__(self, *exc: object) -> None:
+        if self._old is not None:
+            signal.signal(signal.SIGINT, self._old)
+
+
+class Ipopt:
+    """Ipopt set up once for an NLP; call it with parameters and a start as often as needed."""
+
+    def __init__(self, nlp: NLP, options: Mapping[str, Any] | None = None) -> None:
+        self.nlp = nlp
+        self.options = dict(options or {})
+
+    def _solver(self, watch: _Watch, max_iter: int, tol: float, log_file: str | None) -> Any:
+        nlp = self.nlp
+        x, p = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", len(nlp.p))
+        f, g = nlp.oracle(x, p)
+        ipopt: dict[str, Any] = {
+            **DEFAULTS,
+            "max_iter": max_iter,
+            "tol": tol,
+            "dual_inf_tol": tol,
+            "print_level": 0,
+            "sb": "yes",
+            **self.options,
+        }
+        if log_file:
+            ipopt |= {"output_file": log_file, "file_print_level": 5, "file_append": "yes"}
+        options = {
+            "ipopt": ipopt,
+            "grad_f": nlp.grad_f,
+            "jac_g": nlp.jac_g,
+            "hess_lag": nlp.hess_lag,
+            "iteration_callback": watch,
+            "print_time": False,
+            "calc_lam_p": False,
+            "calc_multipliers": False,
+            "no_nlp_grad": True,
+            "show_eval_warnings": False,
+        }
+        try:
+            return ca.nlpsol("solver", "ipopt", {"x": x, "p": p, "f": f, "g": g}, options)
+        except RuntimeError as error:
+            raise SolverError(
+                "Ipopt could not be set up",
+                where=nlp.name,
+                found=str(error).strip().splitlines()[-1],
+                hint="check the names of the options under solver",
+            ) from error
+
+    def __call__(
+        self,
+        *,
+        x0: Float,
+        p: Float | None = None,
+        lam_x0: Float | None = None,
+        lam_g0: Float | None = None,
+        max_iter: int = 100,
+        tol: float = 1e-4,
+        seconds: float = np.inf,
+        stagnation: float | None = None,
+        stage: str = "solve",
+        listener: Listener | None = None,
+        stop: threading.Event | None = None,
+        log_file: str | None = None,
+    ) -> Stage:
+        """Solve from x0.
+
+        Args:
+            x0: (nx,) start.
+            p: Parameters; default the NLP's.
+            lam_x0: (nx,) start of the bound multipliers.
+            lam_g0: (ng,) start of the constraint multipliers.
+            max_iter: Iteration limit.
+            tol: Ipopt's tol and dual_inf_tol.
+            seconds: Time limit; the best iterate is kept.
+            stagnation: Stop when f changes by less than this share, twice in a row.
+            stage: Name for progress.
+            listener: Called at every iteration.
+            stop: Event that ends the solve at the next iteration.
+            log_file: Ipopt's own log is appended here.
+        """
+        nlp = self.nlp
+        begin = time.perf_counter()
+        stop = stop or threading.Event()
+        watch = _Watch(nlp, stage, listener, begin + seconds, stagnation, stop)
+        solver = self._solver(watch, max_iter, tol, log_file)
+        args: dict[str, Any] = {
+            "x0": x0,
+            "p": nlp.p if p is None else p,
+            "lbx": nlp.lbx,
+            "ubx": nlp.ubx,
+            "lbg": nlp.lbg,
+            "ubg": nlp.ubg,
+        }
+        if lam_x0 is not None:
+            args["lam_x0"] = lam_x0
+        if lam_g0 is not None:
+            args["lam_g0"] = lam_g0
+        out = solver(**args)
+        stats = solver.stats()
+        status = watch.reason or str(stats.get("return_status", "Unknown"))
+        converged = status in GOOD
+        x = np.asarray(out["x"]).ravel()
+        f = float(out["f"])
+        if not converged and np.isfinite(watch.best[1]):
+            x, f = watch.best_x, watch.best[1]
+        if not np.isfinite(x).all():
+            x, f = x0, np.nan
+        return Stage(
+            name=stage,
+            status=status,
+            converged=converged,
+            x=x,
+            lam_x=np.asarray(out["lam_x"]).ravel(),
+            lam_g=np.asarray(out["lam_g"]).ravel(),
+            objective=f,
+            iterations=int(stats.get("iter_count", watch.count)),
+            seconds=time.perf_counter() - begin,
+            history={k: np.asarray(v, float) for k, v in stats.get("iterations", {}).items()},
+            calls={
+                k: float(stats.get(f"t_wall_{s}", 0.0))
+                for k, s in (
+                    ("f", "nlp_f"),
+                    ("grad_f", "nlp_grad_f"),
+                    ("g", "nlp_g"),
+                    ("jac_g", "nlp_jac_g"),
+                    ("hess_lag", "nlp_hess_l"),
+                )
+            },
+        )

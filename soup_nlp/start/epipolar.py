@@ -1,0 +1,159 @@
+"""Rigid two-view motion from flow: robust estimation, refinement, repeated fits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from soup_nlp.geometry import rotation
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Rigid motion next_from_ref with a translation of unit length.
+
+    Attributes:
+        R: (3, 3) rotation.
+        t: (3,) direction of the translation.
+    """
+
+    R: Float
+    t: Float
+
+    def essential(self) -> Float:
+        """(3, 3) E with `q^T E r = 0` for rays r (reference) and q (next)."""
+        return rotation.hat(self.t) @ self.R
+
+
+def sampson(E: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
+    """Sampson distance (...) of rays r, q (..., 3) to E (..., 3, 3), times focal (pixels)."""
+    Er = np.einsum("...ij,...j->...i", E, r)
+    Eq = np.einsum("...ji,...j->...i", E, q)
+    top = np.sum(q * Er, axis=-1)
+    down = Er[..., 0] ** 2 + Er[..., 1] ** 2 + Eq[..., 0] ** 2 + Eq[..., 1] ** 2
+    return focal * top / np.sqrt(np.maximum(down, 1e-24))
+
+
+def estimate(
+    r: Float, q: Float, weight: Float, focal: float, threshold: float = 1.0, seed: int = 0
+) -> Motion | None:
+    """Motion of most correspondences, or None where they do not determine one.
+
+    Args:
+        r: (M, 3) reference rays, third component 1.
+        q: (M, 3) next rays.
+        weight: (M,) confidence.
+        focal: Pixels per ray unit, so that the threshold is in pixels.
+        threshold: Inlier distance, pixels.
+        seed: Of RANSAC.
+    """
+    if len(r) < 8:
+        return None
+    cv2.setRNGSeed(seed)
+    a = np.ascontiguousarray(r[:, :2])
+    b = np.ascontiguousarray(q[:, :2])
+    try:
+        E, _ = cv2.findEssentialMat(
+            a, b, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=threshold / focal
+        )
+    except cv2.error:
+        return None
+    if E is None or E.shape[0] < 3 or not np.isfinite(E).all():
+        return None
+    # several solutions come stacked: keep the one with the smallest robust distance
+    stack = np.ascontiguousarray(E[: 3 * (len(E) // 3)]).reshape(-1, 3, 3)
+    cost = [np.mean(np.minimum(np.abs(sampson(e, r, q, focal)), 3.0)) for e in stack]
+    best = np.ascontiguousarray(stack[int(np.argmin(cost))])
+    motion = _decompose(best, r, q)
+    return None if motion is None else refine(motion, r, q, weight, focal, threshold)
+
+
+def _decompose(E: Float, r: Float, q: Float) -> Motion | None:
+    """The (R, t) of E that puts most points in front of both cameras."""
+    R1, R2, t = cv2.decomposeEssentialMat(E)
+    t = t.ravel()
+    best, most = None, -1
+    for R in (R1, R2):
+        for s in (1.0, -1.0):
+            z, z_next = triangulate(Motion(R, s * t), r, q)
+            front = int(np.sum((z > 0) & (z_next > 0)))
+            if front > most:
+                best, most = Motion(R, s * t), front
+    return best
+
+
+def triangulate(motion: Motion, r: Float, q: Float) -> tuple[Float, Float]:
+    """Depths (M,) in both frames of rays r, q under a motion, unit baseline.
+
+    Minimises the algebraic error of `z R r + t ~ q` in the next image.
+    """
+    y = r @ motion.R.T
+    # residual of (z y + t)_xy - q (z y + t)_z, linear in z
+    a = y[:, :2] - q[:, :2] * y[:, 2:]
+    b = motion.t[:2] - q[:, :2] * motion.t[2]
+    z = -np.sum(a * b, axis=1) / np.maximum(np.sum(a * a, axis=1), 1e-18)
+    return z, z * y[:, 2] + motion.t[2]
+
+
+def refine(
+    motion: Motion, r: Float, q: Float, weight: Float, focal: float, threshold: float = 1.0
+) -> Motion:
+    """Motion that minimises the robust (Cauchy), weighted Sampson distance."""
+    root = np.sqrt(weight)
+    basis = np.linalg.svd(motion.t[None])[2][1:]
+
+    def unpack(x: Float) -> Motion:
+        t = motion.t + x[3:] @ basis
+        return Motion(motion.R @ rotation.exp(x[:3]), t / np.linalg.norm(t))
+
+    def residual(x: Float) -> Float:
+        return root * sampson(unpack(x).essential(), r, q, focal)
+
+    scale = max(0.1, 0.5 * threshold)
+    fit = least_squares(residual, np.zeros(5), loss="cauchy", f_scale=scale, max_nfev=30)
+    return unpack(fit.x)
+
+
+def repeated(
+    r: Float,
+    q: Float,
+    weight: Float,
+    focal: float,
+    *,
+    count: int = 5,
+    threshold: float = 1.0,
+    min_share: float = 0.03,
+    seed: int = 0,
+) -> list[Motion]:
+    """Dominant motions by repeated robust fits, each to what the earlier ones leave over.
+
+    Args:
+        r: (M, 3) reference rays.
+        q: (M, 3) next rays.
+        weight: (M,) confidence.
+        focal: Pixels per ray unit.
+        count: At most this many.
+        threshold: Inlier distance, pixels.
+        min_share: A motion needs this share of all correspondences.
+        seed: Of RANSAC.
+    """
+    left = np.ones(len(r), bool)
+    out: list[Motion] = []
+    for k in range(count):
+        if left.sum() < max(8, min_share * len(r)):
+            break
+        motion = estimate(r[left], q[left], weight[left], focal, threshold, seed + k)
+        if motion is None:
+            break
+        inlier = np.abs(sampson(motion.essential(), r, q, focal)) < threshold
+        if np.sum(inlier & left) < min_share * len(r):
+            break
+        out.append(motion)
+        left &= ~inlier
+    return out

@@ -1,0 +1,104 @@
+"""Plane of every superpixel under given motions: linear in n / d, robust, batched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PlaneFit:
+    """Planes of N superpixels under C candidate motions each (unit translation).
+
+    Attributes:
+        inverse_depth: (N, C) 1 / Z at the anchor, in units of |t|; may be negative (bad).
+        slope: (N, C, 2) relative change of inverse depth at the superpixel's radius.
+        cost: (N, C) robust mean re-projection error, pixels; inf where a fit is impossible.
+        parallax: (N, C) pixels that the anchor moves per unit of relative inverse depth.
+    """
+
+    inverse_depth: Float
+    slope: Float
+    cost: Float
+    parallax: Float
+
+
+def fit_planes(
+    R: Float,
+    t: Float,
+    ray: Float,
+    target: Float,
+    weight: Float,
+    anchor: Float,
+    radius: Float,
+    focal: tuple[float, float],
+    *,
+    noise: float = 0.5,
+    slope_prior: float = 0.4,
+    max_slope: float = 0.75,
+    clip: float = 5.0,
+    rounds: int = 4,
+) -> PlaneFit:
+    """Fit `mu(r) = mu_a + g . (r - r_a) / h` with `q ~ R r + mu t` to the flow.
+
+    Args:
+        R: (N, C, 3, 3) rotations.
+        t: (N, C, 3) translations.
+        ray: (N, S, 3) rays of sampled pixels.
+        target: (N, S, 3) rays of their flow targets (next camera).
+        weight: (N, S) confidence.
+        anchor: (N, 3) anchor rays.
+        radius: (N,) reach in ray units (h).
+        focal: (fx, fy) of the next camera: errors are in pixels.
+        noise: Flow noise in pixels that the slope prior is weighed against.
+        slope_prior: Standard deviation of the slopes g / mu_a.
+        max_slope: Slopes are clipped to this.
+        clip: Errors count at most this many pixels.
+        rounds: Reweighting rounds.
+    """
+    f = np.asarray(focal)
+    y = np.einsum("ncij,nsj->ncsi", R, ray)
+    q = target[:, None, :, :2]
+    a = (y[..., :2] - q * y[..., 2:]) * f
+    b = (t[:, :, None, :2] - q * t[:, :, None, 2:]) * f
+    off = (ray - anchor[:, None])[..., :2] / radius[:, None, None]
+    basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
+    outer = basis[..., :, None] * basis[..., None, :]
+    w = np.broadcast_to(weight[:, None], a.shape[:3]).copy()
+    confident = w
+    depth_like = np.maximum(np.abs(y[..., 2]), 1e-6)
+    b2 = np.sum(b * b, axis=-1)
+    ab = np.sum(a * b, axis=-1)
+    mu = np.zeros((*a.shape[:2], 3))
+    floor = 1e-12
+    for step in range(rounds):
+        s = w / depth_like**2
+        mu_a = -np.sum(s * ab, axis=2) / np.maximum(np.sum(s * b2, axis=2), floor)
+        if step == 0:
+            mu[..., 0] = mu_a
+        else:
+            A = np.einsum("ncs,nsij->ncij", s * b2, outer, optimize=True)
+            rhs = -np.einsum("ncs,nsi->nci", s * ab, basis)
+            # slopes are known a priori to slope_prior, the flow to noise pixels
+            prior = (noise / (slope_prior * np.maximum(np.abs(mu[..., 0]), 1e-9))) ** 2
+            A[..., 1, 1] += prior
+            A[..., 2, 2] += prior
+            size = np.trace(A, axis1=-2, axis2=-1)[..., None, None]
+            A += (floor * size + 1e-18) * np.eye(3)
+            mu = np.linalg.solve(A, rhs[..., None])[..., 0]
+            limit = max_slope * np.abs(mu[..., :1])
+            mu[..., 1:] = np.clip(mu[..., 1:], -limit, limit)
+        value = np.einsum("nci,nsi->ncs", mu, basis)
+        depth_like = np.maximum(y[..., 2] + value * t[:, :, None, 2], 1e-3)
+        error = np.linalg.norm(a + b * value[..., None], axis=-1) / depth_like
+        w = confident / np.sqrt(error**2 + noise**2)
+    total = np.maximum(confident.sum(axis=2), 1e-9)
+    cost = np.sum(confident * np.minimum(error, clip), axis=2) / total
+    parallax = np.sqrt(np.sum(confident * b2 / depth_like**2, axis=2) / total)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = np.where(mu[..., :1] != 0, mu[..., 1:] / mu[..., :1], 0.0)
+    return PlaneFit(mu[..., 0], np.clip(slope, -max_slope, max_slope), cost, parallax)
