@@ -1,0 +1,393 @@
+"""Dataset layouts, written small into a temporary folder, and the real pairs where present."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from soup_nlp.data import datasets
+from soup_nlp.data import formats as fmt
+from soup_nlp.data.datasets_sintel import DEFAULT_CAMERA
+from soup_nlp.errors import DataError
+
+H, W = 6, 9
+K = np.array([[100.0, 0.0, 4.0], [0.0, 110.0, 3.0], [0.0, 0.0, 1.0]])
+
+
+def picture(path: Path, seed: int = 0, channels: int = 3) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    noise = np.random.default_rng(seed).integers(0, 256, (H, W, channels)).astype(np.uint8)
+    cv2.imwrite(str(path), noise)
+
+
+def png16(path: Path, values: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), values.astype(np.uint16))
+
+
+def raises(match: str):
+    return pytest.raises(DataError, match=match)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    picture(tmp_path / "pair" / "frame_0.png", 0)
+    picture(tmp_path / "pair" / "frame_1.png", 1)
+    np.savetxt(tmp_path / "pair" / "K.txt", K)
+    return tmp_path / "pair"
+
+
+# --- plain folder -------------------------------------------------------------------------------
+
+
+def test_folder_minimal(folder: Path) -> None:
+    pair = datasets.load_folder(folder)
+    assert (pair.name, pair.size, pair.truth, pair.flow) == ("pair", (H, W), None, None)
+    np.testing.assert_array_equal(pair.K_next, K)
+
+
+def test_folder_with_everything(folder: Path) -> None:
+    (folder / "frame_0.png").rename(folder / "image_ref.png")
+    (folder / "frame_1.png").rename(folder / "image_next.png")
+    (folder / "K_next.txt").write_text("90 91 4 3")
+    png16(folder / "depth.png", np.full((H, W), 1500))
+    fmt.write_dpt(folder / "depth_next.dpt", np.full((H, W), 2.5))
+    fmt.write_flo(folder / "flow.flo", np.full((H, W, 2), np.nan))
+    cv2.imwrite(str(folder / "occluded.png"), np.full((H, W), 255, np.uint8))
+    xyz = np.array([[1.0, 2.0, 550.0], [1.0, 2.0, np.nan]])
+    np.savez(folder / "points.npz", uv_0=np.array([[3.5, 2.5], [1, 1]]), xyz_mm_0=xyz)
+    pair = datasets.load_folder(folder)
+    truth = pair.truth
+    assert truth is not None
+    assert pair.K_next[1, 1] == 91
+    assert truth.depth_ref is not None
+    assert truth.depth_next is not None
+    assert truth.depth_ref[0, 0] == 1.5
+    assert truth.depth_next[0, 0] == 2.5
+    assert truth.flow is not None
+    assert np.isnan(truth.flow).all()
+    assert truth.occluded is not None
+    assert truth.occluded.all()
+    np.testing.assert_allclose(truth.points, [[3.5, 2.5, 0.55]])
+    millimetres = datasets.load_folder(folder, depth_scale=1.0, unit="mm").truth
+    assert millimetres is not None
+    assert millimetres.unit == "mm"
+    np.testing.assert_allclose(millimetres.points, [[3.5, 2.5, 550.0]])
+
+
+def test_folder_array_depth_wins_over_png(folder: Path) -> None:
+    png16(folder / "depth.png", np.full((H, W), 1))
+    np.save(folder / "depth.npy", np.full((H, W), 7.0))
+    truth = datasets.load_folder(folder).truth
+    assert truth is not None
+    assert truth.depth_ref is not None
+    assert truth.depth_ref[0, 0] == 7.0
+
+
+@pytest.mark.parametrize("name", ["frame_0.png", "frame_1.png", "K.txt"])
+def test_folder_missing(folder: Path, name: str) -> None:
+    (folder / name).unlink()
+    with raises(rf"dataset is missing[\s\S]*{name}[\s\S]*expected: frame_0\.png"):
+        datasets.load_folder(folder)
+
+
+def test_folder_bad_truth(folder: Path) -> None:
+    np.save(folder / "depth.npy", np.ones((H, W + 1)))
+    with raises("truth and reference image differ in size"):
+        datasets.load_folder(folder)
+    (folder / "depth.npy").unlink()
+    for arrays, match in [
+        ({"uv_0": np.zeros((2, 2))}, "lacks xyz_mm_0"),
+        ({"uv_0": np.zeros((2, 2)), "xyz_mm_0": np.zeros((3, 3))}, "wrong shape"),
+    ]:
+        np.savez(folder / "points.npz", **arrays)
+        with raises(match):
+            datasets.load_folder(folder)
+    with raises("millimetres"):
+        np.savez(folder / "points.npz", uv_0=np.zeros((2, 2)), xyz_mm_0=np.ones((2, 3)))
+        datasets.load_folder(folder, unit="feet")
+    (folder / "points.npz").write_bytes(b"PK no zip")
+    with raises(r"is no \.npz"):
+        datasets.load_folder(folder)
+    with raises("dataset folder is missing"):
+        datasets.load_folder(folder / "nowhere")
+
+
+# --- KITTI --------------------------------------------------------------------------------------
+
+
+def kitti2012(root: Path) -> Path:
+    base = root / "training"
+    for k in (10, 11):
+        picture(base / "image_0" / f"000007_{k}.png", k, channels=1)
+    (base / "calib").mkdir()
+    (base / "calib" / "000007.txt").write_text(
+        "P0: 100 0 4 0 0 100 3 0 0 0 1 0\nP1: 100 0 4 -54 0 100 3 0 0 0 1 0\n"
+    )
+    disparity = np.full((H, W), 10 * 256)
+    disparity[0, 0] = 0
+    flow = np.ones((H, W, 2))
+    flow[0, 0] = np.nan
+    visible = flow.copy()
+    visible[1] = np.nan
+    for suffix, values in (("occ", flow), ("noc", visible)):
+        png16(base / f"disp_{suffix}" / "000007_10.png", disparity)
+        (base / f"flow_{suffix}").mkdir()
+        fmt.write_kitti_flow(base / f"flow_{suffix}" / "000007_10.png", values)
+    return root
+
+
+@pytest.mark.parametrize("below", ["", "training"])
+@pytest.mark.parametrize("index", [7, "7", "000007"])
+def test_kitti2012(tmp_path: Path, below: str, index: int | str) -> None:
+    pair = datasets.load_kitti2012(kitti2012(tmp_path) / below, index)
+    truth = pair.truth
+    assert truth is not None
+    assert truth.depth_ref is not None
+    assert truth.occluded is not None
+    assert truth.flow is not None
+    assert pair.name == "kitti2012_000007"
+    assert pair.K_ref[0, 2] == 4.0
+    assert np.isnan(truth.depth_ref[0, 0])
+    np.testing.assert_allclose(truth.depth_ref[1:], 54 / 10)
+    assert truth.occluded.sum(axis=1).tolist() == [0, W, 0, 0, 0, 0]
+    visible = datasets.load_kitti2012(tmp_path, index, occ=False).truth
+    assert visible is not None
+    assert visible.flow is not None
+    assert np.isnan(visible.flow[1]).all()
+
+
+def test_kitti2012_errors(tmp_path: Path) -> None:
+    root = kitti2012(tmp_path)
+    with raises(r"000008_10\.png[\s\S]*expected: training/image_0"):
+        datasets.load_kitti2012(root, 8)
+    with raises("index is not a number"):
+        datasets.load_kitti2012(root, "seven")
+    calib = root / "training" / "calib" / "000007.txt"
+    calib.write_text("P0: 100 0 4 0 0 100 3 0 0 0 1 0\n")
+    with raises(r"lacks P1"):
+        datasets.load_kitti2012(root, 7)
+    calib.write_text("P0: 1 2 3\nP1: 1 2 3\n")
+    with raises(r"P0 has the wrong size"):
+        datasets.load_kitti2012(root, 7)
+    calib.write_text("P0: 100 0 4 0 0 100 3 0 0 0 1 0\nP1: 100 0 4 0 0 100 3 0 0 0 1 0\n")
+    with raises("no baseline"):
+        datasets.load_kitti2012(root, 7)
+    with raises(r"has no training|has no image_0|nothing"):
+        datasets.load_kitti2012(tmp_path / "nowhere", 7)
+
+
+def test_kitti2015(tmp_path: Path) -> None:
+    base = tmp_path / "training"
+    for k in (10, 11):
+        picture(base / "image_2" / f"000001_{k}.png", k)
+    (base / "calib_cam_to_cam").mkdir()
+    (base / "calib_cam_to_cam" / "000001.txt").write_text(
+        "calib_time: 09-Jan-2012 13:57:47\n"
+        "P_rect_02: 100 0 4 5 0 100 3 0 0 0 1 0\nP_rect_03: 100 0 4 -49 0 100 3 0 0 0 1 0\n"
+    )
+    png16(base / "disp_occ_0" / "000001_10.png", np.full((H, W), 10 * 256))
+    png16(base / "disp_occ_1" / "000001_10.png", np.full((H, W), 12 * 256))
+    (base / "flow_occ").mkdir()
+    fmt.write_kitti_flow(base / "flow_occ" / "000001_10.png", np.full((H, W, 2), 2.0))
+    (base / "obj_map").mkdir()
+    cv2.imwrite(str(base / "obj_map" / "000001_10.png"), np.eye(H, W, dtype=np.uint8))
+    truth = datasets.load_kitti2015(tmp_path, 1).truth
+    assert truth is not None
+    assert truth.depth_next is None
+    assert truth.occluded is None
+    np.testing.assert_allclose(truth.depth_ref, 5.4)
+    assert truth.scene_flow is not None
+    u, v = 5, 2
+    before = np.array([(u - 4) / 100, (v - 3) / 100, 1]) * 5.4
+    after = np.array([(u + 2 - 4) / 100, (v + 2 - 3) / 100, 1]) * 4.5
+    np.testing.assert_allclose(truth.scene_flow[v, u], after - before)
+    assert truth.bodies is not None
+    assert truth.bodies.sum() == H
+    with raises(r"image_2[\s\S]*calib_cam_to_cam"):
+        datasets.load_kitti2015(tmp_path, 2)
+
+
+# --- Virtual KITTI ------------------------------------------------------------------------------
+
+
+def vkitti_flow(path: Path) -> None:
+    bgr = np.full((H, W, 3), 65535)
+    bgr[0, 0] = 0
+    png16(path, bgr)
+
+
+def test_vkitti1(tmp_path: Path) -> None:
+    for number in (0, 1):
+        name = f"0001/clone/{number:05d}.png"
+        picture(tmp_path / "vkitti_1.3.1_rgb" / name, number)
+        png16(tmp_path / "vkitti_1.3.1_depthgt" / name, np.full((H, W), 1234))
+    vkitti_flow(tmp_path / "vkitti_1.3.1_flowgt" / "0001/clone/00000.png")
+    pair = datasets.load_vkitti1(tmp_path, "0001", 0)
+    assert pair.truth is not None
+    np.testing.assert_allclose(pair.truth.depth_next, 12.34)
+    assert pair.truth.flow is not None
+    assert pair.truth.flow[1, 1].tolist() == [W - 1, H - 1]
+    assert pair.K_ref[0, 0] == 725
+    with raises(r"00002\.png"):
+        datasets.load_vkitti1(tmp_path, "0001", 1)
+    with raises(r"vkitti_\*_rgb"):
+        datasets.load_vkitti1(tmp_path / "vkitti_1.3.1_rgb", "0001", 1)
+
+
+def test_vkitti2(tmp_path: Path) -> None:
+    base = tmp_path / "Scene01" / "clone"
+    for number in (3, 4):
+        picture(base / "frames" / "rgb" / "Camera_1" / f"rgb_{number:05d}.jpg", number)
+        png16(base / f"frames/depth/Camera_1/depth_{number:05d}.png", np.full((H, W), 65535))
+    vkitti_flow(base / "frames" / "forwardFlow" / "Camera_1" / "flow_00003.png")
+    rows = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]\n3 1 725 725 620.5 187\n"
+    (base / "intrinsic.txt").write_text(rows + "4 1 726 726 620.5 187\n")
+    pair = datasets.load_vkitti2(tmp_path, "Scene01", 3, camera=1)
+    assert (pair.K_ref[0, 0], pair.K_next[0, 0]) == (725, 726)
+    assert pair.truth is not None
+    assert pair.truth.depth_ref is not None
+    assert np.isnan(pair.truth.depth_ref).all()
+    (base / "intrinsic.txt").write_text(rows)
+    with raises(r"intrinsics of the frame are missing[\s\S]*frame 4, camera 1"):
+        datasets.load_vkitti2(tmp_path, "Scene01", 3, camera=1)
+    with raises(r"clone/frames/rgb has no Camera_0"):
+        datasets.load_vkitti2(tmp_path, "Scene01", 3)
+
+
+# --- Sintel, TUM, Motorcycle --------------------------------------------------------------------
+
+
+def test_sintel(tmp_path: Path) -> None:
+    base = tmp_path / "training"
+    for number in (1, 2):
+        picture(base / "final" / "cave_2" / f"frame_{number:04d}.png", number)
+    assert datasets.load_sintel(tmp_path, "cave_2", 1, "final").K_ref[0, 0] == DEFAULT_CAMERA[0]
+    assert datasets.load_sintel(tmp_path, "cave_2", 1, "final", K=K).K_next[1, 1] == 110
+    for kind in ("camdata_left", "depth", "flow", "occlusions", "invalid"):
+        (base / kind / "cave_2").mkdir(parents=True)
+    for number, focal in ((1, 100.0), (2, 120.0)):
+        name = f"cave_2/frame_{number:04d}"
+        camera = np.array([[focal, 0, 4.0], [0, focal, 3.0], [0, 0, 1]])
+        fmt.write_cam(base / "camdata_left" / f"{name}.cam", camera, np.eye(3, 4))
+        fmt.write_dpt(base / "depth" / f"{name}.dpt", np.full((H, W), focal))
+    flow = np.zeros((H, W, 2))
+    flow[:, 0, 0] = -1.0
+    fmt.write_flo(base / "flow" / "cave_2" / "frame_0001.flo", flow)
+    mask = np.zeros((H, W), np.uint8)
+    mask[0, 5] = 255
+    cv2.imwrite(str(base / "occlusions" / "cave_2" / "frame_0001.png"), mask)
+    cv2.imwrite(str(base / "invalid" / "cave_2" / "frame_0001.png"), np.roll(mask, 1, axis=0))
+    pair = datasets.load_sintel(tmp_path, "cave_2", 1, "final")
+    truth = pair.truth
+    assert truth is not None
+    assert (pair.K_ref[0, 0], pair.K_next[0, 0]) == (100.0, 120.0)
+    assert truth.depth_next is not None
+    assert truth.depth_next[0, 0] == 120.0
+    assert truth.occluded is not None
+    assert truth.occluded.sum() == H + 1
+    assert truth.flow is not None
+    assert np.isnan(truth.flow).any(axis=2).sum() == 1
+    cv2.imwrite(str(base / "invalid" / "cave_2" / "frame_0001.png"), mask[1:])
+    with raises("mask and flow differ in size"):
+        datasets.load_sintel(tmp_path, "cave_2", 1, "final")
+    with raises(r"clean/cave_2|has no clean"):
+        datasets.load_sintel(tmp_path, "cave_2", 1)
+
+
+def test_tum(tmp_path: Path, folder: Path) -> None:
+    root = tmp_path / "rgbd_dataset_freiburg3_x"
+    for k in range(3):
+        picture(root / "rgb" / f"{k}.png", k)
+        png16(root / "depth" / f"{k}.png", np.full((H, W), 5000 * (k + 1)))
+    (root / "rgb.txt").write_text("# colour\n1.00 rgb/0.png\n1.03 rgb/1.png\n1.06 rgb/2.png\n")
+    (root / "depth.txt").write_text("1.001 depth/0.png\n1.2 depth/1.png\n1.055 depth/2.png\n")
+    pair = datasets.load_tum(root, frame=0, step=2)
+    assert pair.truth is not None
+    assert pair.K_ref[0, 0] == 535.4
+    np.testing.assert_array_equal(pair.truth.depth_ref, 1.0)
+    np.testing.assert_array_equal(pair.truth.depth_next, 3.0)
+    assert datasets.load_tum(root, frame=1, K=K).truth.depth_ref is None
+    with raises(r"not in the sequence[\s\S]*0 to 2"):
+        datasets.load_tum(root, frame=2)
+    (root / "rgb" / "1.png").unlink()
+    with raises(r"1\.png"):
+        datasets.load_tum(root)
+    (root / "rgb.txt").write_text("1.0\n")
+    with raises("line of a file list"):
+        datasets.load_tum(root)
+    png16(folder / "depth_0.png", np.full((H, W), 5000))
+    plain = datasets.load_tum(folder).truth
+    assert plain is not None
+    np.testing.assert_array_equal(plain.depth_ref, 1.0)
+    (folder / "frame_0.png").unlink()
+    with raises(r"rgb\.txt[\s\S]*expected: rgb\.txt, depth\.txt"):
+        datasets.load_tum(folder)
+
+
+def test_motorcycle_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = np.zeros((4, 40, 3), np.uint8)
+    disparity = np.full((4, 40), 5.0, np.float32)
+    disparity[:, 20:30] = 12.0
+    disparity[0, 0], disparity[0, 1] = np.inf, 0.0
+    monkeypatch.setattr("skimage.data.stereo_motorcycle", lambda: (image, image, disparity))
+    pair = datasets.load_motorcycle()
+    truth = pair.truth
+    assert truth is not None
+    assert truth.depth_ref is not None
+    assert truth.flow is not None
+    assert truth.scene_flow is not None
+    assert truth.occluded is not None
+    assert np.isnan(truth.depth_ref[0, :2]).all()
+    v, u = np.mgrid[:4, :40].astype(float)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(pair.K_ref).T
+    moved = rays * truth.depth_ref[..., None] + truth.scene_flow
+    image_of = moved @ pair.K_next.T
+    flow = image_of[..., :2] / image_of[..., 2:] - np.stack([u, v], -1)
+    np.testing.assert_allclose(flow, truth.flow, atol=1e-9)
+    hidden = truth.occluded[2]
+    assert np.flatnonzero(hidden).tolist() == [0, 1, 2, 3, 4, *range(13, 20)]
+
+
+def test_motorcycle_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
+    def offline() -> None:
+        raise ConnectionError("no network")
+
+    monkeypatch.setattr("skimage.data.stereo_motorcycle", offline)
+    with raises(r"not available[\s\S]*no network"):
+        datasets.load_motorcycle()
+
+
+# --- real pairs ---------------------------------------------------------------------------------
+
+
+@pytest.mark.shared
+def test_real_pairs(shared_data: Path) -> None:
+    pair = datasets.load_kitti2012(shared_data / "kitti2012", 27)
+    assert pair.truth is not None
+    assert pair.truth.depth_ref is not None
+    assert pair.truth.occluded is not None
+    depth = pair.truth.depth_ref
+    disparity = fmt.read_kitti_disparity(
+        shared_data / "kitti2012" / "training" / "disp_occ" / "000027_10.png"
+    )
+    known = np.isfinite(disparity)
+    np.testing.assert_array_equal(np.isfinite(depth), known)
+    np.testing.assert_allclose(depth[known] * disparity[known], 718.856 * 0.53717, rtol=1e-4)
+    assert 0.01 < pair.truth.occluded.mean() < 0.1
+    sintel = datasets.load_sintel(shared_data / "sintel", "alley_1", 2)
+    assert "flow, occluded" in str(sintel)
+    assert "depth_ref" in str(datasets.load_sintel(shared_data / "sintel", "alley_1", 20, step=5))
+    driving = datasets.load_folder(shared_data / "driving_synthetic")
+    assert "depth_ref, flow" in str(driving)
+    paper = datasets.load_folder(shared_data / "kinect_paper" / "pair_049")
+    assert paper.truth is not None
+    assert paper.truth.points is not None
+    assert 0.3 < np.median(paper.truth.points[:, 2]) < 1.0
+    desk = datasets.load_tum(shared_data / "tum_fr1").truth
+    assert desk is not None
+    assert desk.depth_ref is not None
+    assert 0.5 < np.nanmedian(desk.depth_ref) < 3.0

@@ -1,0 +1,275 @@
+"""Flow sources: DIS with its confidence, files, truth, plug-ins."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from soup_nlp.data import datasets
+from soup_nlp.data import flow as flow_module
+from soup_nlp.data.flow import (
+    dis_flow,
+    flow_from_truth,
+    leaves,
+    load_flow,
+    resolve_flow,
+    round_trip_error,
+)
+from soup_nlp.data.formats import write_flo, write_kitti_flow
+from soup_nlp.data.pair import Flow, Pair, Truth
+from soup_nlp.errors import DataError
+
+K = np.array([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]])
+
+
+def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def shifted(height: int, width: int, du: int, dv: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two windows of one texture; a pixel of the first is at (u + du, v + dv) in the second."""
+    big = texture(height + 40, width + 40)
+    first = big[20 : 20 + height, 20 : 20 + width]
+    second = big[20 - dv : 20 - dv + height, 20 - du : 20 - du + width]
+    return np.dstack([first] * 3), np.dstack([second] * 3)
+
+
+def pair_of(truth: Truth | None = None, size: tuple[int, int] = (60, 80)) -> Pair:
+    first, second = shifted(*size, 3, 1)
+    return Pair(first, second, K, K, truth=truth, name="test")
+
+
+def raises(match: str):
+    return pytest.raises(DataError, match=match)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    height=st.integers(16, 90),
+    width=st.integers(16, 90),
+    du=st.integers(-3, 3),
+    dv=st.integers(-3, 3),
+)
+def test_dis_finds_a_shift_at_any_size(height: int, width: int, du: int, dv: int) -> None:
+    flow = dis_flow(*shifted(height, width, du, dv))
+    assert flow.uv.shape == (height, width, 2)
+    assert flow.uv.dtype == flow.confidence.dtype == np.float32
+    assert flow.confidence.min() >= 0
+    assert flow.confidence.max() <= 1
+    inside = ~leaves(np.broadcast_to(np.float32([du, dv]), (height, width, 2)), (height, width))
+    inside[:4] = inside[-4:] = inside[:, :4] = inside[:, -4:] = False
+    error = np.linalg.norm(flow.uv - [du, dv], axis=2)[inside]
+    assert np.median(error) < 0.1
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(0.6, 60), (0.8, -10)])
+def test_dis_survives_a_change_of_exposure(gain: float, offset: float) -> None:
+    first, second = shifted(80, 100, 4, -2)
+    second = np.clip(second * gain + offset, 0, 255).astype(np.uint8)
+    for equalize in (False, True):
+        flow = dis_flow(first, second, equalize=equalize)
+        trusted = flow.confidence > 0.5
+        assert trusted.mean() > 0.6
+        assert np.median(np.linalg.norm(flow.uv - [4, -2], axis=2)[trusted]) < 0.2
+
+
+@pytest.mark.parametrize("level", [0, 7, 255])
+def test_dis_without_contrast(level: int) -> None:
+    flat = np.full((40, 50, 3), level, np.uint8)
+    for a, b in ((flat, flat), (flat, np.dstack([texture(40, 50)] * 3))):
+        flow = dis_flow(a, b)
+        assert not flow.uv.any()
+        assert not flow.confidence.any()
+
+
+def test_dis_images_of_different_size() -> None:
+    first, second = shifted(64, 90, 2, 0)
+    flow = dis_flow(first, second[:, :70])
+    assert flow.uv.shape == (64, 90, 2)
+    assert not flow.confidence[:, 72:].any()
+    assert (flow.confidence[10:-10, 10:60] > 0.5).mean() > 0.9
+
+
+def test_dis_is_repeatable() -> None:
+    first, second = shifted(70, 90, 2, 1)
+    one, two = dis_flow(first, second), dis_flow(first, second)
+    np.testing.assert_array_equal(one.uv, two.uv)
+    np.testing.assert_array_equal(one.confidence, two.confidence)
+
+
+def test_dis_confidence_drops_where_nothing_matches() -> None:
+    first, second = shifted(90, 120, 2, 0)
+    second = second.copy()
+    second[30:60, 40:80] = np.dstack([texture(30, 40, seed=5)] * 3)
+    confidence = dis_flow(first, second).confidence
+    assert confidence[35:55, 45:70].mean() < 0.7 * confidence[65:85, 20:100].mean()
+
+
+@pytest.mark.parametrize("finest_scale", [0, 1, 3])
+@pytest.mark.parametrize("preset", ["ultrafast", "fast", "medium"])
+def test_dis_options(finest_scale: int, preset: str) -> None:
+    first, second = shifted(64, 80, 1, 0)
+    flow = dis_flow(first, second, finest_scale, preset=preset, support=1)
+    assert np.isfinite(flow.uv).all()
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"finest_scale": -1},
+        {"preset": "best"},
+        {"patch_size": 2},
+        {"patch_stride": 9},
+        {"tau": 0.0},
+        {"limit": -1.0},
+        {"support": 4},
+    ],
+)
+def test_dis_option_errors(option: dict) -> None:
+    first, second = shifted(20, 20, 0, 0)
+    with raises(rf"out of range[\s\S]*{next(iter(option))}"):
+        dis_flow(first, second, **option)
+
+
+def test_dis_image_errors() -> None:
+    good = np.zeros((20, 20, 3), np.uint8)
+    with raises(r"8-bit[\s\S]*image_next[\s\S]*float64"):
+        dis_flow(good, good.astype(float))
+    with raises("8-bit"):
+        dis_flow(np.zeros((20, 20, 4), np.uint8), good)
+    with raises(r"too small[\s\S]*20x15"):
+        dis_flow(good[:15], good)
+
+
+def test_round_trip_error() -> None:
+    forward = np.zeros((5, 6, 2), np.float32)
+    forward[..., 0] = 1.0
+    backward = np.zeros((5, 6, 2), np.float32)
+    backward[..., 0] = -1.5
+    error = round_trip_error(forward, backward)
+    np.testing.assert_allclose(error[:, :-1], 0.5)
+    assert np.isinf(error[:, -1]).all()
+    forward[0, 0] = np.nan
+    assert np.isinf(round_trip_error(forward, backward)[0, 0])
+
+
+def test_load_flow(tmp_path: Path) -> None:
+    uv = np.ones((4, 5, 2), np.float32)
+    uv[1, 2, 0] = np.nan
+    write_flo(tmp_path / "a.flo", uv)
+    write_kitti_flow(tmp_path / "a.png", uv)
+    for name in ("a.flo", "a.png"):
+        flow = load_flow(tmp_path / name, (4, 5))
+        assert flow.source == name
+        assert flow.confidence.sum() == 19
+        assert flow.confidence[1, 2] == 0
+        assert flow.uv[1, 2].tolist() == [0, 0]
+    with raises(r"differ in size[\s\S]*flow 5x4[\s\S]*5x5"):
+        load_flow(tmp_path / "a.flo", (5, 5))
+    write_flo(tmp_path / "b.flo", np.full((4, 5, 2), np.nan))
+    with raises("every pixel as unknown"):
+        load_flow(tmp_path / "b.flo", (4, 5))
+
+
+def test_flow_from_truth() -> None:
+    uv = np.full((60, 80, 2), 2.0)
+    uv[0, 0] = np.nan
+    occluded = np.zeros((60, 80), bool)
+    occluded[5] = True
+    pair = pair_of(Truth(flow=uv, occluded=occluded))
+    kept = flow_from_truth(pair)
+    assert kept.confidence[0, 0] == 0
+    assert kept.confidence.sum() == 60 * 80 - 1
+    half = flow_from_truth(pair, occluded_confidence=0.5)
+    assert (half.confidence[5] == 0.5).all()
+    assert kept.confidence[5].all()
+    assert np.isnan(uv[0, 0]).all()
+    with raises("out of range"):
+        flow_from_truth(pair, occluded_confidence=1.5)
+    for truth in (None, Truth(depth_ref=np.ones((60, 80)))):
+        with raises("no true flow"):
+            flow_from_truth(pair_of(truth))
+
+
+def test_resolve_flow(tmp_path: Path) -> None:
+    pair = pair_of(Truth(flow=np.zeros((60, 80, 2))))
+    assert resolve_flow(pair, "truth").source == "truth"
+    found = resolve_flow(pair, "dis")
+    assert found.source == "dis"
+    assert np.median(np.abs(found.uv - [3, 1])) < 0.1
+    write_flo(tmp_path / "mine.flo", np.zeros((60, 80, 2)))
+    assert resolve_flow(pair, str(tmp_path / "mine.flo")).source == "mine.flo"
+    with raises(r"unknown flow source[\s\S]*dis, truth"):
+        resolve_flow(pair, "raft")
+    with raises("flow file is missing"):
+        resolve_flow(pair, str(tmp_path / "other.flo"))
+    assert pair.with_flow(found).flow is found
+
+
+def zero(image_ref: np.ndarray, image_next: np.ndarray) -> Flow:
+    shape = image_ref.shape[:2]
+    return Flow(np.zeros((*shape, 2), np.float32), np.ones(shape, np.float32), "zero")
+
+
+def cropped(image_ref: np.ndarray, image_next: np.ndarray) -> Flow:
+    return zero(image_ref[1:], image_next)
+
+
+def array_only(image_ref: np.ndarray, image_next: np.ndarray) -> np.ndarray:
+    return np.zeros((*image_ref.shape[:2], 2))
+
+
+def broken(image_ref: np.ndarray, image_next: np.ndarray) -> Flow:
+    raise RuntimeError("no weights")
+
+
+def test_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ["zero", "cropped", "array_only", "broken", "absent"]
+    points = [EntryPoint(n, f"{__name__}:{n}", flow_module.ENTRY_POINTS) for n in names]
+    monkeypatch.setattr(flow_module, "entry_points", lambda group: points)
+    pair = pair_of()
+    assert resolve_flow(pair, "zero").source == "zero"
+    for name, match in [
+        ("cropped", "differ in size"),
+        ("array_only", r"returned no Flow[\s\S]*ndarray"),
+        ("broken", r"plug-in failed[\s\S]*RuntimeError: no weights"),
+        ("absent", r"plug-in failed[\s\S]*AttributeError"),
+        ("unheard", r"expected: dis, truth, absent, array_only, broken, cropped, zero"),
+    ]:
+        with raises(match):
+            resolve_flow(pair, name)
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    ("index", "median", "outliers", "trusted"), [(27, 0.4, 0.25, 0.05), (138, 0.55, 0.18, 0.04)]
+)
+def test_dis_on_kitti(
+    shared_data: Path, index: int, median: float, outliers: float, trusted: float
+) -> None:
+    pair = datasets.load_kitti2012(shared_data / "kitti2012", index)
+    assert pair.truth is not None
+    assert pair.truth.flow is not None
+    flow = resolve_flow(pair, "dis")
+    error = np.linalg.norm(flow.uv - pair.truth.flow, axis=2)
+    known = np.isfinite(error)
+    assert np.median(error[known]) < median
+    assert (error[known] > 3).mean() < outliers
+    sure = known & (flow.confidence > 0.5)
+    assert sure.sum() > 0.7 * known.sum()
+    assert (error[sure] > 3).mean() < trusted
+    edges = [-1.0, 0.0, 0.25, 0.5, 0.75, 0.9, 1.0]
+    bins = [
+        known & (flow.confidence > low) & (flow.confidence <= high) for low, high in pairwise(edges)
+    ]
+    medians = [np.median(error[bucket]) for bucket in bins]
+    assert medians == sorted(medians, reverse=True)

@@ -1,0 +1,310 @@
+"""File formats: golden bytes, round trips, and every way a file can be wrong."""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from soup_nlp.data import formats as fmt
+from soup_nlp.errors import DataError
+
+many = settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+shapes = st.tuples(st.integers(1, 7), st.integers(1, 7))
+
+
+def floats(low: float, high: float) -> st.SearchStrategy[np.ndarray]:
+    return shapes.flatmap(
+        lambda s: hnp.arrays(np.float32, s, elements=st.floats(low, high, width=32))
+    )
+
+
+def flows(low: float, high: float) -> st.SearchStrategy[np.ndarray]:
+    number = st.floats(low, high, width=32)
+    return shapes.flatmap(lambda s: hnp.arrays(np.float32, (*s, 2), elements=number))
+
+
+def put(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def raises(match: str):
+    return pytest.raises(DataError, match=match)
+
+
+# --- .flo ---------------------------------------------------------------------------------------
+
+
+def test_flo_golden_bytes(tmp_path: Path) -> None:
+    golden = struct.pack("<fii4f", 202021.25, 2, 1, 1.5, -2.0, 1e10, 0.0)
+    assert golden[:4] == b"PIEH"
+    flow = fmt.read_flo(put(tmp_path / "a.flo", golden))
+    assert flow.dtype == np.float32
+    np.testing.assert_array_equal(flow, [[[1.5, -2.0], [np.nan, np.nan]]])
+    fmt.write_flo(tmp_path / "b.flo", np.array([[[1.5, -2.0], [np.nan, 3.0]]]))
+    expected = struct.pack("<fii4f", 202021.25, 2, 1, 1.5, -2.0, 1e10, 1e10)
+    assert (tmp_path / "b.flo").read_bytes() == expected
+
+
+@many
+@given(flow=flows(-1e9, 1e9))
+def test_flo_round_trip(tmp_path: Path, flow: np.ndarray) -> None:
+    fmt.write_flo(tmp_path / "a.flo", flow)
+    np.testing.assert_array_equal(fmt.read_flo(tmp_path / "a.flo"), flow)
+
+
+@pytest.mark.parametrize("mark", [np.nan, np.inf, -np.inf, 1.1e9, -2e9])
+def test_flo_unknown(tmp_path: Path, mark: float) -> None:
+    body = struct.pack("<fii4f", 202021.25, 2, 1, 1.0, mark, 1.0, 1.0)
+    flow = fmt.read_flo(put(tmp_path / "a.flo", body))
+    assert np.isnan(flow[0, 0]).all()
+    assert np.isfinite(flow[0, 1]).all()
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (b"", "is empty"),
+        (b"PIEX" + bytes(16), "wrong magic number"),
+        (b"PIEH\x01", "truncated"),
+        (b"PIEH" + struct.pack("<ii", 4, 3) + bytes(95), "truncated"),
+        (b"PIEH" + struct.pack("<ii", 4, 3) + bytes(97), "left over"),
+        (b"PIEH" + struct.pack("<ii", 0, 3), "impossible size"),
+        (b"PIEH" + struct.pack("<ii", -4, 3) + bytes(96), "impossible size"),
+        (b"PIEH" + struct.pack("<ii", 2**31 - 1, 2**31 - 1), "impossible size"),
+    ],
+)
+@pytest.mark.parametrize(("read", "name"), [(fmt.read_flo, "a.flo"), (fmt.read_dpt, "a.dpt")])
+def test_pieh_errors(tmp_path: Path, content: bytes, match: str, read, name: str) -> None:
+    if "left over" in match and name == "a.dpt":
+        content = content[:-40]
+    if match == "truncated" and len(content) > 20 and name == "a.dpt":
+        content = content[:-50]
+    with raises(match) as caught:
+        read(put(tmp_path / name, content))
+    assert name in str(caught.value)
+
+
+def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
+    put(tmp_path / "flow_0.flo", b"x")
+    with raises(r"flow file is missing[\s\S]*flow_0\.flo"):
+        fmt.read_flo(tmp_path / "flow_1.flo")
+    with raises(r"folder .* does not exist"):
+        fmt.read_flo(tmp_path / "nowhere" / "a.flo")
+    with raises("cannot be read"):
+        fmt.read_flo(tmp_path)
+
+
+def test_writers_refuse_other_shapes(tmp_path: Path) -> None:
+    for write in (fmt.write_flo, fmt.write_kitti_flow):
+        with raises(r"wrong shape[\s\S]*\(H, W, 2\)"):
+            write(tmp_path / "a", np.zeros((3, 4)))
+    for write in (fmt.write_dpt, fmt.write_pfm, fmt.write_depth_png16):
+        with raises(r"wrong shape[\s\S]*\(H, W\)"):
+            write(tmp_path / "a", np.zeros((3, 4, 2)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_write_is_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.flo"
+    fmt.write_flo(path, np.zeros((2, 2, 2)))
+    before = path.read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with raises("No space left"):
+            fmt.write_flo(path, np.ones((2, 2, 2)))
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["a.flo"]
+    with raises("cannot be written"):
+        fmt.write_flo(tmp_path / "nowhere" / "a.flo", np.zeros((2, 2, 2)))
+
+
+# --- flow in PNG --------------------------------------------------------------------------------
+
+
+def test_kitti_flow_channel_order(tmp_path: Path) -> None:
+    rgb = np.array([[[2**15 + 64, 2**15 - 128, 1], [1, 2, 0]]], np.uint16)
+    cv2.imwrite(str(tmp_path / "a.png"), rgb[:, :, ::-1])
+    flow = fmt.read_kitti_flow(tmp_path / "a.png")
+    np.testing.assert_array_equal(flow, [[[1.0, -2.0], [np.nan, np.nan]]])
+
+
+@many
+@given(flow=flows(-512, 511.875))
+def test_kitti_flow_round_trip(tmp_path: Path, flow: np.ndarray) -> None:
+    flow[0, 0] = np.nan
+    fmt.write_kitti_flow(tmp_path / "a.png", flow)
+    back = fmt.read_flow(tmp_path / "a.png")
+    np.testing.assert_allclose(back, flow, atol=1 / 128, rtol=0)
+    fmt.write_kitti_flow(tmp_path / "b.png", back)
+    np.testing.assert_array_equal(fmt.read_kitti_flow(tmp_path / "b.png"), back)
+
+
+def test_kitti_flow_range(tmp_path: Path) -> None:
+    with raises("does not fit the KITTI format"):
+        fmt.write_kitti_flow(tmp_path / "a.png", np.full((2, 2, 2), 513.0))
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_kitti_flow_rejects_8_bit(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4, 3), np.uint8))
+    with raises(r"uint8 with 3 channel"):
+        fmt.read_kitti_flow(tmp_path / "a.png")
+    cv2.imwrite(str(tmp_path / "b.png"), np.zeros((4, 4), np.uint16))
+    with raises(r"uint16 with 1 channel"):
+        fmt.read_kitti_flow(tmp_path / "b.png")
+
+
+def test_vkitti_flow(tmp_path: Path) -> None:
+    height, width = 5, 11
+    flow = np.zeros((height, width, 2))
+    flow[..., 0], flow[..., 1] = 3.0, -1.5
+    code = np.rint((flow / [width - 1, height - 1] + 1) / 2 * 65535)
+    bgr = np.dstack([np.ones((height, width)), code[..., 1], code[..., 0]]).astype(np.uint16)
+    bgr[0, 0, 0] = 0
+    cv2.imwrite(str(tmp_path / "a.png"), bgr)
+    back = fmt.read_vkitti_flow(tmp_path / "a.png")
+    assert np.isnan(back[0, 0]).all()
+    np.testing.assert_allclose(back[1:], flow[1:], atol=2 * (width - 1) / 65535)
+
+
+def test_read_flow_npy_and_suffixes(tmp_path: Path) -> None:
+    flow = np.ones((3, 4, 2))
+    flow[0, 0, 1] = np.inf
+    flow[0, 1, 0] = 1e10
+    np.save(tmp_path / "a.npy", flow)
+    back = fmt.read_flow(tmp_path / "a.npy")
+    assert np.isnan(back[0, :2]).all()
+    assert (back[1:] == 1).all()
+    fmt.write_flo(tmp_path / "A.FLO", flow[1:])
+    assert (fmt.read_flow(tmp_path / "A.FLO") == 1).all()
+    with raises(r"unknown suffix[\s\S]*\.flo, \.png, \.npy"):
+        fmt.read_flow(tmp_path / "a.tiff")
+    np.save(tmp_path / "b.npy", np.array(["x"]))
+    with raises("does not hold numbers"):
+        fmt.read_flow(tmp_path / "b.npy")
+    with raises(r"not a readable \.npy"):
+        fmt.read_flow(put(tmp_path / "c.npy", (tmp_path / "a.npy").read_bytes()[:-9]))
+    np.save(tmp_path / "d.npy", np.zeros((3, 4)))
+    with raises("wrong shape"):
+        fmt.read_flow(tmp_path / "d.npy")
+
+
+# --- depth --------------------------------------------------------------------------------------
+
+
+@many
+@given(depth=floats(0.0009765625, 1e6))
+def test_dpt_and_pfm_round_trip(tmp_path: Path, depth: np.ndarray) -> None:
+    fmt.write_dpt(tmp_path / "a.dpt", depth)
+    np.testing.assert_array_equal(fmt.read_depth(tmp_path / "a.dpt"), depth)
+    for big in (False, True):
+        fmt.write_pfm(tmp_path / "a.pfm", depth, big_endian=big)
+        np.testing.assert_array_equal(fmt.read_depth(tmp_path / "a.pfm"), depth)
+
+
+@many
+@given(
+    code=shapes.flatmap(lambda s: hnp.arrays(np.uint16, s)),
+    scale=st.sampled_from([100, 256, 1000, 5000.0]),
+)
+def test_png16_round_trip(tmp_path: Path, code: np.ndarray, scale: float) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), code)
+    depth = fmt.read_depth_png16(tmp_path / "a.png", scale)
+    np.testing.assert_array_equal(np.isnan(depth), code == 0)
+    np.testing.assert_allclose(depth[code > 0], code[code > 0] / scale)
+    fmt.write_depth_png16(tmp_path / "b.png", depth, scale)
+    again = fmt.read_depth(tmp_path / "b.png", scale)
+    np.testing.assert_array_equal(again, depth)
+
+
+def test_depth_unknown_values(tmp_path: Path) -> None:
+    depth = np.array([[1.0, 0.0, -1.0, np.inf, np.nan]])
+    np.save(tmp_path / "a.npy", depth)
+    fmt.write_dpt(tmp_path / "a.dpt", depth)
+    fmt.write_pfm(tmp_path / "a.pfm", depth)
+    for name in ("a.npy", "a.dpt", "a.pfm"):
+        out = fmt.read_depth(tmp_path / name)
+        assert out.dtype == np.float64
+        np.testing.assert_array_equal(out, [[1.0] + [np.nan] * 4])
+    np.testing.assert_array_equal(fmt.read_pfm(tmp_path / "a.pfm"), depth.astype(np.float32))
+
+
+@pytest.mark.parametrize(("scale", "order"), [(b"-1.0", "<f4"), (b"1", ">f4"), (b"-3.5e-1", "<f4")])
+def test_pfm_golden_bytes(tmp_path: Path, scale: bytes, order: str) -> None:
+    rows = np.array([[1, 2, 3], [4, 5, 6]], order)
+    path = put(tmp_path / "a.pfm", b"Pf\n3 2\n" + scale + b"\n" + rows[::-1].tobytes())
+    np.testing.assert_array_equal(fmt.read_pfm(path), rows)
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (b"PF\n1 1\n-1.0\n" + bytes(12), "in colour"),
+        (b"P5\n1 1\n255\n0", "damaged header"),
+        (b"Pf\n1 1\n0\n" + bytes(4), "damaged header"),
+        (b"Pf\n1 1\n1e1e\n" + bytes(4), "damaged header"),
+        (b"Pf\n0 1\n-1\n", "impossible size"),
+        (b"Pf\n2 2\n-1\n" + bytes(15), "truncated"),
+    ],
+)
+def test_pfm_errors(tmp_path: Path, content: bytes, match: str) -> None:
+    with raises(match):
+        fmt.read_pfm(put(tmp_path / "a.pfm", content))
+
+
+def test_png16_errors(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
+    with raises("16-bit PNG with 1 channel"):
+        fmt.read_depth(tmp_path / "a.png")
+    for scale in (0, -1, np.nan, np.inf):
+        with raises("scale must be positive"):
+            fmt.read_depth_png16(tmp_path / "a.png", scale)
+    for bad in (66.0, 0.0001):
+        with raises("does not fit a 16-bit image"):
+            fmt.write_depth_png16(tmp_path / "b.png", np.full((2, 2), bad))
+    np.save(tmp_path / "c.npy", np.zeros((2, 2, 1)))
+    with raises("wrong shape"):
+        fmt.read_depth(tmp_path / "c.npy")
+
+
+def test_kitti_disparity_and_vkitti_depth(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.array([[0, 256, 384, 65535]], np.uint16))
+    disparity = fmt.read_kitti_disparity(tmp_path / "a.png")
+    np.testing.assert_array_equal(disparity, [[np.nan, 1.0, 1.5, 65535 / 256]])
+    fmt.write_kitti_disparity(tmp_path / "b.png", disparity)
+    np.testing.assert_array_equal(fmt.read_kitti_disparity(tmp_path / "b.png"), disparity)
+    depth = fmt.read_vkitti_depth(tmp_path / "a.png")
+    np.testing.assert_array_equal(depth, [[np.nan, 2.56, 3.84, np.nan]])
+
+
+# --- real files ---------------------------------------------------------------------------------
+
+
+@pytest.mark.shared
+def test_real_files(shared_data: Path, tmp_path: Path) -> None:
+    kitti = shared_data / "kitti2012" / "training"
+    flow = fmt.read_kitti_flow(kitti / "flow_occ" / "000027_10.png")
+    fmt.write_kitti_flow(tmp_path / "a.png", flow)
+    np.testing.assert_array_equal(fmt.read_kitti_flow(tmp_path / "a.png"), flow)
+    sintel = shared_data / "sintel" / "training"
+    path = sintel / "flow" / "alley_1" / "frame_0002.flo"
+    fmt.write_flo(tmp_path / "a.flo", fmt.read_flo(path))
+    assert (tmp_path / "a.flo").read_bytes() == path.read_bytes()
+    depth = fmt.read_dpt(sintel / "depth" / "alley_1" / "frame_0020.dpt")
+    assert depth.shape == (436, 1024)
+    assert fmt.read_kitti_calib(kitti / "calib" / "000027.txt")["P1"][0, 3] == -386.1448

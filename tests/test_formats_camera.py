@@ -1,0 +1,167 @@
+"""Camera files and images: golden bytes, round trips, and every way a file can be wrong."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from soup_nlp.data import formats as fmt
+from soup_nlp.errors import DataError
+
+
+def put(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def raises(match: str):
+    return pytest.raises(DataError, match=match)
+
+
+# --- cameras ------------------------------------------------------------------------------------
+
+K = np.array([[688.0, 0.0, 511.5], [0.0, 688.5, 217.5], [0.0, 0.0, 1.0]])
+
+
+def test_cam_round_trip_and_bytes(tmp_path: Path) -> None:
+    pose = np.arange(12.0).reshape(3, 4)
+    fmt.write_cam(tmp_path / "a.cam", K, pose)
+    content = (tmp_path / "a.cam").read_bytes()
+    assert content == struct.pack("<f21d", 202021.25, *K.ravel(), *pose.ravel())
+    K_back, pose_back = fmt.read_cam(tmp_path / "a.cam")
+    np.testing.assert_array_equal(K_back, K)
+    np.testing.assert_array_equal(pose_back, pose)
+
+
+def test_cam_errors(tmp_path: Path) -> None:
+    with raises("truncated"):
+        fmt.read_cam(put(tmp_path / "a.cam", b"PIEH" + bytes(100)))
+    with raises("wrong magic"):
+        fmt.read_cam(put(tmp_path / "b.cam", bytes(172)))
+    with raises("focal lengths must be positive"):
+        fmt.read_cam(put(tmp_path / "c.cam", b"PIEH" + bytes(168)))
+    bad_pose = struct.pack("<f21d", 202021.25, *K.ravel(), *[np.nan] * 12)
+    with raises("extrinsics are not finite"):
+        fmt.read_cam(put(tmp_path / "d.cam", bad_pose))
+    with raises("extrinsics have the wrong shape"):
+        fmt.write_cam(tmp_path / "e.cam", K, np.eye(3))
+
+
+def test_intrinsics_text(tmp_path: Path) -> None:
+    path = tmp_path / "K.txt"
+    path.write_text("# camera\n688, 0, 511.5\n0 688.5 217.5\n0 0 1\n")
+    np.testing.assert_array_equal(fmt.read_intrinsics(path), K)
+    path.write_text("688 688.5 511.5 217.5")
+    np.testing.assert_array_equal(fmt.read_intrinsics(path), K)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("1 2 3", "wrong number of values"),
+        ("688 f 1 2", "not a number"),
+        ("-688 688 1 2", "must be positive"),
+        ("nan 688 1 2", "not finite"),
+        ("688 0 5 1 688 2 0 0 1", "upper triangular"),
+    ],
+)
+def test_intrinsics_errors(tmp_path: Path, text: str, match: str) -> None:
+    (tmp_path / "K.txt").write_text(text)
+    with raises(match):
+        fmt.read_intrinsics(tmp_path / "K.txt")
+
+
+def test_intrinsics_binary(tmp_path: Path) -> None:
+    with raises("is not text"):
+        fmt.read_intrinsics(put(tmp_path / "K.txt", b"\xff\xfe\x00\x81"))
+
+
+def test_kitti_calib(tmp_path: Path) -> None:
+    path = tmp_path / "calib.txt"
+    path.write_text(
+        "calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.950000e-02\n"
+        "K_00: 1 2 3 4 5 6 7 8 9\n\nP_rect_00: 1 2 3 4 5 6 7 8 9 10 11 12\nT_00: 1 2 3\n"
+    )
+    calib = fmt.read_kitti_calib(path)
+    assert {name: value.shape for name, value in calib.items()} == {
+        "corner_dist": (1,),
+        "K_00": (3, 3),
+        "P_rect_00": (3, 4),
+        "T_00": (3,),
+    }
+    assert calib["P_rect_00"][1, 0] == 5
+    for text, match in [
+        ("1 2 3", "line has no name"),
+        ("P0: 1 2 x", "mixes numbers and words"),
+        ("P0: 1 2 nan", "mixes numbers and words"),
+        ("a: b", "holds no matrix"),
+    ]:
+        path.write_text(text)
+        with raises(match):
+            fmt.read_kitti_calib(path)
+
+
+def test_vkitti_intrinsics(tmp_path: Path) -> None:
+    path = tmp_path / "intrinsic.txt"
+    head = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"
+    path.write_text(f"{head}\n0 0 725.0087 725.0087 620.5 187\n0 1 725 726 620.5 187\n\n")
+    table = fmt.read_vkitti2_intrinsics(path)
+    assert sorted(table) == [(0, 0), (0, 1)]
+    np.testing.assert_array_equal(table[0, 1], [[725, 0, 620.5], [0, 726, 187], [0, 0, 1]])
+    assert fmt.vkitti1_intrinsics()[0].tolist() == [725.0, 0.0, 620.5]
+    path.write_text("frame K[0,0]\n0 1\n")
+    with raises("lacks columns"):
+        fmt.read_vkitti2_intrinsics(path)
+    path.write_text(f"{head}\n0 0 725\n")
+    with raises(r"row is too short[\s\S]*"):
+        fmt.read_vkitti2_intrinsics(path)
+
+
+# --- images -------------------------------------------------------------------------------------
+
+
+def test_image_kinds(tmp_path: Path) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (6, 5, 3)).astype(np.uint8)
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), rgb[:, :, ::-1])
+    np.testing.assert_array_equal(fmt.read_image(path), rgb)
+    rgba = np.dstack([rgb[:, :, ::-1], np.zeros((6, 5), np.uint8)])
+    cv2.imwrite(str(path), rgba)
+    np.testing.assert_array_equal(fmt.read_image(path), rgb)
+    cv2.imwrite(str(path), rgb[:, :, 0])
+    np.testing.assert_array_equal(fmt.read_image(path), np.repeat(rgb[:, :, :1], 3, axis=2))
+    cv2.imwrite(str(path), rgb[:, :, ::-1].astype(np.uint16) * 257)
+    out = fmt.read_image(path)
+    np.testing.assert_array_equal(out, rgb)
+    assert out.dtype == np.uint8
+    assert out.flags.c_contiguous
+
+
+def test_image_16_bit_white(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.array([[0, 4095, 2048, 65535]], np.uint16))
+    assert fmt.read_image(tmp_path / "a.png")[0, :, 0].tolist() == [0, 16, 8, 255]
+    assert fmt.read_image(tmp_path / "a.png", white=4095)[0, :, 0].tolist() == [0, 255, 128, 255]
+
+
+def test_image_errors(tmp_path: Path) -> None:
+    with raises("image is missing"):
+        fmt.read_image(tmp_path / "none.png")
+    with raises(r"cannot be decoded[\s\S]*not an i"):
+        fmt.read_image(put(tmp_path / "a.png", b"not an image at all"))
+    noise = np.random.default_rng(0).integers(0, 256, (32, 32, 3)).astype(np.uint8)
+    for suffix in (".png", ".jpg"):
+        content = cv2.imencode(suffix, noise)[1].tobytes()
+        with raises("is truncated"):
+            fmt.read_image(put(tmp_path / f"t{suffix}", content[: len(content) // 2]))
+    cv2.imwrite(str(tmp_path / "f.tiff"), np.zeros((4, 4), np.float32))
+    with raises("neither 8-bit nor 16-bit"):
+        fmt.read_image(tmp_path / "f.tiff")
+
+
+def test_mask(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "m.png"), np.array([[0, 127, 128, 255]], np.uint8))
+    assert fmt.read_mask(tmp_path / "m.png").tolist() == [[False, False, True, True]]
