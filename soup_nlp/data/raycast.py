@@ -1,0 +1,536 @@
+"""A small ray caster for dynamic scenes: exact depth, flow and visibility, textured images.
+
+A `Scene` holds bodies; a body holds parts that move together; a part is a shape at a pose with a
+texture. Rays are `K^-1 (u, v, 1)`, so the ray parameter of a hit *is* its depth z. Depth, flow,
+labels and visibility are computed at pixel centres in closed form; only colour is averaged over
+the pixel. Every shape also knows which of its points are the same matter in both frames
+(`material` and `place`), which is the identity for rigid shapes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.pair import Pair, Truth
+from soup_nlp.data.texture import Texture
+from soup_nlp.errors import DataError
+from soup_nlp.geometry import camera
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+NEAR = 1e-6
+"""Hits closer than this depth are ignored, unit of length."""
+
+SAME_DEPTH = 1e-6
+"""Relative difference of depth up to which two hits are the same point."""
+
+LIGHT = np.array([0.35, -0.8, -0.5]) / np.linalg.norm([0.35, -0.8, -0.5])
+"""Direction towards the light in scene coordinates at the reference time."""
+
+
+class Shape:
+    """A surface in its own coordinates; `frame` is 0 for the reference and 1 for the next frame.
+
+    Rigid shapes only implement `intersect`, `normals` and `corners`.
+    """
+
+    rigid = True
+
+    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
+        """Smallest ray parameter > NEAR (N,) of rays (N, 3) from `origin` (3,), inf for a miss."""
+        raise NotImplementedError
+
+    def normals(self, points: Float, frame: int) -> Float:
+        """Unit normals (N, 3) at surface points (N, 3)."""
+        raise NotImplementedError
+
+    def corners(self) -> Float | None:
+        """Points (M, 3) whose convex hull contains the shape in both frames; None if unbounded."""
+        raise NotImplementedError
+
+    def material(self, points: Float, frame: int) -> Float:
+        """Material coordinates (N, 3) of surface points (N, 3) in a frame."""
+        return points
+
+    def place(self, material: Float, frame: int) -> Float:
+        """Where material coordinates (N, 3) lie in a frame, (N, 3)."""
+        return material
+
+    def chart(self, material: Float) -> Float:
+        """Two coordinates (N, 2) along the surface, unit of length, for painted patterns."""
+        return material[:, :2]
+
+
+def _corner_points(half: tuple[float, float, float]) -> Float:
+    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
+    return signs * np.asarray(half)
+
+
+def _first_hit(*roots: Float) -> Float:
+    """The smallest root > NEAR of each ray; NaN and inf are misses."""
+    return np.minimum.reduce([np.where(root > NEAR, root, np.inf) for root in roots])
+
+
+@dataclass(frozen=True)
+class Plane(Shape):
+    """The plane z = 0, normal -z; seen from both sides. Bounded by `half` in x and y, or infinite.
+
+    Attributes:
+        half: Half sizes along x and y, unit of length; `inf` for no bound.
+    """
+
+    half: tuple[float, float] = (np.inf, np.inf)
+
+    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
+        """See `Shape`."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = -origin[2] / rays[:, 2]
+            inside = (abs(origin[0] + t * rays[:, 0]) <= self.half[0]) & (
+                abs(origin[1] + t * rays[:, 1]) <= self.half[1]
+            )
+        return np.where(inside, _first_hit(t), np.inf)
+
+    def normals(self, points: Float, frame: int) -> Float:
+        """See `Shape`."""
+        return np.broadcast_to([0.0, 0.0, -1.0], points.shape)
+
+    def corners(self) -> Float | None:
+        """See `Shape`."""
+        return _corner_points((*self.half, 0.0)) if np.isfinite(self.half).all() else None
+
+
+@dataclass(frozen=True)
+class Box(Shape):
+    """A box centred on the origin.
+
+    Attributes:
+        half: Half sizes along x, y and z, unit of length.
+    """
+
+    half: tuple[float, float, float]
+
+    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
+        """See `Shape`."""
+        half = np.asarray(self.half)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (-half - origin) / rays, (half - origin) / rays
+        # fmin and fmax let a ray within a face (0/0) be decided by the other axes
+        enter = np.fmax.reduce(np.fmin(a, b), axis=1)
+        leave = np.fmin.reduce(np.fmax(a, b), axis=1)
+        return np.where(enter <= leave, _first_hit(enter, leave), np.inf)
+
+    def _face(self, points: Float) -> Int:
+        return np.argmax(abs(points) / np.asarray(self.half), axis=1)
+
+    def normals(self, points: Float, frame: int) -> Float:
+        """See `Shape`."""
+        face = self._face(points)
+        rows = np.arange(len(points))
+        out = np.zeros(points.shape)
+        out[rows, face] = np.sign(points[rows, face])
+        return out
+
+    def corners(self) -> Float:
+        """See `Shape`."""
+        return _corner_points(self.half)
+
+    def chart(self, material: Float) -> Float:
+        """See `Shape`; y runs along y on the four sides."""
+        face = self._face(material)
+        across = np.where(face == 0, material[:, 2], material[:, 0])
+        down = np.where(face == 1, material[:, 2], material[:, 1])
+        return np.stack([across, down], axis=1)
+
+
+@dataclass(frozen=True)
+class Sphere(Shape):
+    """A sphere around the origin.
+
+    Attributes:
+        radius: Unit of length.
+    """
+
+    radius: float
+
+    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
+        """See `Shape`."""
+        a = np.einsum("ni,ni->n", rays, rays)
+        b = rays @ origin
+        c = origin @ origin - self.radius**2
+        with np.errstate(invalid="ignore"):
+            root = np.sqrt(b * b - a * c)
+        return _first_hit((-b - root) / a, (-b + root) / a)
+
+    def normals(self, points: Float, frame: int) -> Float:
+        """See `Shape`."""
+        return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+    def corners(self) -> Float:
+        """See `Shape`."""
+        return _corner_points((self.radius,) * 3)
+
+
+@dataclass(frozen=True)
+class Sheet(Shape):
+    """A rectangular sheet bent into a circular cylinder, differently in each frame, isometrically.
+
+    Material coordinates are (x, y, 0) on the flat sheet. Bending about the direction at `angle`
+    from the y axis keeps lengths along the sheet: it is developable. With positive curvature the
+    sides bend towards +z.
+
+    Attributes:
+        half: Half sizes along the material axes x and y, unit of length.
+        curvature: Curvature (1 / unit of length) in the reference and in the next frame; 0 is flat.
+        angle: Direction of the bending axis in both frames, radians from y towards -x.
+    """
+
+    half: tuple[float, float]
+    curvature: tuple[float, float]
+    angle: tuple[float, float] = (0.0, 0.0)
+
+    rigid = False
+
+    def __post_init__(self) -> None:
+        reach = float(np.hypot(*self.half))
+        if max(abs(k) for k in self.curvature) * reach > 0.9 * np.pi:
+            raise DataError(
+                "sheet is bent so far that it meets itself",
+                where="Sheet.curvature",
+                found=self.curvature,
+                expected=f"|curvature| <= {0.9 * np.pi / reach:.3g}",
+            )
+
+    def _turn(self, points: Float, angle: float) -> Float:
+        c, s = np.cos(angle), np.sin(angle)
+        return points @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
+        """See `Shape`; the cylinder is `k (x^2 + z^2) = 2 z`, which stays sound for k = 0."""
+        k = self.curvature[frame]
+        o = self._turn(origin[None], -self.angle[frame])[0]
+        d = self._turn(rays, -self.angle[frame])
+        a = k * (d[:, 0] ** 2 + d[:, 2] ** 2)
+        b = k * (o[0] * d[:, 0] + o[2] * d[:, 2]) - d[:, 2]
+        c = k * (o[0] ** 2 + o[2] ** 2) - 2 * o[2]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            q = -(b + np.copysign(np.sqrt(b * b - a * c), b))
+            roots = (q / a, c / q)
+        return _first_hit(*(self._on_sheet(origin, rays, t, frame) for t in roots))
+
+    def _on_sheet(self, origin: Float, rays: Float, t: Float, frame: int) -> Float:
+        """The ray parameters `t` (N,), NaN where the point lies beyond the edge of the sheet."""
+        with np.errstate(invalid="ignore"):
+            material = self.material(origin + t[:, None] * rays, frame)
+            inside = (abs(material[:, :2]) <= np.asarray(self.half)).all(axis=1)
+        return np.where(inside, t, np.nan)
+
+    def material(self, points: Float, frame: int) -> Float:
+        """See `Shape`: unroll the cylinder."""
+        k = self.curvature[frame]
+        p = self._turn(points, -self.angle[frame])
+        arc = np.arctan2(k * p[:, 0], 1 - k * p[:, 2]) / k if k else p[:, 0]
+        flat = np.stack([arc, p[:, 1], np.zeros(len(p))], axis=1)
+        return self._turn(flat, self.angle[frame])
+
+    def place(self, material: Float, frame: int) -> Float:
+        """See `Shape`: roll the flat sheet up."""
+        k = self.curvature[frame]
+        p = self._turn(material, -self.angle[frame])
+        # np.sinc(x) = sin(pi x) / (pi x) is exact at 0
+        half_angle = 0.5 * k * p[:, 0] / np.pi
+        x = p[:, 0] * np.sinc(2 * half_angle)
+        z = 0.5 * k * p[:, 0] ** 2 * np.sinc(half_angle) ** 2
+        return self._turn(np.stack([x, p[:, 1], z], axis=1), self.angle[frame])
+
+    def normals(self, points: Float, frame: int) -> Float:
+        """See `Shape`; -z at the centre."""
+        k = self.curvature[frame]
+        p = self._turn(points, -self.angle[frame])
+        n = np.stack([k * p[:, 0], np.zeros(len(p)), k * p[:, 2] - 1], axis=1)
+        return self._turn(n / np.linalg.norm(n, axis=1, keepdims=True), self.angle[frame])
+
+    def corners(self) -> Float:
+        """See `Shape`."""
+        return _corner_points((float(np.hypot(*self.half)),) * 3)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A textured shape at a pose.
+
+    Attributes:
+        shape: The surface, in its own coordinates.
+        scene_from_part: (4, 4) rigid pose at the reference time.
+        texture: Colours by material coordinates.
+        glow: Share of the colour that does not depend on the light; 1 for no shading (sky).
+    """
+
+    shape: Shape
+    scene_from_part: Float
+    texture: Texture
+    glow: float = 0.45
+
+    def colour(self, points: Float, footprint: Float, frame: int) -> NDArray[np.float32]:
+        """Colours (N, 3) of points (N, 3) in part coordinates; shading is fixed in the matter."""
+        material = self.shape.material(points, frame)
+        normals = self.shape.normals(self.shape.place(material, 0), 0)
+        light = self.scene_from_part[:3, :3].T @ LIGHT
+        shade = self.glow + (1 - self.glow) * (0.5 + 0.5 * normals @ light)
+        colour = self.texture.colour(material, self.shape.chart(material), footprint)
+        return colour * shade[:, None].astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Body:
+    """Parts that move together.
+
+    Attributes:
+        name: For messages.
+        parts: What the body is made of.
+        motion: (4, 4) motion in scene coordinates from the reference to the next time.
+    """
+
+    name: str
+    parts: tuple[Part, ...]
+    motion: Float = field(default_factory=lambda: np.eye(4))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Bodies and a camera at two times, in any right-handed scene coordinates.
+
+    Attributes:
+        bodies: Their order gives the labels 0, 1, ...
+        ref_from_scene: (4, 4) camera pose at the reference time.
+        next_from_scene: (4, 4) camera pose at the next time.
+    """
+
+    bodies: tuple[Body, ...]
+    ref_from_scene: Float
+    next_from_scene: Float
+
+    @property
+    def parts(self) -> list[Part]:
+        """All parts, body by body."""
+        return [part for body in self.bodies for part in body.parts]
+
+    @property
+    def body_of_part(self) -> NDArray[np.int32]:
+        """(P,) body label of each part."""
+        return np.repeat(
+            np.arange(len(self.bodies), dtype=np.int32), [len(b.parts) for b in self.bodies]
+        )
+
+    def camera_from_part(self, frame: int) -> Float:
+        """(P, 4, 4) poses of all parts in the camera of a frame."""
+        if frame == 0:
+            return np.array([self.ref_from_scene @ part.scene_from_part for part in self.parts])
+        return np.array(
+            [
+                self.next_from_scene @ body.motion @ part.scene_from_part
+                for body in self.bodies
+                for part in body.parts
+            ]
+        )
+
+    def motions(self) -> Float:
+        """(B, 4, 4) next_from_ref of each body, camera motion included; NaN where not rigid."""
+        scene_from_ref = np.linalg.inv(self.ref_from_scene)
+        out = np.array([self.next_from_scene @ b.motion @ scene_from_ref for b in self.bodies])
+        bends = [not all(part.shape.rigid for part in body.parts) for body in self.bodies]
+        out[bends] = np.nan
+        return out
+
+    def trace(self, K: Float, uv: Float, frame: int) -> tuple[Float, Int]:
+        """First surface behind pixels.
+
+        Args:
+            K: (3, 3) intrinsics.
+            uv: (N, 2) pixels, any real numbers.
+            frame: 0 for the reference, 1 for the next frame.
+
+        Returns:
+            Depth z (N,), inf where nothing is hit, and part index (N,), -1 there.
+        """
+        rays = camera.rays(K, uv)
+        depth = np.full(len(uv), np.inf)
+        index = np.full(len(uv), -1, dtype=np.int64)
+        for p, (part, pose) in enumerate(zip(self.parts, self.camera_from_part(frame))):
+            near = _may_hit(part.shape, pose, K, uv)
+            R, t = pose[:3, :3], pose[:3, 3]
+            hit = part.shape.intersect(-R.T @ t, rays[near] @ R, frame)
+            closer = hit < depth[near]
+            depth[near[closer]] = hit[closer]
+            index[near[closer]] = p
+        return depth, index
+
+
+def _may_hit(shape: Shape, camera_from_part: Float, K: Float, uv: Float) -> Int:
+    """Indices of the pixels (N, 2) within the bounding rectangle of a shape's projection."""
+    corners = shape.corners()
+    if corners is not None:
+        seen = corners @ camera_from_part[:3, :3].T + camera_from_part[:3, 3]
+        if seen[:, 2].min() > NEAR:
+            at = camera.project(K, seen)
+            lo, hi = at.min(axis=0) - 1e-6, at.max(axis=0) + 1e-6
+            return np.flatnonzero(((uv >= lo) & (uv <= hi)).all(axis=1))
+    return np.arange(len(uv))
+
+
+def render(scene: Scene, K: Float, height: int, width: int, name: str = "scene") -> Pair:
+    """Both images of a scene and its exact truth.
+
+    Args:
+        scene: What to render.
+        K: (3, 3) intrinsics of both frames, pixels.
+        height: Rows of the images.
+        width: Columns of the images.
+        name: Name of the pair.
+
+    Returns:
+        A `Pair` without a flow but with full truth in the unit of the scene. A reference pixel is
+        occluded when its point is hidden in the next frame, or projects outside the rectangle of
+        the next frame's pixel centres, or lies behind its camera (its flow is NaN then).
+
+    Raises:
+        DataError: a ray of either frame misses every surface, so that depth is not finite.
+    """
+    uv = camera.pixel_grid(height, width).reshape(-1, 2)
+    depths, images, hits = [], [], []
+    for frame in (0, 1):
+        depth, part = scene.trace(K, uv, frame)
+        if (part < 0).any():
+            raise DataError(
+                "scene is open: some rays hit nothing",
+                where=f"{name}, frame {frame}",
+                found=f"{np.mean(part < 0):.1%} of the pixels",
+                expected="a surface behind every pixel",
+                hint="add an infinite background plane",
+            )
+        images.append(_paint(scene, K, depth, part, (height, width), frame))
+        depths.append(depth)
+        hits.append(part)
+    X = depths[0][:, None] * camera.rays(K, uv)
+    X_next = _move(scene, X, hits[0])
+    in_front = X_next[:, 2] > NEAR
+    target = np.full_like(uv, np.nan)
+    target[in_front] = camera.project(K, X_next[in_front])
+    # a target within rounding of the border counts as inside
+    edge = np.array([width, height]) - 1 + 1e-6
+    inside = in_front & ((target >= -1e-6) & (target <= edge)).all(axis=1)
+    visible = inside.copy()
+    first, _ = scene.trace(K, target[inside], 1)
+    visible[inside] = X_next[inside, 2] <= first * (1 + SAME_DEPTH)
+    shape = (height, width)
+    truth = Truth(
+        depth_ref=depths[0].reshape(shape),
+        depth_next=depths[1].reshape(shape),
+        flow=(target - uv).reshape(*shape, 2),
+        occluded=~visible.reshape(shape),
+        bodies=scene.body_of_part[hits[0]].reshape(shape),
+        motions=scene.motions(),
+        scene_flow=(X_next - X).reshape(*shape, 3),
+        unit="m",
+    )
+    return Pair(images[0], images[1], K.copy(), K.copy(), truth=truth, name=name)
+
+
+def _move(scene: Scene, X: Float, part: Int) -> Float:
+    """Next-frame positions (N, 3) of reference points (N, 3) on parts (N,)."""
+    out = np.empty_like(X)
+    before, after = scene.camera_from_part(0), scene.camera_from_part(1)
+    motions = scene.motions()[scene.body_of_part]
+    for p in np.unique(part):
+        on = part == p
+        shape = scene.parts[p].shape
+        if shape.rigid and np.isfinite(motions[p]).all():
+            out[on] = X[on] @ motions[p, :3, :3].T + motions[p, :3, 3]
+        else:
+            local = (X[on] - before[p, :3, 3]) @ before[p, :3, :3]
+            local = shape.place(shape.material(local, 0), 1)
+            out[on] = local @ after[p, :3, :3].T + after[p, :3, 3]
+    return out
+
+
+def _paint(
+    scene: Scene,
+    K: Float,
+    depth: Float,
+    part: Int,
+    shape: tuple[int, int],
+    frame: int,
+    grid: int = 3,
+) -> NDArray[np.uint8]:
+    """The image (H, W, 3); pixels on edges are averages of `grid` x `grid` traced samples."""
+    uv = camera.pixel_grid(*shape).reshape(-1, 2)
+    colour, normals = _shade(scene, K, uv, depth, part, frame)
+    edge = np.flatnonzero(_on_edge(part.reshape(shape), normals.reshape(*shape, 3)))
+    if len(edge):
+        total = np.zeros((len(edge), 3))
+        steps = (np.arange(grid) + 0.5) / grid - 0.5
+        for du in steps:
+            for dv in steps:
+                at = uv[edge] + [du, dv]
+                z, p = scene.trace(K, at, frame)
+                missed = p < 0
+                z[missed], p[missed] = depth[edge[missed]], part[edge[missed]]
+                total += np.clip(_shade(scene, K, at, z, p, frame)[0], 0, 1)
+        colour[edge] = total / grid**2
+    return np.round(255 * np.clip(colour, 0, 1)).astype(np.uint8).reshape(*shape, 3)
+
+
+def _on_edge(part: Int, normals: Float) -> NDArray[np.bool_]:
+    """Pixels (H, W) whose 4-neighbours show another part or another face."""
+    edge = np.zeros(part.shape, bool)
+    for axis in (0, 1):
+        first = tuple(slice(None, -1) if a == axis else slice(None) for a in (0, 1))
+        second = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
+        turned = np.einsum("...i,...i", normals[first], normals[second]) < 0.7
+        differ = (part[first] != part[second]) | turned
+        edge[first] |= differ
+        edge[second] |= differ
+    return edge
+
+
+def _shade(
+    scene: Scene, K: Float, uv: Float, depth: Float, part: Int, frame: int, taps: int = 4
+) -> tuple[NDArray[np.float32], Float]:
+    """Colours (N, 3) and camera-frame normals (N, 3) of hits, averaged along the tilt of a surface.
+
+    A tilted surface is squeezed in one image direction only. Its texture is limited to the finer
+    resolution where `taps` samples along the squeezed direction can average the rest.
+    """
+    colour = np.zeros((len(uv), 3), np.float32)
+    normals = np.zeros((len(uv), 3))
+    rays = camera.rays(K, uv)
+    poses = scene.camera_from_part(frame)
+    for p in np.unique(part):
+        on = np.flatnonzero(part == p)
+        item, (R, t) = scene.parts[p], (poses[p, :3, :3], poses[p, :3, 3])
+        X = depth[on, None] * rays[on]
+        local = (X - t) @ R
+        n = item.shape.normals(local, frame) @ R.T
+        normals[on] = n
+        slope = np.einsum("ni,ni->n", n, rays[on]) / np.linalg.norm(rays[on], axis=1)
+        cosine = np.maximum(abs(slope), 0.02)
+        across = depth[on] / K[0, 0]
+        footprint = np.maximum(across, across / cosine / taps)
+        # direction along which a pixel covers most of the surface, within the surface
+        along = rays[on] - n * np.einsum("ni,ni->n", n, rays[on])[:, None]
+        along /= np.maximum(np.linalg.norm(along, axis=1), 1e-12)[:, None]
+        tilted = cosine < 0.75
+        shown = np.empty((len(on), 3), np.float32)
+        shown[~tilted] = item.colour(local[~tilted], footprint[~tilted], frame)
+        if tilted.any():
+            step = (along * (across / cosine)[:, None])[tilted] @ R
+            offsets = (np.arange(taps) + 0.5) / taps - 0.5
+            samples = [
+                item.colour(local[tilted] + o * step, footprint[tilted], frame) for o in offsets
+            ]
+            shown[tilted] = sum(samples) / np.float32(taps)
+        colour[on] = shown
+    return colour, normals

@@ -1,0 +1,229 @@
+"""Procedural textures: seeded solid noise, limited to what a pixel can show.
+
+A texture is a function of a body's own (material) coordinates, so that it sticks to the body
+while the body moves, turns or bends: the two frames of a rendered pair then show the same colours
+at corresponding points (brightness constancy), up to the sampling by pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import DataError
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Colour = tuple[float, float, float]
+
+PERIOD = 32
+"""Cells after which the noise of one octave repeats; a power of two."""
+
+FINEST_CELLS = (1.25, 2.5)
+"""An octave fades in while its cells grow from the first to the second many footprints."""
+
+GOLDEN = 0.6180339887498949
+
+
+@lru_cache(maxsize=64)
+def _lattice(seed: int) -> Float32:
+    """Random values in [-1, 1] on a periodic lattice, flat (PERIOD**3,)."""
+    rng = np.random.default_rng([seed, 0x50])
+    return rng.uniform(-1, 1, PERIOD**3).astype(np.float32)
+
+
+@lru_cache(maxsize=64)
+def _turn(seed: int) -> Float:
+    """A random rotation (3, 3) that keeps lattice planes away from the faces of a body."""
+    rng = np.random.default_rng([seed, 0x51])
+    Q, R = np.linalg.qr(rng.standard_normal((3, 3)))
+    return Q * np.sign(np.diag(R))
+
+
+def value_noise(points: Float, seed: int) -> Float32:
+    """Smooth solid noise: quintic interpolation of random values on the integer lattice.
+
+    Args:
+        points: (N, 3) positions in lattice cells.
+        seed: Which noise.
+
+    Returns:
+        (N,) values in [-1, 1], twice continuously differentiable, period `PERIOD` in each axis.
+    """
+    table = _lattice(seed)
+    cell = np.floor(points)
+    f = (points - cell).astype(np.float32)
+    f = f * f * f * (f * (f * 6 - 15) + 10)
+    low = cell.astype(np.int64) & (PERIOD - 1)
+    high = (low + 1) & (PERIOD - 1)
+    fx, fy, fz = f.T
+    planes = []
+    for z in (low[:, 2] * PERIOD**2, high[:, 2] * PERIOD**2):
+        rows = []
+        for y in (low[:, 1] * PERIOD, high[:, 1] * PERIOD):
+            base = z + y
+            left, right = table[base + low[:, 0]], table[base + high[:, 0]]
+            rows.append(left + fx * (right - left))
+        planes.append(rows[0] + fy * (rows[1] - rows[0]))
+    out: Float32 = planes[0] + fz * (planes[1] - planes[0])
+    return out
+
+
+def band_weight(cell: float, footprint: Float) -> Float32:
+    """How much (N,) of an octave with this cell size a pixel of this footprint may show, 0 to 1."""
+    lo, hi = FINEST_CELLS
+    x = np.clip((cell / footprint - lo) / (hi - lo), 0, 1)
+    return (x * x * (3 - 2 * x)).astype(np.float32)
+
+
+def fractal_noise(
+    points: Float,
+    footprint: Float,
+    *,
+    cell: float,
+    seed: int,
+    persistence: float = 0.8,
+    lacunarity: float = 1.93,
+    octaves: int = 12,
+) -> Float32:
+    """Sum of octaves of `value_noise`, each octave only where pixels can resolve it.
+
+    Args:
+        points: (N, 3) positions in the unit of length.
+        footprint: (N,) size of a pixel on the surface, same unit.
+        cell: Cell size of the coarsest octave, same unit.
+        seed: Which noise.
+        persistence: Amplitude of an octave relative to the next coarser one.
+        lacunarity: Ratio of the cell sizes of consecutive octaves.
+        octaves: At most this many.
+
+    Returns:
+        (N,) noise of zero mean and, with five octaves, standard deviation of about 0.4.
+    """
+    turned = points @ _turn(seed).T
+    total = np.zeros(len(points), np.float32)
+    finest = float(footprint.min(initial=np.inf))
+    scale = 1 / np.sqrt(sum(persistence ** (2 * k) for k in range(5)))
+    for k in range(octaves):
+        if cell < FINEST_CELLS[0] * finest:
+            break
+        weight = band_weight(cell, footprint)
+        visible = np.flatnonzero(weight)
+        if len(visible):
+            # a shift per octave, or all octaves would share a lattice node at the origin
+            shift = np.mod(GOLDEN * (k + 1) * np.array([1.0, 7.0, 13.0]), 1) * PERIOD
+            where = turned[visible] / cell + shift
+            total[visible] += np.float32(scale) * weight[visible] * value_noise(where, seed)
+        scale *= persistence
+        cell /= lacunarity
+    return total * np.float32(1.6)
+
+
+def pulse_coverage(x: Float, duty: float, width: Float) -> Float:
+    """Box-filtered pulse train: share (N,) of [x - width/2, x + width/2] where frac(x) < duty."""
+    width = np.maximum(width, 1e-6)
+
+    def integral(y: Float) -> Float:
+        whole = np.floor(y)
+        return whole * duty + np.minimum(y - whole, duty)
+
+    covered: Float = (integral(x + width / 2) - integral(x - width / 2)) / width
+    return np.clip(covered, 0, 1)
+
+
+@dataclass(frozen=True)
+class Panels:
+    """A grid of rectangles (windows, tiles, lane marks) on a surface's own chart.
+
+    Attributes:
+        period: Size of a grid cell along both chart axes, unit of length.
+        duty: Share of a cell that the rectangle covers, along both axes.
+        colour: RGB in [0, 1].
+        offset: Where the first rectangle starts, unit of length.
+        variation: Random change of brightness from one rectangle to the next, 0 for none.
+    """
+
+    period: tuple[float, float]
+    duty: tuple[float, float]
+    colour: Colour
+    offset: tuple[float, float] = (0.0, 0.0)
+    variation: float = 0.0
+
+    def __post_init__(self) -> None:
+        if min(self.period) <= 0 or not all(0 < d <= 1 for d in self.duty):
+            raise DataError(
+                "panel grid is empty",
+                where="Panels",
+                found=f"period {self.period}, duty {self.duty}",
+                expected="period > 0 and 0 < duty <= 1",
+            )
+
+    def blend(self, colour: Float32, chart: Float, footprint: Float, seed: int) -> Float32:
+        """Paint the panels over `colour` (N, 3) at chart positions (N, 2), anti-aliased."""
+        grid = (chart - np.asarray(self.offset)) / np.asarray(self.period)
+        width = footprint[:, None] / np.asarray(self.period)
+        share = pulse_coverage(grid[:, 0], self.duty[0], width[:, 0])
+        share = share * pulse_coverage(grid[:, 1], self.duty[1], width[:, 1])
+        # the brightness of a rectangle is constant on it; gaps between rectangles hide the jumps
+        node = np.floor(grid + 0.5 * (1 - np.asarray(self.duty))).astype(np.int64) & (PERIOD - 1)
+        tone = 1 + self.variation * _lattice(seed)[node[:, 0] + PERIOD * node[:, 1]]
+        paint = np.asarray(self.colour, np.float32) * tone[:, None].astype(np.float32)
+        return colour + share[:, None].astype(np.float32) * (paint - colour)
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Colour of a surface point from its material coordinates.
+
+    Attributes:
+        colours: Two RGB colours in [0, 1]; slow noise mixes them.
+        cell: Size of the coarsest noise cells, unit of length.
+        contrast: Strength of the fine multi-octave noise, 0 for flat colours.
+        persistence: Amplitude of each finer octave relative to the coarser one.
+        seed: Which noise.
+        panels: Rectangles painted over the two colours, or None.
+    """
+
+    colours: tuple[Colour, Colour]
+    cell: float
+    contrast: float = 0.6
+    persistence: float = 0.8
+    seed: int = 0
+    panels: Panels | None = None
+
+    def __post_init__(self) -> None:
+        if not self.cell > 0:
+            raise DataError(
+                "texture cells must have a size",
+                where="Texture.cell",
+                found=self.cell,
+                expected="> 0",
+            )
+
+    def colour(self, points: Float, chart: Float, footprint: Float) -> Float32:
+        """Linear RGB of surface points.
+
+        Args:
+            points: (N, 3) material coordinates, unit of length.
+            chart: (N, 2) coordinates on the surface, for `panels`.
+            footprint: (N,) size of a pixel on the surface.
+
+        Returns:
+            (N, 3) float32, mostly within [0, 1].
+        """
+        slow = fractal_noise(
+            points, footprint, cell=1.7 * self.cell, seed=self.seed + 1, persistence=0.6, octaves=3
+        )
+        first, second = np.asarray(self.colours, np.float32)
+        mix = np.clip(0.5 + 0.9 * slow, 0, 1)[:, None]
+        colour = first + mix * (second - first)
+        if self.panels is not None:
+            colour = self.panels.blend(colour, chart, footprint, self.seed)
+        fine = fractal_noise(
+            points, footprint, cell=self.cell, seed=self.seed, persistence=self.persistence
+        )
+        # exp keeps dark parts dark and never negative, unlike adding the noise
+        return colour * np.exp(np.float32(self.contrast) * fine)[:, None]
