@@ -12,7 +12,19 @@ from collections.abc import Callable
 import numpy as np
 
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.raycast import Body, Box, Float, Part, Plane, Scene, Shape, Sheet, Sphere, render
+from soup_nlp.data.raycast import (
+    Body,
+    Box,
+    Float,
+    Part,
+    Plane,
+    Scene,
+    Shape,
+    Sheet,
+    Sphere,
+    inverse,
+    render,
+)
 from soup_nlp.data.texture import Colour, Panels, Texture
 from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera, rotation
@@ -100,7 +112,7 @@ def _about(pivot: Float, turn: Float, shift: Float) -> Float:
 def _views(pose: Float, shift: Float, turn: Float) -> tuple[Float, Float]:
     """(ref_from_scene, next_from_scene) of a camera at `pose` that moves in its own frame."""
     step = _about(np.zeros(3), turn, shift)
-    return np.linalg.inv(pose), np.linalg.inv(pose @ step)
+    return inverse(pose), inverse(pose @ step)
 
 
 def _sign(rng: Random) -> float:
@@ -140,7 +152,7 @@ class _Materials:
     def seed(self) -> int:
         return int(self.rng.integers(2**31))
 
-    def paint(self, cell: float, panels: Panels | None = None, contrast: float = 0.55) -> Texture:
+    def paint(self, cell: float, panels: Panels | None = None, contrast: float = 0.5) -> Texture:
         """The next colour of the palette."""
         self.paints.append(self.paints.pop(0))
         return Texture(self.paints[-1], cell, contrast, seed=self.seed(), panels=panels)
@@ -179,10 +191,10 @@ def _car(m: _Materials, x: float, z: float, yaw: float) -> tuple[Part, ...]:
     body = m.paint(0.7)
     sizes: list[tuple[tuple[float, float, float], tuple[float, float], Texture]] = [
         # half size, (bottom above ground, offset along the car), texture
-        ((0.86, 0.16, 2.02), (0.0, 0.0), m.plain(((0.12, 0.12, 0.13), (0.2, 0.2, 0.21)), 0.4)),
-        ((0.92, 0.32, 2.15), (0.3, 0.0), body),
-        ((0.78, 0.28, 1.15), (0.94, -0.25), m.plain((_GLASS, (0.3, 0.36, 0.42)), 0.5)),
-        ((0.76, 0.03, 1.05), (1.5, -0.25), body),
+        ((0.86, 0.12, 2.02), (0.0, 0.0), m.plain(((0.12, 0.12, 0.13), (0.2, 0.2, 0.21)), 0.4)),
+        ((0.92, 0.33, 2.15), (0.24, 0.0), body),
+        ((0.78, 0.24, 1.1), (0.9, -0.3), m.plain((_GLASS, (0.3, 0.36, 0.42)), 0.5)),
+        ((0.76, 0.03, 1.0), (1.38, -0.3), body),
     ]
     return tuple(
         Part(Box(half), at @ _pose(0, -(bottom + half[1]), along), texture)
@@ -233,7 +245,7 @@ def _street(rng: Random, half_width: float, half_height: float) -> Scene:
     bodies.append(
         Body("car coming", _car(m, -lane, coming, 180.0), _about(np.zeros(3), np.zeros(3), shift))
     )
-    turn = np.array([rng.uniform(-0.1, 0.1), _sign(rng) * rng.uniform(0.2, 0.45), 0.1])
+    turn = np.array([rng.uniform(-0.1, 0.1), _sign(rng) * rng.uniform(0.2, 0.4), 0.1])
     view = _views(
         _pose(rng.uniform(-0.4, 0.4), -rng.uniform(2.1, 2.4), 0, yaw=rng.uniform(-2, 2)),
         np.array([rng.uniform(-0.03, 0.03), 0, drive]),
@@ -242,81 +254,88 @@ def _street(rng: Random, half_width: float, half_height: float) -> Scene:
     return Scene(tuple(bodies), *view)
 
 
+_FRONT = ((-0.62, 3.5), (0.0, 3.4), (0.62, 3.6))
+_BACK = ((-0.88, 4.9), (-0.3, 5.0), (0.31, 4.8), (0.88, 5.0))
+"""Spots on the floor: fraction of half the image's width, distance (m). The back row stands in the
+gaps of the front row."""
+
+_WALL = 6.4
+"""Distance of a room's back wall, m."""
+
+
 def _objects(
-    rng: Random, m: _Materials, spots: list[tuple[float, float]], size: float
+    rng: Random, m: _Materials, spots: tuple[tuple[float, float], ...], half_width: float
 ) -> list[tuple[Part, Float]]:
-    """A box or a sphere standing on the ground at each spot (x, z); with its foot (3,)."""
+    """Boxes and spheres in turn, one standing on each spot; with its foot (3,)."""
     out = []
-    for k, (x, z) in enumerate(spots):
-        foot = np.array([x, 0.0, z])
+    for k, (across, distance) in enumerate(spots):
+        z = distance + rng.uniform(-0.1, 0.1)
+        unit = z * half_width
+        size = 0.15 * unit
+        foot = np.array([(across + rng.uniform(-0.03, 0.03)) * unit, 0.0, z])
         shape: Shape
         if k % 2:
-            radius = size * rng.uniform(0.75, 1.0)
+            radius = size * rng.uniform(0.85, 1.05)
             shape, up, yaw = Sphere(radius), radius, rng.uniform(0, 360)
         else:
-            half = size * rng.uniform([0.6, 0.6, 0.6], [0.95, 1.3, 0.95])
+            half = size * rng.uniform([0.75, 0.75, 0.75], [1.0, 1.4, 1.0])
             shape, up, yaw = Box((half[0], half[1], half[2])), half[1], rng.uniform(20, 70)
-        out.append((Part(shape, _pose(x, -up, z, yaw=yaw), m.paint(0.8 * size)), foot))
+        pose = _pose(foot[0], -up, z, yaw=yaw)
+        out.append((Part(shape, pose, m.paint(0.8 * size)), foot))
     return out
 
 
-def _interior(rng: Random, m: _Materials, half: float, depth: float) -> list[Part]:
-    """Floor, back wall and two side walls; windows would be mirrors of each other, so none."""
+def _interior(rng: Random, m: _Materials, half_width: float) -> list[Part]:
+    """Floor with tiles, papered back wall with a picture, and two side walls."""
     tiles = Panels((0.6, 0.6), (0.965, 0.965), (0.60, 0.50, 0.40), variation=0.25)
     paper = Panels((0.5, 9.0), (0.5, 1.0), (0.62, 0.64, 0.56))
-    picture = Texture(_PAINTS[rng.integers(len(_PAINTS))], 0.3, 0.7, seed=m.seed())
-    at = rng.uniform(-0.5, 0.5) * half
+    side = 0.94 * half_width * _WALL
+    picture = _pose(rng.uniform(-0.5, 0.5) * side, -1.65, _WALL - 0.02)
     return [
         _floor(m.plain(((0.36, 0.30, 0.25), (0.30, 0.26, 0.22)), 0.7, tiles)),
-        _backdrop(depth, m.wall(0.9, paper)),
-        Part(Plane(), _pose(-half, 0, 0, yaw=-90), m.wall(0.9)),
-        Part(Plane(), _pose(half, 0, 0, yaw=90), m.wall(0.9)),
-        Part(Box((0.55, 0.4, 0.02)), _pose(at, -1.75, depth - 0.02), picture),
+        _backdrop(_WALL, m.wall(0.9, paper)),
+        Part(Plane(), _pose(-side, 0, 0, yaw=-90), m.wall(0.9)),
+        Part(Plane(), _pose(side, 0, 0, yaw=90), m.wall(0.9)),
+        Part(Box((0.55, 0.4, 0.02)), picture, m.paint(0.3)),
     ]
 
 
 def _room(rng: Random, half_width: float, half_height: float) -> Scene:
     m = _Materials(rng)
-    reach = 4.2 * half_width
-    # two rows of spots; neighbours in a row are further apart than an object is wide
-    front = [
-        (x * reach + rng.uniform(-0.06, 0.06), 3.5 + rng.uniform(-0.1, 0.1))
-        for x in (-0.62, 0.02, 0.62)
-    ]
-    back = [
-        (x * reach + rng.uniform(-0.1, 0.1), 4.9 + rng.uniform(-0.15, 0.15))
-        for x in (-0.95, -0.32, 0.34, 0.95)
-    ]
-    objects = _objects(rng, m, front, 0.34) + _objects(rng, m, back, 0.42)
-    moving = [int(rng.integers(0, 3)), *(3 + rng.permutation(4)[:2])]
+    objects = _objects(rng, m, _FRONT + _BACK, half_width)
+    moving = [rng.integers(3), *(3 + rng.permutation(4)[:2])]
     rest = [part for k, (part, _) in enumerate(objects) if k not in moving]
-    bodies = [Body("room", (*_interior(rng, m, 4.2 * half_width * 1.75, 6.2), *rest))]
+    bodies = [Body("room", (*_interior(rng, m, half_width), *rest))]
     for rank, k in enumerate(moving):
         part, foot = objects[k]
-        shift = _sign(rng) * rng.uniform([0.03, 0, 0.01], [0.06, 0, 0.06])
+        shift = np.array([_sign(rng), 0, _sign(rng)]) * rng.uniform(
+            [0.03, 0, 0.01], [0.06, 0, 0.06]
+        )
         if rank == 2:
-            shift[1] = -rng.uniform(0.02, 0.05)
+            shift[1] = -rng.uniform(0.02, 0.05)  # lifted off the floor
         turn = np.array([0, _sign(rng) * rng.uniform(2, 4), 0])
         bodies.append(Body(f"mover {rank}", (part,), _about(foot, turn, shift)))
     side = _sign(rng)
     view = _views(
-        _pose(0, -1.35, 0, yaw=side * 2, pitch=-9),
-        np.array([side * rng.uniform(0.06, 0.09), rng.uniform(-0.01, 0.01), 0.04]),
-        np.array([0.1, -side * rng.uniform(0.3, 0.7), _sign(rng) * 0.2]),
+        _pose(0, -1.35, 0, yaw=side, pitch=-9),
+        np.array([side * rng.uniform(0.07, 0.1), rng.uniform(-0.01, 0.01), 0.04]),
+        np.array([0.1, -side * rng.uniform(0.2, 0.5), _sign(rng) * 0.2]),
     )
     return Scene(tuple(bodies), *view)
 
 
 def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
     m = _Materials(rng)
-    bend, change = _sign(rng) * rng.uniform(0.7, 1.0), rng.uniform(0.15, 0.25) * _sign(rng)
+    bend, change = _sign(rng) * rng.uniform(0.7, 1.0), _sign(rng) * rng.uniform(0.15, 0.25)
     axis = rng.uniform(-0.25, 0.25)
+    # sides that bend away from the camera look smaller
+    room = 1.06 if bend > 0 else 0.93
     shape = Sheet(
-        (0.92 * half_width, 0.9 * half_height),
+        (room * half_width, room * half_height),
         (bend, bend + change),
         (axis, axis + _sign(rng) * rng.uniform(0.02, 0.06)),
     )
-    dots = Panels((0.16, 0.16), (0.5, 0.5), (0.72, 0.70, 0.62), variation=0.3)
+    dots = Panels((0.16, 0.16), (0.5, 0.5), (0.66, 0.64, 0.56), variation=0.3)
     cloth = Part(shape, _pose(0, 0, 1.0, yaw=rng.uniform(-8, 8)), m.paint(0.12, dots), glow=0.6)
     shift = rng.uniform([-0.003, -0.003, -0.01], [0.003, 0.003, 0.01])
     bodies = (
@@ -325,7 +344,7 @@ def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
     )
     view = _views(
         np.eye(4),
-        np.array([_sign(rng) * rng.uniform(0.012, 0.018), rng.uniform(-0.004, 0.004), 0.006]),
+        np.array([_sign(rng) * rng.uniform(0.008, 0.013), rng.uniform(-0.004, 0.004), 0.004]),
         rng.uniform(-0.15, 0.15, 3),
     )
     return Scene(bodies, *view)
@@ -333,48 +352,30 @@ def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
 
 def _orbit(rng: Random, half_width: float, half_height: float) -> Scene:
     m = _Materials(rng)
-    reach = 4.2 * half_width
-    spots = [
-        (x * reach + rng.uniform(-0.06, 0.06), z + rng.uniform(-0.1, 0.1))
-        for x, z in (
-            (-0.62, 3.7),
-            (-0.1, 3.3),
-            (0.5, 3.6),
-            (-0.95, 5.0),
-            (-0.3, 4.9),
-            (0.28, 4.8),
-            (0.95, 5.1),
-        )
-    ]
-    objects = _objects(rng, m, spots, 0.38)
-    bodies = [Body("room", tuple(_interior(rng, m, 4.2 * half_width * 1.75, 6.4)))]
+    objects = _objects(rng, m, _FRONT + _BACK, half_width)
+    bodies = [Body("room", tuple(_interior(rng, m, half_width)))]
     bodies += [Body(f"object {k}", (part,)) for k, (part, _) in enumerate(objects)]
-    camera_pose = _pose(0, -1.45, 0, pitch=-9)
+    pose = _pose(0, -1.45, 0, pitch=-9)
     around = _about(
         np.array([0, 0, 4.2]),
         np.array([0, _sign(rng) * rng.uniform(1.2, 2.0), 0]),
         np.array([0, rng.uniform(-0.03, 0.03), rng.uniform(-0.03, 0.06)]),
     )
-    return Scene(tuple(bodies), np.linalg.inv(camera_pose), np.linalg.inv(around @ camera_pose))
+    return Scene(tuple(bodies), inverse(pose), inverse(around @ pose))
 
 
 def _still(rng: Random, half_width: float, half_height: float) -> Scene:
     m = _Materials(rng)
-    reach = 4.2 * half_width
-    spots = [
-        (x * reach + rng.uniform(-0.06, 0.06), z + rng.uniform(-0.1, 0.1))
-        for x, z in ((0.0, 3.4), (-0.66, 4.2), (0.66, 4.3), (-0.3, 5.2), (0.3, 5.2))
-    ]
-    objects = _objects(rng, m, spots, 0.45)
-    part, foot = objects[0]
-    shift = _sign(rng) * np.array([rng.uniform(0.05, 0.09), 0, rng.uniform(-0.08, 0.08)])
-    motion = _about(foot, np.array([0, _sign(rng) * rng.uniform(3, 6), 0]), shift)
-    rest = tuple(p for p, _ in objects[1:])
+    objects = _objects(rng, m, _FRONT + _BACK, half_width)
+    mover = int(rng.integers(3))
+    part, foot = objects.pop(mover)
+    turn = np.array([0, _sign(rng) * rng.uniform(3, 6), 0])
+    shift = np.array([_sign(rng) * rng.uniform(0.05, 0.09), 0, rng.uniform(-0.08, 0.08)])
     bodies = (
-        Body("room", (*_interior(rng, m, 4.2 * half_width * 1.75, 6.4), *rest)),
-        Body("mover", (part,), motion),
+        Body("room", (*_interior(rng, m, half_width), *(p for p, _ in objects))),
+        Body("mover", (part,), _about(foot, turn, shift)),
     )
-    pose = np.linalg.inv(_pose(0, -1.35, 0, pitch=-9))
+    pose = inverse(_pose(0, -1.35, 0, pitch=-9))
     return Scene(bodies, pose, pose)
 
 

@@ -204,7 +204,7 @@ class Texture:
             )
 
     def colour(self, points: Float, chart: Float, footprint: Float) -> Float32:
-        """Linear RGB of surface points.
+        """RGB of surface points.
 
         Args:
             points: (N, 3) material coordinates, unit of length.
@@ -212,7 +212,7 @@ class Texture:
             footprint: (N,) size of a pixel on the surface.
 
         Returns:
-            (N, 3) float32, mostly within [0, 1].
+            (N, 3) float32 in [0, 1).
         """
         slow = fractal_noise(
             points, footprint, cell=1.7 * self.cell, seed=self.seed + 1, persistence=0.6, octaves=3
@@ -225,5 +225,6 @@ class Texture:
         fine = fractal_noise(
             points, footprint, cell=self.cell, seed=self.seed, persistence=self.persistence
         )
-        # exp keeps dark parts dark and never negative, unlike adding the noise
-        return colour * np.exp(np.float32(self.contrast) * fine)[:, None]
+        # exp keeps dark parts dark and never negative; the shoulder keeps detail in bright parts
+        colour = colour * np.exp(np.float32(self.contrast) * fine)[:, None]
+        return colour / np.sqrt(np.sqrt(1 + colour**4))

@@ -1,0 +1,324 @@
+"""Rendered scenes: the truth is exact, and the images carry it."""
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from soup_nlp.data.pair import Pair
+from soup_nlp.data.raycast import Body, Box, Part, Plane, Scene, Sheet, Sphere, inverse, render
+from soup_nlp.data.scenes import SCENES, render_scene
+from soup_nlp.data.texture import Panels, Texture, fractal_noise, pulse_coverage, value_noise
+from soup_nlp.errors import DataError
+from soup_nlp.geometry import camera, rotation
+
+ALL = list(SCENES)
+WIDTH, HEIGHT = 448, 190
+GREY = Texture(((0.5, 0.5, 0.5), (0.4, 0.4, 0.4)), cell=0.3)
+
+
+@cache
+def pair(name: str, seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> Pair:
+    return render_scene(name, seed, width, height)
+
+
+def points(p: Pair) -> np.ndarray:
+    uv = camera.pixel_grid(*p.size)
+    return p.truth.depth_ref[..., None] * camera.rays(p.K_ref, uv)
+
+
+def sample(image: np.ndarray, uv: np.ndarray, order: int = 1) -> np.ndarray:
+    return ndimage.map_coordinates(image, [uv[:, 1], uv[:, 0]], order=order, mode="nearest")
+
+
+# --- exactness of the truth -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_depth_motion_and_flow_agree_exactly(name):
+    p = pair(name)
+    T = p.truth
+    M = T.motions[T.bodies]
+    moved = np.einsum("hwij,hwj->hwi", M[..., :3, :3], points(p)) + M[..., :3, 3]
+    rigid = np.isfinite(moved).all(axis=-1)
+    assert rigid.mean() == 1 if name != "sheet" else 0 < rigid.mean() < 0.5
+    target = camera.project(p.K_next, moved)
+    uv = camera.pixel_grid(*p.size)
+    np.testing.assert_allclose(target[rigid], (uv + T.flow)[rigid], rtol=0, atol=1e-6)
+    np.testing.assert_allclose((moved - points(p))[rigid], T.scene_flow[rigid], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_scene_flow_projects_to_the_flow_on_every_body(name):
+    p = pair(name)
+    target = camera.project(p.K_next, points(p) + p.truth.scene_flow)
+    uv = camera.pixel_grid(*p.size)
+    np.testing.assert_allclose(target, uv + p.truth.flow, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_next_depth_sees_the_moved_points(name):
+    p = pair(name)
+    T = p.truth
+    seen = ~T.occluded
+    target = (camera.pixel_grid(*p.size) + T.flow)[seen]
+    z = (points(p) + T.scene_flow)[seen][:, 2]
+    got = 1 / sample(1 / T.depth_next, target)  # inverse depth is linear on a plane
+    # the rest straddles an edge, where interpolation mixes two surfaces
+    assert np.mean(abs(got - z) < 2e-3 * z) > 0.97
+    assert target.min() >= -1e-6
+    assert (target <= np.array([WIDTH, HEIGHT]) - 1 + 1e-6).all()
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_occluded_points_are_hidden_or_outside(name):
+    p = pair(name)
+    T = p.truth
+    target = camera.pixel_grid(*p.size) + T.flow
+    size = np.array([WIDTH, HEIGHT])
+    inside = ((target >= -1e-6) & (target <= size - 1 + 1e-6)).all(axis=-1)
+    hidden = T.occluded & inside
+    z = (points(p) + T.scene_flow)[..., 2][hidden]
+    near = ndimage.minimum_filter(T.depth_next, 3)  # nearest surface around the target
+    at = np.round(target[hidden]).astype(int)
+    assert np.mean(near[at[:, 1], at[:, 0]] < z * (1 - 1e-4)) > 0.97
+    assert T.occluded[~inside].all()
+    assert 0.001 < T.occluded.mean() < 0.25
+
+
+def test_labels_name_bodies_that_can_be_seen():
+    for name in ALL:
+        for seed in range(3):
+            p = pair(name, seed, 192, 82)
+            count = np.bincount(p.truth.bodies.ravel(), minlength=len(p.truth.motions))
+            assert len(count) == len(p.truth.motions)
+            assert count.min() > 0.003 * count.sum(), (name, seed)
+
+
+def test_motions_are_rigid_and_nan_only_for_the_sheet():
+    for name in ALL:
+        M = pair(name).truth.motions
+        known = np.isfinite(M).all(axis=(1, 2))
+        assert known.tolist() == ([True, False] if name == "sheet" else [True] * len(M))
+        R = M[known, :3, :3]
+        np.testing.assert_allclose(
+            R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-12
+        )
+        np.testing.assert_allclose(np.linalg.det(R), 1)
+
+
+def test_orbit_has_one_motion_and_street_three():
+    M = pair("orbit").truth.motions
+    assert len(M) > 3
+    np.testing.assert_allclose(M, np.tile(M[0], (len(M), 1, 1)), atol=1e-12)
+    assert np.linalg.norm(M[0, :3, 3]) > 0.05
+    M = pair("street").truth.motions
+    gaps = [np.linalg.norm(M[i] - M[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    assert min(gaps) > 0.05
+
+
+def test_still_background_does_not_move():
+    p = pair("still")
+    T = p.truth
+    np.testing.assert_allclose(T.motions[0], np.eye(4), atol=1e-12)
+    assert abs(T.flow[T.bodies == 0]).max() < 1e-9
+    assert np.linalg.norm(T.flow[T.bodies == 1], axis=-1).mean() > 1
+    same = (T.bodies == 0) & (T.depth_ref == T.depth_next)
+    change = np.abs(p.image_ref.astype(int) - p.image_next).max(axis=-1)
+    assert np.mean(change[same] == 0) > 0.95  # the rest are edge pixels of the mover
+
+
+# --- images carry the truth -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_brightness_constancy(name):
+    p = pair(name)
+    seen = ~p.truth.occluded
+    target = (camera.pixel_grid(*p.size) + p.truth.flow)[seen]
+    right = wrong = 0.0
+    for c in range(3):
+        ref = p.image_ref[..., c].astype(float)
+        following = p.image_next[..., c].astype(float)
+        right += np.abs(sample(following, target, 3) - ref[seen]).mean() / 3
+        wrong += np.abs(following - ref)[seen].mean() / 3
+    assert right < 4, right
+    if name != "still":
+        assert wrong > 2.5 * right
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_flow_estimator_finds_the_true_flow(name):
+    p = pair(name)
+    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis.setFinestScale(0)
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (p.image_ref, p.image_next)]
+    flow = dis.calc(*grey, None)
+    error = np.linalg.norm(flow - p.truth.flow, axis=-1)[~p.truth.occluded]
+    assert np.median(error) < 0.1
+    assert error.mean() < 0.5
+    size = np.linalg.norm(p.truth.flow, axis=-1)
+    assert size.max() < 45 * WIDTH / 1024
+    if name != "still":
+        assert 2 * WIDTH / 1024 < size.mean() < 18 * WIDTH / 1024
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_images_are_exposed_well(name):
+    image = pair(name).image_ref
+    assert 60 < image.mean() < 180
+    assert image.std() > 20
+    assert np.mean((image == 0) | (image == 255)) < 0.02
+
+
+# --- shapes -----------------------------------------------------------------------------------
+
+
+def test_sheet_is_isometric_and_its_material_coordinates_are_exact():
+    sheet = Sheet((0.6, 0.4), (0.9, -1.3), (0.2, -0.1))
+    rng = np.random.default_rng(0)
+    a = np.zeros((500, 3))
+    a[:, :2] = rng.uniform(-1, 1, (500, 2)) * sheet.half
+    b = a + 1e-5 * np.c_[rng.standard_normal((500, 2)), np.zeros(500)]
+    for frame in (0, 1):
+        length = np.linalg.norm(sheet.place(a, frame) - sheet.place(b, frame), axis=1)
+        np.testing.assert_allclose(length, np.linalg.norm(a - b, axis=1), rtol=1e-6)
+        np.testing.assert_allclose(sheet.material(sheet.place(a, frame), frame), a, atol=1e-12)
+        step = (sheet.place(b, frame) - sheet.place(a, frame)) / length[:, None]
+        across = np.einsum("ni,ni->n", step, sheet.normals(sheet.place(a, frame), frame))
+        assert abs(across).max() < 1e-4
+
+
+@pytest.mark.parametrize("curvature", [0.0, 1e-9, 1e-4, -0.8, 1.1])
+def test_rays_to_points_of_a_sheet_hit_it_there(curvature):
+    sheet = Sheet((0.6, 0.4), (curvature, 0.0), (0.3, 0.0))
+    rng = np.random.default_rng(1)
+    material = np.zeros((300, 3))
+    material[:, :2] = rng.uniform(-0.99, 0.99, (300, 2)) * sheet.half
+    on = sheet.place(material, 0)
+    eye = np.array([0.1, -0.1, -3.0])
+    t = sheet.intersect(eye, on - eye, 0)
+    np.testing.assert_allclose(t, 1, atol=1e-9)
+    beyond = sheet.place(material / np.abs(material / [0.6, 0.4, 1]).max(1)[:, None] * 1.01, 0)
+    assert np.isinf(sheet.intersect(eye, beyond - eye, 0)).mean() > 0.95
+
+
+def test_hits_by_hand():
+    ahead = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0]])
+    eye = np.array([0.0, 0.0, -5.0])
+    np.testing.assert_allclose(Plane().intersect(eye, ahead, 0), [5, 5])
+    np.testing.assert_allclose(Plane((1.0, 1.0)).intersect(eye, ahead, 0), [5, np.inf])
+    np.testing.assert_allclose(Box((1.0, 1.0, 2.0)).intersect(eye, ahead, 0), [3, np.inf])
+    np.testing.assert_allclose(Sphere(2.0).intersect(eye, ahead, 0), [3, np.inf])
+    np.testing.assert_allclose(Box((1.0, 1.0, 2.0)).intersect(0 * eye, ahead, 0), [2, 2])
+    assert np.isinf(Sphere(2.0).intersect(-eye, ahead, 0)).all()
+
+
+def test_a_pose_and_its_inverse():
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.exp([0.1, -0.4, 0.3])
+    pose[:3, 3] = 1, 2, 3
+    np.testing.assert_allclose(inverse(pose) @ pose, np.eye(4), atol=1e-15)
+
+
+def test_points_that_pass_the_camera_have_no_flow():
+    wall = Body("wall", (Part(Plane(), _at(0, 0, 9), GREY),))
+    near = Body("near", (Part(Plane((0.2, 0.2)), _at(0, 0, 1), GREY),), _at(0, 0, -2))
+    K = camera.intrinsics(64, 64, 31.5, 23.5)
+    T = render(Scene((wall, near), np.eye(4), np.eye(4)), K, 48, 64).truth
+    assert np.isnan(T.flow[T.bodies == 1]).all()
+    assert T.occluded[T.bodies == 1].all()
+    assert np.isfinite(T.flow[T.bodies == 0]).all()
+
+
+def _at(x: float, y: float, z: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+# --- textures ---------------------------------------------------------------------------------
+
+
+def test_noise_is_smooth_and_limited_to_the_footprint():
+    rng = np.random.default_rng(2)
+    at = rng.uniform(-50, 50, (4000, 3))
+    noise = value_noise(at, 3)
+    assert abs(noise).max() <= 1
+    assert 0.2 < noise.std() < 0.6
+    np.testing.assert_allclose(value_noise(at + np.array([1e-4, 0, 0]), 3), noise, atol=1e-3)
+    fine = fractal_noise(at, np.full(4000, 0.01), cell=1.0, seed=3)
+    coarse = fractal_noise(at, np.full(4000, 0.7), cell=1.0, seed=3)
+    none = fractal_noise(at, np.full(4000, 5.0), cell=1.0, seed=3)
+    assert fine.std() > coarse.std() > none.std() == 0
+    assert 0.2 < fine.std() < 0.7
+
+
+def test_pulse_coverage_is_the_share_of_a_window():
+    x = np.linspace(-3, 3, 401)
+    fine = (np.arange(20000) + 0.5) / 20000 - 0.5
+    for width in (0.02, 0.3, 2.5):
+        window = x[:, None] + width * fine
+        share = np.mean(window - np.floor(window) < 0.35, axis=1)
+        got = pulse_coverage(x, 0.35, np.full(401, width))
+        np.testing.assert_allclose(got, share, atol=1e-3)
+
+
+# --- use --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_same_seed_same_bytes_other_seed_other_scene(name):
+    a, b, c = (render_scene(name, seed, 96, 64) for seed in (5, 5, 6))
+    for what in ("image_ref", "image_next", "K_ref"):
+        assert getattr(a, what).tobytes() == getattr(b, what).tobytes()
+    assert a.truth.flow.tobytes() == b.truth.flow.tobytes()
+    assert a.truth.depth_ref.tobytes() == b.truth.depth_ref.tobytes()
+    assert a.image_ref.tobytes() != c.image_ref.tobytes()
+    assert a.truth.flow.tobytes() != c.truth.flow.tobytes()
+
+
+@pytest.mark.parametrize("size", [(64, 48), (65, 131), (300, 60)])
+@pytest.mark.parametrize("name", ALL)
+def test_any_size(name, size):
+    p = pair(name, 0, *size)
+    assert p.size == size[::-1]
+    assert np.isfinite(p.truth.flow).all()
+    assert np.isfinite(p.truth.depth_ref).all()
+    assert p.truth.depth_ref.min() > 0.3
+    assert p.truth.depth_ref.max() < 80
+
+
+def test_the_camera_scales_with_the_width():
+    np.testing.assert_allclose(pair("room", 0, 96, 64).K_ref[0, 0], 0.8 * 96)
+    np.testing.assert_allclose(pair("room", 0, 192, 128).K_ref[0, 0], 0.8 * 192)
+    np.testing.assert_allclose(pair("room", 0, 192, 128).K_ref[:2, 2], [95.5, 63.5])
+
+
+def test_bad_requests_say_what_to_do():
+    with pytest.raises(DataError, match="did you mean 'street'"):
+        render_scene("stret")
+    with pytest.raises(DataError, match="one of street, room, sheet, orbit, still"):
+        render_scene("xyzzy")
+    with pytest.raises(DataError, match="width"):
+        render_scene("room", width=63)
+    with pytest.raises(DataError, match="height"):
+        render_scene("room", height=47)
+    with pytest.raises(DataError, match="height"):
+        render_scene("room", height=99.5)
+    with pytest.raises(DataError, match="seed"):
+        render_scene("room", seed=-1)
+    with pytest.raises(DataError, match="meets itself"):
+        Sheet((1.0, 1.0), (3.0, 0.0))
+    with pytest.raises(DataError, match="panel"):
+        Panels((0.0, 1.0), (0.5, 0.5), (1, 1, 1))
+    with pytest.raises(DataError, match="cells"):
+        Texture(GREY.colours, 0.0)
+
+
+def test_an_open_scene_is_refused():
+    ball = Body("ball", (Part(Sphere(0.5), _at(0, 0, 3), GREY),))
+    with pytest.raises(DataError, match="rays hit nothing"):
+        render(Scene((ball,), np.eye(4), np.eye(4)), camera.intrinsics(64, 64, 31.5, 23.5), 48, 64)
