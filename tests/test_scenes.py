@@ -233,6 +233,23 @@ def test_points_that_pass_the_camera_have_no_flow():
     assert np.isfinite(T.flow[T.bodies == 0]).all()
 
 
+def test_edge_pixels_mix_both_sides_by_their_share():
+    bright = Texture(((0.6,) * 3, (0.6,) * 3), cell=1.0, contrast=0.0)
+    dark = Texture(((0.1,) * 3, (0.1,) * 3), cell=1.0, contrast=0.0)
+    K = camera.intrinsics(64, 64, 31.5, 23.5)
+    # the right edge of the near plane at depth 1 projects to u = 31.5 + 64 * half
+    for third in (0, 1, 2, 3):
+        half = (40 - 0.5 + third / 3 + 1e-6 - 31.5) / 64
+        near = Body("near", (Part(Plane((half, 9.0)), _at(0, 0, 1), bright, glow=1.0),))
+        far = Body("far", (Part(Plane(), _at(0, 0, 4), dark, glow=1.0),))
+        row = render(Scene((far, near), np.eye(4), np.eye(4)), K, 48, 64).image_ref[24, :, 0]
+        inner, outer = int(row[36]), int(row[44])
+        assert inner > 2 * outer
+        assert row[39] == inner
+        assert row[41] == outer
+        assert abs(row[40] - (outer + (inner - outer) * third / 3)) <= 1
+
+
 def _at(x: float, y: float, z: float) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, 3] = x, y, z

@@ -318,7 +318,7 @@ def _room(rng: Random, half_width: float, half_height: float) -> Scene:
     side = _sign(rng)
     view = _views(
         _pose(0, -1.35, 0, yaw=side, pitch=-9),
-        np.array([side * rng.uniform(0.07, 0.1), rng.uniform(-0.01, 0.01), 0.04]),
+        np.array([side * rng.uniform(0.06, 0.085), rng.uniform(-0.01, 0.01), 0.04]),
         np.array([0.1, -side * rng.uniform(0.2, 0.5), _sign(rng) * 0.2]),
     )
     return Scene(tuple(bodies), *view)
