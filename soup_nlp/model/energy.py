@@ -70,6 +70,8 @@ class EnergyData:
         pair_unit: (P,) length unit of the pair.
         pair_count: (P,) 2: directed pairs folded into one (E_orient).
         rim_ray: (N, V, 3) rays where visibility is imposed, the anchor first.
+        local_units: edge_unit and pair_unit are shares of the mean depth of the two anchors (E is
+            then independent of scale, term by term) instead of lengths.
         share: (N,) weights c of the length unit: lengths are measured with sum_i c_i D_i = 1, D the
             plane distances; lam_i = c_i D_i is then on the simplex.
         arap_at_anchors: motion difference taken at the anchors rather than at the camera.
@@ -93,6 +95,7 @@ class EnergyData:
     pair_count: Float
     rim_ray: Float
     share: Float
+    local_units: bool = False
     arap_at_anchors: bool = False
 
     def __len__(self) -> int:
@@ -183,39 +186,30 @@ def build_energy_data(
 
 
 def in_pixels(data: EnergyData, soup: Soup, seg: Segmentation) -> EnergyData:
-    """The same data with every term measured in pixels, so that the weights mean the same
-    on every scene.
+    """The same data with every term measured in pixels: the weights mean the same on every scene.
 
-    A rotation by an angle a moves the image by focal a; a translation T at depth Z by
-    focal T / Z; a depth gap g at depth Z changes the parallax of a baseline T by
-    focal T g / Z^2. Z is the median start depth around a superpixel and T the median start
-    translation: constants of the energy, not functions of the state.
-
-    The simplex weighs a superpixel by p / (p + median p), p its parallax: with equal weights a
-    few superpixels without parallax run away to infinity, which shrinks all others' lengths.
+    A rotation by an angle a moves the image by `focal a`; a length l at depth Z by `focal l / Z`;
+    a depth gap g changes the parallax of a baseline T by `focal g / Z * T / Z`. Z is the mean
+    depth of the two anchors as it is, so that no term gains from shrinking or growing the scene:
+    with one global unit, superpixels without parallax run away to shorten all other lengths. The
+    ratio T / Z is a constant of the energy: its median around the superpixels at the start.
 
     Args:
         data: Data in the paper's units.
-        soup: Start, for local depth and baseline.
+        soup: Start, for the ratio of baseline and depth.
         seg: For the neighbourhoods.
     """
-    depth = soup.depth_at(data.anchor_ray)
+    ratio = np.linalg.norm(soup.translation, axis=1) / soup.depth_at(data.anchor_ray)
     if seg.knn.shape[1]:
-        depth = np.median(depth[np.column_stack([np.arange(len(soup)), seg.knn])], axis=1)
-    length = np.linalg.norm(soup.translation, axis=1)
-    parallax = length / depth
-    share = np.maximum(parallax / (parallax + max(float(np.median(parallax)), 1e-9)), 0.02)
-    share = share / share.sum() / soup.distance
-    # a camera at rest leaves no parallax: 1 % of the depth is the least baseline taken
-    baseline = max(float(np.median(length)), 0.01 * float(np.median(depth)))
+        ratio = np.median(ratio[np.column_stack([np.arange(len(soup)), seg.knn])], axis=1)
+    # a camera at rest leaves no parallax: half a pixel of it is the least taken
     focal = float(data.K_next[0, 0])
-    zi, zk = depth[data.edges].T
-    ui, uk = depth[data.pairs].T
-    unit = float(np.sum(share * soup.distance))
+    ratio = np.maximum(ratio, 0.5 / focal)
+    ri, rk = ratio[data.pairs].T
     return replace(
         data,
-        edge_unit=np.sqrt(zi * zk) / (focal * unit),
+        local_units=True,
+        edge_unit=np.full(len(data.edges), 1.0 / focal),
         rotation_scale=focal,
-        pair_unit=ui * uk / (focal * baseline * unit),
-        share=share / unit,
+        pair_unit=1.0 / (focal * np.sqrt(ri * rk)),
     )

@@ -163,19 +163,17 @@ class _Builder:
         kernel = Kernel(name, x, row, self.theta, constraints=body)
         self.groups.append(Group(kernel, Table(index, data, rows)))
 
-    def add_ridge(self, count: int) -> None:
-        """Zero objective whose stand-in Hessian is ridge on every variable's diagonal."""
-        x = ca.SX.sym("x")
+    def add_ridge(self, metric: Float) -> None:
+        """Zero objective whose stand-in Hessian is ridge x metric on the diagonal.
+
+        Args:
+            metric: (n,) squared inverse length of a natural step of the first n variables.
+        """
+        x, m = ca.SX.sym("x"), ca.SX.sym("metric")
         kernel = Kernel(
-            "ridge",
-            x,
-            ca.SX.sym("none", 0),
-            self.theta,
-            objective=0 * x,
-            curvature=self.theta[3],
+            "ridge", x, m, self.theta, objective=0 * x, curvature=self.theta[3] * m
         )
-        table = Table(np.arange(count)[:, None], np.zeros((count, 0)))
-        self.groups.append(Group(kernel, table))
+        self.groups.append(Group(kernel, Table(np.arange(len(metric))[:, None], metric[:, None])))
 
 
 def _elements(
@@ -220,7 +218,7 @@ def _elements(
         columns,
         e,
         lambda v, row, eps, _: terms.arap(
-            v[0], v[1], row, eps, bool(np.isfinite(w.sigma_arap)), data.arap_at_anchors
+            v[0], v[1], row, eps, bool(np.isfinite(w.sigma_arap)), data.arap_at_anchors, data.local_units
         ),
     )
     n, s = data.pixel_weight.shape
@@ -253,6 +251,8 @@ def _elements(
             "factor": data.pair_factor / data.pair_unit,
             "sigma_ref": full(len(pairs), w.sigma_cont_ref),
             "sigma": full(len(pairs), w.sigma_cont),
+            "ray_i": data.anchor_ray[pairs[:, 0]],
+            "ray_k": data.anchor_ray[pairs[:, 1]],
             "rays": data.boundary_ray.reshape(len(pairs), 3 * b),
         },
         pairs,
@@ -270,6 +270,7 @@ def _elements(
             b,
             bool(np.isfinite(w.sigma_cont_ref)),
             bool(np.isfinite(w.sigma_cont)),
+            data.local_units,
         ),
     )
     fields, columns = base(
@@ -343,7 +344,7 @@ def build_matrix_nlp(
         index = np.column_stack([every, np.full(n, layout.tau)])
         rows = b.new_rows("translation", n, 0.0, 0.0)[:, None]
         b.add_constraint("translation", both, none, ca.sumsqr(v.t) - tau**2, index, empty, rows)
-    b.add_ridge(layout.size)
+    b.add_ridge(_metric(layout, layout.pack(soup), data))
 
     lbx, ubx = np.full(b.nx, -np.inf), np.full(b.nx, np.inf)
     lbx[np.arange(n) * own] = MIN_SCALE
@@ -354,6 +355,26 @@ def build_matrix_nlp(
     x0 = np.concatenate([layout.pack(soup), np.zeros(b.nx - layout.size)])
     nlp = _finish("soup", b, x0, lbx, ubx, layout.size, layout.names)
     return _with_slacks(nlp, layout.size), layout
+
+
+def _metric(layout: MatrixLayout, x: Float, data: EnergyData) -> Float:
+    """Ridge metric of the matrix variables that equals the presolve's at the start.
+
+    A natural step is: relative 1 in scale and offset, a slope of 1 at the superpixel's rim in the
+    normal, one radian in R, one anchor depth in the translation.
+    """
+    n, own = layout.count, layout.stride
+    a = x[: n * own].reshape(n, own)
+    s = layout.unpack(x)
+    facing = -np.einsum("nc,nc->n", s.n, data.anchor_ray)
+    metric = np.ones((n, own))
+    metric[:, 0] = 1 / a[:, 0] ** 2
+    metric[:, 1:4] = (1 / np.maximum(facing * data.radius, 1e-3) ** 2)[:, None]
+    if layout.gauge != "unit-offset":
+        metric[:, 4] = 1 / a[:, 4] ** 2
+    depth = s.depth_at(data.anchor_ray)
+    metric[:, -3:] = (a[:, 0] / depth)[:, None] ** 2
+    return np.append(metric.ravel(), np.ones(layout.size - n * own))
 
 
 def build_tangent_nlp(
@@ -386,7 +407,7 @@ def build_tangent_nlp(
     b.add_constraint(
         "t_simplex", lam, part, part * lam, np.arange(n)[:, None] * 9, share[:, None], row
     )
-    b.add_ridge(9 * n)
+    b.add_ridge(np.ones(9 * n))
     lower, upper = np.full((n, 9), -np.inf), np.full((n, 9), np.inf)
     lower[:, 0] = 1e-3
     lower[:, 1:3], upper[:, 1:3] = -max_slope, max_slope

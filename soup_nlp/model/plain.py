@@ -1,7 +1,8 @@
 """The exact energy in plain numpy: text for newcomers, oracle for tests, referee for reports.
 
 Shares nothing with the symbolic model. Every function follows its equation of the paper; lengths
-are measured with sum_i c_i D_i = 1, which makes E independent of the free global scale.
+are measured in the depth of their anchors or with sum_i c_i D_i = 1: either makes E independent
+of the free global scale.
 """
 
 from __future__ import annotations
@@ -35,10 +36,18 @@ def energy(soup: Soup, data: EnergyData, weights: Weights) -> dict[str, float]:
     return {"total": sum(terms.values()), **terms}
 
 
+def _unit(soup: Soup, data: EnergyData, pairs: NDArray[np.int64]) -> Float | float:
+    """Length unit: the mean depth of two anchors, or the scene's own."""
+    if data.local_units:
+        Z = soup.depth_at(data.anchor_ray)
+        return 0.5 * (Z[pairs[:, 0]] + Z[pairs[:, 1]])
+    return float(np.sum(data.share * soup.distance))
+
+
 def arap(soup: Soup, data: EnergyData, weights: Weights) -> Float:
     """(E,) E_arap of every edge, Eq. 1; an edge carries both its directions."""
     i, k = data.edges.T
-    unit = np.sum(data.share * soup.distance) * data.edge_unit
+    unit = _unit(soup, data, data.edges) * data.edge_unit
     sigma = weights.sigma_arap
     X = soup.points(data.anchor_ray)
     moved = soup.moved(X)
@@ -73,7 +82,7 @@ def continuity(soup: Soup, data: EnergyData, weights: Weights) -> Float:
     if not len(data.pairs):
         return np.zeros(0)
     i, k = data.pairs.T
-    unit = np.sum(data.share * soup.distance) * data.pair_unit
+    unit = _unit(soup, data, data.pairs) * data.pair_unit
     facing_i = -np.einsum("pc,pbc->pb", soup.n[i], data.boundary_ray)
     facing_k = -np.einsum("pc,pbc->pb", soup.n[k], data.boundary_ray)
     Xi = (soup.distance[i][:, None] / facing_i)[..., None] * data.boundary_ray

@@ -17,12 +17,12 @@ Row = Mapping[str, ca.SX]
 
 
 def arap(
-    a: View, b: View, row: Row, eps: ca.SX, truncated: bool, at_anchors: bool
+    a: View, b: View, row: Row, eps: ca.SX, truncated: bool, at_anchors: bool, local: bool
 ) -> list[Norm]:
     """E_arap of an edge, Eq. 1: rotation, translation and distance of the anchors."""
     sigma = row["sigma"] if truncated else None
-    weight, unit = row["weight"], row["unit"]
     Xa, Xb = a.point(row["ray_i"]), b.point(row["ray_k"])
+    weight, unit = row["weight"], row["unit"] * ((Xa[2] + Xb[2]) / 2 if local else 1)
     Ya, Yb = a.move(Xa), b.move(Xb)
     gap = a.lam * a.t - b.lam * b.t
     if at_anchors:
@@ -44,7 +44,14 @@ def reprojection(a: View, row: Row, eps: ca.SX, K_next: ca.DM, truncated: bool) 
 
 
 def continuity(
-    a: View, b: View, row: Row, eps: ca.SX, samples: int, ref_truncated: bool, truncated: bool
+    a: View,
+    b: View,
+    row: Row,
+    eps: ca.SX,
+    samples: int,
+    ref_truncated: bool,
+    truncated: bool,
+    local: bool,
 ) -> list[Norm]:
     """E_cont of a neighbour pair, Eq. 4: boundary gaps in both frames."""
     before, after = [], []
@@ -54,6 +61,8 @@ def continuity(
         before.append(Xa - Xb)
         after.append(a.move(Xa) - b.move(Xb))
     f = row["factor"]
+    if local:
+        f = f * 2 / (a.point(row["ray_i"])[2] + b.point(row["ray_k"])[2])
     return [
         Norm(
             "gap_ref",

@@ -1,0 +1,75 @@
+"""Residuals recomputed: constraints from the arrays in plain numpy, optimality from the NLP."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy import EnergyData
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.nlp import NLP, to_scipy
+from soup_nlp.solve.ipopt import Stage
+
+Float = NDArray[np.float64]
+
+
+def constraint_residuals(soup: Soup, rim_ray: Float, min_facing: float) -> dict[str, float]:
+    """Largest violation of every kind of constraint, from the arrays alone.
+
+    Args:
+        soup: State.
+        rim_ray: (N, V, 3) rays where visibility is imposed.
+        min_facing: c of `-n . r >= c`.
+
+    Returns:
+        so3 (largest entry of |R^T R - I|), normal (| |n|^2 - 1 |), simplex (|sum lam - 1|),
+        positive (how far a scale or offset is below 0), visible (how far -n . r is below c),
+        det (how far det R is from +1).
+    """
+    gram = np.swapaxes(soup.R, 1, 2) @ soup.R - np.eye(3)
+    facing = -np.einsum("nc,nvc->nv", soup.n, rim_ray)
+    return {
+        "so3": float(np.abs(gram).max()),
+        "normal": float(np.abs(np.sum(soup.n**2, axis=1) - 1).max()),
+        "simplex": float(abs(soup.lam.sum() - 1)),
+        "positive": float(max(0.0, -soup.lam.min(), -soup.d.min())),
+        "visible": float(max(0.0, (min_facing - facing).max())),
+        "det": float(np.abs(np.linalg.det(soup.R) - 1).max()),
+    }
+
+
+def optimality(nlp: NLP, x: Float, lam_x: Float, lam_g: Float) -> dict[str, float]:
+    """Dual infeasibility and complementarity of a point and its multipliers.
+
+    Args:
+        nlp: The problem.
+        x: (nx,) point.
+        lam_x: (nx,) multipliers of the bounds (positive at upper bounds).
+        lam_g: (ng,) multipliers of the constraints (positive at upper bounds).
+    """
+    _, gradient = nlp.grad_f(x, nlp.p)
+    g, jacobian = nlp.jac_g(x, nlp.p)
+    dual = np.asarray(gradient).ravel() + to_scipy(jacobian).T @ lam_g + lam_x
+    g = np.asarray(g).ravel()
+    products = [0.0]
+    for value, lower, upper, lam in ((x, nlp.lbx, nlp.ubx, lam_x), (g, nlp.lbg, nlp.ubg, lam_g)):
+        open_ = lower < upper
+        for gap, mult in ((value - lower, -lam), (upper - value, lam)):
+            use = open_ & np.isfinite(gap) & (mult > 0)
+            products.append(float(np.abs(gap[use] * mult[use]).max(initial=0.0)))
+    return {
+        "dual_infeasibility": float(np.abs(dual).max()),
+        "complementarity": max(products),
+    }
+
+
+def residuals(
+    nlp: NLP, layout: MatrixLayout, stage: Stage, data: EnergyData, min_facing: float
+) -> dict[str, float]:
+    """Constraint residuals of a stage's answer, and its optimality."""
+    soup = layout.unpack(stage.x)
+    return {
+        **constraint_residuals(soup, data.rim_ray, min_facing),
+        **optimality(nlp, stage.x, stage.lam_x, stage.lam_g),
+    }

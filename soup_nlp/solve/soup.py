@@ -1,0 +1,221 @@
+"""From a start to a solution: tangent presolve with continuation, then the constrained NLP."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model import plain
+from soup_nlp.model.energy import EnergyData, Weights
+from soup_nlp.model.formulation import Formulation, build_matrix_nlp, build_tangent_nlp
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.nlp import NLP
+from soup_nlp.solve.ipopt import Ipopt, Listener, Stage
+from soup_nlp.solve.kkt import residuals
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """Stages of a solve; eps are smoothing widths in the energy's units (pixels by default).
+
+    Attributes:
+        presolve: Run the tangent presolve; off, the constrained NLP starts from the start.
+        presolve_eps: Continuation of the presolve, large to small.
+        presolve_iterations: Limit of each intermediate stage.
+        presolve_last_iterations: Limit of the last stage.
+        presolve_tol: Dual infeasibility of the last stage.
+        presolve_theta: theta of its Gauss-Newton Hessian.
+        stagnation: Intermediate stages end at this relative change of f, twice in a row.
+        eps: Smoothing of the constrained NLP.
+        max_iter: Iteration limit of the constrained NLP.
+        tol: Tolerance of the constrained NLP.
+        max_seconds: Time limit of all stages together.
+        ipopt: Further Ipopt options of the constrained NLP.
+    """
+
+    presolve: bool = True
+    presolve_eps: tuple[float, ...] = (0.3, 0.1, 0.03)
+    presolve_iterations: int = 30
+    presolve_last_iterations: int = 150
+    presolve_tol: float = 1e-3
+    presolve_theta: float = 0.9
+    stagnation: float = 1e-4
+    eps: float = 0.03
+    max_iter: int = 100
+    tol: float = 1e-2
+    max_seconds: float = 600.0
+    ipopt: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the constrained NLP ended with.
+
+    Attributes:
+        soup: Solution (best iterate when not converged), simplex exact.
+        status: Ipopt's status of the constrained NLP, or why it was stopped.
+        converged: Its claim.
+        stages: Every call of Ipopt in order; the last is the constrained NLP.
+        energy_start: Exact energy by term of the start.
+        energy: Exact energy by term of the solution.
+        residuals: Largest violation by kind of constraint, recomputed from the arrays, and the
+            dual infeasibility and complementarity of the NLP at the solution.
+        multipliers: lam_g by constraint name, lam_x.
+        nlp: Sizes of the constrained NLP.
+        description: The NLP as it prints itself.
+        seconds: Wall time by stage.
+    """
+
+    soup: Soup
+    status: str
+    converged: bool
+    stages: tuple[Stage, ...]
+    energy_start: Mapping[str, float]
+    energy: Mapping[str, float]
+    residuals: Mapping[str, float]
+    multipliers: Mapping[str, Float] = field(repr=False)
+    nlp: Mapping[str, int]
+    description: str = field(repr=False)
+    seconds: Mapping[str, float]
+
+    def __str__(self) -> str:
+        return (
+            f"Solution({self.status}, E {self.energy_start['total']:.4g} ->"
+            f" {self.energy['total']:.4g}, {sum(s.iterations for s in self.stages)} iterations)"
+        )
+
+
+def solve_soup(
+    start: Soup,
+    data: EnergyData,
+    weights: Weights,
+    form: Formulation | None = None,
+    options: SolverOptions | None = None,
+    *,
+    listener: Listener | None = None,
+    stop: threading.Event | None = None,
+    say: Callable[[str], None] | None = None,
+    log_file: str | None = None,
+) -> Solution:
+    """Minimise E from a start.
+
+    Args:
+        start: Initial soup.
+        data: Pixels, graphs and weights of the pair.
+        weights: Constants of the energy.
+        form: Formulation of the constrained NLP.
+        options: Stages and limits.
+        listener: Called at every iteration.
+        stop: Set it to end at the next iteration with the best iterate.
+        say: Called with a line after every stage.
+        log_file: Ipopt's own log is appended here.
+
+    Returns:
+        The solution; a solve that fails is a Solution with its status, not an exception.
+    """
+    form = form or Formulation()
+    o = options or SolverOptions()
+    stop = stop or threading.Event()
+    say = say or (lambda line: None)
+    begin = time.perf_counter()
+    seconds = {"presolve": 0.0}
+    soup = start
+    stages: list[Stage] = []
+    if o.presolve:
+        soup = _presolve(start, data, weights, form, o, stages, listener, stop, say, log_file)
+        seconds["presolve"] = time.perf_counter() - begin
+    if plain.energy(soup, data, weights)["total"] > plain.energy(start, data, weights)["total"]:
+        soup = start
+    mark = time.perf_counter()
+    nlp, layout = build_matrix_nlp(
+        soup, data, weights, replace(form, eps=o.eps, eps_pixel=o.eps)
+    )
+    seconds["build"] = time.perf_counter() - mark
+    seconds["compile"] = nlp.compile_seconds
+    say(str(nlp))
+    mark = time.perf_counter()
+    stage = Ipopt(nlp, o.ipopt)(
+        x0=nlp.x0,
+        max_iter=o.max_iter,
+        tol=o.tol,
+        seconds=max(1.0, o.max_seconds - (mark - begin)),
+        stage="constrained NLP",
+        listener=listener,
+        stop=stop,
+        log_file=log_file,
+    )
+    seconds["solve"] = time.perf_counter() - mark
+    stages.append(stage)
+    say(str(stage))
+    final = layout.unpack(stage.x)
+    return Solution(
+        soup=final,
+        status=stage.status,
+        converged=stage.converged,
+        stages=tuple(stages),
+        energy_start=plain.energy(start, data, weights),
+        energy=plain.energy(final, data, weights),
+        residuals=residuals(nlp, layout, stage, data, form.min_facing),
+        multipliers=_multipliers(nlp, layout, stage),
+        nlp=nlp.sizes(),
+        description=str(nlp),
+        seconds=seconds,
+    )
+
+
+def _presolve(
+    start: Soup,
+    data: EnergyData,
+    weights: Weights,
+    form: Formulation,
+    o: SolverOptions,
+    stages: list[Stage],
+    listener: Listener | None,
+    stop: threading.Event,
+    say: Callable[[str], None],
+    log_file: str | None,
+) -> Soup:
+    tangent = replace(
+        form, norm="smooth", truncation="smooth", hessian="gauss-newton", theta=o.presolve_theta
+    )
+    begin = time.perf_counter()
+    nlp, layout = build_tangent_nlp(start, data, weights, tangent)
+    ipopt, x = Ipopt(nlp), nlp.x0
+    for k, eps in enumerate(o.presolve_eps):
+        last = k == len(o.presolve_eps) - 1
+        stage = ipopt(
+            x0=x,
+            p=nlp.with_theta(eps=eps, eps_pixel=eps),
+            max_iter=o.presolve_last_iterations if last else o.presolve_iterations,
+            tol=o.presolve_tol,
+            stagnation=None if last else o.stagnation,
+            seconds=max(1.0, 0.7 * o.max_seconds - (time.perf_counter() - begin)),
+            stage=f"presolve {eps:g}",
+            listener=listener,
+            stop=stop,
+            log_file=log_file,
+        )
+        stages.append(stage)
+        say(str(stage))
+        x = stage.x
+        if stop.is_set():
+            break
+    return layout.unpack(x)
+
+
+def _multipliers(nlp: NLP, layout: MatrixLayout, stage: Stage) -> dict[str, Float]:
+    """lam_g cut into its kinds of constraint (in the order of nlp.g_blocks), and lam_x."""
+    out = {"lam_x": stage.lam_x}
+    for group in nlp.groups:
+        if group.kernel.nc:
+            out[f"lam_g_{group.kernel.name}"] = stage.lam_g[np.unique(group.table.rows)]
+    return out
