@@ -1,0 +1,214 @@
+"""Tiny problems, finite differences and rendered planes that the tests of the model share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+from hypothesis import settings
+from numpy.typing import NDArray
+
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.raycast import Body, Part, Plane, Scene, render
+from soup_nlp.data.texture import Texture
+from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.superpixels import segment
+from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
+from soup_nlp.model.formulation import Formulation, build_matrix_nlp
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.nlp import NLP, to_scipy
+
+Float = NDArray[np.float64]
+
+# same examples at every run, and no time limit on a busy machine
+settings.register_profile("repeatable", derandomize=True, deadline=None)
+settings.load_profile("repeatable")
+
+GAUGES = ("unit-offset", "unit-translation", "free")
+WIDTH, HEIGHT = 64, 48
+K_REF = camera.intrinsics(70.0, 72.0, 31.0, 24.5)
+K_NEXT = camera.intrinsics(68.0, 69.0, 32.5, 23.0)
+PAPER = Weights(arap=1.0, proj=0.3, cont=0.7, orient=0.9, sigma_cont=0.4, sigma_orient=0.05)
+"""Truncated as the paper has it; some elements are on either side of both truncations."""
+TRUNCATED = replace(PAPER, sigma_cont_ref=0.3, sigma_arap=0.25, sigma_proj=2.0)
+"""Everything truncated."""
+GREY = Texture(((0.5, 0.5, 0.5), (0.3, 0.4, 0.6)), cell=0.2)
+
+
+def weights_for(units: str, truncated: bool = True) -> Weights:
+    """Weights whose truncations cut some elements and spare others."""
+    w = TRUNCATED if truncated else PAPER
+    if units == "pixels":
+        w = replace(w, sigma_cont=6.0)
+        if truncated:
+            w = replace(w, sigma_cont_ref=5.0, sigma_arap=12.0)
+    return w
+
+
+def random_soup(seed: int, count: int, spread: float = 1.0) -> Soup:
+    """A soup whose planes face every ray of the tiny camera; depths, motions vary by spread."""
+    rng = np.random.default_rng(seed)
+    n = np.array([0.0, 0.0, -1.0]) + spread * rng.uniform(-0.35, 0.35, (count, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    D = 1.0 + spread * rng.uniform(-0.3, 0.3, count)
+    R = rotation.exp(np.array([0.02, -0.03, 0.01]) + spread * rng.normal(0, 0.06, (count, 3)))
+    T = np.array([0.1, 0.02, -0.05]) + spread * rng.normal(0, 0.05, (count, 3))
+    lam = rng.uniform(0.5, 2.0, count)
+    return Soup(lam, n, D / lam, R, T / lam[:, None])
+
+
+class Tiny:
+    """12 grid superpixels of a 64 x 48 image of noise, a random soup and a noisy flow."""
+
+    def __init__(
+        self,
+        units: str = "paper",
+        at_anchors: bool = False,
+        seed: int = 0,
+        boundary_samples: int | None = 2,
+        samples: int = 3,
+        neighbours: int = 4,
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        self.image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        labels = segment(self.image, 12, "grid")
+        self.seg: Segmentation = build_segmentation(
+            labels, self.image, neighbours=neighbours, boundary_samples=boundary_samples
+        )
+        self.soup = random_soup(seed + 1, len(self.seg))
+        confidence = rng.choice([0.0, 0.5, 1.0], (HEIGHT, WIDTH), p=[0.1, 0.3, 0.6])
+        H = self.soup.homographies(K_REF, K_NEXT)[labels]
+        uv1 = np.concatenate(
+            [camera.pixel_grid(HEIGHT, WIDTH), np.ones((HEIGHT, WIDTH, 1))], axis=-1
+        )
+        y = np.einsum("hwij,hwj->hwi", H, uv1)
+        exact = y[..., :2] / y[..., 2:] - uv1[..., :2]
+        noisy = exact + rng.normal(0, 1.0, exact.shape)
+        self.flow = Flow(noisy.astype(np.float32), confidence.astype(np.float32), "test")
+        self.data: EnergyData = build_energy_data(
+            self.seg, self.flow, K_REF, K_NEXT, samples, seed, arap_at_anchors=at_anchors
+        )
+        if units == "pixels":
+            self.data = in_pixels(self.data, self.soup, self.seg)
+
+    def nlp(self, weights: Weights, form: Formulation) -> tuple[NLP, MatrixLayout]:
+        """The constrained NLP at the tiny soup."""
+        return build_matrix_nlp(self.soup, self.data, weights, form)
+
+
+# --- values and finite differences of an NLP ---------------------------------------------------
+
+
+def value(nlp: NLP, x: Float, p: Float | None = None) -> tuple[float, Float]:
+    """f and g."""
+    f, g = nlp.oracle(x, nlp.p if p is None else p)
+    return float(f), np.asarray(g).ravel()
+
+
+def gradient(nlp: NLP, x: Float) -> Float:
+    return np.asarray(nlp.grad_f(x, nlp.p)[1]).ravel()
+
+
+def jacobian(nlp: NLP, x: Float) -> Float:
+    return to_scipy(nlp.jac_g(x, nlp.p)[1]).toarray()
+
+
+def hessian(nlp: NLP, x: Float, lam_f: float, lam_g: Float) -> Float:
+    """Both triangles of the Lagrangian's Hessian."""
+    H = to_scipy(nlp.hess_lag(x, nlp.p, lam_f, lam_g)).toarray()
+    assert not np.tril(H, -1).any(), "hess_lag must be upper triangular"
+    return H + np.triu(H, 1).T
+
+
+def lagrangian_gradient(nlp: NLP, x: Float, lam_f: float, lam_g: Float) -> Float:
+    return lam_f * gradient(nlp, x) + to_scipy(nlp.jac_g(x, nlp.p)[1]).T @ lam_g
+
+
+def directional(fun: Callable[[Float], Float], x: Float, v: Float, h: float = 1e-4) -> Float:
+    """Derivative of fun along v by Richardson-extrapolated central differences, O(h^4)."""
+
+    def central(step: float) -> Float:
+        return (np.asarray(fun(x + step * v)) - np.asarray(fun(x - step * v))) / (2 * step)
+
+    return (4 * central(h / 2) - central(h)) / 3
+
+
+def wiggle(nlp: NLP, layout_size: int, seed: int, size: float) -> Float:
+    """A random point near x0, off the manifold; slacks and switches anywhere inside bounds."""
+    rng = np.random.default_rng(seed)
+    x = nlp.x0 * (1 + size * rng.uniform(-1, 1, nlp.nx)) + size * rng.uniform(-0.2, 0.2, nlp.nx)
+    x[layout_size:] = rng.uniform(0.1, 0.9, nlp.nx - layout_size)
+    return np.clip(x, nlp.lbx + 1e-3, nlp.ubx - 1e-3)
+
+
+def kernel_exact(nlp: NLP, x: Float) -> dict[str, float]:
+    """Exact energy by kernel name: every `Kernel.exact` summed over its table."""
+    out = {}
+    for group in nlp.groups:
+        k, t = group.kernel, group.table
+        if k.exact is None:
+            continue
+        # slack and switch variables do not enter the exact energy
+        f = ca.Function("e", [k.x, k.row, k.theta], [k.exact])
+        theta = np.repeat(nlp.p[: len(nlp.theta), None], len(t), axis=1)
+        out[k.name.removeprefix("t_")] = float(np.sum(f.map(len(t))(x[t.index].T, t.data.T, theta)))
+    return out
+
+
+# --- worlds with known truth ---------------------------------------------------------------------
+
+
+def plane_pose(z: float, yaw: float = 0.0, pitch: float = 0.0) -> Float:
+    """Pose of an infinite plane that crosses the optical axis at depth z (degrees)."""
+    out = np.eye(4)
+    out[:3, :3] = rotation.exp(np.radians([0.0, yaw, 0.0])) @ rotation.exp(
+        np.radians([pitch, 0.0, 0.0])
+    )
+    out[:3, 3] = 0, 0, z
+    return out
+
+
+def motion(turn_deg: tuple[float, float, float], shift: tuple[float, float, float]) -> Float:
+    """(4, 4) next_from_ref."""
+    out = np.eye(4)
+    out[:3, :3] = rotation.exp(np.radians(turn_deg))
+    out[:3, 3] = shift
+    return out
+
+
+def plane_world(
+    pose: Float, move: Float, width: int = 96, height: int = 72, focal: float = 90.0
+) -> Pair:
+    """Rendered pair of one infinite plane under one rigid camera motion, with true flow."""
+    K = camera.intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2)
+    scene = Scene((Body("wall", (Part(Plane(), pose, GREY),)),), np.eye(4), move)
+    return with_true_flow(render(scene, K, height, width, "plane"))
+
+
+def with_true_flow(pair: Pair) -> Pair:
+    """The pair with its exact flow, full confidence wherever it is finite."""
+    truth = pair.truth
+    assert truth is not None
+    assert truth.flow is not None
+    known = np.isfinite(truth.flow).all(-1)
+    uv = np.where(known[..., None], truth.flow, 0.0)
+    # float64 on purpose: float32 rounding (1e-6 px) would hide an inexact formula
+    return pair.with_flow(Flow(uv, known.astype(float), "truth"))
+
+
+def plane_soup(pose: Float, move: Float, count: int) -> Soup:
+    """The true soup of `plane_world`: every superpixel has the same plane and motion."""
+    n = pose[:3, :3] @ [0.0, 0.0, -1.0]
+    D = -n @ pose[:3, 3]
+    lam = np.full(count, 1.0 / count)
+    return Soup(
+        lam,
+        np.tile(n, (count, 1)),
+        D / lam,
+        np.tile(move[:3, :3], (count, 1, 1)),
+        move[:3, 3] / lam[:, None],
+    )

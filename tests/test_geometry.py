@@ -1,0 +1,261 @@
+"""Cameras, rotations, homographies, soups and reconstructions against hand answers and truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers_model import K_NEXT, K_REF, motion, plane_pose, plane_soup, plane_world, random_soup
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry.soup import Soup, reconstruct, splat_depth
+
+unit = st.floats(-1.0, 1.0)
+vectors = hnp.arrays(float, (5, 3), elements=unit)
+pixels = hnp.arrays(float, (6, 2), elements=st.floats(-50, 700))
+focals = st.floats(20.0, 2000.0)
+
+
+# --- camera ------------------------------------------------------------------------------------
+
+
+@given(pixels, focals, focals, st.floats(-100, 900), st.floats(-100, 900), st.floats(-5, 5))
+def test_rays_and_project_are_inverse_of_each_other(uv, fx, fy, cx, cy, skew):
+    K = camera.intrinsics(fx, fy, cx, cy)
+    K[0, 1] = skew
+    r = camera.rays(K, uv)
+    assert (r[..., 2] == 1).all()
+    np.testing.assert_allclose(r @ K.T, np.column_stack([uv, np.ones(6)]), atol=1e-9)
+    for depth in (0.1, 7.0):
+        np.testing.assert_allclose(camera.project(K, depth * r), uv, atol=1e-9)
+
+
+def test_the_centre_of_the_top_left_pixel_is_the_origin():
+    K = camera.intrinsics(100.0, 200.0, 10.0, 20.0)
+    np.testing.assert_allclose(camera.rays(K, [10.0, 20.0]), [0, 0, 1])
+    np.testing.assert_allclose(camera.rays(K, [0.0, 0.0]), [-0.1, -0.1, 1])
+    np.testing.assert_allclose(camera.project(K, [0.5, 0.5, 1.0]), [60.0, 120.0])
+
+
+def test_pixel_grid_is_indexed_by_row_and_holds_u_then_v():
+    grid = camera.pixel_grid(3, 5)
+    assert grid.shape == (3, 5, 2)
+    np.testing.assert_array_equal(grid[2, 4], [4.0, 2.0])
+
+
+# --- rotation ----------------------------------------------------------------------------------
+
+
+def assert_rotations(R, tolerance=1e-12):
+    np.testing.assert_allclose(
+        np.swapaxes(R, -1, -2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=tolerance
+    )
+    np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=tolerance)
+
+
+@given(vectors, vectors)
+def test_hat_is_the_cross_product(w, x):
+    np.testing.assert_allclose(
+        np.einsum("nij,nj->ni", rotation.hat(w), x), np.cross(w, x), atol=1e-12
+    )
+
+
+@given(vectors, st.floats(0.0, 3.1))
+def test_exp_and_log_are_inverse_of_each_other(w, angle):
+    length = np.linalg.norm(w, axis=1, keepdims=True)
+    w = np.where(length > 1e-6, angle * w / np.maximum(length, 1e-6), 0.0)
+    R = rotation.exp(w)
+    assert_rotations(R)
+    np.testing.assert_allclose(rotation.log(R), w, atol=1e-6)
+    np.testing.assert_allclose(rotation.exp(rotation.log(R)), R, atol=1e-9)
+
+
+def test_exp_of_a_quarter_turn_about_z_takes_x_to_y():
+    R = rotation.exp([0.0, 0.0, np.pi / 2])
+    np.testing.assert_allclose(R @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    np.testing.assert_array_equal(rotation.exp([0.0, 0.0, 0.0]), np.eye(3))
+
+
+@given(vectors)
+def test_cayley_is_a_rotation_by_twice_the_arc_tangent_about_the_same_axis(w):
+    R = rotation.cayley(2 * w)
+    assert_rotations(R)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", R, w), w, atol=1e-12)
+    cosine = (np.trace(R, axis1=1, axis2=2) - 1) / 2
+    expected = np.cos(2 * np.arctan(np.linalg.norm(w, axis=1)))
+    np.testing.assert_allclose(cosine, expected, atol=1e-12)
+
+
+def test_cayley_equals_exp_to_third_order():
+    w = np.array([0.3, -0.2, 0.5])
+    gap = [np.abs(rotation.cayley(h * w) - rotation.exp(h * w)).max() for h in (1e-1, 5e-2)]
+    assert gap[0] / gap[1] == pytest.approx(8.0, rel=0.05)
+
+
+@given(hnp.arrays(float, (4, 3, 3), elements=unit), hnp.arrays(float, (8, 3), elements=unit))
+def test_nearest_is_a_rotation_and_no_other_is_nearer(M, w):
+    R = rotation.nearest(M)
+    assert_rotations(R)
+    gap = np.linalg.norm(M - R, axis=(1, 2))
+    other = rotation.exp(3 * w)[:, None] @ R[None]
+    assert (np.linalg.norm(M[None] - other, axis=(2, 3)) >= gap - 1e-9).all()
+
+
+@given(vectors)
+def test_nearest_keeps_a_rotation_and_flips_no_reflection_into_det_minus_one(w):
+    R = rotation.exp(w)
+    np.testing.assert_allclose(rotation.nearest(R), R, atol=1e-12)
+    assert_rotations(rotation.nearest(R @ np.diag([1.0, 1.0, -1.0])))
+    np.testing.assert_allclose(rotation.nearest(2.5 * R), R, atol=1e-12)
+
+
+# --- soup --------------------------------------------------------------------------------------
+
+GRID = camera.rays(K_REF, camera.pixel_grid(48, 64)[::9, ::9].reshape(-1, 2))
+
+
+def test_points_lie_on_their_plane_and_on_their_ray():
+    soup = random_soup(0, 7)
+    ray = np.tile(GRID, (7, 1, 1))
+    X = soup.points(ray)
+    np.testing.assert_allclose(
+        np.einsum("nc,nmc->nm", soup.n, X) + soup.distance[:, None], 0.0, atol=1e-12
+    )
+    np.testing.assert_allclose(np.cross(X, ray), 0.0, atol=1e-12)
+    np.testing.assert_allclose(X[..., 2], soup.depth_at(ray))
+    assert (soup.depth_at(ray) > 0).all()
+
+
+def test_depth_by_hand():
+    # plane z = 2 seen at 45 degrees: depth is z, not the distance along the ray
+    soup = Soup(
+        np.array([0.5]),
+        np.array([[0, 0, -1.0]]),
+        np.array([4.0]),
+        np.eye(3)[None],
+        np.array([[2.0, 0, 0]]),
+    )
+    np.testing.assert_allclose(soup.depth_at(np.array([[1.0, 0, 1]])), [2.0])
+    np.testing.assert_allclose(soup.points(np.array([[1.0, 0, 1]])), [[2.0, 0, 2]])
+    np.testing.assert_allclose(soup.moved(np.array([[2.0, 0, 2]])), [[3.0, 0, 2]])
+
+
+def test_one_ray_and_many_rays_per_superpixel_agree():
+    soup = random_soup(1, 4)
+    many = np.tile(GRID[:6].reshape(2, 3, 3), (4, 1, 1, 1))
+    single = many[:, 1, 2]
+    np.testing.assert_array_equal(soup.depth_at(many)[:, 1, 2], soup.depth_at(single))
+    np.testing.assert_array_equal(soup.points(many)[:, 1, 2], soup.points(single))
+    np.testing.assert_allclose(
+        soup.moved(soup.points(many))[:, 1, 2], soup.moved(soup.points(single)), atol=1e-15
+    )
+
+
+@given(st.integers(0, 10_000))
+def test_homography_transfers_pixels_as_points_do(seed):
+    soup = random_soup(seed, 3)
+    uv = camera.project(K_REF, GRID)
+    target = camera.project(K_NEXT, soup.moved(soup.points(np.tile(GRID, (3, 1, 1)))))
+    H = soup.homographies(K_REF, K_NEXT)
+    y = np.einsum("nij,mj->nmi", H, np.column_stack([uv, np.ones(len(uv))]))
+    np.testing.assert_allclose(y[..., :2] / y[..., 2:], target, atol=1e-8)
+
+
+@given(st.integers(0, 10_000), st.floats(1e-3, 1e3))
+def test_normalised_knows_no_gauge_and_no_scale(seed, scale):
+    soup = random_soup(seed, 5)
+    rng = np.random.default_rng(seed)
+    c = rng.uniform(0.1, 10.0, 5)
+    twin = Soup(scale * c * soup.lam, soup.n, soup.d / c, soup.R, soup.t / c[:, None])
+    share = rng.dirichlet(np.ones(5)) if seed % 2 else None
+    a, b = soup.normalised(share), twin.normalised(share)
+    np.testing.assert_allclose(a.lam.sum(), 1.0, rtol=1e-14)
+    for name in ("lam", "d", "n", "R", "t"):
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-11, atol=1e-12)
+    # the same shape: depth ratios and motions relative to depth are untouched
+    ray = np.tile(GRID[3], (5, 1))
+    ratio = a.depth_at(ray) / soup.depth_at(ray)
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-12)
+    np.testing.assert_allclose(a.translation, ratio[0] * soup.translation, rtol=1e-11, atol=1e-14)
+    if share is None:
+        np.testing.assert_allclose(a.distance.mean(), 1.0, rtol=1e-12)
+    else:
+        np.testing.assert_allclose(a.lam, share * a.distance, rtol=1e-12)
+
+
+def test_soup_prints_its_ranges():
+    assert str(random_soup(0, 3)).startswith("Soup(3 superpixels, plane distance ")
+
+
+# --- reconstruction ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("pose", "move"),
+    [
+        (plane_pose(3.0), motion((0, 0, 0), (0.2, 0, 0))),
+        (plane_pose(2.0, yaw=30, pitch=-15), motion((1.0, -2.0, 0.5), (0.05, -0.02, 0.1))),
+    ],
+)
+def test_reconstruction_of_a_rendered_plane_is_exact(pose, move):
+    pair = plane_world(pose, move)
+    truth = pair.truth
+    height, width = pair.size
+    labels = (np.arange(width) * 4 // width)[None].repeat(height, 0).astype(np.int32)
+    rec = reconstruct(plane_soup(pose, move, 4), labels, pair.K_ref, pair.K_next)
+    np.testing.assert_allclose(rec.depth_ref, truth.depth_ref, rtol=1e-12)
+    np.testing.assert_allclose(rec.points_next - rec.points_ref, truth.scene_flow, atol=1e-12)
+    np.testing.assert_allclose(rec.flow, truth.flow, atol=1e-9)
+    seen = np.isfinite(rec.depth_next)
+    assert 0.85 < seen.mean() <= 1
+    # splatting rounds to whole pixels: depth is right up to the slope across two of them
+    slope = max(np.abs(np.diff(truth.depth_next, axis=a)).max() for a in (0, 1))
+    assert np.abs(rec.depth_next - truth.depth_next)[seen].max() <= 4 * slope + 1e-9
+    assert "covered" in str(rec)
+
+
+def test_pixels_that_a_plane_does_not_face_have_no_depth():
+    n = np.array([[np.sin(1.4), 0.0, -np.cos(1.4)]])
+    soup = Soup(np.ones(1), n, np.ones(1), np.eye(3)[None], np.zeros((1, 3)))
+    K = camera.intrinsics(20.0, 20.0, 15.5, 11.5)
+    labels = np.zeros((24, 32), np.int32)
+    rec = reconstruct(soup, labels, K, K)
+    facing = -camera.rays(K, camera.pixel_grid(24, 32)) @ n[0]
+    np.testing.assert_array_equal(np.isnan(rec.depth_ref), facing <= 1e-6)
+    assert 0 < np.isnan(rec.depth_ref).mean() < 1
+    assert (rec.depth_ref[facing > 1e-6] > 0).all()
+
+
+def test_the_next_frame_may_have_another_size():
+    soup = random_soup(0, 1, spread=0.0)
+    rec = reconstruct(soup, np.zeros((12, 16), np.int32), K_REF, K_NEXT, size_next=(30, 20))
+    assert rec.depth_next.shape == (30, 20)
+
+
+def test_the_nearest_surface_wins_the_splat():
+    target = np.array([[[2.0, 1.0], [2.2, 1.1], [2.0, 1.0], [0.0, 3.0]]])
+    depth = splat_depth(target, np.array([[5.0, 3.0, 4.0, -1.0]]), (4, 5))
+    assert depth[1, 2] == 3.0
+    # a point behind the camera leaves no mark, and nothing lands far away
+    assert np.isnan(depth[3, 0])
+    assert np.isnan(depth[0]).all()
+
+
+def test_splat_ignores_what_is_outside_or_not_finite():
+    target = np.array([[[-5.0, 0.0], [np.nan, 1.0], [100.0, 1.0], [1.0, 1.0]]])
+    depth = splat_depth(target, np.ones((1, 4)), (3, 3))
+    assert np.isfinite(depth).sum() == 4
+    assert depth[1, 1] == depth[2, 2] == 1.0
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 1000))
+def test_splat_has_no_cracks_where_a_surface_stretches_by_less_than_two(seed):
+    rng = np.random.default_rng(seed)
+    scale = rng.uniform(1.0, 1.9)
+    target = camera.pixel_grid(12, 12) * scale + rng.uniform(0, 1, 2)
+    depth = splat_depth(target, np.full((12, 12), 2.0), (24, 24))
+    last = int(11 * scale)
+    assert np.isfinite(depth[1:last, 1:last]).all()

@@ -1,0 +1,279 @@
+"""Superpixels and graphs: connected, complete, and equal to brute force on small images."""
+
+from __future__ import annotations
+
+import itertools
+
+import helpers_model  # noqa: F401  (hypothesis profile)
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy import ndimage
+
+from soup_nlp.data.scenes import render_scene
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.superpixels import segment, split_components
+
+FOUR = ((0, 1), (0, -1), (1, 0), (-1, 0))
+
+
+@pytest.fixture(scope="module")
+def image() -> np.ndarray:
+    return render_scene("street", 0, 160, 120).image_ref
+
+
+def noise(height: int, width: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def assert_partition(labels: np.ndarray) -> int:
+    """Labels are 0..N-1 and each is one 4-connected piece; returns N."""
+    assert labels.dtype == np.int32
+    n = int(labels.max()) + 1
+    np.testing.assert_array_equal(np.unique(labels), np.arange(n))
+    for k in range(n):
+        assert ndimage.label(labels == k)[1] == 1, f"superpixel {k} is not connected"
+    return n
+
+
+# --- superpixels -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["slic", "grid"])
+@pytest.mark.parametrize("count", [1, 2, 12, 60, 300])
+def test_superpixels_are_connected_and_numbered(image, method, count):
+    n = assert_partition(segment(image, count, method))
+    assert n == 1 if count == 1 else 0.6 * count <= n <= 1.4 * count
+
+
+@pytest.mark.parametrize("count", [40, 150])
+def test_superpixels_of_noise_are_connected_and_not_tiny(count):
+    labels = segment(noise(60, 80), count, "slic")
+    assert_partition(labels)
+    assert np.median(np.bincount(labels.ravel())) > 0.3 * 60 * 80 / count
+
+
+def test_an_image_of_one_colour_is_cut_into_a_grid():
+    grey = np.full((48, 64, 3), 90, np.uint8)
+    np.testing.assert_array_equal(segment(grey, 12, "slic"), segment(grey, 12, "grid"))
+    assert assert_partition(segment(grey, 12)) == 12
+
+
+def test_grid_cells_have_equal_size():
+    labels = segment(noise(48, 64), 12, "grid")
+    np.testing.assert_array_equal(np.bincount(labels.ravel()), np.full(12, 48 * 64 // 12))
+    assert labels[0, 0] == 0
+    assert labels[-1, -1] == 11
+
+
+@pytest.mark.parametrize("count", [0, -3, 10**6])
+def test_a_count_that_does_not_fit_is_an_error(count):
+    with pytest.raises(DataError, match=r"segmentation\.superpixels"):
+        segment(noise(48, 64), count)
+
+
+@settings(max_examples=60, deadline=None)
+@given(hnp.arrays(np.int32, (8, 9), elements=st.integers(0, 3)), st.integers(1, 12))
+def test_split_components_leaves_connected_pieces(labels, min_size):
+    out = split_components(labels, min_size)
+    assert_partition(out)
+    if min_size == 1:
+        # nothing is merged: exactly the components of the input
+        for k in np.unique(out):
+            assert len(np.unique(labels[out == k])) == 1
+        expected = sum(ndimage.label(labels == k)[1] for k in np.unique(labels))
+        assert out.max() + 1 == expected
+
+
+def test_small_pieces_join_what_is_next_to_them():
+    labels = np.zeros((6, 8), np.int32)
+    labels[:, 4:] = 1
+    labels[2, 6] = 0  # an island of one pixel, with the label of the other side
+    np.testing.assert_array_equal(
+        split_components(labels, 3), np.arange(8)[None] // 4 * np.ones((6, 1))
+    )
+
+
+# --- graphs ------------------------------------------------------------------------------------
+
+
+def test_anchors_sizes_and_radius_by_hand():
+    labels = np.zeros((2, 6), np.int32)
+    labels[:, 4:] = 1
+    seg = build_segmentation(labels, noise(2, 6), neighbours=1)
+    np.testing.assert_allclose(seg.anchors, [[1.5, 0.5], [4.5, 0.5]])
+    np.testing.assert_array_equal(seg.sizes, [8, 4])
+    np.testing.assert_allclose(seg.radius, [np.sqrt(1.25 + 0.25), np.sqrt(0.25 + 0.25)])
+    assert len(seg) == 2
+
+
+@pytest.fixture(scope="module", params=["slic", "grid"])
+def seg(request, image) -> Segmentation:
+    return build_segmentation(segment(image, 60, request.param), image, neighbours=7)
+
+
+def test_knn_is_brute_force_nearest_first(seg):
+    n, k = len(seg), 7
+    d = np.linalg.norm(seg.anchors[:, None] - seg.anchors[None], axis=2)
+    np.fill_diagonal(d, np.inf)
+    found = np.take_along_axis(d, seg.knn, axis=1)
+    # distances, not indices: a grid has ties
+    np.testing.assert_allclose(found, np.sort(d, axis=1)[:, :k], atol=1e-9)
+    assert (np.sort(seg.knn, axis=1)[:, 1:] != np.sort(seg.knn, axis=1)[:, :-1]).all()
+    assert (seg.knn != np.arange(n)[:, None]).all()
+
+
+def test_folded_edges_keep_every_direction(seg):
+    n, k = seg.knn.shape
+    directed = {(i, int(j)) for i in range(n) for j in seg.knn[i]}
+    assert seg.edge_multiplicity.sum() == n * k == len(directed)
+    assert (seg.edges[:, 0] < seg.edges[:, 1]).all()
+    assert len(np.unique(seg.edges, axis=0)) == len(seg.edges)
+    for (i, j), m in zip(seg.edges.tolist(), seg.edge_multiplicity):
+        assert m == ((i, j) in directed) + ((j, i) in directed)
+
+
+def test_edge_weight_is_equation_2(seg):
+    i, k = seg.edges.T
+    distance = np.linalg.norm(seg.anchors[i] - seg.anchors[k], axis=1)
+    np.testing.assert_allclose(seg.edge_weight, seg.edge_multiplicity * np.exp(-0.02 * distance))
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.3])
+def test_beta_is_the_falloff_per_pixel(image, beta):
+    seg = build_segmentation(segment(image, 20, "grid"), image, neighbours=3, beta=beta)
+    i, k = seg.edges.T
+    distance = np.linalg.norm(seg.anchors[i] - seg.anchors[k], axis=1)
+    np.testing.assert_allclose(seg.edge_weight, seg.edge_multiplicity * np.exp(-beta * distance))
+
+
+def brute_pairs(labels):
+    """{(i, k): list of (pixel of i, pixel of k)} over 4-neighbours, i < k."""
+    out = {}
+    height, width = labels.shape
+    for v, u in itertools.product(range(height), range(width)):
+        for dv, du in ((0, 1), (1, 0)):
+            b = v + dv, u + du
+            if b[0] >= height or b[1] >= width or labels[v, u] == labels[b]:
+                continue
+            p, q = sorted([(v, u), b], key=lambda x: labels[x])
+            out.setdefault((int(labels[p]), int(labels[q])), []).append((p, q))
+    return out
+
+
+def brute_w4(image, pixels, beta):
+    """Eq. 5: over four neighbours, exp(-beta |I(X_b) - I(zeta_j)|_F), all boundary pixels stacked."""
+    colour = image / 255.0
+    height, width = image.shape[:2]
+    total = 0.0
+    for dv, du in FOUR:
+        gap = []
+        for v, u in sorted(set(pixels)):
+            w = min(max(v + dv, 0), height - 1), min(max(u + du, 0), width - 1)
+            gap.append(colour[v, u] - colour[w])
+        total += np.exp(-beta * np.linalg.norm(np.stack(gap)))
+    return total
+
+
+def small_labels(seed):
+    rng = np.random.default_rng(seed)
+    raw = np.repeat(np.repeat(rng.integers(0, 4, (4, 5)), 3, 0), 2, 1)
+    return split_components(raw.astype(np.int32), 4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_shared_boundaries_and_w4_are_brute_force(seed):
+    labels, image = small_labels(seed), noise(12, 10, seed)
+    expected = brute_pairs(labels)
+    seg = build_segmentation(labels, image, neighbours=1, beta_colour=0.7, boundary_samples=None)
+    found = [tuple(p) for p in seg.pairs.tolist()]
+    assert sorted(found) == sorted(expected)
+    for p, key in enumerate(found):
+        contact = expected[key]
+        assert seg.boundary_length[p] == len(contact)
+        middles = {tuple((np.array(a) + b)[::-1] / 2) for a, b in contact}
+        assert {tuple(x) for x in seg.boundary[p]} == middles
+        w4 = brute_w4(image, [a for a, _ in contact], 0.7)
+        w4 += brute_w4(image, [b for _, b in contact], 0.7)
+        assert seg.pair_weight[p] == pytest.approx(w4, rel=1e-12)
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_boundary_samples_are_spread_over_the_shared_boundary(samples):
+    labels = np.zeros((9, 10), np.int32)
+    labels[:, 5:] = 1
+    seg = build_segmentation(labels, noise(9, 10), neighbours=1, boundary_samples=samples)
+    assert seg.boundary.shape == (1, samples, 2)
+    np.testing.assert_allclose(seg.boundary[0, :, 0], 4.5)
+    rows = {1: [4.0], 3: [1.0, 4.0, 7.0]}[samples]
+    np.testing.assert_allclose(np.sort(seg.boundary[0, :, 1]), rows)
+
+
+def test_all_boundary_pixels_and_samples_are_on_the_boundary(seg, image):
+    for samples in (None, 1, 3, 8):
+        other = build_segmentation(seg.labels, image, neighbours=3, boundary_samples=samples)
+        b = samples or int(other.boundary_length.max())
+        assert other.boundary.shape == (len(other.pairs), b, 2)
+        u, v = other.boundary[..., 0], other.boundary[..., 1]
+        # a midpoint lies between two pixels that carry the pair's two labels
+        one = other.labels[np.floor(v).astype(int), np.floor(u).astype(int)]
+        two = other.labels[np.ceil(v).astype(int), np.ceil(u).astype(int)]
+        ends = np.sort(np.stack([one, two], -1), axis=-1)
+        assert (ends == other.pairs[:, None]).all()
+
+
+def test_rim_points_are_extreme_pixels_of_their_superpixel(seg):
+    height, width = seg.labels.shape
+    v, u = np.mgrid[0:height, 0:width]
+    directions = seg.rim.shape[1]
+    for i in range(len(seg)):
+        mine = seg.labels == i
+        for k in range(directions):
+            angle = 2 * np.pi * k / directions
+            ru, rv = seg.rim[i, k].astype(int)
+            assert mine[rv, ru]
+            reach = np.cos(angle) * u[mine] + np.sin(angle) * v[mine]
+            assert np.cos(angle) * ru + np.sin(angle) * rv == pytest.approx(reach.max())
+
+
+@pytest.mark.parametrize("k", [0, 12, 40])
+def test_k_must_be_below_the_number_of_superpixels(k):
+    image = noise(48, 64)
+    with pytest.raises(DataError, match=r"segmentation\.neighbours"):
+        build_segmentation(segment(image, 12, "grid"), image, neighbours=k)
+
+
+def test_k_may_be_one_less_than_the_number_of_superpixels():
+    image = noise(48, 64)
+    seg = build_segmentation(segment(image, 12, "grid"), image, neighbours=11)
+    assert len(seg.edges) == 12 * 11 // 2
+    np.testing.assert_array_equal(seg.edge_multiplicity, 2)
+
+
+def test_one_superpixel_has_no_edges_and_no_pairs():
+    seg = build_segmentation(np.zeros((8, 9), np.int32), noise(8, 9))
+    assert len(seg) == 1
+    assert len(seg.edges) == len(seg.pairs) == len(seg.boundary) == 0
+    assert seg.knn.shape == (1, 0)
+    np.testing.assert_allclose(seg.anchors, [[4.0, 3.5]])
+    assert "1 superpixels" in str(seg)
+
+
+def test_relabelling_renames_edges_and_pairs_only():
+    image = noise(48, 64)
+    labels = segment(image, 12, "grid")
+    other = np.random.default_rng(0).permutation(12).astype(np.int32)
+    a = build_segmentation(labels, image, neighbours=4)
+    b = build_segmentation(other[labels], image, neighbours=4)
+
+    def table(pairs, weight, rename):
+        return {frozenset(rename[p].tolist()): w for p, w in zip(pairs, weight)}
+
+    one = table(a.pairs, a.pair_weight, other)
+    two = table(b.pairs, b.pair_weight, np.arange(12))
+    assert one.keys() == two.keys()
+    assert all(one[k] == pytest.approx(two[k], rel=1e-12) for k in one)
+    np.testing.assert_allclose(a.anchors, b.anchors[other])
