@@ -1,0 +1,76 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from soup_nlp.errors import DataError
+
+PathLike = str | os.PathLike[str]
+
+
+@contextmanager
+def atomic_path(path: PathLike) -> Iterator[Path]:
+    """A temporary path that becomes `path` when the block ends without an exception.
+
+    The temporary file lies in the same folder (a rename within one file system is atomic) and has
+    the same suffix (writers that choose a format by suffix keep working). It exists and is empty
+    when the block starts. On any exception it is removed and what was at `path` stays as it was.
+
+    The new file has the permissions of the one it replaces, else those of the process's umask.
+
+    Args:
+        path: The file to write; its folder must exist.
+
+    Yields:
+        The temporary path.
+
+    Raises:
+        DataError: the folder is missing or cannot be written, `path` is a folder, or the block
+            left no file at the temporary path.
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise DataError("cannot write a file over a folder", where=target, expected="a file name")
+    try:
+        handle, name = tempfile.mkstemp(
+            suffix=target.suffix, prefix=f".{target.stem[:64]}.", dir=target.parent
+        )
+    except FileNotFoundError as error:
+        raise DataError(
+            "folder of an output file does not exist",
+            where=target,
+            expected=f"folder {target.parent}",
+            hint="create the folder first",
+        ) from error
+    except OSError as error:
+        raise DataError(
+            "cannot write in the folder of an output file", where=target, found=error
+        ) from error
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        if not temporary.is_file():
+            raise DataError(
+                "writer left no file", where=target, expected=f"a file at {temporary.name}"
+            )
+        temporary.chmod(_mode(target))
+        os.replace(temporary, target)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+def _mode(target: Path) -> int:
+    """Permission bits for the new file: those of the old one, or the default of the process."""
+    with suppress(OSError):
+        return target.stat().st_mode & 0o777
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return 0o666 & ~mask
