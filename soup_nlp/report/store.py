@@ -54,7 +54,7 @@ class Array:
     shape_letters: str = ""
 
 
-Tree: TypeAlias = Mapping[str, Union[Array, "Tree"]]  # noqa: UP007 - the name refers to itself
+Tree: TypeAlias = Mapping[str, Union[Array, "Tree"]]
 ReadTree: TypeAlias = dict[str, Any]
 """Nested dict of numpy arrays, as `read_h5` returns it."""
 

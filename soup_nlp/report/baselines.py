@@ -1,0 +1,186 @@
+"""What a method for dynamic scenes has to beat: one rigid motion, and one constant depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.errors import DataError
+from soup_nlp.start import epipolar
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MIN_CORRESPONDENCES = 8
+"""Fewest pixels with flow for which a motion is looked for."""
+
+
+@dataclass(frozen=True)
+class RigidBaseline:
+    """A reconstruction that takes the whole image for one rigid body.
+
+    Attributes:
+        R: (3, 3) rotation, next_from_ref.
+        t: (3,) translation, next_from_ref, unit length.
+        depth: (H, W) z of the reference frame in lengths of the translation; NaN where the flow
+            has no confidence or the triangulated point is not in front of both cameras.
+        inlier_fraction: Share of the confidence on pixels that the motion explains within the
+            threshold (Sampson distance).
+        coverage: Share of all pixels with a depth; goes with every number made of `depth`.
+    """
+
+    R: Float
+    t: Float
+    depth: Float
+    inlier_fraction: float
+    coverage: float
+
+    def filled(self) -> Float:
+        """(H, W) depth with each unknown pixel given the depth of the nearest known one."""
+        return fill_nearest(self.depth)
+
+    def __str__(self) -> str:
+        return (
+            f"RigidBaseline({self.inlier_fraction:.1%} of the flow explained, "
+            f"{self.coverage:.1%} of the pixels have a depth)"
+        )
+
+
+def rigid_depth(
+    pair: Pair,
+    flow: Flow | None = None,
+    *,
+    threshold: float = 1.0,
+    samples: int = 8000,
+    seed: int = 0,
+) -> RigidBaseline:
+    """Depth under one rigid motion for the whole image, triangulated pixel by pixel.
+
+    The essential matrix comes from a subsample drawn with probability proportional to confidence
+    (RANSAC, then a robust refinement of the Sampson distance), with each frame's own camera. Each
+    pixel with confidence is then triangulated by itself; nothing is smoothed or bounded, so far
+    points with little parallax can have wild depths. That is the point of a baseline: look at the
+    median relative error beside the mean.
+
+    Args:
+        pair: Cameras, and the size of the image.
+        flow: Flow from reference to next; None takes the pair's own.
+        threshold: Inlier distance, pixels of the geometric mean focal length of the frames.
+        samples: At most this many pixels for the motion.
+        seed: Of the subsample and of RANSAC.
+
+    Raises:
+        DataError: there is no flow, it does not fit the pair or has too few usable pixels, an
+            option is out of range, or no motion can be found (no parallax).
+    """
+    flow = pair.flow if flow is None else flow
+    if flow is None:
+        raise DataError(
+            "rigid baseline needs a flow", where=pair.name, hint="give one, or use pair.with_flow"
+        )
+    if flow.confidence.shape != pair.size:
+        raise DataError(
+            "flow and reference image differ in size",
+            where=flow.source,
+            found=flow.confidence.shape,
+            expected=f"{pair.size} (height, width)",
+        )
+    if not (threshold > 0 and samples >= MIN_CORRESPONDENCES):
+        raise DataError(
+            "option of the rigid baseline is out of range",
+            where="threshold, samples",
+            found=(threshold, samples),
+            expected=f"threshold > 0 pixels, samples >= {MIN_CORRESPONDENCES}",
+        )
+    used = flow.confidence > 0
+    count = int(np.count_nonzero(used))
+    if count < MIN_CORRESPONDENCES:
+        raise DataError(
+            "flow has too few usable pixels for a motion",
+            where=flow.source,
+            found=count,
+            expected=f"at least {MIN_CORRESPONDENCES} with positive confidence",
+        )
+    r, q = _rays(pair, flow, used)
+    weight = flow.confidence[used].astype(np.float64)
+    focal = float(
+        np.prod([pair.K_ref[0, 0], pair.K_ref[1, 1], pair.K_next[0, 0], pair.K_next[1, 1]]) ** 0.25
+    )
+    pick = np.arange(count)
+    if count > samples:
+        # weighted sampling without replacement (Efraimidis and Spirakis): the largest of u^(1/w)
+        key = np.log1p(-np.random.default_rng(seed).random(count)) / weight
+        pick = np.sort(np.argpartition(-key, samples)[:samples])
+        drawn = np.ones(samples)  # the draw has done the weighting
+    else:
+        drawn = weight
+    motion = epipolar.estimate(r[pick], q[pick], drawn, focal, threshold, seed)
+    if motion is None or not (np.isfinite(motion.R).all() and np.isfinite(motion.t).all()):
+        raise DataError(
+            "no rigid motion fits the flow",
+            where=f"{pair.name}, flow {flow.source}",
+            expected="a flow with parallax",
+            hint="a still camera in a still scene has no depth from motion",
+        )
+    z, z_next = epipolar.triangulate(motion, r, q)
+    front = np.isfinite(z) & np.isfinite(z_next) & (z > 0) & (z_next > 0)
+    depth = np.full(pair.size, np.nan)
+    depth[used] = np.where(front, z, np.nan)
+    near = np.abs(epipolar.sampson(motion.essential(), r, q, focal)) < threshold
+    return RigidBaseline(
+        R=motion.R,
+        t=motion.t,
+        depth=depth,
+        inlier_fraction=float(np.sum(weight * near) / np.sum(weight)),
+        coverage=float(np.count_nonzero(front) / depth.size),
+    )
+
+
+def _rays(pair: Pair, flow: Flow, used: Mask) -> tuple[Float, Float]:
+    """(M, 3) rays of the used pixels and of their targets, each by its own camera."""
+    v, u = np.nonzero(used)
+    one = np.ones(len(u))
+    uv = flow.uv[used].astype(np.float64)
+    r = np.stack([u, v, one], axis=1) @ np.linalg.inv(pair.K_ref).T
+    q = np.stack([u + uv[:, 0], v + uv[:, 1], one], axis=1) @ np.linalg.inv(pair.K_next).T
+    return r, q
+
+
+def fill_nearest(depth: Float) -> Float:
+    """(H, W) copy in which each non-finite pixel has the value of the nearest finite one.
+
+    Args:
+        depth: (H, W); not finite where unknown.
+
+    Raises:
+        DataError: not a map, or no pixel is known.
+    """
+    unknown = ~np.isfinite(depth)
+    if depth.ndim != 2 or unknown.all():
+        raise DataError(
+            "nothing to fill a depth map from",
+            where="fill_nearest",
+            found=f"shape {depth.shape}, {int((~unknown).sum())} known pixels",
+            expected="(H, W) with at least one finite depth",
+        )
+    if not unknown.any():
+        return depth.copy()
+    index = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    return np.asarray(depth[tuple(index)])
+
+
+def constant_depth(shape: tuple[int, int]) -> Float:
+    """(H, W) of ones: the depth of a method that knows nothing but the global scale.
+
+    Raises:
+        DataError: the shape is not two positive numbers.
+    """
+    if len(shape) != 2 or min(shape) < 1:
+        raise DataError(
+            "constant depth needs the size of an image", found=shape, expected="(height, width)"
+        )
+    return np.ones(shape)
