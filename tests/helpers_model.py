@@ -155,7 +155,9 @@ def kernel_exact(nlp: NLP, x: Float) -> dict[str, float]:
         # slack and switch variables do not enter the exact energy
         f = ca.Function("e", [k.x, k.row, k.theta], [k.exact])
         theta = np.repeat(nlp.p[: len(nlp.theta), None], len(t), axis=1)
-        out[k.name.removeprefix("t_")] = float(np.sum(f.map(len(t))(x[t.index].T, t.data.T, theta)))
+        out[k.name.removeprefix("t_")] = float(
+            np.asarray(f.map(len(t))(x[t.index].T, t.data.T, theta)).sum()
+        )
     return out
 
 

@@ -165,7 +165,7 @@ def brute_pairs(labels):
 
 
 def brute_w4(image, pixels, beta):
-    """Eq. 5: over four neighbours, exp(-beta |I(X_b) - I(zeta_j)|_F), all boundary pixels stacked."""
+    """Eq. 5: over four neighbours, exp(-beta |I(X_b) - I(zeta_j)|_F), boundary pixels stacked."""
     colour = image / 255.0
     height, width = image.shape[:2]
     total = 0.0
