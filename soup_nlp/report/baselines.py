@@ -18,6 +18,9 @@ Mask = NDArray[np.bool_]
 MIN_CORRESPONDENCES = 8
 """Fewest pixels with flow for which a motion is looked for."""
 
+TIGHT = 0.1
+"""The motion is also looked for with this fraction of the inlier distance."""
+
 
 @dataclass(frozen=True)
 class RigidBaseline:
@@ -61,9 +64,11 @@ def rigid_depth(
     """Depth under one rigid motion for the whole image, triangulated pixel by pixel.
 
     The essential matrix comes from a subsample drawn with probability proportional to confidence
-    (RANSAC, then a robust refinement of the Sampson distance), with each frame's own camera. Each
-    pixel with confidence is then triangulated by itself; nothing is smoothed or bounded, so far
-    points with little parallax can have wild depths. That is the point of a baseline: look at the
+    (RANSAC, then a robust refinement of the Sampson distance), with each frame's own camera. It is
+    looked for at the inlier distance and at a tenth of it, and the motion with the smaller Cauchy
+    cost is kept: in small images a body that moves can hide within one pixel of a motion that is
+    right for nothing. Each pixel with confidence is then triangulated by itself; nothing is
+    smoothed or bounded, so far points with little parallax can have wild depths. Look at the
     median relative error beside the mean.
 
     Args:
@@ -118,8 +123,8 @@ def rigid_depth(
         drawn = np.ones(samples)  # the draw has done the weighting
     else:
         drawn = weight
-    motion = epipolar.estimate(r[pick], q[pick], drawn, focal, threshold, seed)
-    if motion is None or not (np.isfinite(motion.R).all() and np.isfinite(motion.t).all()):
+    motion = _best_motion(r[pick], q[pick], drawn, focal, threshold, seed)
+    if motion is None:
         raise DataError(
             "no rigid motion fits the flow",
             where=f"{pair.name}, flow {flow.source}",
@@ -140,6 +145,22 @@ def rigid_depth(
     )
 
 
+def _best_motion(
+    r: Float, q: Float, weight: Float, focal: float, threshold: float, seed: int
+) -> epipolar.Motion | None:
+    """The motion of rays r, q (M, 3) with the smallest Cauchy cost, or None where there is none."""
+    best, lowest = None, np.inf
+    for distance in (threshold, TIGHT * threshold):
+        motion = epipolar.estimate(r, q, weight, focal, distance, seed)
+        if motion is None or not (np.isfinite(motion.R).all() and np.isfinite(motion.t).all()):
+            continue
+        off = epipolar.sampson(motion.essential(), r, q, focal) / (TIGHT * threshold)
+        cost = float(np.sum(weight * np.log1p(off * off)))
+        if cost < lowest:
+            best, lowest = motion, cost
+    return best
+
+
 def _rays(pair: Pair, flow: Flow, used: Mask) -> tuple[Float, Float]:
     """(M, 3) rays of the used pixels and of their targets, each by its own camera."""
     v, u = np.nonzero(used)
@@ -147,7 +168,7 @@ def _rays(pair: Pair, flow: Flow, used: Mask) -> tuple[Float, Float]:
     uv = flow.uv[used].astype(np.float64)
     r = np.stack([u, v, one], axis=1) @ np.linalg.inv(pair.K_ref).T
     q = np.stack([u + uv[:, 0], v + uv[:, 1], one], axis=1) @ np.linalg.inv(pair.K_next).T
-    return r, q
+    return np.asarray(r, np.float64), np.asarray(q, np.float64)
 
 
 def fill_nearest(depth: Float) -> Float:

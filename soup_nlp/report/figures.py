@@ -145,7 +145,7 @@ def colourise_flow(uv: Float, limit: float | None = None) -> Image:
         DataError: wrong shape, or a limit that is not positive.
     """
     flow = _map(uv, "uv", 3, 2)
-    known = np.isfinite(flow).all(axis=2)
+    known: Mask = np.asarray(np.isfinite(flow).all(axis=2))
     flow = np.where(known[:, :, None], flow, 0.0)
     length = np.hypot(flow[:, :, 0], flow[:, :, 1])
     if limit is None:
@@ -176,7 +176,7 @@ def colourise_normals(n_map: Float) -> Image:
         DataError: wrong shape.
     """
     n = _map(n_map, "n_map", 3, 3)
-    known = np.isfinite(n).all(axis=2)
+    known: Mask = np.asarray(np.isfinite(n).all(axis=2))
     signed = np.where(known[:, :, None], n, 0.0) * np.array([1.0, -1.0, -1.0])
     out = ((np.clip(signed, -1, 1) + 1) * 127.5).round().astype(np.uint8)
     out[~known] = 0

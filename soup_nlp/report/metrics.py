@@ -229,7 +229,8 @@ def weighted_median(values: ArrayLike, weights: ArrayLike) -> float:
             expected="equal, positive lengths; weights >= 0 with a positive sum",
         )
     order = np.argsort(v, kind="stable")
-    total = np.cumsum(w[order] / w.max())
+    # a power of two keeps sums in range and ties exact
+    total = np.cumsum(np.ldexp(w[order], -int(np.frexp(w.max())[1])))
     return float(v[order[int(np.searchsorted(total, 0.5 * total[-1]))]])
 
 

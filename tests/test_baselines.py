@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soup_nlp.data.flow import flow_from_truth
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.scenes import render_scene
+from soup_nlp.errors import DataError
+from soup_nlp.geometry import rotation
+from soup_nlp.report.baselines import constant_depth, fill_nearest, rigid_depth
+from soup_nlp.report.metrics import constant_depth_metrics, depth_metrics, skill
+
+
+@pytest.fixture(scope="module")
+def orbit() -> Pair:
+    pair = render_scene("orbit", width=256, height=109)
+    return pair.with_flow(flow_from_truth(pair))
+
+
+def made(K_next, height=60, width=80, turn=(0.01, -0.04, 0.02), shift=(0.3, 0.05, 0.1)):
+    """A wavy surface in front of two cameras, with its exact flow; (pair, depth, R, t)."""
+    K = np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]])
+    v, u = np.mgrid[:height, :width].astype(float)
+    z = 4 + np.sin(u / 9) + 0.5 * np.cos(v / 7)
+    X = z[..., None] * (np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T)
+    R, t = rotation.exp(np.array(turn)), np.array(shift)
+    x = (X @ R.T + t) @ K_next.T
+    uv = (x[..., :2] / x[..., 2:] - np.stack([u, v], -1)).astype(np.float32)
+    image = np.zeros((height, width, 3), np.uint8)
+    flow = Flow(uv, np.ones((height, width), np.float32), "made")
+    return Pair(image, image, K, K_next, flow), z, R, t
+
+
+def test_recovers_a_rigid_scene(orbit):
+    found = rigid_depth(orbit)
+    assert found.depth.shape == orbit.size
+    m = depth_metrics(found.depth, orbit.truth.depth_ref)
+    assert m.mre < 1e-4
+    assert m.coverage == found.coverage == 1.0
+    assert found.inlier_fraction > 0.999
+    assert skill(m.mre, constant_depth_metrics(orbit.truth.depth_ref).mre) > 0.999
+    assert "100.0%" in str(found)
+
+
+def test_same_seed_same_answer(orbit):
+    a, b = (rigid_depth(orbit, samples=500, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(a.depth, b.depth)
+
+
+@pytest.mark.parametrize(
+    "K_next",
+    [
+        np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]]),
+        np.array([[90.0, 0, 72.0], [0, 92.0, 28.0], [0, 0, 1]]),
+        np.array([[140.0, 1.5, 30.0], [0, 120.0, 35.0], [0, 0, 1]]),
+    ],
+)
+def test_each_frame_has_its_own_camera(K_next):
+    pair, z, R, t = made(K_next)
+    found = rigid_depth(pair)
+    np.testing.assert_allclose(found.R, R, atol=1e-4)
+    np.testing.assert_allclose(found.t, t / np.linalg.norm(t), atol=1e-3)
+    np.testing.assert_allclose(found.depth * np.linalg.norm(t), z, rtol=5e-3)
+
+
+def test_wrong_flow_without_confidence_does_no_harm(orbit):
+    rng = np.random.default_rng(0)
+    uv, confidence = orbit.flow.uv.copy(), orbit.flow.confidence.copy()
+    bad = rng.random(confidence.shape) < 0.6
+    uv[bad] = rng.uniform(-30, 30, (int(bad.sum()), 2))
+    confidence[bad] = 0.0
+    uv[0, 0], confidence[0, 0] = np.nan, 0.0
+    bad[0, 0] = True
+    found = rigid_depth(orbit, Flow(uv, confidence))
+    np.testing.assert_array_equal(np.isnan(found.depth), bad)
+    assert found.coverage == pytest.approx(1 - bad.mean())
+    assert depth_metrics(found.depth, orbit.truth.depth_ref).mre < 1e-4
+    filled = found.filled()
+    assert np.isfinite(filled).all()
+    np.testing.assert_array_equal(filled[~bad], found.depth[~bad])
+    assert depth_metrics(filled, orbit.truth.depth_ref).mre < 0.05
+
+
+def test_confidence_weighs_the_motion(orbit):
+    """A moving half that is trusted little does not decide the motion."""
+    uv, confidence = orbit.flow.uv.copy(), orbit.flow.confidence.copy()
+    uv[:, :150] += np.linspace(3, 9, 150)[None, :, None]
+    confidence[:, :150] = 0.02
+    found = rigid_depth(orbit, Flow(uv, confidence), samples=1000)
+    right = depth_metrics(found.depth[:, 150:], orbit.truth.depth_ref[:, 150:])
+    assert right.mre < 0.01
+    assert 0.9 < found.inlier_fraction < 1.0
+
+
+def test_points_behind_a_camera_are_unknown():
+    K = np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]])
+    pair, z, _, _ = made(K, turn=(0.0, 0.0, 0.0), shift=(0.3, 0.0, 0.0))
+    uv = pair.flow.uv.copy()
+    uv[20:40, 20:40] *= -1
+    behind = np.zeros(pair.size, bool)
+    behind[20:40, 20:40] = True
+    found = rigid_depth(pair, Flow(uv, pair.flow.confidence))
+    np.testing.assert_array_equal(np.isnan(found.depth), behind)
+    assert found.coverage == pytest.approx(1 - behind.mean())
+    assert depth_metrics(found.depth, z).coverage == pytest.approx(found.coverage)
+    assert (found.filled() > 0).all()
+
+
+def test_dynamic_scene_is_not_rigid():
+    pair = render_scene("street", width=256, height=109)
+    found = rigid_depth(pair, flow_from_truth(pair))
+    m = depth_metrics(found.depth, pair.truth.depth_ref)
+    static = depth_metrics(found.depth, pair.truth.depth_ref, mask=pair.truth.bodies == 0)
+    assert static.mre < m.mre < 0.05
+    assert found.inlier_fraction < 0.95
+
+
+def test_fill_nearest():
+    z = np.array([[1.0, np.nan, np.nan, 4.0]])
+    np.testing.assert_array_equal(fill_nearest(z), [[1, 1, 4, 4]])
+    full = np.ones((2, 2))
+    assert fill_nearest(full) is not full
+    with pytest.raises(DataError, match="nothing to fill"):
+        fill_nearest(np.full((2, 2), np.nan))
+
+
+def test_constant_depth():
+    np.testing.assert_array_equal(constant_depth((2, 3)), np.ones((2, 3)))
+    with pytest.raises(DataError, match="size of an image"):
+        constant_depth((0, 3))
+
+
+def test_bad_input(orbit):
+    bare = replace(orbit, flow=None)
+    with pytest.raises(DataError, match="needs a flow"):
+        rigid_depth(bare)
+    small = Flow(np.zeros((20, 20, 2), np.float32), np.ones((20, 20), np.float32))
+    with pytest.raises(DataError, match="differ in size"):
+        rigid_depth(orbit, small)
+    none = Flow(orbit.flow.uv, np.zeros_like(orbit.flow.confidence))
+    with pytest.raises(DataError, match="too few"):
+        rigid_depth(orbit, none)
+    with pytest.raises(DataError, match="out of range"):
+        rigid_depth(orbit, samples=3)
+    with pytest.raises(DataError, match="out of range"):
+        rigid_depth(orbit, threshold=0.0)
+
+
+def test_no_motion_is_an_error_that_says_so(orbit, monkeypatch):
+    monkeypatch.setattr("soup_nlp.start.epipolar.estimate", lambda *_: None)
+    with pytest.raises(DataError, match="no rigid motion"):
+        rigid_depth(orbit)
+
+
+def test_still_flow_gives_an_error_or_a_number(orbit):
+    still = Flow(np.zeros_like(orbit.flow.uv), np.ones_like(orbit.flow.confidence), "still")
+    with suppress(DataError):
+        assert 0.0 <= rigid_depth(orbit, still).coverage <= 1.0

@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+import os
+
+import cv2
+import matplotlib
+import numpy as np
+import pytest
+
+from soup_nlp.errors import DataError
+from soup_nlp.report.figures import (
+    colour_wheel,
+    colourise_depth,
+    colourise_error,
+    colourise_flow,
+    colourise_normals,
+    depth_range,
+    draw_superpixels,
+    overview_strip,
+    write_depth_png16,
+    write_png,
+)
+
+
+def turbo(level):
+    return (np.array(matplotlib.colormaps["turbo"](level)[:3]) * 255).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize(("mapping", "middle"), [("inverse", 4 / 2.5), ("log", 2.0)])
+def test_depth_colours(mapping, middle):
+    z = np.array([[1.0, middle, 4.0], [0.01, 1e6, np.nan], [0.0, -1.0, np.inf]])
+    out = colourise_depth(z, 1.0, 4.0, mapping=mapping)
+    assert (out.dtype, out.shape) == (np.uint8, (3, 3, 3))
+    np.testing.assert_array_equal(out[0, 0], turbo(255))
+    np.testing.assert_array_equal(out[0, 2], turbo(0))
+    np.testing.assert_array_equal(out[1, 0], turbo(255))
+    np.testing.assert_array_equal(out[1, 1], turbo(0))
+    np.testing.assert_array_equal(out[0, 1], turbo(128))
+    assert not out[1, 2].any()
+    assert not out[2].any()
+
+
+def test_depth_range_is_robust():
+    z = np.linspace(2.0, 3.0, 1000).reshape(25, 40)
+    z[0, 0], z[0, 1], z[0, 2], z[0, 3] = 1e9, np.nan, -5.0, np.inf
+    near, far = depth_range(z)
+    assert 2.0 < near < 2.1
+    assert 2.9 < far < 3.1
+    near, far = depth_range(np.full((2, 2), 5.0))
+    assert near < 5.0 < far
+    assert depth_range(np.full((2, 2), np.nan)) == (1.0, 2.0)
+    assert not colourise_depth(np.full((2, 2), np.nan)).any()
+    assert colourise_depth(np.full((2, 2), 5.0)).any()
+
+
+def test_flow_wheel():
+    assert colour_wheel().shape == (55, 3)
+    right, down, left, up = (
+        colourise_flow(np.array([[uv]], float), 1.0)[0, 0].astype(int)
+        for uv in ((1, 0), (0, 1), (-1, 0), (0, -1))
+    )
+    np.testing.assert_array_equal(right, [255, 0, 0])
+    assert down[1] > 200  # yellow
+    assert down[0] > 200
+    assert left[2] > 200  # cyan
+    assert left[1] > 200
+    assert up[2] > 200  # blue to violet
+    assert up[1] < 50
+    assert (colourise_flow(np.zeros((2, 2, 2))) == 255).all()
+    unknown = np.full((1, 2, 2), np.nan)
+    assert not colourise_flow(unknown).any()
+    beyond = colourise_flow(np.array([[[5.0, 0.0]]]), 1.0)[0, 0]
+    np.testing.assert_array_equal(beyond, [191, 0, 0])
+
+
+def test_flow_colour_is_continuous_but_for_the_seam_of_the_wheel():
+    """The published wheel has a seam of 43 grey levels in blue, between its last and first."""
+    angle = np.linspace(-np.pi, np.pi, 2000)
+    uv = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[None]
+    out = colourise_flow(uv, 1.01).astype(int)[0]
+    step = np.abs(np.diff(out, axis=0))
+    assert (step.max(axis=1) > 12).sum() == 1
+    assert step.max() <= 43
+    assert step[:, :2].max() < 12
+    assert np.abs(out[0] - out[-1]).max() < 12
+
+
+def test_error_colours():
+    out = colourise_error(np.array([[0.0, 0.2, 7.0, np.nan]]), 0.2).astype(int)[0]
+    assert out[0].any()  # a small error is not the black of the unknown
+    np.testing.assert_array_equal(out[1], out[2])
+    assert out[1].sum() > out[0].sum()
+    assert not out[3].any()
+
+
+def test_normal_colours():
+    n = np.array([[[0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0], [np.nan, 0, 0]]])
+    np.testing.assert_array_equal(
+        colourise_normals(n)[0], [[128, 128, 255], [255, 128, 128], [128, 0, 128], [0, 0, 0]]
+    )
+
+
+def test_superpixel_boundaries():
+    image = np.full((4, 6, 3), 9, np.uint8)
+    labels = np.repeat([[0, 0, 0, 1, 1, 1]], 4, axis=0)
+    labels[3] = 2
+    out = draw_superpixels(image, labels, (1, 2, 3))
+    edge = (out == [1, 2, 3]).all(axis=2)
+    want = np.zeros((4, 6), bool)
+    want[:3, 2] = want[2] = True
+    np.testing.assert_array_equal(edge, want)
+    assert (image == 9).all()
+
+
+def panels():
+    flat = np.full((30, 60, 3), (200, 30, 30), np.uint8)
+    tall = np.full((80, 40, 3), (30, 30, 200), np.uint8)
+    return [("a red panel, 5 $ and 6 $", flat), ("blue", tall), ("red again", flat)]
+
+
+def test_overview(tmp_path):
+    path = tmp_path / "overview.png"
+    overview_strip(path, panels(), "title with $x_1$", columns=2, panel_width=2.0)
+    image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+    assert abs(image.shape[1] - (2 * 2.08 + 0.08) * 100) <= 2
+    assert abs(image.shape[0] - (0.42 + 4.0 + 1.0 + 2 * 0.36) * 100) <= 2
+    for colour, area in (((200, 30, 30), 2 * 200 * 100), ((30, 30, 200), 200 * 400)):
+        found = (np.abs(image.astype(int) - colour).max(axis=2) < 3).sum()
+        assert found == pytest.approx(area, rel=0.05)
+    assert os.listdir(tmp_path) == ["overview.png"]
+
+
+def test_overview_does_not_touch_global_state(tmp_path):
+    import sys
+
+    before = dict(matplotlib.rcParams)
+    overview_strip(tmp_path / "a.png", panels()[:1], "")
+    assert dict(matplotlib.rcParams) == before
+    if "matplotlib.pyplot" in sys.modules:
+        assert not sys.modules["matplotlib.pyplot"].get_fignums()
+
+
+def test_overview_bad_input_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_bytes(b"old")
+    with pytest.raises(DataError, match="at least one"):
+        overview_strip(path, [], "t")
+    with pytest.raises(DataError, match="at least one"):
+        overview_strip(path, panels(), "t", columns=0)
+    with pytest.raises(DataError, match="8-bit RGB"):
+        overview_strip(path, [("grey", np.zeros((3, 3), np.uint8))], "t")
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["a.png"]
+
+
+def test_png_round_trip(tmp_path):
+    rgb = np.random.default_rng(0).integers(0, 256, (5, 7, 3)).astype(np.uint8)
+    write_png(tmp_path / "a.png", rgb)
+    back = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png")), cv2.COLOR_BGR2RGB)
+    np.testing.assert_array_equal(back, rgb)
+    with pytest.raises(DataError, match="does not exist"):
+        write_png(tmp_path / "no" / "a.png", rgb)
+    with pytest.raises(DataError, match="8-bit RGB"):
+        write_png(tmp_path / "a.png", rgb.astype(float))
+
+
+def test_depth_png(tmp_path):
+    path = tmp_path / "d.png"
+    z = np.array([[1.0, 2.5, np.nan], [1e-9, 1e9, -1.0]])
+    assert write_depth_png16(path, z, 1000) == 1000.0
+    back = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert back.dtype == np.uint16
+    np.testing.assert_array_equal(back, [[1000, 2500, 0], [1, 65535, 0]])
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e5])
+def test_depth_png_chooses_a_scale(tmp_path, unit):
+    z = unit * np.random.default_rng(0).uniform(1, 10, (20, 30))
+    scale = write_depth_png16(tmp_path / "d.png", z)
+    back = cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED)
+    assert np.log2(scale) == round(np.log2(scale))
+    np.testing.assert_allclose(back / scale, z, atol=0.51 / scale, rtol=1e-3)
+    assert back.max() > 32767
+    assert write_depth_png16(tmp_path / "d.png", np.full((2, 2), np.nan)) > 0
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: colourise_depth(np.zeros((2, 2, 1))), "shape"),
+        (lambda: colourise_depth(np.ones((2, 2)), 3.0, 2.0), "depth range"),
+        (lambda: colourise_depth(np.ones((2, 2)), mapping="linear"), "mapping"),
+        (lambda: colourise_depth(np.ones((2, 2)), cmap="no such"), "colour map"),
+        (lambda: colourise_flow(np.zeros((2, 2, 3))), "shape"),
+        (lambda: colourise_flow(np.zeros((2, 2, 2)), -1.0), "limit"),
+        (lambda: colourise_error(np.zeros((2, 2)), 0.0), "limit"),
+        (lambda: colourise_normals(np.zeros((2, 2))), "shape"),
+        (lambda: draw_superpixels(np.zeros((2, 2, 3), np.uint8), np.zeros((2, 3), int)), "labels"),
+        (lambda: write_depth_png16("x.png", np.ones((2, 2)), -1.0), "scale"),
+    ],
+)
+def test_bad_input(call, words):
+    with pytest.raises(DataError, match=words):
+        call()

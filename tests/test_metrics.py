@@ -1,0 +1,196 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from soup_nlp.errors import DataError
+from soup_nlp.report.metrics import (
+    PROTOCOLS,
+    constant_depth_metrics,
+    depth_metrics,
+    sample_at_points,
+    scene_flow_epe,
+    skill,
+    weighted_median,
+)
+
+depths = arrays(np.float64, 12, elements=st.floats(0.1, 100.0))
+factors = st.floats(1e-3, 1e3)
+quick = settings(max_examples=60, deadline=None)
+
+
+def test_hand_values():
+    m = depth_metrics([1.0, 3.0], [2.0, 2.0], scale="none")
+    assert m.mre == pytest.approx(0.5)
+    assert m.median_relative == pytest.approx(0.5)
+    assert m.sq_rel == pytest.approx(0.5)
+    assert m.rmse == pytest.approx(1.0)
+    assert m.log_rmse == pytest.approx(np.sqrt((np.log(2) ** 2 + np.log(1.5) ** 2) / 2))
+    assert (m.delta1, m.delta2, m.delta3) == (0.0, 0.5, 0.5)  # ratios 2 and 1.5
+    assert (m.scale, m.scale_rule, m.cap, m.coverage, m.n_pixels) == (1.0, "none", None, 1.0, 2)
+
+
+@pytest.mark.parametrize(
+    ("rule", "scale"),
+    [
+        ("none", 1.0),
+        ("median", 2.0),  # ratios 4, 2, 1
+        ("mre", 1.0),  # weights 1/4, 1/2, 1
+        ("lsq", (4 + 32 + 256) / (1 + 16 + 256)),
+    ],
+)
+def test_scale_rules(rule, scale):
+    m = depth_metrics([1.0, 4.0, 16.0], [4.0, 8.0, 16.0], scale=rule)
+    assert m.scale == pytest.approx(scale)
+
+
+def test_coverage_cap_and_mask():
+    truth = np.array([[1.0, 2.0, np.nan], [4.0, 100.0, 0.0]])
+    estimate = np.array([[1.0, np.nan, 5.0], [4.0, 100.0, 1.0]])
+    m = depth_metrics(estimate, truth)
+    assert (m.n_pixels, m.coverage) == (3, 0.75)
+    m = depth_metrics(estimate, truth, cap=4.0)
+    assert (m.n_pixels, m.coverage, m.cap) == (2, pytest.approx(2 / 3), 4.0)
+    m = depth_metrics(estimate, truth, mask=truth == 2.0)
+    assert (m.n_pixels, m.coverage) == (0, 0.0)
+    assert np.isnan(m.mre)
+
+
+def test_negative_and_infinite_estimates_cost_coverage_not_error():
+    m = depth_metrics([1.0, -1.0, 0.0, np.inf], [1.0, 1.0, 1.0, 1.0])
+    assert (m.mre, m.coverage) == (0.0, 0.25)
+
+
+def test_printed_with_its_protocol_on_one_line():
+    text = str(depth_metrics([1.0, np.nan], [2.0, 2.0], **PROTOCOLS["eigen80"]))
+    assert "\n" not in text
+    for word in ("scale median = 2", "cap 80", "coverage 50.0%", "1 px"):
+        assert word in text
+
+
+def test_as_dict_keys_are_stable():
+    keys = (
+        "mre median_relative sq_rel rmse log_rmse delta1 delta2 delta3 scale_rule scale cap "
+        "coverage n_pixels"
+    )
+    m = depth_metrics([1.0], [2.0])
+    assert list(m.as_dict()) == keys.split()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        m.mre = 0.0  # type: ignore[misc]
+
+
+def test_protocols():
+    assert set(PROTOCOLS) == {"paper", "sintel70", "kitti", "eigen80", "best"}
+    for protocol in PROTOCOLS.values():
+        assert depth_metrics([1.0, 2.0], [2.0, 4.0], **protocol).mre == 0.0
+
+
+@quick
+@given(depths, depths, factors, st.sampled_from(["median", "mre", "lsq"]))
+def test_scale_of_the_estimate_changes_nothing(z, gt, factor, rule):
+    a, b = depth_metrics(z, gt, scale=rule), depth_metrics(factor * z, gt, scale=rule)
+    for name in ("mre", "rmse", "log_rmse", "sq_rel", "median_relative"):
+        assert getattr(a, name) == pytest.approx(getattr(b, name), rel=1e-6, abs=1e-9)
+    assert b.scale * factor == pytest.approx(a.scale, rel=1e-6)
+
+
+@quick
+@given(depths, depths, st.floats(1e-2, 1e2))
+def test_each_rule_minimises_what_it_says(z, gt, factor):
+    best = depth_metrics(z, gt, scale="mre").mre
+    rmse = depth_metrics(z, gt, scale="lsq").rmse
+    for rule in ("median", "lsq"):
+        assert best <= depth_metrics(z, gt, scale=rule).mre * (1 + 1e-9) + 1e-12
+    assert best <= depth_metrics(factor * z, gt, scale="none").mre * (1 + 1e-9) + 1e-12
+    assert rmse <= depth_metrics(factor * z, gt, scale="none").rmse * (1 + 1e-9) + 1e-12
+
+
+@quick
+@given(
+    st.lists(
+        st.tuples(st.floats(-50, 50), st.integers(0, 6)).filter(lambda x: x[1] > 0), min_size=1
+    )
+)
+def test_weighted_median_against_repetition(pairs):
+    values = np.array([v for v, _ in pairs])
+    weights = np.array([w for _, w in pairs])
+    repeated = np.sort(np.repeat(values, weights))
+    assert weighted_median(values, weights) == repeated[(len(repeated) - 1) // 2]
+
+
+def test_weighted_median_ignores_zero_weights():
+    assert weighted_median([1.0, 2.0, 3.0], [0.0, 0.0, 1.0]) == 3.0
+    assert weighted_median([3.0, 1.0], [1e-300, 0.0]) == 3.0
+
+
+@pytest.mark.parametrize(
+    ("values", "weights"),
+    [([], []), ([1.0], [1.0, 2.0]), ([np.nan], [1.0]), ([1.0], [-1.0]), ([1.0], [0.0])],
+)
+def test_weighted_median_rejects(values, weights):
+    with pytest.raises(DataError, match="weighted median"):
+        weighted_median(values, weights)
+
+
+def test_constant_depth_and_skill():
+    truth = np.array([[1.0, 2.0], [4.0, np.nan]])
+    m = constant_depth_metrics(truth)
+    assert m.scale == 2.0
+    assert m.mre == pytest.approx((1 + 0 + 0.5) / 3)
+    assert skill(0.25, 0.5) == 0.5
+    assert skill(0.0, 0.5) == 1.0
+    assert skill(1.0, 0.5) == -1.0
+    assert np.isnan(skill(0.1, 0.0))
+    assert np.isnan(skill(float("nan"), 0.5))
+
+
+def test_sampling_takes_the_nearest_pixel():
+    depth = np.arange(6.0).reshape(2, 3)
+    points = [[0.4, 0.0, 9.0], [0.6, 0.6, 8.0], [2.49, 1.0, 7.0], [2.5, 0, 6.0], [-0.6, 0, 5.0]]
+    estimate, truth = sample_at_points(depth, [*points, [np.nan, 0, 4.0]])
+    np.testing.assert_array_equal(estimate, [0, 4, 5, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(truth, [9, 8, 7, 6, 5, 4])
+    with pytest.raises(DataError, match="sample"):
+        sample_at_points(depth, [[0.0, 0.0]])
+
+
+def test_scene_flow_epe():
+    truth = np.array([[3.0, 0, 4.0], [0, 0, 0], [np.nan, 0, 0], [1, 1, 1]])
+    estimate = np.array([[0.0, 0, 0], [0, 0, 0.5], [0, 0, 0], [np.nan, 0, 0]])
+    out = scene_flow_epe(estimate, truth, scale=2.0)
+    assert out["mean"] == pytest.approx(3.0)
+    assert out["median"] == pytest.approx(3.0)
+    assert out["mean_truth_length"] == pytest.approx(2.5)
+    assert out["coverage"] == pytest.approx(2 / 3)
+    assert out["n_pixels"] == 2
+    assert scene_flow_epe(truth, truth, mask=[True, False, True, False])["mean"] == 0.0
+    assert np.isnan(scene_flow_epe(np.full((4, 3), np.nan), truth)["mean"])
+    with pytest.raises(DataError, match="fit"):
+        scene_flow_epe(truth, truth[:2])
+    with pytest.raises(DataError, match="differ in shape"):
+        scene_flow_epe(truth, truth, mask=[True])
+    with pytest.raises(DataError, match="no pixel"):
+        scene_flow_epe(truth, np.full((4, 3), np.nan))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"truth": [1.0, 2.0]}, "differ in shape"),
+        ({"scale": "mean"}, "unknown scale rule"),
+        ({"cap": 0.0}, "must be positive"),
+        ({"cap": float("nan")}, "must be positive"),
+        ({"mask": [True, False]}, "mask"),
+        ({"truth": [np.nan]}, "no pixel"),
+        ({"cap": 0.5}, "no pixel"),
+    ],
+)
+def test_bad_input(kwargs, words):
+    arguments = {"truth": [1.0], **kwargs}
+    with pytest.raises(DataError, match=words):
+        depth_metrics([1.0], arguments.pop("truth"), **arguments)

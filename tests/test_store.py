@@ -1,0 +1,259 @@
+from __future__ import annotations
+
+import json
+import os
+import stat
+from dataclasses import dataclass
+
+import h5py
+import numpy as np
+import pytest
+
+from soup_nlp.errors import DataError
+from soup_nlp.report.atomic import atomic_path
+from soup_nlp.report.store import (
+    Array,
+    plain,
+    read_attrs,
+    read_h5,
+    require,
+    versions,
+    write_h5,
+    write_json,
+)
+
+
+def tree():
+    rng = np.random.default_rng(0)
+    return {
+        "soup": {
+            "R": Array(rng.normal(size=(5, 3, 3)), "1", "rotations", "N,3,3"),
+            "inner": {"ok": Array(np.array([True, False]), "1", "flags", "N")},
+        },
+        "depth": Array(rng.normal(size=(100, 200)).astype(np.float32), "scene", "z", "H,W"),
+        "labels": Array(np.arange(4, dtype=np.int32), "1", "labels"),
+        "energy": Array(1.5, "px", "a scalar"),
+        "names": Array(["ä", "b"], "1", "text"),
+        "none": Array(np.zeros((0, 3)), "m", "no rows", "M,3"),
+        "group": {},
+    }
+
+
+# --- atomic ---------------------------------------------------------------------------------
+
+
+def test_atomic_replaces_and_keeps_suffix(tmp_path):
+    target = tmp_path / "a.json"
+    target.write_text("old")
+    with atomic_path(target) as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".json"
+        temporary.write_text("new")
+        assert target.read_text() == "old"
+    assert target.read_text() == "new"
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_atomic_leaves_nothing_after_a_failure(tmp_path, error):
+    target = tmp_path / "a.txt"
+    target.write_text("old")
+
+    def fail():
+        with atomic_path(target) as temporary:
+            temporary.write_text("half")
+            raise error
+
+    with pytest.raises(error):
+        fail()
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_atomic_permissions(tmp_path):
+    target = tmp_path / "a.txt"
+    umask = os.umask(0o027)
+    try:
+        with atomic_path(target) as temporary:
+            temporary.write_text("x")
+        assert stat.S_IMODE(target.stat().st_mode) == 0o640
+        target.chmod(0o604)
+        with atomic_path(str(target)) as temporary:
+            temporary.write_text("y")
+        assert stat.S_IMODE(target.stat().st_mode) == 0o604
+    finally:
+        os.umask(umask)
+
+
+def test_atomic_bad_targets(tmp_path):
+    with pytest.raises(DataError, match="folder"), atomic_path(tmp_path):
+        pass
+    with pytest.raises(DataError, match="does not exist"), atomic_path(tmp_path / "no" / "a"):
+        pass
+    with pytest.raises(DataError, match="left no file"), atomic_path(tmp_path / "a") as temporary:
+        temporary.unlink()
+    assert os.listdir(tmp_path) == []
+
+
+# --- HDF5 -----------------------------------------------------------------------------------
+
+
+def test_h5_round_trip(tmp_path):
+    path = tmp_path / "r.h5"
+    source = tree()
+    write_h5(path, source, {"name": "pair", "seed": 3, "size": (2, 3), "none": None, "m": {"a": 1}})
+    back = read_h5(path)
+    assert set(back) == set(source)
+    for name in ("soup/R", "soup/inner/ok", "depth", "labels", "none"):
+        want = source
+        for key in name.split("/"):
+            want = want[key]
+        got = require(back, name)
+        np.testing.assert_array_equal(got, want.value)
+        assert got.dtype == want.value.dtype
+    assert float(require(back, "energy")) == 1.5
+    assert list(require(back, "names")) == ["ä", "b"]
+    assert back["group"] == {}
+
+    attrs = read_attrs(path)
+    assert (attrs["name"], attrs["seed"], attrs["schema"]) == ("pair", 3, 1)
+    assert list(attrs["size"]) == [2, 3]
+    assert json.loads(attrs["m"]) == {"a": 1}
+    assert "none" not in attrs
+    assert attrs["versions"] == versions()
+    assert os.uname().nodename not in attrs["machine"]
+    assert read_attrs(path, "depth") == {
+        "units": "scene",
+        "description": "z",
+        "shape_letters": "H,W",
+    }
+    with pytest.raises(DataError, match="no such entry"):
+        read_attrs(path, "width")
+
+
+def test_h5_compresses_only_large_arrays(tmp_path):
+    write_h5(tmp_path / "r.h5", tree(), {})
+    with h5py.File(tmp_path / "r.h5") as file:
+        large, small = file["depth"], file["soup/R"]
+        assert (large.compression, large.compression_opts, large.shuffle) == ("gzip", 1, True)
+        assert small.compression is None
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ({"a/b": Array(1, "1", "")}, "name"),
+        ({"": Array(1, "1", "")}, "name"),
+        ({"g": {"a": np.zeros(3)}}, "other than arrays"),
+        ({"a": Array(np.array([object()]), "1", "")}, "cannot be stored"),
+        ({"a": Array([[1], [1, 2]], "1", "")}, "ragged"),
+    ],
+)
+def test_h5_bad_tree_leaves_the_old_file(tmp_path, bad, words):
+    path = tmp_path / "r.h5"
+    path.write_bytes(b"old")
+    with pytest.raises(DataError, match=words):
+        write_h5(path, {"good": Array(np.zeros(3), "1", ""), **bad}, {})
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["r.h5"]
+
+
+def test_h5_failure_half_way_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "r.h5"
+    path.write_bytes(b"old")
+
+    def fail(*args, **kwargs):
+        raise OSError("disk is full")
+
+    monkeypatch.setattr("soup_nlp.report.store._write_dataset", fail)
+    with pytest.raises(DataError, match="disk is full"):
+        write_h5(path, tree(), {})
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["r.h5"]
+
+
+def test_h5_reserved_attribute(tmp_path):
+    with pytest.raises(DataError, match="reserved"):
+        write_h5(tmp_path / "r.h5", {}, {"machine": "mine"})
+
+
+def test_h5_unreadable(tmp_path):
+    with pytest.raises(DataError, match="does not exist"):
+        read_h5(tmp_path / "no.h5")
+    (tmp_path / "text.h5").write_text("no HDF5")
+    with pytest.raises(DataError, match="not a readable"):
+        read_attrs(tmp_path / "text.h5")
+
+
+def test_require_lists_what_is_there():
+    there = {"soup": {"R": np.eye(3), "t": np.zeros(3)}}
+    np.testing.assert_array_equal(require(there, "soup/R"), np.eye(3))
+    with pytest.raises(DataError, match=r"\['R', 't'\]"):
+        require(there, "soup/lambda")
+    with pytest.raises(DataError, match=r"\['soup'\]"):
+        require(there, "graph/edges")
+    with pytest.raises(DataError, match="is a group"):
+        require(there, "soup")
+    with pytest.raises(DataError, match="an array"):
+        require(there, "soup/R/x")
+
+
+# --- JSON -----------------------------------------------------------------------------------
+
+
+@dataclass
+class Record:
+    a: np.float64
+    b: tuple[int, ...]
+
+
+def test_json(tmp_path):
+    path = tmp_path / "a.json"
+    obj = {
+        "f": np.float32(0.5),
+        "i": np.int64(3),
+        "b": np.bool_(True),
+        "nan": float("nan"),
+        "inf": np.float64(-np.inf),
+        "array": np.array([[1.0, np.nan]]),
+        "record": Record(np.float64(2), (1, 2)),
+        "path": tmp_path,
+        "set": {2, 1},
+        "text": "ä",
+        3: None,
+    }
+    write_json(path, obj)
+
+    def refuse(text):
+        raise AssertionError(text)
+
+    back = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+    assert back == {
+        "f": 0.5,
+        "i": 3,
+        "b": True,
+        "nan": None,
+        "inf": None,
+        "array": [[1.0, None]],
+        "record": {"a": 2.0, "b": [1, 2]},
+        "path": str(tmp_path),
+        "set": [1, 2],
+        "text": "ä",
+        "3": None,
+    }
+
+
+def test_json_bad_value_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(DataError, match="JSON"):
+        write_json(path, {"a": object()})
+    assert json.loads(path.read_text()) == {"a": 1}
+    assert plain(np.array(1.5)) == 1.5
+
+
+def test_versions():
+    out = versions()
+    assert " ".join(out) == "soup_nlp python casadi numpy scipy opencv skimage h5py"
+    assert out["numpy"] == np.__version__
+    assert "unknown" not in out.values()
