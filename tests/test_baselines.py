@@ -11,7 +11,7 @@ from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes import render_scene
 from soup_nlp.errors import DataError
 from soup_nlp.geometry import rotation
-from soup_nlp.report.baselines import constant_depth, fill_nearest, rigid_depth
+from soup_nlp.report.baselines import FAR, constant_depth, fill_nearest, rigid_depth
 from soup_nlp.report.metrics import constant_depth_metrics, depth_metrics, skill
 
 
@@ -21,7 +21,9 @@ def orbit() -> Pair:
     return pair.with_flow(flow_from_truth(pair))
 
 
-def made(K_next, height=60, width=80, turn=(0.01, -0.04, 0.02), shift=(0.3, 0.05, 0.1)):
+def made(
+    K_next, height=60, width=80, turn=(0.01, -0.04, 0.02), shift=(0.3, 0.05, 0.1), dtype=np.float32
+):
     """A wavy surface in front of two cameras, with its exact flow; (pair, depth, R, t)."""
     K = np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]])
     v, u = np.mgrid[:height, :width].astype(float)
@@ -29,7 +31,7 @@ def made(K_next, height=60, width=80, turn=(0.01, -0.04, 0.02), shift=(0.3, 0.05
     X = z[..., None] * (np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T)
     R, t = rotation.exp(np.array(turn)), np.array(shift)
     x = (X @ R.T + t) @ K_next.T
-    uv = (x[..., :2] / x[..., 2:] - np.stack([u, v], -1)).astype(np.float32)
+    uv = (x[..., :2] / x[..., 2:] - np.stack([u, v], -1)).astype(dtype)
     image = np.zeros((height, width, 3), np.uint8)
     flow = Flow(uv, np.ones((height, width), np.float32), "made")
     return Pair(image, image, K, K_next, flow), z, R, t
@@ -65,6 +67,30 @@ def test_each_frame_has_its_own_camera(K_next):
     np.testing.assert_allclose(found.R, R, atol=1e-4)
     np.testing.assert_allclose(found.t, t / np.linalg.norm(t), atol=1e-3)
     np.testing.assert_allclose(found.depth * np.linalg.norm(t), z, rtol=5e-3)
+
+
+@pytest.mark.parametrize("cx", [41.0, 72.0])
+def test_exact_flow_gives_exact_depth(cx):
+    """With a flow in double precision nothing but rounding is left."""
+    K_next = np.array([[90.0, 0, cx], [0, 110.0, 28.0], [0, 0, 1]])
+    pair, z, R, t = made(K_next, dtype=np.float64)
+    found = rigid_depth(pair)
+    np.testing.assert_allclose(found.R, R, atol=1e-6)
+    np.testing.assert_allclose(found.depth * np.linalg.norm(t), z, rtol=1e-6)
+
+
+def test_depth_without_parallax_is_unknown():
+    """Pixels moved to where a point at infinity would land have no depth, whatever the noise."""
+    pair, z, R, t = made(np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]]), dtype=np.float64)
+    v, u = np.mgrid[:60, :80]
+    far = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(pair.K_ref).T * 10 * FAR * 4
+    x = (far @ R.T + t) @ pair.K_next.T
+    uv = pair.flow.uv.copy()
+    uv[:10] = (x[..., :2] / x[..., 2:] - np.stack([u, v], -1))[:10]
+    found = rigid_depth(pair, Flow(uv, pair.flow.confidence))
+    assert np.isnan(found.depth[:10]).all()
+    np.testing.assert_allclose(found.depth[10:] * np.linalg.norm(t), z[10:], rtol=1e-6)
+    assert found.coverage == pytest.approx(50 / 60)
 
 
 def test_wrong_flow_without_confidence_does_no_harm(orbit):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import os
 
 import cv2
@@ -7,7 +8,9 @@ import matplotlib
 import numpy as np
 import pytest
 
+from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.errors import DataError
+from soup_nlp.report import figures
 from soup_nlp.report.figures import (
     colour_wheel,
     colourise_depth,
@@ -16,10 +19,12 @@ from soup_nlp.report.figures import (
     colourise_normals,
     depth_range,
     draw_superpixels,
+    overview,
     overview_strip,
     write_depth_png16,
     write_png,
 )
+from soup_nlp.report.metrics import depth_metrics
 
 
 def turbo(level):
@@ -151,6 +156,98 @@ def test_overview_bad_input_leaves_the_old_file(tmp_path):
         overview_strip(path, [("grey", np.zeros((3, 3), np.uint8))], "t")
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["a.png"]
+
+
+def small_pair(**known):
+    """8 x 6 pair with a flow that half of the pixels trust."""
+    image = np.full((6, 8, 3), 90, np.uint8)
+    confidence = np.tile(np.array([0, 1] * 4, np.float32), (6, 1))
+    flow = Flow(np.ones((6, 8, 2), np.float32), confidence, "made")
+    K = np.array([[9.0, 0, 4], [0, 9.0, 3], [0, 0, 1]])
+    truth = Truth(**known) if known else None
+    return Pair(image, image[:5], K, K, flow, truth, "small")
+
+
+def drawn(monkeypatch, *args, **kwargs):
+    """What `overview` hands to `overview_strip`: panels by caption, and the title."""
+    seen = {}
+
+    def catch(path, panels, title):
+        seen.update(panels={p[0]: p[1:] for p in panels}, title=title)
+
+    monkeypatch.setattr(figures, "overview_strip", catch)
+    overview("unused.png", *args, **kwargs)
+    return seen["panels"], seen["title"]
+
+
+def test_overview_of_everything(monkeypatch):
+    truth = np.linspace(2, 4, 48).reshape(6, 8)
+    truth[0, 0] = np.nan
+    start, solution = np.ones((6, 8)), 10 * truth
+    solution[:, 4:] = np.nan
+    solution[5, 0] *= 1.5
+    panels, title = drawn(
+        monkeypatch,
+        small_pair(depth_ref=truth),
+        labels=np.arange(48).reshape(6, 8) // 24,
+        depths={"start": start, "solution": solution},
+        normals=np.tile([0.0, 0.0, -1.0], (6, 8, 1)),
+    )
+    assert title == "small"
+    # 47 true pixels, 23 with an estimate, one of them 50 % too deep: 0.5 / 23
+    mre = depth_metrics(start, truth).mre
+    assert list(panels) == [
+        "reference frame",
+        "next frame",
+        "2 superpixels",
+        "flow (made)",
+        "confidence, 50% above 0 (black)",
+        f"start, MRE {mre:.3f} (median), coverage 100%",
+        "solution, MRE 0.022 (median), coverage 49%",
+        "true depth (m)",
+        "relative error, solution",
+        "normals",
+    ]
+    flow = panels["flow (made)"][0]
+    assert not flow[:, ::2].any()
+    assert flow[:, 1::2].any(axis=2).all()
+    # one colour range: where the solution is right it has the colours of the truth
+    right = panels["solution, MRE 0.022 (median), coverage 49%"][0][:5, 1:4]
+    np.testing.assert_array_equal(right, panels["true depth (m)"][0][:5, 1:4])
+    error, (bar, low, high) = panels["relative error, solution"]
+    assert (low, high) == ("0", "0.2")
+    np.testing.assert_array_equal(error[1, 1], bar[0, 0])
+    np.testing.assert_array_equal(error[5, 0], bar[0, -1])  # 0.5 is beyond the bar
+    assert not error[0, 0].any()
+    assert not error[:, 4:].any()
+
+
+def test_overview_leaves_out_what_is_unknown(monkeypatch):
+    panels, title = drawn(monkeypatch, small_pair(), title="")
+    assert len(panels) == 4
+    assert title == ""
+    bare = dataclasses.replace(small_pair(), flow=None)
+    panels, _ = drawn(monkeypatch, bare, depths={"a": np.full((6, 8), 2.0)})
+    assert list(panels) == ["reference frame", "next frame", "a"]
+    panels, _ = drawn(monkeypatch, bare, depths={"nothing": np.full((6, 8), np.nan)})
+    assert not panels["nothing"][0].any()
+    points = np.array([[0.0, 0, 3.0], [1.2, 2, 3.0], [7, 5, 6.0]])
+    panels, _ = drawn(monkeypatch, small_pair(points=points), depths={"a": np.full((6, 8), 2.0)})
+    # scale 3/2 at the median; |6 - 3| / 6 at one point of three
+    assert list(panels)[-1] == "a, MRE 0.167 (median), coverage 100%"
+
+
+def test_overview_file(tmp_path):
+    truth = np.linspace(2, 4, 48).reshape(6, 8)
+    overview(tmp_path / "o.png", small_pair(depth_ref=truth), depths={"solution": truth})
+    image = cv2.imread(str(tmp_path / "o.png"))
+    # two rows with bars, below one without: panels 4.2 in wide, 4.2 * 6 / 8 in high
+    assert image.shape[1] == pytest.approx(100 * (3 * 4.28 + 0.08), abs=2)
+    rows = 3 * (3.15 + 0.36)
+    assert image.shape[0] == pytest.approx(100 * (0.42 + rows + 2 * 0.2), abs=2)
+    with pytest.raises(DataError, match="does not fit the pair"):
+        overview(tmp_path / "o.png", small_pair(), depths={"a": np.ones((5, 8))})
+    assert os.listdir(tmp_path) == ["o.png"]
 
 
 def test_png_round_trip(tmp_path):

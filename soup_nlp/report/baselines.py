@@ -21,6 +21,9 @@ MIN_CORRESPONDENCES = 8
 TIGHT = 0.1
 """The motion is also looked for with this fraction of the inlier distance."""
 
+FAR = 1000.0
+"""Depths beyond this multiple of the median depth count as unknown: there is no parallax left."""
+
 
 @dataclass(frozen=True)
 class RigidBaseline:
@@ -30,7 +33,8 @@ class RigidBaseline:
         R: (3, 3) rotation, next_from_ref.
         t: (3,) translation, next_from_ref, unit length.
         depth: (H, W) z of the reference frame in lengths of the translation; NaN where the flow
-            has no confidence or the triangulated point is not in front of both cameras.
+            has no confidence, the triangulated point is not in front of both cameras, or it lies
+            beyond `FAR` times the median depth.
         inlier_fraction: Share of the confidence on pixels that the motion explains within the
             threshold (Sampson distance).
         coverage: Share of all pixels with a depth; goes with every number made of `depth`.
@@ -68,8 +72,8 @@ def rigid_depth(
     looked for at the inlier distance and at a tenth of it, and the motion with the smaller Cauchy
     cost is kept: in small images a body that moves can hide within one pixel of a motion that is
     right for nothing. Each pixel with confidence is then triangulated by itself; nothing is
-    smoothed or bounded, so far points with little parallax can have wild depths. Look at the
-    median relative error beside the mean.
+    smoothed, so far points with little parallax can have wild depths; only those beyond `FAR`
+    times the median are dropped. Look at the median relative error beside the mean.
 
     Args:
         pair: Cameras, and the size of the image.
@@ -133,6 +137,8 @@ def rigid_depth(
         )
     z, z_next = epipolar.triangulate(motion, r, q)
     front = np.isfinite(z) & np.isfinite(z_next) & (z > 0) & (z_next > 0)
+    if front.any():
+        front &= z <= FAR * np.median(z[front])
     depth = np.full(pair.size, np.nan)
     depth[used] = np.where(front, z, np.nan)
     near = np.abs(epipolar.sampson(motion.essential(), r, q, focal)) < threshold

@@ -1,10 +1,11 @@
-"""Images of depth, flow, errors, normals and superpixels, and strips of them for reports.
+"""Images of depth, flow, errors, normals and superpixels, and overviews of them for reports.
 
 Every `colourise_*` function returns (H, W, 3) uint8 RGB; what is unknown is black.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import cv2
@@ -14,16 +15,23 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 from soup_nlp.report.atomic import PathLike, atomic_path
+from soup_nlp.report.metrics import depth_metrics, sample_at_points
 
 Float = NDArray[np.floating]
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-Mapping = Literal["inverse", "log"]
+DepthMapping = Literal["inverse", "log"]
+Bar = tuple[Image, str, str]
+"""Colour bar of a panel: (1, M, 3) colours, text at their left end, text at their right end."""
+Panel = tuple[str, Image] | tuple[str, Image, Bar]
+"""Caption, (H, W, 3) uint8 RGB picture and, where colours are numbers, their bar."""
 
 _WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 _DPI = 100
+_BAR_HEIGHT = 0.2  # inches, of a row's line of colour bars
 
 
 def depth_range(
@@ -53,7 +61,7 @@ def colourise_depth(
     vmin: float | None = None,
     vmax: float | None = None,
     *,
-    mapping: Mapping = "inverse",
+    mapping: DepthMapping = "inverse",
     cmap: str = "turbo",
 ) -> Image:
     """Depth in colour: near is the upper end of the colour map (red), far the lower (blue).
@@ -236,7 +244,7 @@ def _check_rgb(image: Image, where: str) -> None:
 
 def overview_strip(
     path: PathLike,
-    panels: list[tuple[str, Image]],
+    panels: Sequence[Panel],
     title: str,
     columns: int | None = None,
     panel_width: float = 4.2,
@@ -248,7 +256,7 @@ def overview_strip(
 
     Args:
         path: PNG file to write; its folder must exist.
-        panels: (caption, (H, W, 3) uint8 RGB) in reading order.
+        panels: (caption, (H, W, 3) uint8 RGB[, colour bar]) in reading order.
         title: Above the panels; "" for none.
         columns: Panels in a row; None takes up to three.
         panel_width: Width of a panel, inches at 100 dpi.
@@ -264,14 +272,18 @@ def overview_strip(
             where=path,
             found=f"{len(panels)} panels, {columns} columns",
         )
-    for caption, image in panels:
-        _check_rgb(image, f"panel {caption!r}")
+    for panel in panels:
+        _check_rgb(panel[1], f"panel {panel[0]!r}")
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     # layout in inches, from the top
     caption_height, gap = 0.28, 0.08
     head = 0.42 if title else gap
-    heights = [panel_width * max(im.shape[0] / im.shape[1] for _, im in row) for row in rows]
+    heights = [
+        panel_width * max(panel[1].shape[0] / panel[1].shape[1] for panel in row)
+        + _BAR_HEIGHT * any(len(panel) == 3 for panel in row)
+        for row in rows
+    ]
     width = columns * (panel_width + gap) + gap
     height = head + sum(h + caption_height + gap for h in heights)
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
@@ -283,7 +295,8 @@ def overview_strip(
         text.set_parse_math(False)
     top = head
     for row, row_height in zip(rows, heights, strict=True):
-        for k, (caption, image) in enumerate(row):
+        for k, panel in enumerate(row):
+            caption, image = panel[0], panel[1]
             left = gap + k * (panel_width + gap)
             text = figure.text(
                 left / width, 1 - (top + 0.5 * caption_height) / height, caption, va="center"
@@ -296,9 +309,115 @@ def overview_strip(
             )
             axes.imshow(image, interpolation="antialiased", aspect="auto")
             axes.set_axis_off()
+            if len(panel) == 3:
+                _draw_bar(figure, panel[2], left, bottom - _BAR_HEIGHT, panel_width)
         top += row_height + caption_height + gap
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)
+
+
+def _draw_bar(figure: Figure, bar: Bar, left: float, bottom: float, width: float) -> None:
+    """A colour bar between its two texts, below a panel (inches from the lower left corner)."""
+    colours, low, high = bar
+    wide, tall = figure.get_size_inches()
+    middle = (bottom + 0.5 * _BAR_HEIGHT) / tall
+    figure.text(left / wide, middle, low, va="center", fontsize=8)
+    figure.text((left + width) / wide, middle, high, va="center", ha="right", fontsize=8)
+    axes = figure.add_axes(
+        ((left + 0.45) / wide, (bottom + 0.05) / tall, (width - 0.9) / wide, 0.1 / tall)
+    )
+    axes.imshow(colours, interpolation="nearest", aspect="auto")
+    axes.set_axis_off()
+
+
+def overview(
+    path: PathLike,
+    pair: Pair,
+    *,
+    labels: NDArray[np.integer] | None = None,
+    depths: Mapping[str, Float] | None = None,
+    normals: Float | None = None,
+    limit: float = 0.2,
+    title: str | None = None,
+) -> None:
+    """Write the overview of a result: input, superpixels, flow, depths, truth, error, normals.
+
+    What is None is left out. The depths share one colour range, that of the truth (without one, of
+    the last of them), to which each is brought by the median ratio; a caption says the MRE by that
+    rule and the coverage. The error shown is that of the last depth.
+
+    Args:
+        path: PNG file to write; its folder must exist.
+        pair: Images, flow and truth (dense, or sparse points: an MRE without a picture).
+        labels: (H, W) superpixels.
+        depths: (H, W) z by stage, in order, such as "start", "solution", "refined".
+        normals: (H, W, 3) unit normals.
+        limit: Relative error at the upper end of its colour bar.
+        title: Above the panels; None takes the name of the pair.
+
+    Raises:
+        DataError: an array does not fit the pair, or the folder cannot be written.
+    """
+    panels: list[Panel] = [("reference frame", pair.image_ref), ("next frame", pair.image_next)]
+    if labels is not None:
+        count = f"{np.unique(labels).size} superpixels"
+        panels.append((count, draw_superpixels(pair.image_ref, labels)))
+    if pair.flow is not None:
+        sure = np.clip(pair.flow.confidence, 0, 1).astype(np.float64)
+        uv = np.where(sure[:, :, None] > 0, pair.flow.uv, np.nan)
+        panels.append((f"flow ({pair.flow.source})", colourise_flow(uv)))
+        grey = np.repeat((255 * sure).round().astype(np.uint8)[:, :, None], 3, axis=2)
+        panels.append((f"confidence, {np.mean(sure > 0):.0%} above 0 (black)", grey))
+    panels += _depth_panels(pair, depths or {}, limit)
+    if normals is not None:
+        panels.append(("normals", colourise_normals(normals)))
+    overview_strip(path, panels, pair.name if title is None else title)
+
+
+def _depth_panels(pair: Pair, depths: Mapping[str, Float], limit: float) -> list[Panel]:
+    """Panels of the depths on one scale, of the true depth and of the relative error."""
+    truth = pair.truth.depth_ref if pair.truth is not None else None
+    common = truth if truth is not None else next(reversed([*depths.values()]), None)
+    if common is None:
+        return []
+    out: list[Panel] = []
+    maps = {name: _scaled(pair, name, z, common) for name, z in depths.items()}
+    near, far = depth_range(common if truth is not None else [*maps.values()][-1][0])
+    levels = 1 / np.linspace(1 / far, 1 / near, 64)[None]
+    bar = (colourise_depth(levels, near, far), f"{far:.3g}", f"{near:.3g}")
+    for name, (z, score) in maps.items():
+        out.append((f"{name}{score}", colourise_depth(z, near, far), bar))
+    if truth is not None:
+        unit = pair.truth.unit if pair.truth is not None else ""
+        out.append((f"true depth ({unit})", colourise_depth(truth, near, far), bar))
+        for name, (z, _) in [*maps.items()][-1:]:
+            known = (truth > 0) & (z > 0)
+            error = np.full(truth.shape, np.nan)
+            error[known] = np.abs(truth[known] - z[known]) / truth[known]
+            shown = colourise_error(np.linspace(0, limit, 64)[None], limit)
+            picture = colourise_error(error, limit)
+            out.append((f"relative error, {name}", picture, (shown, "0", f"{limit:g}")))
+    return out
+
+
+def _scaled(pair: Pair, name: str, depth: Float, common: Float) -> tuple[Float, str]:
+    """A depth times its median ratio to the truth (to `common` without one), and its score."""
+    z = _map(depth, name, 2)
+    if z.shape != pair.size:
+        raise DataError(
+            "depth does not fit the pair", where=name, found=z.shape, expected=pair.size
+        )
+    z = np.where(np.isfinite(z) & (z > 0), z, np.nan)
+    known = pair.truth is not None and pair.truth.depth_ref is not None
+    estimate, target = z, common
+    if not known and pair.truth is not None and pair.truth.points is not None:
+        estimate, target = sample_at_points(z, pair.truth.points)
+        known = True
+    if not (np.isfinite(target) & (target > 0)).any():
+        return z, ""
+    m = depth_metrics(estimate, target)
+    score = f", MRE {m.mre:.3f} ({m.scale_rule}), coverage {m.coverage:.0%}" if known else ""
+    return (z * m.scale if m.n_pixels else z), score
 
 
 def write_png(path: PathLike, rgb: Image) -> None:

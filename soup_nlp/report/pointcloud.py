@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from soup_nlp.data.pair import check_intrinsics
 from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import rays
 from soup_nlp.report.atomic import PathLike, atomic_path
 
 Float32 = NDArray[np.float32]
@@ -111,6 +113,60 @@ def _triples(value: ArrayLike, where: str) -> NDArray[np.generic]:
             expected="numbers (..., 3)",
         )
     return array.reshape(-1, 3)
+
+
+def points_from_depth(
+    depth: ArrayLike, K: ArrayLike, image: ArrayLike, max_edge: float | None = None
+) -> tuple[NDArray[np.float64], Bytes]:
+    """The coloured points `z K^-1 (u, v, 1)` of a depth map, ready for `write_ply`.
+
+    A depth map interpolated across an occlusion edge leaves points that fly between two surfaces.
+    With `max_edge` both sides of such an edge are left out: a pixel goes where its depth and that
+    of one of its four neighbours differ by more than this share of the nearer of the two.
+
+    Args:
+        depth: (H, W) z; unknown where not finite or not positive.
+        K: (3, 3) intrinsics, pixels; (0, 0) is the centre of the top-left pixel.
+        image: (H, W, 3) uint8 RGB.
+        max_edge: Largest relative jump of depth between neighbours; None keeps every pixel.
+
+    Returns:
+        (M, 3) points in the camera frame, in the unit of the depth, and (M, 3) colours, in row
+        order of the pixels that are left.
+
+    Raises:
+        DataError: shapes or types do not fit, the camera is wrong, or `max_edge` is not positive.
+    """
+    z, rgb, camera = np.asarray(depth, np.float64), np.asarray(image), np.asarray(K, np.float64)
+    check_intrinsics(camera, "K")
+    if z.ndim != 2 or rgb.shape != (*z.shape, 3) or rgb.dtype != np.uint8:
+        raise DataError(
+            "depth and image do not fit",
+            where="points_from_depth",
+            found=f"depth {z.shape}, image {rgb.dtype} {rgb.shape}",
+            expected="depth (H, W), image uint8 (H, W, 3)",
+        )
+    if max_edge is not None and not max_edge > 0:
+        raise DataError(
+            "largest jump of depth must be positive",
+            where="max_edge",
+            found=max_edge,
+            expected="> 0, as a share of the depth, or None",
+        )
+    keep = np.isfinite(z) & (z > 0)
+    if max_edge is not None:
+        safe = np.where(keep, z, np.nan)  # a comparison with NaN is no jump
+        for here, there in (
+            ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+            ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
+        ):
+            a, b = safe[here], safe[there]
+            jump = np.abs(a - b) > max_edge * np.fmin(a, b)
+            keep[here] &= ~jump
+            keep[there] &= ~jump
+    v, u = np.nonzero(keep)
+    ray = rays(camera, np.stack([u, v], axis=-1))
+    return ray * z[keep][:, None], np.asarray(rgb[keep], np.uint8)
 
 
 def read_ply(path: PathLike) -> tuple[Float32, Bytes, Float32 | None]:
