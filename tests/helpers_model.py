@@ -16,7 +16,7 @@ from soup_nlp.data.texture import Texture
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.geometry.superpixels import segment
+from soup_nlp.geometry.superpixels import segment, split_components
 from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
 from soup_nlp.model.formulation import Formulation, build_matrix_nlp
 from soup_nlp.model.layout import MatrixLayout
@@ -32,7 +32,17 @@ GAUGES = ("unit-offset", "unit-translation", "free")
 WIDTH, HEIGHT = 64, 48
 K_REF = camera.intrinsics(70.0, 72.0, 31.0, 24.5)
 K_NEXT = camera.intrinsics(68.0, 69.0, 32.5, 23.0)
-PAPER = Weights(arap=1.0, proj=0.3, cont=0.7, orient=0.9, sigma_cont=0.4, sigma_orient=0.05)
+PAPER = Weights(
+    arap=1.0,
+    proj=0.3,
+    cont=0.7,
+    orient=0.9,
+    sigma_cont=0.4,
+    sigma_cont_ref=np.inf,
+    sigma_orient=0.05,
+    sigma_arap=np.inf,
+    sigma_proj=np.inf,
+)
 """Truncated as the paper has it; some elements are on either side of both truncations."""
 TRUNCATED = replace(PAPER, sigma_cont_ref=0.3, sigma_arap=0.25, sigma_proj=2.0)
 """Everything truncated."""
@@ -214,3 +224,50 @@ def plane_soup(pose: Float, move: Float, count: int) -> Soup:
         np.tile(move[:3, :3], (count, 1, 1)),
         move[:3, 3] / lam[:, None],
     )
+
+
+def corner_scene(move: Float, body: Float | None = None, turn: float = 0.0) -> Scene:
+    """Floor and two walls that meet in a corner; with `body`, also a moving wedge of two planes.
+
+    Args:
+        move: (4, 4) next_from_ref of the room (the camera's motion).
+        body: (4, 4) motion of the wedge in camera coordinates before the camera moves.
+        turn: Turns the wedge about its edge, degrees.
+    """
+    room = (
+        Part(Plane(), plane_pose(6.0, yaw=35), GREY),
+        Part(Plane(), plane_pose(6.0, yaw=-45), GREY),
+        Part(Plane(), plane_pose(0.0, pitch=-90) @ shift(0, 0, -1.2), GREY),
+    )
+    bodies = [Body("room", room)]
+    if body is not None:
+        half = Plane((0.7, 0.8))
+        wedge = []
+        for side in (-1.0, 1.0):
+            yaw = turn + side * 40.0
+            pose = plane_pose(3.0, yaw=yaw) @ shift(side * 0.7, 0, 0)
+            wedge.append(Part(half, pose, GREY))
+        bodies.append(Body("wedge", tuple(wedge), body))
+    return Scene(tuple(bodies), np.eye(4), move)
+
+
+def shift(x: float, y: float, z: float) -> Float:
+    """(4, 4) translation."""
+    out = np.eye(4)
+    out[:3, 3] = x, y, z
+    return out
+
+
+def cut_by_part(
+    scene: Scene, pair: Pair, count: int
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Grid superpixels cut along the parts' outlines; and which of them lie on one part only."""
+    height, width = pair.size
+    uv = camera.pixel_grid(height, width).reshape(-1, 2)
+    part = scene.trace(pair.K_ref, uv, 0)[1].reshape(height, width)
+    cells = segment(pair.image_ref, count, "grid")
+    labels = split_components(cells * len(scene.parts) + part.astype(np.int32), 40)
+    low, high = np.full(labels.max() + 1, 99), np.full(labels.max() + 1, -1)
+    np.minimum.at(low, labels.ravel(), part.ravel())
+    np.maximum.at(high, labels.ravel(), part.ravel())
+    return labels, low == high

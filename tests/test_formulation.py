@@ -308,22 +308,36 @@ def by_term(nlp: NLP, x: np.ndarray, p: np.ndarray) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("units", UNITS)
-def test_the_smooth_form_tends_to_the_exact_energy(units):
-    problem, weights = tiny(units), weights_for(units)
+def test_the_smooth_norm_tends_to_the_exact_energy(units):
+    problem = tiny(units)
+    weights = replace(weights_for(units, truncated=False), sigma_cont=np.inf)
     nlp, _ = problem.nlp(weights, form(truncation="smooth"))
     exact = plain.energy(problem.soup, problem.data, weights)
     gap = []
     for eps in (1e-2, 1e-3, 1e-4, 1e-7):
         made = by_term(nlp, nlp.x0, nlp.with_theta(eps=eps, eps_pixel=eps))
-        gap.append([abs(made[k] - exact[k]) / exact[k] for k in ("arap", "proj", "cont")])
-    gap = np.array(gap)
-    assert (gap[1:] < gap[:-1]).all()
-    assert (gap[-1] < 1e-6).all()
-    # the width of rho_n does not shrink with eps: it stays within a tenth of sigma
-    turn = by_term(nlp, nlp.x0, nlp.p)["orient"]
-    assert abs(turn - exact["orient"]) <= 0.1 * weights.sigma_orient * weights.orient * float(
-        problem.data.pair_count.sum()
-    )
+        gap.append([(exact[k] - made[k]) / exact[k] for k in ("arap", "proj", "cont")])
+    # sqrt(v^2 + eps^2) - eps is below |v| by less than eps, and nearer with every smaller eps
+    assert (np.array(gap) > 0).all()
+    assert (np.diff(gap, axis=0) < 0).all()
+    assert max(gap[-1]) < 1e-5
+
+
+@pytest.mark.parametrize("units", UNITS)
+def test_the_smooth_truncation_stays_near_the_exact_energy(units):
+    """Its corner is rounded by a share of sigma, whatever eps: within a fifth of sigma a norm."""
+    problem, weights, data = tiny(units), weights_for(units), tiny(units).data
+    nlp, _ = problem.nlp(weights, form(truncation="smooth", eps=1e-7, eps_pixel=1e-7))
+    exact, made = plain.energy(problem.soup, data, weights), by_term(nlp, nlp.x0, nlp.p)
+    w = weights
+    cap = {
+        "arap": 3 * w.arap * w.sigma_arap * data.edge_weight.sum(),
+        "proj": w.proj * w.sigma_proj * data.pixel_weight.sum(),
+        "cont": w.cont * (w.sigma_cont + w.sigma_cont_ref) * data.pair_weight.sum(),
+        "orient": w.orient * w.sigma_orient * data.pair_count.sum(),
+    }
+    for term in TERMS:
+        assert abs(made[term] - exact[term]) <= 0.2 * cap[term]
 
 
 def parts(nlp: NLP, letter: str) -> dict[str, int]:
@@ -573,7 +587,7 @@ def test_two_superpixels_by_hand():
     soup = Soup(
         lam, np.tile([0, 0, -1.0], (2, 1)), D / lam, np.tile(np.eye(3), (2, 1, 1)), T / lam[:, None]
     )
-    w = Weights(arap=1, proj=1, cont=1, orient=1, sigma_cont=0.2, sigma_orient=0.5)
+    w = replace(PAPER, arap=1, proj=1, cont=1, orient=1, sigma_cont=0.2, sigma_orient=0.5)
     e = plain.energy(soup, data, w)
     mean = 2.0  # of the plane distances: the length unit
     anchor = np.array([[-0.2, 0, 1], [0.2, 0, 1]])  # centroids 1.5 and 5.5 of columns about 3.5

@@ -1,0 +1,350 @@
+"""The start: exact on noise-free planes, finite and flagged on everything degenerate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import pytest
+from helpers_model import (
+    corner_scene,
+    cut_by_part,
+    motion,
+    plane_pose,
+    plane_world,
+    with_true_flow,
+)
+
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.raycast import Scene, render
+from soup_nlp.errors import DataError
+from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.superpixels import segment
+from soup_nlp.solve.kkt import constraint_residuals
+from soup_nlp.start.propose import Start, StartOptions, propose
+
+WIDTH, HEIGHT = 192, 144
+K = camera.intrinsics(180.0, 180.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+CAMERA = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Of every superpixel that lies on one plane: angles in degrees, relative depth ratio."""
+
+    body: np.ndarray
+    rotation: np.ndarray
+    direction: np.ndarray
+    normal: np.ndarray
+    depth_ratio: np.ndarray
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Degrees between rows; exact for small angles too."""
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1)))
+
+
+def compare(start: Start, pair: Pair, seg: Segmentation, pure: np.ndarray) -> Errors:
+    """Errors against the truth that the pixels of each superpixel carry."""
+    truth, soup = pair.truth, start.soup
+    X = truth.depth_ref[..., None] * camera.rays(pair.K_ref, camera.pixel_grid(*pair.size))
+    body, normal, depth = [], [], []
+    anchor = camera.rays(pair.K_ref, seg.anchors)
+    for i in range(len(seg)):
+        mine = seg.labels == i
+        body.append(np.bincount(truth.bodies[mine]).argmax())
+        P = X[mine]
+        n = np.linalg.svd(P - P.mean(0), full_matrices=False)[2][2]
+        n *= -np.sign(n @ P.mean(0))
+        normal.append(n)
+        depth.append((n @ P.mean(0)) / (n @ anchor[i]))
+    M = truth.motions[np.array(body)]
+    turn = rotation.log(np.swapaxes(M[:, :3, :3], 1, 2) @ soup.R)
+    return Errors(
+        body=np.array(body)[pure],
+        rotation=np.degrees(np.linalg.norm(turn, axis=1))[pure],
+        direction=angle(soup.translation, M[:, :3, 3])[pure],
+        normal=angle(np.array(normal), soup.n)[pure],
+        depth_ratio=(soup.depth_at(anchor) / np.array(depth))[pure],
+    )
+
+
+NO_PARALLAX = pytest.mark.xfail(
+    reason="propose: where every superpixel is without parallax, `weak` is reset to mu <= 0, so"
+    " depths of rounding errors are kept and not flagged",
+    strict=False,
+)
+
+
+def cut(scene: Scene, count: int = 48) -> tuple[Pair, Segmentation, np.ndarray]:
+    pair = with_true_flow(render(scene, K, HEIGHT, WIDTH))
+    labels, pure = cut_by_part(scene, pair, count)
+    return pair, build_segmentation(labels, pair.image_ref, neighbours=10), pure
+
+
+def assert_usable(start: Start, seg: Segmentation) -> None:
+    """No NaN, and every constraint of the NLP holds but visibility's margin."""
+    for f in fields(start.soup):
+        assert np.isfinite(getattr(start.soup, f.name)).all(), f.name
+    for name in ("error", "parallax"):
+        assert not np.isnan(getattr(start, name)).any(), name
+    assert len(start.soup) == len(start.borrowed) == len(start.motion) == len(seg)
+    anchors = camera.rays(K, seg.anchors)[:, None]
+    r = constraint_residuals(start.soup, anchors, 0.0)
+    assert r["so3"] <= 1e-8
+    assert r["det"] <= 1e-8
+    assert r["normal"] <= 1e-10
+    assert r["simplex"] <= 1e-10
+    assert r["positive"] == 0
+    assert r["visible"] == 0
+    assert (start.soup.distance > 0).all()
+
+
+# --- the truth of noise-free planes --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shift", [(0.35, 0.05, 0.1), (1.0, 0.1, 0.2), (-0.2, 0.0, 0.5)])
+def test_one_motion_is_recovered_exactly(shift):
+    pair, seg, pure = cut(corner_scene(motion((0.5, -1.5, 0.3), shift)))
+    start = propose(seg, pair.flow, K, K)
+    assert_usable(start, seg)
+    assert pure.mean() > 0.85
+    e = compare(start, pair, seg, pure)
+    assert e.rotation.max() < 1e-5
+    assert e.direction.max() < 1e-3
+    # the prior of the slopes counts for half a pixel of noise: it bends planes of little parallax
+    assert np.median(e.normal) < 0.1
+    assert e.normal.max() < 3.0
+    ratio = e.depth_ratio / np.median(e.depth_ratio)
+    assert np.median(np.abs(ratio - 1)) < 1e-4
+    assert np.abs(ratio - 1).max() < 2e-3
+    assert start.error[pure].max() < 0.05
+    assert not start.borrowed[pure].any()
+    assert (start.motion == 0).mean() > 0.9
+
+
+def test_two_motions_are_told_apart():
+    body = motion((0, 3, 0), (-0.15, 0.02, 0.1))
+    pair, seg, pure = cut(corner_scene(CAMERA, body, turn=10))
+    start = propose(seg, pair.flow, K, K)
+    assert_usable(start, seg)
+    e = compare(start, pair, seg, pure)
+    for b, (turn, direction, normal, depth) in enumerate(
+        [(0.05, 1.0, 1.0, 0.01), (1.5, 10.0, 8.0, 0.03)]
+    ):
+        mine = e.body == b
+        assert mine.sum() >= 10
+        assert np.median(e.rotation[mine]) < turn
+        assert np.median(e.direction[mine]) < direction
+        assert np.median(e.normal[mine]) < normal
+        ratio = e.depth_ratio[mine] / np.median(e.depth_ratio[mine])
+        assert np.median(np.abs(ratio - 1)) < depth
+    # explaining the flow is what was asked for
+    assert np.median(start.error[pure]) < 0.1
+    assert np.quantile(start.error[pure], 0.95) < 0.5
+
+
+def test_noise_makes_it_worse_but_not_wild():
+    """Two-sided: half a pixel of noise must show, and must not ruin."""
+    pair, seg, pure = cut(corner_scene(CAMERA))
+    noise = np.random.default_rng(99).normal(0, 0.5, pair.flow.uv.shape)
+    start = propose(seg, replace(pair.flow, uv=pair.flow.uv + noise), K, K)
+    assert_usable(start, seg)
+    e = compare(start, pair, seg, pure)
+    ratio = np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1)
+    assert 1e-3 < np.median(ratio) < 0.05
+    assert 0.01 < np.median(e.direction) < 5
+    assert 0.3 < np.median(start.error) < 1.0
+
+
+def test_confident_pixels_decide():
+    """Wrong flow of confidence 0 is never looked at."""
+    pair, seg, pure = cut(corner_scene(CAMERA))
+    rng = np.random.default_rng(99)
+    bad = rng.random(pair.size) < 0.4
+    uv = np.where(bad[..., None], rng.normal(0, 50, pair.flow.uv.shape), pair.flow.uv)
+    start = propose(seg, Flow(uv, (~bad).astype(float), "test"), K, K)
+    e = compare(start, pair, seg, pure)
+    assert e.rotation.max() < 1e-5
+    assert np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1).max() < 2e-3
+
+
+def test_outliers_of_full_confidence_are_outvoted():
+    pair, seg, pure = cut(corner_scene(CAMERA))
+    rng = np.random.default_rng(99)
+    bad = rng.random(pair.size) < 0.1
+    uv = np.where(
+        bad[..., None], pair.flow.uv + rng.normal(0, 20, pair.flow.uv.shape), pair.flow.uv
+    )
+    start = propose(seg, replace(pair.flow, uv=uv), K, K)
+    assert_usable(start, seg)
+    e = compare(start, pair, seg, pure)
+    assert np.median(e.rotation) < 0.1
+    assert np.median(np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1)) < 0.02
+
+
+def test_two_cameras_with_different_intrinsics():
+    pair, seg, pure = cut(corner_scene(CAMERA))
+    K_next = camera.intrinsics(230.0, 210.0, 80.0, 60.0)
+    grid = camera.pixel_grid(*pair.size)
+    target = camera.project(K_next, camera.rays(K, grid + pair.flow.uv))
+    start = propose(seg, replace(pair.flow, uv=target - grid), K, K_next)
+    e = compare(start, pair, seg, pure)
+    assert e.rotation.max() < 1e-5
+    assert np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1).max() < 2e-3
+
+
+# --- same seed, same start -----------------------------------------------------------------------
+
+
+def test_the_start_is_a_function_of_its_seed():
+    pair, seg, _ = cut(corner_scene(CAMERA, motion((0, 3, 0), (-0.15, 0.02, 0.1))))
+    noise = np.random.default_rng(99).normal(0, 0.3, pair.flow.uv.shape)
+    flow = replace(pair.flow, uv=pair.flow.uv + noise)
+    one, two = (propose(seg, flow, K, K, StartOptions(seed=3)) for _ in range(2))
+    other = propose(seg, flow, K, K, StartOptions(seed=4))
+    for f in fields(one.soup):
+        np.testing.assert_array_equal(getattr(one.soup, f.name), getattr(two.soup, f.name))
+    np.testing.assert_array_equal(one.motion, two.motion)
+    assert (one.soup.lam != other.soup.lam).any()
+
+
+# --- degenerate input ----------------------------------------------------------------------------
+
+
+ZERO = Flow(np.zeros((HEIGHT, WIDTH, 2)), np.ones((HEIGHT, WIDTH)), "zero")
+
+
+@pytest.fixture(scope="module")
+def corner() -> tuple[Pair, Segmentation, np.ndarray]:
+    return cut(corner_scene(CAMERA))
+
+
+def test_zero_flow_everywhere_is_finite(corner):
+    seg = corner[1]
+    assert_usable(propose(seg, ZERO, K, K), seg)
+
+
+@NO_PARALLAX
+def test_zero_flow_everywhere_is_flagged(corner):
+    assert propose(corner[1], ZERO, K, K).borrowed.all()
+
+
+def test_superpixels_without_confidence_borrow(corner):
+    pair, seg, pure = corner
+    blind = np.zeros(len(seg), bool)
+    blind[[0, 7, 20, 21, 22, 40]] = True
+    confidence = np.where(blind[seg.labels], 0.0, 1.0)
+    start = propose(seg, Flow(pair.flow.uv, confidence, "test"), K, K)
+    assert_usable(start, seg)
+    assert start.borrowed[blind].all()
+    assert not start.borrowed[~blind & pure].any()
+    e = compare(start, pair, seg, np.ones(len(seg), bool))
+    assert e.rotation[blind].max() < 1e-3
+    ratio = e.depth_ratio / np.median(e.depth_ratio)
+    assert (np.abs(ratio[blind] - 1) < 0.5).all()
+
+
+def test_one_confident_superpixel_is_enough_to_go_on(corner):
+    pair, seg, _ = corner
+    start = propose(seg, Flow(pair.flow.uv, (seg.labels == 11).astype(float), "test"), K, K)
+    assert_usable(start, seg)
+    assert start.borrowed[np.arange(len(seg)) != 11].all()
+
+
+def test_superpixels_of_one_column_or_row_are_finite():
+    pair = plane_world(plane_pose(3.0, yaw=20), CAMERA, 64, 48)
+    for labels in (
+        np.tile(np.arange(64), (48, 1)),
+        np.tile(np.arange(48)[:, None], (1, 64)),
+    ):
+        seg = build_segmentation(labels.astype(np.int32), pair.image_ref, neighbours=6)
+        start = propose(seg, pair.flow, pair.K_ref, pair.K_next)
+        assert_usable_of(start, seg, pair)
+
+
+def test_superpixels_of_four_pixels_are_finite():
+    pair = plane_world(plane_pose(3.0, yaw=20), CAMERA, 64, 48)
+    seg = build_segmentation(segment(pair.image_ref, 768, "grid"), pair.image_ref, neighbours=8)
+    start = propose(seg, pair.flow, pair.K_ref, pair.K_next)
+    assert_usable_of(start, seg, pair)
+
+
+def assert_usable_of(start: Start, seg: Segmentation, pair: Pair) -> None:
+    """assert_usable with the pair's camera."""
+    for f in fields(start.soup):
+        assert np.isfinite(getattr(start.soup, f.name)).all(), f.name
+    r = constraint_residuals(start.soup, camera.rays(pair.K_ref, seg.anchors)[:, None], 0.0)
+    assert max(r["so3"], r["det"], r["normal"], r["simplex"]) <= 1e-8
+    assert r["positive"] == r["visible"] == 0
+
+
+@pytest.mark.parametrize("turn", [(0.0, 2.0, 0.0), (1.0, -1.0, 3.0)])
+def test_pure_rotation_is_finite_and_explains_the_flow(turn):
+    pair, seg, _ = cut(corner_scene(motion(turn, (0, 0, 0))))
+    start = propose(seg, pair.flow, K, K)
+    assert_usable(start, seg)
+    assert np.median(start.error) < 0.3
+
+
+@NO_PARALLAX
+@pytest.mark.parametrize("turn", [(0.0, 2.0, 0.0), (1.0, -1.0, 3.0)])
+def test_pure_rotation_is_flagged(turn):
+    """Nothing says how far anything is."""
+    pair, seg, _ = cut(corner_scene(motion(turn, (0, 0, 0))))
+    assert propose(seg, pair.flow, K, K).borrowed.mean() > 0.9
+
+
+def test_a_single_plane_is_finite():
+    # the homography of one plane has two rigid explanations; either is a start
+    pair = plane_world(plane_pose(3.0, yaw=20, pitch=10), CAMERA, WIDTH, HEIGHT)
+    seg = build_segmentation(segment(pair.image_ref, 40, "grid"), pair.image_ref, neighbours=8)
+    start = propose(seg, pair.flow, pair.K_ref, pair.K_next)
+    assert_usable_of(start, seg, pair)
+    assert np.median(start.error) < 0.05
+
+
+def test_random_flow_is_finite(corner):
+    _, seg, _ = corner
+    uv = np.random.default_rng(99).normal(0, 30, (HEIGHT, WIDTH, 2))
+    assert_usable(propose(seg, Flow(uv, np.ones((HEIGHT, WIDTH)), "noise"), K, K), seg)
+
+
+def test_one_superpixel_is_finite(corner):
+    pair, _, _ = corner
+    seg = build_segmentation(np.zeros((HEIGHT, WIDTH), np.int32), pair.image_ref)
+    assert_usable(propose(seg, pair.flow, K, K), seg)
+
+
+def test_two_superpixels_are_finite(corner):
+    pair, _, _ = corner
+    seg = build_segmentation(segment(pair.image_ref, 2, "grid"), pair.image_ref, neighbours=1)
+    assert_usable(propose(seg, pair.flow, K, K), seg)
+
+
+@pytest.mark.parametrize("usable", [0, 7])
+def test_too_few_usable_pixels_are_an_error(corner, usable):
+    pair, seg, _ = corner
+    confidence = np.zeros((HEIGHT, WIDTH))
+    confidence[70, 50 : 50 + usable] = 1
+    with pytest.raises(DataError, match="too few pixels") as caught:
+        propose(seg, Flow(pair.flow.uv, confidence, "thin"), K, K)
+    assert "thin" in str(caught.value)
+    assert str(usable) in str(caught.value)
+
+
+def test_eight_usable_pixels_are_finite(corner):
+    pair, seg, _ = corner
+    confidence = np.zeros((HEIGHT, WIDTH))
+    confidence[70, 50:58] = 1
+    start = propose(seg, Flow(pair.flow.uv, confidence, "thin"), K, K)
+    assert_usable(start, seg)
+    assert start.borrowed.mean() > 0.9
+
+
+def test_the_start_prints_itself(corner):
+    pair, seg, _ = corner
+    text = str(propose(seg, pair.flow, K, K))
+    assert text.startswith(f"Start({len(seg)} superpixels, ")
+    assert "borrowed" in text
