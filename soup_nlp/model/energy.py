@@ -22,10 +22,12 @@ TERMS = ("arap", "proj", "cont", "orient")
 class Weights:
     """Constants of E = E_arap + alpha1 E_proj + alpha2 E_cont + alpha3 E_orient.
 
-    Lengths are in units of the mean plane distance. beta, w1 to w4 live in the segmentation.
+    The defaults belong to `in_pixels`, where every term is measured in pixels; in the paper's
+    units (lengths with sum_i c_i D_i = 1) other values are needed. beta, w1 to w4 live in the
+    segmentation.
 
     Attributes:
-        arap: Factor of E_arap (the paper's is 1).
+        arap: Factor of E_arap (the paper's is 1; only the ratios of the four factors matter).
         proj: alpha1, per pixel of re-projection error.
         cont: alpha2.
         orient: alpha3.
@@ -36,14 +38,14 @@ class Weights:
         sigma_proj: Truncation of a pixel's re-projection error, pixels; inf is the paper's form.
     """
 
-    arap: float = 1.0
+    arap: float = 0.15
     proj: float = 1.0
-    cont: float = 1.0
-    orient: float = 1.0
+    cont: float = 3e-4
+    orient: float = 5e-3
     sigma_cont: float = 1.0
     sigma_cont_ref: float = np.inf
     sigma_orient: float = 0.5
-    sigma_arap: float = np.inf
+    sigma_arap: float = 1.0
     sigma_proj: float = np.inf
 
 
@@ -106,6 +108,15 @@ class EnergyData:
             f"EnergyData({len(self)} superpixels x {self.pixel_ray.shape[1]} pixels,"
             f" {len(self.edges)} edges, {len(self.pairs)} pairs x {self.boundary_ray.shape[1]})"
         )
+
+    def visibility_ray(self, depth_ratio: float) -> Float:
+        """(N, V, 3) rays v with `-n . v >= c` for visibility: the anchor, then r_rim - r_a / ratio.
+
+        The latter bounds the depth at a rim pixel by `ratio` times the anchor's and implies
+        `-n . r_rim >= c`.
+        """
+        rim = self.rim_ray[:, 1:] - self.rim_ray[:, :1] / depth_ratio
+        return np.concatenate([self.rim_ray[:, :1], rim], axis=1)
 
     def arrays(self) -> dict[str, Float]:
         """Every array by name, for storing."""
@@ -185,7 +196,9 @@ def build_energy_data(
     )
 
 
-def in_pixels(data: EnergyData, soup: Soup, seg: Segmentation) -> EnergyData:
+def in_pixels(
+    data: EnergyData, soup: Soup, seg: Segmentation, rotation_px: float | None = None
+) -> EnergyData:
     """The same data with every term measured in pixels: the weights mean the same on every scene.
 
     A rotation by an angle a moves the image by `focal a`; a length l at depth Z by `focal l / Z`;
@@ -198,6 +211,7 @@ def in_pixels(data: EnergyData, soup: Soup, seg: Segmentation) -> EnergyData:
         data: Data in the paper's units.
         soup: Start, for the ratio of baseline and depth.
         seg: For the neighbourhoods.
+        rotation_px: Pixels that a radian of rotation difference costs; default the focal length.
     """
     ratio = np.linalg.norm(soup.translation, axis=1) / soup.depth_at(data.anchor_ray)
     if seg.knn.shape[1]:
@@ -210,6 +224,6 @@ def in_pixels(data: EnergyData, soup: Soup, seg: Segmentation) -> EnergyData:
         data,
         local_units=True,
         edge_unit=np.full(len(data.edges), 1.0 / focal),
-        rotation_scale=focal,
+        rotation_scale=rotation_px or focal,
         pair_unit=1.0 / (focal * np.sqrt(ri * rk)),
     )

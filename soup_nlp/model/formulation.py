@@ -36,23 +36,25 @@ class Formulation:
         norm: "smooth" (sqrt(|v|^2 + eps^2) - eps) or "epigraph" (slack s, |v|^2 <= s^2).
         truncation: "smooth" or "lifted" (z in [0, 1], exact).
         hessian: "exact", "gauss-newton" or "gauss-newton+constraints".
-        eps: Smoothing of lengths and rotations (mean plane distance, radians).
+        eps: Smoothing of lengths and rotations, in the energy's unit (pixels by default).
         eps_pixel: Smoothing of re-projection errors, pixels.
         theta: Share of curvature along a residual that the Gauss-Newton Hessian leaves out.
         ridge: Added to the Gauss-Newton Hessian's diagonal.
         min_facing: Visibility: lower bound c of -n . r.
+        depth_ratio: Depth at a rim pixel is at most this many times the anchor's.
         compiled: Compile kernels where a C compiler is found.
     """
 
     gauge: Gauge = "unit-offset"
     norm: NormForm = "smooth"
     truncation: TruncationForm = "smooth"
-    hessian: str = "gauss-newton"
-    eps: float = 1e-3
+    hessian: str = "gauss-newton+constraints"
+    eps: float = 1e-2
     eps_pixel: float = 1e-2
     theta: float = 0.9
     ridge: float = 1e-2
     min_facing: float = 1e-3
+    depth_ratio: float = 5.0
     compiled: bool = True
 
 
@@ -329,7 +331,13 @@ def build_matrix_nlp(
     ray = ca.SX.sym("rays", 3 * count)
     rows = b.new_rows("visible", count * n, form.min_facing, np.inf).reshape(n, count)
     b.add_constraint(
-        "visible", x, ray, terms.visibility(v, ray, count), every, data.rim_ray.reshape(n, -1), rows
+        "visible",
+        x,
+        ray,
+        terms.visibility(v, ray, count),
+        every,
+        data.visibility_ray(form.depth_ratio).reshape(n, -1),
+        rows,
     )
     row = np.tile(b.new_rows("simplex", 1, 1.0, 1.0), (n, 1))
     b.add_constraint("simplex", x, none, v.lam / n, every, empty, row)
@@ -378,16 +386,15 @@ def _metric(layout: MatrixLayout, x: Float, data: EnergyData) -> Float:
 
 
 def build_tangent_nlp(
-    soup: Soup, data: EnergyData, weights: Weights, form: Formulation, max_slope: float = 0.8
+    soup: Soup, data: EnergyData, weights: Weights, form: Formulation
 ) -> tuple[NLP, TangentLayout]:
-    """The presolve: 9 free coordinates per superpixel about the soup, one constraint.
+    """The presolve: 9 coordinates per superpixel about the soup, linear constraints only.
 
     Args:
         soup: Base and start.
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
         form: Smoothing and Hessian; gauge is not used.
-        max_slope: Bound of each slope: depth stays positive on the whole superpixel.
     """
     n = len(data)
     layout = TangentLayout.about(soup, data)
@@ -407,12 +414,26 @@ def build_tangent_nlp(
     b.add_constraint(
         "t_simplex", lam, part, part * lam, np.arange(n)[:, None] * 9, share[:, None], row
     )
+    # visibility as in the constrained NLP, linear in the slopes
+    count = data.rim_ray.shape[1] - 1
+    off = (data.rim_ray[:, 1:] - data.rim_ray[:, :1])[..., :2] / layout.radius[:, None, None]
+    slope, place = ca.SX.sym("slope", 2), ca.SX.sym("off", 2 * count)
+    rows = b.new_rows("visible", count * n, 1 / form.depth_ratio - 1 + 1e-2, np.inf)
+    b.add_constraint(
+        "t_visible",
+        slope,
+        place,
+        ca.vertcat(*[ca.dot(slope, place[2 * j : 2 * j + 2]) for j in range(count)]),
+        np.arange(n)[:, None] * 9 + np.array([1, 2]),
+        off.reshape(n, -1),
+        rows.reshape(n, count),
+    )
     b.add_ridge(np.ones(9 * n))
     lower, upper = np.full((n, 9), -np.inf), np.full((n, 9), np.inf)
     lower[:, 0] = 1e-3
-    lower[:, 1:3], upper[:, 1:3] = -max_slope, max_slope
+    lower[:, 1:3], upper[:, 1:3] = -0.99 * form.depth_ratio, 0.99 * form.depth_ratio
     extra = b.nx - 9 * n
-    x0 = np.concatenate([layout.pack(soup), np.zeros(extra)])
+    x0 = np.concatenate([_visible(layout.pack(soup), off, form.depth_ratio), np.zeros(extra)])
     nlp = _finish(
         "presolve",
         b,
@@ -424,6 +445,15 @@ def build_tangent_nlp(
     )
     nlp = _with_slacks(nlp, 9 * n)
     return nlp, layout
+
+
+def _visible(x: Float, off: Float, depth_ratio: float) -> Float:
+    """Shrink the slopes of a presolve vector until every rim pixel is visible."""
+    x = x.reshape(-1, 9).copy()
+    least = np.einsum("nc,nvc->nv", x[:, 1:3], off).min(axis=1)
+    limit = 0.95 * (1 / depth_ratio - 1)
+    x[:, 1:3] *= np.minimum(1.0, limit / np.minimum(least, limit))[:, None]
+    return x.ravel()
 
 
 def _finish(

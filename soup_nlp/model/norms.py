@@ -107,6 +107,7 @@ def solver_form(
     elif switch is not None:
         value, slope = switch * y + (1 - switch) * norm.sigma, switch
     else:
-        width = norm.eps if norm.kind == "norm" else 0.2 * norm.sigma
+        # a corner as sharp as eps makes the truncation as hard as the norm itself
+        width = ca.fmax(norm.eps, 0.3 * norm.sigma)
         value, slope = smooth_min(y, norm.sigma, width)
     return Form(norm.weight * value, norm.weight * slope * dy * outer, constraint)

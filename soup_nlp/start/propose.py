@@ -118,9 +118,9 @@ def propose(
     motions = _dominant(views, o)
     fit = views.fit(motions)
     cost = _penalised(fit)
+    noise = _noise(cost)
     # what no motion explains yet, piece by piece
     for _ in range(o.rounds):
-        noise = _noise(cost)
         extra = _of_pieces(views, seg, motions, cost, noise, o)
         if not extra:
             break
@@ -129,10 +129,10 @@ def propose(
         cost = _penalised(fit)
         kept = _select(cost, noise, o)
         motions, fit, cost = [motions[c] for c in kept], _columns(fit, kept), cost[:, kept]
+        noise = _noise(cost)
     # the dominant motion is preferred where another is not clearly better
     prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * o.unexplained_px))
     label = _smooth_choice(cost + prefer, seg, o.smoothness)
-    noise = _noise(cost)
     R = np.stack([m.R for m in motions])[label]
     t = np.stack([m.t for m in motions])[label]
     take = np.arange(len(seg)), label
