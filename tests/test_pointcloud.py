@@ -135,6 +135,8 @@ def test_points_at_a_jump_of_depth_are_left_out(tmp_path):
     # columns 1 and 2 face a jump from 1 to 2; 2.0 beside an unknown pixel stays
     np.testing.assert_allclose(kept[0][:, 2], [1.0, 2.0, 1.0])
     assert len(points_from_depth(z, K, image, max_edge=2.0)[0]) == 7
+    pair = np.array([[1.0, 1.0515]])  # a share of the nearer: 0.0515, of the farther: 0.049
+    assert not len(points_from_depth(pair, K, image[:1, :2], max_edge=0.05)[0])
     assert write_ply(tmp_path / "a.ply", *kept) == 3
     empty = points_from_depth(np.full((2, 4), np.nan), K, image, max_edge=0.1)
     assert write_ply(tmp_path / "a.ply", *empty) == 0
