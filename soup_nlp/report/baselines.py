@@ -21,8 +21,9 @@ MIN_CORRESPONDENCES = 8
 TIGHT = 0.1
 """The motion is also looked for with this fraction of the inlier distance."""
 
-FAR = 1000.0
-"""Depths beyond this multiple of the median depth count as unknown: there is no parallax left."""
+FAR = 100.0
+"""Depths beyond this multiple of the median depth count as unknown: there is no parallax left.
+True depths of driving and indoor pairs reach 14 times their median."""
 
 
 @dataclass(frozen=True)
