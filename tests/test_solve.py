@@ -584,19 +584,18 @@ def slanted() -> tuple[Soup, EnergyData]:
 
 
 @pytest.mark.parametrize(
-    ("gauge", "presolve", "hessian"),
+    ("gauge", "hessian"),
     [
-        *[(g, True, "gauss-newton+constraints") for g in GAUGES],
-        *[("unit-offset", True, h) for h in HESSIANS if h != "gauss-newton+constraints"],
-        ("unit-offset", False, "exact"),
+        *[(g, "gauss-newton+constraints") for g in GAUGES],
+        *[("unit-offset", h) for h in HESSIANS if h != "gauss-newton+constraints"],
     ],
 )
-def test_a_rigid_plane_is_recovered_from_a_disturbed_start(slanted, gauge, presolve, hessian):
+def test_a_rigid_plane_is_recovered_from_a_disturbed_start(slanted, gauge, hessian):
     """E >= 0 and E = 0 at the truth: the optimum is known."""
     truth, data = slanted
     start = disturbed(truth, 0.05)
     weights = replace(PAPER, cont=0.05, sigma_cont=np.inf, sigma_orient=0.5, proj=1.0)
-    options = replace(OPTIONS, presolve=presolve, tol=1e-6, presolve_tol=1e-5, max_iter=200)
+    options = replace(OPTIONS, tol=1e-6, presolve_tol=1e-5, max_iter=200)
     solution = solve_soup(start, data, weights, form(gauge=gauge, hessian=hessian), options)
     before, after = solution.energy_start["total"], solution.energy["total"]
     assert before > 10

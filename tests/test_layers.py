@@ -1,0 +1,210 @@
+"""The house stands as DESIGN says: each room knows only the rooms before it."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "soup_nlp"
+
+ALLOWED = {
+    # rays, rotations and graphs: nothing but numbers
+    "geometry": {"errors"},
+    # the ray caster needs cameras and rotations
+    "data": {"errors", "geometry"},
+    "model": {"errors", "data", "geometry"},
+    "start": {"errors", "data", "geometry", "model"},
+    "solve": {"errors", "data", "geometry", "model", "start"},
+    "export": {"errors", "geometry", "model", "solve"},
+    "refine": {"errors", "data", "geometry", "model", "solve"},
+    "report": {"errors", "data", "geometry", "model", "start", "solve", "refine", "export"},
+}
+"""Rooms in their order. Modules beside the rooms (cli, config ...) may import every room; no room
+may import them, but for `errors`."""
+
+DOORS = {
+    # records cross the door, readers of files do not
+    ("model", "data"): {"data.pair"},
+    ("start", "data"): {"data.pair"},
+    ("start", "model"): {"model.energy"},
+    ("solve", "data"): {"data.pair"},
+    ("refine", "data"): {"data.pair"},
+}
+"""Where one room may enter another only through some of its modules."""
+
+LIBRARIES = {
+    "casadi": {"model", "solve", "export"},
+    "matplotlib": {"report"},
+    "h5py": {"report", "data"},
+    "typer": {"cli"},
+    "rich": {"cli", "report"},
+    "yaml": {"config", "data", "report", "cli"},
+    "cv2": {"data", "start", "report"},
+    "skimage": {"data", "geometry"},
+}
+"""Which rooms may import a library; `importlib.metadata` names versions without importing."""
+
+NUMBERS_ONLY = ("model.plain", "model.energy", "model.layout")
+"""Modules that must not reach casadi, not even through others: the oracle shares nothing with the
+symbolic model."""
+
+
+def modules() -> dict[str, Path]:
+    """Module name inside the package ("model.nlp", "errors") to file."""
+    out = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        if parts[-1] == "__init__":
+            parts = parts[:-1]
+        out[".".join(parts)] = path
+    return out
+
+
+MODULES = modules()
+
+
+def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[str]:
+    """Absolute names that a module imports, also inside functions."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (a.name for a in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                home = f"soup_nlp.{module}".rstrip(".").split(".")
+                keep = len(home) - node.level + is_package
+                base = ".".join([*home[:keep], *([base] if base else [])])
+            yield from (f"{base}.{a.name}" for a in node.names)
+
+
+def own(name: str) -> str | None:
+    """The package's module that an imported name is, or is in; None for a foreign one."""
+    if name != "soup_nlp" and not name.startswith("soup_nlp."):
+        return None
+    inner = name.removeprefix("soup_nlp").lstrip(".")
+    while inner and inner not in MODULES:
+        inner = inner.rpartition(".")[0]
+    return inner
+
+
+def graph() -> tuple[dict[str, set[str]], dict[str, set[str]]]:
+    """(own modules, foreign libraries) that every module imports."""
+    inside: dict[str, set[str]] = {}
+    outside: dict[str, set[str]] = {}
+    for module, path in MODULES.items():
+        inside[module], outside[module] = set(), set()
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for name in imports(tree, module, path.name == "__init__.py"):
+            target = own(name)
+            if target is None:
+                outside[module].add(name.partition(".")[0])
+            elif target != module:
+                inside[module].add(target)
+    return inside, outside
+
+
+INSIDE, OUTSIDE = graph()
+
+
+def room(module: str) -> str:
+    return module.partition(".")[0]
+
+
+def test_the_parser_sees_the_imports():
+    # or everything below would pass on nothing
+    assert {"geometry.soup", "model.plain", "model.nlp"} <= INSIDE["solve.soup"]
+    assert "model.energy" in INSIDE["start.propose"]
+    assert "casadi" in OUTSIDE["model.kernel"]
+    tree = ast.parse("def f():\n    from ..model import nlp\n    from . import trws")
+    found = set(imports(tree, "refine.mppbp", False))
+    assert found == {"soup_nlp.model.nlp", "soup_nlp.refine.trws"}
+    assert own("soup_nlp.model.nlp.NLP") == "model.nlp"
+    assert own("soup_nlp.__version__") == ""
+    assert own("soup_nlpx") is None
+
+
+def test_every_room_has_its_place_in_the_order():
+    rooms = {room(m) for m, p in MODULES.items() if p.parent != PACKAGE}
+    assert rooms <= ALLOWED.keys(), "a new room: say in ALLOWED what it may import"
+    order = list(ALLOWED)
+    for here, known in ALLOWED.items():
+        later = {r for r in known - {"errors"} if order.index(r) >= order.index(here)}
+        assert not later, f"{here} is placed before {later}"
+
+
+def test_no_room_imports_a_later_room():
+    wrong = [
+        f"{module} imports {target}"
+        for module, targets in INSIDE.items()
+        if room(module) in ALLOWED
+        for target in sorted(targets)
+        # "" is the package itself: its version
+        if target and room(target) not in {room(module), *ALLOWED[room(module)]}
+    ]
+    assert not wrong
+
+
+def test_rooms_are_entered_through_their_doors():
+    wrong = [
+        f"{module} imports {target}"
+        for module, targets in INSIDE.items()
+        for target in sorted(targets)
+        if target not in DOORS.get((room(module), room(target)), {target})
+    ]
+    assert not wrong
+
+
+def test_errors_import_nothing_of_the_house():
+    assert not INSIDE["errors"]
+    assert OUTSIDE["errors"] <= set(sys.stdlib_module_names)
+
+
+def test_message_passing_knows_labels_and_costs_only():
+    for module in MODULES:
+        if module.startswith("refine.trws"):
+            assert {t for t in INSIDE[module] if not t.startswith("refine.trws")} <= {"errors"}
+            assert OUTSIDE[module] <= {"numpy", "scipy", *sys.stdlib_module_names}
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_a_library_stays_in_its_rooms(library):
+    wrong = {m for m, names in OUTSIDE.items() if library in names} - {
+        m for m in MODULES if room(m) in LIBRARIES[library]
+    }
+    assert not wrong
+
+
+def reached(module: str) -> set[str]:
+    """Every module that importing one brings along, itself included."""
+    seen, todo = set(), [module]
+    while todo:
+        here = todo.pop()
+        if here not in seen:
+            seen.add(here)
+            todo += INSIDE[here]
+    return seen
+
+
+@pytest.mark.parametrize("module", NUMBERS_ONLY)
+def test_numbers_do_not_reach_symbols(module):
+    with_symbols = {m for m in reached(module) if "casadi" in OUTSIDE[m]}
+    assert not with_symbols
+
+
+def test_modules_do_not_import_in_circles():
+    for module in MODULES:
+        for target in INSIDE[module]:
+            # the package itself is imported for its version and imports nothing back
+            if target:
+                assert module not in reached(target), f"{module} and {target} need each other"
+
+
+def test_every_module_says_in_its_first_line_what_it_is_for():
+    for module, path in MODULES.items():
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+        assert text, module
+        assert len(text.splitlines()[0]) > 10, module
