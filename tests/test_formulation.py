@@ -604,6 +604,53 @@ def test_two_superpixels_by_hand():
     assert e["orient"] == 0
 
 
+def test_pixel_units_by_hand():
+    """At depth Z under a baseline T: a turn costs focal x angle, a motion gap g costs focal g / Z,
+    a depth gap g costs the parallax focal (g / Z) (T / Z)."""
+    Z, T, g = 2.0, 0.1, 1e-4
+    soup, data = world("fronto-parallel, sideways", "pixels", False)
+    soup = replace(soup, lam=soup.lam.copy(), R=soup.R.copy(), t=soup.t.copy())
+    base = np.linalg.norm(WORLDS["fronto-parallel, sideways"][1][:3, 3])
+    assert base == pytest.approx(np.hypot(T, 0.03))
+    focal = 90.0
+    here = 5
+    edge = (data.edges == here).any(axis=1)
+    wide = replace(PAPER, sigma_cont=np.inf)
+    arap = data.edge_weight * edge
+    turned = soup.R.copy()
+    angle = 1e-3
+    turned[here] = turned[here] @ rotation.exp([0, 0, angle])
+    # |R_i - R_k|_F = sqrt(8) sin(angle / 2); turning about z leaves the camera's own motion
+    e = plain.arap(replace(soup, R=turned), data, wide)
+    rotating = focal * np.sqrt(8) * np.sin(angle / 2)
+    np.testing.assert_array_less(arap * rotating - 1e-9, e)
+    assert np.median(e[edge] / (arap[edge] * rotating)) == pytest.approx(1, abs=0.5)
+    moved = soup.t.copy()
+    moved[here] += [0, 0, g / soup.lam[here]]
+    gap = plain.arap(replace(soup, t=moved), data, wide)
+    at_least = arap * focal * g / Z
+    assert (gap >= at_least - 1e-9).all()
+    assert (gap <= 2 * at_least + 1e-9).all()
+    assert gap[edge].min() > 0
+    # deeper by g, with the motion unchanged: both frames' gaps are g along the rays
+    deeper = replace(soup, d=np.where(np.arange(12) == here, soup.d * (1 + g / Z), soup.d))
+    cont = plain.continuity(deeper, data, wide)
+    pair = (data.pairs == here).any(axis=1)
+    length = np.linalg.norm(data.boundary_ray, axis=2)
+    whole = np.sqrt(np.sum(length**2, axis=1)) * data.pair_factor
+    parallax = focal * (g / Z) * (base / Z)
+    expected = 2 * data.pair_weight * pair * whole * parallax
+    np.testing.assert_allclose(cont, expected, rtol=1e-3, atol=1e-9)
+
+
+def test_a_camera_at_rest_counts_half_a_pixel_of_parallax():
+    data = world("at rest", "pixels", False)[1]
+    focal = float(data.K_next[0, 0])
+    np.testing.assert_allclose(data.pair_unit, 1 / 0.5)
+    np.testing.assert_allclose(data.edge_unit, 1 / focal)
+    assert data.local_units
+
+
 def test_sampled_boundaries_stand_for_the_whole():
     """With constant gaps the sampled Frobenius norm, times its factor, is that of all points."""
     soup = random_soup(0, 12, spread=0.0)
