@@ -69,6 +69,11 @@ def smooth_min(y: ca.SX, sigma: ca.SX, width: ca.SX) -> tuple[ca.SX, ca.SX]:
     return (y + sigma - root) / 2 - at_zero, (1 - (y - sigma) / root) / 2
 
 
+def _corner(norm: Norm) -> ca.SX:
+    """Width of a truncation's corner: as sharp as eps it would be as hard as the norm itself."""
+    return ca.fmax(norm.eps, 0.3 * norm.sigma)
+
+
 def solver_form(
     norm: Norm,
     x: ca.SX,
@@ -101,13 +106,15 @@ def solver_form(
         root = ca.sqrt(square + norm.eps**2)
         y, dy = root - norm.eps, 1 / root
         along = ca.mtimes(J.T, v / root)
+        if norm.sigma is not None and switch is None:
+            # near its corner a truncated norm is concave along the residual: there only the full
+            # reweighted curvature still bounds it from above
+            theta = theta * smooth_min(y, norm.sigma, _corner(norm))[1] ** 2
         outer = ca.mtimes(J.T, J) - theta * ca.mtimes(along, along.T)
     if norm.sigma is None:
         value, slope = y, ca.SX(1.0)
     elif switch is not None:
         value, slope = switch * y + (1 - switch) * norm.sigma, switch
     else:
-        # a corner as sharp as eps makes the truncation as hard as the norm itself
-        width = ca.fmax(norm.eps, 0.3 * norm.sigma)
-        value, slope = smooth_min(y, norm.sigma, width)
+        value, slope = smooth_min(y, norm.sigma, _corner(norm))
     return Form(norm.weight * value, norm.weight * slope * dy * outer, constraint)

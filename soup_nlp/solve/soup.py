@@ -43,13 +43,13 @@ class SolverOptions:
     """
 
     presolve: bool = True
-    presolve_eps: tuple[float, ...] = (0.1, 0.03, 0.01)
+    presolve_eps: tuple[float, ...] = (0.1, 0.03)
     presolve_iterations: int = 30
-    presolve_last_iterations: int = 150
+    presolve_last_iterations: int = 100
     presolve_tol: float = 1e-3
     presolve_theta: float = 0.9
     stagnation: float = 1e-4
-    eps: float = 0.01
+    eps: float = 0.03
     max_iter: int = 100
     tol: float = 1e-2
     max_seconds: float = 600.0
