@@ -195,9 +195,7 @@ def _sample_along(points: Float, which: Int, count: Int, samples: int | None) ->
     n_pairs = len(count)
     mean = np.stack([np.bincount(which, points[:, c]) / count for c in (0, 1)], axis=1)
     off = points - mean[which]
-    sxx, syy, sxy = (
-        np.bincount(which, off[:, a] * off[:, b]) for a, b in ((0, 0), (1, 1), (0, 1))
-    )
+    sxx, syy, sxy = (np.bincount(which, off[:, a] * off[:, b]) for a, b in ((0, 0), (1, 1), (0, 1)))
     angle = 0.5 * np.arctan2(2 * sxy, sxx - syy)
     along = off[:, 0] * np.cos(angle)[which] + off[:, 1] * np.sin(angle)[which]
     order = np.lexsort((along, which))

@@ -172,9 +172,7 @@ class _Builder:
             metric: (n,) squared inverse length of a natural step of the first n variables.
         """
         x, m = ca.SX.sym("x"), ca.SX.sym("metric")
-        kernel = Kernel(
-            "ridge", x, m, self.theta, objective=0 * x, curvature=self.theta[3] * m
-        )
+        kernel = Kernel("ridge", x, m, self.theta, objective=0 * x, curvature=self.theta[3] * m)
         self.groups.append(Group(kernel, Table(np.arange(len(metric))[:, None], metric[:, None])))
 
 
@@ -220,7 +218,13 @@ def _elements(
         columns,
         e,
         lambda v, row, eps, _: terms.arap(
-            v[0], v[1], row, eps, bool(np.isfinite(w.sigma_arap)), data.arap_at_anchors, data.local_units
+            v[0],
+            v[1],
+            row,
+            eps,
+            bool(np.isfinite(w.sigma_arap)),
+            data.arap_at_anchors,
+            data.local_units,
         ),
     )
     n, s = data.pixel_weight.shape
@@ -401,7 +405,9 @@ def build_tangent_nlp(
     b = _Builder(form, 9 * n)
 
     def view(x: ca.SX, row: dict[str, ca.SX], a: int) -> View:
-        return tangent_view(x, row[f"anchor_{a}"], row[f"radius_{a}"], row[f"depth_{a}"], row[f"R0_{a}"])
+        return tangent_view(
+            x, row[f"anchor_{a}"], row[f"radius_{a}"], row[f"depth_{a}"], row[f"R0_{a}"]
+        )
 
     for name, element in _elements(data, weights, layout).items():
         placed = np.concatenate([layout.of(c) for c in element.index.T], axis=1)

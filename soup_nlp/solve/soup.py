@@ -136,9 +136,7 @@ def solve_soup(
     if plain.energy(soup, data, weights)["total"] > plain.energy(start, data, weights)["total"]:
         soup = start
     mark = time.perf_counter()
-    nlp, layout = build_matrix_nlp(
-        soup, data, weights, replace(form, eps=o.eps, eps_pixel=o.eps)
-    )
+    nlp, layout = build_matrix_nlp(soup, data, weights, replace(form, eps=o.eps, eps_pixel=o.eps))
     seconds["build"] = time.perf_counter() - mark
     seconds["compile"] = nlp.compile_seconds
     say(str(nlp))

@@ -276,7 +276,9 @@ def _local(
             break
         near = np.column_stack([np.arange(n), seg.knn[:, : min(size, k)]])
         step = max(1, near.shape[1] * views.ray.shape[1] // 200)
-        r, q, w = (neighbourhood(v[:, ::step], near) for v in (views.ray, views.target, views.weight))
+        r, q, w = (
+            neighbourhood(v[:, ::step], near) for v in (views.ray, views.target, views.weight)
+        )
         t1 = fit_translation(R, r, q, w, views.focal[0], max(noise, 0.1))
         R2, t2 = refine_motion(R, t, r, q, w, views.focal[0], max(noise, 0.1))
         R3, t3 = refine_motion(R, t1, r, q, w, views.focal[0], max(noise, 0.1))

@@ -1,0 +1,227 @@
+"""The command line: exit code 0 good, 1 not converged or a claim fails, 2 bad input."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from soup_nlp.config import Problem, dump_problem, load_problem, make_problem
+from soup_nlp.data.scenes import SCENES
+from soup_nlp.errors import ConfigError, SoupError
+from soup_nlp.pipeline import evaluate as evaluate_folder
+from soup_nlp.pipeline import run as run_problem
+from soup_nlp.report.check import check_folder
+from soup_nlp.report.folder import prepare_folder, write_folder, write_text
+from soup_nlp.solve.ipopt import Progress, interruptible
+from soup_nlp.verdict import verdict
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.",
+)
+
+Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
+
+
+class _Teller:
+    """Lines for the terminal and the log; iterations rewrite one line on a terminal."""
+
+    def __init__(self, quiet: bool) -> None:
+        self.console = Console(stderr=True, highlight=False)
+        self.quiet = quiet
+        self.lines: list[str] = []
+        self.live = self.console.is_terminal and not quiet
+
+    def say(self, line: str) -> None:
+        """A line after a stage."""
+        self.lines.append(line)
+        if not self.quiet:
+            self._clear()
+            self.console.print(line, markup=False)
+
+    def iteration(self, progress: Progress) -> None:
+        """A line per iteration."""
+        line = str(progress)
+        self.lines.append(line)
+        if self.live:
+            self._clear()
+            self.console.file.write(line)
+            self.console.file.flush()
+
+    def _clear(self) -> None:
+        if self.live:
+            self.console.file.write("\r\x1b[2K")
+
+
+@app.command()
+def solve(
+    problem: Annotated[Path | None, typer.Argument(help="Problem file, see problems/.")] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Result folder.")] = Path("out/run"),
+    overrides: Set = None,
+    ref: Annotated[str | None, typer.Option(help="Reference image.")] = None,
+    next_: Annotated[str | None, typer.Option("--next", help="Next image.")] = None,
+    intrinsics: Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels.")] = None,
+    intrinsics_next: Annotated[
+        str | None, typer.Option(help="fx,fy,cx,cy of the next frame, if they differ.")
+    ] = None,
+    flow: Annotated[str | None, typer.Option(help=".flo, KITTI .png or .npy; default DIS.")] = None,
+    depth: Annotated[str | None, typer.Option(help="True depth of the reference frame.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
+) -> None:
+    """Solve a pair of frames and write a result folder."""
+    if problem is not None:
+        if ref or next_ or intrinsics:
+            raise ConfigError("give a problem file or --ref/--next/--intrinsics, not both")
+        chosen = load_problem(problem, overrides or [])
+    else:
+        chosen = _from_options(ref, next_, intrinsics, intrinsics_next, flow, depth, overrides)
+    folder = prepare_folder(out)
+    config = dump_problem(chosen)
+    teller = _Teller(quiet)
+    ipopt_log = folder / "ipopt.log"
+    ipopt_log.unlink(missing_ok=True)
+    write_text(folder / "config.yaml", config)
+    try:
+        with interruptible() as stop:
+            run = run_problem(
+                chosen,
+                listener=teller.iteration,
+                stop=stop,
+                say=teller.say,
+                ipopt_log=str(ipopt_log),
+            )
+    except BaseException as error:
+        teller.lines.append(f"failed: {error}")
+        write_text(folder / "log.txt", "\n".join(teller.lines) + "\n")
+        raise
+    files = write_folder(folder, run, config, "\n".join(teller.lines) + "\n")
+    text = verdict(run, folder, files)
+    write_text(folder / "log.txt", "\n".join([*teller.lines, text]) + "\n")
+    print(text)
+    # what a problem file expects holds for the file as it is
+    limit = None if overrides else chosen.expected.mre_at_most
+    missed = limit is not None and run.metrics and run.metrics["solution"].mre > limit
+    if missed:
+        print(f"expected    MRE at most {limit}: missed")
+    raise typer.Exit(0 if run.solution.converged and not missed else 1)
+
+
+def _four(text: str, option: str) -> list[float]:
+    try:
+        values = [float(x) for x in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 4:
+        raise ConfigError(
+            "camera is not four numbers", where=option, found=text, expected="fx,fy,cx,cy"
+        )
+    return values
+
+
+def _from_options(
+    ref: str | None,
+    next_: str | None,
+    intrinsics: str | None,
+    intrinsics_next: str | None,
+    flow: str | None,
+    depth: str | None,
+    overrides: Sequence[str] | None,
+) -> Problem:
+    if not (ref and next_ and intrinsics):
+        raise ConfigError(
+            "nothing to solve",
+            found="no problem file",
+            expected="PROBLEM.yaml, or --ref, --next and --intrinsics",
+            hint="soup-nlp solve problems/motorcycle.yaml --out out/motorcycle",
+        )
+    source: dict[str, Any] = {
+        "kind": "files",
+        "ref": ref,
+        "next": next_,
+        "intrinsics": _four(intrinsics, "--intrinsics"),
+    }
+    if intrinsics_next:
+        source["intrinsics_next"] = _four(intrinsics_next, "--intrinsics-next")
+    if depth:
+        source["depth"] = depth
+    raw: dict[str, Any] = {"name": Path(ref).stem, "input": source, "base": str(Path.cwd())}
+    if flow:
+        raw["flow"] = {"source": flow}
+    return make_problem(raw, overrides or [], where="command line")
+
+
+@app.command()
+def check(folder: Annotated[Path, typer.Argument(help="Result folder.")]) -> None:
+    """Recompute energy, constraints and metrics of a result from its arrays."""
+    report = check_folder(folder)
+    print(report)
+    print("every claim holds" if report.ok else "a claim does not hold")
+    raise typer.Exit(0 if report.ok else 1)
+
+
+@app.command()
+def evaluate(
+    folder: Annotated[Path, typer.Argument(help="Result folder.")],
+    depth: Annotated[Path, typer.Option(help="True depth: .dpt, .npy, .pfm, 16-bit .png (mm).")],
+    scale: Annotated[str, typer.Option(help="median, mre, lsq or none.")] = "median",
+    cap: Annotated[float | None, typer.Option(help="Drop truth beyond this depth.")] = None,
+) -> None:
+    """Score a result against a truth file."""
+    if scale not in ("median", "mre", "lsq", "none"):
+        raise ConfigError(
+            "unknown scale rule", where="--scale", found=scale, expected="median, mre, lsq, none"
+        )
+    for name, metrics in evaluate_folder(folder, depth, scale=scale, cap=cap).items():
+        print(f"{name:<9} {metrics}")
+
+
+@app.command()
+def show(
+    problem: Annotated[Path, typer.Argument(help="Problem file.")], overrides: Set = None
+) -> None:
+    """Print the merged problem and its hash."""
+    chosen = load_problem(problem, overrides or [])
+    print(dump_problem(chosen), end="")
+    print(f"# hash {chosen.digest()}")
+
+
+@app.command(name="list")
+def list_() -> None:
+    """Print the rendered scenes."""
+    for name, text in SCENES.items():
+        print(f"{name:<8} {text}")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: Arguments; default sys.argv.
+
+    Returns:
+        0 good, 1 not converged or a claim fails, 2 bad input.
+    """
+    try:
+        code = app(args=list(argv) if argv is not None else None, standalone_mode=False)
+        return int(code or 0)
+    except SoupError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except typer.Exit as done:
+        return int(done.exit_code)
+    except KeyboardInterrupt:
+        print("interrupted before the solve began", file=sys.stderr)
+        return 1
+    except Exception as error:
+        # usage errors of the command line library carry their own message
+        if hasattr(error, "format_message"):
+            print(f"error: {error.format_message()}", file=sys.stderr)
+            return 2
+        raise
