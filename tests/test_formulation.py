@@ -142,7 +142,10 @@ def test_names_of_the_presolve():
     problem = tiny()
     nlp, _ = build_tangent_nlp(problem.soup, problem.data, PAPER, form())
     assert len(set(nlp.x_names())) == nlp.nx == 9 * 12
-    assert nlp.g_names() == ["simplex[0]"]
+    names = nlp.g_names()
+    assert len(set(names)) == nlp.ng
+    assert {re.sub(r"\[.*", "", name) for name in names} == {"simplex", "visible"}
+    assert nlp.x_names()[9:12] == ["lam[1]", "s1[1]", "s2[1]"]
 
 
 def test_sizes_are_those_of_the_formulation():
@@ -253,7 +256,9 @@ def test_the_start_is_feasible(gauge, norm, truncation):
 def test_the_start_of_the_presolve_is_feasible():
     problem = tiny("pixels")
     nlp, _ = build_tangent_nlp(problem.soup, problem.data, weights_for("pixels"), form())
-    np.testing.assert_allclose(value(nlp, nlp.x0)[1], 1.0, atol=1e-12)
+    g = value(nlp, nlp.x0)[1]
+    assert g[nlp.g_names().index("simplex[0]")] == pytest.approx(1.0, abs=1e-12)
+    assert np.maximum(nlp.lbg - g, g - nlp.ubg).max() <= 1e-9
     assert ((nlp.lbx <= nlp.x0) & (nlp.x0 <= nlp.ubx)).all()
 
 
@@ -261,7 +266,7 @@ def test_the_start_of_the_presolve_is_feasible():
 def test_constraints_say_what_is_wrong_with_a_point(gauge):
     """Each kind of constraint reacts to its own violation, by the amount of the formula."""
     problem = tiny()
-    nlp, layout = problem.nlp(PAPER, form(gauge=gauge))
+    nlp, layout = problem.nlp(PAPER, form(gauge=gauge, depth_ratio=4.0))
     names, x_names = nlp.g_names(), nlp.x_names()
 
     def rows(kind: str, x: np.ndarray) -> np.ndarray:
@@ -286,9 +291,50 @@ def test_constraints_say_what_is_wrong_with_a_point(gauge):
     np.testing.assert_allclose(
         rows("so3", x).reshape(-1, 6)[4], [0, 0.1, 0.01, 0, 0, 0], atol=1e-12
     )
+    # the anchor faces the camera, and no rim pixel is more than four times as deep
     soup = layout.unpack(nlp.x0)
     facing = -np.einsum("nc,nvc->nv", soup.n, problem.data.rim_ray)
+    facing[:, 1:] -= facing[:, :1] / 4.0
     np.testing.assert_allclose(rows("visible", nlp.x0), facing.ravel(), atol=1e-14)
+    assert (nlp.lbg[[name.startswith("visible") for name in names]] > 0).all()
+
+
+@pytest.mark.parametrize("ratio", [2.0, 5.0])
+def test_visibility_bounds_the_depth_over_a_superpixel(ratio):
+    """A plane that the constrained NLP or the presolve admits is nowhere too steep."""
+    problem, rng = tiny(), np.random.default_rng(0)
+    f = form(depth_ratio=ratio)
+    nlp, layout = problem.nlp(PAPER, f)
+    pre, tangent = build_tangent_nlp(problem.soup, problem.data, PAPER, f)
+    rim = problem.data.rim_ray
+    admitted = 0
+    for _ in range(200):
+        n = rng.normal(0, 1, (12, 3)) * [4, 4, 1]
+        n /= -np.sign(n[:, 2:]) * np.linalg.norm(n, axis=1, keepdims=True)
+        soup = replace(problem.soup, n=n)
+        facing = -np.einsum("nc,nvc->nv", n, rim)
+        steep = (facing[:, 1:] <= facing[:, :1] / ratio).any(axis=1) | (facing <= 0).any(axis=1)
+        g = value(nlp, layout.pack(soup))[1]
+        bad = _violated(nlp, g)
+        assert (bad[facing[:, 0] > 0] >= steep[facing[:, 0] > 0]).all()
+        assert bad[facing[:, 0] <= 0].all()
+        admitted += int((~bad).sum())
+        # the presolve admits no more than the constrained NLP
+        sees = (facing > 0).all(axis=1)
+        other = _violated(pre, value(pre, tangent.pack(replace(soup, n=_facing(n, sees))))[1])
+        assert (other[sees] >= bad[sees]).all()
+    assert admitted > 100
+
+
+def _facing(n: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    """Normals, those not kept replaced by the optical axis."""
+    return np.where(keep[:, None], n, [0.0, 0.0, -1.0])
+
+
+def _violated(nlp: NLP, g: np.ndarray) -> np.ndarray:
+    """(N,) whether any visibility row of a superpixel is violated."""
+    rows = np.array([name.startswith("visible") for name in nlp.g_names()])
+    return (g[rows] < nlp.lbg[rows]).reshape(12, -1).any(axis=1)
 
 
 # --- solver forms and the exact energy -----------------------------------------------------------

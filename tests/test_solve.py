@@ -14,6 +14,7 @@ from helpers_model import (
     GAUGES,
     PAPER,
     gradient,
+    hessian,
     motion,
     plane_pose,
     plane_soup,
@@ -111,12 +112,15 @@ HS071 = np.array([1.0, 4.742999643, 3.821149978, 1.379408294]), 17.0140172892
 
 
 def rosenbrock(n: int, lbx: float = -np.inf, ubx: float = np.inf) -> NLP:
-    """Chained Rosenbrock: one kernel over n - 1 overlapping pairs."""
+    """Chained Rosenbrock: one kernel over n - 1 overlapping pairs.
+
+    The later variable comes first in the kernel: tables need not be sorted.
+    """
     x, row, one = symbols(2, 1)
     kernel = Kernel(
-        "valley", x, row, one, objective=row * (x[1] - x[0] ** 2) ** 2 + (one - x[0]) ** 2
+        "valley", x, row, one, objective=row * (x[0] - x[1] ** 2) ** 2 + (one - x[1]) ** 2
     )
-    index = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)
+    index = np.stack([np.arange(1, n), np.arange(n - 1)], axis=1)
     table = Table(index, np.full((n - 1, 1), 100.0))
     return make_nlp([Group(kernel, table)], [0.8] * n, lbx, ubx, [], [])
 
@@ -180,6 +184,18 @@ def test_chained_rosenbrock_reaches_the_ones():
         "dual_infeasibility": pytest.approx(0, abs=1e-6),
         "complementarity": 0.0,
     }
+
+
+def test_hessian_of_an_unsorted_table_is_upper_triangular():
+    nlp = rosenbrock(4)
+    x = np.array([0.3, -0.5, 0.7, 1.2])
+    H = hessian(nlp, x, 1.0, np.zeros(0))
+    expected = np.zeros((4, 4))
+    for i in range(3):
+        expected[i, i] += 1200 * x[i] ** 2 - 400 * x[i + 1] + 2
+        expected[i + 1, i + 1] += 200
+        expected[i, i + 1] = expected[i + 1, i] = -400 * x[i]
+    np.testing.assert_allclose(H, expected, rtol=1e-12)
 
 
 def test_a_bound_that_cuts_off_the_optimum_is_active_with_its_multiplier():
@@ -584,19 +600,19 @@ def slanted() -> tuple[Soup, EnergyData]:
 
 
 @pytest.mark.parametrize(
-    ("gauge", "hessian"),
+    ("gauge", "kind"),
     [
         *[(g, "gauss-newton+constraints") for g in GAUGES],
         *[("unit-offset", h) for h in HESSIANS if h != "gauss-newton+constraints"],
     ],
 )
-def test_a_rigid_plane_is_recovered_from_a_disturbed_start(slanted, gauge, hessian):
+def test_a_rigid_plane_is_recovered_from_a_disturbed_start(slanted, gauge, kind):
     """E >= 0 and E = 0 at the truth: the optimum is known."""
     truth, data = slanted
     start = disturbed(truth, 0.05)
     weights = replace(PAPER, cont=0.05, sigma_cont=np.inf, sigma_orient=0.5, proj=1.0)
     options = replace(OPTIONS, tol=1e-6, presolve_tol=1e-5, max_iter=200)
-    solution = solve_soup(start, data, weights, form(gauge=gauge, hessian=hessian), options)
+    solution = solve_soup(start, data, weights, form(gauge=gauge, hessian=kind), options)
     before, after = solution.energy_start["total"], solution.energy["total"]
     assert before > 10
     assert after < 1e-3 * before

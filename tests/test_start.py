@@ -246,6 +246,20 @@ def test_superpixels_without_confidence_borrow(corner):
     assert (np.abs(ratio[blind] - 1) < 0.5).all()
 
 
+def test_a_superpixel_without_parallax_borrows_its_depth(corner):
+    """The camera's rotation alone moves it, as it does the sky."""
+    pair, seg, _ = corner
+    far = 27
+    grid = camera.pixel_grid(*pair.size)
+    turned = camera.project(K, camera.rays(K, grid) @ CAMERA[:3, :3].T) - grid
+    uv = np.where((seg.labels == far)[..., None], turned, pair.flow.uv)
+    start = propose(seg, replace(pair.flow, uv=uv), K, K)
+    assert_usable(start, seg)
+    assert start.borrowed[far]
+    z = start.soup.depth_at(camera.rays(K, seg.anchors))
+    assert 0.3 < z[far] / np.median(z[seg.knn[far]]) < 3
+
+
 def test_one_confident_superpixel_is_enough_to_go_on(corner):
     pair, seg, _ = corner
     start = propose(seg, Flow(pair.flow.uv, (seg.labels == 11).astype(float), "test"), K, K)
