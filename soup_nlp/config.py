@@ -28,12 +28,11 @@ class _Strict(BaseModel):
 
 # what a number may be, by field name: everything not named is just finite
 _RANGES: Mapping[str, tuple[float | None, float | None]] = {
-    **{k: (0, None) for k in ("arap", "proj", "cont", "orient", "theta", "ridge", "smoothness")},
-    **{k: (1e-12, None) for k in ("eps", "tol", "presolve_tol", "eps_pixel", "max_seconds")},
-    **{k: (1e-12, None) for k in ("sigma_cont", "sigma_cont_ref", "sigma_orient", "sigma_arap")},
-    **{
-        k: (1, None) for k in ("samples", "dominant", "pieces", "piece_size", "presolve_iterations")
-    },
+    **dict.fromkeys(("arap", "proj", "cont", "orient", "theta", "ridge", "smoothness"), (0, None)),
+    **dict.fromkeys(("eps", "tol", "presolve_tol", "eps_pixel", "max_seconds"), (1e-12, None)),
+    **dict.fromkeys(("sigma_cont", "sigma_cont_ref", "sigma_orient", "sigma_arap"), (1e-12, None)),
+    **dict.fromkeys(("samples", "dominant", "pieces", "piece_size"), (1, None)),
+    "presolve_iterations": (1, None),
     "sigma_proj": (1e-12, None),
     "presolve_last_iterations": (0, None),
     "max_iter": (0, None),
@@ -50,7 +49,8 @@ def _mirror(record: type, name: str, **fixed: Any) -> type[_Strict]:
     for f in fields(record):
         if f.name in fixed:
             continue
-        default = f.default if f.default is not MISSING else f.default_factory()  # type: ignore[misc]
+        factory: Any = f.default_factory
+        default: Any = factory() if f.default is MISSING else f.default
         kind: Any = hints[f.name]
         if typing.get_origin(kind) is tuple:
             kind = list[float]
@@ -67,10 +67,10 @@ def _mirror(record: type, name: str, **fixed: Any) -> type[_Strict]:
     return create_model(name, __base__=_Strict, **made)
 
 
-EnergyWeights = _mirror(Weights, "EnergyWeights")
-StartConfig = _mirror(StartOptions, "StartConfig")
-FormulationConfig = _mirror(Formulation, "FormulationConfig", eps=0, eps_pixel=0)
-SolverConfig = _mirror(SolverOptions, "SolverConfig")
+EnergyWeights: Any = _mirror(Weights, "EnergyWeights")
+StartConfig: Any = _mirror(StartOptions, "StartConfig")
+FormulationConfig: Any = _mirror(Formulation, "FormulationConfig", eps=0, eps_pixel=0)
+SolverConfig: Any = _mirror(SolverOptions, "SolverConfig")
 
 Four = Annotated[list[float], Field(min_length=4, max_length=4)]
 
@@ -206,7 +206,7 @@ class EnergyConfig(_Strict):
     arap_at_anchors: bool = False
     rotation_px: Annotated[float, Field(gt=0)] | None = None
     pixel_samples: Annotated[int, Field(ge=1)] | Literal["all"] = 16
-    weights: EnergyWeights = EnergyWeights()  # type: ignore[valid-type]
+    weights: EnergyWeights = EnergyWeights()
 
 
 class Expected(_Strict):
@@ -231,10 +231,10 @@ class Problem(_Strict):
     seed: Annotated[int, Field(ge=0)] = 0
     segmentation: SegmentationConfig = SegmentationConfig()
     flow: FlowConfig = FlowConfig()
-    start: StartConfig = StartConfig()  # type: ignore[valid-type]
+    start: StartConfig = StartConfig()
     energy: EnergyConfig = EnergyConfig()
-    formulation: FormulationConfig = FormulationConfig()  # type: ignore[valid-type]
-    solver: SolverConfig = SolverConfig()  # type: ignore[valid-type]
+    formulation: FormulationConfig = FormulationConfig()
+    solver: SolverConfig = SolverConfig()
     expected: Expected = Expected()
     base: str = "."
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -104,13 +105,15 @@ def load_pair(problem: Problem) -> Pair:
             problem.path(source.root), source.scene, source.frame, source.render, source.step
         )
     elif isinstance(source, KittiInput):
-        kitti = {"kitti2012": datasets.load_kitti2012, "kitti2015": datasets.load_kitti2015}
-        pair = kitti[source.kind](problem.path(source.root), source.index, source.occ)
+        twelve = source.kind == "kitti2012"
+        kitti = datasets.load_kitti2012 if twelve else datasets.load_kitti2015
+        pair = kitti(problem.path(source.root), source.index, source.occ)
     else:
-        vkitti = {"vkitti1": datasets.load_vkitti1, "vkitti2": datasets.load_vkitti2}
-        pair = vkitti[source.kind](
-            problem.path(source.root), source.scene, source.frame, source.variation
-        )
+        root, where = problem.path(source.root), (source.scene, source.frame, source.variation)
+        if source.kind == "vkitti1":
+            pair = datasets.load_vkitti1(root, *where, step=source.step)
+        else:
+            pair = datasets.load_vkitti2(root, *where, step=source.step)
     return replace(pair, name=problem.name)
 
 
@@ -197,7 +200,7 @@ def run(
     )
     if e.units == "pixel":
         data = in_pixels(data, start.soup, seg, e.rotation_px)
-    weights = Weights(**e.weights.model_dump())  # type: ignore[attr-defined]
+    weights = Weights(**e.weights.model_dump())
     solver = problem.solver.model_dump()
     solver["presolve_eps"] = tuple(solver["presolve_eps"])
     solution = solve_soup(
@@ -252,10 +255,9 @@ def score(
     if pair.truth is None:
         return {}
     depths = {"solution": after.depth_ref, "start": before.depth_ref}
-    try:
+    # where no rigid motion can be fitted the row is absent
+    with contextlib.suppress(DataError):
         depths["rigid"] = rigid_depth(pair).depth
-    except DataError:
-        pass  # no rigid motion can be fitted: the row is absent
     return score_depths(pair.truth, depths, scale)
 
 

@@ -144,7 +144,7 @@ def _shared_boundaries(
     beta_colour: float,
     samples: int | None,
 ) -> tuple[Int, Float, Int, Float]:
-    height, width = labels.shape
+    width = labels.shape[1]
     n = int(labels.max()) + 1
     index = np.arange(labels.size).reshape(labels.shape)
     first, second = [], []

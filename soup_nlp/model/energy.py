@@ -165,7 +165,7 @@ def build_energy_data(
     arap_at_anchors: bool = False,
 ) -> EnergyData:
     """Collect rays, targets and weights of a segmented pair."""
-    height, width = seg.labels.shape
+    width = seg.labels.shape[1]
     index, there = sample_pixels(seg.labels, flow, samples, seed)
     uv = np.stack([index % width, index // width], axis=-1).astype(float)
     confidence = np.where(there, flow.confidence.ravel()[index].astype(float), 0.0)

@@ -81,7 +81,7 @@ class MatrixLayout:
         length = np.linalg.norm(T, axis=1)
         # a superpixel at rest has no direction in this gauge: give it a tiny one
         floor = 1e-3 * max(float(np.median(length)), 1e-6)
-        T = np.where((length < floor)[:, None], T + [floor, 0.0, 0.0], T)
+        T = np.where((length < floor)[:, None], T + np.array([floor, 0.0, 0.0]), T)
         length = np.linalg.norm(T, axis=1)
         tau = float(length.mean())
         lam = length / tau

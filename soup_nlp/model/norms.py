@@ -69,9 +69,9 @@ def smooth_min(y: ca.SX, sigma: ca.SX, width: ca.SX) -> tuple[ca.SX, ca.SX]:
     return (y + sigma - root) / 2 - at_zero, (1 - (y - sigma) / root) / 2
 
 
-def _corner(norm: Norm) -> ca.SX:
+def _corner(eps: ca.SX, sigma: ca.SX) -> ca.SX:
     """Width of a truncation's corner: as sharp as eps it would be as hard as the norm itself."""
-    return ca.fmax(norm.eps, 0.3 * norm.sigma)
+    return ca.fmax(eps, 0.3 * sigma)
 
 
 def solver_form(
@@ -109,12 +109,12 @@ def solver_form(
         if norm.sigma is not None and switch is None:
             # near its corner a truncated norm is concave along the residual: there only the full
             # reweighted curvature still bounds it from above
-            theta = theta * smooth_min(y, norm.sigma, _corner(norm))[1] ** 2
+            theta = theta * smooth_min(y, norm.sigma, _corner(norm.eps, norm.sigma))[1] ** 2
         outer = ca.mtimes(J.T, J) - theta * ca.mtimes(along, along.T)
     if norm.sigma is None:
         value, slope = y, ca.SX(1.0)
     elif switch is not None:
         value, slope = switch * y + (1 - switch) * norm.sigma, switch
     else:
-        value, slope = smooth_min(y, norm.sigma, _corner(norm))
+        value, slope = smooth_min(y, norm.sigma, _corner(norm.eps, norm.sigma))
     return Form(norm.weight * value, norm.weight * slope * dy * outer, constraint)

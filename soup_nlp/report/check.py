@@ -102,7 +102,8 @@ State = Mapping[str, Float]
 
 
 def _state(tree: Mapping[str, Any], which: str) -> State:
-    return {k: np.asarray(require(tree, f"{which}/{k}"), float) for k in "lam n d R t".split()}
+    names = ("lam", "n", "d", "R", "t")
+    return {k: np.asarray(require(tree, f"{which}/{k}"), float) for k in names}
 
 
 def _lift(s: State, ray: Float, who: NDArray[np.int64]) -> tuple[Float, Float]:

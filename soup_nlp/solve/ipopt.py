@@ -99,7 +99,7 @@ class Stage:
         )
 
 
-class _Watch(ca.Callback):  # type: ignore[misc]
+class _Watch(ca.Callback):
     """CasADi's iteration callback: progress, limits, the best iterate."""
 
     def __init__(

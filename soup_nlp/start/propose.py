@@ -93,7 +93,7 @@ def propose(
         DataError: fewer than 8 pixels have a usable flow.
     """
     o = options or StartOptions()
-    height, width = seg.labels.shape
+    width = seg.labels.shape[1]
     index, there = sample_pixels(seg.labels, flow, o.samples, o.seed)
     if there.sum() < 8:
         raise DataError(
@@ -382,7 +382,7 @@ def _penalised(fit: PlaneFit) -> Float:
 
 def _smooth_choice(cost: Float, seg: Segmentation, gain: float, rounds: int = 10) -> Int:
     """Labels by iterated conditional modes: cost plus `gain` x share of unlike neighbours."""
-    n, m = cost.shape
+    m = cost.shape[1]
     label = np.argmin(cost, axis=1)
     if m == 1:
         return label
