@@ -28,7 +28,10 @@ class _Strict(BaseModel):
 
 # what a number may be, by field name: everything not named is just finite
 _RANGES: Mapping[str, tuple[float | None, float | None]] = {
-    **dict.fromkeys(("arap", "proj", "cont", "orient", "theta", "ridge", "smoothness"), (0, None)),
+    **dict.fromkeys(
+        ("arap", "proj", "cont", "orient", "theta", "ridge", "presolve_ridge", "smoothness"),
+        (0, None),
+    ),
     **dict.fromkeys(("eps", "tol", "presolve_tol", "eps_pixel", "max_seconds"), (1e-12, None)),
     **dict.fromkeys(("sigma_cont", "sigma_cont_ref", "sigma_orient", "sigma_arap"), (1e-12, None)),
     **dict.fromkeys(("samples", "dominant", "pieces", "piece_size"), (1, None)),

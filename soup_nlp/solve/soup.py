@@ -34,6 +34,8 @@ class SolverOptions:
         presolve_last_iterations: Limit of the last stage.
         presolve_tol: Dual infeasibility of the last stage.
         presolve_theta: theta of its Gauss-Newton Hessian.
+        presolve_ridge: ridge of that Hessian; larger than the constrained NLP's, which starts near
+            its end.
         stagnation: Intermediate stages end at this relative change of f, twice in a row.
         eps: Smoothing of the constrained NLP.
         max_iter: Iteration limit of the constrained NLP.
@@ -48,6 +50,7 @@ class SolverOptions:
     presolve_last_iterations: int = 100
     presolve_tol: float = 1e-3
     presolve_theta: float = 0.9
+    presolve_ridge: float = 1e-2
     stagnation: float = 1e-4
     eps: float = 0.03
     max_iter: int = 100
@@ -183,7 +186,12 @@ def _presolve(
     log_file: str | None,
 ) -> Soup:
     tangent = replace(
-        form, norm="smooth", truncation="smooth", hessian="gauss-newton", theta=o.presolve_theta
+        form,
+        norm="smooth",
+        truncation="smooth",
+        hessian="gauss-newton",
+        theta=o.presolve_theta,
+        ridge=o.presolve_ridge,
     )
     begin = time.perf_counter()
     nlp, layout = build_tangent_nlp(start, data, weights, tangent)
