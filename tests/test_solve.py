@@ -159,10 +159,6 @@ def test_kkt_residuals_are_small_at_the_optimum_only():
     assert residual(lam_x=stage.lam_x - [0, 0.5, 0, 0]) > 0.1
 
 
-@pytest.mark.xfail(
-    reason="kkt.optimality: a multiplier that pushes towards an absent bound is not counted",
-    strict=False,
-)
 def test_a_multiplier_of_the_wrong_sign_is_no_optimum():
     """max x, x >= 0: at 0 the gradient is balanced only by a force from an upper bound."""
     x, row, one = symbols(1)

@@ -58,6 +58,9 @@ def optimality(nlp: NLP, x: Float, lam_x: Float, lam_g: Float) -> dict[str, floa
         for gap, mult in ((value - lower, -lam), (upper - value, lam)):
             use = open_ & np.isfinite(gap) & (mult > 0)
             products.append(float(np.abs(gap[use] * mult[use]).max(initial=0.0)))
+            # a force from a bound that is not there balances nothing
+            absent = mult[~np.isfinite(gap) & (mult > 0)]
+            products.append(float(absent.max(initial=0.0)))
     return {
         "dual_infeasibility": float(np.abs(dual).max()),
         "complementarity": max(products),

@@ -144,7 +144,8 @@ def propose(
     weak = (mu <= 0) | (parallax < o.min_parallax_px) | (own.cost[:, 0] > 3.0) | poor
     weak |= weight.sum(axis=1) < 2.0
     if weak.all():
-        weak = ~np.isfinite(mu) | (mu <= 0)
+        # little parallax everywhere is still some, until it is the rounding of the flow
+        weak = ~np.isfinite(mu) | (mu <= 0) | (parallax < 0.02)
     if weak.all():
         n = len(seg)
         mu, slope, weak = np.ones(n), np.zeros((n, 2)), np.ones(n, bool)

@@ -1,0 +1,290 @@
+"""The command line: exit codes, messages, files; bad input never gets far."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from soup_nlp.cli import main
+from soup_nlp.config import load_problem, make_problem
+from soup_nlp.data.formats import write_flo
+from soup_nlp.data.scenes import render_scene
+from soup_nlp.errors import ConfigError
+from soup_nlp.pipeline import load_pair, run, solve_pair
+from soup_nlp.report.check import check_folder
+from soup_nlp.report.pointcloud import read_ply
+
+SMALL = [
+    "--set", "input.width=192", "--set", "input.height=128",
+    "--set", "segmentation.superpixels=50", "--set", "segmentation.neighbours=8",
+    "--set", "flow.source=truth", "--set", "solver.presolve_last_iterations=60",
+]  # fmt: skip
+FILES = [
+    "config.yaml",
+    "result.h5",
+    "summary.json",
+    "log.txt",
+    "ipopt.log",
+    "depth_ref.png",
+    "depth_next.png",
+    "depth_ref_colour.png",
+    "depth_next_colour.png",
+    "superpixels.png",
+    "flow.png",
+    "error.png",
+    "overview.png",
+    "points_ref.ply",
+    "points_next.ply",
+]
+PROBLEMS = sorted((Path(__file__).parent.parent / "problems").glob("*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("solved")
+    assert main(["solve", str(PROBLEMS[0].parent / "orbit.yaml"), "--out", str(out), *SMALL]) == 0
+    return out
+
+
+@pytest.mark.parametrize("path", PROBLEMS, ids=lambda p: p.stem)
+def test_every_problem_file_loads_and_loads_again(path, tmp_path, capsys):
+    assert load_problem(path).name
+    assert main(["show", str(path)]) == 0
+    text = capsys.readouterr().out
+    (tmp_path / "again.yaml").write_text(text)
+    assert load_problem(tmp_path / "again.yaml") == load_problem(path)
+
+
+def test_a_solve_writes_every_file(solved):
+    for name in FILES:
+        assert (solved / name).stat().st_size > 0, name
+    summary = json.loads((solved / "summary.json").read_text())
+    assert summary["converged"]
+    assert summary["energy"]["solution"]["total"] < summary["energy"]["start"]["total"]
+    assert summary["residuals"]["so3"] < 1e-8
+    assert summary["residuals"]["normal"] < 1e-8
+    assert summary["metrics"]["solution"]["mre"] < summary["metrics"]["constant"]["mre"]
+    xyz, rgb, _ = read_ply(solved / "points_ref.ply")
+    assert len(xyz) == len(rgb) > 0.9 * 192 * 128
+    with h5py.File(solved / "result.h5") as file:
+        assert file["solution/R"].attrs["units"] == "1"
+        assert file["depth/ref"].shape == (128, 192)
+        assert "lam_g_so3" in file["multipliers"]
+        assert "config" in file.attrs
+    depth = cv2.imread(str(solved / "depth_ref.png"), cv2.IMREAD_UNCHANGED)
+    assert depth.dtype == np.uint16
+
+
+def test_config_of_a_result_solves_to_the_same(solved, tmp_path):
+    again = tmp_path / "again"
+    main(["solve", str(solved / "config.yaml"), "--out", str(again), "-q"])
+    a, b = (json.loads((p / "summary.json").read_text()) for p in (solved, again))
+    assert a["energy"] == b["energy"]
+    assert a["problem_hash"] == b["problem_hash"]
+
+
+def test_check_holds_and_catches_tampering(solved, capsys):
+    assert main(["check", str(solved)]) == 0
+    original = (solved / "summary.json").read_text()
+    claim = json.loads(original)
+    claim["energy"]["solution"]["arap"] *= 0.99
+    (solved / "summary.json").write_text(json.dumps(claim))
+    assert main(["check", str(solved)]) == 1
+    assert "FAIL energy solution arap" in capsys.readouterr().out
+    (solved / "summary.json").write_text(original)
+    with h5py.File(solved / "result.h5", "a") as file:
+        kept = file["solution/R"][3]
+        file["solution/R"][3] = 1.001 * kept
+    report = check_folder(solved)
+    assert not report.ok
+    assert any(r.name == "constraint so3" and r.worst == 3 and not r.ok for r in report.rows)
+    with h5py.File(solved / "result.h5", "a") as file:
+        file["solution/R"][3] = kept
+    assert check_folder(solved).ok
+
+
+def test_evaluate_scores_against_a_file(solved, tmp_path, capsys):
+    with h5py.File(solved / "result.h5") as file:
+        np.save(tmp_path / "gt.npy", 7.0 * file["depth/ref"][:])
+    assert main(["evaluate", str(solved), "--depth", str(tmp_path / "gt.npy")]) == 0
+    assert "solution" in capsys.readouterr().out
+    np.save(tmp_path / "gt.npy", np.ones((3, 3)))
+    assert main(["evaluate", str(solved), "--depth", str(tmp_path / "gt.npy")]) == 2
+    assert main(["evaluate", str(solved), "--depth", "x.npy", "--scale", "best"]) == 2
+
+
+def test_a_solve_that_stops_early_is_a_result(tmp_path):
+    limit = ["--set", "solver.max_iter=0", "--set", "solver.presolve=false"]
+    path = str(PROBLEMS[0].parent / "street.yaml")
+    assert main(["solve", path, "--out", str(tmp_path), *SMALL, *limit, "-q"]) == 1
+    for name in FILES:
+        assert (tmp_path / name).exists(), name
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["status"] == "Maximum_Iterations_Exceeded"
+    assert not summary["converged"]
+    assert check_folder(tmp_path).ok
+
+
+def test_an_interruption_keeps_the_best_iterate():
+    stop = threading.Event()
+    problem = make_problem(
+        {
+            "input": {
+                "kind": "scene", "scene": "orbit", "width": 128, "height": 96
+            },
+            "segmentation": {"superpixels": 30, "neighbours": 5},
+            "flow": {"source": "truth"},
+        }
+    )  # fmt: skip
+    seen = []
+
+    def listener(progress):
+        seen.append(progress)
+        if len(seen) == 3:
+            stop.set()
+
+    result = run(problem, listener=listener, stop=stop)
+    assert result.solution.status == "Interrupted"
+    assert result.solution.energy["total"] <= result.solution.energy_start["total"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "parts"),
+    [
+        (["solver.max_itr=3"], ["unknown key", "solver.max_itr", "did you mean max_iter?"]),
+        (["solver.max_iter=many"], ["solver.max_iter", "'many'", "integer"]),
+        (["solver.max_iter=-1"], ["greater than or equal to 0"]),
+        (["energy.weights.proj=-1"], ["energy.weights.proj"]),
+        (["formulation.gauge=unit_offset"], ["unit-offset", "did you mean unit-offset?"]),
+        (["input.scene=stret"], ["did you mean street?"]),
+        (["input.kind=movie"], ["kind"]),
+        (["segmentation.superpixels=0"], ["segmentation.superpixels"]),
+        (["nonsense"], ["--set", "key=value"]),
+    ],
+)
+def test_a_wrong_problem_says_what_and_where(overrides, parts):
+    with pytest.raises(ConfigError) as caught:
+        load_problem(PROBLEMS[0].parent / "street.yaml", overrides)
+    for part in parts:
+        assert part in str(caught.value)
+
+
+def test_an_unknown_key_names_its_line(tmp_path):
+    path = tmp_path / "p.yaml"
+    path.write_text("input: {kind: motorcycle}\nsegmentation:\n  superpixls: 7\n")
+    with pytest.raises(ConfigError, match="line 3"):
+        load_problem(path)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("images")
+    pair = render_scene("orbit", 0, 160, 120)
+    cv2.imwrite(str(folder / "a.png"), pair.image_ref[..., ::-1])
+    cv2.imwrite(str(folder / "b.png"), pair.image_next[..., ::-1])
+    cv2.imwrite(str(folder / "small.png"), pair.image_next[:50, :50, ::-1])
+    cv2.imwrite(str(folder / "grey16.png"), pair.image_ref[..., 0].astype(np.uint16) * 257)
+    rgba = np.dstack([pair.image_next[..., ::-1], np.full((120, 160), 255, np.uint8)])
+    cv2.imwrite(str(folder / "rgba.png"), rgba)
+    cv2.imwrite(str(folder / "grey.png"), pair.image_next[..., 1])
+    cv2.imwrite(str(folder / "flat.png"), np.full((120, 160, 3), 128, np.uint8))
+    flow = pair.truth.flow.astype(np.float32)
+    write_flo(folder / "true.flo", flow)
+    (folder / "cut.flo").write_bytes((folder / "true.flo").read_bytes()[:1000])
+    write_flo(folder / "wrong_size.flo", flow[:50])
+    np.save(folder / "nan.npy", np.full_like(flow, np.nan))
+    np.save(folder / "inf.npy", np.full_like(flow, np.inf))
+    write_flo(folder / "zero.flo", 0 * flow)
+    return folder
+
+
+def solve_files(images: Path, out: Path, **changes: str) -> int:
+    options = {"ref": "a.png", "next": "b.png", "intrinsics": "144,144,79.5,59.5"} | changes
+    more = options.pop("sets", "segmentation.superpixels=40 segmentation.neighbours=6").split()
+    args = ["solve", "--out", str(out), "-q"]
+    for key, value in options.items():
+        path = key in ("ref", "next", "flow", "depth")
+        args += [f"--{key.replace('_', '-')}", str(images / value) if path else value]
+    for item in more:
+        args += ["--set", item]
+    return main(args)
+
+
+@pytest.mark.parametrize(
+    ("changes", "part"),
+    [
+        ({"ref": "missing.png"}, "missing.png"),
+        ({"next": "small.png"}, "differ in size"),
+        ({"intrinsics": "0,0,79.5,59.5"}, "focal"),
+        ({"intrinsics": "-9,9,1,1"}, "focal"),
+        ({"intrinsics": "nan,9,1,1"}, "finite"),
+        ({"intrinsics": "1,2,3"}, "fx,fy,cx,cy"),
+        ({"flow": "cut.flo"}, "cut.flo"),
+        ({"flow": "wrong_size.flo"}, "wrong_size.flo"),
+        ({"flow": "nan.npy"}, "nan.npy"),
+        ({"flow": "inf.npy"}, "inf.npy"),
+        ({"ref": "flat.png", "next": "flat.png"}, "too few pixels"),
+        ({"sets": "segmentation.superpixels=10 segmentation.neighbours=15"}, "K"),
+    ],
+)
+def test_bad_input_is_refused_with_code_2(images, tmp_path, capsys, changes, part):
+    assert solve_files(images, tmp_path / "out", **changes) == 2
+    error = capsys.readouterr().err
+    assert part in error
+    assert "Traceback" not in error
+
+
+def test_bad_input_leaves_its_log(images, tmp_path):
+    assert solve_files(images, tmp_path, flow="cut.flo") == 2
+    assert "failed" in (tmp_path / "log.txt").read_text()
+
+
+def test_an_unwritable_output_is_refused(images, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert solve_files(images, tmp_path / "file" / "out") == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "changes", [{"ref": "grey16.png", "next": "grey.png"}, {"next": "rgba.png"}]
+)
+def test_any_kind_of_image_is_read(images, tmp_path, changes):
+    assert solve_files(images, tmp_path, flow="true.flo", **changes) in (0, 1)
+    assert (tmp_path / "overview.png").exists()
+
+
+def test_zero_flow_gives_a_constant_depth_and_says_so(images, tmp_path):
+    assert solve_files(images, tmp_path, flow="zero.flo") in (0, 1)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    # nothing moves: no superpixel has a depth of its own
+    assert summary["start"]["borrowed"] == summary["sizes"]["superpixels"]
+
+
+def test_one_superpixel_is_one_plane(images, tmp_path):
+    code = solve_files(images, tmp_path, flow="true.flo", sets="segmentation.superpixels=1")
+    assert code in (0, 1)
+    assert json.loads((tmp_path / "summary.json").read_text())["sizes"]["superpixels"] == 1
+
+
+def test_nothing_to_solve(capsys):
+    assert main(["solve"]) == 2
+    assert main(["solve", "missing.yaml"]) == 2
+    assert main(["check", "missing"]) == 2
+    assert "summary.json" in capsys.readouterr().err
+
+
+def test_python_functions_do_the_same():
+    pair = render_scene("orbit", 0, 128, 96)
+    result = solve_pair(
+        pair, segmentation={"superpixels": 30, "neighbours": 5}, flow={"source": "truth"}
+    )
+    assert result.metrics["solution"].mre < 0.05
+    assert len(result.soup) == len(result.segmentation)
+    again = load_pair(make_problem({"input": {"kind": "motorcycle"}}))
+    assert again.K_next[0, 2] > again.K_ref[0, 2]
