@@ -457,10 +457,6 @@ def test_epigraph_alone_at_its_optimum_is_the_exact_energy_without_truncations()
     assert value(nlp, optimal_extras(nlp))[0] == pytest.approx(exact, rel=1e-10)
 
 
-@pytest.mark.xfail(
-    reason="formulation: an infinite sigma_orient reaches the kernel as 0 and removes the term",
-    strict=False,
-)
 def test_orientation_can_do_without_truncation():
     problem, weights = tiny(), replace(PAPER, sigma_orient=np.inf)
     nlp, _ = problem.nlp(weights, form())

@@ -75,8 +75,8 @@ def build_segmentation(
         neighbours: K of the K-NN graph; at most N - 1 (a larger K is an error).
         beta: Fall-off of w1, w2 with anchor distance, 1/pixel (Eq. 2).
         beta_colour: Fall-off of w4 with colour difference, colours in [0, 1] (Eq. 5).
-        boundary_samples: Boundary points kept per pair, None for all (padded by repetition of
-            the pairs' own points to the longest boundary, with weights corrected by the model).
+        boundary_samples: Boundary points kept per pair, evenly spaced; None takes as many as the
+            longest boundary has (shorter ones repeat their points, nearly evenly).
 
     Raises:
         DataError: K >= N.

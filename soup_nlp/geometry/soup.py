@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry.camera import pixel_grid, project, rays
+from soup_nlp.geometry.rotation import nearest
 
 Float = NDArray[np.float64]
 
@@ -79,6 +80,14 @@ class Soup:
         D, T = self.distance / unit, self.translation / unit
         lam = c * D
         return Soup(lam, self.n, 1.0 / c, self.R, T / lam[:, None])
+
+    def retracted(self) -> Soup:
+        """Nearest soup that satisfies SO(3), unit normals and the simplex to rounding."""
+        n = self.n / np.linalg.norm(self.n, axis=1, keepdims=True)
+        # the plane stays where it is: d belongs to a normal of unit length
+        d = self.d / np.linalg.norm(self.n, axis=1)
+        total = self.lam.sum()
+        return Soup(self.lam / total, n, d, nearest(self.R), self.t)
 
     def homographies(self, K_ref: Float, K_next: Float) -> Float:
         """(N, 3, 3) `K_next (R - t n^T / d) K_ref^-1`, paper Eq. 3."""

@@ -283,7 +283,13 @@ def _elements(
         {"weight": w.orient * data.pair_count, "sigma": full(len(pairs), w.sigma_orient)}, pairs
     )
     out["orient"] = _Element(
-        2, fields, columns, pairs, lambda v, row, eps, _: terms.orientation(v[0], v[1], row, eps)
+        2,
+        fields,
+        columns,
+        pairs,
+        lambda v, row, eps, _: terms.orientation(
+            v[0], v[1], row, eps, bool(np.isfinite(w.sigma_orient))
+        ),
     )
     return out
 

@@ -81,12 +81,13 @@ def continuity(
     ]
 
 
-def orientation(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
+def orientation(a: View, b: View, row: Row, eps: ca.SX, truncated: bool) -> list[Norm]:
     """E_orient of a neighbour pair.
 
     `1 - n_i . n_k = |n_i - n_k|^2 / 2` on the unit sphere; the square is convex off it too.
     """
-    return [Norm("turn", row["weight"], a.n - b.n, eps, row["sigma"], kind="half_square")]
+    sigma = row["sigma"] if truncated else None
+    return [Norm("turn", row["weight"], a.n - b.n, eps, sigma, kind="half_square")]
 
 
 def so3(a: View) -> ca.SX:

@@ -71,10 +71,9 @@ class Stage:
         name: Stage.
         status: Ipopt's return status, or "Interrupted", "Time_Limit", "Stagnated".
         converged: Ipopt's own claim.
-        x: Best iterate: the last one when converged, else the lowest objective among the most
-            feasible.
-        lam_x: Multipliers of the bounds at the last iterate.
-        lam_g: Multipliers of the constraints at the last iterate.
+        x: Best iterate: the last one when converged, else the lowest f + penalty.
+        lam_x: Multipliers of the bounds at x.
+        lam_g: Multipliers of the constraints at x.
         objective: f at x.
         iterations: Count.
         seconds: Wall time, set-up included.
@@ -120,8 +119,9 @@ class _Watch(ca.Callback):
         self.count = 0
         self.small = 0
         self.last = np.inf
-        self.best: tuple[float, float] = (np.inf, np.inf)
+        self.best = self.best_f = np.inf
         self.best_x = nlp.x0
+        self.best_lam: tuple[Float, Float] | None = None
         self.reason = ""
         self.construct(f"watch_{nlp.name}", {})
 
@@ -162,10 +162,11 @@ class _Watch(ca.Callback):
         g = np.asarray(arg[2]).ravel()
         outside = np.maximum(nlp.lbg - g, g - nlp.ubg)
         infeasible = float(max(outside.max(initial=0.0), 0.0))
-        # feasible to 1e-5 counts as feasible: then the objective decides
-        rank = (max(infeasible, 1e-5), f)
+        # an exact penalty: a small violation is repaired by retraction, a large one is not
+        rank = f + 10.0 * infeasible * max(1.0, abs(f))
         if np.isfinite(f) and rank < self.best:
-            self.best, self.best_x = rank, x
+            self.best, self.best_x, self.best_f = rank, x, f
+            self.best_lam = np.asarray(arg[3]).ravel(), np.asarray(arg[4]).ravel()
         now = time.perf_counter()
         if self.listener:
             self.listener(Progress(self.stage, self.count, f, infeasible, now - self.begin))
@@ -302,8 +303,9 @@ class Ipopt:
         converged = status in GOOD
         x = np.asarray(out["x"]).ravel()
         f = float(out["f"])
-        if not converged and np.isfinite(watch.best[1]):
-            x, f = watch.best_x, watch.best[1]
+        lam_x, lam_g = np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_g"]).ravel()
+        if not converged and watch.best_lam is not None:
+            x, f, (lam_x, lam_g) = watch.best_x, watch.best_f, watch.best_lam
         if not np.isfinite(x).all():
             x, f = x0, np.nan
         return Stage(
@@ -311,8 +313,8 @@ class Ipopt:
             status=status,
             converged=converged,
             x=x,
-            lam_x=np.asarray(out["lam_x"]).ravel(),
-            lam_g=np.asarray(out["lam_g"]).ravel(),
+            lam_x=lam_x,
+            lam_g=lam_g,
             objective=f,
             iterations=int(stats.get("iter_count", watch.count)),
             seconds=time.perf_counter() - begin,

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy import EnergyData
-from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP, to_scipy
 from soup_nlp.solve.ipopt import Stage
 
@@ -68,11 +67,13 @@ def optimality(nlp: NLP, x: Float, lam_x: Float, lam_g: Float) -> dict[str, floa
 
 
 def residuals(
-    nlp: NLP, layout: MatrixLayout, stage: Stage, data: EnergyData, min_facing: float
+    nlp: NLP, soup: Soup, stage: Stage, data: EnergyData, min_facing: float
 ) -> dict[str, float]:
-    """Constraint residuals of a stage's answer, and its optimality."""
-    soup = layout.unpack(stage.x)
+    """Constraint residuals of the delivered soup; violation and optimality of Ipopt's answer."""
+    g = np.asarray(nlp.oracle(stage.x, nlp.p)[1]).ravel()
+    outside = np.maximum(nlp.lbg - g, g - nlp.ubg).max(initial=0.0)
     return {
         **constraint_residuals(soup, data.rim_ray, min_facing),
+        "nlp_infeasibility": float(max(outside, 0.0)),
         **optimality(nlp, stage.x, stage.lam_x, stage.lam_g),
     }

@@ -64,7 +64,8 @@ class Solution:
     """What the constrained NLP ended with.
 
     Attributes:
-        soup: Solution (best iterate when not converged), simplex exact.
+        soup: Solution: Ipopt's answer (best iterate when not converged), or the presolve's where
+            that has the lower exact energy, with rounding-size constraint violations retracted.
         status: Ipopt's status of the constrained NLP, or why it was stopped.
         converged: Its claim.
         stages: Every call of Ipopt in order; the last is the constrained NLP.
@@ -157,7 +158,9 @@ def solve_soup(
     seconds["solve"] = time.perf_counter() - mark
     stages.append(stage)
     say(str(stage))
-    final = layout.unpack(stage.x)
+    final = layout.unpack(stage.x).retracted()
+    if plain.energy(final, data, weights)["total"] > plain.energy(soup, data, weights)["total"]:
+        final = soup.normalised(data.share).retracted()
     return Solution(
         soup=final,
         status=stage.status,
@@ -165,7 +168,7 @@ def solve_soup(
         stages=tuple(stages),
         energy_start=plain.energy(start, data, weights),
         energy=plain.energy(final, data, weights),
-        residuals=residuals(nlp, layout, stage, data, form.min_facing),
+        residuals=residuals(nlp, final, stage, data, form.min_facing),
         multipliers=_multipliers(nlp, layout, stage),
         nlp=nlp.sizes(),
         description=str(nlp),
