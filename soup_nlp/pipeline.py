@@ -13,14 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.config import Problem, make_problem
-from soup_nlp.config_inputs import (
+from soup_nlp.config import (
     FilesInput,
     FolderInput,
     KittiInput,
     MotorcycleInput,
+    Problem,
     SceneInput,
     SintelInput,
+    make_problem,
 )
 from soup_nlp.data import datasets
 from soup_nlp.data.flow import resolve_flow
