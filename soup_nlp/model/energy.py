@@ -59,8 +59,7 @@ class EnergyData:
         radius: (N,) largest distance of a rim pixel from the anchor, ray units.
         pixel_ray: (N, S, 3) sampled pixels of every superpixel.
         pixel_target: (N, S, 2) their flow targets, pixels.
-        pixel_weight: (N, S) confidence x usable share / sample size: E_proj is a mean over all
-            pixels of a superpixel, of which those without flow add nothing.
+        pixel_weight: (N, S) confidence / S: E_proj is the confidence-weighted mean of the sample.
         edges: (E, 2) K-NN edges i < k.
         edge_weight: (E,) w1 = w2, both directions folded.
         edge_unit: (E,) length unit of the edge (1: the mean plane distance).
@@ -169,9 +168,6 @@ def build_energy_data(
     width = seg.labels.shape[1]
     index, there = sample_pixels(seg.labels, flow, samples, seed)
     uv = np.stack([index % width, index // width], axis=-1).astype(float)
-    # the mean is over all pixels of a superpixel: unusable ones weigh nothing but count
-    usable = np.bincount(seg.labels.ravel()[flow.confidence.ravel() > 0], minlength=len(seg))
-    drawn = np.maximum(there.sum(axis=1), 1)
     confidence = np.where(there, flow.confidence.ravel()[index].astype(float), 0.0)
     target = uv + np.where(there[..., None], flow.uv.reshape(-1, 2)[index], 0.0)
     anchor = rays(K_ref, seg.anchors)
@@ -183,7 +179,7 @@ def build_energy_data(
         radius=np.maximum(reach, 1.0 / K_ref[0, 0]),
         pixel_ray=rays(K_ref, uv),
         pixel_target=target,
-        pixel_weight=confidence * (usable / (seg.sizes * drawn))[:, None],
+        pixel_weight=confidence / index.shape[1],
         edges=seg.edges,
         edge_weight=seg.edge_weight,
         edge_unit=np.ones(len(seg.edges)),

@@ -52,7 +52,7 @@ class Formulation:
     eps: float = 1e-2
     eps_pixel: float = 1e-2
     theta: float = 0.9
-    ridge: float = 1e-4
+    ridge: float = 1e-2
     min_facing: float = 1e-3
     depth_ratio: float = 5.0
     compiled: bool = True

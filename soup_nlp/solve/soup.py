@@ -53,7 +53,7 @@ class SolverOptions:
     presolve_ridge: float = 1e-2
     stagnation: float = 1e-4
     eps: float = 0.03
-    max_iter: int = 100
+    max_iter: int = 60
     tol: float = 1e-2
     max_seconds: float = 600.0
     ipopt: Mapping[str, Any] = field(default_factory=dict)
