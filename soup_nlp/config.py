@@ -2,230 +2,125 @@
 
 from __future__ import annotations
 
-import difflib
+import copy
 import hashlib
 import json
-import types
-import typing
-from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, fields
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
+from pydantic import Field, ValidationError
 
+from soup_nlp.config_errors import Place, explain
+from soup_nlp.config_inputs import Input, Positive
+from soup_nlp.config_mirror import Strict, attribute_docs, mirror
+from soup_nlp.data.flow import dis_flow
 from soup_nlp.errors import ConfigError
 from soup_nlp.model.energy import Weights
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.kernel import HESSIANS
 from soup_nlp.solve.soup import SolverOptions
 from soup_nlp.start.propose import StartOptions
 
-
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
-# what a number may be, by field name: everything not named is just finite
-_RANGES: Mapping[str, tuple[float | None, float | None]] = {
-    **dict.fromkeys(
-        ("arap", "proj", "cont", "orient", "theta", "ridge", "presolve_ridge", "smoothness"),
-        (0, None),
-    ),
-    **dict.fromkeys(("eps", "tol", "presolve_tol", "eps_pixel", "max_seconds"), (1e-12, None)),
-    **dict.fromkeys(("sigma_cont", "sigma_cont_ref", "sigma_orient", "sigma_arap"), (1e-12, None)),
-    **dict.fromkeys(("samples", "dominant", "pieces", "piece_size"), (1, None)),
-    "presolve_iterations": (1, None),
-    "sigma_proj": (1e-12, None),
-    "presolve_last_iterations": (0, None),
-    "max_iter": (0, None),
-    "depth_ratio": (1.0, None),
-    "min_facing": (0, 0.5),
-    "presolve_theta": (0, 1),
-}
+# smoothing belongs to the solver's stages, the seed to the problem
+EnergyWeights: Any = mirror(Weights, "EnergyWeights")
+StartConfig: Any = mirror(StartOptions, "StartConfig", leave_out=("seed",))
+FormulationConfig: Any = mirror(
+    Formulation,
+    "FormulationConfig",
+    leave_out=("eps", "eps_pixel"),
+    choices={"hessian": HESSIANS},
+)
+SolverConfig: Any = mirror(SolverOptions, "SolverConfig")
+DisConfig: Any = mirror(dis_flow, "DisConfig", choices={"preset": ("ultrafast", "fast", "medium")})
 
 
-def _mirror(record: type, name: str, **fixed: Any) -> type[_Strict]:
-    """Strict model with the fields and defaults of a dataclass."""
-    hints = typing.get_type_hints(record)
-    made: dict[str, Any] = {}
-    for f in fields(record):
-        if f.name in fixed:
-            continue
-        factory: Any = f.default_factory
-        default: Any = factory() if f.default is MISSING else f.default
-        kind: Any = hints[f.name]
-        if typing.get_origin(kind) is tuple:
-            kind = list[float]
-            default = list(default)
-        elif typing.get_origin(kind) in (Mapping, types.MappingProxyType) or "Mapping" in str(kind):
-            kind = dict[str, Any]
-            default = dict(default)
-        elif kind is float and f.name.startswith("sigma"):
-            kind = Annotated[float, Field(gt=0, allow_inf_nan=True, strict=False)]
-        elif kind in (float, int):
-            low, high = _RANGES.get(f.name, (None, None))
-            kind = Annotated[kind, Field(ge=low, le=high, allow_inf_nan=False)]
-        made[f.name] = (kind, default)
-    return create_model(name, __base__=_Strict, **made)
-
-
-EnergyWeights: Any = _mirror(Weights, "EnergyWeights")
-StartConfig: Any = _mirror(StartOptions, "StartConfig")
-FormulationConfig: Any = _mirror(Formulation, "FormulationConfig", eps=0, eps_pixel=0)
-SolverConfig: Any = _mirror(SolverOptions, "SolverConfig")
-
-Four = Annotated[list[float], Field(min_length=4, max_length=4)]
-
-
-class FilesInput(_Strict):
-    """Two image files and their cameras.
-
-    Attributes:
-        ref, next: Images.
-        intrinsics: fx, fy, cx, cy of the reference frame, pixels.
-        intrinsics_next: Of the next frame; default the same.
-        depth: Optional true depth of the reference frame.
-    """
-
-    kind: Literal["files"]
-    ref: str
-    next: str
-    intrinsics: Four
-    intrinsics_next: Four | None = None
-    depth: str | None = None
-
-
-class FolderInput(_Strict):
-    """A folder with frame_0, frame_1, K.txt and optional truth."""
-
-    kind: Literal["folder"]
-    path: str
-    depth_scale: Annotated[float, Field(gt=0)] = 1000.0
-    unit: str = "m"
-
-
-class MotorcycleInput(_Strict):
-    """The Middlebury motorcycle pair that scikit-image ships."""
-
-    kind: Literal["motorcycle"]
-
-
-class SceneInput(_Strict):
-    """A rendered dynamic scene."""
-
-    kind: Literal["scene"]
-    scene: Literal["street", "room", "sheet", "orbit", "still"]
-    seed: Annotated[int, Field(ge=0)] = 0
-    width: Annotated[int, Field(ge=64)] = 1024
-    height: Annotated[int, Field(ge=48)] = 436
-
-
-class SintelInput(_Strict):
-    """MPI Sintel, official layout."""
-
-    kind: Literal["sintel"]
-    root: str
-    scene: str
-    frame: Annotated[int, Field(ge=0)]
-    render: str = "clean"
-    step: int = 1
-
-
-class KittiInput(_Strict):
-    """KITTI 2012 or 2015, official layout."""
-
-    kind: Literal["kitti2012", "kitti2015"]
-    root: str
-    index: str
-    occ: bool = True
-
-
-class VkittiInput(_Strict):
-    """Virtual KITTI 1 (scene = world) or 2, official layout."""
-
-    kind: Literal["vkitti1", "vkitti2"]
-    root: str
-    scene: str
-    frame: Annotated[int, Field(ge=0)]
-    variation: str = "clone"
-    step: int = 1
-
-
-Input = Annotated[
-    FilesInput
-    | FolderInput
-    | MotorcycleInput
-    | SceneInput
-    | SintelInput
-    | KittiInput
-    | VkittiInput,
-    Field(discriminator="kind"),
-]
-
-
-class SegmentationConfig(_Strict):
+class SegmentationConfig(Strict):
     """Superpixels and graphs.
 
     Attributes:
-        superpixels: Wanted number.
-        method: "slic" or "grid".
+        superpixels: Wanted number; the answer may differ by a few per cent.
+        method: slic, or grid (the paper's worst case).
         compactness: SLIC's balance of colour and distance.
-        smoothing_px: Gaussian pre-smoothing of SLIC.
-        neighbours: K of the K-NN graph.
+        smoothing_px: Gaussian pre-smoothing of SLIC, pixels.
+        neighbours: K of the K-NN graph, less than the number of superpixels.
         beta: Fall-off of w1, w2 with distance, 1/pixel.
-        beta_colour: Fall-off of w4 with colour difference.
-        boundary_samples: Points per shared boundary, or "all".
+        beta_colour: Fall-off of w4 with colour difference, colours in [0, 1].
+        boundary_samples: Points per shared boundary, or all.
     """
 
     superpixels: Annotated[int, Field(ge=1)] = 1000
     method: Literal["slic", "grid"] = "slic"
-    compactness: Annotated[float, Field(gt=0)] = 10.0
-    smoothing_px: Annotated[float, Field(ge=0)] = 0.0
+    compactness: Positive = 10.0
+    smoothing_px: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     neighbours: Annotated[int, Field(ge=1)] = 15
-    beta: Annotated[float, Field(ge=0)] = 0.02
-    beta_colour: Annotated[float, Field(ge=0)] = 1.0
+    beta: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.02
+    beta_colour: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
     boundary_samples: Annotated[int, Field(ge=1)] | Literal["all"] = 3
 
 
-class FlowConfig(_Strict):
-    """Flow source: "dis", "truth", a file (.flo, KITTI .png, .npy), or a plug-in's name."""
+class FlowConfig(Strict):
+    """Where the flow comes from.
+
+    Attributes:
+        source: dis, truth, a file (.flo, KITTI .png, .npy), or the name of a plug-in.
+        occluded_confidence: Confidence of occluded pixels when the source is truth.
+        dis: Options of OpenCV's DIS flow and of its forward-backward check.
+    """
 
     source: str = "dis"
+    occluded_confidence: Annotated[float, Field(ge=0, le=1)] = 1.0
+    dis: DisConfig = DisConfig()
 
 
-class EnergyConfig(_Strict):
+class EnergyConfig(Strict):
     """The energy.
 
     Attributes:
-        units: "pixel" (every term in pixels, scale-free) or "paper" (one length unit).
+        units: pixel (every term in pixels, free of scale) or paper (one length unit).
         arap_at_anchors: Motion difference at the anchors instead of the camera's origin.
         rotation_px: Pixels per radian of rotation difference; null for the focal length.
-        pixel_samples: Pixels per superpixel in E_proj, or "all".
-        weights: alpha1 to alpha3 and the truncations.
+        pixel_samples: Pixels per superpixel in E_proj, or all.
+        weights: Factors of the terms and their truncations.
     """
 
     units: Literal["pixel", "paper"] = "pixel"
     arap_at_anchors: bool = False
-    rotation_px: Annotated[float, Field(gt=0)] | None = None
+    rotation_px: Positive | None = None
     pixel_samples: Annotated[int, Field(ge=1)] | Literal["all"] = 16
     weights: EnergyWeights = EnergyWeights()
 
 
-class Expected(_Strict):
-    """What a run should score, where known."""
+class Expected(Strict):
+    """What a run should score; solve exits with 1 where it does not.
 
-    mre_at_most: float | None = None
+    Attributes:
+        mre_at_most: Largest mean relative error of the solution's depth; null for no claim.
+        scale: Rule of the one global scale that depth metrics are after.
+        cap: Truth beyond this depth is left out, unit of the truth; null for none.
+    """
+
+    mre_at_most: Positive | None = None
     scale: Literal["median", "mre", "lsq", "none"] = "median"
+    cap: Positive | None = None
 
 
-class Problem(_Strict):
+class Problem(Strict):
     """One problem file.
 
     Attributes:
         name: For titles.
-        input: What to solve, by `kind`.
+        input: What to solve, by its kind.
         seed: Of every random draw.
+        segmentation: Superpixels and graphs.
+        flow: Where the flow comes from.
+        start: How the start is made.
+        energy: Terms, weights, units.
+        formulation: How the energy is written for the solver.
+        solver: Stages and limits; eps are smoothing widths in the energy's unit.
+        expected: What the run should score.
         base: Folder that relative paths start from (the file's own).
     """
 
@@ -246,9 +141,9 @@ class Problem(_Strict):
         return (Path(self.base) / Path(name).expanduser()).resolve()
 
     def digest(self) -> str:
-        """Hash of everything that decides the result."""
-        text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
+        """Hash of everything that decides the result; neither the name nor the place does."""
+        tree = self.model_dump(mode="json", exclude={"name", "base"})
+        return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
@@ -259,115 +154,161 @@ def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
         overrides: `a.b=value` with the value in YAML.
 
     Raises:
-        ConfigError: the file is missing or not YAML, a key is unknown, a value is of the wrong
-            type or out of range.
+        ConfigError: the file is missing or not YAML, a key is unknown or given twice, a value is
+            of the wrong type or out of range.
     """
     path = Path(path)
     try:
-        text = path.read_text()
-    except OSError as error:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
-            "problem file cannot be read", where=path, found=error.strerror, hint="see problems/"
+            "problem file cannot be read",
+            where=path,
+            found=getattr(error, "strerror", None) or error,
+            hint="soup-nlp list shows the problems of a folder",
         ) from error
-    try:
-        raw = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError("problem file is not YAML", where=path, found=str(error)) from error
+    raw, lines = _parse(text, str(path))
     if not isinstance(raw, dict):
         raise ConfigError(
-            "problem file must be a mapping", where=path, found=type(raw).__name__, expected="keys"
+            "problem file must be a mapping",
+            where=path,
+            found=type(raw).__name__,
+            expected="keys such as input: {kind: motorcycle}",
         )
     raw.setdefault("name", path.stem)
     raw.setdefault("base", str(path.resolve().parent))
-    return make_problem(raw, overrides, where=str(path), text=text)
+    return make_problem(raw, overrides, where=str(path), lines=lines)
 
 
 def make_problem(
-    raw: Mapping[str, Any], overrides: Sequence[str] = (), where: str = "problem", text: str = ""
+    raw: Mapping[str, Any],
+    overrides: Sequence[str] = (),
+    where: str = "problem",
+    lines: Mapping[Place, str] | None = None,
 ) -> Problem:
-    """Check a mapping and its overrides; see `load_problem`."""
-    tree = json.loads(json.dumps(raw))
+    """Check a mapping and its overrides; see `load_problem`.
+
+    Args:
+        raw: Sections by name.
+        overrides: `a.b=value` with the value in YAML.
+        where: Source of the mapping, for messages.
+        lines: Where in the source each key is, for messages.
+
+    Raises:
+        ConfigError: as `load_problem`.
+    """
+    tree = copy.deepcopy(dict(raw))
+    lines = dict(lines or {})
     for item in overrides:
-        _override(tree, item)
+        lines[_override(tree, item)] = f"--set {item}"
     try:
         return Problem.model_validate(tree)
     except ValidationError as error:
-        raise _explain(error, where, text) from error
-
-
-def _override(tree: dict[str, Any], item: str) -> None:
-    key, eq, value = item.partition("=")
-    if not eq or not key:
-        raise ConfigError(
-            "override is not key=value", where="--set", found=item, expected="solver.max_iter=200"
-        )
-    *parents, last = key.split(".")
-    node = tree
-    for part in parents:
-        node = node.setdefault(part, {})
-        if not isinstance(node, dict):
-            raise ConfigError("override goes below a value", where="--set", found=item)
-    node[last] = yaml.safe_load(value)
-
-
-def _explain(error: ValidationError, where: str, text: str) -> ConfigError:
-    """The first problem of a validation in our words: key, found, allowed, nearest spelling."""
-    first = error.errors()[0]
-    # the tagged union puts its tag into the location; it is no key of the file
-    place = [str(p) for p in first["loc"]]
-    if len(place) > 1 and place[0] == "input":
-        place.pop(1)
-    key = ".".join(place)
-    line = _line(text, place[-1] if place else "")
-    where = f"{where}{f', line {line}' if line else ''}, key {key or '(top)'}"
-    if first["type"] == "extra_forbidden":
-        allowed = sorted(_allowed(place[:-1], first["loc"]))
-        near = difflib.get_close_matches(place[-1], allowed, 1)
-        return ConfigError(
-            "unknown key",
-            where=where,
-            found=place[-1],
-            expected="one of " + ", ".join(allowed),
-            hint=f"did you mean {near[0]}?" if near else None,
-        )
-    expected = first["msg"]
-    hint = None
-    if first["type"] == "literal_error":
-        allowed = [
-            s.strip("'")
-            for s in str(first.get("ctx", {}).get("expected", "")).replace(" or ", ", ").split(", ")
-        ]
-        near = difflib.get_close_matches(str(first["input"]), allowed, 1, 0.4)
-        hint = f"did you mean {near[0]}?" if near else None
-    return ConfigError(
-        "missing key" if first["type"] == "missing" else "value does not fit",
-        where=where,
-        found=None if first["type"] == "missing" else repr(first["input"]),
-        expected=expected,
-        hint=hint,
-    )
-
-
-def _allowed(place: list[str], loc: tuple[int | str, ...]) -> list[str]:
-    """Keys that the model at a place has."""
-    if place == ["input"]:
-        kinds = typing.get_args(typing.get_args(Input)[0])
-        tag = str(loc[1])
-        models = [m for m in kinds if tag in typing.get_args(m.model_fields["kind"].annotation)]
-        return [k for m in models for k in m.model_fields]
-    model: Any = Problem
-    for part in place:
-        model = model.model_fields[part].annotation
-    return [k for k in model.model_fields if k != "base"]
-
-
-def _line(text: str, key: str) -> int | None:
-    for number, line in enumerate(text.splitlines(), 1):
-        if line.strip().startswith(f"{key}:"):
-            return number
-    return None
+        raise explain(error, Problem, tree, where, lines) from error
 
 
 def dump_problem(problem: Problem) -> str:
-    """The complete, merged problem as YAML; it can be solved again."""
-    return yaml.safe_dump(problem.model_dump(mode="json"), sort_keys=False)
+    """The complete, merged problem as YAML with a comment on every key; it can be solved again."""
+    return "\n".join(_write(problem, "")) + "\n"
+
+
+def _write(model: Strict, pad: str) -> Iterator[str]:
+    docs = attribute_docs(type(model).__doc__)
+    for key in type(model).model_fields:
+        value = getattr(model, key)
+        comment = f"  # {docs[key]}" if key in docs else ""
+        if isinstance(value, Strict):
+            yield f"{pad}{key}:{comment}"
+            yield from _write(value, pad + "  ")
+        else:
+            flow = None if isinstance(value, list | dict) else False
+            text = yaml.dump({key: value}, Dumper=_Dumper, default_flow_style=flow, width=10**6)
+            yield f"{pad}{text.rstrip()}{comment}"
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with the numbers and booleans of version 1.2: 1e-3 is a number, `no` is a word."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes whatever either version would not read as a string."""
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, rule) for tag, rule in rules if tag.split(":")[-1] in ("null", "merge")]
+    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+for _tag, _rule, _first in (
+    ("bool", r"true|false|True|False|TRUE|FALSE", "tTfF"),
+    ("int", r"[-+]?\d+", "-+0123456789"),
+    (
+        "float",
+        r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        "-+.0123456789",
+    ),
+):
+    for _class in (_Loader, _Dumper):
+        _class.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_tag}", re.compile(rf"(?:{_rule})\Z"), list(_first)
+        )
+# 010 is ten, not eight
+_Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value))
+_Loader.add_constructor(
+    "tag:yaml.org,2002:float",
+    lambda loader, node: float(node.value.lower().replace(".inf", "inf").replace(".nan", "nan")),
+)
+
+
+def _parse(text: str, source: str) -> tuple[Any, dict[Place, str]]:
+    """The content of a YAML text, and the line of every key."""
+    loader = _Loader(text)
+    lines: dict[Place, str] = {}
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None, lines
+        _locate(node, (), lines, source)
+        return loader.construct_document(node), lines
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        raise ConfigError(
+            "text is not YAML",
+            where=f"{source}, line {mark.line + 1}" if mark else source,
+            found=getattr(error, "problem", None) or error,
+        ) from error
+    finally:
+        loader.dispose()
+
+
+def _locate(node: yaml.Node, place: Place, lines: dict[Place, str], source: str) -> None:
+    """Fill in the line of every key; a key that is given twice is an error."""
+    if not isinstance(node, yaml.MappingNode):
+        return
+    for key, value in node.value:
+        here = (*place, str(key.value))
+        line = f"line {key.start_mark.line + 1}"
+        if here in lines:
+            raise ConfigError("key is given twice", where=f"{source}, {line}", found=".".join(here))
+        lines[here] = line
+        _locate(value, here, lines, source)
+
+
+def _override(tree: dict[str, Any], item: str) -> Place:
+    key, eq, value = item.partition("=")
+    place = tuple(key.strip().split("."))
+    if not eq or not all(place):
+        raise ConfigError(
+            "override is not key=value", where="--set", found=item, expected="solver.max_iter=200"
+        )
+    node: Any = tree
+    for k, part in enumerate(place[:-1]):
+        node = node.setdefault(part, {})
+        if not isinstance(node, dict):
+            raise ConfigError(
+                "override goes below a value",
+                where="--set",
+                found=item,
+                expected=f"{'.'.join(place[: k + 1])} is a section",
+            )
+    node[place[-1]] = _parse(value, f"--set {item}")[0]
+    return place

@@ -2,51 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from soup_nlp.config import (
-    FilesInput,
-    FolderInput,
-    KittiInput,
-    MotorcycleInput,
-    Problem,
-    SceneInput,
-    SintelInput,
-    make_problem,
-)
-from soup_nlp.data import datasets
-from soup_nlp.data.flow import resolve_flow
-from soup_nlp.data.formats import read_depth, read_image
-from soup_nlp.data.pair import Flow, Pair, Truth
-from soup_nlp.data.scenes import render_scene
-from soup_nlp.errors import DataError
-from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.config import Problem, make_problem
+from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.superpixels import segment
+from soup_nlp.inputs import load_flow_of, load_pair
 from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.report.baselines import rigid_depth
-from soup_nlp.report.metrics import (
-    DepthMetrics,
-    constant_depth_metrics,
-    depth_metrics,
-    sample_at_points,
-)
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.report.baselines import RigidBaseline
+from soup_nlp.report.metrics import DepthMetrics
+from soup_nlp.scoring import evaluate, rigid_baseline, score
 from soup_nlp.solve.ipopt import Listener
 from soup_nlp.solve.soup import Solution, SolverOptions, solve_soup
 from soup_nlp.start.propose import Start, StartOptions, propose
 
-Float = NDArray[np.float64]
+__all__ = ["Run", "evaluate", "load_pair", "run", "solve_pair"]
 
 
 @dataclass(frozen=True)
@@ -61,10 +41,16 @@ class Run:
         data: Numbers of the energy.
         weights: Constants of the energy.
         solution: What the constrained NLP ended with.
+        answer: Ipopt's own answer to the constrained NLP (the best iterate where it did not
+            converge), before anything is made of it: constraints hold to its tolerance only.
+        delivered: What `solution.soup` is made of: "constrained NLP", or "presolve" where that
+            has the lower exact energy.
         start_reconstruction: Dense 3D of the start.
         reconstruction: Dense 3D of the solution.
-        metrics: By "solution", "start", "constant", "rigid"; empty without truth.
-        seconds: Wall time by stage.
+        rigid: One rigid motion for the whole image; None without truth or where none fits.
+        metrics: By "solution", "start", "constant", "rigid", and "solution_next" for the next
+            frame; a key without truth is absent.
+        seconds: Wall time by stage; those that start with nlp_ are parts of "nlp".
     """
 
     problem: Problem
@@ -74,8 +60,11 @@ class Run:
     data: EnergyData
     weights: Weights
     solution: Solution
+    answer: Soup
+    delivered: str
     start_reconstruction: Reconstruction
     reconstruction: Reconstruction
+    rigid: RigidBaseline | None
     metrics: Mapping[str, DepthMetrics] = field(repr=False)
     seconds: Mapping[str, float]
 
@@ -83,62 +72,6 @@ class Run:
     def soup(self) -> Soup:
         """The solution's soup."""
         return self.solution.soup
-
-
-def load_pair(problem: Problem) -> Pair:
-    """The frame pair of a problem, without its flow.
-
-    Raises:
-        DataError: a file is missing, damaged, or does not fit.
-    """
-    source = problem.input
-    if isinstance(source, MotorcycleInput):
-        pair = datasets.load_motorcycle()
-    elif isinstance(source, SceneInput):
-        pair = render_scene(source.scene, source.seed, source.width, source.height)
-    elif isinstance(source, FilesInput):
-        pair = _load_files(problem, source)
-    elif isinstance(source, FolderInput):
-        pair = datasets.load_folder(problem.path(source.path), source.depth_scale, source.unit)
-    elif isinstance(source, SintelInput):
-        pair = datasets.load_sintel(
-            problem.path(source.root), source.scene, source.frame, source.render, source.step
-        )
-    elif isinstance(source, KittiInput):
-        twelve = source.kind == "kitti2012"
-        kitti = datasets.load_kitti2012 if twelve else datasets.load_kitti2015
-        pair = kitti(problem.path(source.root), source.index, source.occ)
-    else:
-        root, where = problem.path(source.root), (source.scene, source.frame, source.variation)
-        if source.kind == "vkitti1":
-            pair = datasets.load_vkitti1(root, *where, step=source.step)
-        else:
-            pair = datasets.load_vkitti2(root, *where, step=source.step)
-    return replace(pair, name=problem.name)
-
-
-def _load_files(problem: Problem, source: FilesInput) -> Pair:
-    ref, next_ = read_image(problem.path(source.ref)), read_image(problem.path(source.next))
-    if ref.shape != next_.shape:
-        raise DataError(
-            "the two images differ in size",
-            where=f"{source.ref}, {source.next}",
-            found=f"{ref.shape[1]}x{ref.shape[0]} and {next_.shape[1]}x{next_.shape[0]}",
-            expected="the same size",
-        )
-    truth = None
-    if source.depth:
-        truth = Truth(depth_ref=read_depth(problem.path(source.depth)), unit="file")
-    K_next = source.intrinsics_next or source.intrinsics
-    return Pair(ref, next_, intrinsics(*source.intrinsics), intrinsics(*K_next), truth=truth)
-
-
-def load_flow_of(problem: Problem, pair: Pair) -> Flow:
-    """The flow that a problem asks for."""
-    source = problem.flow.source
-    if source.endswith((".flo", ".png", ".npy")):
-        source = str(problem.path(source))
-    return resolve_flow(pair, source)
 
 
 def _tell(say: Callable[[str], None] | None, line: object) -> None:
@@ -203,11 +136,12 @@ def run(
     weights = Weights(**e.weights.model_dump())
     solver = problem.solver.model_dump()
     solver["presolve_eps"] = tuple(solver["presolve_eps"])
+    form = Formulation(**problem.formulation.model_dump())
     solution = solve_soup(
         start.soup,
         data,
         weights,
-        Formulation(**problem.formulation.model_dump()),
+        form,
         SolverOptions(**solver),
         listener=listener,
         stop=stop,
@@ -219,21 +153,26 @@ def run(
     before, after = (
         reconstruct(x, labels, pair.K_ref, pair.K_next, size) for x in (start.soup, solution.soup)
     )
-    metrics = score(pair, before, after, problem.expected.scale)
+    answer = MatrixLayout(data.share, form.gauge).unpack(solution.stages[-1].x)
+    own = np.array_equal(answer.retracted().lam, solution.soup.lam)
+    rigid = rigid_baseline(pair)
+    metrics = score(pair, before, after, rigid, problem.expected.scale, problem.expected.cap)
     lap("evaluation")
-    nlp = {f"nlp_{k}": v for k, v in solution.seconds.items()}
     return Run(
-        problem,
-        pair,
-        seg,
-        start,
-        data,
-        weights,
-        solution,
-        before,
-        after,
-        metrics,
-        {**seconds, **nlp},
+        problem=problem,
+        pair=pair,
+        segmentation=seg,
+        start=start,
+        data=data,
+        weights=weights,
+        solution=solution,
+        answer=answer,
+        delivered="constrained NLP" if own else "presolve",
+        start_reconstruction=before,
+        reconstruction=after,
+        rigid=rigid,
+        metrics=metrics,
+        seconds={**seconds, **{f"nlp_{k}": v for k, v in solution.seconds.items()}},
     )
 
 
@@ -243,69 +182,10 @@ def solve_pair(pair: Pair, **options: Any) -> Run:
     Args:
         pair: Images, cameras, and a flow if there is one (else OpenCV DIS).
         options: Sections of a problem file, e.g. `segmentation={"superpixels": 500}`.
+
+    Raises:
+        ConfigError: an option is wrong.
+        DataError: the pair cannot be used.
     """
     raw = {"name": pair.name, "input": {"kind": "motorcycle"}, **options}
     return run(make_problem(raw, where="solve_pair"), pair=pair)
-
-
-def score(
-    pair: Pair, before: Reconstruction, after: Reconstruction, scale: str = "median"
-) -> dict[str, DepthMetrics]:
-    """Metrics of start, solution, a constant depth and one rigid motion; {} without truth."""
-    if pair.truth is None:
-        return {}
-    depths = {"solution": after.depth_ref, "start": before.depth_ref}
-    # where no rigid motion can be fitted the row is absent
-    with contextlib.suppress(DataError):
-        depths["rigid"] = rigid_depth(pair).depth
-    return score_depths(pair.truth, depths, scale)
-
-
-def score_depths(
-    truth: Truth, depths: Mapping[str, Float], scale: str = "median", cap: float | None = None
-) -> dict[str, DepthMetrics]:
-    """Metrics of named depth maps against dense or sparse truth, constant depth beside them."""
-    out: dict[str, DepthMetrics] = {}
-    gt = truth.depth_ref
-    for name, depth in depths.items():
-        estimate, reference = (depth, gt)
-        if gt is None:
-            if truth.points is None:
-                return {}
-            estimate, reference = sample_at_points(depth, truth.points)
-        assert reference is not None
-        out[name] = depth_metrics(estimate, reference, scale=scale, cap=cap)  # type: ignore[arg-type]
-        if "constant" not in out:
-            out["constant"] = constant_depth_metrics(reference, scale=scale, cap=cap)  # type: ignore[arg-type]
-    return out
-
-
-def evaluate(
-    folder: str | Path,
-    depth: str | Path,
-    *,
-    scale: str = "median",
-    cap: float | None = None,
-) -> dict[str, DepthMetrics]:
-    """Score the depth of a result folder against a truth file.
-
-    Args:
-        folder: Result folder.
-        depth: .dpt, .npy, .pfm or 16-bit .png depth of the reference frame.
-        scale: "median", "mre", "lsq" or "none".
-        cap: Truth beyond this depth is dropped.
-
-    Raises:
-        DataError: a file is missing or sizes differ.
-    """
-    from soup_nlp.report.store import read_h5, require
-
-    tree = read_h5(Path(folder) / "result.h5")
-    estimate, start = require(tree, "depth/ref"), require(tree, "depth/start_ref")
-    gt = read_depth(Path(depth))
-    if gt.shape != estimate.shape:
-        raise DataError(
-            "truth and result differ in size", where=depth, found=gt.shape, expected=estimate.shape
-        )
-    truth = Truth(depth_ref=np.asarray(gt, float))
-    return score_depths(truth, {"solution": estimate, "start": start}, scale, cap)
