@@ -103,7 +103,7 @@ def test_check_holds_and_catches_tampering(solved, capsys):
         file["solution/R"][3] = 1.001 * kept
     report = check_folder(solved)
     assert not report.ok
-    assert any(r.name == "constraint so3" and r.worst == 3 and not r.ok for r in report.rows)
+    assert any(r.name == "solution so3" and r.worst == 3 and not r.ok for r in report.rows)
     with h5py.File(solved / "result.h5", "a") as file:
         file["solution/R"][3] = kept
     assert check_folder(solved).ok

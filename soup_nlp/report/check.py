@@ -1,27 +1,36 @@
-"""Claims of a result folder recomputed from its arrays, with code of its own.
-
-Nothing of `soup_nlp.model` or `soup_nlp.solve` is used: the energy is written a third time here,
-straight from the equations, so that a mistake in the model cannot confirm itself.
-"""
+"""Claims of a result folder, each recomputed from its arrays with code of its own."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import yaml
 
 from soup_nlp.errors import DataError
-from soup_nlp.report.metrics import depth_metrics, sample_at_points
-from soup_nlp.report.store import read_h5, require
+from soup_nlp.report import recompute
+from soup_nlp.report.store import read_attrs, read_h5, require
 
-Float = NDArray[np.float64]
+LIMITS = {
+    "so3": 1e-8,
+    "normal": 1e-8,
+    "simplex": 1e-10,
+    "positive": 0.0,
+    "det": 1e-8,
+    # Ipopt keeps inequalities to its own tolerance
+    "visible": 1e-6,
+}
+"""Largest violation that a delivered soup may have."""
 
-LIMITS = {"so3": 1e-8, "normal": 1e-8, "simplex": 1e-10, "positive": 0.0, "det": 1e-8}
+GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+DEPTHS = {"solution": "ref", "start": "start_ref", "rigid": "rigid_ref"}
+RELATIVE = 1e-9
+ABSOLUTE = 1e-12
+NOT_CHECKED = "dual infeasibility and complementarity need the model's derivatives: not rechecked"
 
 
 @dataclass(frozen=True)
@@ -32,9 +41,10 @@ class Row:
         name: What is claimed.
         claimed: Value in summary.json.
         found: Value recomputed from the arrays.
-        limit: Largest allowed found value (constraints) or relative difference (numbers).
+        limit: Largest allowed found value (constraints) or difference (numbers, relative).
         ok: Whether the claim holds.
         worst: Superpixel with the largest residual, -1 where there is none.
+        note: More about it.
     """
 
     name: str
@@ -43,12 +53,13 @@ class Row:
     limit: float
     ok: bool
     worst: int = -1
+    note: str = ""
 
     def __str__(self) -> str:
         where = f"  superpixel {self.worst}" if self.worst >= 0 else ""
-        mark = "ok  " if self.ok else "FAIL"
-        return f"{mark} {self.name:<24} {self.claimed:>13.6g} {self.found:>13.6g}" + (
-            f" {self.limit:>9.1e}{where}"
+        return (
+            f"{'ok  ' if self.ok else 'FAIL'} {self.name:<28} {self.claimed:>13.6g}"
+            f" {self.found:>13.6g} {self.limit:>9.1e}{where}{'  ' if self.note else ''}{self.note}"
         )
 
 
@@ -64,167 +75,190 @@ class CheckReport:
         return all(r.ok for r in self.rows)
 
     def __str__(self) -> str:
-        head = f"     {'claim':<24} {'claimed':>13} {'recomputed':>13} {'limit':>9}"
-        return "\n".join([head, *map(str, self.rows)])
+        head = f"     {'claim':<28} {'claimed':>13} {'recomputed':>13} {'limit':>9}"
+        return "\n".join([head, *map(str, self.rows), f"     {NOT_CHECKED}"])
 
 
 def check_folder(folder: str | Path) -> CheckReport:
-    """Recompute energy, constraints and metrics of a result folder.
+    """Recompute energy, constraints, depth and metrics of a result folder.
+
+    Args:
+        folder: Result folder.
 
     Raises:
-        DataError: a file or array is missing.
+        DataError: a file, a claim or an array is missing or not what it should be.
     """
     folder = Path(folder)
+    claims = _claims(folder)
+    path = folder / "result.h5"
+    tree, attrs = read_h5(path), read_attrs(path)
     try:
-        claims = json.loads((folder / "summary.json").read_text())
+        return CheckReport(tuple(_rows(folder, claims, tree, attrs)))
+    except KeyError as error:
+        raise DataError("result lacks a claim or an array", where=folder, found=error) from error
+    except (ValueError, IndexError, TypeError, AttributeError, np.linalg.LinAlgError) as error:
+        raise DataError(
+            "claims and arrays of a result do not fit together", where=folder, found=error
+        ) from error
+
+
+def _claims(folder: Path) -> dict[str, Any]:
+    try:
+        claims = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DataError(
-            "summary.json cannot be read", where=folder, found=str(error), hint="run solve first"
+            "summary.json cannot be read", where=folder, found=error, hint="run solve first"
         ) from error
-    tree = read_h5(folder / "result.h5")
-    rows: list[Row] = []
+    if not isinstance(claims, dict):
+        raise DataError("summary.json holds no claims", where=folder, found=type(claims).__name__)
+    return claims
+
+
+def _rows(
+    folder: Path, claims: Mapping[str, Any], tree: Mapping[str, Any], attrs: Mapping[str, Any]
+) -> Iterator[Row]:
+    config = (folder / "config.yaml").read_text(encoding="utf-8")
+    yield from _labels(claims, attrs, config)
+    settings = yaml.safe_load(str(attrs["config"]))
+    weights = {k: float(v) for k, v in tree["weights"].items()}
+    for key in ("arap", "proj", "cont", "orient"):
+        yield _same(f"weight {key}", settings["energy"]["weights"][key], weights[key])
+    for name, gap in recompute.data_errors(tree, float(settings["segmentation"]["beta"])).items():
+        yield Row(f"data {name}", 0.0, gap, RELATIVE, gap <= RELATIVE)
     for which in ("start", "solution"):
-        found = _energy(_state(tree, which), tree)
+        found = recompute.energy(_state(tree, which), tree["energy"], weights)
         for term, value in found.items():
-            claimed = float(claims["energy"][which][term])
-            ok = abs(value - claimed) <= 1e-9 * max(1.0, abs(value))
-            rows.append(Row(f"energy {which} {term}", claimed, value, 1e-9, ok))
-    rows += _constraints(_state(tree, "solution"), tree, claims["residuals"])
-    rows += _depth(tree)
-    rows += _metrics(tree, claims["metrics"])
+            yield _same(f"energy {which} {term}", claims["energy"][which][term], value)
     if claims["converged"]:
-        start, end = (float(claims["energy"][k]["total"]) for k in ("start", "solution"))
-        rows.append(Row("energy falls", end, end - start, 0.0, end <= start))
-    return CheckReport(tuple(rows))
+        before, after = (float(claims["energy"][k]["total"]) for k in ("start", "solution"))
+        ok = after <= before * (1 + RELATIVE)
+        yield Row("energy falls", before, after, before, ok)
+    yield from _constraints(claims, tree, weights)
+    yield from _depth(tree)
+    yield from _metrics(tree, claims["metrics"])
 
 
-State = Mapping[str, Float]
+def _number(value: Any) -> float:
+    """A claim as a number; JSON has null for what is not finite."""
+    return float("nan") if value is None else float(value)
 
 
-def _state(tree: Mapping[str, Any], which: str) -> State:
-    names = ("lam", "n", "d", "R", "t")
-    return {k: np.asarray(require(tree, f"{which}/{k}"), float) for k in names}
+def _same(name: str, claimed: Any, found: float, note: str = "") -> Row:
+    """A claim that must equal what was found, to rounding."""
+    value = _number(claimed)
+    gap = abs(value - found)
+    ok = gap <= RELATIVE * abs(found) + ABSOLUTE or (np.isnan(value) and np.isnan(found))
+    return Row(name, value, found, RELATIVE, bool(ok), note=note)
 
 
-def _lift(s: State, ray: Float, who: NDArray[np.int64]) -> tuple[Float, Float]:
-    """Points in both frames of rays (M, ..., 3) on the planes of superpixels who (M,)."""
-    more = (slice(None),) + (None,) * (ray.ndim - 2)
-    facing = -(s["n"][who][(*more, slice(None))] * ray).sum(-1)
-    X = ((s["lam"] * s["d"])[who][more] / facing)[..., None] * ray
-    T = (s["lam"][:, None] * s["t"])[who]
-    Y = np.matmul(X.reshape(len(who), -1, 3), np.swapaxes(s["R"][who], 1, 2)) + T[:, None]
-    return X, Y.reshape(X.shape)
-
-
-def _energy(s: State, tree: Mapping[str, Any]) -> dict[str, float]:
-    e = {k: np.asarray(v) for k, v in tree["energy"].items()}
-    w = {k: float(np.asarray(v)) for k, v in tree["weights"].items()}
-    ray, every = e["anchor_ray"], np.arange(len(s["lam"]))
-    A, B = _lift(s, ray[:, None], every)
-    A, B = A[:, 0], B[:, 0]
-    T = s["lam"][:, None] * s["t"]
-    scene = float((e["share"] * s["lam"] * s["d"]).sum())
-
-    def unit(pairs: NDArray[np.int64]) -> Float:
-        if bool(e["local_units"]):
-            return A[pairs, 2].mean(axis=1)
-        return np.full(len(pairs), scene)
-
-    i, k = e["edges"].T
-    length = unit(e["edges"]) * e["edge_unit"]
-    dR = s["R"][i] - s["R"][k]
-    shift = T[i] - T[k]
-    if bool(e["arap_at_anchors"]):
-        shift = shift + np.einsum("eij,ej->ei", dR, (A[i] + A[k]) / 2)
-    parts = (
-        float(e["rotation_scale"]) * np.sqrt((dR**2).sum((1, 2))),
-        np.sqrt((shift**2).sum(1)) / length,
-        np.abs(np.sqrt(((A[i] - A[k]) ** 2).sum(1)) - np.sqrt(((B[i] - B[k]) ** 2).sum(1)))
-        / length,
-    )
-    arap = float((e["edge_weight"] * sum(np.minimum(p, w["sigma_arap"]) for p in parts)).sum())
-
-    _, moved = _lift(s, e["pixel_ray"], every)
-    image = moved @ e["K_next"].T
-    miss = image[..., :2] / image[..., 2:] - e["pixel_target"]
-    miss = np.minimum(np.sqrt((miss**2).sum(-1)), w["sigma_proj"])
-    proj = float((e["pixel_weight"] * miss).sum())
-
-    cont = orient = 0.0
-    if len(e["pairs"]):
-        i, k = e["pairs"].T
-        Xi, Yi = _lift(s, e["boundary_ray"], i)
-        Xk, Yk = _lift(s, e["boundary_ray"], k)
-        factor = e["pair_factor"] / (unit(e["pairs"]) * e["pair_unit"])
-        before = factor * np.sqrt(((Xi - Xk) ** 2).sum((1, 2)))
-        after = factor * np.sqrt(((Yi - Yk) ** 2).sum((1, 2)))
-        gap = np.minimum(before, w["sigma_cont_ref"]) + np.minimum(after, w["sigma_cont"])
-        cont = float((e["pair_weight"] * gap).sum())
-        turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
-        orient = float((e["pair_count"] * np.minimum(turn, w["sigma_orient"])).sum())
-    terms = {
-        "arap": w["arap"] * arap,
-        "proj": w["proj"] * proj,
-        "cont": w["cont"] * cont,
-        "orient": w["orient"] * orient,
+def _labels(claims: Mapping[str, Any], attrs: Mapping[str, Any], config: str) -> Iterator[Row]:
+    """What the three files say in words must agree; 1 is agreement."""
+    pairs = {
+        "status": claims["status"] == attrs["status"],
+        "converged": bool(claims["converged"]) == (attrs["status"] in GOOD),
+        "delivered": claims["delivered"] == attrs["delivered"],
+        "problem hash": claims["problem_hash"] == attrs["problem_hash"],
+        "seed": claims["seed"] == attrs["seed"],
+        "config.yaml": config == attrs["config"],
     }
-    return {"total": sum(terms.values()), **terms}
+    for name, ok in pairs.items():
+        yield Row(f"{name} as in result.h5", 1.0, float(ok), 0.0, ok)
 
 
-def _constraints(s: State, tree: Mapping[str, Any], claims: Mapping[str, float]) -> list[Row]:
-    n = len(s["lam"])
-    gram = np.einsum("nji,njk->nik", s["R"], s["R"]) - np.eye(3)
-    facing = -(s["n"][:, None] * require(tree, "energy/rim_ray")).sum(-1)
-    low = float(np.asarray(require(tree, "weights/min_facing")))
-    # Ipopt keeps inequalities to its own constraint tolerance
-    limits = {**LIMITS, "visible": 1e-6}
-    each = {
-        "so3": np.abs(gram).reshape(n, -1).max(1),
-        "normal": np.abs((s["n"] ** 2).sum(1) - 1),
-        "positive": np.maximum(0.0, -np.minimum(s["lam"], s["d"])),
-        "det": np.abs(np.linalg.det(s["R"]) - 1),
-        "visible": np.maximum(0.0, (low - facing).max(1)),
-    }
-    rows = []
-    for name, value in each.items():
-        found, claimed = float(value.max()), float(claims[name])
-        same = abs(found - claimed) <= 1e-12 + 1e-3 * abs(found)
-        ok = found <= limits[name] and same
-        rows.append(
-            Row(f"constraint {name}", claimed, found, limits[name], ok, int(value.argmax()))
-        )
-    total = float(abs(s["lam"].sum() - 1))
-    claimed = float(claims["simplex"])
-    rows.append(Row("constraint simplex", claimed, total, LIMITS["simplex"], total <= 1e-10))
-    return rows
+def _state(tree: Mapping[str, Any], which: str) -> dict[str, recompute.Float]:
+    """The arrays of a soup.
+
+    Raises:
+        DataError: one is missing or has the wrong shape.
+    """
+    n = len(require(tree, f"{which}/lam"))
+    shapes = {"lam": (n,), "n": (n, 3), "d": (n,), "R": (n, 3, 3), "t": (n, 3)}
+    out = {}
+    for key, shape in shapes.items():
+        out[key] = np.asarray(require(tree, f"{which}/{key}"), float)
+        if out[key].shape != shape:
+            raise DataError(
+                "array of a soup has the wrong shape",
+                where=f"{which}/{key}",
+                found=out[key].shape,
+                expected=shape,
+            )
+    return out
 
 
-def _depth(tree: Mapping[str, Any]) -> list[Row]:
-    """The stored depth map is the one of the stored planes."""
-    s, labels = _state(tree, "solution"), require(tree, "segmentation/labels")
-    K, depth = require(tree, "input/K_ref"), require(tree, "depth/ref")
-    v, u = np.mgrid[0 : labels.shape[0], 0 : labels.shape[1]]
-    ray = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = (s["lam"] * s["d"])[labels] / -(s["n"][labels] * ray).sum(-1)
-    known = np.isfinite(depth)
-    off = float(np.abs(z[known] / depth[known] - 1).max(initial=0.0))
-    return [Row("depth map", 0.0, off, 1e-9, off <= 1e-9)]
+def _constraints(
+    claims: Mapping[str, Any], tree: Mapping[str, Any], weights: Mapping[str, float]
+) -> Iterator[Row]:
+    rim = require(tree, "energy/rim_ray")
+    # Ipopt's answer may violate its constraints by as much as it says, the delivered soup by less
+    own = float(claims["residuals"]["nlp_infeasibility"])
+    within = own * (1 + 1e-6) + ABSOLUTE
+    for which, key, limits in (
+        ("solution", "residuals", LIMITS),
+        ("answer", "answer_residuals", dict.fromkeys(("so3", "normal", "simplex"), within)),
+    ):
+        state = _state(tree, which)
+        found = recompute.constraints(state, rim, weights["min_facing"])
+        for name, limit in limits.items():
+            value, claimed = float(found[name].max()), _number(claims[key][name])
+            ok = value <= limit and abs(value - claimed) <= 1e-3 * value + ABSOLUTE
+            worst = int(found[name].argmax()) if name != "simplex" and value > 0 else -1
+            yield Row(f"{which} {name}", claimed, value, limit, bool(ok), worst)
+    if claims["delivered"] == "constrained NLP":
+        a, b = _state(tree, "answer"), _state(tree, "solution")
+        gap = max(float(np.abs(a[k] - b[k]).max()) for k in ("n", "R"))
+        gap = max(gap, float(np.abs(a["lam"] / b["lam"] - 1).max()))
+        limit = 10 * within + RELATIVE
+        yield Row("solution is Ipopt's answer", 0.0, gap, limit, gap <= limit)
 
 
-def _metrics(tree: Mapping[str, Any], claims: Mapping[str, Any]) -> list[Row]:
-    rows = []
+def _depth(tree: Mapping[str, Any]) -> Iterator[Row]:
+    """The stored depth maps are those of the stored planes."""
+    labels, K = require(tree, "segmentation/labels"), require(tree, "input/K_ref")
+    for which, key in (("solution", "ref"), ("start", "start_ref")):
+        depth = require(tree, f"depth/{key}")
+        z = recompute.depth_map(_state(tree, which), labels, K)
+        known = np.isfinite(depth) & np.isfinite(z)
+        # a pixel exactly at the horizon may fall on either side
+        lost = float((np.isfinite(depth) != np.isfinite(z)).mean())
+        off = float(np.abs(z[known] / depth[known] - 1).max(initial=0.0))
+        ok = off <= RELATIVE and lost <= 1e-4
+        note = "" if lost <= 1e-4 else f"{lost:.1%} of the pixels are known in one only"
+        yield Row(f"depth map {which}", 0.0, off, RELATIVE, ok, note=note)
+
+
+def _metrics(tree: Mapping[str, Any], claims: Mapping[str, Any]) -> Iterator[Row]:
     truth = tree.get("truth", {})
-    for name, key in (("solution", "ref"), ("start", "start_ref")):
+    constant = float("nan")
+    for name in ("constant", *(k for k in claims if k != "constant")):
         if name not in claims:
             continue
-        claim, depth = claims[name], require(tree, f"depth/{key}")
-        if "depth_ref" in truth:
-            estimate, gt = depth, truth["depth_ref"]
-        else:
-            estimate, gt = sample_at_points(depth, truth["points"])
-        found = depth_metrics(estimate, gt, scale=claim["scale_rule"], cap=claim["cap"]).mre
-        claimed = float(claim["mre"])
-        ok = abs(found - claimed) <= 1e-9 * max(1.0, found)
-        rows.append(Row(f"mre {name}", claimed, found, 1e-9, ok))
-    return rows
+        claim = claims[name]
+        z, gt = _compared(tree, truth, name)
+        found = recompute.scores(z, gt, claim["scale_rule"], claim["cap"])
+        if name == "constant":
+            constant = found.get("mre", constant)
+        if "skill" in claim and constant > 0:
+            found["skill"] = 1 - found.get("mre", np.nan) / constant
+        yield _same(f"mre {name}", claim["mre"], found.get("mre", np.nan))
+        others = [_same(key, claim[key], value) for key, value in found.items() if key != "mre"]
+        bad = [row for row in others if not row.ok]
+        note = ", ".join(f"{r.name} is {r.found:.6g}, not {r.claimed:.6g}" for r in bad)
+        count = float(len(others))
+        yield Row(f"other scores {name}", count, count - len(bad), 0.0, not bad, note=note)
+
+
+def _compared(
+    tree: Mapping[str, Any], truth: Mapping[str, Any], name: str
+) -> tuple[recompute.Float, recompute.Float]:
+    """Estimate and truth that a row of metrics is about."""
+    if name == "solution_next":
+        return require(tree, "depth/next"), require(tree, "truth/depth_next")
+    if name == "constant":
+        z = np.ones_like(require(tree, "depth/ref"))
+    else:
+        z = require(tree, f"depth/{DEPTHS[name]}")
+    if "depth_ref" in truth:
+        return z, truth["depth_ref"]
+    estimate, gt = recompute.at_points(z, require(tree, "truth/points"))
+    return (np.ones_like(gt), gt) if name == "constant" else (estimate, gt)

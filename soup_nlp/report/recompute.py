@@ -1,0 +1,220 @@
+"""Energy, constraints, depth and scores from stored arrays, written once more from the equations.
+
+Nothing of `soup_nlp.model`, `soup_nlp.solve` or `soup_nlp.report.metrics` is used, so that a
+mistake there cannot confirm itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+State = Mapping[str, Float]
+"""lam (N,), n (N, 3), d (N,), R (N, 3, 3), t (N, 3) of a soup."""
+
+
+def lift(s: State, ray: Float, who: Int) -> tuple[Float, Float]:
+    """Points in both frames of rays on the planes of superpixels.
+
+    Args:
+        s: Soup.
+        ray: (M, B, 3) rays.
+        who: (M,) superpixel of each row.
+
+    Returns:
+        (M, B, 3) reference-frame and next-frame points.
+    """
+    facing = -(s["n"][who][:, None] * ray).sum(-1)
+    X = ((s["lam"] * s["d"])[who][:, None] / facing)[..., None] * ray
+    T = (s["lam"][:, None] * s["t"])[who]
+    return X, np.matmul(X, np.swapaxes(s["R"][who], 1, 2)) + T[:, None]
+
+
+def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, float]:
+    """Exact E and its weighted terms (paper Eq. 1 to 6, FORMULATION's choices).
+
+    Args:
+        s: Soup.
+        e: Arrays of the energy, as stored.
+        w: Factors and truncations.
+    """
+    every = np.arange(len(s["lam"]))
+    A, B = (x[:, 0] for x in lift(s, e["anchor_ray"][:, None], every))
+    T = s["lam"][:, None] * s["t"]
+    scene = float((e["share"] * s["lam"] * s["d"]).sum())
+
+    def unit(pairs: Int) -> Float:
+        if bool(e["local_units"]):
+            return np.asarray(A[pairs, 2].mean(axis=1))
+        return np.full(len(pairs), scene)
+
+    arap = cont = orient = 0.0
+    if len(e["edges"]):
+        i, k = e["edges"].T
+        length = unit(e["edges"]) * e["edge_unit"]
+        dR = s["R"][i] - s["R"][k]
+        shift = T[i] - T[k]
+        if bool(e["arap_at_anchors"]):
+            shift = shift + np.einsum("eij,ej->ei", dR, (A[i] + A[k]) / 2)
+        stretch = _length(A[i] - A[k]) - _length(B[i] - B[k])
+        parts = (
+            float(e["rotation_scale"]) * np.sqrt((dR**2).sum((1, 2))),
+            _length(shift) / length,
+            np.abs(stretch) / length,
+        )
+        cut = sum(np.minimum(p, w["sigma_arap"]) for p in parts)
+        arap = float((e["edge_weight"] * cut).sum())
+
+    image = lift(s, e["pixel_ray"], every)[1] @ e["K_next"].T
+    miss = _length(image[..., :2] / image[..., 2:] - e["pixel_target"])
+    proj = float((e["pixel_weight"] * np.minimum(miss, w["sigma_proj"])).sum())
+
+    if len(e["pairs"]):
+        i, k = e["pairs"].T
+        Xi, Yi = lift(s, e["boundary_ray"], i)
+        Xk, Yk = lift(s, e["boundary_ray"], k)
+        factor = e["pair_factor"] / (unit(e["pairs"]) * e["pair_unit"])
+        before = factor * np.sqrt(((Xi - Xk) ** 2).sum((1, 2)))
+        after = factor * np.sqrt(((Yi - Yk) ** 2).sum((1, 2)))
+        gap = np.minimum(before, w["sigma_cont_ref"]) + np.minimum(after, w["sigma_cont"])
+        cont = float((e["pair_weight"] * gap).sum())
+        turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
+        orient = float((e["pair_count"] * np.minimum(turn, w["sigma_orient"])).sum())
+    terms = {"arap": arap, "proj": proj, "cont": cont, "orient": orient}
+    terms = {name: w[name] * value for name, value in terms.items()}
+    return {"total": sum(terms.values()), **terms}
+
+
+def _length(v: Float) -> Float:
+    return np.asarray(np.sqrt((v**2).sum(-1)))
+
+
+def constraints(s: State, rim_ray: Float, min_facing: float) -> dict[str, Float]:
+    """Violation of every kind of constraint, by superpixel (simplex: one number).
+
+    Args:
+        s: Soup.
+        rim_ray: (N, V, 3) rays where visibility is imposed.
+        min_facing: c of `-n . r >= c`.
+    """
+    n = len(s["lam"])
+    gram = np.einsum("nji,njk->nik", s["R"], s["R"]) - np.eye(3)
+    facing = -(s["n"][:, None] * rim_ray).sum(-1)
+    return {
+        "so3": np.abs(gram).reshape(n, -1).max(1),
+        "normal": np.abs((s["n"] ** 2).sum(1) - 1),
+        "simplex": np.abs(s["lam"].sum(keepdims=True) - 1),
+        "positive": np.maximum(0.0, -np.minimum(s["lam"], s["d"])),
+        "det": np.abs(np.linalg.det(s["R"]) - 1),
+        "visible": np.maximum(0.0, (min_facing - facing).max(1)),
+    }
+
+
+def depth_map(s: State, labels: Int, K: Float) -> Float:
+    """(H, W) z of the reference frame; NaN where a plane does not face its pixel."""
+    v, u = np.mgrid[0 : labels.shape[0], 0 : labels.shape[1]]
+    ray = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
+    facing = -(s["n"][labels] * ray).sum(-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = (s["lam"] * s["d"])[labels] / facing
+    return np.where(facing > 1e-6, z, np.nan)
+
+
+def scores(z: Float, gt: Float, rule: str, cap: float | None) -> dict[str, float]:
+    """Depth errors after one global scale, by their names in summary.json.
+
+    Args:
+        z: Estimated depth, NaN where unknown.
+        gt: True depth of the same shape, NaN where unknown.
+        rule: "median", "mre", "lsq" or "none".
+        cap: Truth beyond this depth is left out.
+    """
+    true = np.isfinite(gt) & (gt > 0) & (gt <= (np.inf if cap is None else cap))
+    both = true & np.isfinite(z) & (z > 0)
+    z, gt = z[both], gt[both]
+    if not len(z):
+        return {"coverage": 0.0, "n_pixels": 0.0}
+    ratio = gt / z
+    if rule == "median":
+        factor = float(np.median(ratio))
+    elif rule == "mre":
+        order = np.argsort(ratio)
+        mass = np.cumsum(1.0 / ratio[order])
+        factor = float(ratio[order][np.searchsorted(mass, 0.5 * mass[-1])])
+    else:
+        factor = float((z * gt).sum() / (z * z).sum()) if rule == "lsq" else 1.0
+    off = np.abs(gt - factor * z)
+    fold = np.maximum(gt / (factor * z), factor * z / gt)
+    return {
+        "mre": float((off / gt).mean()),
+        "median_relative": float(np.median(off / gt)),
+        "sq_rel": float((off**2 / gt).mean()),
+        "rmse": float(np.sqrt((off**2).mean())),
+        "log_rmse": float(np.sqrt((np.log(fold) ** 2).mean())),
+        **{f"delta{k}": float((fold < 1.25**k).mean()) for k in (1, 2, 3)},
+        "scale": factor,
+        "coverage": len(z) / int(true.sum()),
+        "n_pixels": float(len(z)),
+    }
+
+
+def at_points(z: Float, points: Float) -> tuple[Float, Float]:
+    """Depth at the pixels nearest to sparse points (u, v, z): (estimate, truth)."""
+    u, v = (np.floor(points[:, c] + 0.5) for c in (0, 1))
+    inside = (u >= 0) & (v >= 0) & (u < z.shape[1]) & (v < z.shape[0])
+    out = np.full(len(points), np.nan)
+    out[inside] = z[v[inside].astype(int), u[inside].astype(int)]
+    return out, points[:, 2]
+
+
+def data_errors(tree: Mapping[str, Any], beta: float) -> dict[str, float]:
+    """How far the stored numbers of the energy are from labels, flow and cameras.
+
+    Args:
+        tree: Arrays of result.h5.
+        beta: Fall-off of w1, w2, 1/pixel.
+
+    Returns:
+        Largest absolute difference by name; 0 is agreement.
+    """
+    e, seg, given = tree["energy"], tree["segmentation"], tree["input"]
+    labels, inverse = seg["labels"], np.linalg.inv(given["K_ref"])
+    flat, n = labels.ravel(), len(seg["anchors"])
+    count = np.bincount(flat, minlength=n)
+    v, u = (x.ravel() for x in np.mgrid[0 : labels.shape[0], 0 : labels.shape[1]])
+    centre = np.stack([np.bincount(flat, x, n) / count for x in (u, v)], 1)
+
+    def rays(uv: Float) -> Float:
+        return np.asarray(np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], -1) @ inverse.T)
+
+    rim = np.concatenate([seg["anchors"][:, None], seg["rim"]], 1)
+    pixel = e["pixel_ray"] @ given["K_ref"].T
+    at = np.floor(pixel[..., :2] + 0.5).astype(int)
+    used = e["pixel_weight"] > 0
+    column, row = at[used].T
+    owner = np.nonzero(used)[0]
+    target = at[used] + given["flow"].astype(float)[row, column]
+    i, k = e["edges"].T
+    gap = np.sqrt(((centre[i] - centre[k]) ** 2).sum(1))
+    own, near = np.repeat(np.arange(n), seg["knn"].shape[1]), seg["knn"].ravel()
+    directed = np.unique(np.minimum(own, near) * n + np.maximum(own, near))
+    weight = seg["edge_multiplicity"] * np.exp(-beta * gap)
+    return {
+        "anchors": _gap(centre, seg["anchors"]),
+        "anchor rays": _gap(rays(centre), e["anchor_ray"]),
+        "rim rays": _gap(rays(rim), e["rim_ray"]),
+        "boundary rays": _gap(rays(seg["boundary"]), e["boundary_ray"]),
+        "pixels in superpixels": float((labels[row, column] != owner).sum()),
+        "pixel targets": _gap(target, e["pixel_target"][used]),
+        "K-NN edges": float(len(np.setxor1d(directed, i * n + k))),
+        "edge weights": _gap(weight, e["edge_weight"]),
+    }
+
+
+def _gap(a: Float, b: Float) -> float:
+    return float(np.abs(a - b).max(initial=0.0))
