@@ -19,9 +19,11 @@ ALLOWED = {
     "model": {"errors", "data", "geometry"},
     "start": {"errors", "data", "geometry", "model"},
     "solve": {"errors", "data", "geometry", "model", "start"},
-    "export": {"errors", "geometry", "model", "solve"},
     "refine": {"errors", "data", "geometry", "model", "solve"},
-    "report": {"errors", "data", "geometry", "model", "start", "solve", "refine", "export"},
+    "report": {"errors", "data", "geometry", "model", "start", "solve", "refine"},
+    # files for and from other solvers, and runs of those
+    "export": {"errors", "geometry", "model", "solve", "report"},
+    "compare": {"errors", "geometry", "model", "solve", "report", "export"},
 }
 """Rooms in their order. Modules beside the rooms (cli, config ...) may import every room; no room
 may import them, but for `errors`."""
@@ -33,12 +35,14 @@ DOORS = {
     ("start", "model"): {"model.energy"},
     ("solve", "data"): {"data.pair"},
     ("refine", "data"): {"data.pair"},
+    ("export", "report"): {"report.atomic", "report.store"},
+    ("compare", "report"): {"report.atomic", "report.store"},
 }
 """Where one room may enter another only through some of its modules."""
 
 LIBRARIES = {
-    "casadi": {"model", "solve", "export"},
-    "matplotlib": {"report"},
+    "casadi": {"model", "solve", "export", "compare"},
+    "matplotlib": {"report", "compare"},
     "h5py": {"report", "data"},
     "typer": {"cli"},
     "rich": {"cli", "report"},

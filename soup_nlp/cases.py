@@ -1,0 +1,103 @@
+"""One problem ready for any solver: pair, start and energy, up to but not into a solve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from soup_nlp.config import Problem
+from soup_nlp.data.pair import Pair
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.superpixels import segment
+from soup_nlp.inputs import load_flow_of, load_pair
+from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
+from soup_nlp.model.formulation import Formulation, build_matrix_nlp
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.nlp import NLP
+from soup_nlp.solve.soup import SolverOptions, solve_soup
+from soup_nlp.start.propose import Start, StartOptions, propose
+
+
+@dataclass(frozen=True)
+class Case:
+    """A problem as `pipeline.run` has it before it solves.
+
+    Attributes:
+        problem: The merged problem.
+        pair: Images, cameras, flow, truth.
+        segmentation: Superpixels and graphs.
+        start: The unorganised soup.
+        data: Numbers of the energy.
+        weights: Constants of the energy.
+        soup: Where solvers start: the start, or the presolve's answer.
+        options: Stages and limits of the problem.
+    """
+
+    problem: Problem
+    pair: Pair
+    segmentation: Segmentation
+    start: Start
+    data: EnergyData
+    weights: Weights
+    soup: Soup
+    options: SolverOptions
+
+    def __len__(self) -> int:
+        return len(self.segmentation)
+
+    def formulation(self, **changes: object) -> Formulation:
+        """The problem's formulation with its smoothing, changed."""
+        own = self.problem.formulation.model_dump()
+        eps = self.options.eps
+        return Formulation(**{**own, "eps": eps, "eps_pixel": eps, **changes})
+
+    def nlp(self, form: Formulation) -> tuple[NLP, MatrixLayout]:
+        """The constrained NLP at the case's soup."""
+        return build_matrix_nlp(self.soup, self.data, self.weights, form)
+
+
+def prepare(
+    problem: Problem, presolve: bool = False, say: Callable[[str], None] | None = None
+) -> Case:
+    """Load, segment, start and weigh a problem, as `pipeline.run` does.
+
+    Args:
+        problem: See `config.load_problem`.
+        presolve: Let solvers start where the tangent presolve ends.
+        say: Called with a line after every stage.
+
+    Raises:
+        SoupError: the input cannot be used.
+    """
+    say = say or (lambda line: None)
+    pair = load_pair(problem)
+    flow = pair.flow or load_flow_of(problem, pair)
+    pair = pair.with_flow(flow)
+    say(str(pair))
+    s = problem.segmentation
+    labels = segment(pair.image_ref, s.superpixels, s.method, s.compactness, s.smoothing_px)
+    samples = None if s.boundary_samples == "all" else s.boundary_samples
+    seg = build_segmentation(labels, pair.image_ref, s.neighbours, s.beta, s.beta_colour, samples)
+    say(str(seg))
+    options = StartOptions(**{**problem.start.model_dump(), "seed": problem.seed})
+    start = propose(seg, flow, pair.K_ref, pair.K_next, options)
+    say(str(start))
+    e = problem.energy
+    pixels = None if e.pixel_samples == "all" else e.pixel_samples
+    data = build_energy_data(
+        seg, flow, pair.K_ref, pair.K_next, pixels, problem.seed, e.arap_at_anchors
+    )
+    if e.units == "pixel":
+        data = in_pixels(data, start.soup, seg, e.rotation_px)
+    weights = Weights(**e.weights.model_dump())
+    solver = problem.solver.model_dump()
+    solver["presolve_eps"] = tuple(solver["presolve_eps"])
+    stages = SolverOptions(**solver)
+    case = Case(problem, pair, seg, start, data, weights, start.soup, stages)
+    if not presolve:
+        return case
+    # one iteration of the constrained NLP is the least that a solve has
+    once = replace(stages, presolve=True, max_iter=1)
+    answer = solve_soup(start.soup, data, weights, case.formulation(), once, say=say)
+    return replace(case, soup=answer.soup)

@@ -1,0 +1,81 @@
+"""Names that a person understands: `R[17,2,1]`, `so3[17,3]`, `epigraph_gap_ref[17,23]`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import ExportError
+from soup_nlp.model.kernel import Group
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.nlp import NLP
+
+Int = NDArray[np.int64]
+
+
+def readable_names(nlp: NLP, layout: MatrixLayout) -> tuple[list[str], list[str]]:
+    """Names of variables and constraints of the constrained NLP; all differ.
+
+    The first index is the superpixel, for an edge or a neighbour pair the first two are the two
+    superpixels. A third counts, from 1, what a superpixel has several of: rows of R'R = I in the
+    order 11 12 22 13 23 33, rim rays (the anchor is 1), sampled pixels.
+
+    Args:
+        nlp: From `build_matrix_nlp`.
+        layout: Its layout.
+
+    Returns:
+        (nx,) and (ng,) names.
+    """
+    x_names, g_names = nlp.x_names(), nlp.g_names()
+    for group in nlp.groups:
+        table, kernel = group.table, group.kernel
+        owner = _owners(group, layout)
+        if owner is None:
+            continue
+        labels = _labels(owner)
+        for j in np.flatnonzero(table.index[0] >= layout.size):
+            name = kernel.x[int(j)].name()
+            for k, label in zip(table.index[:, j].tolist(), labels):
+                x_names[k] = f"{name}[{label}]"
+        if not kernel.nc:
+            continue
+        repeated = len(np.unique(table.rows)) < table.rows.size
+        for c in range(kernel.nc):
+            for k, label in zip(table.rows[:, c].tolist(), labels):
+                stem = g_names[k].partition("[")[0]
+                if repeated:
+                    g_names[k] = stem
+                elif stem.startswith("epigraph") or kernel.nc == 1:
+                    g_names[k] = f"{stem}[{label}]"
+                else:
+                    g_names[k] = f"{stem}[{label},{c + 1}]"
+    for names in (x_names, g_names):
+        if len(set(names)) < len(names):
+            raise ExportError("names are not unique", where=nlp.name)
+    return x_names, g_names
+
+
+def _owners(group: Group, layout: MatrixLayout) -> Int | None:
+    """(E, 1 or 2) superpixels of each element; None where the variables are not a soup's."""
+    index = group.table.index
+    own = index < layout.count * layout.stride
+    if group.kernel.name == "ridge" or not own[:, 0].all():
+        return None
+    superpixel = np.where(own, index // layout.stride, index[:, :1] // layout.stride)
+    first = superpixel[:, 0]
+    second = np.where(superpixel == first[:, None], -1, superpixel).max(axis=1)
+    return np.column_stack([first, second]) if (second >= 0).all() else first[:, None]
+
+
+def _labels(owner: Int) -> list[str]:
+    """`i`, `i,k`, or `i,3` for the third element of a superpixel that has several."""
+    own = [",".join(map(str, row)) for row in owner.tolist()]
+    if len(set(own)) == len(own):
+        return own
+    seen: dict[str, int] = {}
+    out = []
+    for label in own:
+        seen[label] = seen.get(label, 0) + 1
+        out.append(f"{label},{seen[label]}")
+    return out

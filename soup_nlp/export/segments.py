@@ -1,0 +1,57 @@
+"""Segments of a .nl file that are lists of numbers: start, bounds, sparsity, linear parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from soup_nlp.export.opcodes import number
+
+Float = NDArray[np.float64]
+
+
+def start(x0: Float, lam: Float | None) -> Iterator[str]:
+    """`d` and `x` segments; AMPL's multipliers have the sign opposite to CasADi's."""
+    if lam is not None and len(lam):
+        yield f"d{len(lam)}"
+        yield from (f"{k} {number(-v)}" for k, v in enumerate(lam.tolist()))
+    yield f"x{len(x0)}"
+    yield from (f"{k} {number(v)}" for k, v in enumerate(x0.tolist()))
+
+
+def bounds(segment: str, lower: Float, upper: Float) -> Iterator[str]:
+    """`b` or `r` segment."""
+    if segment == "r" and not len(lower):
+        return
+    yield segment
+    for lo, up in zip(lower.tolist(), upper.tolist()):
+        if lo == up:
+            yield f"4 {number(lo)}"
+        elif lo > -np.inf and up < np.inf:
+            yield f"0 {number(lo)} {number(up)}"
+        elif lo > -np.inf:
+            yield f"2 {number(lo)}"
+        elif up < np.inf:
+            yield f"1 {number(up)}"
+        else:
+            yield "3"
+
+
+def linear(J: sparse.csr_matrix, G: sparse.csr_matrix) -> Iterator[str]:
+    """`k` (column counts), `J` and `G` segments; entries of nonlinear variables may be 0."""
+    if J.shape[0]:
+        count = np.bincount(J.indices, minlength=J.shape[1])
+        yield f"k{J.shape[1] - 1}"
+        yield from map(str, np.cumsum(count)[:-1].tolist())
+    for letter, matrix in (("J", J), ("G", G)):
+        at = matrix.indptr.tolist()
+        for k in range(matrix.shape[0]):
+            begin, end = at[k], at[k + 1]
+            if begin == end:
+                continue
+            yield f"{letter}{k} {end - begin}"
+            columns, values = matrix.indices[begin:end].tolist(), matrix.data[begin:end].tolist()
+            yield from (f"{c} {number(v)}" for c, v in zip(columns, values))

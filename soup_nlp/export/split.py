@@ -1,0 +1,77 @@
+"""Linear from nonlinear: what of a kernel goes to J and G segments, and what to expressions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.model.kernel import Group, Kernel
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Split:
+    """A kernel's outputs (the objective first, if it has one, then its rows) in two parts.
+
+    Attributes:
+        nonlinear: (m,) expressions without the variables that enter them linearly.
+        row, column: (k,) output and local variable of every Jacobian nonzero.
+        is_linear: (k,) the nonzero is a number, wherever the variables are.
+        coefficient: (E, k) that number for every element; 0 where it is not one.
+        objective: The kernel has an objective (output 0).
+    """
+
+    nonlinear: ca.SX
+    row: Int
+    column: Int
+    is_linear: NDArray[np.bool_]
+    coefficient: Float
+    objective: bool
+
+
+def outputs(kernel: Kernel) -> ca.SX:
+    """(m,) objective, if there is one, and constraints."""
+    parts = [p for p in (kernel.objective, kernel.constraints) if p is not None]
+    return ca.densify(ca.vertcat(*parts)) if parts else ca.SX(0, 1)
+
+
+def split(group: Group, theta: Float) -> Split:
+    """Split the outputs of a kernel.
+
+    A variable is linear in an output where that entry of the Jacobian depends on no variable.
+
+    Args:
+        group: Kernel and table.
+        theta: Values of the shared parameters.
+    """
+    kernel, table = group.kernel, group.table
+    out = outputs(kernel)
+    jacobian = ca.jacobian(out, kernel.x)
+    r, c = jacobian.sparsity().get_triplet()
+    row, column = np.asarray(r, np.int64), np.asarray(c, np.int64)
+    entries = ca.vertcat(*jacobian.nonzeros()) if len(row) else ca.SX(0, 1)
+    linear = np.zeros(len(row), bool)
+    if len(row):
+        linear = ~np.asarray(ca.which_depends(entries, kernel.x, 1, True), bool)
+    coefficient = np.zeros((group.size, len(row)))
+    if linear.any():
+        kept = ca.vertcat(*[entries[int(k)] for k in np.flatnonzero(linear)])
+        function = ca.Function("c", [kernel.x, kernel.row, kernel.theta], [kept])
+        nowhere = np.zeros((kernel.nx, group.size))
+        shared = np.repeat(np.asarray(theta, float)[:, None], group.size, axis=1)
+        value = function.map(group.size)(nowhere, table.data.T, shared)
+        coefficient[:, linear] = np.asarray(value).reshape(-1, group.size).T
+    parts = []
+    for k in range(out.numel()):
+        part, gone = out[k], column[linear & (row == k)]
+        if len(gone):
+            held = ca.vertcat(*[kernel.x[int(j)] for j in gone])
+            part = ca.substitute(part, held, ca.SX.zeros(len(gone)))
+        parts.append(part)
+    nonlinear = ca.densify(ca.cse(ca.vertcat(*parts))) if parts else ca.SX(0, 1)
+    return Split(nonlinear, row, column, linear, coefficient, kernel.objective is not None)

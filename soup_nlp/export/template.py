@@ -1,0 +1,307 @@
+"""A kernel's expressions as prefix text with holes, to be stamped once per element.
+
+The symbolic instructions are read once. What depends on data alone is folded to numbers, for all
+elements at a time; what an element uses more than once, or what many elements have in common (the
+3-D anchor of a superpixel that fifteen edges meet at), becomes a defined variable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import ExportError
+from soup_nlp.export.opcodes import COMMUTATIVE, NAMES, OPS, PLUS, SUM, number
+from soup_nlp.model.kernel import Group
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+WORTH_NAMING = 4
+"""Operations and leaves that an expression must have to become a defined variable."""
+
+SHARED_BELOW = 0.6
+"""A part is common to elements when it has at most this share of as many distinct instances."""
+
+VARIABLE, NUMBER, DEFINED = "x", "n", "v"
+
+
+@dataclass(frozen=True)
+class Text:
+    """Prefix text with a hole `%s` for every entry of `holes`.
+
+    Attributes:
+        pattern: Lines joined by newlines, without one at the end.
+        holes: (kind, number): a local variable, a numeric column, or a defined node.
+    """
+
+    pattern: str
+    holes: tuple[tuple[str, int], ...]
+
+
+@dataclass
+class _Graph:
+    """Instructions of a kernel after folding; nodes are numbered in their order of evaluation."""
+
+    op: list[int] = field(default_factory=list)
+    args: list[tuple[int, ...]] = field(default_factory=list)
+    variable: dict[int, int] = field(default_factory=dict)
+    number: dict[int, Float] = field(default_factory=dict)
+    roots: list[int] = field(default_factory=list)
+
+    def add(self, op: int, args: tuple[int, ...]) -> int:
+        self.op.append(op)
+        self.args.append(args)
+        return len(self.op) - 1
+
+
+def _trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
+    """Instructions of the outputs; a number is a scalar, or (E,) where it depends on the data."""
+    kernel, table = group.kernel, group.table
+    function = ca.Function("f", [kernel.x, kernel.row, kernel.theta], [ca.densify(outputs)])
+    graph = _Graph(roots=[-1] * outputs.numel())
+    known: dict[object, int] = {}
+    work: dict[int, int] = {}
+
+    def once(key: object, value: Float | None = None, variable: int | None = None) -> int:
+        if key not in known:
+            node = graph.add(-1, ())
+            known[key] = node
+            if value is not None:
+                graph.number[node] = value
+            if variable is not None:
+                graph.variable[node] = variable
+        return known[key]
+
+    for k in range(function.n_instructions()):
+        op = function.instruction_id(k)
+        if op == ca.OP_OUTPUT:
+            graph.roots[function.instruction_output(k)[1]] = work[function.instruction_input(k)[0]]
+            continue
+        target = function.instruction_output(k)[0]
+        if op == ca.OP_CONST:
+            value = function.instruction_constant(k)
+            work[target] = once(("const", value), np.float64(value))  # type: ignore[arg-type]
+        elif op == ca.OP_INPUT:
+            which, place = function.instruction_input(k)
+            if which == 0:
+                work[target] = once((0, place), variable=place)
+            else:
+                values = table.data[:, place] if which == 1 else np.float64(theta[place])
+                work[target] = once((which, place), values)  # type: ignore[arg-type]
+        else:
+            args = tuple(work[a] for a in function.instruction_input(k))
+            work[target] = _apply(name, graph, known, op, args)
+    return graph
+
+
+def _apply(
+    name: str, graph: _Graph, known: dict[object, int], op: int, args: tuple[int, ...]
+) -> int:
+    """Node of an operation: an old one where it is there, a number where no variable enters."""
+    if op == ca.OP_ASSIGN:
+        return args[0]
+    if op not in OPS:
+        raise ExportError(
+            "operation cannot be written to .nl", where=name, found=NAMES.get(op, str(op))
+        )
+    key = (op, tuple(sorted(args)) if op in COMMUTATIVE else args)
+    if key in known:
+        return known[key]
+    if all(a in graph.number for a in args):
+        node = graph.add(-1, ())
+        with np.errstate(all="ignore"):
+            graph.number[node] = OPS[op].fold(*(graph.number[a] for a in args))
+    else:
+        node = graph.add(op, args)
+    known[key] = node
+    return node
+
+
+@dataclass(frozen=True)
+class Template:
+    """What is stamped for the elements of a group.
+
+    Attributes:
+        name: Of the kernel.
+        defined: Node and text of every defined variable, dependencies first.
+        roots: Text of every output, or None where it is a number.
+        constants: (E,) or scalar number of every such output, else 0.
+        numbers: Folded columns by node: scalar or (E,).
+    """
+
+    name: str
+    defined: tuple[tuple[int, Text], ...]
+    roots: tuple[Text | None, ...]
+    constants: tuple[Float, ...]
+    numbers: dict[int, Float]
+
+
+def make_template(name: str, outputs: ca.SX, group: Group, theta: Float) -> Template:
+    """Read a kernel's outputs into a template.
+
+    Args:
+        name: For messages.
+        outputs: (m,) expressions of the kernel's x, row and theta.
+        group: Kernel and table; numbers are folded for its elements.
+        theta: Values of the shared parameters.
+
+    Raises:
+        ExportError: an operation has no .nl opcode.
+    """
+    graph = _trace(name, outputs, group, theta)
+    names = _defined(graph, group)
+    defined = tuple((n, _emit(graph, n, names)) for n in sorted(names))
+    roots: list[Text | None] = []
+    constants: list[Float] = []
+    for root in graph.roots:
+        # an output without an instruction is a structural zero
+        value = np.float64(0.0) if root < 0 else graph.number.get(root)
+        roots.append(_emit(graph, root, names, root=True) if value is None else None)
+        constants.append(np.asarray(0.0 if value is None else value))
+    for node, values in graph.number.items():
+        graph.number[node] = np.asarray(values)
+    return Template(name, defined, tuple(roots), tuple(constants), graph.number)
+
+
+def _operations(graph: _Graph) -> list[int]:
+    """Nodes that outputs need and that depend on variables, leaves left out; arguments first."""
+    needed = set()
+    todo = [r for r in graph.roots if r >= 0]
+    while todo:
+        node = todo.pop()
+        if node in needed or graph.op[node] < 0:
+            continue
+        needed.add(node)
+        todo += graph.args[node]
+    return sorted(needed)
+
+
+def _defined(graph: _Graph, group: Group) -> set[int]:
+    """Nodes that become defined variables."""
+    nodes = _operations(graph)
+    uses = dict.fromkeys(nodes, 0)
+    parents: dict[int, list[int]] = {n: [] for n in nodes}
+    for node in nodes:
+        for a in graph.args[node]:
+            if a in uses:
+                uses[a] += 1
+                parents[a].append(node)
+    roots = set()
+    for root in graph.roots:
+        if root in uses:
+            uses[root] += 1
+            roots.add(root)
+    common = _common(graph, nodes, group) if group.size > 1 else set()
+    size: dict[int, int] = {}
+    names = set()
+    for node in nodes:
+        size[node] = 1 + sum(1 if a in names else size.get(a, 1) for a in graph.args[node])
+        # the largest part that elements share, not every part of it
+        top = node in common and (node in roots or not common.issuperset(parents[node]))
+        if (uses[node] > 1 or top) and size[node] >= WORTH_NAMING:
+            names.add(node)
+    return names
+
+
+def _common(graph: _Graph, nodes: list[int], group: Group) -> set[int]:
+    """Nodes of which many elements have the same instance: same variables, same numbers."""
+    index = group.table.index
+    columns: dict[int, Int] = {}
+    bit: dict[int, int] = {}
+    support: dict[int, int] = {}
+
+    def leaf(node: int) -> int:
+        if node not in bit:
+            if node in graph.variable:
+                column = index[:, graph.variable[node]].astype(np.int64)
+            elif np.ndim(graph.number[node]):
+                column = np.ascontiguousarray(graph.number[node]).view(np.int64)
+            else:
+                bit[node] = 0
+                return 0
+            bit[node] = 1 << len(columns)
+            columns[len(columns)] = column
+        return bit[node]
+
+    distinct: dict[int, int] = {}
+    common = set()
+    for node in nodes:
+        mask = 0
+        for a in graph.args[node]:
+            mask |= support[a] if a in support else leaf(a)
+        support[node] = mask
+        if mask not in distinct:
+            distinct[mask] = len(np.unique(_hash(columns, mask)))
+        if distinct[mask] <= SHARED_BELOW * group.size:
+            common.add(node)
+    return common
+
+
+def _hash(columns: dict[int, Int], mask: int) -> NDArray[np.uint64]:
+    """(E,) hash of the columns whose bits are set."""
+    total = np.zeros(len(columns[0]), np.uint64)
+    place = 0
+    while mask >> place:
+        if mask >> place & 1:
+            h = columns[place].view(np.uint64) + np.uint64(0x9E3779B97F4A7C15 * (place + 1) % 2**64)
+            h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            total += h ^ (h >> np.uint64(31))
+        place += 1
+    return total
+
+
+def _emit(graph: _Graph, top: int, names: set[int], root: bool = False) -> Text:
+    """Prefix text of a node; defined nodes below it (and, for a root, itself) are holes."""
+    lines: list[str] = []
+    holes: list[tuple[str, int]] = []
+    todo: list[int | str] = [top]
+    first = not root
+    while todo:
+        node = todo.pop()
+        if isinstance(node, str):
+            lines.append(node)
+        elif node in names and not first:
+            lines.append("v%s")
+            holes.append((DEFINED, node))
+        elif node in graph.variable:
+            lines.append("v%s")
+            holes.append((VARIABLE, graph.variable[node]))
+        elif node in graph.number:
+            value = graph.number[node]
+            if np.ndim(value):
+                lines.append("n%s")
+                holes.append((NUMBER, node))
+            else:
+                lines.append(f"n{number(float(value))}")
+        else:
+            todo += reversed(_expand(graph, node, names, lines))
+        first = False
+    return Text("\n".join(lines), tuple(holes))
+
+
+def _expand(graph: _Graph, node: int, names: set[int], lines: list[str]) -> list[int | str]:
+    """Write the opcode of an operation; what must follow, in order."""
+    op, args = graph.op[node], graph.args[node]
+    if op == ca.OP_ADD:
+        terms: list[int | str] = []
+        todo = [node]
+        while todo:
+            term = todo.pop()
+            inner = term == node or (graph.op[term] == ca.OP_ADD and term not in names)
+            if inner:
+                todo += reversed(graph.args[term])
+            else:
+                terms.append(term)
+        lines.append(PLUS if len(terms) == 2 else f"{SUM}\n{len(terms)}")
+        return terms
+    if op == ca.OP_SQ and (args[0] in names or args[0] in graph.variable):
+        lines.append("o2")
+        return [args[0], args[0]]
+    rule = OPS[op]
+    lines.append(rule.code)
+    return [*(f"n{c}" for c in rule.before), *args, *(f"n{c}" for c in rule.after)]
