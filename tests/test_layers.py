@@ -19,7 +19,7 @@ ALLOWED = {
     "model": {"errors", "data", "geometry"},
     "start": {"errors", "data", "geometry", "model"},
     "solve": {"errors", "data", "geometry", "model", "start"},
-    "refine": {"errors", "data", "geometry", "model", "solve"},
+    "refine": {"errors", "data", "geometry", "model", "start", "solve"},
     "report": {"errors", "data", "geometry", "model", "start", "solve", "refine"},
     # files for and from other solvers, and runs of those
     "export": {"errors", "geometry", "model", "solve", "report"},

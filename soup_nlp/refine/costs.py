@@ -1,0 +1,300 @@
+"""Costs of particles: E_proj of every label, the other terms of every pair of labels, in numpy.
+
+The sum of the costs of chosen labels equals `plain.energy` of the soup that they make: it is the
+same energy, laid out for a pairwise MRF. Differences are taken component by component, not from
+inner products, so that nothing cancels where particles are nearly or exactly alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy import EnergyData, Weights
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+BLOCK_BYTES = 1 << 18  # one of the half dozen buffers of a block of edges
+UNARY_BYTES = 1 << 23  # one of the arrays of a block of superpixels
+
+
+@dataclass(frozen=True)
+class Particles:
+    """L possible states of each of N superpixels: plane `n . X + D = 0`, motion `X' = R X + T`.
+
+    Attributes:
+        n: (N, L, 3) unit normals that face the camera.
+        D: (N, L) distances of the planes, positive.
+        R: (N, L, 3, 3) rotations.
+        T: (N, L, 3) translations.
+    """
+
+    n: Float
+    D: Float
+    R: Float
+    T: Float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(N, L)."""
+        return self.D.shape[0], self.D.shape[1]
+
+    @classmethod
+    def of(cls, soup: Soup) -> Particles:
+        """A soup as one particle each."""
+        T = soup.translation[:, None]
+        return cls(soup.n[:, None], soup.distance[:, None], soup.R[:, None], T)
+
+    def joined(self, *others: Particles) -> Particles:
+        """The particles of several sets, one behind the other."""
+        every = (self, *others)
+        return Particles(
+            *(np.concatenate([getattr(p, k) for p in every], axis=1) for k in ("n", "D", "R", "T"))
+        )
+
+    def take(self, which: Int) -> Particles:
+        """Particles (N, C) by their numbers, chosen by superpixel."""
+        rows = np.arange(len(self.D))[:, None]
+        return Particles(*(a[rows, which] for a in (self.n, self.D, self.R, self.T)))
+
+    def soup(self, labels: Int, share: Float) -> Soup:
+        """The soup of one label each, with sum(lam) = 1 exactly restored (`Soup.normalised`)."""
+        own = self.take(labels[:, None])
+        one = np.ones(len(labels))
+        return Soup(one, own.n[:, 0], own.D[:, 0], own.R[:, 0], own.T[:, 0]).normalised(share)
+
+
+def anchor_depth(p: Particles, anchor_ray: Float) -> Float:
+    """(N, L) depth of every particle's plane at the anchor."""
+    return -p.D / np.einsum("nlc,nc->nl", p.n, anchor_ray)
+
+
+def feasible(p: Particles, visibility_ray: Float, min_facing: float) -> NDArray[np.bool_]:
+    """(N, L) whether `-n . v >= min_facing` on every row of `EnergyData.visibility_ray`.
+
+    SO(3), unit normals and positive scales hold for every particle by construction.
+    """
+    facing = -np.matmul(p.n, np.swapaxes(visibility_ray, 1, 2))
+    return np.asarray((facing.min(axis=2) >= min_facing) & (p.D > 0))
+
+
+def unary_costs(
+    p: Particles, data: EnergyData, weights: Weights
+) -> tuple[Float, NDArray[np.bool_]]:
+    """alpha1 E_proj of every particle, and whether it keeps its pixels in front of the camera.
+
+    Args:
+        p: (N, L) particles.
+        data: Pixels of the pair; all or sampled, as the data has them.
+        weights: alpha1 and its truncation.
+
+    Returns:
+        (N, L) costs and (N, L) bool.
+    """
+    n_nodes, n_labels = p.shape
+    out, ahead = np.empty(p.shape), np.empty(p.shape, bool)
+    step = max(1, UNARY_BYTES // (8 * 3 * n_labels * max(1, data.pixel_ray.shape[1])))
+    for a in range(0, n_nodes, step):
+        b = slice(a, a + step)
+        H = p.R[b] - p.T[b][..., :, None] * (p.n[b] / p.D[b][..., None])[..., None, :]
+        y = np.matmul(data.K_next @ H, np.swapaxes(data.pixel_ray[b], 1, 2)[:, None])
+        used = data.pixel_weight[b, None] > 0
+        ahead[b] = (y[:, :, 2] > 1e-9).all(axis=2, where=used)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = y[:, :, 0] / y[:, :, 2] - data.pixel_target[b, None, :, 0]
+            v = y[:, :, 1] / y[:, :, 2] - data.pixel_target[b, None, :, 1]
+            error = np.minimum(np.sqrt(u * u + v * v), weights.sigma_proj)
+        error = np.where(used, error, 0.0)
+        out[b] = weights.proj * np.einsum("nls,ns->nl", error, data.pixel_weight[b])
+    return out, ahead & np.isfinite(out)
+
+
+class PairCosts:
+    """Pairwise costs over the union of the K-NN and the neighbour graph.
+
+    Attributes:
+        edges: (E, 2) union of `data.edges` and `data.pairs`, i < k, each pair once.
+        arap_row: (E,) row of `data.edges`, -1 where there is none.
+        cont_row: (E,) row of `data.pairs`, -1 where there is none.
+
+    Args:
+        data: Graphs and weights of the pair.
+        weights: Factors and truncations.
+    """
+
+    def __init__(self, data: EnergyData, weights: Weights) -> None:
+        self.data, self.weights = data, weights
+        n = len(data)
+        arap, cont = (e[:, 0] * n + e[:, 1] for e in (data.edges, data.pairs))
+        key = np.union1d(arap, cont)
+        self.edges = np.stack([key // n, key % n], axis=1).astype(np.int64)
+        self.arap_row = _rows(key, arap)
+        self.cont_row = _rows(key, cont)
+
+    def bytes(self, labels: int, dtype: type | np.dtype = np.float64) -> int:
+        """Memory of the tables of so many labels; the buffers beside them are below 8 MiB."""
+        return len(self.edges) * labels * labels * np.dtype(dtype).itemsize
+
+    def tables(
+        self, p: Particles, unit: float = 1.0, dtype: type | np.dtype = np.float64
+    ) -> NDArray[np.floating]:
+        """(E, L, L) `E_arap + alpha2 E_cont + alpha3 E_orient` of every pair of labels.
+
+        Args:
+            p: (N, L) particles.
+            unit: The scene's length unit `sum_i c_i D_i` where lengths are not local.
+            dtype: float64, or float32 for half the memory.
+        """
+        labels = p.shape[1]
+        out = np.zeros((len(self.edges), labels, labels), dtype)
+        state = _State(p, self.data)
+        step = max(1, BLOCK_BYTES // (8 * labels * labels))
+        buffers = np.empty((4, step, labels, labels))
+        for rows, add in ((self.arap_row, self._arap), (self.cont_row, self._cont)):
+            there = np.flatnonzero(rows >= 0)
+            for a in range(0, len(there), step):
+                at = there[a : a + step]
+                out[at] += add(state, rows[at], unit, buffers[:, : len(at)])
+        return out
+
+    def _unit(self, s: _State, i: Int, k: Int, unit: float, out: Float) -> Float:
+        """1 / length unit of a block, (b, L, L) or (b, 1, 1)."""
+        if not self.data.local_units:
+            return np.full((len(i), 1, 1), 1.0 / unit)
+        np.add(s.Z[i][:, :, None], s.Z[k][:, None, :], out=out)
+        return np.divide(2.0, out, out=out)
+
+    def _arap(self, s: _State, rows: Int, unit: float, buffers: Float) -> Float:
+        d, w = self.data, self.weights
+        i, k = d.edges[rows].T
+        total, scale, x, y = buffers
+        sigma = w.sigma_arap
+        # |R - S|_F of unit quaternions q, r: with s = |q - r|^2 it is sqrt(2 s (4 - s))
+        _distance2(s.q[:, i], s.q[:, k], total, x)
+        np.subtract(4.0, total, out=x)
+        total *= x
+        np.maximum(total, 0.0, out=total)
+        np.sqrt(total, out=total)
+        total *= np.sqrt(2.0) * d.rotation_scale
+        np.minimum(total, sigma, out=total)
+
+        per = self._unit(s, i, k, unit, scale) / d.edge_unit[rows][:, None, None]
+        if d.arap_at_anchors:
+            gap = _anchor_gap(s, d.anchor_ray, i, k)
+            np.sqrt(np.einsum("cbij,cbij->bij", gap, gap), out=x)
+        else:
+            _distance2(s.T[:, i], s.T[:, k], x, y)
+            np.sqrt(x, out=x)
+        x *= per
+        total += np.minimum(x, sigma, out=x)
+
+        _distance2(s.Y[:, i], s.Y[:, k], x, y)
+        after = np.sqrt(x)
+        _distance2(s.X[:, i], s.X[:, k], x, y)
+        np.sqrt(x, out=x)
+        x -= after
+        np.abs(x, out=x)
+        x *= per
+        total += np.minimum(x, sigma, out=x)
+        total *= w.arap * d.edge_weight[rows][:, None, None]
+        return total
+
+    def _cont(self, s: _State, rows: Int, unit: float, buffers: Float) -> Float:
+        d, w = self.data, self.weights
+        i, k = d.pairs[rows].T
+        total, scale, x, y = buffers
+        ray = d.boundary_ray[rows]
+        Xi, Yi = s.boundary(i, ray)
+        Xk, Yk = s.boundary(k, ray)
+        per = self._unit(s, i, k, unit, scale) * (d.pair_factor / d.pair_unit)[rows][:, None, None]
+        # both points lie on the same ray: their gap is |r| times that of the depths
+        _distance2(Xi, Xk, total, x)
+        np.sqrt(total, out=total)
+        total *= per
+        np.minimum(total, w.sigma_cont_ref, out=total)
+        _distance2(Yi, Yk, x, y)
+        np.sqrt(x, out=x)
+        x *= per
+        total += np.minimum(x, w.sigma_cont, out=x)
+        total *= w.cont * d.pair_weight[rows][:, None, None]
+        # 1 - n . n' = |n - n'|^2 / 2 of unit normals
+        _distance2(s.n[:, i], s.n[:, k], x, y)
+        x *= 0.5
+        np.minimum(x, w.sigma_orient, out=x)
+        x *= w.orient * d.pair_count[rows][:, None, None]
+        total += x
+        return total
+
+
+class _State:
+    """Components first, so that those of a block of edges lie together: each (c, N, L)."""
+
+    def __init__(self, p: Particles, data: EnergyData) -> None:
+        n_nodes, labels = p.shape
+        self.Z = anchor_depth(p, data.anchor_ray)
+        q = Rotation.from_matrix(p.R.reshape(-1, 3, 3)).as_quat()
+        # the sign does not matter to the chord's formula, but its rounding is best for small s
+        q = np.where(q[:, 3:] < 0, -q, q)
+        X = self.Z[..., None] * data.anchor_ray[:, None]
+        Y = np.matmul(p.R, X[..., None])[..., 0] + p.T
+        self.q = _first(q.reshape(n_nodes, labels, 4))
+        self.n, self.T, self.X, self.Y = (_first(v) for v in (p.n, p.T, X, Y))
+        self.D, self.R = p.D, _first(p.R.reshape(n_nodes, labels, 9))
+
+    def boundary(self, who: Int, ray: Float) -> tuple[Float, Float]:
+        """Distances along boundary rays (b, B, 3), and next-frame points.
+
+        Returns:
+            (B, b, L) depths times |r|, and (3 B, b, L) points.
+        """
+        n, D, R, T = self.n[:, who], self.D[who], self.R[:, who], self.T[:, who]
+        r = ray.transpose(1, 2, 0)[..., None]
+        facing = -(n[0] * r[:, 0] + n[1] * r[:, 1] + n[2] * r[:, 2])
+        facing = np.where(np.abs(facing) < 1e-12, 1e-12, facing)
+        z = D / facing
+        turned = [
+            R[3 * c] * r[:, 0] + R[3 * c + 1] * r[:, 1] + R[3 * c + 2] * r[:, 2] for c in (0, 1, 2)
+        ]
+        points = np.concatenate([z * v + T[c] for c, v in enumerate(turned)])
+        return z * np.sqrt(np.sum(r * r, axis=1)), points
+
+
+def _first(values: Float) -> Float:
+    return np.ascontiguousarray(np.moveaxis(values, -1, 0))
+
+
+def _rows(key: Int, part: Int) -> Int:
+    out = np.full(len(key), -1, np.int64)
+    out[np.searchsorted(key, part)] = np.arange(len(part))
+    return out
+
+
+def _distance2(a: Float, b: Float, out: Float, buffer: Float) -> None:
+    """out[e, x, y] = sum_c (a[c, e, x] - b[c, e, y])^2."""
+    for c in range(len(a)):
+        target = buffer if c else out
+        np.subtract(a[c][:, :, None], b[c][:, None, :], out=target)
+        np.multiply(target, target, out=target)
+        if c:
+            out += buffer
+
+
+def _anchor_gap(s: _State, ray: Float, i: Int, k: Int) -> Float:
+    """(3, b, L, L) `(R_i - R_k) (X_i + X_k) / 2 + T_i - T_k`."""
+
+    def turned(who: Int, other: Int) -> Float:
+        r = ray[other].T[..., None]
+        R = s.R[:, who]
+        return np.stack([sum(R[3 * c + j] * r[j] for j in range(3)) for c in range(3)])
+
+    own_i, own_k = (s.Y[:, j] + s.T[:, j] for j in (i, k))
+    # Y = R X + T, so R_i X_i / 2 + T_i = (Y_i + T_i) / 2
+    out = own_i[..., :, None] - own_k[..., None, :]
+    out += turned(i, k)[..., :, None] * s.Z[k][:, None, :]
+    out -= turned(k, i)[..., None, :] * s.Z[i][:, :, None]
+    return 0.5 * out

@@ -1,0 +1,113 @@
+"""A superpixel about its anchor, who its neighbours are, and the motion of given points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry import rotation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.refine.costs import Particles
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Local:
+    """States about the anchors; leading shape (N, C).
+
+    Attributes:
+        Z: (N, C) depth at the anchor.
+        g: (N, C, 2) slope of the relative inverse depth, per ray unit.
+        R: (N, C, 3, 3) rotations.
+        T: (N, C, 3) translations.
+    """
+
+    Z: Float
+    g: Float
+    R: Float
+    T: Float
+
+    def particles(self, anchor_ray: Float) -> Particles:
+        """The same as planes with unit normals."""
+        a = anchor_ray[:, None, :2]
+        last = 1.0 - np.sum(self.g * a, axis=-1)
+        m = np.concatenate([self.g, last[..., None]], axis=-1) / self.Z[..., None]
+        length = np.linalg.norm(m, axis=-1)
+        return Particles(-m / length[..., None], 1.0 / length, self.R, self.T)
+
+    @classmethod
+    def of(cls, soup: Soup, anchor_ray: Float) -> Local:
+        """A soup, C = 1."""
+        m = -soup.n / soup.distance[:, None]
+        Z = 1.0 / np.einsum("nc,nc->n", m, anchor_ray)
+        return cls(
+            Z[:, None], (m[:, :2] * Z[:, None])[:, None], soup.R[:, None], soup.translation[:, None]
+        )
+
+    def repeated(self, count: int) -> Local:
+        """C = 1 to C = count."""
+        return Local(*(np.repeat(v, count, axis=1) for v in (self.Z, self.g, self.R, self.T)))
+
+
+def neighbours(edges: Int, anchor_ray: Float) -> Int:
+    """(N, K) neighbours of every superpixel on a graph, nearest first; K the smallest degree.
+
+    Args:
+        edges: (E, 2) undirected edges.
+        anchor_ray: (N, 3).
+    """
+    n = len(anchor_ray)
+    if not len(edges):
+        return np.zeros((n, 0), np.int64)
+    own = np.concatenate([edges[:, 0], edges[:, 1]])
+    other = np.concatenate([edges[:, 1], edges[:, 0]])
+    gap = np.linalg.norm(anchor_ray[own] - anchor_ray[other], axis=1)
+    order = np.lexsort((gap, own))
+    degree = np.bincount(own, minlength=n)
+    start = np.concatenate([[0], np.cumsum(degree)[:-1]])
+    k = int(degree.min())
+    return other[order][start[:, None] + np.arange(k)].astype(np.int64)
+
+
+def fit_motion(
+    R: Float, T: Float, X: Float, target: Float, weight: Float, focal: float, rounds: int = 5
+) -> tuple[Float, Float]:
+    """The motion near a given one that brings points to their targets: reweighted Gauss-Newton.
+
+    Args:
+        R: (3, 3) rotation to start from.
+        T: (3,) translation to start from.
+        X: (M, 3) reference-frame points.
+        target: (M, 3) rays of their targets in the next camera.
+        weight: (M,) of the un-squared distances.
+        focal: Pixels per ray unit.
+        rounds: Steps.
+
+    Returns:
+        Rotation and translation; those given where a step goes wrong.
+    """
+    best, found = np.inf, (R, T)
+    for _ in range(rounds + 1):
+        Y = X @ R.T + T
+        z = np.maximum(Y[:, 2:], 1e-9)
+        e = focal * (Y[:, :2] / z - target[:, :2])
+        size = np.linalg.norm(e, axis=1)
+        cost = float(np.sum(weight * size))
+        if not cost < best:
+            break
+        best, found = cost, (R, T)
+        P = np.zeros((len(X), 2, 3))
+        P[:, 0, 0] = P[:, 1, 1] = focal / z[:, 0]
+        P[:, :, 2] = -focal * Y[:, :2] / z**2
+        # Y + w x (R X) + dT
+        J = np.concatenate([-P @ rotation.hat(X @ R.T), P], axis=2)
+        w = weight / np.sqrt(size**2 + 0.05**2)
+        A = np.einsum("m,mci,mcj->ij", w, J, J, optimize=True)
+        A += 1e-9 * np.diag(np.diag(A)) + 1e-15 * np.trace(A) * np.eye(6)
+        step = -np.linalg.solve(A, np.einsum("m,mci,mc->i", w, J, e, optimize=True))
+        R, T = rotation.exp(step[:3]) @ R, T + step[3:]
+    return found

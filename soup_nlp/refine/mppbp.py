@@ -1,0 +1,394 @@
+"""Max-product particle belief propagation: the discrete half of the paper (Sec. 4.4.2).
+
+Every round draws particles around the current soup, lays the exact energy out over them as a
+pairwise MRF, finds a good joint choice with TRW-S, and goes on from there. The current belief is
+always particle 0 and a choice is taken only if `plain.energy` says that it is lower: E never
+rises. Feasibility holds by construction: rotations by the exponential map, normals on the sphere,
+positive distances, visibility by an infinite cost, the simplex by the free global scale.
+
+With one global length unit (`local_units` off) the unit `u = sum_i c_i D_i` couples everything.
+The MRF then has u fixed and its first-order change in the unary costs; the comparison of rounds
+is with the exact energy, at sum(lam) = 1.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model import plain
+from soup_nlp.model.energy import EnergyData, Weights
+from soup_nlp.refine.costs import PairCosts, Particles, feasible, unary_costs
+from soup_nlp.refine.local import neighbours
+from soup_nlp.refine.particles import COMMON, KINDS, WALKS, Proposals, Proposer
+from soup_nlp.refine.select import conditional_costs, diverse, upright, within_reach
+from soup_nlp.refine.trws import TRWSResult, solve_trws
+from soup_nlp.solve.ipopt import Listener, Progress
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+CURRENT, KEPT = KINDS.index("current"), KINDS.index("kept")
+SHARES: Mapping[str, float] = {
+    "walk_plane": 3,
+    "walk_motion": 3,
+    "walk_pivot": 2,
+    "walk_scale": 3,
+    "walk_all": 2,
+    "common_scale": 3,
+    "common_motion": 2,
+    "neighbour_plane": 3,
+    "neighbour_motion": 3,
+    "neighbour_both": 5,
+    "neighbour_refit": 2,
+    "own_refit": 1,
+    "dominant": 3,
+    "mean": 3,
+}
+"""Proposals by kind in the first round, relative."""
+FEW = ("own_refit",)
+"""Kinds of which there is one proposal at most: they draw nothing."""
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """Discrete refinement after the NLP.
+
+    Attributes:
+        enabled: Refine at all.
+        from_start: Refine the start: the NLP is skipped.
+        rounds: Rounds of particles.
+        particles: Labels of every superpixel, the current belief among them.
+        keep: Share of the particles that stays for the next round.
+        depth_reach: A new depth is at most this many times the upper quartile of the neighbours'
+            depths, and at least their lower quartile over this squared.
+        trws_iterations: Most iterations of TRW-S in a round.
+        trws_gap: TRW-S stops at this relative gap.
+        stagnation: End when two rounds in a row lower E by less than this share; 0 never.
+        max_seconds: Time limit of the rounds together.
+        float32: Tables in single precision: half the memory; the bound is exact to that rounding.
+        polish: Solve the NLP again from the refined soup and keep the better.
+    """
+
+    enabled: bool = True
+    from_start: bool = False
+    rounds: int = 10
+    particles: int = 50
+    keep: float = 0.25
+    depth_reach: float = 2.0
+    trws_iterations: int = 30
+    trws_gap: float = 1e-4
+    stagnation: float = 0.0
+    max_seconds: float = 300.0
+    float32: bool = False
+    polish: bool = False
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round as it went.
+
+    Attributes:
+        energy: Exact E by term afterwards.
+        mrf_energy: Energy of the chosen labels in the MRF.
+        bound: TRW-S's lower bound on every choice among these particles.
+        iterations: Of TRW-S.
+        status: Of TRW-S.
+        ties: Superpixels whose label was a tie when decoded.
+        taken: Whether the choice lowered E; if not, the belief stays.
+        moved: Superpixels that left their current belief.
+        proposed: Feasible particles by kind.
+        accepted: Chosen particles by kind.
+        seconds: Wall time.
+    """
+
+    energy: Mapping[str, float]
+    mrf_energy: float
+    bound: float
+    iterations: int
+    status: str
+    ties: int
+    taken: bool
+    moved: int
+    proposed: Mapping[str, int] = field(repr=False)
+    accepted: Mapping[str, int] = field(repr=False)
+    seconds: float
+
+    def __str__(self) -> str:
+        return (
+            f"E {self.energy['total']:.6g}, bound {self.bound:.6g}, gap {self.gap:.3g},"
+            f" {self.moved} moved, {self.ties} ties, {self.iterations} iterations,"
+            f" {self.seconds:.1f} s"
+        )
+
+    @property
+    def gap(self) -> float:
+        """How far the choice can be from the best one among these particles."""
+        return self.mrf_energy - self.bound
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What the refinement ended with.
+
+    Attributes:
+        soup: Best soup.
+        energy_begin: Exact E by term before.
+        energy: Exact E by term of `soup`.
+        rounds: Every round.
+        status: "rounds" (all of them), "stagnated", "interrupted" or "time limit".
+        seconds: Wall time.
+    """
+
+    soup: Soup
+    energy_begin: Mapping[str, float]
+    energy: Mapping[str, float]
+    rounds: tuple[Round, ...]
+    status: str
+    seconds: float
+
+    def __str__(self) -> str:
+        gap = f", gap {self.rounds[-1].gap:.3g}" if self.rounds else ""
+        return (
+            f"Refined({self.status}, E {self.energy_begin['total']:.5g} ->"
+            f" {self.energy['total']:.5g} in {len(self.rounds)} rounds{gap}, {self.seconds:.1f} s)"
+        )
+
+
+def refine_soup(
+    soup: Soup,
+    data: EnergyData,
+    weights: Weights,
+    options: RefineOptions | None = None,
+    *,
+    seed: int = 0,
+    min_facing: float = 1e-3,
+    depth_ratio: float = 5.0,
+    listener: Listener | None = None,
+    stop: threading.Event | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Refined:
+    """Lower the exact energy of a soup by particles; see the module.
+
+    Args:
+        soup: Current belief. Planes that break visibility are first tilted until they do not.
+        data: Numbers of the energy.
+        weights: Its constants.
+        options: Rounds, particles, limits.
+        seed: Of every draw.
+        min_facing: Visibility, as in the constrained NLP.
+        depth_ratio: The same.
+        listener: Called at every iteration of TRW-S.
+        stop: Set it to end with the best soup so far.
+        say: Called with a line after every round.
+
+    Returns:
+        The best soup, normalised to sum(lam) = 1, and what happened.
+    """
+    o = options or RefineOptions()
+    stop = stop or threading.Event()
+    begin = time.perf_counter()
+    deadline = begin + o.max_seconds
+    rays = data.visibility_ray(depth_ratio)
+    best = upright(soup, data.anchor_ray, rays, min_facing).normalised(data.share).retracted()
+    energy = energy_begin = plain.energy(best, data, weights)
+    pair_costs = PairCosts(data, weights)
+    proposer = Proposer(data, neighbours(pair_costs.edges, data.anchor_ray), seed)
+    shares = dict(SHARES)
+    kept: Particles | None = None
+    rounds: list[Round] = []
+    status, slow = "rounds", 0
+    for number in range(o.rounds):
+        if stop.is_set() or time.perf_counter() > deadline:
+            break
+        mark = time.perf_counter()
+        drawn = _draw(proposer, best, kept, o, shares)
+        p = drawn.particles
+        unary, pairwise = _costs(best, p, data, weights, pair_costs, o)
+        unary[~feasible(p, rays, min_facing)] = np.inf
+        unary[~within_reach(p, best, proposer.near, data.anchor_ray, o.depth_reach)] = np.inf
+        unary[:, 0] = _current_cost(unary, best, data, weights)
+
+        def watch(k: int, bound: float, e: float, least: float) -> bool:
+            now = time.perf_counter()
+            if listener:
+                stage = f"refine {number + 1}"  # noqa: B023
+                listener(Progress(stage, k - 1, least, 0.0, now - mark))  # noqa: B023
+            return stop.is_set() or now > deadline
+
+        result = solve_trws(
+            unary,
+            pair_costs.edges,
+            pairwise,
+            max_iter=o.trws_iterations,
+            gap=o.trws_gap,
+            dtype=pairwise.dtype,
+            init_labels=np.zeros(len(best), np.int64),
+            polish=True,
+            callback=watch,
+        )
+        labels = result.labels
+        new = p.soup(labels, data.share).retracted()
+        new_energy = plain.energy(new, data, weights)
+        taken = new_energy["total"] < energy["total"]
+        if not taken:
+            labels = np.zeros(len(best), np.int64)
+        before = energy["total"]
+        if taken:
+            best, energy = new, new_energy
+        cost = conditional_costs(labels, unary, pair_costs.edges, pairwise)
+        which = diverse(p, labels, cost, round(o.keep * o.particles), data)
+        kept = p.take(which)
+        del pairwise
+        rounds.append(_round(result, drawn, unary, labels, energy, taken, mark))
+        _learn(proposer, shares, drawn, unary, labels, rounds[-1])
+        if say:
+            say(f"refine {number + 1}: {rounds[-1]}")
+        slow = slow + 1 if before - energy["total"] < o.stagnation * abs(before) else 0
+        if slow >= 2:
+            status = "stagnated"
+            break
+    if stop.is_set():
+        status = "interrupted"
+    elif len(rounds) < o.rounds and status == "rounds":
+        status = "time limit"
+    return Refined(best, energy_begin, energy, tuple(rounds), status, time.perf_counter() - begin)
+
+
+def _draw(
+    proposer: Proposer,
+    best: Soup,
+    kept: Particles | None,
+    o: RefineOptions,
+    shares: Mapping[str, float],
+) -> Proposals:
+    """The current belief, what was kept, and new proposals: `o.particles` in all."""
+    n = len(best)
+    current = Particles.of(best)
+    fixed = current if kept is None else current.joined(kept)
+    have = fixed.shape[1]
+    count = _counts(shares, max(0, o.particles - have), proposer.near.shape[1])
+    kind = np.full(have, KEPT)
+    kind[0] = CURRENT
+    if not sum(count.values()):
+        return Proposals(fixed, kind, np.full((n, have), np.nan))
+    new = proposer.propose(best, count)
+    return Proposals(
+        fixed.joined(new.particles),
+        np.concatenate([kind, new.kind]),
+        np.hstack([np.full((n, have), np.nan), new.step]),
+    )
+
+
+def _counts(shares: Mapping[str, float], total: int, near: int) -> dict[str, int]:
+    """`total` proposals split by shares, largest remainders first; limits by kind respected."""
+    most = {
+        k: 1 if k in FEW else near if k.startswith("neighbour") or k == "mean" else total
+        for k in shares
+    }
+    whole = sum(shares.values())
+    exact = {k: min(total * v / whole, most[k]) for k, v in shares.items()}
+    out = {k: int(v) for k, v in exact.items()}
+    for k in sorted(exact, key=lambda k: out[k] - exact[k]):
+        if sum(out.values()) < total and out[k] < most[k]:
+            out[k] += 1
+    out["walk_all"] += total - sum(out.values())
+    return out
+
+
+def _costs(
+    best: Soup,
+    p: Particles,
+    data: EnergyData,
+    weights: Weights,
+    pair_costs: PairCosts,
+    o: RefineOptions,
+) -> tuple[Float, NDArray[np.floating]]:
+    unary, ahead = unary_costs(p, data, weights)
+    unary[~ahead] = np.inf
+    unit = float(np.sum(data.share * best.distance))
+    if not data.local_units:
+        unary -= (
+            length_slope(best, data, weights)
+            * data.share[:, None]
+            * (p.D - best.distance[:, None])
+            / unit
+        )
+    dtype = np.float32 if o.float32 else np.float64
+    return unary, pair_costs.tables(p, unit, dtype)
+
+
+def length_slope(soup: Soup, data: EnergyData, weights: Weights, h: float = 1e-4) -> float:
+    """`-dE / d log u`: by how much E rises when the scene's length unit shrinks, all else fixed."""
+    up, down = (
+        plain.energy(
+            soup, replace(data, edge_unit=data.edge_unit * s, pair_unit=data.pair_unit * s), weights
+        )["total"]
+        for s in (1 + h, 1 - h)
+    )
+    return (down - up) / (2 * h)
+
+
+def _current_cost(unary: Float, best: Soup, data: EnergyData, weights: Weights) -> Float:
+    """Finite costs of the current belief, whatever it violates."""
+    own = unary[:, 0]
+    if np.isfinite(own).all():
+        return own
+    exact = weights.proj * plain.reprojection(best, data, weights)
+    return np.where(np.isfinite(own), own, np.minimum(exact, 1e9))
+
+
+def _round(
+    result: TRWSResult,
+    drawn: Proposals,
+    unary: Float,
+    labels: Int,
+    energy: Mapping[str, float],
+    taken: bool,
+    mark: float,
+) -> Round:
+    possible = np.isfinite(unary)
+    proposed = {k: int(possible[:, drawn.kind == c].sum()) for c, k in enumerate(KINDS)}
+    chosen = np.bincount(drawn.kind[labels], minlength=len(KINDS))
+    return Round(
+        energy=dict(energy),
+        mrf_energy=result.energy,
+        bound=result.lower_bound,
+        iterations=result.iterations,
+        status=result.status,
+        ties=result.ties,
+        taken=taken,
+        moved=int((labels > 0).sum()),
+        proposed=proposed,
+        accepted={k: int(chosen[c]) for c, k in enumerate(KINDS)},
+        seconds=time.perf_counter() - mark,
+    )
+
+
+def _learn(
+    proposer: Proposer,
+    shares: dict[str, float],
+    drawn: Proposals,
+    unary: Float,
+    labels: Int,
+    done: Round,
+) -> None:
+    """Steps and shares of the kinds follow what was accepted."""
+    own = np.arange(len(labels))
+    kind, step = drawn.kind[labels], drawn.step[own, labels]
+    for name in (*WALKS, *COMMON):
+        proposer.spread.learn(name, step[kind == KINDS.index(name)])
+    rate = {k: done.accepted[k] / max(1, done.proposed[k]) for k in shares}
+    mean = sum(rate.values()) / len(rate)
+    if mean > 0:
+        whole = sum(SHARES.values()) / len(SHARES)
+        for k in shares:
+            # half of what is usual stays for every kind: what fails now may help later
+            wanted = 0.5 * SHARES[k] + 0.5 * whole * min(rate[k] / mean, 3.0)
+            shares[k] += 0.5 * (wanted - shares[k])
