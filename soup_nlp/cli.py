@@ -10,12 +10,12 @@ from typing import Annotated, Any, cast, get_args
 import typer
 from rich.console import Console
 
+from soup_nlp.cli_export import register as register_export
 from soup_nlp.config import Problem, dump_problem, load_problem, make_problem
 from soup_nlp.data.scenes import SCENES
 from soup_nlp.errors import ConfigError, SoupError
 from soup_nlp.pipeline import evaluate as evaluate_folder
 from soup_nlp.pipeline import run as run_problem
-from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder, write_text
 from soup_nlp.report.metrics import Scale
 from soup_nlp.solve.ipopt import Progress, interruptible
@@ -74,13 +74,27 @@ def solve(
     ] = None,
     flow: Annotated[str | None, typer.Option(help=".flo, KITTI .png or .npy; default DIS.")] = None,
     depth: Annotated[str | None, typer.Option(help="True depth of the reference frame.")] = None,
+    no_refine: Annotated[
+        bool, typer.Option("--no-refine", help="The NLP alone, as refine.enabled=false.")
+    ] = False,
+    no_nlp: Annotated[
+        bool, typer.Option("--no-nlp", help="Refine the start, as refine.from_start=true.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
 ) -> None:
     """Solve a pair of frames and write a result folder."""
+    if no_refine and no_nlp:
+        raise ConfigError(
+            "nothing is left to do",
+            found="--no-nlp and --no-refine",
+            expected="one of them at most",
+        )
+    halves = {"refine.enabled=false": no_refine, "refine.from_start=true": no_nlp}
+    overrides = [*(overrides or []), *(item for item, on in halves.items() if on)]
     if problem is not None:
         if ref or next_ or intrinsics:
             raise ConfigError("give a problem file or --ref/--next/--intrinsics, not both")
-        chosen = load_problem(problem, overrides or [])
+        chosen = load_problem(problem, overrides)
     else:
         chosen = _from_options(ref, next_, intrinsics, intrinsics_next, flow, depth, overrides)
     folder = prepare_folder(out)
@@ -103,7 +117,7 @@ def solve(
     text = verdict(run, folder, files, None if overrides else chosen.expected.mre_at_most)
     write_text(folder / "log.txt", "\n".join([*teller.lines, text]) + "\n")
     print(text)
-    good = run.solution.converged and not (not overrides and missed(run))
+    good = run.good and not (not overrides and missed(run))
     raise typer.Exit(0 if good else 1)
 
 
@@ -152,15 +166,6 @@ def _from_options(
 
 
 @app.command()
-def check(folder: Annotated[Path, typer.Argument(help="Result folder.")]) -> None:
-    """Recompute energy, constraints and metrics of a result from its arrays."""
-    report = check_folder(folder)
-    print(report)
-    print("every claim holds" if report.ok else "a claim does not hold")
-    raise typer.Exit(0 if report.ok else 1)
-
-
-@app.command()
 def evaluate(
     folder: Annotated[Path, typer.Argument(help="Result folder.")],
     depth: Annotated[Path, typer.Option(help="True depth: .dpt, .npy, .pfm or 16-bit .png.")],
@@ -205,6 +210,9 @@ def list_(
         print()
     for name, text in SCENES.items():
         print(f"scene {name:<22} {text}")
+
+
+register_export(app)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,0 +1,188 @@
+"""export, import and check on the command line: a family of files, and answers made results."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import casadi as ca
+import h5py
+import numpy as np
+import pytest
+from test_nl import ReadBack, close
+
+from soup_nlp.artefact import import_sol, parse_formulation
+from soup_nlp.cases import prepare
+from soup_nlp.cli import main
+from soup_nlp.config import load_problem
+from soup_nlp.errors import ConfigError, ExportError
+from soup_nlp.export.names import readable_names
+from soup_nlp.export.residuals import kind, residual_table, table_text
+from soup_nlp.export.sol import write_sol
+from soup_nlp.model import plain
+
+PROBLEMS = Path(__file__).parent.parent / "problems"
+TINY = [
+    "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",
+    "--set", "segmentation.neighbours=4", "--set", "energy.pixel_samples=4",
+]  # fmt: skip
+FOUR = ["unit-offset", "unit-translation/smooth/lifted", "free/epigraph", "free/epigraph/lifted"]
+
+
+def write(out: Path, *words: str, scene: str = "orbit") -> int:
+    return main(["export", str(PROBLEMS / f"{scene}.yaml"), "-o", str(out), *TINY, *words])
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("exported")
+    assert write(out, "--superpixels", "16", "--format", "h5", "--format", "casadi") == 0
+    return out
+
+
+def problem_of(folder: Path):
+    """NLP, layout, names and order of the files of an exported folder."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    case = prepare(load_problem(folder / "problem.yaml"))
+    chosen = {**manifest["formulation"], **manifest["smoothing"]}
+    nlp, layout = case.nlp(case.formulation(**chosen, hessian="exact", compiled=False))
+    orders = []
+    for suffix, names in zip((".col", ".row"), readable_names(nlp, layout)):
+        lines = (folder / f"soup{suffix}").read_text().split()
+        orders.append(np.array([names.index(n) for n in lines[: len(names)]]))
+    return case, nlp, layout, orders, manifest
+
+
+@pytest.mark.parametrize("scene", ["orbit", "street"])
+def test_a_family_is_exported_and_read_back(scene, tmp_path):
+    words = [w for f in FOUR for w in ("--formulation", f)]
+    sizes = ["--superpixels", "9", "--superpixels", "12"]
+    assert write(tmp_path, *words, *sizes, "-q", scene=scene) == 0
+    folders = sorted(p.parent for p in tmp_path.rglob("soup.nl"))
+    assert len(folders) == 8
+    hashes = set()
+    for folder in folders:
+        case, nlp, _, (v, r), manifest = problem_of(folder)
+        back = ReadBack(folder / "soup.nl")
+        assert manifest["sizes"]["variables"] == len(back.x0) == nlp.nx
+        assert manifest["sizes"]["jacobian_nonzeros"] == nlp.nnzj
+        close(back.x0, nlp.x0[v])
+        rng = np.random.default_rng(0)
+        x = np.clip(nlp.x0 + 0.05 * rng.normal(size=nlp.nx), nlp.lbx, nlp.ubx)
+        f, g = nlp.oracle(x, nlp.p)
+        close(back.values(x[v])[0], f)
+        close(back.values(x[v])[1], np.asarray(g).ravel()[r])
+        close(back.values(x[v])[2], np.asarray(nlp.grad_f(x, nlp.p)[1]).ravel()[v])
+        assert manifest["objective_at_start"] == float(nlp.oracle(nlp.x0, nlp.p)[0])
+        exact = plain.energy(case.soup, case.data, case.weights)["total"]
+        assert manifest["exact_energy_at_start"]["total"] == pytest.approx(exact, rel=1e-12)
+        hashes.add(manifest["nl"]["sha256"])
+    assert len(hashes) == 8
+
+
+def test_other_formats_say_the_same(exported):
+    _, nlp, _, _, _ = problem_of(exported)
+    oracle = ca.Function.load(str(exported / "oracle.casadi"))
+    hess = ca.Function.load(str(exported / "hess_lag.casadi"))
+    with h5py.File(exported / "soup.h5") as file:
+        p, x0 = file["p"][:], file["x0"][:]
+        close(oracle(x0, p)[0], file["at_start/f"][()])
+        close(oracle(x0, p)[1], file["at_start/g"][:])
+        stored = file["at_start/hess_lag/value"][:]
+        assert file["x_names"].asstr()[0] == "lam[0]"
+    close(np.array(hess(x0, p, 1, np.ones(nlp.ng)).nonzeros()), stored)
+    assert np.array_equal(x0, nlp.x0)
+
+
+def answer(folder: Path, name: str, move: float = 0.0, code: int = 0) -> Path:
+    """A .sol whose point is the start, moved."""
+    _, nlp, _, (v, r), _ = problem_of(folder)
+    x = nlp.x0 + move * np.random.default_rng(1).normal(size=nlp.nx)
+    write_sol(folder / name, x, None, v, r, "hand made", code)
+    return folder / name
+
+
+def test_a_solution_becomes_depth_maps(exported, tmp_path, capsys):
+    sol = answer(exported, "good.sol")
+    out = tmp_path / "result"
+    assert main(["import", str(exported), str(sol), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "hand made (solved, code 0): verified" in said
+    for name in ("depth_ref.png", "points_ref.ply", "overview.png", "result.h5", "config.yaml"):
+        assert (out / name).stat().st_size > 0
+    assert main(["check", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "worst superpixels" in said
+    assert "every claim holds" in said
+    manifest = json.loads((exported / "manifest.json").read_text())
+    assert manifest["best_known"]["found_by"] == "hand made"
+    start = manifest["exact_energy_at_start"]["total"]
+    assert manifest["best_known"]["exact_energy"] == pytest.approx(start, rel=1e-9)
+
+
+def test_a_false_claim_is_not_believed(exported, tmp_path, capsys):
+    sol = answer(exported, "false.sol", move=1e-3)
+    run = import_sol(exported, sol, renew=False).run
+    assert not run.solution.converged
+    assert run.solution.stages[-1].objective != 0
+    assert main(["check", str(sol)]) == 1
+    said = capsys.readouterr().out
+    assert "FAIL so3" in said
+    assert "not verified" in said
+    assert "a constraint does not hold" in said
+    assert main(["import", str(exported), str(sol), "--out", str(tmp_path / "r")]) == 1
+    limit = answer(exported, "limit.sol", code=400)
+    assert main(["import", str(exported), str(limit), "--out", str(tmp_path / "l")]) == 1
+    assert "no success claimed" in capsys.readouterr().out
+
+
+def test_the_worst_superpixel_is_named(exported):
+    _, nlp, layout, (v, r), _ = problem_of(exported)
+    x = nlp.x0.copy()
+    x[layout.of(np.array([7]))[0, 5]] += 1e-2
+    write_sol(exported / "seven.sol", x, None, v, r)
+    imported = import_sol(exported, exported / "seven.sol", renew=False)
+    state = {k: getattr(imported.run.answer, k) for k in ("lam", "n", "d", "R", "t")}
+    rows = residual_table(
+        state,
+        imported.run.data.rim_ray,
+        1e-3,
+        dict.fromkeys(("so3", "normal", "simplex", "positive", "det", "visible"), 1e-6),
+    )
+    so3 = next(row for row in rows if row.name == "so3")
+    assert so3.worst[0][0] == 7
+    assert so3.count == 1
+    assert not so3.ok
+    assert "7 (" in table_text(rows)
+    assert kind("normal", np.array([0.0, np.nan]), 1e-6).largest == np.inf
+
+
+def test_folders_that_do_not_fit(exported, tmp_path):
+    sol = answer(exported, "good.sol")
+    other = tmp_path / "other"
+    shutil.copytree(exported, other)
+    path = other / "problem.yaml"
+    path.write_text(path.read_text().replace("\nseed: 0", "\nseed: 1"))
+    with pytest.raises(ExportError, match="not the one that was exported"):
+        import_sol(other, sol)
+    shutil.copy(exported / "problem.yaml", path)
+    names = (other / "soup.col").read_text()
+    (other / "soup.col").write_text(names.replace("lam[0]", "lam[1]"))
+    with pytest.raises(ExportError, match="not complete"):
+        import_sol(other, sol)
+    (other / "manifest.json").write_text("{}")
+    with pytest.raises(ExportError, match="lacks"):
+        import_sol(other, sol)
+    assert main(["import", str(tmp_path), str(sol)]) == 2
+
+
+def test_options_are_checked(tmp_path, capsys):
+    assert parse_formulation("free/epigraph") == {"gauge": "free", "norm": "epigraph"}
+    for text in ("fre", "free/smoth", "free/smooth/smooth/exact"):
+        with pytest.raises(ConfigError, match="formulation"):
+            parse_formulation(text)
+    assert write(tmp_path, "--formulation", "nothing") == 2
+    assert write(tmp_path, "--superpixels", "12", "--format", "mps") == 2
+    assert "nl, casadi, h5" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("manifest.json"))
