@@ -21,6 +21,7 @@ from soup_nlp.errors import ConfigError
 from soup_nlp.model.energy import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS
+from soup_nlp.refine.mppbp import RefineOptions
 from soup_nlp.solve.soup import SolverOptions
 from soup_nlp.start.propose import StartOptions
 
@@ -34,6 +35,7 @@ FormulationConfig: Any = mirror(
     choices={"hessian": HESSIANS},
 )
 SolverConfig: Any = mirror(SolverOptions, "SolverConfig")
+RefineConfig: Any = mirror(RefineOptions, "RefineConfig")
 DisConfig: Any = mirror(dis_flow, "DisConfig", choices={"preset": ("ultrafast", "fast", "medium")})
 
 
@@ -120,6 +122,7 @@ class Problem(Strict):
         energy: Terms, weights, units.
         formulation: How the energy is written for the solver.
         solver: Stages and limits; eps are smoothing widths in the energy's unit.
+        refine: Discrete refinement by particles.
         expected: What the run should score.
         base: Folder that relative paths start from (the file's own).
     """
@@ -133,6 +136,7 @@ class Problem(Strict):
     energy: EnergyConfig = EnergyConfig()
     formulation: FormulationConfig = FormulationConfig()
     solver: SolverConfig = SolverConfig()
+    refine: RefineConfig = RefineConfig()
     expected: Expected = Expected()
     base: str = "."
 

@@ -33,6 +33,10 @@ RANGES: Mapping[str, tuple[float | None, float | None]] = {
     "tau": (1e-6, None),
     "limit": (1e-6, None),
     "support": (1, None),
+    "particles": (2, None),
+    "keep": (0, 0.9),
+    "depth_reach": (1, None),
+    "trws_iterations": (1, None),
 }
 """Smallest and largest value by name; a number that is not named here is at least 0."""
 

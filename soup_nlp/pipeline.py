@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,13 +16,17 @@ from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.inputs import load_flow_of, load_pair
+from soup_nlp.model import plain
 from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.refine.mppbp import Refined, RefineOptions, refine_soup
+from soup_nlp.refine.select import upright
 from soup_nlp.report.baselines import RigidBaseline
 from soup_nlp.report.metrics import DepthMetrics
 from soup_nlp.scoring import evaluate, rigid_baseline, score
 from soup_nlp.solve.ipopt import Listener
+from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.soup import Solution, SolverOptions, solve_soup
 from soup_nlp.start.propose import Start, StartOptions, propose
 
@@ -40,17 +44,19 @@ class Run:
         start: The unorganised soup.
         data: Numbers of the energy.
         weights: Constants of the energy.
-        solution: What the constrained NLP ended with.
+        solution: What the constrained NLP ended with, before any refinement.
         answer: Ipopt's own answer to the constrained NLP (the best iterate where it did not
             converge), before anything is made of it: constraints hold to its tolerance only.
-        delivered: What `solution.soup` is made of: "constrained NLP", or "presolve" where that
-            has the lower exact energy.
+        delivered: What `solution.soup` is made of: "constrained NLP", "presolve" where that has
+            the lower exact energy, or "start" where the NLP was skipped.
         start_reconstruction: Dense 3D of the start.
-        reconstruction: Dense 3D of the solution.
+        reconstruction: Dense 3D of `soup`.
         rigid: One rigid motion for the whole image; None without truth or where none fits.
-        metrics: By "solution", "start", "constant", "rigid", and "solution_next" for the next
-            frame; a key without truth is absent.
+        metrics: By "solution" (delivered), "nlp" (where refined), "start", "constant", "rigid",
+            and "solution_next" for the next frame; a key without truth is absent.
         seconds: Wall time by stage; those that start with nlp_ are parts of "nlp".
+        refined: What the refinement made of `solution`; None where it is off.
+        nlp_reconstruction: Dense 3D of `solution`, where there is an NLP and it was refined.
     """
 
     problem: Problem
@@ -67,11 +73,31 @@ class Run:
     rigid: RigidBaseline | None
     metrics: Mapping[str, DepthMetrics] = field(repr=False)
     seconds: Mapping[str, float]
+    refined: Refined | None = None
+    nlp_reconstruction: Reconstruction | None = None
 
     @property
     def soup(self) -> Soup:
-        """The solution's soup."""
-        return self.solution.soup
+        """What is delivered: the refined soup, or the NLP's where there is no refinement."""
+        return self.refined.soup if self.refined else self.solution.soup
+
+    @property
+    def energy(self) -> Mapping[str, float]:
+        """Exact energy by term of `soup`."""
+        return self.refined.energy if self.refined else self.solution.energy
+
+    @property
+    def residuals(self) -> dict[str, float]:
+        """Constraint residuals of `soup`; what is said of Ipopt's answer stays as it is."""
+        facing = self.problem.formulation.min_facing
+        own = constraint_residuals(self.soup, self.data.rim_ray, facing)
+        return {**self.solution.residuals, **own}
+
+    @property
+    def good(self) -> bool:
+        """Whether the NLP converged (or was skipped) and nobody interrupted the refinement."""
+        solved = self.solution.converged or self.solution.status == "Skipped"
+        return solved and (self.refined is None or self.refined.status != "interrupted")
 
 
 def _tell(say: Callable[[str], None] | None, line: object) -> None:
@@ -134,29 +160,63 @@ def run(
     if e.units == "pixel":
         data = in_pixels(data, start.soup, seg, e.rotation_px)
     weights = Weights(**e.weights.model_dump())
-    solver = problem.solver.model_dump()
-    solver["presolve_eps"] = tuple(solver["presolve_eps"])
     form = Formulation(**problem.formulation.model_dump())
-    solution = solve_soup(
-        start.soup,
-        data,
-        weights,
-        form,
-        SolverOptions(**solver),
-        listener=listener,
-        stop=stop,
-        say=say,
-        log_file=ipopt_log,
-    )
-    lap("nlp")
+    refine = RefineOptions(**problem.refine.model_dump())
+
+    def nlp(soup: Soup) -> Solution:
+        solver = problem.solver.model_dump()
+        solver["presolve_eps"] = tuple(solver["presolve_eps"])
+        options = SolverOptions(**solver)
+        return solve_soup(
+            soup,
+            data,
+            weights,
+            form,
+            options,
+            listener=listener,
+            stop=stop,
+            say=say,
+            log_file=ipopt_log,
+        )
+
+    if refine.enabled and refine.from_start:
+        solution = _skipped(start.soup, data, weights, form)
+        answer, delivered = solution.soup, "start"
+    else:
+        solution = nlp(start.soup)
+        answer = MatrixLayout(data.share, form.gauge).unpack(solution.stages[-1].x)
+        own = np.array_equal(answer.retracted().lam, solution.soup.lam)
+        delivered = "constrained NLP" if own else "presolve"
+        lap("nlp")
+    refined = None
+    if refine.enabled:
+        refined = refine_soup(
+            solution.soup,
+            data,
+            weights,
+            refine,
+            seed=problem.seed,
+            min_facing=form.min_facing,
+            depth_ratio=form.depth_ratio,
+            listener=listener,
+            stop=stop,
+            say=say,
+        )
+        if refine.polish and refined.status != "interrupted":
+            refined = _polished(refined, nlp(refined.soup))
+        _tell(say, refined)
+        lap("refine")
     size = pair.image_next.shape[0], pair.image_next.shape[1]
-    before, after = (
+    before, middle = (
         reconstruct(x, labels, pair.K_ref, pair.K_next, size) for x in (start.soup, solution.soup)
     )
-    answer = MatrixLayout(data.share, form.gauge).unpack(solution.stages[-1].x)
-    own = np.array_equal(answer.retracted().lam, solution.soup.lam)
+    after = middle
+    if refined is not None:
+        after = reconstruct(refined.soup, labels, pair.K_ref, pair.K_next, size)
+    between = middle if refined is not None and solution.stages else None
     rigid = rigid_baseline(pair)
-    metrics = score(pair, before, after, rigid, problem.expected.scale, problem.expected.cap)
+    scale, cap = problem.expected.scale, problem.expected.cap
+    metrics = score(pair, before, after, rigid, scale, cap, between)
     lap("evaluation")
     return Run(
         problem=problem,
@@ -167,13 +227,44 @@ def run(
         weights=weights,
         solution=solution,
         answer=answer,
-        delivered="constrained NLP" if own else "presolve",
+        delivered=delivered,
         start_reconstruction=before,
         reconstruction=after,
         rigid=rigid,
         metrics=metrics,
         seconds={**seconds, **{f"nlp_{k}": v for k, v in solution.seconds.items()}},
+        refined=refined,
+        nlp_reconstruction=between,
     )
+
+
+def _skipped(start: Soup, data: EnergyData, weights: Weights, form: Formulation) -> Solution:
+    """The start in the place of the NLP's solution: planes tilted until they face the camera."""
+    rays = data.visibility_ray(form.depth_ratio)
+    soup = upright(start, data.anchor_ray, rays, form.min_facing)
+    soup = soup.normalised(data.share).retracted()
+    return Solution(
+        soup=soup,
+        status="Skipped",
+        converged=False,
+        stages=(),
+        energy_start=plain.energy(start, data, weights),
+        energy=plain.energy(soup, data, weights),
+        residuals=constraint_residuals(soup, data.rim_ray, form.min_facing),
+        multipliers={},
+        nlp={},
+        description="",
+        seconds={},
+    )
+
+
+def _polished(refined: Refined, again: Solution) -> Refined:
+    """The refined soup, or the NLP's answer from it where that has the lower exact energy."""
+    gain = refined.energy["total"] - again.energy["total"]
+    # what rounding gives is no gain
+    if gain <= 1e-9 * refined.energy["total"]:
+        return replace(refined, polish_gain=0.0)
+    return replace(refined, soup=again.soup, energy=again.energy, polish_gain=gain)
 
 
 def solve_pair(pair: Pair, **options: Any) -> Run:

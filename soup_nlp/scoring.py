@@ -25,7 +25,7 @@ from soup_nlp.report.store import read_h5, require
 
 Float = NDArray[np.float64]
 
-DEPTHS = {"solution": "ref", "start": "start_ref", "rigid": "rigid_ref"}
+DEPTHS = {"solution": "ref", "nlp": "nlp_ref", "start": "start_ref", "rigid": "rigid_ref"}
 """Depth maps of the reference frame that a result stores, by the name of their metrics."""
 
 
@@ -44,6 +44,7 @@ def score(
     rigid: RigidBaseline | None = None,
     scale: Scale = "median",
     cap: float | None = None,
+    nlp: Reconstruction | None = None,
 ) -> dict[str, DepthMetrics]:
     """Metrics of solution, start, a constant depth and one rigid motion; {} without truth.
 
@@ -54,10 +55,13 @@ def score(
         rigid: The baseline, if there is one.
         scale: Rule of the one global scale of each depth map.
         cap: Truth beyond this depth is left out.
+        nlp: The NLP's solution, where it was refined.
     """
     if pair.truth is None:
         return {}
     depths = {"solution": after.depth_ref, "start": before.depth_ref}
+    if nlp is not None:
+        depths["nlp"] = nlp.depth_ref
     if rigid is not None:
         depths["rigid"] = rigid.depth
     out = score_depths(pair.truth, depths, scale, cap)
@@ -120,7 +124,7 @@ def evaluate(
         depth_scale: Values per unit of length of a .png.
 
     Returns:
-        Metrics by "solution", "start", "rigid" (if stored) and "constant".
+        Metrics by "solution", "start", "nlp" and "rigid" (if stored) and "constant".
 
     Raises:
         DataError: a file is missing, sizes differ, or the truth knows no pixel.

@@ -10,17 +10,24 @@ from soup_nlp.report.metrics import DepthMetrics, skill
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline import Run
+    from soup_nlp.refine.mppbp import Refined
 
 WORDS = {
     "Solve_Succeeded": "converged to the tolerance",
     "Solved_To_Acceptable_Level": "converged to Ipopt's acceptable level",
     "Maximum_Iterations_Exceeded": "not converged: iteration limit, best iterate kept",
     "Time_Limit": "not converged: time limit, best iterate kept",
+    "Skipped": "refined from the start, no NLP",
     "Interrupted": "interrupted, best iterate kept",
     "Infeasible_Problem_Detected": "not converged: no feasible point nearby, best iterate kept",
     "Restoration_Failed": "not converged: feasibility could not be restored, best iterate kept",
 }
-TITLES = {"rigid": "one rigid motion", "constant": "constant depth"}
+TITLES = {"nlp": "NLP alone", "rigid": "one rigid motion", "constant": "constant depth"}
+DELIVERED = {
+    "constrained NLP": "its answer, retracted to the constraints",
+    "presolve": "the presolve's answer, whose exact energy is lower",
+    "start": "the start",
+}
 OF_ANSWER = ("nlp_infeasibility", "dual_infeasibility", "complementarity")
 """Residuals of Ipopt's own answer; the others are those of the delivered soup."""
 
@@ -38,24 +45,26 @@ def verdict(run: Run, folder: Path, files: Sequence[str], limit: float | None = 
     """
     s = run.solution
     words = WORDS.get(s.status, f"not converged: {s.status}, best iterate kept")
-    every = sum(stage.iterations for stage in s.stages)
-    lines = [
-        f"status      {words} ({s.status})",
-        f"{PAD}constrained NLP {s.stages[-1].iterations} iterations of {every}; delivered: "
-        + (
-            "its answer, retracted to the constraints"
-            if run.delivered == "constrained NLP"
-            else "the presolve's answer, whose exact energy is lower"
-        ),
-    ]
+    lines = [f"status      {words} ({s.status})"]
+    made = DELIVERED[run.delivered]
+    if s.stages:
+        every = sum(stage.iterations for stage in s.stages)
+        counted = f"constrained NLP {s.stages[-1].iterations} iterations of {every}"
+        lines.append(f"{PAD}{counted}; {'refined' if run.refined else 'delivered'}: {made}")
+    if run.refined is not None:
+        lines += [PAD + line for line in refinement(run.refined)]
     names = list(s.energy)
     lines.append("energy      " + " " * 9 + "".join(f"{k:>11}" for k in names))
-    for title, energy in (("start", s.energy_start), ("solution", s.energy)):
+    rows = {"start": s.energy_start, "NLP": s.energy, "solution": run.energy}
+    if run.refined is None or not s.stages:
+        del rows["NLP"]
+    for title, energy in rows.items():
         lines.append(f"{PAD}{title:<9}" + "".join(f"{energy[k]:>11.5g}" for k in names))
-    own = {k: v for k, v in s.residuals.items() if k not in OF_ANSWER}
+    own = {k: v for k, v in run.residuals.items() if k not in OF_ANSWER}
     lines.append("residuals   " + "  ".join(f"{k} {v:.1e}" for k, v in own.items()))
     answer = "  ".join(f"{k} {s.residuals[k]:.1e}" for k in OF_ANSWER if k in s.residuals)
-    lines.append(f"{PAD}Ipopt's answer: {answer}")
+    if answer:
+        lines.append(f"{PAD}Ipopt's answer: {answer}")
     if run.metrics:
         lines += [f"accuracy    {protocol(run.metrics)}"]
         lines += [PAD + line for line in accuracy(run.metrics)]
@@ -66,11 +75,26 @@ def verdict(run: Run, folder: Path, files: Sequence[str], limit: float | None = 
     lines += [
         f"seconds     {sum(whole.values()):.1f}: "
         + "  ".join(f"{k} {v:.1f}" for k, v in whole.items()),
-        f"{PAD}of nlp: " + "  ".join(f"{k} {v:.1f}" for k, v in inner.items()),
+        *([f"{PAD}of nlp: " + "  ".join(f"{k} {v:.1f}" for k, v in inner.items())] * bool(inner)),
         f"files       {folder}/: " + ", ".join(files),
         f"next        soup-nlp check {folder}",
     ]
     return "\n".join(lines)
+
+
+def refinement(r: Refined) -> list[str]:
+    """What the refinement did, and how far its choice can be from the best one."""
+    if not r.rounds:
+        return [f"refinement: {r.status} before its first round"]
+    last = r.rounds[-1]
+    fall = 1 - r.energy["total"] / r.energy_begin["total"]
+    lines = [
+        f"refinement {len(r.rounds)} rounds ({r.status}): E {fall:.1%} lower; the last choice is at"
+        f" most {max(last.gap, 0) / last.mrf_energy:.2%} above the best among its particles"
+    ]
+    if r.polish_gain is not None:
+        lines.append(f"polish by the NLP: E {r.polish_gain:.3g} lower")
+    return lines
 
 
 def protocol(metrics: Mapping[str, DepthMetrics]) -> str:
@@ -85,7 +109,7 @@ def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
     """A table of scores: the solution beside the start, one rigid motion and a constant depth."""
     lines = [f"{'':<17}{'MRE':>8}{'median':>9}{'skill':>8}{'coverage':>10}"]
     worst = metrics["constant"].mre
-    for name in ("solution", "start", "rigid", "constant"):
+    for name in ("solution", "nlp", "start", "rigid", "constant"):
         if name in metrics:
             m = metrics[name]
             lines.append(

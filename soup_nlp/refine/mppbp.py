@@ -144,6 +144,7 @@ class Refined:
         rounds: Every round.
         status: "rounds" (all of them), "stagnated", "interrupted" or "time limit".
         seconds: Wall time.
+        polish_gain: By how much an NLP from the last round's soup lowered E; None without one.
     """
 
     soup: Soup
@@ -152,6 +153,7 @@ class Refined:
     rounds: tuple[Round, ...]
     status: str
     seconds: float
+    polish_gain: float | None = None
 
     def __str__(self) -> str:
         gap = f", gap {self.rounds[-1].gap:.3g}" if self.rounds else ""

@@ -27,7 +27,7 @@ LIMITS = {
 """Largest violation that a delivered soup may have."""
 
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-DEPTHS = {"solution": "ref", "start": "start_ref", "rigid": "rigid_ref"}
+DEPTHS = {"solution": "ref", "nlp": "nlp_ref", "start": "start_ref", "rigid": "rigid_ref"}
 RELATIVE = 1e-9
 ABSOLUTE = 1e-12
 NOT_CHECKED = "dual infeasibility and complementarity need the model's derivatives: not rechecked"
@@ -125,7 +125,7 @@ def _rows(
         yield _same(f"weight {key}", settings["energy"]["weights"][key], weights[key])
     for name, gap in recompute.data_errors(tree, float(settings["segmentation"]["beta"])).items():
         yield Row(f"data {name}", 0.0, gap, RELATIVE, gap <= RELATIVE)
-    for which in ("start", "solution"):
+    for which in ("start", "nlp", "solution"):
         found = recompute.energy(_state(tree, which), tree["energy"], weights)
         for term, value in found.items():
             yield _same(f"energy {which} {term}", claims["energy"][which][term], value)
@@ -133,9 +133,26 @@ def _rows(
         before, after = (float(claims["energy"][k]["total"]) for k in ("start", "solution"))
         ok = after <= before * (1 + RELATIVE)
         yield Row("energy falls", before, after, before, ok)
+    yield from _rounds(claims)
     yield from _constraints(claims, tree, weights)
     yield from _depth(tree)
     yield from _metrics(tree, claims["metrics"])
+
+
+def _rounds(claims: Mapping[str, Any]) -> Iterator[Row]:
+    """E never rises from round to round, and no round claims less than its lower bound."""
+    refinement = claims.get("refinement")
+    if not refinement or not refinement["rounds"]:
+        return
+    rounds = refinement["rounds"]
+    path = [refinement["begin"], *(r["energy"] for r in rounds), claims["energy"]["solution"]]
+    totals = np.array([float(e["total"]) for e in path])
+    rise = float(np.diff(totals).max())
+    yield Row("no round raises E", 0.0, rise, 0.0, rise <= RELATIVE * abs(totals[0]))
+    under = max(float(r["bound"]) - float(r["mrf_energy"]) for r in rounds)
+    yield Row("no choice below its bound", 0.0, under, 0.0, under <= RELATIVE * abs(totals[0]))
+    if not refinement["polish_gain"]:
+        yield _same("last round is delivered", totals[-2], totals[-1])
 
 
 def _number(value: Any) -> float:
@@ -189,33 +206,50 @@ def _state(tree: Mapping[str, Any], which: str) -> dict[str, recompute.Float]:
 def _constraints(
     claims: Mapping[str, Any], tree: Mapping[str, Any], weights: Mapping[str, float]
 ) -> Iterator[Row]:
-    rim = require(tree, "energy/rim_ray")
+    if claims["status"] == "Skipped":
+        yield from _satisfied(claims, tree, weights, "solution", "residuals", LIMITS)
+        return
     # Ipopt's answer may violate its constraints by as much as it says, the delivered soup by less
     own = float(claims["residuals"]["nlp_infeasibility"])
     within = own * (1 + 1e-6) + ABSOLUTE
     for which, key, limits in (
         ("solution", "residuals", LIMITS),
+        ("nlp", "nlp_residuals", LIMITS),
         ("answer", "answer_residuals", dict.fromkeys(("so3", "normal", "simplex"), within)),
     ):
-        state = _state(tree, which)
-        found = recompute.constraints(state, rim, weights["min_facing"])
-        for name, limit in limits.items():
-            value, claimed = float(found[name].max()), _number(claims[key][name])
-            ok = value <= limit and abs(value - claimed) <= 1e-3 * value + ABSOLUTE
-            worst = int(found[name].argmax()) if name != "simplex" and value > 0 else -1
-            yield Row(f"{which} {name}", claimed, value, limit, bool(ok), worst)
+        yield from _satisfied(claims, tree, weights, which, key, limits)
     if claims["delivered"] == "constrained NLP":
-        a, b = _state(tree, "answer"), _state(tree, "solution")
+        a, b = _state(tree, "answer"), _state(tree, "nlp")
         gap = max(float(np.abs(a[k] - b[k]).max()) for k in ("n", "R"))
         gap = max(gap, float(np.abs(a["lam"] / b["lam"] - 1).max()))
         limit = 10 * within + RELATIVE
-        yield Row("solution is Ipopt's answer", 0.0, gap, limit, gap <= limit)
+        yield Row("nlp is Ipopt's answer", 0.0, gap, limit, gap <= limit)
+
+
+def _satisfied(
+    claims: Mapping[str, Any],
+    tree: Mapping[str, Any],
+    weights: Mapping[str, float],
+    which: str,
+    key: str,
+    limits: Mapping[str, float],
+) -> Iterator[Row]:
+    """Constraints of one soup, and what is claimed of them."""
+    rim = require(tree, "energy/rim_ray")
+    found = recompute.constraints(_state(tree, which), rim, weights["min_facing"])
+    for name, limit in limits.items():
+        value, claimed = float(found[name].max()), _number(claims[key][name])
+        ok = value <= limit and abs(value - claimed) <= 1e-3 * value + ABSOLUTE
+        worst = int(found[name].argmax()) if name != "simplex" and value > 0 else -1
+        yield Row(f"{which} {name}", claimed, value, limit, bool(ok), worst)
 
 
 def _depth(tree: Mapping[str, Any]) -> Iterator[Row]:
     """The stored depth maps are those of the stored planes."""
     labels, K = require(tree, "segmentation/labels"), require(tree, "input/K_ref")
-    for which, key in (("solution", "ref"), ("start", "start_ref")):
+    for which, key in (("solution", "ref"), ("nlp", "nlp_ref"), ("start", "start_ref")):
+        if key not in tree["depth"]:
+            continue
         depth = require(tree, f"depth/{key}")
         z = recompute.depth_map(_state(tree, which), labels, K)
         known = np.isfinite(depth) & np.isfinite(z)

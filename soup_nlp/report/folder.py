@@ -121,9 +121,15 @@ def summary(run: Run) -> dict[str, Any]:
         "status": s.status,
         "converged": s.converged,
         "delivered": run.delivered,
-        "energy": {"start": dict(s.energy_start), "solution": dict(s.energy)},
-        "residuals": dict(s.residuals),
+        "energy": {
+            "start": dict(s.energy_start),
+            "nlp": dict(s.energy),
+            "solution": dict(run.energy),
+        },
+        "residuals": run.residuals,
+        "nlp_residuals": constraint_residuals(s.soup, run.data.rim_ray, facing),
         "answer_residuals": constraint_residuals(run.answer, run.data.rim_ray, facing),
+        "refinement": refinement(run),
         "metrics": {
             # the next frame has a constant depth of its own
             k: m.as_dict() | ({} if k == "solution_next" else {"skill": skill(m.mre, constant)})
@@ -148,6 +154,36 @@ def summary(run: Run) -> dict[str, Any]:
         "flow": str(run.pair.flow),
         "versions": versions(),
         "seed": run.problem.seed,
+    }
+
+
+def refinement(run: Run) -> dict[str, Any] | None:
+    """How the refinement went, round by round; None where it was off."""
+    r = run.refined
+    if r is None:
+        return None
+    return {
+        "status": r.status,
+        "polish_gain": r.polish_gain,
+        "seconds": r.seconds,
+        "begin": dict(r.energy_begin),
+        "rounds": [
+            {
+                "energy": dict(one.energy),
+                "mrf_energy": one.mrf_energy,
+                "bound": one.bound,
+                "gap": one.gap,
+                "taken": one.taken,
+                "moved": one.moved,
+                "ties": one.ties,
+                "iterations": one.iterations,
+                "status": one.status,
+                "seconds": one.seconds,
+                "proposed": dict(one.proposed),
+                "accepted": dict(one.accepted),
+            }
+            for one in r.rounds
+        ],
     }
 
 

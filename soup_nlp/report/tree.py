@@ -47,6 +47,16 @@ _HISTORY = {
     "alpha_du": "step size, multipliers",
     "ls_trials": "trial points of the line search",
 }
+_ROUNDS = {
+    "mrf_energy": "energy of the chosen labels in the MRF of the particles",
+    "bound": "TRW-S's lower bound on every choice among the particles",
+    "gap": "how far the choice can be from the best one among the particles",
+    "moved": "superpixels that left their belief",
+    "ties": "superpixels whose label was a tie when decoded",
+    "iterations": "iterations of TRW-S",
+    "taken": "whether the choice lowered the exact E",
+    "seconds": "wall time",
+}
 _TRUTH = {
     "depth_ref": ("H,W", "true z of the reference frame, NaN where unknown"),
     "depth_next": ("H,W", "true z of the next frame, NaN where unknown"),
@@ -74,6 +84,9 @@ def result_tree(run: Run) -> Tree:
         depth["rigid_ref"] = Array(
             run.rigid.depth, "translations", "z by one rigid motion, reference frame", "H,W"
         )
+    if run.nlp_reconstruction is not None:
+        nlp = run.nlp_reconstruction.depth_ref
+        depth["nlp_ref"] = Array(nlp, "soup", "the NLP's z, reference frame", "H,W")
     return {
         "input": {
             "K_ref": Array(pair.K_ref, "px", "intrinsics of the reference frame", "3,3"),
@@ -95,6 +108,8 @@ def result_tree(run: Run) -> Tree:
             "motion": Array(run.start.motion, "1", "dominant motion, -1 for its own", "N"),
         },
         "solution": _soup(run.soup),
+        "nlp": _soup(run.solution.soup),
+        "refine": _refine(run),
         "answer": _soup(run.answer),
         "multipliers": {
             key: Array(
@@ -117,6 +132,27 @@ def result_tree(run: Run) -> Tree:
         "depth": depth,
         "truth": _truth(run),
     }
+
+
+def _refine(run: Run) -> dict[str, Array]:
+    """The refinement by round (T) and kind of proposal (C)."""
+    r = run.refined
+    if r is None or not r.rounds:
+        return {}
+    kinds = ", ".join(r.rounds[0].proposed)
+    out = {
+        f"energy_{term}": Array(
+            np.array([one.energy[term] for one in r.rounds]), "1", f"exact E, {term}, by round", "T"
+        )
+        for term in r.energy
+    }
+    for key, sentence in _ROUNDS.items():
+        values = np.array([getattr(one, key) for one in r.rounds])
+        out[key] = Array(values, "s" if key == "seconds" else "1", f"{sentence}, by round", "T")
+    for key, sentence in (("proposed", "feasible particles"), ("accepted", "chosen particles")):
+        table = np.array([list(getattr(one, key).values()) for one in r.rounds])
+        out[key] = Array(table, "1", f"{sentence} by round and kind: {kinds}", "T,C")
+    return out
 
 
 def attributes(run: Run, config: str) -> dict[str, Any]:
