@@ -14,10 +14,11 @@ from soup_nlp.report.metrics import (
     constant_depth_metrics,
     depth_metrics,
     sample_at_points,
-    scene_flow_epe,
     skill,
     weighted_median,
 )
+from soup_nlp.report.protocols import PRESETS, preset
+from soup_nlp.report.scene_flow import scene_flow_epe
 
 depths = arrays(np.float64, 12, elements=st.floats(0.1, 100.0))
 factors = st.floats(1e-3, 1e3)
@@ -194,3 +195,34 @@ def test_bad_input(kwargs, words):
     arguments = {"truth": [1.0], **kwargs}
     with pytest.raises(DataError, match=words):
         depth_metrics([1.0], arguments.pop("truth"), **arguments)
+
+
+def test_a_clamp_moves_scaled_estimates_only():
+    free = depth_metrics([1.0, 200.0], [1.0, 100.0], scale="none")
+    held = depth_metrics([1.0, 200.0], [1.0, 100.0], scale="none", clamp=(1e-3, 80.0))
+    assert free.mre == pytest.approx(0.5)
+    assert held.mre == pytest.approx(0.1)
+    assert held.coverage == 1.0
+    with pytest.raises(DataError, match="no range"):
+        depth_metrics([1.0], [1.0], clamp=(2.0, 1.0))
+
+
+def test_presets_leave_out_what_they_say():
+    truth = np.full((100, 200), 10.0)
+    truth[:, 100:] = 75.0
+    estimate = np.where(truth == 75.0, 300.0, 20.0)
+    assert PRESETS["sintel70"].score(estimate, truth).mre == pytest.approx(0.0)
+    assert PRESETS["sintel70"].score(estimate, truth).n_pixels == 100 * 100
+    assert PRESETS["kitti"].score(estimate, truth).mre > 0.2
+    eigen = PRESETS["eigen80"]
+    assert eigen.mask(truth).sum() == (99 - 40) * (192 - 7)
+    # the upper part of the image does not count
+    worse = estimate.copy()
+    worse[:40] = 1.0
+    assert eigen.score(worse, truth) == eigen.score(estimate, truth)
+    assert not PRESETS["near20"].counts(np.full((2, 2), 21.0))
+    with pytest.raises(DataError, match="crop"):
+        eigen.score([1.0], [1.0])
+    with pytest.raises(DataError, match="unknown metric preset"):
+        preset("papr")
+    assert all(p.text and p.name in str(p) for p in PRESETS.values())

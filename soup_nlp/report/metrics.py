@@ -1,4 +1,4 @@
-"""How far an estimated depth or scene flow is from the truth, with the protocol beside the number.
+"""How far an estimated depth is from the truth, with the protocol beside the number.
 
 A two-view reconstruction has a free global scale, so a depth error means little without the rule
 that chose the scale, the depth cap and the share of the truth that has an estimate at all. Each
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
-from typing import Any, Literal, TypedDict, cast, get_args
+from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Scale = Literal["median", "mre", "lsq", "none"]
 
 
@@ -100,6 +99,7 @@ def depth_metrics(
     scale: Scale = "median",
     cap: float | None = None,
     mask: ArrayLike | None = None,
+    clamp: tuple[float, float] | None = None,
 ) -> DepthMetrics:
     """Errors of an estimated depth, after one global scale s on the estimate.
 
@@ -121,17 +121,21 @@ def depth_metrics(
         scale: Scale rule.
         cap: Leave out truth deeper than this, unit of the truth; None keeps all.
         mask: Bool, same shape; False leaves a pixel out. None keeps all.
+        clamp: After scaling, estimates are moved into [low, high], unit of the truth, as Eigen's
+            protocol does; None leaves them as they are.
 
     Raises:
-        DataError: shapes differ, the rule is unknown, the cap is not positive, or no pixel has a
-            truth to compare with.
+        DataError: shapes differ, the rule is unknown, the cap is not positive, the clamp is not
+            0 < low < high, or no pixel has a truth to compare with.
     """
+    if clamp is not None and not 0 < clamp[0] < clamp[1]:
+        raise DataError("clamp is no range of depths", found=clamp, expected="0 < low < high")
     z, gt, coverage = _compared(estimate, truth, scale, cap, mask)
     if z.size == 0:
         nan = float("nan")
         return DepthMetrics(nan, nan, nan, nan, nan, nan, nan, nan, scale, nan, cap, 0.0, 0)
     s = _scale(z, gt, scale)
-    z = s * z
+    z = s * z if clamp is None else np.clip(s * z, *clamp)
     gap = np.abs(gt - z)
     relative = gap / gt
     log = np.abs(np.log(gt) - np.log(z))
@@ -295,56 +299,3 @@ def sample_at_points(depth: ArrayLike, points: ArrayLike) -> tuple[Float, Float]
     out = np.full(len(at), np.nan)
     out[inside] = z[v[inside].astype(np.intp), u[inside].astype(np.intp)]
     return out, at[:, 2].copy()
-
-
-def scene_flow_epe(
-    estimate: ArrayLike, truth: ArrayLike, *, scale: float = 1.0, mask: ArrayLike | None = None
-) -> dict[str, float | int]:
-    """End-point error of a scene flow: mean and median length of s * estimate - truth.
-
-    Args:
-        estimate: (..., 3) X' - X; NaN where unknown.
-        truth: (..., 3) true X' - X, same shape; NaN where unknown.
-        scale: The factor s; use `DepthMetrics.scale` so that depth and motion share one scale.
-        mask: (...) bool; False leaves a pixel out.
-
-    Returns:
-        mean, median, mean_truth_length (unit of the truth), coverage, n_pixels. The errors are
-        NaN when nothing can be compared.
-
-    Raises:
-        DataError: shapes do not fit, or no pixel has a true scene flow.
-    """
-    est, gt = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
-    if est.shape != gt.shape or gt.ndim < 1 or gt.shape[-1] != 3:
-        raise DataError(
-            "estimated and true scene flow do not fit",
-            where="scene_flow_epe",
-            found=f"estimate {est.shape}, truth {gt.shape}",
-            expected="the same shape (..., 3)",
-        )
-    true = np.isfinite(gt).all(axis=-1)
-    if mask is not None:
-        keep = np.asarray(mask, bool)
-        if keep.shape != true.shape:
-            raise DataError(
-                "mask and scene flow differ in shape",
-                where="mask",
-                found=keep.shape,
-                expected=true.shape,
-            )
-        true &= keep
-    total = int(np.count_nonzero(true))
-    if total == 0:
-        raise DataError("no pixel has a true scene flow", where="scene_flow_epe")
-    both = cast(Mask, true & np.isfinite(est).all(axis=-1))
-    n = int(np.count_nonzero(both))
-    error = np.linalg.norm(scale * est[both] - gt[both], axis=-1)
-    length = np.linalg.norm(gt[both], axis=-1)
-    return {
-        "mean": float(np.mean(error)) if n else float("nan"),
-        "median": float(np.median(error)) if n else float("nan"),
-        "mean_truth_length": float(np.mean(length)) if n else float("nan"),
-        "coverage": n / total,
-        "n_pixels": n,
-    }
