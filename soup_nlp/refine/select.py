@@ -130,7 +130,7 @@ def upright(soup: Soup, anchor_ray: Float, visibility_ray: Float, min_facing: fl
     share = np.ones(len(soup))
     n, D = soup.n.copy(), soup.distance.copy()
     for _ in range(60):
-        facing = -np.einsum("nc,nvc->nv", n, visibility_ray).min(axis=1)
+        facing = -np.einsum("nc,nvc->nv", n, visibility_ray).max(axis=1)
         # an NLP's answer keeps its inequalities to a tolerance: it stays as it is
         bad = (facing < min_facing - TOLERANCE) | bad_depth
         bad_depth = np.zeros(len(soup), bool)

@@ -1,0 +1,337 @@
+"""Particles are feasible and mean what they say; rounds never raise E, and they find repairs."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_model import K_NEXT, K_REF, Tiny, random_soup, weights_for
+
+from soup_nlp.data.pair import Flow
+from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.superpixels import segment
+from soup_nlp.model import plain
+from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
+from soup_nlp.refine.costs import Particles, anchor_depth, unary_costs
+from soup_nlp.refine.local import Local, fit_motion, neighbours
+from soup_nlp.refine.mppbp import RefineOptions, refine_soup
+from soup_nlp.refine.particles import BORROWED, COMMON, KINDS, WALKS, Proposer
+from soup_nlp.solve.kkt import constraint_residuals
+
+FEW = RefineOptions(rounds=3, particles=16, trws_iterations=15)
+NEW = (*WALKS, *COMMON, *BORROWED)
+
+
+def proposer(tiny: Tiny, seed: int = 0) -> Proposer:
+    near = neighbours(tiny.data.edges, tiny.data.anchor_ray)
+    return Proposer(tiny.data, near, seed)
+
+
+def anchor_targets(p: Particles, data: EnergyData) -> np.ndarray:
+    """(N, L, 2) where anchors go, pixels."""
+    X = anchor_depth(p, data.anchor_ray)[..., None] * data.anchor_ray[:, None]
+    return camera.project(data.K_next, np.einsum("nlij,nlj->nli", p.R, X) + p.T)
+
+
+class Planar:
+    """Two planes under two motions in 30 grid superpixels, exact flow: the truth has known E."""
+
+    def __init__(self, broken: int = 0, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        image = np.zeros((60, 80, 3), np.uint8)
+        labels = segment(image, 30, "grid")
+        seg = build_segmentation(labels, image, 6, boundary_samples=2)
+        n = len(seg)
+        self.left = left = seg.anchors[:, 0] < 40
+        normal = np.where(left[:, None], [0.2, 0.1, -1.0], [-0.3, 0.0, -1.0])
+        normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        D = np.where(left, 1.0, 1.3)
+        R = rotation.exp(np.where(left[:, None], [0.0, 0.02, 0.0], [0.03, -0.02, 0.01]))
+        T = np.where(left[:, None], [0.08, 0.0, 0.02], [-0.05, 0.04, 0.0])
+        self.truth = Soup(np.ones(n), normal, D, R, T)
+        H = self.truth.homographies(K_REF, K_NEXT)[labels]
+        uv = camera.pixel_grid(60, 80)
+        y = np.einsum("hwij,hwj->hwi", H, np.concatenate([uv, np.ones((60, 80, 1))], axis=-1))
+        flow = Flow(
+            (y[..., :2] / y[..., 2:] - uv).astype(np.float32), np.ones((60, 80), np.float32), "test"
+        )
+        data = build_energy_data(seg, flow, K_REF, K_NEXT, 8, seed)
+        self.data = in_pixels(data, self.truth, seg)
+        self.bad = rng.choice(n, broken, replace=False)
+        m = {k: getattr(self.truth, k).copy() for k in ("lam", "n", "d", "R", "t")}
+        other = random_soup(seed + 7, n)
+        for i in self.bad:
+            m["n"][i], m["R"][i] = other.n[i], other.R[i]
+            m["d"][i] *= np.exp(rng.normal(0, 0.3))
+            m["t"][i] = other.t[i] * other.lam[i]
+        self.soup = Soup(**m)
+
+
+def test_local_coordinates_lose_nothing():
+    tiny = Tiny()
+    p = Local.of(tiny.soup, tiny.data.anchor_ray).particles(tiny.data.anchor_ray)
+    for a, b in zip((p.n, p.D, p.R, p.T), vars(Particles.of(tiny.soup)).values()):
+        assert np.allclose(a, b, atol=1e-14)
+
+
+@pytest.mark.parametrize("kind", NEW)
+def test_every_proposal_is_feasible_by_construction(kind):
+    tiny = Tiny("pixels", samples=8)
+    made = proposer(tiny).propose(tiny.soup, {kind: 4})
+    p = made.particles
+    n, count = p.shape
+    assert n == len(tiny.soup)
+    assert 1 <= count <= 4
+    assert set(made.kind) == {KINDS.index(kind)}
+    assert made.step.shape == (n, count)
+    gram = np.swapaxes(p.R, 2, 3) @ p.R
+    assert np.abs(gram - np.eye(3)).max() < 1e-13
+    assert (np.linalg.det(p.R) > 0).all()
+    assert np.abs(np.linalg.norm(p.n, axis=2) - 1).max() < 1e-14
+    assert (p.D > 0).sum() >= 0.9 * p.D.size
+    assert all(np.isfinite(v).all() for v in vars(p).values())
+    # something is proposed: at most a re-fit may find the state that is there
+    now = Particles.of(tiny.soup)
+    moved = np.abs(p.R - now.R).max(axis=(2, 3)) + np.abs(p.T - now.T).max(axis=2)
+    moved = moved + np.abs(p.n - now.n).max(axis=2) + np.abs(p.D - now.D)
+    assert (moved > 1e-9).any(axis=1).all()
+
+
+def test_a_step_of_scale_leaves_the_anchors_target_and_a_turn_about_it_too():
+    tiny = Tiny("pixels")
+    before = anchor_targets(Particles.of(tiny.soup), tiny.data)
+    for kind in ("walk_scale", "walk_pivot", "common_scale"):
+        p = proposer(tiny).propose(tiny.soup, {kind: 5}).particles
+        assert np.abs(anchor_targets(p, tiny.data) - before).max() < 1e-9, kind
+    p = proposer(tiny).propose(tiny.soup, {"walk_motion": 5}).particles
+    assert np.abs(anchor_targets(p, tiny.data) - before).max() > 0.05
+
+
+def test_a_common_scale_keeps_every_pixels_target():
+    tiny = Tiny("pixels", samples=8)
+    weights = Weights()
+    before, _ = unary_costs(Particles.of(tiny.soup), tiny.data, weights)
+    p = proposer(tiny).propose(tiny.soup, {"common_scale": 3}).particles
+    after, _ = unary_costs(p, tiny.data, weights)
+    assert np.allclose(after, before, rtol=1e-10)
+    Z = anchor_depth(p, tiny.data.anchor_ray) / tiny.soup.depth_at(tiny.data.anchor_ray)[:, None]
+    assert np.allclose(Z, Z[:1])
+    assert (np.abs(Z[0] - 1) > 1e-4).all()
+
+
+def test_a_step_is_about_so_many_pixels():
+    tiny = Tiny("pixels")
+    before = anchor_targets(Particles.of(tiny.soup), tiny.data)
+    for kind in ("walk_plane", "walk_motion"):
+        maker = proposer(tiny)
+        maker.spread.width = 0.0
+        maker.spread.centre[kind] = np.log(0.1)
+        p = maker.propose(tiny.soup, {kind: 200}).particles
+        moved = np.linalg.norm(anchor_targets(p, tiny.data) - before, axis=2)
+        # several coordinates add up: from a third of the step to four times it
+        assert 0.03 < np.median(moved) < 0.4, kind
+
+
+def test_steps_follow_what_was_accepted():
+    spread = proposer(Tiny()).spread
+    spread.learn("walk_all", np.array([0.01, 0.01, 0.01, np.nan]))
+    assert spread.centre["walk_all"] < np.log(0.1)
+    before = spread.centre["walk_plane"]
+    spread.learn("walk_plane", np.array([np.nan, 1.0]))
+    assert spread.centre["walk_plane"] == pytest.approx(before + np.log(spread.shrink))
+
+
+def test_neighbours_on_one_plane_propose_that_plane():
+    scene = Planar()
+    near = neighbours(scene.data.edges, scene.data.anchor_ray)
+    made = Proposer(scene.data, near, 0).propose(scene.truth, {"neighbour_both": 3})
+    p = made.particles
+    same = np.abs(p.n - scene.truth.n[:, None]).max(axis=2) < 1e-9
+    same &= np.abs(p.D - scene.truth.distance[:, None]) < 1e-9
+    same &= np.abs(p.T - scene.truth.translation[:, None]).max(axis=2) < 1e-12
+    # all but those beside the other body find themselves
+    assert same.any(axis=1).mean() > 0.8
+    assert same.mean() > 0.5
+
+
+def test_a_refit_under_the_true_motion_finds_the_true_plane():
+    scene = Planar(broken=6)
+    truth, bad = scene.truth, scene.bad
+    n = scene.soup.n.copy()
+    D = scene.soup.distance.copy()
+    planes_only = Soup(np.ones(len(n)), n, D, truth.R, truth.translation)
+    near = neighbours(scene.data.edges, scene.data.anchor_ray)
+    p = Proposer(scene.data, near, 0).propose(planes_only, {"own_refit": 1}).particles
+    Z = anchor_depth(p, scene.data.anchor_ray)[:, 0]
+    true = truth.depth_at(scene.data.anchor_ray)
+    was = np.abs(planes_only.depth_at(scene.data.anchor_ray) / true - 1)[bad]
+    assert was.mean() > 0.1
+    assert np.abs(Z / true - 1)[bad].max() < 0.02
+
+
+def test_a_motion_is_fitted_to_its_points():
+    rng = np.random.default_rng(0)
+    X = rng.uniform([-1, -1, 2], [1, 1, 4], (60, 3))
+    R, T = rotation.exp([0.03, -0.02, 0.05]), np.array([0.1, -0.05, 0.2])
+    Y = X @ R.T + T
+    target = Y / Y[:, 2:]
+    target[:5, :2] += 0.3  # outliers
+    R1, T1 = fit_motion(np.eye(3), np.zeros(3), X, target, np.ones(60), 500.0, rounds=15)
+    assert np.abs(R1 - R).max() < 1e-3
+    assert np.abs(T1 - T).max() < 5e-3
+
+
+def test_neighbours_come_nearest_first():
+    tiny = Tiny()
+    near = neighbours(tiny.data.edges, tiny.data.anchor_ray)
+    gap = np.linalg.norm(tiny.data.anchor_ray[near] - tiny.data.anchor_ray[:, None], axis=2)
+    assert (np.diff(gap, axis=1) >= 0).all()
+    edges = {tuple(e) for e in tiny.data.edges}
+    assert all((min(i, k), max(i, k)) in edges for i in range(len(near)) for k in near[i])
+    assert neighbours(np.zeros((0, 2), int), tiny.data.anchor_ray).shape == (12, 0)
+
+
+@pytest.mark.parametrize("units", ["paper", "pixels"])
+def test_no_round_raises_the_exact_energy_and_the_soup_is_feasible(units):
+    tiny = Tiny(units, samples=6)
+    weights = weights_for(units)
+    done = refine_soup(tiny.soup, tiny.data, weights, FEW, seed=1)
+    totals = [done.energy_begin["total"], *(r.energy["total"] for r in done.rounds)]
+    assert (np.diff(totals) <= 0).all()
+    assert totals[-1] < 0.9 * totals[0]
+    assert done.energy == plain.energy(done.soup, tiny.data, weights)
+    assert done.status == "rounds"
+    assert len(done.rounds) == FEW.rounds
+    residuals = constraint_residuals(done.soup, tiny.data.rim_ray, 1e-3)
+    assert max(residuals.values()) < 1e-12
+    for r in done.rounds:
+        assert r.bound <= r.mrf_energy + 1e-9
+        assert r.gap >= -1e-9
+        assert sum(r.accepted.values()) == len(tiny.soup)
+        assert sum(r.proposed.values()) <= FEW.particles * len(tiny.soup)
+        if units == "pixels" and r.taken:
+            assert r.mrf_energy == pytest.approx(r.energy["total"], rel=1e-9)
+    assert set(done.rounds[0].accepted) == set(KINDS)
+
+
+def test_the_same_seed_gives_the_same_soup_and_another_another():
+    tiny = Tiny("pixels", samples=6)
+    weights = weights_for("pixels")
+    a, b, c = (
+        refine_soup(tiny.soup, tiny.data, weights, FEW, seed=s).soup.distance for s in (1, 1, 2)
+    )
+    assert np.array_equal(a, b)
+    assert not np.allclose(a, c)
+
+
+def test_broken_superpixels_are_repaired_by_their_neighbours():
+    scene = Planar(broken=6)
+    weights = Weights()
+    truth = plain.energy(scene.truth, scene.data, weights)["total"]
+    begin = plain.energy(scene.soup, scene.data, weights)["total"]
+    assert begin > 1.5 * truth
+    done = refine_soup(scene.soup, scene.data, weights, replace(FEW, particles=30), seed=0)
+    assert done.energy["total"] < truth + 0.05 * (begin - truth)
+    ratio = done.soup.depth_at(scene.data.anchor_ray) / scene.truth.depth_at(scene.data.anchor_ray)
+    # what remains is the scale between the two bodies, which two views do not determine
+    for body in (scene.left, ~scene.left):
+        assert np.abs(ratio[body] / np.median(ratio[body]) - 1).max() < 1e-3
+
+
+def test_a_soup_at_its_optimum_is_left_alone():
+    scene = Planar()
+    # one plane under one motion with exact flow: E is 0
+    one = np.zeros(len(scene.truth), int)
+    same = Soup(*(v[one] for v in vars(scene.truth).values()))
+    y = same.moved(same.points(scene.data.pixel_ray.reshape(len(same), -1, 3)))
+    data = replace(scene.data, pixel_target=camera.project(K_NEXT, y))
+    done = refine_soup(same, data, Weights(), FEW, seed=0)
+    assert done.energy["total"] < 1e-9
+    ratio = done.soup.depth_at(data.anchor_ray) / same.depth_at(data.anchor_ray)
+    assert np.abs(ratio / ratio[0] - 1).max() < 1e-6
+    gap = done.soup.R - same.R
+    assert np.abs(gap).max() < 1e-6
+
+
+def test_interruption_and_time_limit_keep_the_best():
+    tiny = Tiny("pixels", samples=6)
+    weights = weights_for("pixels")
+    stop = threading.Event()
+    stop.set()
+    done = refine_soup(tiny.soup, tiny.data, weights, FEW, stop=stop)
+    assert done.status == "interrupted"
+    assert not done.rounds
+    assert done.energy["total"] == pytest.approx(
+        plain.energy(tiny.soup, tiny.data, weights)["total"], rel=1e-12
+    )
+    stop.clear()
+    lines: list[str] = []
+
+    def say(line: str) -> None:
+        lines.append(line)
+        stop.set()
+
+    done = refine_soup(tiny.soup, tiny.data, weights, FEW, stop=stop, say=say)
+    assert done.status == "interrupted"
+    assert len(done.rounds) == len(lines) == 1
+    assert done.energy["total"] < done.energy_begin["total"]
+    late = refine_soup(tiny.soup, tiny.data, weights, replace(FEW, max_seconds=1e-9))
+    assert late.status == "time limit"
+    assert not late.rounds
+
+
+def test_a_listener_hears_every_iteration_and_can_stop_within_a_round():
+    tiny = Tiny("pixels", samples=6)
+    stop = threading.Event()
+    heard: list[str] = []
+
+    def listener(progress: object) -> None:
+        heard.append(str(progress))
+        if len(heard) == 2:
+            stop.set()
+
+    done = refine_soup(
+        tiny.soup, tiny.data, weights_for("pixels"), FEW, stop=stop, listener=listener
+    )
+    assert done.status == "interrupted"
+    assert len(heard) == 2
+    assert heard[0].startswith("refine 1")
+    assert done.rounds[0].iterations == 2
+    assert done.energy["total"] <= done.energy_begin["total"]
+
+
+def test_stagnation_ends_the_rounds():
+    tiny = Tiny("pixels", samples=6)
+    o = replace(FEW, rounds=30, stagnation=0.5)
+    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o)
+    assert done.status == "stagnated"
+    assert len(done.rounds) < 30
+
+
+@pytest.mark.parametrize("particles", [2, 3, 9])
+def test_few_particles_and_a_superpixel_without_edges_are_no_special_case(particles):
+    tiny = Tiny("pixels", samples=6)
+    o = replace(FEW, particles=particles)
+    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o)
+    assert done.energy["total"] <= done.energy_begin["total"]
+    alone = replace(
+        tiny.data,
+        **{k: getattr(tiny.data, k)[:0] for k in ("edges", "edge_weight", "edge_unit")},
+        **{
+            k: getattr(tiny.data, k)[:0]
+            for k in (
+                "pairs",
+                "boundary_ray",
+                "pair_weight",
+                "pair_factor",
+                "pair_unit",
+                "pair_count",
+            )
+        },
+    )
+    done = refine_soup(tiny.soup, alone, weights_for("pixels"), o)
+    assert done.energy["total"] <= done.energy_begin["total"]

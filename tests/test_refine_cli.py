@@ -1,0 +1,156 @@
+"""`solve` refines by default; each half can be left out; the history is stored and checked."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+
+from soup_nlp.cli import main
+from soup_nlp.config import make_problem
+from soup_nlp.errors import ConfigError
+from soup_nlp.pipeline import run
+from soup_nlp.refine.mppbp import RefineOptions
+from soup_nlp.refine.particles import KINDS
+from soup_nlp.report.check import check_folder
+
+ORBIT = Path(__file__).parent.parent / "problems" / "orbit.yaml"
+SMALL = [
+    "--set", "input.width=160", "--set", "input.height=96",
+    "--set", "segmentation.superpixels=30", "--set", "segmentation.neighbours=6",
+    "--set", "flow.source=truth", "--set", "refine.rounds=3", "--set", "refine.particles=20",
+]  # fmt: skip
+TERMS = ("total", "arap", "proj", "cont", "orient")
+
+
+def solve(folder: Path, *options: str) -> tuple[int, dict]:
+    code = main(["solve", str(ORBIT), "--out", str(folder), "-q", *SMALL, *options])
+    return code, json.loads((folder / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("both")
+    assert solve(out)[0] == 0
+    return out
+
+
+def test_solve_delivers_the_refined_soup_and_keeps_the_nlps(both):
+    summary = json.loads((both / "summary.json").read_text())
+    E = summary["energy"]
+    assert E["solution"]["total"] < E["nlp"]["total"] < E["start"]["total"]
+    assert set(summary["metrics"]) >= {"start", "nlp", "solution", "constant"}
+    assert summary["residuals"]["so3"] < 1e-12
+    r = summary["refinement"]
+    assert r["status"] == "rounds"
+    assert len(r["rounds"]) == 3
+    assert r["begin"] == pytest.approx(E["nlp"], rel=1e-9)
+    assert r["rounds"][-1]["energy"] == E["solution"]
+    assert set(r["rounds"][0]["accepted"]) == set(KINDS)
+    with h5py.File(both / "result.h5") as file:
+        for term in TERMS:
+            values = file[f"refine/energy_{term}"][:]
+            assert list(values) == [one["energy"][term] for one in r["rounds"]]
+        assert file["refine/accepted"].shape == (3, len(KINDS))
+        assert (file["refine/bound"][:] <= file["refine/mrf_energy"][:] + 1e-9).all()
+        assert file["depth/nlp_ref"].shape == file["depth/ref"].shape
+        assert np.abs(file["nlp/R"][:] - file["solution/R"][:]).max() > 0
+    assert check_folder(both).ok
+
+
+def test_the_verdict_tells_energy_gap_and_both_depths(both, tmp_path, capsys):
+    assert solve(tmp_path)[0] == 0
+    text = capsys.readouterr().out
+    assert "refinement 3 rounds" in text
+    assert "above the best among its particles" in text
+    assert "NLP alone" in text
+    assert (tmp_path / "log.txt").read_text().count("refine ") >= 3
+
+
+def test_a_changed_history_is_found(both, tmp_path):
+    solve(tmp_path)
+    path = tmp_path / "summary.json"
+    told = json.loads(path.read_text())
+    for change in (
+        lambda c: c["refinement"]["rounds"][1]["energy"].update(total=1e6),
+        lambda c: c["refinement"]["rounds"][1].update(bound=1e6),
+        lambda c: c["energy"]["solution"].update(total=c["energy"]["solution"]["total"] * 0.99),
+        lambda c: c["energy"]["nlp"].update(arap=c["energy"]["nlp"]["arap"] + 0.01),
+        lambda c: c["nlp_residuals"].update(so3=1.0),
+    ):
+        claims = json.loads(json.dumps(told))
+        change(claims)
+        path.write_text(json.dumps(claims))
+        assert not check_folder(tmp_path).ok
+
+
+def test_without_refinement_the_nlps_soup_is_delivered(tmp_path):
+    code, summary = solve(tmp_path, "--no-refine")
+    assert code == 0
+    assert summary["refinement"] is None
+    assert summary["energy"]["nlp"] == summary["energy"]["solution"]
+    assert "nlp" not in summary["metrics"]
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["refine"]["enabled"] is False
+    assert check_folder(tmp_path).ok
+
+
+def test_without_the_nlp_the_start_is_refined(tmp_path, capsys):
+    code, summary = solve(tmp_path, "--no-nlp")
+    assert code == 0
+    assert "Ipopt" not in capsys.readouterr().out
+    assert summary["status"] == "Skipped"
+    assert summary["delivered"] == "start"
+    assert summary["iterations"] == {}
+    assert summary["energy"]["solution"]["total"] < 0.95 * summary["energy"]["start"]["total"]
+    assert "nlp" not in summary["metrics"]
+    assert check_folder(tmp_path).ok
+    # what was done can be done again from the folder alone
+    again = tmp_path / "again"
+    assert main(["solve", str(tmp_path / "config.yaml"), "-q", "--out", str(again)]) == 0
+    assert json.loads((again / "summary.json").read_text())["energy"] == summary["energy"]
+
+
+def test_both_halves_cannot_be_left_out(tmp_path, capsys):
+    assert main(["solve", str(ORBIT), "-o", str(tmp_path), "--no-nlp", "--no-refine"]) == 2
+    assert "nothing is left to do" in capsys.readouterr().err
+
+
+def test_an_interrupted_refinement_keeps_its_best_and_exits_with_1(tmp_path):
+    stop = threading.Event()
+
+    def say(line: str) -> None:
+        if line.startswith("refine 1"):
+            stop.set()
+
+    overrides = [s for s in SMALL if s != "--set"] + ["refine.from_start=true"]
+    problem = make_problem(yaml.safe_load(ORBIT.read_text()), overrides)
+    done = run(problem, stop=stop, say=say)
+    assert done.refined is not None
+    assert done.refined.status == "interrupted"
+    assert len(done.refined.rounds) == 1
+    assert not done.good
+    assert done.energy["total"] < done.solution.energy["total"]
+
+
+def test_a_polish_keeps_the_better_soup(tmp_path):
+    code, summary = solve(tmp_path, "--set", "refine.polish=true", "--set", "refine.rounds=1")
+    assert code == 0
+    r = summary["refinement"]
+    assert r["polish_gain"] >= 0
+    last = r["rounds"][-1]["energy"]["total"]
+    assert summary["energy"]["solution"]["total"] == pytest.approx(last - r["polish_gain"])
+    assert check_folder(tmp_path).ok
+
+
+def test_the_section_mirrors_its_record_and_is_strict():
+    problem = make_problem({"input": {"kind": "motorcycle"}})
+    assert RefineOptions(**problem.refine.model_dump()) == RefineOptions()
+    assert problem.refine.particles == 50
+    for wrong in ("refine.particles=1", "refine.keep=2", "refine.round=3", "refine.rounds=-1"):
+        with pytest.raises(ConfigError):
+            make_problem({"input": {"kind": "motorcycle"}}, [wrong])

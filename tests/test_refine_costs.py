@@ -1,0 +1,243 @@
+"""Costs of particles are the exact energy, label by label and pair by pair."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_model import Tiny, random_soup, weights_for
+
+from soup_nlp.geometry import rotation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model import plain
+from soup_nlp.refine.costs import PairCosts, Particles, anchor_depth, feasible, unary_costs
+from soup_nlp.refine.mppbp import length_slope
+from soup_nlp.refine.select import conditional_costs, diverse, upright, within_reach
+
+
+def cloud(tiny: Tiny, labels: int, seed: int = 3, spread: float = 1.0) -> Particles:
+    """So many random soups as particles; particle 0 is the tiny soup."""
+    n = len(tiny.soup)
+    others = [Particles.of(random_soup(seed + k, n, spread)) for k in range(labels - 1)]
+    return Particles.of(tiny.soup).joined(*others)
+
+
+def chosen(p: Particles, labels: np.ndarray) -> Soup:
+    """The soup of labels, in the length unit of its particles."""
+    own = p.take(labels[:, None])
+    one = np.ones(len(labels))
+    return Soup(one, own.n[:, 0], own.D[:, 0], own.R[:, 0], own.T[:, 0])
+
+
+def assembled(costs: PairCosts, p: Particles, labels: np.ndarray, unit: float = 1.0) -> float:
+    unary, _ = unary_costs(p, costs.data, costs.weights)
+    table = costs.tables(p, unit)
+    i, k = costs.edges.T
+    pairs = table[np.arange(len(i)), labels[i], labels[k]]
+    return float(unary[np.arange(len(labels)), labels].sum() + pairs.sum())
+
+
+@pytest.mark.parametrize("units", ["paper", "pixels"])
+@pytest.mark.parametrize("at_anchors", [False, True])
+@pytest.mark.parametrize("truncated", [False, True])
+def test_costs_of_chosen_labels_are_the_exact_energy(units, at_anchors, truncated):
+    tiny = Tiny(units, at_anchors=at_anchors, samples=None)
+    weights = weights_for(units, truncated)
+    costs = PairCosts(tiny.data, weights)
+    p = cloud(tiny, 6)
+    rng = np.random.default_rng(5)
+    for _ in range(4):
+        labels = rng.integers(0, 6, len(tiny.soup))
+        soup = chosen(p, labels)
+        unit = float(np.sum(tiny.data.share * soup.distance))
+        exact = plain.energy(soup, tiny.data, weights)["total"]
+        assert assembled(costs, p, labels, unit) == pytest.approx(exact, rel=1e-12)
+        # and the soup that is delivered has the same energy: E does not depend on the scale
+        delivered = plain.energy(p.soup(labels, tiny.data.share), tiny.data, weights)["total"]
+        assert delivered == pytest.approx(exact, rel=1e-12)
+
+
+def test_every_entry_is_the_energy_of_its_pair_however_close_the_particles():
+    tiny = Tiny("pixels")
+    weights = weights_for("pixels", truncated=False)
+    n = len(tiny.soup)
+    near = Particles.of(tiny.soup)
+    steps = (0.0, 1e-9, 1e-6, 1e-3)
+    rng = np.random.default_rng(0)
+    turn = rng.normal(size=(n, 1, 3))
+    p = near.joined(
+        *(
+            Particles(near.n, near.D * (1 + s), rotation.exp(s * turn) @ near.R, near.T * (1 - s))
+            for s in steps
+        )
+    )
+    costs = PairCosts(tiny.data, weights)
+    table = costs.tables(p)
+    only_pairs = {"proj": 0.0}
+    w = replace(weights, **only_pairs)
+    for e in (0, len(costs.edges) // 2, len(costs.edges) - 1):
+        i, k = costs.edges[e]
+        data = replace(
+            tiny.data,
+            edges=np.array([[i, k]]) if costs.arap_row[e] >= 0 else np.zeros((0, 2), int),
+            edge_weight=tiny.data.edge_weight[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
+            edge_unit=tiny.data.edge_unit[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
+            pairs=np.array([[i, k]]) if costs.cont_row[e] >= 0 else np.zeros((0, 2), int),
+            **{
+                key: getattr(tiny.data, key)[[max(costs.cont_row[e], 0)]]
+                for key in (
+                    "boundary_ray",
+                    "pair_weight",
+                    "pair_factor",
+                    "pair_unit",
+                    "pair_count",
+                )
+            },
+        )
+        for a in range(p.shape[1]):
+            for b in range(p.shape[1]):
+                labels = np.zeros(n, int)
+                labels[i], labels[k] = a, b
+                exact = plain.energy(chosen(p, labels), data, w)["total"]
+                assert table[e, a, b] == pytest.approx(exact, rel=1e-9, abs=1e-12 * table.max())
+
+
+def test_alike_motions_and_planes_cost_exactly_nothing():
+    tiny = Tiny("pixels")
+    one = Particles.of(tiny.soup)
+    n = len(tiny.soup)
+    same = Particles(*(np.repeat(v[:1], n, axis=0) for v in (one.n, one.D, one.R, one.T)))
+    table = PairCosts(tiny.data, weights_for("pixels")).tables(same.joined(one))
+    # rotation, translation, gaps and turn vanish; the distances are kept up to rounding
+    assert np.abs(table[:, 0, 0]).max() < 1e-12 * table.max()
+
+
+def test_edges_are_the_union_of_both_graphs_once_each():
+    tiny = Tiny(neighbours=2)
+    costs = PairCosts(tiny.data, weights_for("paper"))
+    found = {tuple(e) for e in costs.edges}
+    assert len(found) == len(costs.edges)
+    assert found == {tuple(e) for e in (*tiny.data.edges, *tiny.data.pairs)}
+    assert (costs.edges[:, 0] < costs.edges[:, 1]).all()
+    for rows, graph in ((costs.arap_row, tiny.data.edges), (costs.cont_row, tiny.data.pairs)):
+        assert np.array_equal(costs.edges[rows >= 0], graph[rows[rows >= 0]])
+        assert (rows >= 0).sum() == len(graph)
+
+
+def test_blocks_and_single_precision_change_no_digit_that_matters(monkeypatch):
+    tiny = Tiny("pixels")
+    costs = PairCosts(tiny.data, weights_for("pixels"))
+    p = cloud(tiny, 5)
+    whole = costs.tables(p)
+    monkeypatch.setattr("soup_nlp.refine.costs.BLOCK_BYTES", 1)
+    monkeypatch.setattr("soup_nlp.refine.costs.UNARY_BYTES", 1)
+    assert np.array_equal(costs.tables(p), whole)
+    single = costs.tables(p, dtype=np.float32)
+    assert single.dtype == np.float32
+    assert np.allclose(single, whole, rtol=1e-6, atol=1e-6 * whole.max())
+    assert costs.bytes(5, np.float32) == single.nbytes
+
+
+def test_a_particle_whose_pixels_fall_behind_the_camera_is_told():
+    tiny = Tiny("pixels")
+    p = cloud(tiny, 2)
+    p.T[3, 1] = [0.0, 0.0, -50.0]
+    _, ahead = unary_costs(p, tiny.data, weights_for("pixels"))
+    assert not ahead[3, 1]
+    assert ahead.sum() == ahead.size - 1
+
+
+def test_visibility_is_that_of_the_nlp():
+    tiny = Tiny()
+    p = cloud(tiny, 2)
+    rays = tiny.data.visibility_ray(5.0)
+    assert feasible(p, rays, 1e-3).all()
+    p.n[2, 1] = [0.0, 0.0, 1.0]
+    found = feasible(p, rays, 1e-3)
+    assert not found[2, 1]
+    assert found.sum() == found.size - 1
+
+
+def test_the_length_slope_is_the_derivative_of_the_energy():
+    tiny = Tiny("paper")
+    weights = weights_for("paper", truncated=False)
+    h = 1e-5
+    scaled = [
+        replace(tiny.data, share=tiny.data.share * (1 + s * h)) for s in (1, -1)
+    ]  # the unit is sum(share D)
+    up, down = (plain.energy(tiny.soup, d, weights)["total"] for d in scaled)
+    assert length_slope(tiny.soup, tiny.data, weights) == pytest.approx(
+        (down - up) / (2 * h), rel=1e-5
+    )
+
+
+def test_conditional_costs_are_differences_of_the_energy():
+    tiny = Tiny("pixels")
+    weights = weights_for("pixels")
+    costs = PairCosts(tiny.data, weights)
+    p = cloud(tiny, 4)
+    unary, _ = unary_costs(p, tiny.data, weights)
+    labels = np.random.default_rng(0).integers(0, 4, len(tiny.soup))
+    found = conditional_costs(labels, unary, costs.edges, costs.tables(p))
+    base = plain.energy(chosen(p, labels), tiny.data, weights)["total"]
+    for i in (0, 5, 11):
+        for x in range(4):
+            other = labels.copy()
+            other[i] = x
+            gain = plain.energy(chosen(p, other), tiny.data, weights)["total"] - base
+            assert found[i, x] - found[i, labels[i]] == pytest.approx(gain, abs=1e-10)
+
+
+def test_kept_particles_are_cheap_feasible_and_different():
+    tiny = Tiny("pixels")
+    p = cloud(tiny, 6)
+    n = len(tiny.soup)
+    p = p.joined(p.take(np.full((n, 1), 2)))  # number 6 repeats number 2
+    cost = np.tile(np.array([0.0, 1.0, 2.0, 3.0, np.inf, 5.0, 2.1]), (n, 1))
+    labels = np.zeros(n, int)
+    kept = diverse(p, labels, cost, 4, tiny.data)
+    assert np.array_equal(kept, np.tile([1, 2, 3, 5], (n, 1)))
+    # with nothing else left: the repeated one, then the infeasible one
+    every = diverse(p, labels, cost, 20, tiny.data)
+    assert np.array_equal(every[:, 4:], np.tile([6, 4], (n, 1)))
+
+
+def test_planes_that_turn_away_are_tilted_about_their_anchor():
+    tiny = Tiny()
+    data, soup = tiny.data, tiny.soup
+    n = soup.n.copy()
+    rays = data.visibility_ray(5.0)
+    # nearly edge-on at its anchor, so that its far rim is beyond the horizon
+    a = data.anchor_ray[4]
+    steep = np.array([1.0, 0.0, -a[0] - 0.02])
+    n[4] = steep / np.linalg.norm(steep)
+    broken = Soup(soup.lam, n, soup.d, soup.R, soup.t)
+    assert not feasible(Particles.of(broken), rays, 1e-3)[4, 0]
+    good = upright(broken, data.anchor_ray, rays, 1e-3)
+    assert feasible(Particles.of(good), rays, 1e-3).all()
+    before, after = broken.depth_at(data.anchor_ray), good.depth_at(data.anchor_ray)
+    assert before[4] > 0
+    assert after[4] == pytest.approx(before[4])
+    others = np.arange(len(soup)) != 4
+    assert np.array_equal(good.n[others], soup.n[others])
+    assert np.allclose(good.translation, soup.translation)
+
+
+def test_no_particle_runs_away_but_the_current_one_may_stay():
+    tiny = Tiny()
+    n = len(tiny.soup)
+    now = tiny.soup
+    far = Soup(now.lam, now.n, now.d * np.where(np.arange(n) == 3, 1e3, 1.0), now.R, now.t)
+    p = Particles.of(far)
+    p = p.joined(*(Particles(p.n, p.D * s, p.R, p.T) for s in (1.3, 100.0, 1e-3)))
+    near = np.array([[j for j in range(n) if j != i][:6] for i in range(n)])
+    found = within_reach(p, far, near, tiny.data.anchor_ray, 2.0)
+    assert found[:, 0].all()
+    others = np.arange(n) != 3
+    assert found[others, 1].all()
+    assert not found[:, 2].any()
+    assert not found[others, 3].any()
+    # back to its neighbours is open to the one that ran away
+    assert found[3, 3]
+    assert anchor_depth(p, tiny.data.anchor_ray)[3, 3] < 2.0
