@@ -10,6 +10,7 @@ from typing import Annotated, Any, cast, get_args
 import typer
 from rich.console import Console
 
+from soup_nlp.cli_bench import register as register_bench
 from soup_nlp.cli_export import register as register_export
 from soup_nlp.config import Problem, dump_problem, load_problem, make_problem
 from soup_nlp.data.scenes import SCENES
@@ -213,6 +214,7 @@ def list_(
 
 
 register_export(app)
+register_bench(app)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

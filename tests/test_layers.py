@@ -24,6 +24,8 @@ ALLOWED = {
     # files for and from other solvers, and runs of those
     "export": {"errors", "geometry", "model", "solve", "report"},
     "compare": {"errors", "geometry", "model", "solve", "report", "export"},
+    # tables, plots and gates over many runs; what runs a problem stands beside the rooms
+    "bench": {"errors", "data", "geometry", "model", "start", "solve", "refine", "report"},
 }
 """Rooms in their order. Modules beside the rooms (cli, config ...) may import every room; no room
 may import them, but for `errors`."""
@@ -42,9 +44,9 @@ DOORS = {
 
 LIBRARIES = {
     "casadi": {"model", "solve", "export", "compare"},
-    "matplotlib": {"report", "compare"},
+    "matplotlib": {"report", "compare", "bench"},
     "h5py": {"report", "data"},
-    "typer": {"cli", "cli_export"},
+    "typer": {"cli", "cli_bench", "cli_export", "comparing"},
     "rich": {"cli", "report"},
     "yaml": {"config", "data", "report", "cli"},
     "cv2": {"data", "start", "report"},

@@ -1,0 +1,17 @@
+"""Commands bench: speed, and what else is measured over many runs."""
+
+from __future__ import annotations
+
+import typer
+
+bench = typer.Typer(no_args_is_help=True, help="Measure over many runs; tables, plots and gates.")
+
+
+@bench.callback()
+def _group() -> None:
+    """Measure over many runs; tables, plots and gates."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the group of commands to the program."""
+    app.add_typer(bench, name="bench")
