@@ -1,0 +1,134 @@
+"""Yardsticks without Ipopt: same energy, same ground to within a few per cent, honest records."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from soup_nlp.cases import Case, prepare
+from soup_nlp.config import make_problem
+from soup_nlp.model import plain
+from soup_nlp.model.energy import Weights
+from soup_nlp.solve import yardstick
+from soup_nlp.solve.kkt import constraint_residuals
+from soup_nlp.solve.soup import SolverOptions, solve_soup
+from soup_nlp.solve.yardstick import Yardstick, lbfgs, levenberg_marquardt
+
+SCHEDULE = (0.1, 0.03)
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    scene = {"kind": "scene", "scene": "street", "seed": 0, "width": 256, "height": 128}
+    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+
+
+@pytest.fixture(scope="module")
+def lm(case: Case) -> Yardstick:
+    return levenberg_marquardt(case.soup, case.data, case.weights, eps=SCHEDULE)
+
+
+def check(case: Case, y: Yardstick) -> None:
+    """What holds for every record."""
+    exact = plain.energy(y.soup, case.data, case.weights)
+    assert dict(y.energy) == exact
+    assert exact["total"] == y.history[:, 1].min()
+    assert y.history.shape[1] == 2
+    assert (np.diff(y.history[:, 0]) > 0).all()
+    assert 1 < len(y.history) <= y.iterations + 1
+    assert y.seconds >= y.history[-1, 0]
+    worst = constraint_residuals(y.soup, case.data.rim_ray, 0.0)
+    assert max(worst.values()) < 1e-9
+
+
+def test_levenberg_marquardt_lowers_the_energy(case, lm):
+    check(case, lm)
+    before = plain.energy(case.soup, case.data, case.weights)["total"]
+    assert lm.energy["total"] < 0.7 * before
+    assert lm.history[0, 1] == pytest.approx(before, rel=0.05)
+    assert str(lm).startswith("levenberg-marquardt")
+
+
+def test_lbfgs_lowers_the_energy(case):
+    y = lbfgs(case.soup, case.data, case.weights, eps=SCHEDULE, iterations=150)
+    check(case, y)
+    assert y.name == "l-bfgs"
+    assert y.status == "Iteration_Limit"
+    assert y.iterations <= 300
+    assert y.energy["total"] < 0.9 * y.history[0, 1]
+
+
+def test_ipopt_and_levenberg_marquardt_agree(case, lm):
+    options = SolverOptions(presolve_eps=SCHEDULE, eps=SCHEDULE[-1])
+    s = solve_soup(case.soup, case.data, case.weights, case.formulation(), options)
+    assert lm.energy["total"] == pytest.approx(s.energy["total"], rel=0.04)
+
+
+def test_it_is_the_same_energy(case):
+    # without truncations the smoothed energy tends to the exact one
+    free = replace(
+        Weights(), sigma_cont=np.inf, sigma_orient=np.inf, sigma_arap=np.inf, sigma_proj=np.inf
+    )
+    problem = yardstick._Tangent(case.soup, case.data, free, None)
+    x = problem.project(problem.nlp.x0)
+    exact = plain.energy(problem.layout.unpack(x), case.data, free)["total"]
+    problem.smoothing(1e-7)
+    assert problem.value(x) == pytest.approx(exact, rel=1e-5)
+    problem.smoothing(1.0)
+    assert problem.value(x) < exact
+
+
+def test_projection_keeps_bounds_and_visibility(case):
+    problem = yardstick._Tangent(case.soup, case.data, case.weights, None)
+    inside = problem.project(problem.nlp.x0)
+    np.testing.assert_array_equal(problem.project(inside), inside)
+    rng = np.random.default_rng(0)
+    wild = inside + rng.normal(0, 3.0, inside.shape)
+    assert (problem.rows @ wild < problem.lower).any()
+    kept = problem.project(wild)
+    assert (problem.rows @ kept >= problem.lower - 1e-12).all()
+    assert (kept >= problem.nlp.lbx).all()
+    assert (kept <= problem.nlp.ubx).all()
+    # nothing but scales and slopes moves
+    np.testing.assert_array_equal(kept.reshape(-1, 9)[:, 3:], wild.reshape(-1, 9)[:, 3:])
+
+
+def test_factorisations_agree():
+    rng = np.random.default_rng(1)
+    J = sparse.random(60, 30, 0.1, "csr", rng=rng) + sparse.eye(60, 30)
+    H = sparse.triu(J.T @ J).tocsc()
+    H.sort_indices()
+    nonzeros = H.data.copy()
+    upper = sparse.csc_matrix((np.arange(H.nnz, dtype=float), H.indices, H.indptr), H.shape)
+    b = rng.normal(size=30)
+    full = (J.T @ J).toarray()
+    methods = [yardstick._superlu(upper), yardstick.factorisation(upper)[1]]
+    for solve in methods:
+        for scale, damping in ((1.0, 0.1), (2.0, 0.7)):
+            expected = np.linalg.solve(scale * full + damping * np.eye(30), b)
+            np.testing.assert_allclose(solve(scale * nonzeros, damping)(b), expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("method", [levenberg_marquardt, lbfgs])
+def test_limits_end_with_the_best_iterate(case, method):
+    stop = threading.Event()
+    stop.set()
+    y = method(case.soup, case.data, case.weights, stop=stop)
+    assert y.status == "Interrupted"
+    assert y.iterations <= 1
+    assert method(case.soup, case.data, case.weights, seconds=0.0).status == "Time_Limit"
+
+
+def test_the_listener_sees_every_step(case):
+    seen = []
+    y = levenberg_marquardt(
+        case.soup, case.data, case.weights, eps=(0.1,), iterations=5, listener=seen.append
+    )
+    assert [p.iteration for p in seen] == list(range(y.iterations))
+    assert y.status == "Iteration_Limit"
+    values = [p.objective for p in seen]
+    assert values == sorted(values, reverse=True)
