@@ -19,7 +19,7 @@ from soup_nlp.config_inputs import (
     TumInput,
 )
 from soup_nlp.data import datasets
-from soup_nlp.data.flow import dis_flow, flow_from_truth, flow_sources, resolve_flow
+from soup_nlp.data.flow import dis_flow, flow_from_truth, is_named, resolve_flow
 from soup_nlp.data.formats import read_depth, read_image
 from soup_nlp.data.formats_camera import read_intrinsics
 from soup_nlp.data.pair import Flow, Pair, Truth
@@ -101,6 +101,6 @@ def load_flow_of(problem: Problem, pair: Pair) -> Flow:
         return dis_flow(pair.image_ref, pair.image_next, **f.dis.model_dump())
     if f.source == "truth":
         return flow_from_truth(pair, f.occluded_confidence)
-    if f.source in flow_sources() or not (Path(f.source).suffix or "/" in f.source):
+    if is_named(f.source) or not (Path(f.source).suffix or "/" in f.source):
         return resolve_flow(pair, f.source)
     return resolve_flow(pair, str(problem.path(f.source)))

@@ -243,7 +243,7 @@ def test_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
         ("array_only", r"returned no Flow[\s\S]*ndarray"),
         ("broken", r"plug-in failed[\s\S]*RuntimeError: no weights"),
         ("absent", r"plug-in failed[\s\S]*AttributeError"),
-        ("unheard", r"expected: dis, truth, absent, array_only, broken, cropped, zero"),
+        ("unheard", r"raft_large, absent, array_only, broken, cropped, zero, or the path"),
     ]:
         with raises(match):
             resolve_flow(pair, name)

@@ -14,14 +14,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.data.flow_check import checked_flow, leaves, round_trip_error
+from soup_nlp.data.flow_learned import MODELS, learned_flow
+from soup_nlp.data.flow_noise import PREFIX, noise_level, noisy
+from soup_nlp.data.flow_rlof import rlof_flow
 from soup_nlp.data.formats_flow import read_flow
 from soup_nlp.data.formats_image import PathLike
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
 
 Image = NDArray[np.uint8]
-FloatMap = NDArray[np.float32]
 FlowSource = Callable[[Image, Image], Flow]
+
+__all__ = [
+    "dis_flow",
+    "flow_from_array",
+    "flow_from_truth",
+    "flow_sources",
+    "is_named",
+    "leaves",
+    "load_flow",
+    "resolve_flow",
+    "round_trip_error",
+]
 
 ENTRY_POINTS = "soup_nlp.flow"
 """Entry-point group in which other packages announce flow methods."""
@@ -36,7 +51,6 @@ _PRESETS = {
 }
 _FLAT = 1.0  # standard deviation, grey levels, below which an image holds nothing to match
 _WORK_SIDE = 64  # DIS gets images of at least this side; smaller ones are padded
-_NOISE_CAP = 5.0  # pixels; keeps one wild pixel from condemning its whole window
 
 
 def dis_flow(
@@ -121,59 +135,8 @@ def dis_flow(
         raise DataError(
             "DIS flow failed", where=f"images {width}x{height}", found=str(error).strip()
         ) from error
-    uv = np.ascontiguousarray(forward[:height, :width], dtype=np.float32)
-    gap = round_trip_error(uv, backward[: nxt.shape[0], : nxt.shape[1]])
-    if support > 1:
-        mean = cv2.blur(np.minimum(gap, _NOISE_CAP), (support, support))
-        gap = np.maximum(gap, mean)
-    confidence = np.exp(-np.square(np.minimum(gap, limit) / tau), dtype=np.float32)
-    confidence[~(gap <= limit)] = 0.0
-    return Flow(uv, confidence, "dis")
-
-
-def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
-    """Distance between each pixel and where the forward, then the backward flow bring it.
-
-    Args:
-        forward: (H, W, 2) flow from the first to the second image, pixels.
-        backward: (H', W', 2) flow from the second to the first image, pixels.
-
-    Returns:
-        (H, W) float32, pixels; infinite where the forward flow leaves the second image or is not
-        finite.
-    """
-    height, width = forward.shape[:2]
-    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    inside = ~leaves(forward, (backward.shape[0], backward.shape[1]))
-    x = np.where(inside, u + forward[:, :, 0], 0.0).astype(np.float32)
-    y = np.where(inside, v + forward[:, :, 1], 0.0).astype(np.float32)
-    back = cv2.remap(
-        np.ascontiguousarray(backward, dtype=np.float32),
-        x,
-        y,
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-    error = np.hypot(x + back[:, :, 0] - u, y + back[:, :, 1] - v)
-    error[~inside] = np.inf
-    return np.asarray(error, dtype=np.float32)
-
-
-def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Where a flow points outside the next image.
-
-    Args:
-        flow: (H, W, 2), pixels.
-        shape: (H', W') of the next image.
-
-    Returns:
-        (H, W) bool; True also where the flow is not finite.
-    """
-    height, width = flow.shape[:2]
-    x = np.arange(width)[None, :] + flow[:, :, 0]
-    y = np.arange(height)[:, None] + flow[:, :, 1]
-    inside = (x >= 0) & (x <= shape[1] - 1) & (y >= 0) & (y <= shape[0] - 1)
-    return np.asarray(~inside)
+    way, back = forward[:height, :width], backward[: nxt.shape[0], : nxt.shape[1]]
+    return checked_flow(way, back, "dis", tau, limit, support)
 
 
 def _grey(image: Image, where: str) -> Image:
@@ -297,13 +260,21 @@ def flow_sources() -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
 
 
+def is_named(source: str) -> bool:
+    """Whether a flow source is a name rather than the path of a file."""
+    named = source in ("dis", "truth", "rlof", *MODELS) or source.startswith(PREFIX)
+    return named or source in flow_sources()
+
+
 def resolve_flow(pair: Pair, source: str) -> Flow:
     """The flow of a pair from a named source.
 
     Args:
         pair: The pair; its own `flow` is not looked at.
-        source: "dis" (`dis_flow` with its defaults), "truth" (`flow_from_truth`), the name of an
-            installed plug-in (entry-point group `soup_nlp.flow`), or the path of a flow file.
+        source: "dis" (`dis_flow` with its defaults), "truth" (`flow_from_truth`),
+            "truth+noise:SIGMA" (`flow_noise.noisy`), "rlof" (needs opencv-contrib), "raft_small" or
+            "raft_large" (need torchvision), the name of an installed plug-in (entry-point group
+            `soup_nlp.flow`), the path of a network (.onnx, or .pth for RAFT) or of a flow file.
 
     Raises:
         DataError: the source is unknown or fails, or its flow does not fit the pair.
@@ -312,6 +283,12 @@ def resolve_flow(pair: Pair, source: str) -> Flow:
         return dis_flow(pair.image_ref, pair.image_next)
     if source == "truth":
         return flow_from_truth(pair)
+    if source.startswith(PREFIX):
+        return noisy(flow_from_truth(pair), noise_level(source))
+    if source == "rlof":
+        return rlof_flow(pair.image_ref, pair.image_next)
+    if source in MODELS or Path(source).suffix in (".onnx", ".pth"):
+        return learned_flow(source, pair.image_ref, pair.image_next)
     plugins = flow_sources()
     if source in plugins:
         return _run_plugin(plugins[source], pair)
@@ -319,7 +296,10 @@ def resolve_flow(pair: Pair, source: str) -> Flow:
         raise DataError(
             "unknown flow source",
             found=repr(source),
-            expected=", ".join(["dis", "truth", *sorted(plugins), "or the path of a flow file"]),
+            expected=", ".join(
+                ["dis", "truth", f"{PREFIX}SIGMA", "rlof", *MODELS, *sorted(plugins)]
+            )
+            + ", or the path of a flow file or network",
         )
     return load_flow(source, pair.size)
 

@@ -1,0 +1,91 @@
+"""How far a flow can be trusted: where it leaves the image, and whether the way back agrees."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.pair import Flow
+
+FloatMap = NDArray[np.float32]
+
+_NOISE_CAP = 5.0  # pixels; keeps one wild pixel from condemning its whole window
+
+
+def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
+    """Distance between each pixel and where the forward, then the backward flow bring it.
+
+    Args:
+        forward: (H, W, 2) flow from the first to the second image, pixels.
+        backward: (H', W', 2) flow from the second to the first image, pixels.
+
+    Returns:
+        (H, W) float32, pixels; infinite where the forward flow leaves the second image or is not
+        finite.
+    """
+    height, width = forward.shape[:2]
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    inside = ~leaves(forward, (backward.shape[0], backward.shape[1]))
+    x = np.where(inside, u + forward[:, :, 0], 0.0).astype(np.float32)
+    y = np.where(inside, v + forward[:, :, 1], 0.0).astype(np.float32)
+    back = cv2.remap(
+        np.ascontiguousarray(backward, dtype=np.float32),
+        x,
+        y,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    error = np.hypot(x + back[:, :, 0] - u, y + back[:, :, 1] - v)
+    error[~inside] = np.inf
+    return np.asarray(error, dtype=np.float32)
+
+
+def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Where a flow points outside the next image.
+
+    Args:
+        flow: (H, W, 2), pixels.
+        shape: (H', W') of the next image.
+
+    Returns:
+        (H, W) bool; True also where the flow is not finite.
+    """
+    height, width = flow.shape[:2]
+    x = np.arange(width)[None, :] + flow[:, :, 0]
+    y = np.arange(height)[:, None] + flow[:, :, 1]
+    inside = (x >= 0) & (x <= shape[1] - 1) & (y >= 0) & (y <= shape[0] - 1)
+    return np.asarray(~inside)
+
+
+def checked_flow(
+    forward: FloatMap,
+    backward: FloatMap,
+    source: str,
+    tau: float = 1.0,
+    limit: float = 3.0,
+    support: int = 5,
+) -> Flow:
+    """A Flow whose confidence is its forward-backward consistency.
+
+    With e the round-trip error in pixels and E the larger of e and the mean of min(e, 5) over a
+    window of `support` pixels, the confidence is `exp(-(E / tau)^2)`, and 0 where E > limit or
+    where the forward flow leaves the next image.
+
+    Args:
+        forward: (H, W, 2) flow from the reference to the next image, pixels.
+        backward: (H', W', 2) flow from the next to the reference image.
+        source: Name for reports.
+        tau: Error, pixels, at which confidence is exp(-1).
+        limit: Error, pixels, above which confidence is 0.
+        support: Side of the window for the mean error, odd, pixels; 1 is the pixel itself.
+    """
+    uv = np.ascontiguousarray(forward, dtype=np.float32)
+    gap = round_trip_error(uv, backward)
+    if support > 1:
+        mean = cv2.blur(np.minimum(gap, _NOISE_CAP), (support, support))
+        gap = np.maximum(gap, mean)
+    confidence = np.exp(-np.square(np.minimum(gap, limit) / tau), dtype=np.float32)
+    confidence[~(gap <= limit)] = 0.0
+    uv[~np.isfinite(uv).all(axis=2)] = 0.0
+    return Flow(uv, confidence, source)
