@@ -23,7 +23,7 @@ from soup_nlp.report.pointcloud import read_ply
 SMALL = [
     "--set", "input.width=192", "--set", "input.height=128",
     "--set", "segmentation.superpixels=50", "--set", "segmentation.neighbours=8",
-    "--set", "flow.source=truth", "--set", "solver.presolve_last_iterations=60",
+    "--set", "flow.source=truth", "--set", "solver.presolve_iterations=60",
 ]  # fmt: skip
 FILES = [
     "config.yaml",

@@ -437,7 +437,7 @@ def test_the_solution_carries_what_a_report_needs(room, solved):
     solution = solved["unit-offset"]
     n = len(room.start)
     assert [s.name for s in solution.stages][-1] == "constrained NLP"
-    assert len(solution.stages) == 1 + len(OPTIONS.presolve_eps)
+    assert len(solution.stages) == 2 + len(OPTIONS.presolve_eps)
     assert solution.seconds.keys() >= {"presolve", "build", "compile", "solve"}
     assert solution.nlp["variables"] == 16 * n
     assert solution.multipliers["lam_x"].shape == (16 * n,)
@@ -501,9 +501,7 @@ def assert_whole(solution: Solution, problem: Problem) -> None:
 
 
 def test_one_iteration_gives_a_whole_solution(room):
-    options = replace(
-        OPTIONS, max_iter=1, presolve_iterations=1, presolve_last_iterations=1, tol=1e-12
-    )
+    options = replace(OPTIONS, max_iter=1, presolve_iterations=1, polish_iterations=1, tol=1e-12)
     solution = room.solve(options)
     assert not solution.converged
     assert solution.status == "Maximum_Iterations_Exceeded"

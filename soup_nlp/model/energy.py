@@ -35,6 +35,8 @@ class Weights:
         sigma_cont_ref: Truncation of its reference-frame gap; inf is the paper's form.
         sigma_orient: Truncation n of rho_n.
         sigma_arap: Truncation of every ARAP norm; inf is the paper's form.
+        leak_arap: Share of an ARAP norm that is not truncated: it pulls motions that nothing else
+            holds back to their neighbours', where a full truncation leaves them adrift.
         sigma_proj: Truncation of a pixel's re-projection error, pixels; inf is the paper's form.
     """
 
@@ -46,6 +48,7 @@ class Weights:
     sigma_cont_ref: float = np.inf
     sigma_orient: float = 0.5
     sigma_arap: float = 1.0
+    leak_arap: float = 0.01
     sigma_proj: float = np.inf
 
 

@@ -48,7 +48,7 @@ class Formulation:
     gauge: Gauge = "unit-offset"
     norm: NormForm = "smooth"
     truncation: TruncationForm = "smooth"
-    hessian: str = "gauss-newton+constraints"
+    hessian: str = "exact"
     eps: float = 1e-2
     eps_pixel: float = 1e-2
     theta: float = 0.9
@@ -207,6 +207,7 @@ def _elements(
             "unit": data.edge_unit,
             "turn": full(len(e), data.rotation_scale),
             "sigma": full(len(e), w.sigma_arap),
+            "leak": full(len(e), w.leak_arap),
             "ray_i": data.anchor_ray[e[:, 0]],
             "ray_k": data.anchor_ray[e[:, 1]],
         },

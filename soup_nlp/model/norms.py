@@ -1,7 +1,7 @@
 """Un-squared norms and truncations in the forms that a solver can take.
 
-A term of the energy is a sum of `weight * min(|vector|, sigma)`. The exact sum is the energy that
-is reported; a solver gets a smooth, an epigraph or a lifted form of it.
+A term of the energy is a sum of `weight * ((1 - leak) min(|vector|, sigma) + leak |vector|)`. The
+exact sum is the energy that is reported; a solver gets a smooth, an epigraph or a lifted form.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Kind = Literal["norm", "half_square"]
 
 @dataclass(frozen=True)
 class Norm:
-    """One robust norm `weight * min(|vector|, sigma)` of a kernel.
+    """One robust norm `weight * ((1 - leak) min(|vector|, sigma) + leak |vector|)` of a kernel.
 
     Attributes:
         name: For the names of its slack variables and constraints.
@@ -26,6 +26,7 @@ class Norm:
         vector: Column expression.
         eps: Smoothing length of |.| in the vector's unit (a parameter of the NLP).
         sigma: Truncation, or None when there is none.
+        leak: Share that is not truncated.
         kind: "norm" for |v|; "half_square" for |v|^2 / 2, smooth as it is.
     """
 
@@ -35,12 +36,15 @@ class Norm:
     eps: ca.SX
     sigma: ca.SX | None = None
     kind: Kind = "norm"
+    leak: ca.SX | float = 0.0
 
     def exact(self) -> ca.SX:
         """The value in the energy that is reported."""
         square = ca.dot(self.vector, self.vector)
         y = square / 2 if self.kind == "half_square" else ca.sqrt(square)
-        return self.weight * (y if self.sigma is None else ca.fmin(y, self.sigma))
+        if self.sigma is None:
+            return self.weight * y
+        return self.weight * ((1 - self.leak) * ca.fmin(y, self.sigma) + self.leak * y)
 
 
 @dataclass(frozen=True)
@@ -117,4 +121,6 @@ def solver_form(
         value, slope = switch * y + (1 - switch) * norm.sigma, switch
     else:
         value, slope = smooth_min(y, norm.sigma, _corner(norm.eps, norm.sigma))
+    if norm.sigma is not None:
+        value, slope = (1 - norm.leak) * value + norm.leak * y, norm.leak + (1 - norm.leak) * slope
     return Form(norm.weight * value, norm.weight * slope * dy * outer, constraint)

@@ -48,7 +48,7 @@ def arap(soup: Soup, data: EnergyData, weights: Weights) -> Float:
     """(E,) E_arap of every edge, Eq. 1; an edge carries both its directions."""
     i, k = data.edges.T
     unit = _unit(soup, data, data.edges) * data.edge_unit
-    sigma = weights.sigma_arap
+    sigma, leak = weights.sigma_arap, weights.leak_arap
     X = soup.points(data.anchor_ray)
     moved = soup.moved(X)
     turn = data.rotation_scale * (soup.R[i] - soup.R[k])
@@ -63,10 +63,15 @@ def arap(soup: Soup, data: EnergyData, weights: Weights) -> Float:
     after = np.linalg.norm(moved[i] - moved[k], axis=1)
     length = np.abs(before - after)
     return data.edge_weight * (
-        np.minimum(rotation, sigma)
-        + np.minimum(translation / unit, sigma)
-        + np.minimum(length / unit, sigma)
+        _leaky(rotation, sigma, leak)
+        + _leaky(translation / unit, sigma, leak)
+        + _leaky(length / unit, sigma, leak)
     )
+
+
+def _leaky(y: Float, sigma: float, leak: float) -> Float:
+    """`(1 - leak) min(y, sigma) + leak y`."""
+    return (1 - leak) * np.minimum(y, sigma) + leak * y
 
 
 def reprojection(soup: Soup, data: EnergyData, weights: Weights) -> Float:

@@ -20,7 +20,7 @@ def arap(
     a: View, b: View, row: Row, eps: ca.SX, truncated: bool, at_anchors: bool, local: bool
 ) -> list[Norm]:
     """E_arap of an edge, Eq. 1: rotation, translation and distance of the anchors."""
-    sigma = row["sigma"] if truncated else None
+    sigma, leak = (row["sigma"], row["leak"]) if truncated else (None, 0.0)
     Xa, Xb = a.point(row["ray_i"]), b.point(row["ray_k"])
     weight, unit = row["weight"], row["unit"] * ((Xa[2] + Xb[2]) / 2 if local else 1)
     Ya, Yb = a.move(Xa), b.move(Xb)
@@ -30,9 +30,9 @@ def arap(
     # |Xa - Xb| is smooth wherever two anchors differ, so it needs no slack of its own
     stretch = ca.sqrt(ca.sumsqr(Xa - Xb) + 1e-12) - ca.sqrt(ca.sumsqr(Ya - Yb) + 1e-12)
     return [
-        Norm("rotation", weight, row["turn"] * ca.vec(a.R - b.R), eps, sigma),
-        Norm("translation", weight, gap / unit, eps, sigma),
-        Norm("distance", weight, stretch / unit, eps, sigma),
+        Norm("rotation", weight, row["turn"] * ca.vec(a.R - b.R), eps, sigma, leak=leak),
+        Norm("translation", weight, gap / unit, eps, sigma, leak=leak),
+        Norm("distance", weight, stretch / unit, eps, sigma, leak=leak),
     ]
 
 

@@ -181,7 +181,7 @@ class PairCosts:
         np.maximum(total, 0.0, out=total)
         np.sqrt(total, out=total)
         total *= np.sqrt(2.0) * d.rotation_scale
-        np.minimum(total, sigma, out=total)
+        _leaky(total, sigma, w.leak_arap)
 
         per = self._unit(s, i, k, unit, scale) / d.edge_unit[rows][:, None, None]
         if d.arap_at_anchors:
@@ -191,7 +191,7 @@ class PairCosts:
             _distance2(s.T[:, i], s.T[:, k], x, y)
             np.sqrt(x, out=x)
         x *= per
-        total += np.minimum(x, sigma, out=x)
+        total += _leaky(x, sigma, w.leak_arap)
 
         _distance2(s.Y[:, i], s.Y[:, k], x, y)
         after = np.sqrt(x)
@@ -200,7 +200,7 @@ class PairCosts:
         x -= after
         np.abs(x, out=x)
         x *= per
-        total += np.minimum(x, sigma, out=x)
+        total += _leaky(x, sigma, w.leak_arap)
         total *= w.arap * d.edge_weight[rows][:, None, None]
         return total
 
@@ -229,6 +229,17 @@ class PairCosts:
         x *= w.orient * d.pair_count[rows][:, None, None]
         total += x
         return total
+
+
+def _leaky(y: Float, sigma: float, leak: float) -> Float:
+    """`(1 - leak) min(y, sigma) + leak y` in place, as (1 - leak) (min(y, sigma) + c y)."""
+    if leak >= 1:
+        return y
+    tail = y * (leak / (1 - leak))
+    np.minimum(y, sigma, out=y)
+    y += tail
+    y *= 1 - leak
+    return y
 
 
 class _State:

@@ -67,7 +67,8 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
             _length(shift) / length,
             np.abs(stretch) / length,
         )
-        cut = sum(np.minimum(p, w["sigma_arap"]) for p in parts)
+        leak = w["leak_arap"]
+        cut = sum((1 - leak) * np.minimum(p, w["sigma_arap"]) + leak * p for p in parts)
         arap = float((e["edge_weight"] * cut).sum())
 
     image = lift(s, e["pixel_ray"], every)[1] @ e["K_next"].T

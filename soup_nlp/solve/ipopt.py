@@ -25,7 +25,7 @@ DEFAULTS: Mapping[str, Any] = {
     "mu_strategy": "monotone",
     "mu_init": 1e-5,
     "nlp_scaling_method": "none",
-    "constr_viol_tol": 1e-7,
+    "constr_viol_tol": 1e-9,
     "compl_inf_tol": 1e-4,
     "bound_push": 1e-6,
     "bound_frac": 1e-6,
