@@ -47,7 +47,7 @@ LIBRARIES = {
     "casadi": {"model", "solve", "export", "compare"},
     "matplotlib": {"report", "compare", "bench"},
     "h5py": {"report", "data"},
-    "typer": {"cli", "cli_accuracy", "cli_bench", "cli_export", "comparing"},
+    "typer": {"cli", "cli_accuracy", "cli_bench", "cli_export", "cli_speed", "comparing"},
     "rich": {"cli", "report"},
     "yaml": {"config", "data", "report", "cli"},
     "cv2": {"data", "start", "report"},
