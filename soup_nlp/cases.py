@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from soup_nlp.config import Problem
+from soup_nlp.data.flow_robust import reweighted
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
@@ -77,6 +78,9 @@ def prepare(
     say(str(pair))
     s = problem.segmentation
     labels = segment(pair.image_ref, s.superpixels, s.method, s.compactness, s.smoothing_px)
+    if problem.flow.reweight_px is not None:
+        flow = reweighted(flow, labels, problem.flow.reweight_px)
+        pair = pair.with_flow(flow)
     samples = None if s.boundary_samples == "all" else s.boundary_samples
     seg = build_segmentation(labels, pair.image_ref, s.neighbours, s.beta, s.beta_colour, samples)
     say(str(seg))

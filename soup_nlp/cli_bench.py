@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import typer
 
+from soup_nlp.cli_accuracy import register as register_accuracy
+from soup_nlp.cli_speed import register as register_speed
+
 bench = typer.Typer(no_args_is_help=True, help="Measure over many runs; tables, plots and gates.")
+
+
+register_accuracy(bench)
+register_speed(bench)
 
 
 @bench.callback()

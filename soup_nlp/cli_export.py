@@ -18,6 +18,7 @@ from soup_nlp.artefact import (
     sol_table,
 )
 from soup_nlp.cases import prepare
+from soup_nlp.comparing import compare
 from soup_nlp.config import dump_problem, load_problem
 from soup_nlp.export.formats import FORMATS
 from soup_nlp.export.residuals import residual_table, table_text
@@ -32,6 +33,7 @@ def register(app: typer.Typer) -> None:
     app.command(name="export")(export)
     app.command(name="import")(import_)
     app.command(name="check")(check)
+    app.command(name="compare")(compare)
 
 
 def export(

@@ -69,11 +69,14 @@ class FlowConfig(Strict):
     Attributes:
         source: dis, truth, a file (.flo, KITTI .png, .npy), or the name of a plug-in.
         occluded_confidence: Confidence of occluded pixels when the source is truth.
+        reweight_px: Pixels that disagree with their superpixel's affine flow by more than about
+            this count less; null for never.
         dis: Options of OpenCV's DIS flow and of its forward-backward check.
     """
 
     source: str = "dis"
     occluded_confidence: Annotated[float, Field(ge=0, le=1)] = 1.0
+    reweight_px: Positive | None = None
     dis: DisConfig = DisConfig()
 
 

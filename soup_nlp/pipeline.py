@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from soup_nlp.config import Problem, make_problem
+from soup_nlp.data.flow_robust import reweighted
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
@@ -144,6 +145,9 @@ def run(
     _tell(say, pair)
     s = problem.segmentation
     labels = segment(pair.image_ref, s.superpixels, s.method, s.compactness, s.smoothing_px)
+    if problem.flow.reweight_px is not None:
+        flow = reweighted(flow, labels, problem.flow.reweight_px)
+        pair = pair.with_flow(flow)
     samples = None if s.boundary_samples == "all" else s.boundary_samples
     seg = build_segmentation(labels, pair.image_ref, s.neighbours, s.beta, s.beta_colour, samples)
     lap("segmentation")

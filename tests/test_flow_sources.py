@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from soup_nlp.cases import prepare
 from soup_nlp.config import make_problem
 from soup_nlp.data.flow import flow_from_truth, is_named, resolve_flow
 from soup_nlp.data.flow_check import checked_flow
@@ -90,6 +91,16 @@ def test_reweighting_suspects_the_minority_of_a_superpixel(pair):
         reweighted(flow, labels[1:])
     with pytest.raises(DataError, match="positive"):
         reweighted(flow, labels, 0.0)
+
+
+def test_a_problem_can_ask_for_reweighting():
+    scene = {"kind": "scene", "scene": "street", "width": 128, "height": 64}
+    raw = {"input": scene, "segmentation": {"superpixels": 30, "neighbours": 5}}
+    weights = [
+        prepare(make_problem({**raw, "flow": {"reweight_px": px}})).data.pixel_weight
+        for px in (None, 0.3)
+    ]
+    assert 0.1 * weights[0].sum() < weights[1].sum() < 0.98 * weights[0].sum()
 
 
 def test_rlof_needs_the_contributed_modules(pair, monkeypatch):

@@ -9,6 +9,8 @@ positive distances, visibility by an infinite cost, the simplex by the free glob
 With one global length unit (`local_units` off) the unit `u = sum_i c_i D_i` couples everything.
 The MRF then has u fixed and its first-order change in the unary costs; the comparison of rounds
 is with the exact energy, at sum(lam) = 1.
+
+TRW-S starts every round with messages of zero: nearly all of its labels are new ones.
 """
 
 from __future__ import annotations
@@ -249,7 +251,7 @@ def refine_soup(
         kept = p.take(which)
         del pairwise
         rounds.append(_round(result, drawn, unary, labels, energy, taken, mark))
-        _learn(proposer, shares, drawn, unary, labels, rounds[-1])
+        _learn(proposer, shares, drawn, labels, rounds[-1])
         if say:
             say(f"refine {number + 1}: {rounds[-1]}")
         slow = slow + 1 if before - energy["total"] < o.stagnation * abs(before) else 0
@@ -377,7 +379,6 @@ def _learn(
     proposer: Proposer,
     shares: dict[str, float],
     drawn: Proposals,
-    unary: Float,
     labels: Int,
     done: Round,
 ) -> None:

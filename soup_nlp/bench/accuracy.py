@@ -1,0 +1,222 @@
+"""One pair measured: solution and rivals under every convention, as one row of plain numbers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import soup_nlp
+from soup_nlp.bench.rivals import depth_maps, true_depth
+from soup_nlp.bench.suites import Item
+from soup_nlp.bench.truth import true_soup
+from soup_nlp.config import Problem, dump_problem
+from soup_nlp.data.pair import Pair
+from soup_nlp.errors import DataError
+from soup_nlp.model import plain
+from soup_nlp.pipeline import Run, run
+from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.report.metrics import sample_at_points, skill
+from soup_nlp.report.protocols import preset
+from soup_nlp.report.scene_flow import scene_flow_epe
+
+Float = NDArray[np.float64]
+Row = dict[str, Any]
+
+KEPT = ("mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3")
+"""Errors that a row keeps, beside scale, coverage and skill."""
+
+CODE = ("data", "geometry", "model", "start", "solve", "refine", "report")
+"""Rooms whose sources make the code version of a row."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One row to be measured; it can be sent to another process.
+
+    Attributes:
+        item: Pair and flow.
+        overrides: Of its problem.
+        variant: Name of the overrides in an analysis; empty for the defaults.
+        folder: Where to write the result folder; None to keep the row only.
+    """
+
+    item: Item
+    overrides: tuple[str, ...] = ()
+    variant: str = ""
+    folder: Path | None = None
+
+    @property
+    def key(self) -> str:
+        """Unique in a table."""
+        return f"{self.item.key} {self.variant}".strip()
+
+
+def settings_hash(problem: Problem) -> str:
+    """Hash of everything but the input: the same settings on every pair and in every place."""
+    out = ("name", "base", "input", "expected")
+    tree = problem.model_dump(mode="json", exclude=set(out))
+    return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
+
+
+@cache
+def code_version() -> str:
+    """Version and hash of the sources that decide a result, as they were at the first call."""
+    root = Path(soup_nlp.__file__).parent
+    digest = hashlib.sha256()
+    files = [f for name in CODE for f in (root / name).glob("*.py")]
+    for file in sorted([*files, *(root / f"{n}.py" for n in ("pipeline", "inputs", "scoring"))]):
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return f"{soup_nlp.__version__}-{digest.hexdigest()[:10]}"
+
+
+def measure(job: Job) -> Row:
+    """Solve and score one pair; whatever fails becomes a row with `ok` false and the reason."""
+    row = head(job)
+    begin, cpu = time.perf_counter(), time.process_time()
+    try:
+        problem = job.item.problem(job.overrides)
+        if job.folder is None:
+            result = run(problem)
+        else:
+            folder = prepare_folder(job.folder)
+            result = run(problem, ipopt_log=str(folder / "ipopt.log"))
+            write_folder(folder, result, dump_problem(problem), "")
+        row |= {"ok": True, "error": None, **scores(result, job.item.presets)}
+    except Exception as error:
+        row |= {"ok": False, "error": f"{type(error).__name__}: {error}"}
+    row["seconds"] = time.perf_counter() - begin
+    row["cpu_seconds"] = time.process_time() - cpu
+    return clean(row)
+
+
+def head(job: Job) -> Row:
+    """What names a row."""
+    item = job.item
+    try:
+        settings = settings_hash(item.problem(job.overrides))
+    except Exception:
+        settings = "wrong"
+    return {
+        "key": job.key,
+        "suite": item.suite,
+        "sequence": item.sequence,
+        "pair": item.name,
+        "flow": item.flow,
+        "variant": job.variant,
+        "overrides": list(job.overrides),
+        "presets": list(item.presets),
+        "settings": settings,
+    }
+
+
+def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
+    """Metrics by convention and method, energies, flow error and scene flow of a run.
+
+    A convention under which the truth has no pixel, or that needs a depth map where the truth is
+    sparse points, is left out.
+    """
+    maps = depth_maps(result)
+    s = result.solution
+    energy: dict[str, Mapping[str, float]] = {"start": s.energy_start}
+    if result.refined is not None:
+        energy["nlp"] = s.energy
+    energy["solution"] = result.energy
+    row: Row = {
+        "status": s.status,
+        "good": result.good,
+        "superpixels": len(result.segmentation),
+        "size": list(result.pair.size),
+        "stages": dict(result.seconds),
+        "iterations": sum(stage.iterations for stage in s.stages),
+        "parallax_px": float(np.median(result.start.parallax)),
+        "flow_error": flow_error(result.pair),
+        "metrics": {},
+    }
+    try:
+        true = true_soup(result.pair, result.segmentation)
+        energy["truth"] = plain.energy(true.soup, result.data, result.weights)
+    except DataError:
+        pass  # most real pairs have no true motions
+    row["energy"] = {k: dict(v) for k, v in energy.items()}
+    for name in presets:
+        if table := _table(result, maps, name):
+            row["metrics"][name] = table
+    row["scene_flow"] = _scene_flow(result, row["metrics"])
+    return row
+
+
+def _table(result: Run, maps: Mapping[str, Float], name: str) -> dict[str, dict[str, float]]:
+    """Metrics of every method under one convention; {} where it does not apply."""
+    truth, convention = result.pair.truth, preset(name)
+    if truth is None or true_depth(result) is None:
+        return {}
+    if truth.depth_ref is None and convention.crop is not None:
+        return {}
+    out: dict[str, dict[str, float]] = {}
+    for method, depth in maps.items():
+        if truth.depth_ref is not None:
+            estimate, gt = depth, truth.depth_ref
+        else:
+            assert truth.points is not None
+            estimate, gt = sample_at_points(depth, truth.points)
+        if not convention.counts(gt):
+            return {}
+        m = convention.score(estimate, gt).as_dict()
+        out[method] = {k: m[k] for k in (*KEPT, "scale", "coverage", "n_pixels")}
+    for m in out.values():
+        m["skill"] = skill(m["mre"], out["constant"]["mre"])
+    return out
+
+
+def _scene_flow(result: Run, metrics: Mapping[str, Any]) -> dict[str, float | int] | None:
+    """3D end-point error with the depth's own scale; None without truth."""
+    truth = result.pair.truth
+    if truth is None or truth.scene_flow is None or not metrics:
+        return None
+    rec = result.reconstruction
+    scale = next(iter(metrics.values()))["solution"]["scale"]
+    if not math.isfinite(scale):
+        return None
+    return scene_flow_epe(rec.points_next - rec.points_ref, truth.scene_flow, scale=scale)
+
+
+def flow_error(pair: Pair) -> dict[str, float] | None:
+    """End-point error in pixels of the flow that was used; None without a true flow."""
+    if pair.flow is None or pair.truth is None or pair.truth.flow is None:
+        return None
+    known = np.isfinite(pair.truth.flow).all(axis=2)
+    used = known & (pair.flow.confidence > 0)
+    if not used.any():
+        return None
+    gap = np.linalg.norm(pair.flow.uv[used] - pair.truth.flow[used], axis=1)
+    weight = pair.flow.confidence[used].astype(np.float64)
+    return {
+        "mean": float(gap.mean()),
+        "weighted_mean": float(np.sum(weight * gap) / weight.sum()),
+        "median": float(np.median(gap)),
+        "over_3px": float(np.mean(gap > 3)),
+        "used": float(used.sum() / known.sum()),
+    }
+
+
+def clean(value: Any) -> Any:
+    """Plain JSON: numbers of numpy made plain, what is not finite made None."""
+    if isinstance(value, Mapping):
+        return {str(k): clean(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [clean(v) for v in value]
+    if isinstance(value, np.generic):
+        return clean(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,202 @@
+"""Many rows: in this process, in processes of one machine (joblib), or on a cluster (Dask).
+
+Rows are appended to a JSON-lines file by the parent alone, each as soon as it is there, so a run
+that was stopped goes on where it was. A row stands for its key, settings and code version; a row
+that failed is tried again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from soup_nlp.bench.accuracy import Job, Row, clean, code_version, head, measure
+from soup_nlp.errors import ConfigError, DataError
+
+Function = Callable[[Job], Row]
+Say = Callable[[int, int, Row], None]
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where rows are measured.
+
+    Attributes:
+        workers: Processes of this machine; 1 measures in this process.
+        dask: Address of a Dask scheduler, such as tcp://host:8786; empty for none.
+    """
+
+    workers: int = 1
+    dask: str = ""
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Rows of a JSON-lines file, the last one of every key, settings and code version.
+
+    A line that was cut off by a crash is left out.
+    """
+    if not path.is_file():
+        return []
+    out: dict[tuple[str, str, str], Row] = {}
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            row = json.loads(line)
+            out[row["key"], row["settings"], row["code"]] = row
+        except (ValueError, KeyError, TypeError):
+            continue
+    return list(out.values())
+
+
+def measure_all(
+    jobs: Sequence[Job],
+    path: Path,
+    where: Where | None = None,
+    *,
+    say: Say | None = None,
+    any_code: bool = False,
+    function: Function = measure,
+) -> list[Row]:
+    """The row of every job, measured where the file does not have it yet.
+
+    Args:
+        jobs: What to measure; keys are unique.
+        path: JSON-lines file, appended to.
+        where: Processes or cluster.
+        say: Called with (done, total, row) after every new row.
+        any_code: Take rows of another code version as well.
+        function: What measures a job, for tests.
+
+    Raises:
+        DataError: the file cannot be written.
+        ConfigError: joblib or Dask is needed and not installed, or the cluster does not answer.
+    """
+    where, code = where or Where(), code_version()
+    known: dict[tuple[str, str], Row] = {}
+    for row in read_rows(path):
+        if row["ok"] and (any_code or row["code"] == code):
+            known[row["key"], row["settings"]] = row
+    names = [(job.key, head(job)["settings"]) for job in jobs]
+    if len(set(names)) < len(names):
+        twice = next(n for n in names if names.count(n) > 1)
+        raise ConfigError("a row is asked for twice", found=twice[0])
+    todo = [job for job, name in zip(jobs, names, strict=True) if name not in known]
+    done = len(jobs) - len(todo)
+    with _Appender(path) as file:
+        for row in _rows(todo, function, where) if todo else ():
+            row["code"] = code
+            file.add(row)
+            known[row["key"], row["settings"]] = row
+            done += 1
+            if say:
+                say(done, len(jobs), row)
+    return [known[name] for name in names]
+
+
+class _Appender:
+    """Whole lines at the end of a file, each on disk before the next is measured."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # what a crash cut off must not run into the next line
+            cut = path.is_file() and path.stat().st_size and path.read_bytes()[-1:] != b"\n"
+            self.file = path.open("a", encoding="utf-8")
+            if cut:
+                self.file.write("\n")
+        except OSError as error:
+            raise DataError("rows cannot be written", where=path, found=error.strerror) from error
+
+    def __enter__(self) -> _Appender:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.file.close()
+
+    def add(self, row: Row) -> None:
+        self.file.write(json.dumps(row, allow_nan=False) + "\n")
+        self.file.flush()
+        os.fsync(self.file.fileno())
+
+
+def _rows(jobs: Sequence[Job], function: Function, where: Where) -> Iterator[Row]:
+    if where.dask:
+        yield from _by_dask(jobs, function, where.dask)
+    elif where.workers == 1:
+        yield from (function(job) for job in jobs)
+    else:
+        yield from _by_joblib(jobs, function, where.workers)
+
+
+def _by_joblib(jobs: Sequence[Job], function: Function, workers: int) -> Iterator[Row]:
+    try:
+        from joblib import Parallel, delayed, parallel_config
+        from joblib.externals.loky.process_executor import BrokenProcessPool
+    except ImportError as error:
+        raise ConfigError(
+            "parallel processes need joblib", where="--workers", hint="pip install soup-nlp[bench]"
+        ) from error
+    left = {job.key: job for job in jobs}
+    try:
+        with parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1):
+            tasks = (delayed(function)(job) for job in jobs)
+            for row in Parallel(return_as="generator_unordered", batch_size=1)(tasks):
+                del left[row["key"]]
+                yield row
+    except BrokenProcessPool:
+        # a process died (memory, a crash of native code): find out whose it was, one by one
+        for job in left.values():
+            yield _alone(job, function)
+
+
+def _alone(job: Job, function: Function) -> Row:
+    """The row of a job in a process of its own; that process may die."""
+    from joblib.externals.loky import ProcessPoolExecutor
+    from joblib.externals.loky.process_executor import BrokenProcessPool
+
+    pool = ProcessPoolExecutor(max_workers=1)
+    try:
+        row: Row = pool.submit(function, job).result()
+        return row
+    except BrokenProcessPool:
+        return _failed(job, "the process died (out of memory, or a crash of native code)")
+    finally:
+        pool.shutdown(wait=False, kill_workers=True)
+
+
+def _by_dask(jobs: Sequence[Job], function: Function, address: str) -> Iterator[Row]:
+    try:
+        from dask.distributed import Client, as_completed
+    except ImportError as error:
+        raise ConfigError(
+            "a cluster needs Dask", where="--dask", hint="pip install soup-nlp[dask]"
+        ) from error
+    try:
+        client = Client(address, timeout=10)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            "the Dask scheduler does not answer",
+            where="--dask",
+            found=f"{address}: {error}",
+            hint="start one with: dask scheduler, and workers with: dask worker ADDRESS",
+        ) from error
+    with client:
+        # one thread at a time in a worker: Ipopt and its MUMPS share static memory
+        futures: dict[Any, Job] = {
+            client.submit(function, job, pure=False, retries=1): job for job in jobs
+        }
+        for future in as_completed(list(futures)):
+            wrong = future.exception()
+            if wrong is not None:
+                yield _failed(futures[future], f"{type(wrong).__name__}: {wrong}")
+            else:
+                yield future.result()
+            future.release()
+
+
+def _failed(job: Job, reason: str) -> Row:
+    row: Row = clean({**head(job), "ok": False, "error": reason, "seconds": 0.0})
+    return row

@@ -1,0 +1,205 @@
+"""The paper's analyses: one change at a time over a list of pairs, a table and a plot each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+
+from soup_nlp.bench.accuracy import Job, Row, measure
+from soup_nlp.bench.accuracy_runner import Say, Where, measure_all
+from soup_nlp.bench.analyses_energy import measure_energy
+from soup_nlp.bench.analyses_report import plot_energy, plot_variants, text_energy, text_variants
+from soup_nlp.bench.suites import Item, Listing
+from soup_nlp.errors import ConfigError
+from soup_nlp.report.atomic import atomic_path
+from soup_nlp.report.folder import prepare_folder, write_text
+
+Overrides = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """What is changed.
+
+    Attributes:
+        name: On the command line.
+        text: What it asks.
+        variants: Overrides by the name of a variant, in the order of tables.
+        axis: Label of the variants.
+        numeric: The variants are numbers, drawn on an axis.
+        true_flow_only: Only pairs with a true flow.
+        function: What measures a pair.
+    """
+
+    name: str
+    text: str
+    variants: Mapping[str, Overrides]
+    axis: str
+    numeric: bool = False
+    true_flow_only: bool = False
+    function: Callable[[Job], Row] = measure
+
+
+def _over(key: str, values: Sequence[object]) -> dict[str, Overrides]:
+    return {str(v): (f"{key}={v}",) for v in values}
+
+
+def _without(*terms: str) -> Overrides:
+    return tuple(f"energy.weights.{t}=0.0" for t in terms)
+
+
+_ALL = (
+    Analysis(
+        "ablation",
+        "what each term of the energy adds (the paper's ablation table)",
+        {
+            "arap": _without("proj", "cont", "orient"),
+            "+ proj": _without("cont", "orient"),
+            "+ cont": _without("orient"),
+            "+ orient": (),
+        },
+        "terms",
+    ),
+    Analysis(
+        "superpixels",
+        "number of superpixels, 100 to 2,000",
+        _over("segmentation.superpixels", (100, 250, 500, 1000, 2000)),
+        "superpixels",
+        numeric=True,
+    ),
+    Analysis(
+        "neighbours",
+        "K of the K-NN graph, 4 to 20",
+        _over("segmentation.neighbours", (4, 8, 12, 15, 20)),
+        "K",
+        numeric=True,
+    ),
+    Analysis(
+        "pattern",
+        "SLIC against a regular grid",
+        _over("segmentation.method", ("slic", "grid")),
+        "superpixels",
+    ),
+    Analysis(
+        "flow",
+        "flow source: true, DIS, and the truth with noise of 0.1 to 2 pixels",
+        _over(
+            "flow.source",
+            (
+                "truth",
+                "truth+noise:0.1",
+                "truth+noise:0.5",
+                "truth+noise:1",
+                "truth+noise:2",
+                "dis",
+            ),
+        ),
+        "flow",
+        true_flow_only=True,
+    ),
+    Analysis(
+        "stages",
+        "the NLP only, the refinement only, and both",
+        {
+            "NLP": ("refine.enabled=false",),
+            "refinement": ("refine.enabled=true", "refine.from_start=true"),
+            "both": ("refine.enabled=true", "refine.from_start=false"),
+        },
+        "stages",
+    ),
+    Analysis(
+        "energy",
+        "energy at the truth against the solution, by term; what is made of the truth",
+        {"": ()},
+        "",
+        function=measure_energy,
+    ),
+)
+ANALYSES: Mapping[str, Analysis] = MappingProxyType({a.name: a for a in _ALL})
+"""Analyses by name."""
+
+
+def run_analysis(
+    name: str,
+    listings: Sequence[Listing],
+    out: Path,
+    overrides: Overrides = (),
+    where: Where | None = None,
+    *,
+    values: Sequence[str] | None = None,
+    say: Say | None = None,
+    any_code: bool = False,
+) -> Path:
+    """Measure every variant on every pair and write OUT/NAME.md, .png and .jsonl.
+
+    Args:
+        name: One of `ANALYSES`.
+        listings: Pairs.
+        out: Folder.
+        overrides: Of every problem; a variant's own come after them.
+        where: Processes or cluster.
+        values: Only these variants; of a numeric analysis other values as well.
+        say: Progress.
+        any_code: Also take stored rows of other code versions.
+
+    Returns:
+        The table's file.
+
+    Raises:
+        ConfigError: there is no such analysis or variant, or no pair is left.
+    """
+    if name not in ANALYSES:
+        raise ConfigError("unknown analysis", found=name, expected=", ".join(ANALYSES))
+    analysis = _chosen(ANALYSES[name], values)
+    items = [i for listing in listings for i in listing.items]
+    if analysis.true_flow_only:
+        items = _with_true_flow(items)
+    if not items:
+        raise ConfigError("no pair is left for the analysis", where=name)
+    prepare_folder(out)
+    jobs = [
+        Job(item, (*overrides, *own), variant)
+        for item in items
+        for variant, own in analysis.variants.items()
+    ]
+    rows = measure_all(
+        jobs,
+        out / f"{name}.jsonl",
+        where,
+        say=say,
+        any_code=any_code,
+        function=analysis.function,
+    )
+    note = f"Overrides of every pair: {', '.join(f'`{o}`' for o in overrides) or 'none'}."
+    text = text_energy if name == "energy" else text_variants
+    plot = plot_energy if name == "energy" else plot_variants
+    write_text(out / f"{name}.md", text(analysis.name, analysis.text, rows, note))
+    with atomic_path(out / f"{name}.png") as temporary:
+        if name == "energy":
+            plot_energy(temporary, rows)
+        else:
+            plot_variants(temporary, analysis.axis, analysis.text, rows, analysis.numeric)
+    del plot
+    return out / f"{name}.md"
+
+
+def _chosen(analysis: Analysis, values: Sequence[str] | None) -> Analysis:
+    if not values:
+        return analysis
+    variants = dict(analysis.variants)
+    if analysis.numeric:
+        key = next(iter(variants.values()))[0].partition("=")[0]
+        return replace(analysis, variants=_over(key, values))
+    if analysis.name == "flow":
+        return replace(analysis, variants=_over("flow.source", values))
+    wrong = [v for v in values if v not in variants]
+    if wrong:
+        raise ConfigError("unknown variant", found=wrong[0], expected=", ".join(variants))
+    return replace(analysis, variants={v: variants[v] for v in values})
+
+
+def _with_true_flow(items: Sequence[Item]) -> list[Item]:
+    """One item a pair, of those that are listed with their true flow."""
+    return [i for i in items if i.flow == "truth"]

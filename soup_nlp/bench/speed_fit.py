@@ -1,0 +1,96 @@
+"""How costs grow: exponents of power laws fitted over the number of superpixels."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Record = Mapping[str, Any]
+
+COSTS: dict[str, Callable[[Record], float]] = {
+    "NLP, CPU s": lambda r: r["cpu"]["nlp"],
+    "CPU s an iteration": lambda r: r["cpu"]["nlp"] / max(1, r["iterations"]),
+    "functions, s": lambda r: r["wall"]["functions"],
+    "linear algebra, s": lambda r: r["wall"]["linear algebra"],
+    "outside the NLP, CPU s": lambda r: outside(r),
+    "Hessian nonzeros": lambda r: r["sizes"]["hessian_nonzeros"],
+    "peak memory": lambda r: r["peak_bytes"],
+}
+"""What growth is fitted of."""
+
+OUTSIDE = ("flow", "segmentation", "start", "weights", "evaluation", "output")
+"""Stages that are not Ipopt's and not the loading or rendering of frames."""
+
+
+def outside(record: Record) -> float:
+    """CPU seconds of every stage but loading and the NLP."""
+    return float(sum(record["cpu"].get(stage, 0.0) for stage in OUTSIDE))
+
+
+@dataclass(frozen=True)
+class Growth:
+    """cost = factor N^exponent.
+
+    Attributes:
+        exponent: Slope of log cost over log N.
+        error: Standard error of the slope; NaN for two points.
+        low: Smallest N.
+        high: Largest N.
+        count: Runs.
+    """
+
+    exponent: float
+    error: float
+    low: float
+    high: float
+    count: int
+
+    def __str__(self) -> str:
+        error = "" if np.isnan(self.error) else f" ± {self.error:.2f}"
+        return f"{self.exponent:.2f}{error}"
+
+
+def fit(sizes: Sequence[float], costs: Sequence[float]) -> Growth | None:
+    """Least squares of log cost over log N; None with fewer than two different sizes.
+
+    Args:
+        sizes: N of every run.
+        costs: Positive cost of every run.
+    """
+    n, c = np.asarray(sizes, float), np.asarray(costs, float)
+    use = (n > 0) & (c > 0)
+    x, y = np.log(n[use]), np.log(c[use])
+    # actual numbers of superpixels differ a little between seeds of one size
+    if len(x) < 2 or np.ptp(x) < 0.2:
+        return None
+    dx = x - x.mean()
+    slope = float(dx @ y / (dx @ dx))
+    rest = y - y.mean() - slope * dx
+    free = len(x) - 2
+    error = float(np.sqrt(rest @ rest / free / (dx @ dx))) if free else np.nan
+    return Growth(slope, error, float(n[use].min()), float(n[use].max()), len(x))
+
+
+def growth(records: Sequence[Record], least: int = 0) -> dict[tuple[str, int], dict[str, Growth]]:
+    """Growth of every cost by scene and K, seeds together.
+
+    Args:
+        records: Measured runs.
+        least: Leave out runs with fewer wanted superpixels than this.
+    """
+    groups: dict[tuple[str, int], list[Record]] = defaultdict(list)
+    for record in records:
+        if "error" not in record and record["spec"]["superpixels"] >= least:
+            groups[record["spec"]["scene"], record["spec"]["neighbours"]].append(record)
+    out = {}
+    for key, group in groups.items():
+        sizes = [r["sizes"]["superpixels"] for r in group]
+        fits = {name: fit(sizes, [cost(r) for r in group]) for name, cost in COSTS.items()}
+        found = {name: f for name, f in fits.items() if f is not None}
+        if found:
+            out[key] = found
+    return out

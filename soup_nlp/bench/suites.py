@@ -1,0 +1,173 @@
+"""Suites by name, with where to get their data and how to lay it out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from soup_nlp.bench.suites_pairs import (
+    RENDERED,
+    Item,
+    Options,
+    Suite,
+    kinect,
+    kitti,
+    rendered,
+    shared,
+    sintel,
+    spread,
+    vkitti,
+)
+from soup_nlp.errors import DataError
+
+__all__ = ["SUITES", "Item", "Listing", "Options", "Suite", "list_suite"]
+
+_KINECT_LAYOUT = (
+    "pair_NNN/ with frame_0.png, frame_1.png, K.txt and points.npz (uv_0 in pixels, xyz_mm_0) or"
+    " depth.png (16 bit, millimetres), one folder a pair of frames of the sequence"
+)
+_KINECT_SOURCE = (
+    "EPFL CVLab, deformable surface reconstruction, https://www.epfl.ch/labs/cvlab/data/data-dsr/"
+)
+_ALL = (
+    Suite("rendered", f"{len(RENDERED)} rendered dynamic scenes", rendered, ("truth", "dis")),
+    Suite(
+        "shared",
+        "the real pairs that development was done with",
+        shared,
+        ("truth", "dis"),
+        folders=(".", "../shared/data"),
+        layout="kitti2012/, driving_synthetic/, kinect_paper/, sintel/ and tum_fr1/",
+        source="a folder with these pairs; the motorcycle pair comes with scikit-image",
+    ),
+    Suite(
+        "sintel",
+        "MPI Sintel, the paper's five sequences, 24 pairs each",
+        sintel,
+        presets=("sintel70", "paper", "best"),
+        folders=(".", "sintel", "MPI-Sintel-complete"),
+        layout=(
+            "training/clean/SCENE/frame_NNNN.png, training/depth/SCENE/frame_NNNN.dpt,"
+            " training/camdata_left/SCENE/frame_NNNN.cam"
+        ),
+        source="http://sintel.is.tue.mpg.de/downloads and its depth training data /depth",
+    ),
+    Suite(
+        "kitti2012",
+        "KITTI stereo and flow 2012, 194 training pairs",
+        kitti,
+        presets=("kitti", "eigen80", "best"),
+        folders=(".", "kitti2012", "data_stereo_flow"),
+        layout="training/image_0, training/calib, training/disp_occ, training/flow_occ",
+        source="https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php (data_stereo_flow.zip)",
+    ),
+    Suite(
+        "kitti2015",
+        "KITTI scene flow 2015, 200 training pairs",
+        kitti,
+        presets=("kitti", "eigen80", "best"),
+        folders=(".", "kitti2015", "data_scene_flow"),
+        layout="training/image_2, training/calib_cam_to_cam, training/disp_occ_0, disp_occ_1",
+        source=(
+            "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (data_scene_flow.zip and"
+            " data_scene_flow_calib.zip)"
+        ),
+    ),
+    Suite(
+        "vkitti",
+        "Virtual KITTI 1 or 2, the paper's four worlds, 30 morning pairs each",
+        vkitti,
+        presets=("kitti", "eigen80", "best"),
+        folders=(".", "vkitti", "vkitti1", "vkitti2"),
+        layout=(
+            "vkitti_1.3.1_rgb/WORLD/morning and _depthgt, _flowgt (version 1), or"
+            " SceneNN/morning/frames/rgb, depth, forwardFlow (version 2)"
+        ),
+        source="https://europe.naverlabs.com/proxy-virtual-worlds/",
+    ),
+    Suite(
+        "kinect_paper",
+        "bending paper of EPFL",
+        kinect,
+        folders=("kinect_paper", "."),
+        layout=_KINECT_LAYOUT,
+        source=_KINECT_SOURCE,
+    ),
+    Suite(
+        "kinect_tshirt",
+        "bending T-shirt of EPFL",
+        kinect,
+        folders=("kinect_tshirt", "."),
+        layout=_KINECT_LAYOUT,
+        source=_KINECT_SOURCE,
+    ),
+)
+SUITES: Mapping[str, Suite] = MappingProxyType({s.name: s for s in _ALL})
+"""Suites by name."""
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The pairs of a suite that are there.
+
+    Attributes:
+        suite: The suite.
+        items: Pairs to measure.
+        listed: Pairs of the suite's list (with its filters) whether there or not.
+    """
+
+    suite: Suite
+    items: tuple[Item, ...]
+    listed: int
+
+    def __str__(self) -> str:
+        missing = self.listed - len(self.items)
+        lack = f", {missing} of the list are not in the folder" if missing else ""
+        return f"suite {self.suite.name}: {len(self.items)} pairs{lack}"
+
+
+def list_suite(name: str, data: Path | None = None, options: Options | None = None) -> Listing:
+    """The pairs of a suite.
+
+    Args:
+        name: One of `SUITES`.
+        data: Root folder of the dataset, or a folder that holds it.
+        options: Filters and variants.
+
+    Raises:
+        DataError: there is no such suite, or none of its pairs is in the folder; the message says
+            where to get the dataset and how to lay it out.
+    """
+    if name not in SUITES:
+        raise DataError("unknown suite", found=repr(name), expected=", ".join(SUITES))
+    suite, o = SUITES[name], options or Options()
+    root = (data or Path()).expanduser().resolve()
+    listed: list[Item] = []
+    for folder in suite.folders:
+        listed = [i for i in suite.build(suite, (root / folder).resolve(), o) if _wanted(i, o)]
+        here = [i for i in listed if all(f.is_file() for f in i.needs)]
+        if any(i.needs for i in here) or (here and not suite.layout):
+            return Listing(suite, tuple(_thinned(here, o.limit)), len(listed))
+    if o.only and not listed and (not suite.layout or root.is_dir()):
+        raise DataError(
+            "no pair of the suite has such a name", where=f"suite {name}", found=", ".join(o.only)
+        )
+    raise DataError(
+        f"suite {name} ({suite.text}) has no pair in the folder",
+        where=data or "--data was not given",
+        found="no folder" if not root.is_dir() else "none of its images",
+        expected=suite.layout,
+        hint=f"get it from {suite.source}, lay it out so, and give its root as --data",
+    )
+
+
+def _wanted(item: Item, o: Options) -> bool:
+    return not o.only or any(word in item.name for word in o.only)
+
+
+def _thinned(items: list[Item], limit: int | None) -> list[Item]:
+    if limit is None or limit >= len(items):
+        return items
+    return [items[k] for k in spread(len(items), limit)]

@@ -1,0 +1,165 @@
+"""Command bench accuracy: suites of pairs against their truth, beside rivals and published rows."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from soup_nlp.bench.accuracy import Job, Row
+from soup_nlp.bench.accuracy_runner import Where, measure_all
+from soup_nlp.bench.accuracy_table import get, report, show
+from soup_nlp.bench.suites import SUITES, Options, list_suite
+from soup_nlp.errors import ConfigError
+from soup_nlp.report.folder import write_text
+from soup_nlp.report.protocols import preset
+
+SuiteName = Annotated[
+    list[str] | None, typer.Option("--suite", help=f"{', '.join(SUITES)}; may be repeated.")
+]
+Data = Annotated[Path | None, typer.Option(help="Root folder of the dataset.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of rows, tables and plots.")]
+Set = Annotated[list[str] | None, typer.Option("--set", help="Override of every problem.")]
+Flow = Annotated[
+    list[str] | None, typer.Option(help="Flow source instead of the suite's own; may be repeated.")
+]
+Width = Annotated[int, typer.Option(help="Columns of rendered scenes.", min=64)]
+Seeds = Annotated[str, typer.Option(help="Seeds of rendered scenes, such as 0,1,2.")]
+Only = Annotated[list[str] | None, typer.Option(help="Only pairs whose name holds this word.")]
+Limit = Annotated[int | None, typer.Option(help="At most this many pairs a suite.", min=1)]
+Workers = Annotated[int, typer.Option(help="Processes of this machine (extra: bench).", min=1)]
+Dask = Annotated[str, typer.Option(help="Address of a Dask scheduler (extra: dask).")]
+AnyCode = Annotated[bool, typer.Option(help="Also take stored rows of other code versions.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+
+
+def register(bench: typer.Typer) -> None:
+    """Add the command to the group."""
+    bench.command(name="accuracy")(accuracy)
+
+
+def numbers(text: str, option: str) -> tuple[int, ...]:
+    """Whole numbers of a comma-separated list.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    try:
+        return tuple(int(x) for x in text.split(","))
+    except ValueError:
+        raise ConfigError(
+            "not a list of whole numbers", where=option, found=text, expected="0,1,2"
+        ) from None
+
+
+class Progress:
+    """Pairs done and time left: one rewritten line on a terminal, a line a pair in a log."""
+
+    def __init__(self, quiet: bool) -> None:
+        self.quiet = quiet
+        self.live = sys.stderr.isatty()
+        self.spent: list[float] = []
+
+    def __call__(self, done: int, total: int, row: Row) -> None:
+        """A new row."""
+        if self.quiet:
+            return
+        self.spent.append(float(row["seconds"]))
+        left = sum(self.spent) / len(self.spent) * (total - done)
+        if row["ok"]:
+            main = row["presets"][0]
+            result = f"MRE {show(get(row, main, 'solution'))}"
+        else:
+            result = f"failed: {str(row['error']).splitlines()[0]}"
+        line = f"{done}/{total}  {row['key']}  {result}  {row['seconds']:.0f} s"
+        if total > done:
+            line += f"  (about {left:.0f} s of work left)"
+        if self.live:
+            print(f"\r\x1b[2K{line}", end="\n" if done == total else "", file=sys.stderr)
+        else:
+            print(line, file=sys.stderr)
+        sys.stderr.flush()
+
+
+def accuracy(
+    suite: SuiteName = None,
+    data: Data = None,
+    out: Out = Path("results/accuracy"),
+    analysis: Annotated[
+        str | None, typer.Option(help="An analysis instead of the table; `list` names them.")
+    ] = None,
+    overrides: Set = None,
+    flow: Flow = None,
+    width: Width = 1024,
+    seeds: Seeds = "0",
+    only: Only = None,
+    limit: Limit = None,
+    workers: Workers = 1,
+    dask: Dask = "",
+    folders: Annotated[Path | None, typer.Option(help="Keep every result folder here.")] = None,
+    conventions: Annotated[
+        list[str] | None, typer.Option("--preset", help="Metric convention; may be repeated.")
+    ] = None,
+    any_code: AnyCode = False,
+    quiet: Quiet = False,
+) -> None:
+    """Depth against truth on a suite of pairs; stopped runs go on where they were."""
+    from soup_nlp.bench.analyses import ANALYSES, run_analysis
+
+    if analysis == "list":
+        for name, entry in ANALYSES.items():
+            print(f"{name:<12} {entry.text}")
+        return
+    if not suite and not analysis:
+        for name, known in SUITES.items():
+            print(f"{name:<14} {known.text}")
+        raise ConfigError("no suite was named", where="--suite", expected=", ".join(SUITES))
+    for name in conventions or []:
+        preset(name)
+    options = Options(
+        flows=tuple(flow) if flow else None,
+        width=width,
+        seeds=numbers(seeds, "--seeds"),
+        limit=limit,
+        only=tuple(only or ()),
+    )
+    where, progress = Where(workers, dask), Progress(quiet)
+    names: Sequence[str] = suite or ["rendered"]
+    if analysis:
+        path = run_analysis(
+            analysis,
+            [list_suite(name, data, options) for name in names],
+            out,
+            tuple(overrides or ()),
+            where,
+            say=progress,
+            any_code=any_code,
+        )
+        print(path.read_text(encoding="utf-8"))
+        print(f"files       {path.parent}/{path.stem}.*")
+        return
+    failed = 0
+    for name in names:
+        listing = list_suite(name, data, options)
+        if not quiet:
+            print(listing, file=sys.stderr)
+        jobs = [
+            Job(
+                item if not conventions else item.scored_by(tuple(conventions)),
+                tuple(overrides or ()),
+                folder=folders / item.key.replace(" ", "_") if folders else None,
+            )
+            for item in listing.items
+        ]
+        rows = measure_all(jobs, out / f"{name}.jsonl", where, say=progress, any_code=any_code)
+        failed += sum(not row["ok"] for row in rows)
+        note = f"Suite `{name}`: {listing.suite.text}."
+        if overrides:
+            note += f" Overrides: {', '.join(f'`{o}`' for o in overrides)}."
+        write_text(out / f"{name}.md", report(f"Accuracy on {name}", rows, note))
+        print((out / f"{name}.md").read_text(encoding="utf-8"))
+        print(f"files       {out / name}.md, {out / name}.jsonl")
+    raise typer.Exit(1 if failed else 0)

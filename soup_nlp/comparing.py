@@ -1,0 +1,130 @@
+"""Problems, sizes and formulations as tasks for the comparison, and its command."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from soup_nlp.artefact import form_label, parse_formulation
+from soup_nlp.cases import Case, prepare
+from soup_nlp.compare.profile import draw_curves, draw_profiles
+from soup_nlp.compare.report import conclusion, page
+from soup_nlp.compare.runner import compare as run_all
+from soup_nlp.compare.solvers import available, find_solver
+from soup_nlp.compare.task import Limits, Task
+from soup_nlp.config import load_problem
+from soup_nlp.errors import ConfigError
+from soup_nlp.model import plain
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.report.folder import prepare_folder, write_text
+
+ENERGY_SLACK = 1e-3
+"""A solution's exact energy may be this share above the proposal's: the smoothing moves it."""
+
+Label = Mapping[str, Any]
+Maker = Callable[[Path], Task]
+
+
+def make_tasks(
+    case: Case, forms: list[dict[str, str]], limits: Limits, presolved: bool
+) -> list[tuple[Label, Maker]]:
+    """Label and maker of the task of every formulation.
+
+    Args:
+        case: Problem with its start.
+        forms: Gauge, norm, truncation, each or none.
+        limits: For every solver.
+        presolved: The case starts at the presolve's answer.
+    """
+    out: list[tuple[Label, Maker]] = []
+    ceiling = plain.energy(case.start.soup, case.data, case.weights)["total"]
+    for chosen in forms:
+        form = case.formulation(**chosen, hessian="exact", compiled=False)
+        label = {
+            "problem": case.problem.name,
+            "problem_hash": case.problem.digest(),
+            "superpixels": len(case),
+            "formulation": form_label(form),
+            "start": "presolve" if presolved else "proposal",
+            "energy_limit": ceiling * (1 + ENERGY_SLACK),
+        }
+        out.append((label, _Maker(case, form, limits)))
+    return out
+
+
+class _Maker:
+    """Builds the NLPs of a formulation once, when the first solver asks."""
+
+    def __init__(self, case: Case, form: Formulation, limits: Limits) -> None:
+        self.case, self.form, self.limits = case, form, limits
+        self._built: Task | None = None
+
+    def __call__(self, folder: Path) -> Task:
+        if self._built is None:
+            nlp, layout = self.case.nlp(self.form)
+            second, _ = self.case.nlp(replace(self.form, hessian="gauss-newton+constraints"))
+            self._built = Task(
+                nlp=nlp,
+                gauss_newton=second,
+                layout=layout,
+                soup=self.case.soup,
+                data=self.case.data,
+                weights=self.case.weights,
+                form=self.form,
+                limits=self.limits,
+                folder=folder,
+            )
+        return replace(self._built, folder=folder)
+
+
+def compare(
+    problems: Annotated[list[Path], typer.Argument(help="Problem files.")],
+    solvers: Annotated[
+        str, typer.Option(help="Comma-separated, or all; a program that reads .nl may be named.")
+    ] = "all",
+    formulation: Annotated[
+        list[str] | None, typer.Option("--formulation", help="gauge/norm/truncation; repeatable.")
+    ] = None,
+    superpixels: Annotated[list[int] | None, typer.Option(help="Repeatable.")] = None,
+    seconds: Annotated[float, typer.Option(help="Time limit of a run.")] = 60.0,
+    iterations: Annotated[int, typer.Option(help="Iteration limit of a run.")] = 300,
+    tol: Annotated[float, typer.Option(help="Dual infeasibility; constraints get 1/100.")] = 1e-4,
+    memory: Annotated[float, typer.Option(help="Memory limit of a run, GiB.")] = 4.0,
+    presolve: Annotated[
+        bool, typer.Option(help="Start where the tangent presolve ends, not at the proposal.")
+    ] = True,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder.")] = Path("results/solvers"),
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="Override.")] = None,
+) -> None:
+    """Run real solvers on problems, verify their claims, write table and profiles."""
+    if not (seconds > 0 and iterations > 0 and tol > 0 and memory > 0):
+        raise ConfigError(
+            "limits must be positive",
+            where="compare",
+            found=f"{seconds:g} s, {iterations} iterations, tol {tol:g}, {memory:g} GiB",
+        )
+    names = list(available()) if solvers == "all" else [s.strip() for s in solvers.split(",")]
+    for name in names:
+        find_solver(name)
+    forms = [parse_formulation(text) for text in formulation or []] or [{}]
+    limits = Limits(seconds, iterations, tol, int(memory * 2**30))
+    folder = prepare_folder(out)
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for path in problems:
+            for size in [*(superpixels or ())] or [None]:
+                own = [f"segmentation.superpixels={size}"] if size else []
+                case = prepare(load_problem(path, [*(overrides or []), *own]), presolve)
+                tasks = make_tasks(case, forms, limits, presolve)
+                rows = run_all(tasks, names, limits, folder / "runs.jsonl", Path(scratch), print)
+    write_text(folder / "README.md", page(rows))
+    draw_profiles(folder / "profile.png", rows)
+    draw_curves(folder / "curves.png", rows)
+    print("\n".join(conclusion(rows)))
+    print(f"files       {folder}/: README.md, profile.png, curves.png, runs.jsonl")
+    raise typer.Exit(0 if any(r["verified"] for r in rows) else 1)
