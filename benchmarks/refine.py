@@ -143,7 +143,8 @@ def main() -> None:
                 f" {last['polish_gain']:.3g} |"
             )
             print(polish[-1], flush=True)
-    write(args.out, args.superpixels, lines, polish if args.polish else [])
+        # what is there so far: the command can be stopped and taken up again
+        write(args.out, args.superpixels, lines, polish if args.polish else [])
 
 
 if __name__ == "__main__":
