@@ -42,28 +42,53 @@ def fit_translation(
     Returns:
         (N, 3) unit translations with most points in front of the camera.
     """
-    y = np.einsum("nij,nmj->nmi", R, r)
-    normal = np.cross(y, q)
+    y, q_ = R @ _rows(r), _rows(q)
+    normal = _cross(y, q_)
     w = weight.copy()
     t = np.zeros((len(R), 3))
     for _ in range(rounds):
-        A = np.einsum("nm,nmi,nmj->nij", w, normal, normal, optimize=True)
+        A = (normal * w[:, None]) @ normal.transpose(0, 2, 1)
         t = np.linalg.eigh(A)[1][:, :, 0]
-        algebraic = np.einsum("nmi,ni->nm", normal, t)
-        spread = np.linalg.norm(np.cross(t[:, None], q)[..., :2], axis=2)
+        algebraic = (t[:, None] @ normal)[:, 0]
+        spread = np.sqrt(_square(*_cross_xy(t[..., None], q_)))
         error = focal * np.abs(algebraic) / np.maximum(spread, 1e-9)
         w = weight / (1 + (error / noise) ** 2)
         # Sampson's weight: error in pixels, not the algebraic one
         w = w / np.maximum(spread, 1e-6) ** 2
-    return face_forward(R, t, r, q, weight)
+    return _facing(t, y, q_, weight)
+
+
+def _rows(v: Float) -> Float:
+    """(N, 3, M) of (N, M, 3): a coordinate of all points lies together, which is fast."""
+    return np.ascontiguousarray(v.transpose(0, 2, 1))
+
+
+def _cross_xy(a: Float, b: Float) -> tuple[Float, Float]:
+    """First two coordinates (N, M) of the cross product of (N, 3, M)."""
+    x = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+    return x, a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
+
+
+def _cross(a: Float, b: Float) -> Float:
+    """Cross product of (N, 3, M)."""
+    return np.stack([*_cross_xy(a, b), a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]], axis=1)
+
+
+def _square(x: Float, y: Float) -> Float:
+    return x * x + y * y
 
 
 def face_forward(R: Float, t: Float, r: Float, q: Float, weight: Float) -> Float:
     """The sign of t (N, 3) under which most depths are positive."""
-    y = np.einsum("nij,nmj->nmi", R, r)
-    a = y[..., :2] - q[..., :2] * y[..., 2:]
-    b = t[:, None, :2] - q[..., :2] * t[:, None, 2:]
-    vote = np.sum(weight * np.sign(-np.sum(a * b, axis=2)), axis=1)
+    return _facing(t, R @ _rows(r), _rows(q), weight)
+
+
+def _facing(t: Float, y: Float, q: Float, weight: Float) -> Float:
+    """`face_forward` of turned rays y and next rays q, both (N, 3, M)."""
+    s = t[..., None]
+    dot = (y[:, 0] - q[:, 0] * y[:, 2]) * (s[:, 0] - q[:, 0] * s[:, 2])
+    dot += (y[:, 1] - q[:, 1] * y[:, 2]) * (s[:, 1] - q[:, 1] * s[:, 2])
+    vote = np.sum(weight * np.sign(-dot), axis=1)
     return t * np.where(vote >= 0, 1.0, -1.0)[:, None]
 
 
@@ -98,24 +123,27 @@ def refine_motion(
     """
     R0, t0 = R, t
     turn = np.zeros((len(R), 3))
+    r_, q_ = _rows(r), _rows(q)
+    J = np.empty((len(R), 5, r.shape[1]))
     for _ in range(rounds):
-        y = np.einsum("nij,nmj->nmi", R, r)
-        cross = np.cross(y, q)
-        value = np.einsum("nmi,ni->nm", cross, t)
-        Eq = np.linalg.norm(np.cross(t[:, None], y)[..., :2], axis=2)
-        Er = np.linalg.norm(np.einsum("nji,nmj->nmi", R, np.cross(q, t[:, None]))[..., :2], axis=2)
-        spread = np.maximum(np.sqrt(Eq**2 + Er**2), 1e-9)
-        ty = np.einsum("nmi,ni->nm", y, t)
-        yq = np.sum(y * q, axis=2)
-        d_turn = ty[..., None] * q - yq[..., None] * t[:, None]
+        y, s = R @ r_, t[..., None]
+        cross = _cross(y, q_)
+        value = (t[:, None] @ cross)[:, 0]
+        back = R[:, :, :2].transpose(0, 2, 1) @ _cross(q_, s)
+        spread = np.sqrt(_square(*_cross_xy(s, y)) + _square(back[:, 0], back[:, 1]))
+        spread = np.maximum(spread, 1e-9)
+        ty = (t[:, None] @ y)[:, 0]
+        yq = np.sum(y * q_, axis=1)
         # t moves in its tangent plane
         basis = np.linalg.svd(t[:, None, :])[2][:, 1:]
-        d_t = np.einsum("nmi,nbi->nmb", cross, basis)
-        J = np.concatenate([d_turn, d_t], axis=2) * (focal / spread)[..., None]
+        J[:, :3] = ty[:, None] * q_ - yq[:, None] * s
+        J[:, 3:] = basis @ cross
+        J *= (focal / spread)[:, None]
         e = focal * value / spread
         w = weight / (1 + (e / noise) ** 2) / noise**2
-        A = np.einsum("nm,nmi,nmj->nij", w, J, J, optimize=True)
-        g = np.einsum("nm,nmi,nm->ni", w, J, e, optimize=True)
+        Jw = J * w[:, None]
+        A = Jw @ J.transpose(0, 2, 1)
+        g = (Jw @ e[..., None])[..., 0]
         prior = np.array([rotation_prior] * 3 + [translation_prior] * 2) ** -2.0
         A += np.diag(prior)
         g[:, :3] += prior[:3] * turn
@@ -127,4 +155,4 @@ def refine_motion(
         R = rotation.exp(turn) @ R0
         t = t + np.einsum("nb,nbi->ni", step[:, 3:], basis)
         t = t / np.linalg.norm(t, axis=1, keepdims=True)
-    return R, face_forward(R, t, r, q, weight)
+    return R, _facing(t, R @ r_, q_, weight)

@@ -60,20 +60,21 @@ def fit_planes(
         clip: Errors count at most this many pixels.
         rounds: Reweighting rounds.
     """
-    f = np.asarray(focal)
-    y = np.einsum("ncij,nsj->ncsi", R, ray)
-    q = target[:, None, :, :2]
-    a = (y[..., :2] - q * y[..., 2:]) * f
-    b = (t[:, :, None, :2] - q * t[:, :, None, 2:]) * f
+    # coordinates apart, all pixels of one together: (N, C, S) each
+    y = R @ np.ascontiguousarray(ray.transpose(0, 2, 1))[:, None]
+    front, shift = y[:, :, 2], t[:, :, None, 2]
+    q = target[:, None]
+    ax, ay = ((y[:, :, i] - q[..., i] * front) * focal[i] for i in (0, 1))
+    bx, by = ((t[:, :, None, i] - q[..., i] * shift) * focal[i] for i in (0, 1))
     off = (ray - anchor[:, None])[..., :2] / radius[:, None, None]
     basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
-    outer = basis[..., :, None] * basis[..., None, :]
-    w = np.broadcast_to(weight[:, None], a.shape[:3]).copy()
+    outer = (basis[..., :, None] * basis[..., None, :]).reshape(*basis.shape[:2], 9)
+    w = np.broadcast_to(weight[:, None], front.shape).copy()
     confident = w
-    depth_like = np.maximum(np.abs(y[..., 2]), 1e-6)
-    b2 = np.sum(b * b, axis=-1)
-    ab = np.sum(a * b, axis=-1)
-    mu = np.zeros((*a.shape[:2], 3))
+    depth_like = np.maximum(np.abs(front), 1e-6)
+    b2 = bx * bx + by * by
+    ab = ax * bx + ay * by
+    mu = np.zeros((*front.shape[:2], 3))
     floor = 1e-12
     for step in range(rounds):
         s = w / depth_like**2
@@ -81,8 +82,8 @@ def fit_planes(
         if step == 0:
             mu[..., 0] = mu_a
         else:
-            A = np.einsum("ncs,nsij->ncij", s * b2, outer, optimize=True)
-            rhs = -np.einsum("ncs,nsi->nci", s * ab, basis)
+            A = ((s * b2) @ outer).reshape(*mu.shape, 3)
+            rhs = -(s * ab) @ basis
             # slopes are known a priori to slope_prior, the flow to noise pixels
             prior = (noise / (slope_prior * np.maximum(np.abs(mu[..., 0]), 1e-9))) ** 2
             A[..., 1, 1] += prior
@@ -92,9 +93,10 @@ def fit_planes(
             mu = np.linalg.solve(A, rhs[..., None])[..., 0]
             limit = max_slope * np.abs(mu[..., :1])
             mu[..., 1:] = np.clip(mu[..., 1:], -limit, limit)
-        value = np.einsum("nci,nsi->ncs", mu, basis)
-        depth_like = np.maximum(y[..., 2] + value * t[:, :, None, 2], 1e-3)
-        error = np.linalg.norm(a + b * value[..., None], axis=-1) / depth_like
+        value = mu @ basis.transpose(0, 2, 1)
+        depth_like = np.maximum(front + value * shift, 1e-3)
+        ex, ey = ax + bx * value, ay + by * value
+        error = np.sqrt(ex * ex + ey * ey) / depth_like
         w = confident / np.sqrt(error**2 + noise**2)
     total = np.maximum(confident.sum(axis=2), 1e-9)
     cost = np.sum(confident * np.minimum(error, clip), axis=2) / total
