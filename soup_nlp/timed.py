@@ -35,6 +35,9 @@ from soup_nlp.solve.yardstick import EPS, Yardstick, levenberg_marquardt
 
 Float = NDArray[np.float64]
 
+YARDSTICK_ITERATIONS = 100
+"""Limit of Levenberg-Marquardt's steps for every smoothing width."""
+
 
 class Clocks:
     """Wall and CPU seconds by stage."""
@@ -216,7 +219,7 @@ def _yardstick(case: Case, kind: str) -> dict[str, Any]:
         case.weights,
         case.formulation(),
         eps=schedule(kind, case.options),
-        iterations=case.options.presolve_last_iterations,
+        iterations=YARDSTICK_ITERATIONS,
         seconds=case.options.max_seconds,
     )
     mre = None

@@ -127,6 +127,14 @@ class _Tangent:
         H = self.nlp.hess_lag(x, self.p, 1.0, np.zeros(self.nlp.ng))
         return np.array(H.nonzeros())
 
+    def diagonal(self, nonzeros: Float) -> Float:
+        """Diagonal of the normal matrix (9 N,)."""
+        column = np.repeat(np.arange(self.nlp.nx), np.diff(self.upper.indptr))
+        out = np.zeros(self.nlp.nx)
+        on = self.upper.indices == column
+        out[column[on]] = nonzeros[on]
+        return out
+
     def project(self, x: Float) -> Float:
         """The point with bounds kept and slopes shrunk until every rim pixel is visible."""
         x = np.clip(x, self.nlp.lbx, self.nlp.ubx)
@@ -341,8 +349,9 @@ def lbfgs(
 ) -> Yardstick:
     """scipy's L-BFGS-B on the same tangent problem, smaller and smaller smoothing.
 
-    Bounds are its own; simplex and visibility are half squares of their violation in f, and every
-    iterate is projected before its exact energy is taken.
+    Variables are scaled by the diagonal of the normal matrix where an eps begins. Bounds are its
+    own; simplex and visibility are half squares of their violation in f, and every iterate is
+    projected before its exact energy is taken.
 
     Args:
         start: Initial soup.
@@ -366,33 +375,36 @@ def lbfgs(
     total = float(a @ x)
     record.note(problem.layout.unpack(x))
 
-    def objective(x: Float) -> tuple[float, Float]:
+    def objective(z: Float) -> tuple[float, Float]:
+        x = z * unit
         f, gradient = problem.gradient(x)
         off = float(a @ x) - total
         hidden = np.minimum(A @ x - lower, 0.0)
         f += 0.5 * penalty * (off**2 + float(hidden @ hidden))
-        return f, gradient + penalty * (off * a + A.T @ hidden)
+        return f, unit * (gradient + penalty * (off * a + A.T @ hidden))
 
     count, status = 0, "Converged"
 
-    def iterate(x: Float) -> None:
+    def iterate(z: Float) -> None:
         nonlocal count
         count += 1
-        record.note(problem.layout.unpack(problem.project(x)))
+        record.note(problem.layout.unpack(problem.project(z * unit)))
         if listener:
-            listener(Progress("L-BFGS", count, problem.value(x), 0.0, record.seconds()))
+            listener(Progress("L-BFGS", count, problem.value(z * unit), 0.0, record.seconds()))
         if stop.is_set() or record.seconds() > seconds:
             raise StopIteration
 
     bounds = np.column_stack([problem.nlp.lbx, problem.nlp.ubx])
     for width in eps:
         problem.smoothing(width)
+        # units in which the normal matrix has a diagonal of ones
+        unit = 1 / np.sqrt(problem.diagonal(problem.normal_matrix(x)) + 1e-2)
         out = minimize(
             objective,
-            x,
+            x / unit,
             jac=True,
             method="L-BFGS-B",
-            bounds=bounds,
+            bounds=bounds / unit[:, None],
             callback=iterate,
             options={
                 "maxiter": iterations,
@@ -405,6 +417,6 @@ def lbfgs(
         if stop.is_set() or record.seconds() > seconds:
             status = "Interrupted" if stop.is_set() else "Time_Limit"
             break
-        x = np.asarray(out.x)
+        x = np.asarray(out.x) * unit
         status = "Iteration_Limit" if out.status == 1 else "Converged"
     return record.finish("l-bfgs", count, status)
