@@ -18,7 +18,7 @@ LIMITS = (
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
     "Solvers run with the options in `soup_nlp/compare/solvers.py`, the package's own ones being "
     "tuned on problems of this kind; the others are as they come, but for tolerances and limits.",
-    "alpaqa, bonmin and sleqp differentiate an expanded expression graph, which costs set-up time; "
+    "alpaqa and sleqp differentiate an expanded expression graph, which costs set-up time; "
     "every other plug-in gets this package's own derivatives, and readers of .nl make theirs.",
     "lm and lbfgs, the yardsticks on the manifold, end where the energy stops falling and claim "
     "no optimum; their rows are for the energy.",

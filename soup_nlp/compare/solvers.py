@@ -32,6 +32,7 @@ CLAIMS = ("Solve_Succeeded", "Solved_To_Acceptable_Level", "SUCCESS", "success",
 TRIU = ("triu_hess_gamma_x_x",)
 CACHED: Mapping[str, tuple[tuple[str, ...], ...]] = {
     "uno": (("grad_f_x",), ("jac_g_x",), TRIU),
+    "bonmin": (("f", "grad_f_x"), ("g", "jac_g_x"), TRIU),
     "fatrop": (("grad_f_x",), ("g", "jac_g_x"), ("grad_gamma_x", "hess_gamma_x_x")),
 }
 """Outputs of nlp_grad_f, nlp_jac_g and nlp_hess_l that a plug-in asks CasADi for."""
@@ -92,6 +93,8 @@ def _sqp(limits: Limits, qpsol: str, qp: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+NEAR = {k: v for k, v in DEFAULTS.items() if k.startswith(("mu_", "bound_", "nlp_scaling"))}
+"""Options of a start near the end, for solvers of Ipopt's family."""
 QUIET_OSQP = {"osqp": {"verbose": False, "eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20000}}
 PLUGINS: Mapping[str, tuple[str, str, bool, Callable[[Limits], dict[str, Any]]]] = {
     "ipopt": ("ipopt", "exact", True, lambda m: {"ipopt": _ipopt(m)}),
@@ -131,9 +134,29 @@ PLUGINS: Mapping[str, tuple[str, str, bool, Callable[[Limits], dict[str, Any]]]]
         False,
         lambda m: {"fatrop": {"max_iter": m.iterations, "tol": m.tol, "print_level": 0}},
     ),
+    "bonmin-tuned": (
+        "bonmin",
+        "exact",
+        False,
+        lambda m: {"bonmin": {**NEAR, "max_iter": m.iterations, "tol": m.tol, "print_level": 0}},
+    ),
+    "fatrop-tuned": (
+        "fatrop",
+        "exact",
+        False,
+        lambda m: {
+            "fatrop": {
+                "mu_init": NEAR["mu_init"],
+                "max_iter": m.iterations,
+                "tol": m.tol,
+                "print_level": 0,
+            }
+        },
+    ),
 }
 """Plug-in, Hessian, whether it calls back at every iteration, options. "ipopt-soup" is how `solve`
-runs Ipopt, "ipopt-tuned" the same with the exact Hessian, "ipopt" Ipopt as it comes. blocksqp is
+runs Ipopt, "ipopt-tuned" the same with the exact Hessian, "ipopt" Ipopt as it comes; other names
+with "-tuned" have its options for a start near the end. blocksqp is
 left out: it needs a linear solver (ma27) that CasADi's wheel lacks."""
 
 
@@ -167,9 +190,10 @@ def plugin(name: str, task: Task) -> Answer:
             names = ["x", "p"], ["f", "grad_f_x", "g", "jac_g_x"]
             common["jac_fg"] = ca.Function("nlp_jac_fg", [x, q], [f, grad, g, jac], *names)
     elif library in CACHED:
-        x, q = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", len(p))
-        f, g = nlp.oracle(x, q)
-        problem = {"x": x, "p": q, "f": f, "g": g}
+        # with numbers for the parameters: bonmin knows none
+        x = ca.MX.sym("x", nlp.nx)
+        f, g = nlp.oracle(x, p)
+        problem, p = {"x": x, "f": f, "g": g}, np.zeros(0)
         common["cache"] = _cache(nlp, CACHED[library])
     else:
         s = ca.SX.sym("x", nlp.nx)
@@ -198,11 +222,11 @@ def plugin(name: str, task: Task) -> Answer:
 
 def _cache(nlp: NLP, wanted: tuple[tuple[str, ...], ...]) -> dict[str, ca.Function]:
     """The package's derivatives under the names and with the outputs that a plug-in asks for."""
-    x, q = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", len(nlp.p))
+    x, q = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", 0)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", nlp.ng)
-    f, grad = nlp.grad_f(x, q)
-    g, jac = nlp.jac_g(x, q)
-    upper = nlp.hess_lag(x, q, lam_f, lam_g)
+    f, grad = nlp.grad_f(x, nlp.p)
+    g, jac = nlp.jac_g(x, nlp.p)
+    upper = nlp.hess_lag(x, nlp.p, lam_f, lam_g)
     known = {
         "f": f,
         "grad_f_x": grad,
@@ -248,7 +272,7 @@ def executable(command: str, task: Task, options: tuple[str, ...] = ()) -> Answe
     return Answer(sol.x, sol.lam_g, status, sol.solved, -1, seconds)
 
 
-def _ampl(name: str, task: Task) -> Answer:
+def _ampl(name: str, task: Task, near: bool = False) -> Answer:
     """An executable that is found on the path or beside Python."""
     m = task.limits
     options: dict[str, tuple[str, ...]] = {
@@ -263,7 +287,10 @@ def _ampl(name: str, task: Task) -> Answer:
             "print_level=0",
         ),
     }
-    return executable(_find(name) or name, task, options.get(name, ()))
+    words = options.get(name, ())
+    if near:
+        words = (*words, *(f"{k}={v}" for k, v in NEAR.items()))
+    return executable(_find(name) or name, task, words)
 
 
 def _find(name: str) -> str | None:
@@ -313,7 +340,7 @@ def yardstick(method: Callable[..., Yardstick], task: Task) -> Answer:
         task.weights,
         task.form,
         eps=[*(e for e in EPS if e > last), last],
-        seconds=task.limits.seconds,
+        seconds=0.8 * task.limits.seconds,
     )
     x = task.nlp.x0.copy()
     x[: task.layout.size] = task.layout.pack(record.soup)
@@ -328,6 +355,7 @@ def available() -> dict[str, Solver]:
     }
     if _find("pounce"):
         out["pounce"] = partial(_ampl, "pounce")
+        out["pounce-tuned"] = partial(_ampl, "pounce", near=True)
     out["lm"] = partial(yardstick, levenberg_marquardt)
     out["lbfgs"] = partial(yardstick, lbfgs)
     if importlib.util.find_spec("pyscipopt"):
