@@ -1,4 +1,4 @@
-"""Command bench accuracy: suites of pairs against their truth, beside rivals and published rows."""
+"""Commands bench accuracy (suites against truth and rivals) and bench search (defaults)."""
 
 from __future__ import annotations
 
@@ -37,8 +37,9 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 
 
 def register(bench: typer.Typer) -> None:
-    """Add the command to the group."""
+    """Add the commands to the group."""
     bench.command(name="accuracy")(accuracy)
+    bench.command(name="search")(search)
 
 
 def numbers(text: str, option: str) -> tuple[int, ...]:
@@ -91,6 +92,9 @@ def accuracy(
     analysis: Annotated[
         str | None, typer.Option(help="An analysis instead of the table; `list` names them.")
     ] = None,
+    values: Annotated[
+        str | None, typer.Option(help="Variants of the analysis, such as 100,250,500.")
+    ] = None,
     overrides: Set = None,
     flow: Flow = None,
     width: Width = 1024,
@@ -135,6 +139,7 @@ def accuracy(
             out,
             tuple(overrides or ()),
             where,
+            values=values.split(",") if values else None,
             say=progress,
             any_code=any_code,
         )
@@ -163,3 +168,71 @@ def accuracy(
         print((out / f"{name}.md").read_text(encoding="utf-8"))
         print(f"files       {out / name}.md, {out / name}.jsonl")
     raise typer.Exit(1 if failed else 0)
+
+
+def search(
+    suite: SuiteName = None,
+    data: Data = None,
+    out: Out = Path("results/accuracy"),
+    params: Annotated[
+        list[str] | None,
+        typer.Option("--param", help="KEY=log|linear|int:LOW:HIGH or KEY=choice:A:B instead."),
+    ] = None,
+    trials: Annotated[int, typer.Option(help="Configurations beside the default.", min=1)] = 24,
+    finalists: Annotated[int, typer.Option(help="Best trials that are validated.", min=1)] = 3,
+    seed: Annotated[int, typer.Option(help="Of the trials.", min=0)] = 0,
+    seeds: Seeds = "0,1",
+    validation_seeds: Annotated[
+        str, typer.Option(help="Seeds of rendered scenes that only validate.")
+    ] = "2,3",
+    overrides: Set = None,
+    flow: Flow = None,
+    width: Width = 512,
+    only: Only = None,
+    workers: Workers = 1,
+    dask: Dask = "",
+    any_code: AnyCode = False,
+    quiet: Quiet = False,
+) -> None:
+    """Search for better defaults on some pairs and check them on others; OUT/search.md, .jsonl."""
+    from soup_nlp.bench.search import DEFAULT_SPACE, parameter, split
+    from soup_nlp.bench.search import search as run_search
+    from soup_nlp.bench.search_report import text_search
+
+    ours, theirs = numbers(seeds, "--seeds"), numbers(validation_seeds, "--validation-seeds")
+    options = Options(
+        flows=tuple(flow) if flow else None,
+        width=width,
+        seeds=tuple(dict.fromkeys((*ours, *theirs))),
+        only=tuple(only or ()),
+    )
+    space = tuple(parameter(p) for p in params) if params else DEFAULT_SPACE
+    items = [i for name in suite or ["rendered"] for i in list_suite(name, data, options).items]
+    train, validation = split(items, ours, theirs)
+    if not quiet:
+        print(
+            f"{trials} trials of {len(space)} settings on {len(train)} pairs,"
+            f" {len(validation)} validate",
+            file=sys.stderr,
+        )
+    found = run_search(
+        space,
+        train,
+        validation,
+        out / "search.jsonl",
+        trials=trials,
+        finalists=finalists,
+        seed=seed,
+        overrides=tuple(overrides or ()),
+        where=Where(workers, dask),
+        say=Progress(quiet),
+        any_code=any_code,
+    )
+    words = [f"--suite {s}" for s in suite or ["rendered"]] + (["--data DIR"] if data else [])
+    words += [f"--trials {trials} --seed {seed} --seeds {seeds}"]
+    words += [f"--validation-seeds {validation_seeds} --width {width}"]
+    words += [f"--flow {f}" for f in flow or []] + [f"--only '{o}'" for o in only or []]
+    words += [f"--set '{o}'" for o in overrides or []] + [f"--param '{p}'" for p in params or []]
+    write_text(out / "search.md", text_search(found, f"soup-nlp bench search {' '.join(words)}"))
+    print((out / "search.md").read_text(encoding="utf-8"))
+    print(f"files       {out}/search.md, {out}/search.jsonl")

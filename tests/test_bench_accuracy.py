@@ -32,8 +32,7 @@ from soup_nlp.model.energy import Weights, build_energy_data, in_pixels
 QUICK = (
     "segmentation.superpixels=40",
     "segmentation.neighbours=6",
-    "solver.presolve_iterations=5",
-    "solver.presolve_last_iterations=10",
+    "solver.presolve=false",
     "solver.max_iter=5",
     "refine.rounds=1",
     "refine.particles=6",

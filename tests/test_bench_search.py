@@ -1,0 +1,229 @@
+"""Analyses and the search for defaults, on rows that a formula makes."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from soup_nlp.bench import analyses
+from soup_nlp.bench.accuracy import Job, head
+from soup_nlp.bench.analyses import ANALYSES, run_analysis
+from soup_nlp.bench.analyses_energy import measure_energy
+from soup_nlp.bench.analyses_report import plot_variants, text_energy, text_variants
+from soup_nlp.bench.search import (
+    DEFAULT_SPACE,
+    FAILED,
+    Parameter,
+    Trial,
+    loss,
+    parameter,
+    search,
+    split,
+)
+from soup_nlp.bench.search_report import text_search
+from soup_nlp.bench.suites import Options, list_suite
+from soup_nlp.bench.suites_pairs import Item
+from soup_nlp.cli import main
+from soup_nlp.errors import ConfigError
+
+QUICK = (
+    "segmentation.superpixels=40",
+    "segmentation.neighbours=6",
+    "solver.presolve=false",
+    "solver.max_iter=5",
+    "refine.rounds=1",
+    "refine.particles=6",
+)
+SPACE = (
+    parameter("energy.weights.cont=log:1e-5:1e-1"),
+    parameter("segmentation.neighbours=int:4:20"),
+)
+
+
+def fake(job: Job) -> dict:
+    """A row whose MRE is least at cont = 1e-3 and K = 12."""
+    given = dict(o.split("=", 1) for o in job.overrides)
+    cont = float(given.get("energy.weights.cont", "0.1"))
+    k = float(given.get("segmentation.neighbours", "20"))
+    mre = 0.02 * (1 + abs(math.log10(cont) + 3) + 0.1 * abs(k - 12))
+    return {
+        **head(job),
+        **{"ok": True, "error": None, "seconds": 0.0, "cpu_seconds": 0.0},
+        "metrics": {
+            "paper": {
+                "solution": {"mre": mre, "median_relative": mre / 2, "skill": 1 - mre / 0.4},
+                "constant": {"mre": 0.4},
+            }
+        },
+        "energy": {"solution": {"total": 10.0}, "truth": {"total": 10.0}},
+    }
+
+
+def items(*seeds: int) -> list[Item]:
+    return list(list_suite("rendered", None, Options(width=128, seeds=seeds)).items)
+
+
+def test_parameters():
+    p = parameter("energy.weights.cont=log:1e-4:1e-2")
+    assert [float(p.at(x)) for x in (0.0, 0.5, 1.0)] == pytest.approx([1e-4, 1e-3, 1e-2])
+    p = parameter("segmentation.neighbours=int:8:20")
+    assert {p.at(x) for x in np.linspace(0, 1, 200)} == {str(k) for k in range(8, 21)}
+    assert parameter("solver.eps=linear:0:1").at(1.0) == "1.0"
+    p = parameter("flow.reweight_px=choice:null:0.5")
+    assert (p.at(0.0), p.at(0.99), p.at(1.0)) == ("null", "0.5", "0.5")
+    for text in (
+        "a",
+        "a=log:1",
+        "a=log:0:1",
+        "a=linear:2:1",
+        "a=choice:1",
+        "a=cube:0:1",
+        "=log:1:2",
+    ):
+        with pytest.raises(ConfigError, match="not a parameter"):
+            parameter(text)
+
+
+def test_every_setting_of_the_default_space_is_accepted_at_both_ends():
+    problem = items(0)[0]
+    for p in DEFAULT_SPACE:
+        for x in (0.0, 0.3, 1.0):
+            problem.problem([f"{p.key}={p.at(x)}"])
+
+
+def test_search_finds_the_minimum_and_goes_on_where_it_was(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    calls = []
+
+    def counted(job):
+        calls.append(job.key)
+        return fake(job)
+
+    train, validation = items(0)[:2], items(1)[:2]
+    found = search(SPACE, train, validation, path, trials=30, function=counted)
+    assert len(found.train) == 31
+    assert found.train[0].overrides == ()
+    assert found.train[0].loss == pytest.approx(math.log(0.02 * (1 + 2 + 0.8) / 0.4))
+    assert found.best.loss < found.train[0].loss - 0.6
+    chosen = dict(o.split("=") for o in found.best.overrides)
+    assert 1e-4 < float(chosen["energy.weights.cont"]) < 1e-2
+    assert found.validation[0].name == "t000"
+    assert found.best.name in {t.name for t in found.validation}
+    # later trials are nearer to the best than the first ones
+    far = [np.linalg.norm(t.unit - found.best.unit) for t in found.train[1:]]
+    assert np.median(far[20:]) < np.median(far[:15])
+    before = len(calls)
+    again = search(SPACE, train, validation, path, trials=30, function=counted)
+    assert len(calls) == before
+    assert [t.overrides for t in again.train] == [t.overrides for t in found.train]
+    text = text_search(found, "soup-nlp bench search")
+    assert "the gain holds" in text
+    assert "`energy.weights.cont` | log | 1e-5 to 1e-1" in text
+    assert "t000 (default)" in text
+
+
+def test_search_refuses_what_cannot_be_right(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    with pytest.raises(ConfigError, match="both trains and validates"):
+        search(SPACE, items(0), items(0), path, function=fake)
+    with pytest.raises(ConfigError, match="no training pair"):
+        search(SPACE, [], items(0), path, function=fake)
+    with pytest.raises(ConfigError):
+        search([Parameter("energy.wieghts", "linear", ("0", "1"))], items(0), [], path)
+
+
+def test_loss_charges_failures_and_a_minimum_far_from_the_truth():
+    row = fake(Job(items(0)[0]))
+    plain = loss(row)
+    far = {**row, "energy": {"solution": {"total": 10.0}, "truth": {"total": 22.0}}}
+    assert loss(far) == pytest.approx(plain + math.log(2.0))
+    assert loss({**row, "ok": False}) == FAILED
+    worse = fake(Job(items(0)[0], ("segmentation.neighbours=400",)))
+    assert plain < loss(worse) <= FAILED
+    assert Trial("t", (), np.zeros(1)).loss == math.inf
+
+
+def test_split_keeps_scenes_apart():
+    real = [
+        Item("shared", n, n, f, {"kind": "motorcycle"}) for n in "abcd" for f in ("truth", "dis")
+    ]
+    train, validation = split([*items(0, 1, 2), *real], (0, 1), (2,))
+    assert len(train) + len(validation) == 30 + 8
+    assert {i.input["seed"] for i in validation if "seed" in i.input} == {2}
+    assert {i.name for i in validation if "seed" not in i.input} == {"b", "d"}
+    assert not {i.name for i in train} & {i.name for i in validation}
+
+
+@pytest.mark.parametrize("name", [n for n in ANALYSES if n not in ("energy", "flows")])
+def test_every_variant_of_an_analysis_is_a_problem(name):
+    for overrides in ANALYSES[name].variants.values():
+        items(0)[0].problem(overrides)
+
+
+def test_an_analysis_writes_table_and_plot(tmp_path, monkeypatch):
+    changed = analyses.replace(ANALYSES["neighbours"], function=fake)
+    monkeypatch.setattr(analyses, "ANALYSES", {"neighbours": changed})
+    listing = list_suite("rendered", None, Options(width=128, flows=("truth",), limit=2))
+    path = run_analysis("neighbours", [listing], tmp_path, values=["4", "12", "30"])
+    text = path.read_text()
+    assert "| pair, flow | 4 | 12 | 30 |" in text
+    # cont stays at 0.1: 1 + 2 + 0.1 |K - 12|
+    assert "| mean of 2 | 0.0760 | 0.0600 | 0.0960 |" in text
+    assert (tmp_path / "neighbours.png").read_bytes()[:4] == b"\x89PNG"
+    assert len((tmp_path / "neighbours.jsonl").read_text().splitlines()) == 6
+    with pytest.raises(ConfigError, match="unknown analysis"):
+        run_analysis("neighbour", [listing], tmp_path)
+    with pytest.raises(ConfigError, match="no pair is left"):
+        run_analysis("neighbours", [], tmp_path)
+
+
+def test_tables_bear_failed_rows(tmp_path):
+    jobs = [Job(i, (f"segmentation.neighbours={k}",), str(k)) for i in items(0)[:2] for k in (4, 8)]
+    rows = [{**fake(j), "code": "c"} for j in jobs]
+    rows[1] = {**head(jobs[1]), "ok": False, "error": "out of luck", "code": "c"}
+    text = text_variants("ablation", "what", rows)
+    assert "out of luck" in text
+    assert "alley_1 (published)" in text
+    assert "-" in next(line for line in text.splitlines() if line.startswith("| street"))
+    plot_variants(tmp_path / "a.png", "K", "what", rows, numeric=True)
+    assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+def test_energy_at_the_truth(tmp_path):
+    raw = {"kind": "scene", "scene": "orbit", "seed": 0, "width": 128, "height": 64}
+    item = Item("rendered", "orbit", "orbit", "truth", raw)
+    row = measure_energy(Job(item, QUICK))
+    assert row["ok"], row["error"]
+    json.dumps(row, allow_nan=False)
+    energy = {k: v["total"] for k, v in row["energy"].items()}
+    assert set(energy) == {"start", "solution", "truth", "NLP from truth", "refined from truth"}
+    assert energy["solution"] <= energy["start"]
+    tol = 1 + 1e-9
+    assert energy["NLP from truth"] <= tol * energy["truth"]
+    assert energy["refined from truth"] <= tol * energy["NLP from truth"]
+    text = text_energy("energy", "what", [{**row, "code": "c"}])
+    assert f"{energy['truth'] / energy['solution']:.3f}" in text
+    # a pair without motions says so
+    bare = Item("shared", "tum", "t", "dis", {"kind": "tum", "path": str(tmp_path)})
+    assert not measure_energy(Job(bare))["ok"]
+
+
+def test_command_line_of_analyses_and_search(tmp_path, capsys, monkeypatch):
+    assert main(["bench", "accuracy", "--analysis", "list"]) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in ANALYSES)
+    assert main(["bench", "accuracy", "--analysis", "nothing", "--out", str(tmp_path)]) == 2
+    from soup_nlp.bench import search as module
+
+    kwdefaults = {**module.search.__kwdefaults__, "function": fake}
+    monkeypatch.setattr(module.search, "__kwdefaults__", kwdefaults)
+    words = ["bench", "search", "--trials", "4", "--width", "128", "--out", str(tmp_path)]
+    assert main([*words, "--param", "segmentation.neighbours=int:4:19", "-q"]) == 0
+    text = (tmp_path / "search.md").read_text()
+    assert "--param 'segmentation.neighbours=int:4:19'" in text
+    assert Path(tmp_path / "search.jsonl").is_file()
+    assert main([*words, "--param", "nonsense"]) == 2
