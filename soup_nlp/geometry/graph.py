@@ -208,12 +208,17 @@ def _sample_along(points: Float, which: Int, count: Int, samples: int | None) ->
 
 
 def _rim(labels: NDArray[np.int32], u: Float, v: Float, n: int, directions: int = 8) -> Float:
-    flat = labels.ravel()
+    order = np.argsort(labels.ravel(), kind="stable")
+    count = np.bincount(labels.ravel(), minlength=n)
+    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    owner, u, v = labels.ravel()[order], u[order], v[order]
     out = np.empty((n, directions, 2))
+    last = np.empty(n, np.int64)
     for k in range(directions):
         angle = 2 * np.pi * k / directions
         reach = u * np.cos(angle) + v * np.sin(angle)
-        order = np.lexsort((reach, flat))
-        last = order[np.cumsum(np.bincount(flat, minlength=n)) - 1]
+        top = np.flatnonzero(reach == np.maximum.reduceat(reach, start)[owner])
+        # of pixels that reach equally far the last one stays
+        last[owner[top]] = top
         out[:, k] = np.stack([u[last], v[last]], axis=1)
     return out
