@@ -236,8 +236,14 @@ def _yardstick(case: Case, kind: str) -> dict[str, Any]:
         "seconds": y.seconds,
         "cpu_seconds": y.cpu_seconds,
         "mre": mre,
-        "history": np.round(y.history, 6).tolist(),
+        "history": np.round(_thin(y.history), 6).tolist(),
     }
+
+
+def _thin(history: Float, most: int = 60) -> Float:
+    """At most `most` rows, first and last among them: enough for a plot."""
+    index = np.linspace(0, len(history) - 1, min(most, len(history))).round().astype(int)
+    return history[index]
 
 
 def main(argv: list[str]) -> int:
