@@ -14,6 +14,8 @@ Row = Mapping[str, Any]
 LIMITS = (
     "Times are wall times of one run each, set-up included, on the machine named; where it was "
     "shared with other work, CPU seconds stand beside them.",
+    "From the presolve's answer little is left to do: energies hardly move, what is compared is "
+    "how quickly a solver proves a point that is almost optimal. From the proposal it is harder.",
     "Local solvers end in local minima: an energy says where this start led, not what is best.",
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
     "Solvers run with the options in `soup_nlp/compare/solvers.py`, the package's own ones being "
