@@ -158,7 +158,7 @@ def test_split_keeps_scenes_apart():
     assert not {i.name for i in train} & {i.name for i in validation}
 
 
-@pytest.mark.parametrize("name", [n for n in ANALYSES if n not in ("energy", "flows")])
+@pytest.mark.parametrize("name", [n for n in ANALYSES if n != "energy"])
 def test_every_variant_of_an_analysis_is_a_problem(name):
     for overrides in ANALYSES[name].variants.values():
         items(0)[0].problem(overrides)
@@ -210,6 +210,20 @@ def test_energy_at_the_truth(tmp_path):
     # a pair without motions says so
     bare = Item("shared", "tum", "t", "dis", {"kind": "tum", "path": str(tmp_path)})
     assert not measure_energy(Job(bare))["ok"]
+
+
+def test_errors_of_flow_sources(tmp_path):
+    listing = list_suite("rendered", None, Options(width=160, flows=("truth",), limit=2))
+    path = run_analysis("flows", [listing], tmp_path, ("segmentation.superpixels=30",))
+    text = path.read_text()
+    rows = [json.loads(line) for line in (tmp_path / "flows.jsonl").read_text().splitlines()]
+    error = {(r["pair"], r["variant"]): r["flow_error"]["weighted_mean"] for r in rows if r["ok"]}
+    for pair in {p for p, _ in error}:
+        assert 0 < error[pair, "dis, reweighted 0.25"] < error[pair, "dis"] < 1.0
+    assert "Mean of 2 pairs" in text
+    # without the contributed modules the source is a row that failed
+    assert "rlof" in text
+    assert (tmp_path / "flows.png").stat().st_size > 1000
 
 
 def test_command_line_of_analyses_and_search(tmp_path, capsys, monkeypatch):

@@ -10,6 +10,7 @@ from types import MappingProxyType
 from soup_nlp.bench.accuracy import Job, Row, measure
 from soup_nlp.bench.accuracy_runner import Say, Where, measure_all
 from soup_nlp.bench.analyses_energy import measure_energy
+from soup_nlp.bench.analyses_flow import measure_flow, plot_flow, text_flow
 from soup_nlp.bench.analyses_report import plot_energy, plot_variants, text_energy, text_variants
 from soup_nlp.bench.suites import Item, Listing
 from soup_nlp.errors import ConfigError
@@ -110,6 +111,20 @@ _ALL = (
         "stages",
     ),
     Analysis(
+        "flows",
+        "error of the flow itself by source, with and without robust re-weighting (no solve)",
+        {
+            "dis": ("flow.source=dis",),
+            "dis, reweighted 0.5": ("flow.source=dis", "flow.reweight_px=0.5"),
+            "dis, reweighted 0.25": ("flow.source=dis", "flow.reweight_px=0.25"),
+            "rlof": ("flow.source=rlof",),
+            "rlof, reweighted 0.25": ("flow.source=rlof", "flow.reweight_px=0.25"),
+        },
+        "flow",
+        true_flow_only=True,
+        function=measure_flow,
+    ),
+    Analysis(
         "energy",
         "energy at the truth against the solution, by term; what is made of the truth",
         {"": ()},
@@ -173,15 +188,15 @@ def run_analysis(
         function=analysis.function,
     )
     note = f"Overrides of every pair: {', '.join(f'`{o}`' for o in overrides) or 'none'}."
-    text = text_energy if name == "energy" else text_variants
-    plot = plot_energy if name == "energy" else plot_variants
+    text = {"energy": text_energy, "flows": text_flow}.get(name, text_variants)
     write_text(out / f"{name}.md", text(analysis.name, analysis.text, rows, note))
     with atomic_path(out / f"{name}.png") as temporary:
         if name == "energy":
             plot_energy(temporary, rows)
+        elif name == "flows":
+            plot_flow(temporary, rows)
         else:
             plot_variants(temporary, analysis.axis, analysis.text, rows, analysis.numeric)
-    del plot
     return out / f"{name}.md"
 
 
