@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from soup_nlp.bench.speed_fit import fit, outside
 from soup_nlp.report.atomic import atomic_path
@@ -64,6 +65,14 @@ def plot_growth(path: Path, records: Sequence[Record]) -> None:
     left.legend(fontsize=8)
     right.set(xlabel="superpixels N", ylabel="GB")
     right.set_title("peak memory", fontsize=10)
+    for axes in (left, right):
+        sizes = sorted({r["spec"]["superpixels"] for r in records})
+        axes.set_xticks(sizes, [str(n) for n in sizes])
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    figure.tight_layout()
     _save(figure, path)
 
 

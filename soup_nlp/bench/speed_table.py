@@ -74,6 +74,7 @@ def _size(name: str) -> Cell:
 STAGES: dict[str, Cell] = {
     **IDENTITY,
     **{name: _phase(name) for name in PHASES},
+    "compiler, CPU s": lambda r: f"{r['cpu'].get('compiler', 0.0):.2f}",
     "outside, CPU s": lambda r: f"{outside(r):.2f}",
 }
 SIZES: dict[str, Cell] = {
@@ -221,8 +222,8 @@ def report(records: Sequence[Record], machine: Mapping[str, str], day: str) -> s
         "## Limits",
         "",
         "Wall times of a shared machine vary with its load; CPU times less so. One thread."
-        " Compiling the kernels happens once a machine and is in the wall time of the run that"
-        " does it, not in CPU time. Loading is rendering for the scenes; outside: flow,"
+        " Compiling the kernels happens once a machine and is in the wall time (build) of the run"
+        " that does it, not in its CPU time. Loading is rendering for the scenes; outside: flow,"
         " segmentation, start, weights, evaluation and output with every picture, point cloud"
         " and HDF5.",
     ]
