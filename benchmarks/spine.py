@@ -3,7 +3,8 @@
     python benchmarks/spine.py [--data ../shared/data] [--out out/spine] [--only street,room]
 
 A run whose folder already holds a summary is not repeated, so the table can be resumed. Real
-pairs are measured where --data holds them (kitti2012/, driving_synthetic/) and skipped elsewhere.
+pairs are measured where --data holds them (kitti2012/, driving_synthetic/ and so on) and skipped
+elsewhere. `soup-nlp bench accuracy` measures the same pairs beside their rivals.
 """
 
 from __future__ import annotations
@@ -16,35 +17,22 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from soup_nlp import load_problem, make_problem, run
+from soup_nlp import run
+from soup_nlp.bench.suites import list_suite
 from soup_nlp.config import Problem, dump_problem
 from soup_nlp.report.folder import prepare_folder, write_folder
 
 ROOT = Path(__file__).parent.parent
-SCENES = ("street", "room", "sheet", "orbit", "still")
 
 
 def problems(data: Path) -> Iterator[tuple[str, str, Problem]]:
-    """(name, flow source, problem) of the suite."""
-    for scene in SCENES:
-        for flow in ("truth", "dis"):
-            path = ROOT / "problems" / f"{scene}.yaml"
-            yield scene, flow, load_problem(path, [f"flow.source={flow}"])
-    yield "motorcycle", "dis", load_problem(ROOT / "problems" / "motorcycle.yaml")
-    if (data / "kitti2012").is_dir():
-        for index in ("000138", "000027"):
-            for flow in ("truth", "dis"):
-                source = {"kind": "kitti2012", "root": str(data / "kitti2012"), "index": index}
-                raw: dict[str, Any] = {"input": source, "flow": {"source": flow}}
-                yield f"kitti2012 {index}", flow, make_problem(raw)
-    if (data / "driving_synthetic").is_dir():
-        for flow in ("truth", "dis"):
-            source = {"kind": "folder", "path": str(data / "driving_synthetic")}
-            yield (
-                "driving_synthetic",
-                flow,
-                make_problem({"input": source, "flow": {"source": flow}}),
-            )
+    """(name, flow source, problem): the rendered scenes and the real pairs that are there."""
+    items = list(list_suite("rendered").items)
+    if data.is_dir():
+        items += list_suite("shared", data).items
+    for item in items:
+        name = item.sequence if item.suite == "rendered" else item.name
+        yield name, item.flow, item.problem()
 
 
 def row(name: str, flow: str, summary: dict[str, Any]) -> str:
