@@ -13,7 +13,12 @@ from soup_nlp.bench import analyses
 from soup_nlp.bench.accuracy import Job, head
 from soup_nlp.bench.analyses import ANALYSES, run_analysis
 from soup_nlp.bench.analyses_energy import measure_energy
-from soup_nlp.bench.analyses_report import plot_variants, text_energy, text_variants
+from soup_nlp.bench.analyses_report import (
+    plot_energy,
+    plot_variants,
+    text_energy,
+    text_variants,
+)
 from soup_nlp.bench.search import (
     DEFAULT_SPACE,
     FAILED,
@@ -207,6 +212,8 @@ def test_energy_at_the_truth(tmp_path):
     assert energy["refined from truth"] <= tol * energy["NLP from truth"]
     text = text_energy("energy", "what", [{**row, "code": "c"}])
     assert f"{energy['truth'] / energy['solution']:.3f}" in text
+    plot_energy(tmp_path / "e.png", [row, row])
+    assert (tmp_path / "e.png").stat().st_size > 1000
     # a pair without motions says so
     bare = Item("shared", "tum", "t", "dis", {"kind": "tum", "path": str(tmp_path)})
     assert not measure_energy(Job(bare))["ok"]

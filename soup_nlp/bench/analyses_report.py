@@ -172,26 +172,30 @@ def plot_variants(
 
 
 def plot_energy(path: Path, rows: Sequence[Row]) -> None:
-    """Stacked terms of every soup, relative to the solution's energy."""
+    """Terms of every soup stacked, relative to the solution's energy; a panel a pair.
+
+    A start far above all others is cut off at the top.
+    """
     good = [r for r in rows if r.get("ok")]
-    figure, ax = _figure(max(5.0, 1.6 * len(good) + 2), 4)
-    position, ticks = 0.0, []
-    for row in good:
-        total = row["energy"]["solution"]["total"] or 1.0
-        for soup, e in row["energy"].items():
-            bottom = 0.0
-            for term in TERMS:
-                part = e[term] / total
-                ax.bar(position, part, bottom=bottom, width=0.9, color=COLOURS[term])
-                bottom += part
-            ticks.append((position, f"{soup}"))
-            position += 1
-        ax.text(position - 1, 1.02, _title(row), fontsize=6, ha="right", rotation=0)
-        position += 1
-    ax.axhline(1.0, color="k", lw=0.5)
-    ax.set_xticks([t[0] for t in ticks], [t[1] for t in ticks], rotation=90, fontsize=6)
-    for term in TERMS:
-        ax.bar(0, 0, color=COLOURS[term], label=term)
-    ax.legend(fontsize=7)
-    ax.set(ylabel="E / E(solution)", title="Energy at the truth and at the solution")
+    columns = min(5, max(1, len(good)))
+    lines = max(1, -(-len(good) // columns))
+    figure = Figure(figsize=(2.4 * columns + 1, 3.2 * lines), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    for k, row in enumerate(good):
+        ax = figure.add_subplot(lines, columns, k + 1)
+        unit = row["energy"]["solution"]["total"] or 1.0
+        soups = list(row["energy"])
+        bottom = np.zeros(len(soups))
+        for term in TERMS:
+            part = np.array([row["energy"][s][term] for s in soups]) / unit
+            ax.bar(np.arange(len(soups)), part, bottom=bottom, color=COLOURS[term], label=term)
+            bottom += part
+        ax.set_ylim(0, 1.1 * max(total for s, total in zip(soups, bottom) if s != "start"))
+        ax.axhline(1.0, color="k", lw=0.5)
+        ax.set_xticks(np.arange(len(soups)), soups, rotation=90, fontsize=7)
+        ax.set_title(_title(row), fontsize=7)
+        if k % columns == 0:
+            ax.set_ylabel("E / E(solution)")
+        if k == 0:
+            ax.legend(fontsize=6)
     figure.savefig(path, format="png")
