@@ -47,7 +47,7 @@ class Weights:
     sigma_cont: float = 1.0
     sigma_cont_ref: float = np.inf
     sigma_orient: float = 0.5
-    sigma_arap: float = 1.0
+    sigma_arap: float = 0.5
     leak_arap: float = 0.01
     sigma_proj: float = np.inf
 
