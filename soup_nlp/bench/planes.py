@@ -22,7 +22,7 @@ def fit_planes(
 
     Minimises sum |z - 1 / (m . r)| / z = sum |u - 1| / u with u = z m . r by iteratively
     re-weighted least squares from the least-squares plane; the best iterate of each label is kept,
-    a constant inverse depth where no plane is better. The mean relative error is not convex in m,
+    the best constant depth where no plane is better. The mean relative error is not convex in m,
     so this is an upper bound of the best, close to it where one plane suits most pixels.
 
     Args:
@@ -48,26 +48,34 @@ def fit_planes(
     z = depth[known].astype(np.float64)
     zr = z[:, None] * rays(K, pixel_grid(*depth.shape))[known]
     count = np.bincount(which, minlength=n)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean_inverse = np.bincount(which, 1 / z, n) / count
-    best = np.column_stack([np.zeros((n, 2)), mean_inverse])
-    lowest = _errors(best, which, zr, count)
-    # the median inverse depth is the best constant but for a weight
-    order = np.lexsort((1 / z, which))
-    begin = np.concatenate([[0], np.cumsum(count)[:-1]])
-    middle = np.minimum(begin + count // 2, len(order) - 1)
-    median = np.column_stack([np.zeros((n, 2)), (1 / z)[order][middle]])
-    best, lowest = _better(best, lowest, median, _errors(median, which, zr, count), count > 0)
+    constant = np.column_stack([np.zeros((n, 2)), _best_constant(which, z, count)])
+    best, lowest = constant, _errors(constant, which, zr, count)
     weight = np.ones(len(z))
     rich = count >= LEAST
     for _ in range(rounds):
-        m = _solve(which, zr, weight, n, median)
+        m = _solve(which, zr, weight, n, constant)
         cost = _errors(m, which, zr, count)
         best, lowest = _better(best, lowest, m, cost, rich)
         u = np.maximum(np.einsum("pc,pc->p", zr, m[which]), 0.05)
         weight = 1.0 / (u * u * np.maximum(np.abs(1 - 1 / u), softening))
     best[count == 0] = np.nan
     return best
+
+
+def _best_constant(which: Labels, z: Float, count: Labels) -> Float:
+    """(N,) inverse of the constant c that minimises sum |z - c| / z: a weighted median of z."""
+    order = np.lexsort((z, which))
+    own = which[order]
+    mass = np.cumsum(1 / z[order])
+    end = np.cumsum(count)
+    before = np.where(end - count > 0, mass[np.maximum(end - count, 1) - 1], 0.0)
+    half = 0.5 * (before + mass[np.maximum(end, 1) - 1])
+    # the first pixel of every label at which half of its weight is reached
+    reached = np.flatnonzero(mass >= half[own] * (1 - 1e-12))
+    out = np.ones(len(count))
+    label, first = np.unique(own[reached], return_index=True)
+    out[label] = 1 / z[order][reached[first]]
+    return out
 
 
 def _solve(which: Labels, zr: Float, weight: Float, n: int, prior: Float) -> Float:
