@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from soup_nlp.bench import accuracy
 from soup_nlp.bench.accuracy import Job, clean, code_version, measure, settings_hash
 from soup_nlp.bench.accuracy_runner import Where, measure_all, read_rows
 from soup_nlp.bench.accuracy_table import report
@@ -182,6 +183,12 @@ def test_settings_hash_is_the_same_on_every_pair():
     assert settings_hash(a) == settings_hash(b)
     assert settings_hash(a) != settings_hash(item().problem(["flow.source=truth"]))
     assert settings_hash(a) != settings_hash(item().problem(["energy.weights.cont=9.0"]))
+
+
+def test_code_version_knows_every_source():
+    root = Path(accuracy.__file__).parents[1]
+    assert all(list(root.glob(pattern)) for pattern in accuracy.CODE)
+    assert code_version().startswith("0.")
 
 
 def test_clean_leaves_plain_json():

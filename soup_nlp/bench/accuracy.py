@@ -35,8 +35,13 @@ Row = dict[str, Any]
 KEPT = ("mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3")
 """Errors that a row keeps, beside scale, coverage and skill."""
 
-CODE = ("data", "geometry", "model", "start", "solve", "refine", "report")
-"""Rooms whose sources make the code version of a row."""
+CODE = (
+    *(f"{room}/*.py" for room in ("data", "geometry", "model", "start", "solve", "refine")),
+    *(f"report/{name}.py" for name in ("metrics", "protocols", "scene_flow", "baselines")),
+    *(f"bench/{name}.py" for name in ("accuracy", "planes", "rivals", "truth")),
+    *("pipeline.py", "inputs.py", "scoring.py"),
+)
+"""Sources that decide the numbers of a row: they make its code version."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +78,8 @@ def code_version() -> str:
     """Version and hash of the sources that decide a result, as they were at the first call."""
     root = Path(soup_nlp.__file__).parent
     digest = hashlib.sha256()
-    files = [f for name in CODE for f in (root / name).glob("*.py")]
-    for file in sorted([*files, *(root / f"{n}.py" for n in ("pipeline", "inputs", "scoring"))]):
-        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    for file in sorted({f for pattern in CODE for f in root.glob(pattern)}):
+        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
     return f"{soup_nlp.__version__}-{digest.hexdigest()[:10]}"
 
 
