@@ -427,18 +427,22 @@ def build_tangent_nlp(
     b.add_constraint(
         "t_simplex", lam, part, part * lam, np.arange(n)[:, None] * 9, share[:, None], row
     )
-    # visibility as in the constrained NLP, linear in the slopes
+    # visibility as in the constrained NLP, divided by the anchor's facing 1 / |m|: the same set, so
+    # that one's solution is the other's
     count = data.rim_ray.shape[1] - 1
     off = (data.rim_ray[:, 1:] - data.rim_ray[:, :1])[..., :2] / layout.radius[:, None, None]
     slope, place = ca.SX.sym("slope", 2), ca.SX.sym("off", 2 * count)
-    rows = b.new_rows("visible", count * n, 1 / form.depth_ratio - 1 + 1e-2, np.inf)
+    ray, reach = ca.SX.sym("ray", 2), ca.SX.sym("radius")
+    facing = ca.norm_2(ca.vertcat(slope / reach, 1 - ca.dot(slope, ray) / reach))
+    rows = b.new_rows("visible", count * n, 1 / form.depth_ratio - 1, np.inf)
     b.add_constraint(
         "t_visible",
         slope,
-        place,
-        ca.vertcat(*[ca.dot(slope, place[2 * j : 2 * j + 2]) for j in range(count)]),
+        ca.vertcat(place, ray, reach),
+        ca.vertcat(*[ca.dot(slope, place[2 * j : 2 * j + 2]) for j in range(count)])
+        - form.min_facing * facing,
         np.arange(n)[:, None] * 9 + np.array([1, 2]),
-        off.reshape(n, -1),
+        np.column_stack([off.reshape(n, -1), layout.anchor[:, :2], layout.radius]),
         rows.reshape(n, count),
     )
     b.add_ridge(np.ones(9 * n))

@@ -19,6 +19,7 @@ from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.ipopt import Ipopt, Listener, Stage
 from soup_nlp.solve.kkt import residuals
+from soup_nlp.solve.warm import WARM, warm_start
 
 Float = NDArray[np.float64]
 
@@ -137,10 +138,11 @@ def solve_soup(
     say = say or (lambda line: None)
     begin = time.perf_counter()
     seconds = {"presolve": 0.0}
-    soup = start
+    soup, presolved = start, None
     stages: list[Stage] = []
     if o.presolve:
-        soup = _presolve(start, data, weights, form, o, stages, listener, stop, say, log_file)
+        presolved = _presolve(start, data, weights, form, o, stages, listener, stop, say, log_file)
+        soup = presolved
         seconds["presolve"] = time.perf_counter() - begin
     if plain.energy(soup, data, weights)["total"] > plain.energy(start, data, weights)["total"]:
         soup = start
@@ -150,8 +152,13 @@ def solve_soup(
     seconds["compile"] = nlp.compile_seconds
     say(str(nlp))
     mark = time.perf_counter()
-    stage = Ipopt(nlp, o.ipopt)(
+    warm: dict[str, Any] = {}
+    smooth = form.norm == "smooth" and form.truncation == "smooth"
+    if smooth and soup is presolved and o.polish_iterations and stages[-1].converged:
+        warm = warm_start(nlp, data, soup, stages[-1].lam_g)
+    stage = Ipopt(nlp, {**(WARM if warm else {}), **o.ipopt})(
         x0=nlp.x0,
+        **warm,
         max_iter=o.max_iter,
         tol=o.tol,
         seconds=max(1.0, o.max_seconds - (mark - begin)),

@@ -1,0 +1,64 @@
+"""Multipliers of the constrained NLP from those of the presolve: a start at its KKT point.
+
+Without them Ipopt's least-squares guess gives active visibility rows no force; the Hessian of the
+Lagrangian is then indefinite and the first dozen iterations walk back to where they began.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy import EnergyData
+from soup_nlp.model.nlp import NLP, to_scipy
+
+Float = NDArray[np.float64]
+
+WARM: Mapping[str, Any] = {
+    "warm_start_init_point": "yes",
+    "mu_init": 1e-8,
+    "warm_start_bound_push": 1e-10,
+    "warm_start_bound_frac": 1e-10,
+    "warm_start_slack_bound_push": 1e-10,
+    "warm_start_slack_bound_frac": 1e-10,
+    "warm_start_mult_bound_push": 1e-10,
+}
+"""Ipopt options that leave a given start where it is."""
+
+
+def warm_start(nlp: NLP, data: EnergyData, soup: Soup, lam_tangent: Float) -> dict[str, Float]:
+    """Start multipliers of the constrained NLP at the presolve's solution.
+
+    Args:
+        nlp: The constrained NLP, started at `soup`.
+        data: Numbers of the energy.
+        soup: The presolve's answer.
+        lam_tangent: (1 + N V,) multipliers of the presolve: simplex, then rim visibility.
+
+    Returns:
+        lam_x0, lam_g0. Visibility: the presolve's rows are the constrained NLP's divided by the
+        anchor's facing, so the multipliers are as well. Equalities: least squares of
+        stationarity.
+    """
+    n, rims = len(data), data.rim_ray.shape[1] - 1
+    lam_g = np.zeros(nlp.ng)
+    rim = lam_tangent[1 : 1 + n * rims].reshape(n, rims)
+    facing = -np.einsum("nc,nc->n", soup.n, data.anchor_ray)
+    visible = next(g for g in nlp.groups if g.kernel.name == "visible").table.rows
+    lam_g[visible[:, 1:]] = rim / facing[:, None]
+    _, gradient = nlp.grad_f(nlp.x0, nlp.p)
+    J = to_scipy(nlp.jac_g(nlp.x0, nlp.p)[1]).tocsr()
+    force = np.asarray(gradient).ravel() + J.T @ lam_g
+    equal = np.flatnonzero(nlp.lbg == nlp.ubg)
+    A = J[equal]
+    gram = (A @ A.T).tocsc()
+    lam_g[equal] = splu(gram + 1e-12 * sparse.identity(len(equal), format="csc")).solve(
+        -(A @ force)
+    )
+    return {"lam_x0": np.zeros(nlp.nx), "lam_g0": lam_g}
