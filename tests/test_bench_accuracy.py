@@ -342,6 +342,12 @@ def test_published_numbers_are_marked():
     assert "| BMM (published) | 0.0322 |" in text
     assert "(measured) | 0.0300 |" in text
     assert "beats every rival on 1 of 1" in text
+    # one rigid motion is met on its own pixels
+    metrics = row["metrics"]["paper"]
+    metrics |= {"rigid": {"mre": 0.025, "coverage": 0.6}, "solution_rigid": {"mre": 0.02}}
+    assert "beats every rival on 1 of 1" in report("T", [row])
+    metrics["solution_rigid"]["mre"] = 0.026
+    assert "beats every rival on 0 of 1" in report("T", [row])
     assert set(RIVALS) <= set(METHODS)
 
 

@@ -70,18 +70,27 @@ def report(title: str, rows: Sequence[Row], note: str = "") -> str:
 
 
 def _verdict(good: Sequence[Row], total: int, convention: str) -> str:
-    beaten = [
-        r
-        for r in good
-        if (own := get(r, convention, "solution")) is not None
-        and all(own < x for m in RIVALS if (x := get(r, convention, m)) is not None)
-    ]
+    beaten = [r for r in good if _beats_all(r, convention)]
     with_truth = [r for r in good if get(r, convention, "solution") is not None]
     return (
         f"{len(good)} of {total} pairs measured, {sum(bool(r['good']) for r in good)} converged."
         f" The solution beats every rival on {len(beaten)} of {len(with_truth)}"
         f" (MRE, convention `{convention}`)."
     )
+
+
+def _beats_all(row: Row, convention: str) -> bool:
+    """Whether the solution is better than every rival; `rigid` is met where it has a depth."""
+    own = get(row, convention, "solution")
+    if own is None:
+        return False
+    there = get(row, convention, "solution_rigid")
+    for rival in RIVALS:
+        theirs = get(row, convention, rival)
+        mine = there if rival == "rigid" and there is not None else own
+        if theirs is not None and not mine < theirs:
+            return False
+    return True
 
 
 def _made(rows: Sequence[Row]) -> str:

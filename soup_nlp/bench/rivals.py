@@ -24,6 +24,7 @@ METHODS: Mapping[str, str] = MappingProxyType(
         "nlp": "the NLP alone, before refinement",
         "start": "the start: shared motions, scales by contact",
         "unorganised": "independent superpixels: each with a translation of length 1, no assembly",
+        "solution_rigid": "the solution, only where one rigid motion has a depth",
         "rigid": "one rigid motion, triangulated; only where it has a depth",
         "rigid_filled": "the same, holes filled from the nearest pixel",
         "plane": "the best single plane (fitted to the truth)",
@@ -67,6 +68,8 @@ def depth_maps(run: Run) -> dict[str, Float]:
     alone = reconstruct(unorganised(run.start.soup), labels, pair.K_ref, pair.K_next)
     out["unorganised"] = alone.depth_ref
     if run.rigid is not None:
+        there = np.isfinite(run.rigid.depth)
+        out["solution_rigid"] = np.where(there, run.reconstruction.depth_ref, np.nan)
         out["rigid"] = run.rigid.depth
         if np.isfinite(run.rigid.depth).any():
             out["rigid_filled"] = fill_nearest(run.rigid.depth)
