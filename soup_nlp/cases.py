@@ -12,10 +12,11 @@ from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.inputs import load_flow_of, load_pair
-from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
+from soup_nlp.model.energy import EnergyData, Weights
 from soup_nlp.model.formulation import Formulation, build_matrix_nlp
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
+from soup_nlp.pipeline import build_energy
 from soup_nlp.solve.soup import SolverOptions, solve_soup
 from soup_nlp.start.propose import Start, StartOptions, propose
 
@@ -87,14 +88,7 @@ def prepare(
     options = StartOptions(**{**problem.start.model_dump(), "seed": problem.seed})
     start = propose(seg, flow, pair.K_ref, pair.K_next, options)
     say(str(start))
-    e = problem.energy
-    pixels = None if e.pixel_samples == "all" else e.pixel_samples
-    data = build_energy_data(
-        seg, flow, pair.K_ref, pair.K_next, pixels, problem.seed, e.arap_at_anchors
-    )
-    if e.units == "pixel":
-        data = in_pixels(data, start.soup, seg, e.rotation_px)
-    weights = Weights(**e.weights.model_dump())
+    data, weights = build_energy(problem, pair, seg, start)
     solver = problem.solver.model_dump()
     solver["presolve_eps"] = tuple(solver["presolve_eps"])
     stages = SolverOptions(**solver)

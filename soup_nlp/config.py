@@ -86,6 +86,8 @@ class EnergyConfig(Strict):
     Attributes:
         units: pixel (every term in pixels, free of scale) or paper (one length unit).
         arap_at_anchors: Motion difference at the anchors instead of the camera's origin.
+        arap_across: Factor of E_arap between superpixels that the start gives to different bodies;
+            1 is the paper's.
         rotation_px: Pixels per radian of rotation difference; null for the focal length.
         pixel_samples: Pixels per superpixel in E_proj, or all.
         weights: Factors of the terms and their truncations.
@@ -93,6 +95,7 @@ class EnergyConfig(Strict):
 
     units: Literal["pixel", "paper"] = "pixel"
     arap_at_anchors: bool = False
+    arap_across: Annotated[float, Field(ge=0, le=1)] = 0.1
     rotation_px: Positive | None = None
     pixel_samples: Annotated[int, Field(ge=1)] | Literal["all"] = 16
     weights: EnergyWeights = EnergyWeights()

@@ -33,6 +33,7 @@ RANGES: Mapping[str, tuple[float | None, float | None]] = {
     "tau": (1e-6, None),
     "limit": (1e-6, None),
     "support": (1, None),
+    "planes": (0, 20),
     "particles": (2, None),
     "keep": (0, 0.9),
     "depth_reach": (1, None),

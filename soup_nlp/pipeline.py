@@ -18,7 +18,13 @@ from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.inputs import load_flow_of, load_pair
 from soup_nlp.model import plain
-from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
+from soup_nlp.model.energy import (
+    EnergyData,
+    Weights,
+    between_bodies,
+    build_energy_data,
+    in_pixels,
+)
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.refine.mppbp import Refined, RefineOptions, refine_soup
@@ -156,14 +162,7 @@ def run(
     start = propose(seg, flow, pair.K_ref, pair.K_next, options)
     lap("start")
     _tell(say, start)
-    e = problem.energy
-    pixels = None if e.pixel_samples == "all" else e.pixel_samples
-    data = build_energy_data(
-        seg, flow, pair.K_ref, pair.K_next, pixels, problem.seed, e.arap_at_anchors
-    )
-    if e.units == "pixel":
-        data = in_pixels(data, start.soup, seg, e.rotation_px)
-    weights = Weights(**e.weights.model_dump())
+    data, weights = build_energy(problem, pair, seg, start)
     form = Formulation(**problem.formulation.model_dump())
     refine = RefineOptions(**problem.refine.model_dump())
 
@@ -260,6 +259,22 @@ def _skipped(start: Soup, data: EnergyData, weights: Weights, form: Formulation)
         description="",
         seconds={},
     )
+
+
+def build_energy(
+    problem: Problem, pair: Pair, seg: Segmentation, start: Start
+) -> tuple[EnergyData, Weights]:
+    """The energy that a problem asks for, on a pair that carries its flow."""
+    assert pair.flow is not None
+    e = problem.energy
+    pixels = None if e.pixel_samples == "all" else e.pixel_samples
+    data = build_energy_data(
+        seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, e.arap_at_anchors
+    )
+    data = between_bodies(data, start.body, e.arap_across)
+    if e.units == "pixel":
+        data = in_pixels(data, start.soup, seg, e.rotation_px)
+    return data, Weights(**e.weights.model_dump())
 
 
 def _polished(refined: Refined, again: Solution) -> Refined:

@@ -165,7 +165,7 @@ def test_onnx_network(onnx, tmp_path, stacked, size):
     np.testing.assert_allclose(flow.uv[20, 20], 2.0 * scale, rtol=1e-4)
     assert flow.uv.shape == (90, 130, 2)
     # the way back has the opposite sign: all but the edge is consistent
-    assert flow.confidence[:80, :120].min() > 0.99
+    assert flow.confidence[:72, :112].min() > 0.99
     assert flow.source == "tiny.onnx"
 
 

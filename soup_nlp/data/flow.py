@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.flow_check import checked_flow, leaves, round_trip_error
+from soup_nlp.data.flow_check import SUPPORT, FloatMap, confidence_of, leaves, round_trip_error
+from soup_nlp.data.flow_guided import guided_flow
 from soup_nlp.data.flow_learned import MODELS, learned_flow
 from soup_nlp.data.flow_noise import PREFIX, noise_level, noisy
 from soup_nlp.data.flow_rlof import rlof_flow
@@ -68,7 +69,8 @@ def dis_flow(
     equalize: bool = False,
     tau: float = 1.0,
     limit: float = 3.0,
-    support: int = 5,
+    support: int = SUPPORT,
+    planes: int = 4,
 ) -> Flow:
     """Dense inverse search flow (Kroeger et al., ECCV 2016) with forward-backward confidence.
 
@@ -80,6 +82,10 @@ def dis_flow(
     The defaults are the medium preset at full resolution with denser patches (stride 2 for 3)
     and a longer, smoother refinement (20 iterations for 5, alpha 30 for 20) that trusts gradients
     over intensities (delta 1 for 5); the error falls on driving, indoor and rendered pairs alike.
+
+    The flow is also looked for after each of the dominant homographies (`planes`) has brought the
+    images together, and the better one is taken pixel by pixel (`flow_guided`): near a driving
+    camera displacements are too large for the coarse-to-fine search alone.
 
     Consistency is not proof: a wrong flow that both directions agree on, as on weak texture, keeps
     its confidence.
@@ -102,6 +108,7 @@ def dis_flow(
         tau: Forward-backward error, pixels, at which confidence is exp(-1).
         limit: Forward-backward error, pixels, above which confidence is 0.
         support: Side of the window for the mean error, odd, pixels; 1 is the pixel itself.
+        planes: Dominant homographies under which the flow is looked for again; 0 for none.
 
     Returns:
         Flow of source "dis", size of the reference image.
@@ -110,7 +117,7 @@ def dis_flow(
         DataError: an image is not uint8, too small, or an option is out of range.
     """
     ref, nxt = _grey(image_ref, "image_ref"), _grey(image_next, "image_next")
-    _check_options(finest_scale, preset, patch_size, patch_stride, tau, limit, support)
+    _check_options(finest_scale, preset, patch_size, patch_stride, tau, limit, support, planes)
     height, width = ref.shape
     if min(float(ref.std()), float(nxt.std())) < _FLAT:
         zero = np.zeros((height, width), np.float32)
@@ -127,16 +134,21 @@ def dis_flow(
     dis.setVariationalRefinementDelta(delta)
     dis.setVariationalRefinementGamma(gamma)
     side = max(_WORK_SIDE, 2 * patch_size << finest_scale)
-    rows, cols = (max(*pair, side) for pair in zip(ref.shape, nxt.shape, strict=True))
-    a, b = _pad(ref, rows, cols), _pad(nxt, rows, cols)
+
+    def match(first: Image, second: Image) -> tuple[FloatMap, FloatMap]:
+        rows, cols = (max(*pair, side) for pair in zip(first.shape, second.shape, strict=True))
+        a, b = _pad(first, rows, cols), _pad(second, rows, cols)
+        (h1, w1), (h2, w2) = first.shape, second.shape
+        return dis.calc(a, b, None)[:h1, :w1], dis.calc(b, a, None)[:h2, :w2]
+
     try:
-        forward, backward = dis.calc(a, b, None), dis.calc(b, a, None)
+        forward, backward = match(ref, nxt)
+        uv, gap = guided_flow(ref, nxt, match, forward, backward, planes)
     except cv2.error as error:
         raise DataError(
             "DIS flow failed", where=f"images {width}x{height}", found=str(error).strip()
         ) from error
-    way, back = forward[:height, :width], backward[: nxt.shape[0], : nxt.shape[1]]
-    return checked_flow(way, back, "dis", tau, limit, support)
+    return Flow(np.ascontiguousarray(uv), confidence_of(gap, tau, limit, support), "dis")
 
 
 def _grey(image: Image, where: str) -> Image:
@@ -172,6 +184,7 @@ def _check_options(
     tau: float,
     limit: float,
     support: int,
+    planes: int,
 ) -> None:
     checks: list[tuple[str, object, bool, str]] = [
         ("finest_scale", finest_scale, 0 <= finest_scale <= 5, "0 to 5"),
@@ -181,6 +194,7 @@ def _check_options(
         ("tau", tau, tau > 0, "a positive number of pixels"),
         ("limit", limit, 0 < limit < np.inf, "a positive number of pixels"),
         ("support", support, support >= 1 and support % 2 == 1, "an odd number of pixels"),
+        ("planes", planes, 0 <= planes <= 20, "0 to 20"),
     ]
     for name, value, good, expected in checks:
         if not good:

@@ -10,6 +10,10 @@ from soup_nlp.data.pair import Flow
 
 FloatMap = NDArray[np.float32]
 
+SUPPORT = 15
+"""Side of the window over which the round trip must close as well, pixels: a wrong flow may agree
+with itself in a pixel, less so all around it."""
+
 _NOISE_CAP = 5.0  # pixels; keeps one wild pixel from condemning its whole window
 
 
@@ -64,7 +68,7 @@ def checked_flow(
     source: str,
     tau: float = 1.0,
     limit: float = 3.0,
-    support: int = 5,
+    support: int = SUPPORT,
 ) -> Flow:
     """A Flow whose confidence is its forward-backward consistency.
 
@@ -81,11 +85,18 @@ def checked_flow(
         support: Side of the window for the mean error, odd, pixels; 1 is the pixel itself.
     """
     uv = np.ascontiguousarray(forward, dtype=np.float32)
-    gap = round_trip_error(uv, backward)
+    confidence = confidence_of(round_trip_error(uv, backward), tau, limit, support)
+    uv[~np.isfinite(uv).all(axis=2)] = 0.0
+    return Flow(uv, confidence, source)
+
+
+def confidence_of(
+    gap: FloatMap, tau: float = 1.0, limit: float = 3.0, support: int = SUPPORT
+) -> FloatMap:
+    """(H, W) confidence of a round-trip error `gap`, see `checked_flow`."""
     if support > 1:
         mean = cv2.blur(np.minimum(gap, _NOISE_CAP), (support, support))
         gap = np.maximum(gap, mean)
     confidence = np.exp(-np.square(np.minimum(gap, limit) / tau), dtype=np.float32)
     confidence[~(gap <= limit)] = 0.0
-    uv[~np.isfinite(uv).all(axis=2)] = 0.0
-    return Flow(uv, confidence, source)
+    return np.asarray(confidence, dtype=np.float32)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.flow_check import checked_flow
+from soup_nlp.data.flow_check import SUPPORT, checked_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 
@@ -41,7 +41,7 @@ def learned_flow(
     *,
     tau: float = 1.0,
     limit: float = 3.0,
-    support: int = 5,
+    support: int = SUPPORT,
 ) -> Flow:
     """Flow of a network in both directions, with forward-backward confidence.
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.flow_check import checked_flow
+from soup_nlp.data.flow_check import SUPPORT, checked_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 
@@ -30,7 +30,7 @@ def rlof_flow(
     grid_step: int = 4,
     tau: float = 1.0,
     limit: float = 3.0,
-    support: int = 5,
+    support: int = SUPPORT,
 ) -> Flow:
     """Dense RLOF with forward-backward confidence.
 

@@ -75,8 +75,8 @@ class EnergyData:
         pair_unit: (P,) length unit of the pair.
         pair_count: (P,) 2: directed pairs folded into one (E_orient).
         rim_ray: (N, V, 3) rays where visibility is imposed, the anchor first.
-        local_units: edge_unit and pair_unit are shares of the mean depth of the two anchors (E is
-            then independent of scale, term by term) instead of lengths.
+        local_units: edge_unit and pair_unit are shares of the depth of the two anchors, mostly the
+            nearer one (E is then independent of scale, term by term), instead of lengths.
         share: (N,) weights c of the length unit: lengths are measured with sum_i c_i D_i = 1, D the
             plane distances; lam_i = c_i D_i is then on the simplex.
         arap_at_anchors: motion difference taken at the anchors rather than at the camera.
@@ -199,16 +199,33 @@ def build_energy_data(
     )
 
 
+def between_bodies(data: EnergyData, body: NDArray[np.int64], factor: float) -> EnergyData:
+    """The same data with E_arap's weights times `factor` on edges from one body to another.
+
+    As-rigid-as-possible holds inside a body. Across bodies it pulls a body that the camera's
+    motion explains at a wrong depth to that depth: with equal motions such an edge costs nothing.
+
+    Args:
+        data: Data of the pair.
+        body: (N,) group of every superpixel, as the start finds them.
+        factor: 1 is the paper's energy.
+    """
+    i, k = data.edges.T
+    return replace(data, edge_weight=np.where(body[i] == body[k], 1.0, factor) * data.edge_weight)
+
+
 def in_pixels(
     data: EnergyData, soup: Soup, seg: Segmentation, rotation_px: float | None = None
 ) -> EnergyData:
     """The same data with every term measured in pixels: the weights mean the same on every scene.
 
     A rotation by an angle a moves the image by `focal a`; a length l at depth Z by `focal l / Z`;
-    a depth gap g changes the parallax of a baseline T by `focal g / Z * T / Z`. Z is the mean
-    depth of the two anchors as it is, so that no term gains from shrinking or growing the scene:
-    with one global unit, superpixels without parallax run away to shorten all other lengths. The
-    ratio T / Z is a constant of the energy: its median around the superpixels at the start.
+    a depth gap g changes the parallax of a baseline T by `focal g / Z * T / Z`. Z is the depth
+    of the two anchors as they are, so that no term gains from shrinking or growing the scene: with
+    one global unit, superpixels without parallax run away to shorten all other lengths. It is
+    their power mean of exponent -4, close to the nearer one: the arithmetic mean rewards whoever
+    recedes. The ratio T / Z is a constant of the energy: its median around the superpixels at the
+    start.
 
     Args:
         data: Data in the paper's units.

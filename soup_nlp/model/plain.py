@@ -37,10 +37,10 @@ def energy(soup: Soup, data: EnergyData, weights: Weights) -> dict[str, float]:
 
 
 def _unit(soup: Soup, data: EnergyData, pairs: NDArray[np.int64]) -> Float | float:
-    """Length unit: the mean depth of two anchors, or the scene's own."""
+    """Length unit: a mean of the depths of two anchors near the smaller, or the scene's own."""
     if data.local_units:
         Z = soup.depth_at(data.anchor_ray)
-        return 0.5 * (Z[pairs[:, 0]] + Z[pairs[:, 1]])
+        return np.mean(Z[pairs] ** -4.0, axis=1) ** -0.25
     return float(np.sum(data.share * soup.distance))
 
 

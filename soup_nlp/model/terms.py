@@ -22,7 +22,9 @@ def arap(
     """E_arap of an edge, Eq. 1: rotation, translation and distance of the anchors."""
     sigma, leak = (row["sigma"], row["leak"]) if truncated else (None, 0.0)
     Xa, Xb = a.point(row["ray_i"]), b.point(row["ray_k"])
-    weight, unit = row["weight"], row["unit"] * ((Xa[2] + Xb[2]) / 2 if local else 1)
+    weight, unit = row["weight"], row["unit"]
+    if local:
+        unit = unit / _nearness(Xa, Xb)
     Ya, Yb = a.move(Xa), b.move(Xb)
     gap = a.lam * a.t - b.lam * b.t
     if at_anchors:
@@ -34,6 +36,12 @@ def arap(
         Norm("translation", weight, gap / unit, eps, sigma, leak=leak),
         Norm("distance", weight, stretch / unit, eps, sigma, leak=leak),
     ]
+
+
+def _nearness(Xa: ca.SX, Xb: ca.SX) -> ca.SX:
+    """Inverse depth of two points, mostly of the nearer: little is gained when one recedes."""
+    a, b = 1 / (Xa[2] * Xa[2]), 1 / (Xb[2] * Xb[2])
+    return ca.sqrt(ca.sqrt((a * a + b * b) / 2))
 
 
 def reprojection(a: View, row: Row, eps: ca.SX, K_next: ca.DM, truncated: bool) -> list[Norm]:
@@ -62,7 +70,7 @@ def continuity(
         after.append(a.move(Xa) - b.move(Xb))
     f = row["factor"]
     if local:
-        f = f * 2 / (a.point(row["ray_i"])[2] + b.point(row["ray_k"])[2])
+        f = f * _nearness(a.point(row["ray_i"]), b.point(row["ray_k"]))
     return [
         Norm(
             "gap_ref",

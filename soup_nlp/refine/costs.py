@@ -166,8 +166,10 @@ class PairCosts:
         """1 / length unit of a block, (b, L, L) or (b, 1, 1)."""
         if not self.data.local_units:
             return np.full((len(i), 1, 1), 1.0 / unit)
-        np.add(s.Z[i][:, :, None], s.Z[k][:, None, :], out=out)
-        return np.divide(2.0, out, out=out)
+        q = 0.5 * s.Z**-4.0
+        np.add(q[i][:, :, None], q[k][:, None, :], out=out)
+        np.sqrt(out, out=out)
+        return np.sqrt(out, out=out)
 
     def _arap(self, s: _State, rows: Int, unit: float, buffers: Float) -> Float:
         d, w = self.data, self.weights

@@ -123,7 +123,8 @@ def _rows(
     weights = {k: float(v) for k, v in tree["weights"].items()}
     for key in ("arap", "proj", "cont", "orient"):
         yield _same(f"weight {key}", settings["energy"]["weights"][key], weights[key])
-    for name, gap in recompute.data_errors(tree, float(settings["segmentation"]["beta"])).items():
+    beta, across = settings["segmentation"]["beta"], settings["energy"]["arap_across"]
+    for name, gap in recompute.data_errors(tree, float(beta), float(across)).items():
         yield Row(f"data {name}", 0.0, gap, RELATIVE, gap <= RELATIVE)
     for which in ("start", "nlp", "solution"):
         found = recompute.energy(_state(tree, which), tree["energy"], weights)

@@ -50,7 +50,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
 
     def unit(pairs: Int) -> Float:
         if bool(e["local_units"]):
-            return np.asarray(A[pairs, 2].mean(axis=1))
+            return np.asarray((1 / A[pairs, 2] ** 4).mean(axis=1) ** -0.25)
         return np.full(len(pairs), scene)
 
     arap = cont = orient = 0.0
@@ -173,12 +173,13 @@ def at_points(z: Float, points: Float) -> tuple[Float, Float]:
     return out, points[:, 2]
 
 
-def data_errors(tree: Mapping[str, Any], beta: float) -> dict[str, float]:
+def data_errors(tree: Mapping[str, Any], beta: float, across: float) -> dict[str, float]:
     """How far the stored numbers of the energy are from labels, flow and cameras.
 
     Args:
         tree: Arrays of result.h5.
         beta: Fall-off of w1, w2, 1/pixel.
+        across: Factor of an edge between two bodies of the start.
 
     Returns:
         Largest absolute difference by name; 0 is agreement.
@@ -204,7 +205,9 @@ def data_errors(tree: Mapping[str, Any], beta: float) -> dict[str, float]:
     gap = np.sqrt(((centre[i] - centre[k]) ** 2).sum(1))
     own, near = np.repeat(np.arange(n), seg["knn"].shape[1]), seg["knn"].ravel()
     directed = np.unique(np.minimum(own, near) * n + np.maximum(own, near))
+    body = tree["start"]["body"]
     weight = seg["edge_multiplicity"] * np.exp(-beta * gap)
+    weight[body[i] != body[k]] *= across
     return {
         "anchors": _gap(centre, seg["anchors"]),
         "anchor rays": _gap(rays(centre), e["anchor_ray"]),

@@ -22,7 +22,7 @@ _ENERGY: Mapping[str, tuple[str, str, str]] = {
     "pixel_target": ("px", "N,S,2", "where the flow brings the sampled pixels"),
     "pixel_weight": ("1", "N,S", "confidence x usable share / sample size; 0 drops a pixel"),
     "edges": ("1", "E,2", "K-NN edges i < k"),
-    "edge_weight": ("1", "E", "w1 = w2, both directions folded"),
+    "edge_weight": ("1", "E", "w1 = w2, both directions folded, less between two bodies"),
     "edge_unit": ("1", "E", "length unit of an edge, see local_units"),
     "rotation_scale": ("1", "", "factor of |R_i - R_k|"),
     "pairs": ("1", "P,2", "neighbours i < k that share boundary"),
@@ -33,7 +33,7 @@ _ENERGY: Mapping[str, tuple[str, str, str]] = {
     "pair_count": ("1", "P", "directed pairs folded into one (E_orient)"),
     "rim_ray": ("1", "N,V,3", "rays where visibility is imposed, the anchor first"),
     "share": ("1", "N", "weights c of the length unit sum_i c_i D_i = 1"),
-    "local_units": ("1", "", "units are shares of the mean depth of the two anchors"),
+    "local_units": ("1", "", "units are shares of the depths of two anchors, power mean -4"),
     "arap_at_anchors": ("1", "", "motion difference at the anchors, not at the camera"),
 }
 _HISTORY = {
@@ -106,6 +106,7 @@ def result_tree(run: Run) -> Tree:
             "parallax": Array(run.start.parallax, "px", "by which the translation moves", "N"),
             "borrowed": Array(run.start.borrowed, "1", "plane or motion from neighbours", "N"),
             "motion": Array(run.start.motion, "1", "dominant motion, -1 for its own", "N"),
+            "body": Array(run.start.body, "1", "group that seems to move as one", "N"),
         },
         "solution": _soup(run.soup),
         "nlp": _soup(run.solution.soup),

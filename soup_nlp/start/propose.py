@@ -60,6 +60,8 @@ class Start:
         parallax: (N,) pixels that its translation moves the anchor.
         borrowed: (N,) True where plane or motion come from neighbours.
         motion: (N,) index of its motion among `motions`, -1 for one of its own.
+        body: (N,) group that seems to move as one and shares one scale: a dominant motion, or a
+            connected piece of superpixels with motions of their own.
         motions: The dominant motions.
     """
 
@@ -68,6 +70,7 @@ class Start:
     parallax: Float
     borrowed: NDArray[np.bool_]
     motion: Int
+    body: Int
     motions: list[Motion]
 
     def __str__(self) -> str:
@@ -151,9 +154,10 @@ def propose(
         mu, slope, weak = np.ones(n), np.zeros((n, 2)), np.ones(n, bool)
     mu, slope = _borrow(mu, slope, label, weak, seg)
     soup = _soup(mu, slope, R, t, anchor, radius)
-    scale = _contact_scales(soup, _pieces(label, seg), seg, K_ref)
+    body = _pieces(label, seg)
+    scale = _contact_scales(soup, body, seg, K_ref)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t).normalised()
-    return Start(soup, own.cost[:, 0], parallax, weak, label, motions)
+    return Start(soup, own.cost[:, 0], parallax, weak, label, body, motions)
 
 
 @dataclass(frozen=True)
