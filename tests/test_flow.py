@@ -132,6 +132,7 @@ def test_dis_options(finest_scale: int, preset: str) -> None:
         {"tau": 0.0},
         {"limit": -1.0},
         {"support": 4},
+        {"planes": -1},
     ],
 )
 def test_dis_option_errors(option: dict) -> None:

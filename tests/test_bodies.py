@@ -1,0 +1,68 @@
+"""E_arap between bodies: who recedes gains little, and edges of two bodies weigh less."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soup_nlp.data.pair import Flow
+from soup_nlp.geometry import camera
+from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model import plain
+from soup_nlp.model.energy import Weights, between_bodies, build_energy_data, in_pixels
+
+K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
+
+
+@pytest.fixture(scope="module")
+def world():
+    """Eight fronto-parallel planes in two rows, the right half with another translation."""
+    v, u = np.mgrid[0:16, 0:32]
+    labels = (v // 8 * 4 + u // 8).astype(np.int32)
+    seg = build_segmentation(labels, np.zeros((16, 32, 3), np.uint8), neighbours=4)
+    flow = Flow(np.zeros((16, 32, 2), np.float32), np.ones((16, 32), np.float32), "zero")
+    body = (seg.anchors[:, 0] > 16).astype(np.int64)
+    T = np.where(body[:, None] == 1, [[0.3, 0, 0]], [[0.1, 0, 0]])
+    lam = np.full(8, 1 / 8)
+    soup = Soup(
+        lam,
+        np.tile([0, 0, -1.0], (8, 1)),
+        np.full(8, 16.0),
+        np.tile(np.eye(3), (8, 1, 1)),
+        T / lam[:, None],
+    )
+    return seg, soup, body, build_energy_data(seg, flow, K, K, 4)
+
+
+def test_edges_of_two_bodies_weigh_less(world):
+    seg, _, body, data = world
+    i, k = seg.edges.T
+    across = body[i] != body[k]
+    assert across.any()
+    assert not across.all()
+    less = between_bodies(data, body, 0.1)
+    np.testing.assert_allclose(less.edge_weight[across], 0.1 * seg.edge_weight[across], rtol=1e-15)
+    np.testing.assert_array_equal(less.edge_weight[~across], seg.edge_weight[~across])
+    np.testing.assert_array_equal(between_bodies(data, body, 1.0).edge_weight, seg.edge_weight)
+    np.testing.assert_array_equal(between_bodies(data, 0 * body, 0.1).edge_weight, seg.edge_weight)
+
+
+@pytest.mark.parametrize("factor", [10.0, 1e4])
+def test_a_body_gains_little_by_receding(world, factor):
+    """Its motion kept, the right body goes far away: 2^(1/4) is the most that E_arap falls."""
+    seg, soup, body, data = world
+    data = in_pixels(data, soup, seg)
+    weights = Weights(sigma_arap=np.inf)
+    across = np.abs(np.diff(body[seg.edges], axis=1)[:, 0]) == 1
+    far = np.where(body == 1, factor, 1.0)
+    away = replace(soup, d=soup.d * far)
+    np.testing.assert_allclose(away.translation, soup.translation, rtol=1e-14)
+    gap = data.edge_weight[across] * 50.0 * 0.2 / 2.0  # focal x |T_i - T_k| / depth
+    near = plain.arap(soup, data, weights)[across]
+    # the anchors' distance changes by at most |T_i - T_k|: the sum is once or twice the gap
+    assert (near >= gap * (1 - 1e-12)).all()
+    assert (near <= 2 * gap * (1 + 1e-12)).all()
+    assert (plain.arap(away, data, weights)[across] >= 2**-0.25 * gap * (1 - 1e-12)).all()
