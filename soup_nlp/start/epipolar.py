@@ -14,6 +14,13 @@ from soup_nlp.geometry import rotation
 Float = NDArray[np.float64]
 
 
+REFINEMENTS = 5
+"""Robust fits of one motion at most, each with the noise that the one before has left."""
+
+LEAST_NOISE = 0.01
+"""Smallest scale of the robust loss, pixels."""
+
+
 @dataclass(frozen=True)
 class Motion:
     """Rigid motion next_from_ref with a translation of unit length.
@@ -115,9 +122,18 @@ def refine(
     def residual(x: Float) -> Float:
         return root * sampson(unpack(x).essential(), r, q, focal)
 
+    # from the inlier distance down to the noise: bodies that move a little otherwise let go
     scale = max(0.1, 0.5 * threshold)
-    fit = least_squares(residual, np.zeros(5), loss="cauchy", f_scale=scale, max_nfev=30)
-    return unpack(fit.x)
+    x = np.zeros(5)
+    for _ in range(REFINEMENTS):
+        x = least_squares(residual, x, loss="cauchy", f_scale=scale, max_nfev=30).x
+        error = np.abs(residual(x))
+        near = error[error < max(3 * scale, LEAST_NOISE)]
+        noise = 1.5 * float(np.median(near)) if len(near) else scale
+        if noise > 0.8 * scale:
+            break
+        scale = max(noise, LEAST_NOISE)
+    return unpack(x)
 
 
 def repeated(
