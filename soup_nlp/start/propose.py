@@ -44,7 +44,7 @@ class StartOptions:
     smoothness: float = 0.5
     min_parallax_px: float = 0.25
     rounds: int = 3
-    unexplained_px: float = 0.3
+    unexplained_px: float = 0.1
     pieces: int = 6
     piece_size: int = 4
     seed: int = 0
