@@ -12,18 +12,17 @@ from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.inputs import load_flow_of, load_pair
-from soup_nlp.model.energy import EnergyData, Weights
+from soup_nlp.model.energy import EnergyData, Weights, between_bodies, build_energy_data, in_pixels
 from soup_nlp.model.formulation import Formulation, build_matrix_nlp
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.pipeline import build_energy
 from soup_nlp.solve.soup import SolverOptions, solve_soup
 from soup_nlp.start.propose import Start, StartOptions, propose
 
 
 @dataclass(frozen=True)
 class Case:
-    """A problem as `pipeline.run` has it before it solves.
+    """A problem before it is solved.
 
     Attributes:
         problem: The merged problem.
@@ -60,22 +59,32 @@ class Case:
 
 
 def prepare(
-    problem: Problem, presolve: bool = False, say: Callable[[str], None] | None = None
+    problem: Problem,
+    presolve: bool = False,
+    say: Callable[[str], None] | None = None,
+    *,
+    pair: Pair | None = None,
+    lap: Callable[[str], None] | None = None,
 ) -> Case:
-    """Load, segment, start and weigh a problem, as `pipeline.run` does.
+    """Load, segment, start and weigh a problem: what comes before every solve.
 
     Args:
         problem: See `config.load_problem`.
         presolve: Let solvers start where the tangent presolve ends.
         say: Called with a line after every stage.
+        pair: Images and cameras, instead of the problem's input; its flow is used when it has one.
+        lap: Called with the name of a stage at its end: "load", "flow", "segmentation", "start".
 
     Raises:
         SoupError: the input cannot be used.
     """
     say = say or (lambda line: None)
-    pair = load_pair(problem)
+    lap = lap or (lambda stage: None)
+    pair = pair or load_pair(problem)
+    lap("load")
     flow = pair.flow or load_flow_of(problem, pair)
     pair = pair.with_flow(flow)
+    lap("flow")
     say(str(pair))
     s = problem.segmentation
     labels = segment(pair.image_ref, s.superpixels, s.method, s.compactness, s.smoothing_px)
@@ -84,9 +93,11 @@ def prepare(
         pair = pair.with_flow(flow)
     samples = None if s.boundary_samples == "all" else s.boundary_samples
     seg = build_segmentation(labels, pair.image_ref, s.neighbours, s.beta, s.beta_colour, samples)
+    lap("segmentation")
     say(str(seg))
     options = StartOptions(**{**problem.start.model_dump(), "seed": problem.seed})
     start = propose(seg, flow, pair.K_ref, pair.K_next, options)
+    lap("start")
     say(str(start))
     data, weights = build_energy(problem, pair, seg, start)
     solver = problem.solver.model_dump()
@@ -99,3 +110,19 @@ def prepare(
     once = replace(stages, presolve=True, max_iter=1)
     answer = solve_soup(start.soup, data, weights, case.formulation(), once, say=say)
     return replace(case, soup=answer.soup)
+
+
+def build_energy(
+    problem: Problem, pair: Pair, seg: Segmentation, start: Start
+) -> tuple[EnergyData, Weights]:
+    """The energy that a problem asks for, on a pair that carries its flow."""
+    assert pair.flow is not None
+    e = problem.energy
+    pixels = None if e.pixel_samples == "all" else e.pixel_samples
+    data = build_energy_data(
+        seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, e.arap_at_anchors
+    )
+    data = between_bodies(data, start.body, e.arap_across)
+    if e.units == "pixel":
+        data = in_pixels(data, start.soup, seg, e.rotation_px)
+    return data, Weights(**e.weights.model_dump())

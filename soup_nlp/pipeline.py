@@ -10,21 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from soup_nlp.cases import prepare
 from soup_nlp.config import Problem, make_problem
-from soup_nlp.data.flow_robust import reweighted
 from soup_nlp.data.pair import Pair
-from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
-from soup_nlp.geometry.superpixels import segment
-from soup_nlp.inputs import load_flow_of, load_pair
+from soup_nlp.inputs import load_pair
 from soup_nlp.model import plain
-from soup_nlp.model.energy import (
-    EnergyData,
-    Weights,
-    between_bodies,
-    build_energy_data,
-    in_pixels,
-)
+from soup_nlp.model.energy import EnergyData, Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.refine.mppbp import Refined, RefineOptions, refine_soup
@@ -34,8 +27,8 @@ from soup_nlp.report.metrics import DepthMetrics
 from soup_nlp.scoring import evaluate, rigid_baseline, score
 from soup_nlp.solve.ipopt import Listener
 from soup_nlp.solve.kkt import constraint_residuals
-from soup_nlp.solve.soup import Solution, SolverOptions, solve_soup
-from soup_nlp.start.propose import Start, StartOptions, propose
+from soup_nlp.solve.soup import Solution, solve_soup
+from soup_nlp.start.propose import Start
 
 __all__ = ["Run", "evaluate", "load_pair", "run", "solve_pair"]
 
@@ -107,11 +100,6 @@ class Run:
         return solved and (self.refined is None or self.refined.status != "interrupted")
 
 
-def _tell(say: Callable[[str], None] | None, line: object) -> None:
-    if say:
-        say(str(line))
-
-
 def run(
     problem: Problem,
     *,
@@ -143,39 +131,18 @@ def run(
         seconds[stage] = seconds.get(stage, 0.0) + now - clock
         clock = now
 
-    pair = pair or load_pair(problem)
-    lap("load")
-    flow = pair.flow or load_flow_of(problem, pair)
-    pair = pair.with_flow(flow)
-    lap("flow")
-    _tell(say, pair)
-    s = problem.segmentation
-    labels = segment(pair.image_ref, s.superpixels, s.method, s.compactness, s.smoothing_px)
-    if problem.flow.reweight_px is not None:
-        flow = reweighted(flow, labels, problem.flow.reweight_px)
-        pair = pair.with_flow(flow)
-    samples = None if s.boundary_samples == "all" else s.boundary_samples
-    seg = build_segmentation(labels, pair.image_ref, s.neighbours, s.beta, s.beta_colour, samples)
-    lap("segmentation")
-    _tell(say, seg)
-    options = StartOptions(**{**problem.start.model_dump(), "seed": problem.seed})
-    start = propose(seg, flow, pair.K_ref, pair.K_next, options)
-    lap("start")
-    _tell(say, start)
-    data, weights = build_energy(problem, pair, seg, start)
+    case = prepare(problem, pair=pair, lap=lap, say=say)
+    pair, start, data, weights = case.pair, case.start, case.data, case.weights
     form = Formulation(**problem.formulation.model_dump())
     refine = RefineOptions(**problem.refine.model_dump())
 
     def nlp(soup: Soup) -> Solution:
-        solver = problem.solver.model_dump()
-        solver["presolve_eps"] = tuple(solver["presolve_eps"])
-        options = SolverOptions(**solver)
         return solve_soup(
             soup,
             data,
             weights,
             form,
-            options,
+            case.options,
             listener=listener,
             stop=stop,
             say=say,
@@ -207,8 +174,10 @@ def run(
         )
         if refine.polish and refined.status != "interrupted":
             refined = _polished(refined, nlp(refined.soup))
-        _tell(say, refined)
+        if say:
+            say(str(refined))
         lap("refine")
+    labels = case.segmentation.labels
     size = pair.image_next.shape[0], pair.image_next.shape[1]
     before, middle = (
         reconstruct(x, labels, pair.K_ref, pair.K_next, size) for x in (start.soup, solution.soup)
@@ -224,7 +193,7 @@ def run(
     return Run(
         problem=problem,
         pair=pair,
-        segmentation=seg,
+        segmentation=case.segmentation,
         start=start,
         data=data,
         weights=weights,
@@ -259,22 +228,6 @@ def _skipped(start: Soup, data: EnergyData, weights: Weights, form: Formulation)
         description="",
         seconds={},
     )
-
-
-def build_energy(
-    problem: Problem, pair: Pair, seg: Segmentation, start: Start
-) -> tuple[EnergyData, Weights]:
-    """The energy that a problem asks for, on a pair that carries its flow."""
-    assert pair.flow is not None
-    e = problem.energy
-    pixels = None if e.pixel_samples == "all" else e.pixel_samples
-    data = build_energy_data(
-        seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, e.arap_at_anchors
-    )
-    data = between_bodies(data, start.body, e.arap_across)
-    if e.units == "pixel":
-        data = in_pixels(data, start.soup, seg, e.rotation_px)
-    return data, Weights(**e.weights.model_dump())
 
 
 def _polished(refined: Refined, again: Solution) -> Refined:

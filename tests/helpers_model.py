@@ -11,7 +11,8 @@ from hypothesis import settings
 from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.data.raycast import Body, Part, Plane, Scene, render
+from soup_nlp.data.raycast import Body, Part, Scene, render
+from soup_nlp.data.shapes import Plane
 from soup_nlp.data.texture import Texture
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation

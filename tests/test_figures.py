@@ -11,7 +11,7 @@ import pytest
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.report import figures
-from soup_nlp.report.figures import (
+from soup_nlp.report.colour import (
     colour_wheel,
     colourise_depth,
     colourise_error,
@@ -19,11 +19,8 @@ from soup_nlp.report.figures import (
     colourise_normals,
     depth_range,
     draw_superpixels,
-    overview,
-    overview_strip,
-    write_depth_png16,
-    write_png,
 )
+from soup_nlp.report.figures import overview, overview_strip, write_depth_png16, write_png
 from soup_nlp.report.metrics import depth_metrics
 
 

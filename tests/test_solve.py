@@ -1,25 +1,20 @@
-"""Ipopt on kernels and soups: known optima, constraints, limits, interruption, residuals."""
+"""Soups solved: constraints, gauges, limits, interruption, a world whose truth is the optimum."""
 
 from __future__ import annotations
 
-import os
-import signal
 import threading
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
 from helpers_model import (
     GAUGES,
     PAPER,
     gradient,
-    hessian,
     motion,
     plane_pose,
     plane_soup,
     plane_world,
-    value,
     with_true_flow,
 )
 
@@ -32,9 +27,8 @@ from soup_nlp.geometry.superpixels import segment
 from soup_nlp.model import plain
 from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
 from soup_nlp.model.formulation import Formulation, build_matrix_nlp
-from soup_nlp.model.kernel import HESSIANS, Group, Kernel, Table
-from soup_nlp.model.nlp import NLP, assemble
-from soup_nlp.solve.ipopt import Ipopt, Progress, Stage, interruptible
+from soup_nlp.model.kernel import HESSIANS
+from soup_nlp.solve.ipopt import Ipopt, Progress
 from soup_nlp.solve.kkt import constraint_residuals, optimality
 from soup_nlp.solve.soup import Solution, SolverOptions, solve_soup
 from soup_nlp.start.propose import propose
@@ -59,277 +53,6 @@ def form(**options) -> Formulation:
     return Formulation(
         **{"compiled": False, "hessian": "gauss-newton+constraints", "norm": "smooth", **options}
     )
-
-
-# --- textbook problems as kernels and tables -----------------------------------------------------
-
-
-def make_nlp(
-    groups: list[Group], x0: list[float], lbx, ubx, lbg, ubg, hessian: str = "exact"
-) -> NLP:
-    n, m = len(x0), len(lbg)
-    return assemble(
-        "textbook",
-        tuple(groups),
-        x0=np.array(x0, float),
-        lbx=np.broadcast_to(np.asarray(lbx, float), n),
-        ubx=np.broadcast_to(np.asarray(ubx, float), n),
-        lbg=np.array(lbg, float),
-        ubg=np.array(ubg, float),
-        theta={"one": 1.0},
-        hessian=hessian,
-        x_names=lambda: [f"x[{i}]" for i in range(n)],
-        g_names=lambda: [f"g[{i}]" for i in range(m)],
-        compiled=False,
-    )
-
-
-def symbols(n: int, data: int = 0) -> tuple[ca.SX, ca.SX, ca.SX]:
-    return ca.SX.sym("x", n), ca.SX.sym("row", data), ca.SX.sym("one")
-
-
-def hs071() -> NLP:
-    """Hock and Schittkowski 71; the sum of squares is added up over four elements of one row."""
-    x, row, one = symbols(4)
-    main = Kernel(
-        "main",
-        x,
-        row,
-        one,
-        objective=one * x[0] * x[3] * (x[0] + x[1] + x[2]) + x[2],
-        constraints=x[0] * x[1] * x[2] * x[3],
-    )
-    y, weight, two = symbols(1, 1)
-    square = Kernel("square", y, weight, two, constraints=weight * y**2)
-    groups = [
-        Group(main, Table(np.arange(4)[None], np.zeros((1, 0)), np.array([[0]]))),
-        Group(square, Table(np.arange(4)[:, None], np.ones((4, 1)), np.ones((4, 1), int))),
-    ]
-    return make_nlp(groups, [1, 5, 5, 1], 1, 5, [25, 40], [np.inf, 40])
-
-
-HS071 = np.array([1.0, 4.742999643, 3.821149978, 1.379408294]), 17.0140172892
-
-
-def rosenbrock(n: int, lbx: float = -np.inf, ubx: float = np.inf) -> NLP:
-    """Chained Rosenbrock: one kernel over n - 1 overlapping pairs.
-
-    The later variable comes first in the kernel: tables need not be sorted.
-    """
-    x, row, one = symbols(2, 1)
-    kernel = Kernel(
-        "valley", x, row, one, objective=row * (x[0] - x[1] ** 2) ** 2 + (one - x[1]) ** 2
-    )
-    index = np.stack([np.arange(1, n), np.arange(n - 1)], axis=1)
-    table = Table(index, np.full((n - 1, 1), 100.0))
-    return make_nlp([Group(kernel, table)], [0.8] * n, lbx, ubx, [], [])
-
-
-def solve(nlp: NLP, **options) -> Stage:
-    return Ipopt(nlp)(x0=nlp.x0, **{"tol": 1e-8, **options})
-
-
-def test_hs071_is_solved_to_its_known_optimum():
-    nlp = hs071()
-    stage = solve(nlp)
-    assert stage.converged
-    assert stage.status == "Solve_Succeeded"
-    np.testing.assert_allclose(stage.x, HS071[0], atol=1e-5)
-    assert stage.objective == pytest.approx(HS071[1], abs=1e-5)
-    # multipliers of the book, in CasADi's sign: negative at a lower bound
-    np.testing.assert_allclose(stage.lam_g, [-0.55229366, 0.16146857], atol=1e-4)
-    np.testing.assert_allclose(stage.lam_x, [-1.08787121, 0, 0, 0], atol=1e-4)
-
-
-def test_kkt_residuals_are_small_at_the_optimum_only():
-    nlp = hs071()
-    stage = solve(nlp)
-    best = optimality(nlp, stage.x, stage.lam_x, stage.lam_g)
-    assert best["dual_infeasibility"] <= 1e-6
-    assert best["complementarity"] <= 1e-4  # mu_init is small but not zero
-
-    def residual(x=stage.x, lam_x=stage.lam_x, lam_g=stage.lam_g) -> float:
-        return max(optimality(nlp, x, lam_x, lam_g).values())
-
-    assert residual(x=nlp.x0) > 1
-    assert residual(lam_g=0 * stage.lam_g) > 0.1
-    assert residual(lam_g=-stage.lam_g) > 0.1
-    assert residual(lam_x=0 * stage.lam_x) > 0.1
-    # a multiplier on an open bound is not complementary
-    assert residual(lam_x=stage.lam_x - [0, 0.5, 0, 0]) > 0.1
-
-
-def test_a_multiplier_of_the_wrong_sign_is_no_optimum():
-    """max x, x >= 0: at 0 the gradient is balanced only by a force from an upper bound."""
-    x, row, one = symbols(1)
-    kernel = Kernel("line", x, row, one, objective=-x)
-    nlp = make_nlp(
-        [Group(kernel, Table(np.zeros((1, 1), int), np.zeros((1, 0))))], [0.0], 0, np.inf, [], []
-    )
-    residual = optimality(nlp, np.zeros(1), np.array([1.0]), np.zeros(0))
-    assert max(residual.values()) >= 1
-
-
-def test_chained_rosenbrock_reaches_the_ones():
-    stage = solve(rosenbrock(10))
-    assert stage.converged
-    np.testing.assert_allclose(stage.x, 1.0, atol=1e-6)
-    assert stage.objective == pytest.approx(0, abs=1e-10)
-    residual = optimality(rosenbrock(10), stage.x, stage.lam_x, stage.lam_g)
-    assert residual == {
-        "dual_infeasibility": pytest.approx(0, abs=1e-6),
-        "complementarity": 0.0,
-    }
-
-
-def test_hessian_of_an_unsorted_table_is_upper_triangular():
-    nlp = rosenbrock(4)
-    x = np.array([0.3, -0.5, 0.7, 1.2])
-    H = hessian(nlp, x, 1.0, np.zeros(0))
-    expected = np.zeros((4, 4))
-    for i in range(3):
-        expected[i, i] += 1200 * x[i] ** 2 - 400 * x[i + 1] + 2
-        expected[i + 1, i + 1] += 200
-        expected[i, i + 1] = expected[i + 1, i] = -400 * x[i]
-    np.testing.assert_allclose(H, expected, rtol=1e-12)
-
-
-def test_a_bound_that_cuts_off_the_optimum_is_active_with_its_multiplier():
-    nlp = rosenbrock(2, ubx=0.5)
-    stage = solve(nlp)
-    # on x1 = 0.5 the best x2 is 0.25
-    np.testing.assert_allclose(stage.x, [0.5, 0.25], atol=1e-4)
-    assert stage.lam_x[0] == pytest.approx(1.0, rel=1e-3)
-    assert (stage.x <= 0.5 + 1e-8).all()
-
-
-def infeasible() -> NLP:
-    """x^2 <= -1."""
-    x, row, one = symbols(1)
-    kernel = Kernel("square", x, row, one, objective=x, constraints=x**2)
-    table = Table(np.zeros((1, 1), int), np.zeros((1, 0)), np.zeros((1, 1), int))
-    return make_nlp([Group(kernel, table)], [1.0], -np.inf, np.inf, [-np.inf], [-1.0])
-
-
-def test_an_infeasible_problem_is_a_result_with_its_status():
-    stage = solve(infeasible(), max_iter=200)
-    assert not stage.converged
-    assert stage.status in ("Infeasible_Problem_Detected", "Restoration_Failed")
-    assert np.isfinite(stage.x).all()
-    assert str(stage).startswith(f"solve: {stage.status}, ")
-
-
-def test_history_counts_and_call_times_are_kept():
-    seen: list[Progress] = []
-    stage = solve(hs071(), stage="textbook", listener=seen.append)
-    assert [p.iteration for p in seen] == list(range(stage.iterations + 1))
-    assert {p.stage for p in seen} == {"textbook"}
-    assert (np.diff([p.seconds for p in seen]) >= 0).all()
-    assert seen[-1].objective == pytest.approx(stage.objective, rel=1e-6)
-    assert seen[-1].infeasibility < 1e-6 < max(p.infeasibility for p in seen)
-    assert "it " in str(seen[0])
-    assert stage.history.keys() >= {"obj", "inf_pr", "inf_du", "mu"}
-    assert all(len(v) == stage.iterations + 1 for v in stage.history.values())
-    np.testing.assert_allclose(stage.history["obj"], [p.objective for p in seen])
-    assert stage.calls.keys() == {"f", "grad_f", "g", "jac_g", "hess_lag"}
-    assert 0 <= sum(stage.calls.values()) <= stage.seconds
-
-
-@pytest.mark.parametrize(
-    "options", [{"no_such_option": 1}, {"max_iter": "many"}, {"linear_solver": "abacus"}]
-)
-def test_a_wrong_ipopt_option_is_a_solver_error(options):
-    nlp = hs071()
-    with pytest.raises(SolverError) as caught:
-        Ipopt(nlp, options)(x0=nlp.x0)
-    assert "textbook" in str(caught.value)
-
-
-def test_options_reach_ipopt(tmp_path):
-    nlp, log = hs071(), tmp_path / "ipopt.log"
-    Ipopt(nlp, {"mu_init": 0.123})(x0=nlp.x0, log_file=str(log))
-    text = log.read_text()
-    assert "Number of nonzeros" in text
-    assert "lg(mu)" in text
-    stage = Ipopt(nlp, {"mu_init": 0.123})(x0=nlp.x0)
-    assert stage.history["mu"][0] == pytest.approx(0.123)
-
-
-def test_the_iteration_limit_keeps_the_best_iterate():
-    nlp = rosenbrock(10)
-    start = value(nlp, nlp.x0)[0]
-    f = []
-    for limit in (0, 1, 3, 6):
-        stage = solve(nlp, max_iter=limit)
-        assert not stage.converged
-        assert stage.status == "Maximum_Iterations_Exceeded"
-        assert stage.iterations == limit
-        assert value(nlp, stage.x)[0] == pytest.approx(stage.objective)
-        assert stage.objective <= start
-        f.append(stage.objective)
-    assert (np.diff(f) <= 0).all()
-    assert f[-1] < start
-
-
-def test_the_time_limit_stops_and_keeps_the_best_iterate():
-    nlp = rosenbrock(10)
-    stage = solve(nlp, seconds=0.0)
-    assert stage.status == "Time_Limit"
-    assert not stage.converged
-    assert np.isfinite(stage.x).all()
-    assert stage.iterations <= 1
-
-
-def test_an_event_stops_and_keeps_the_best_iterate():
-    nlp, stop, seen = rosenbrock(10), threading.Event(), []
-
-    def listen(p: Progress) -> None:
-        seen.append(p.objective)
-        if p.iteration == 3:
-            stop.set()
-
-    stage = solve(nlp, listener=listen, stop=stop)
-    assert stage.status == "Interrupted"
-    assert len(seen) == 4
-    assert stage.objective == min(seen)
-    assert value(nlp, stage.x)[0] == pytest.approx(stage.objective)
-
-
-def test_stagnation_stops_early():
-    nlp = rosenbrock(10)
-    assert solve(nlp, stagnation=0.9).status in ("Stagnated", "Solve_Succeeded")
-    # twice in a row below a share that everything is below
-    stage = solve(nlp, stagnation=1e9)
-    assert stage.status == "Stagnated"
-    assert stage.iterations <= 3
-
-
-def test_a_listener_that_fails_ends_the_solve_with_its_message():
-    def listen(p: Progress) -> None:
-        raise ValueError("no more paper")
-
-    stage = solve(rosenbrock(10), listener=listen)
-    assert "no more paper" in stage.status
-    assert not stage.converged
-    assert np.isfinite(stage.x).all()
-
-
-def test_control_c_sets_the_event_and_the_old_handler_returns():
-    before = signal.getsignal(signal.SIGINT)
-    with interruptible() as stop:
-        os.kill(os.getpid(), signal.SIGINT)
-        assert stop.wait(5)
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_a_nan_in_the_objective_is_a_result_too():
-    x, row, one = symbols(1)
-    kernel = Kernel("root", x, row, one, objective=ca.sqrt(x - 2))
-    table = Table(np.zeros((1, 1), int), np.zeros((1, 0)))
-    nlp = make_nlp([Group(kernel, table)], [1.0], -np.inf, np.inf, [], [])
-    stage = solve(nlp)
-    assert not stage.converged
-    assert np.isfinite(stage.x).all()
 
 
 # --- residuals of soups --------------------------------------------------------------------------

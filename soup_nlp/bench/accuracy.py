@@ -39,7 +39,7 @@ CODE = (
     *(f"{room}/*.py" for room in ("data", "geometry", "model", "start", "solve", "refine")),
     *(f"report/{name}.py" for name in ("metrics", "protocols", "scene_flow", "baselines")),
     *(f"bench/{name}.py" for name in ("accuracy", "planes", "rivals", "truth")),
-    *("pipeline.py", "inputs.py", "scoring.py"),
+    *("pipeline.py", "cases.py", "inputs.py", "scoring.py"),
 )
 """Sources that decide the numbers of a row: they make its code version."""
 

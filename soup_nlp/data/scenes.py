@@ -12,19 +12,8 @@ from collections.abc import Callable
 import numpy as np
 
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.raycast import (
-    Body,
-    Box,
-    Float,
-    Part,
-    Plane,
-    Scene,
-    Shape,
-    Sheet,
-    Sphere,
-    inverse,
-    render,
-)
+from soup_nlp.data.raycast import Body, Part, Scene, inverse, render
+from soup_nlp.data.shapes import Box, Float, Plane, Shape, Sheet, Sphere
 from soup_nlp.data.texture import Colour, Panels, Texture
 from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera, rotation

@@ -1,15 +1,10 @@
-"""Images of depth, flow, errors, normals and superpixels, and overviews of them for reports.
-
-Every `colourise_*` function returns (H, W, 3) uint8 RGB; what is unknown is black.
-"""
+"""Overviews of a result for reports, panel by panel, and images written as PNG."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import cv2
-import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -18,228 +13,27 @@ from numpy.typing import NDArray
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 from soup_nlp.report.atomic import PathLike, atomic_path
+from soup_nlp.report.colour import (
+    Image,
+    as_map,
+    check_rgb,
+    colourise_depth,
+    colourise_error,
+    colourise_flow,
+    colourise_normals,
+    depth_range,
+    draw_superpixels,
+)
 from soup_nlp.report.metrics import depth_metrics, sample_at_points
 
 Float = NDArray[np.floating]
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-DepthMapping = Literal["inverse", "log"]
 Bar = tuple[Image, str, str]
 """Colour bar of a panel: (1, M, 3) colours, text at their left end, text at their right end."""
 Panel = tuple[str, Image] | tuple[str, Image, Bar]
 """Caption, (H, W, 3) uint8 RGB picture and, where colours are numbers, their bar."""
 
-_WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 _DPI = 100
 _BAR_HEIGHT = 0.2  # inches, of a row's line of colour bars
-
-
-def depth_range(
-    depth: Float, percentiles: tuple[float, float] = (2.0, 98.0)
-) -> tuple[float, float]:
-    """Robust (near, far) of a depth map, for a colour scale that several maps share.
-
-    Args:
-        depth: (H, W) z; values that are not finite or not positive are left out.
-        percentiles: Of near and far, in percent.
-
-    Returns:
-        near < far, in the unit of the depth; (1, 2) where nothing is known.
-    """
-    z = np.asarray(depth, np.float64)
-    z = z[np.isfinite(z) & (z > 0)]
-    if z.size == 0:
-        return 1.0, 2.0
-    near, far = (float(x) for x in np.percentile(z, percentiles))
-    if not far > near * (1 + 1e-9):  # a constant depth still needs a scale
-        near, far = near / 1.1, far * 1.1
-    return near, far
-
-
-def colourise_depth(
-    depth: Float,
-    vmin: float | None = None,
-    vmax: float | None = None,
-    *,
-    mapping: DepthMapping = "inverse",
-    cmap: str = "turbo",
-) -> Image:
-    """Depth in colour: near is the upper end of the colour map (red), far the lower (blue).
-
-    Args:
-        depth: (H, W) z; black where not finite or not positive.
-        vmin: Depth of the near end; None takes a robust percentile.
-        vmax: Depth of the far end; None takes a robust percentile.
-        mapping: Even steps of colour in 1/z ("inverse", as a disparity looks) or in ln z ("log").
-        cmap: Name of a matplotlib colour map.
-
-    Raises:
-        DataError: not a map, an unknown mapping or colour map, or not 0 < vmin < vmax.
-    """
-    z = _map(depth, "depth", 2)
-    near, far = depth_range(z)
-    near = near if vmin is None else float(vmin)
-    far = far if vmax is None else float(vmax)
-    if not 0 < near < far < np.inf:
-        raise DataError(
-            "depth range is wrong", where="vmin, vmax", found=(near, far), expected="0 < near < far"
-        )
-    if mapping not in ("inverse", "log"):
-        raise DataError(
-            "unknown depth mapping", where="mapping", found=mapping, expected="inverse or log"
-        )
-    known = np.isfinite(z) & (z > 0)
-    safe = np.clip(np.where(known, z, near), near, far)
-    if mapping == "log":
-        level = np.log(far / safe) / np.log(far / near)
-    else:
-        level = (1 / safe - 1 / far) / (1 / near - 1 / far)
-    return _paint(level, known, cmap)
-
-
-def colourise_error(relative_error: Float, limit: float = 0.2, cmap: str = "inferno") -> Image:
-    """Relative depth error in colour, from 0 (dark) to `limit` and above (bright).
-
-    The lowest tenth of the colour map is left out, so that a small error is not taken for black,
-    the colour of the unknown.
-
-    Args:
-        relative_error: (H, W) |z_gt - z| / z_gt; black where not finite.
-        limit: Error at the upper end.
-        cmap: Name of a matplotlib colour map.
-
-    Raises:
-        DataError: not a map, or a limit that is not positive.
-    """
-    error = np.abs(_map(relative_error, "relative_error", 2))
-    if not 0 < limit < np.inf:
-        raise DataError("error limit must be positive", where="limit", found=limit, expected="> 0")
-    known = np.isfinite(error)
-    level = np.minimum(np.where(known, error, 0.0) / limit, 1.0)
-    return _paint(0.1 + 0.9 * level, known, cmap)
-
-
-def _paint(level: NDArray[np.float64], known: Mask, cmap: str) -> Image:
-    """(H, W, 3) colours of levels (H, W) in [0, 1], black where not known."""
-    if cmap not in matplotlib.colormaps:
-        raise DataError(
-            "unknown colour map", where="cmap", found=cmap, expected="a matplotlib colour map"
-        )
-    table = (matplotlib.colormaps[cmap](np.linspace(0, 1, 256))[:, :3] * 255).round()
-    out = table.astype(np.uint8)[(level * 255).round().astype(np.intp)]
-    out[~known] = 0
-    return np.asarray(out)
-
-
-def colour_wheel() -> NDArray[np.float64]:
-    """(55, 3) colours, 0 to 255, of the Middlebury flow wheel (Baker et al., IJCV 2011)."""
-    pure = np.array([[1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1], [1, 0, 1], [1, 0, 0]])
-    parts = []
-    for k, steps in enumerate(_WHEEL):
-        ramp = np.floor(255 * np.arange(steps) / steps)[:, None]
-        parts.append(255.0 * pure[k] + ramp * (pure[k + 1] - pure[k]))
-    return np.concatenate(parts)
-
-
-def colourise_flow(uv: Float, limit: float | None = None) -> Image:
-    """Flow in the colours of the Middlebury wheel: hue is direction, white is no motion.
-
-    Args:
-        uv: (H, W, 2) displacement, pixels; black where not finite.
-        limit: Length, pixels, of full saturation; longer is darker. None takes the 99th
-            percentile.
-
-    Raises:
-        DataError: wrong shape, or a limit that is not positive.
-    """
-    flow = _map(uv, "uv", 3, 2)
-    known: Mask = np.asarray(np.isfinite(flow).all(axis=2))
-    flow = np.where(known[:, :, None], flow, 0.0)
-    length = np.hypot(flow[:, :, 0], flow[:, :, 1])
-    if limit is None:
-        limit = max(float(np.percentile(length[known], 99)), 1e-6) if known.any() else 1.0
-    if not 0 < limit < np.inf:
-        raise DataError("flow limit must be positive", where="limit", found=limit, expected="> 0")
-    radius = (length / limit)[:, :, None]
-    wheel = colour_wheel() / 255
-    turn = np.arctan2(-flow[:, :, 1], -flow[:, :, 0]) / np.pi
-    place = (turn + 1) / 2 * (len(wheel) - 1)
-    low = np.floor(place).astype(np.intp)
-    part = (place - low)[:, :, None]
-    hue = (1 - part) * wheel[low] + part * wheel[(low + 1) % len(wheel)]
-    colour = np.where(radius <= 1, 1 - radius * (1 - hue), 0.75 * hue)
-    out = np.floor(255 * colour).astype(np.uint8)
-    out[~known] = 0
-    return np.asarray(out)
-
-
-def colourise_normals(n_map: Float) -> Image:
-    """Normals in colour: (x, -y, -z) from [-1, 1] to RGB, so one that faces the camera is blue.
-
-    Args:
-        n_map: (H, W, 3) unit normals in the camera frame (x right, y down, z forward); black where
-            not finite.
-
-    Raises:
-        DataError: wrong shape.
-    """
-    n = _map(n_map, "n_map", 3, 3)
-    known: Mask = np.asarray(np.isfinite(n).all(axis=2))
-    signed = np.where(known[:, :, None], n, 0.0) * np.array([1.0, -1.0, -1.0])
-    out = ((np.clip(signed, -1, 1) + 1) * 127.5).round().astype(np.uint8)
-    out[~known] = 0
-    return np.asarray(out)
-
-
-def draw_superpixels(
-    image: Image, labels: NDArray[np.integer], colour: tuple[int, int, int] = (255, 255, 0)
-) -> Image:
-    """The image with the boundaries of a labelling drawn one pixel wide.
-
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        labels: (H, W) integer labels.
-        colour: RGB, 0 to 255.
-
-    Raises:
-        DataError: the image is not RGB, or the labels do not fit it.
-    """
-    _check_rgb(image, "image")
-    if labels.shape != image.shape[:2]:
-        raise DataError(
-            "labels do not fit the image",
-            where="labels",
-            found=labels.shape,
-            expected=image.shape[:2],
-        )
-    edge = np.zeros(labels.shape, bool)
-    edge[:, :-1] |= labels[:, :-1] != labels[:, 1:]
-    edge[:-1] |= labels[:-1] != labels[1:]
-    out = image.copy()
-    out[edge] = np.asarray(colour, np.uint8)
-    return out
-
-
-def _map(value: Float, where: str, ndim: int, channels: int = 0) -> NDArray[np.float64]:
-    array = np.asarray(value, np.float64)
-    if array.ndim != ndim or array.size == 0 or (channels and array.shape[-1] != channels):
-        raise DataError(
-            "cannot draw an array of this shape",
-            where=where,
-            found=array.shape,
-            expected=f"(H, W, {channels})" if channels else "(H, W)",
-        )
-    return array
-
-
-def _check_rgb(image: Image, where: str) -> None:
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
-        raise DataError(
-            "image must be 8-bit RGB",
-            where=where,
-            found=f"{image.dtype} {image.shape}",
-            expected="uint8 (H, W, 3)",
-        )
 
 
 def overview_strip(
@@ -273,7 +67,7 @@ def overview_strip(
             found=f"{len(panels)} panels, {columns} columns",
         )
     for panel in panels:
-        _check_rgb(panel[1], f"panel {panel[0]!r}")
+        check_rgb(panel[1], f"panel {panel[0]!r}")
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     # layout in inches, from the top
@@ -402,7 +196,7 @@ def _depth_panels(pair: Pair, depths: Mapping[str, Float], limit: float) -> list
 
 def _scaled(pair: Pair, name: str, depth: Float, common: Float) -> tuple[Float, str]:
     """A depth times its median ratio to the truth (to `common` without one), and its score."""
-    z = _map(depth, name, 2)
+    z = as_map(depth, name, 2)
     if z.shape != pair.size:
         raise DataError(
             "depth does not fit the pair", where=name, found=z.shape, expected=pair.size
@@ -426,7 +220,7 @@ def write_png(path: PathLike, rgb: Image) -> None:
     Raises:
         DataError: the image is not RGB, or the folder cannot be written.
     """
-    _check_rgb(rgb, "rgb")
+    check_rgb(rgb, "rgb")
     _encode(path, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 
 
@@ -447,7 +241,7 @@ def write_depth_png16(path: PathLike, depth: Float, scale: float | None = None) 
     Raises:
         DataError: not a map, a scale that is not positive, or a folder that cannot be written.
     """
-    z = _map(depth, "depth", 2)
+    z = as_map(depth, "depth", 2)
     known = np.isfinite(z) & (z > 0)
     if scale is None:
         far = float(np.percentile(z[known], 99.9)) if known.any() else 1.0

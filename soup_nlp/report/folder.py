@@ -10,16 +10,14 @@ import numpy as np
 
 from soup_nlp.errors import DataError
 from soup_nlp.report.atomic import atomic_path
-from soup_nlp.report.figures import (
+from soup_nlp.report.colour import (
     colourise_depth,
     colourise_error,
     colourise_flow,
     depth_range,
     draw_superpixels,
-    overview,
-    write_depth_png16,
-    write_png,
 )
+from soup_nlp.report.figures import overview, write_depth_png16, write_png
 from soup_nlp.report.metrics import skill
 from soup_nlp.report.pointcloud import write_ply
 from soup_nlp.report.store import versions, write_h5, write_json

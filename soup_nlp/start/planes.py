@@ -7,7 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.start.epipolar import Motion
+
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,20 @@ class PlaneFit:
     slope: Float
     cost: Float
     parallax: Float
+
+    def pick(self, take: tuple[Int, Int]) -> PlaneFit:
+        """One candidate of each superpixel, (N, 1), from index arrays (N,) of both axes."""
+        return PlaneFit(*(v[take][:, None] for v in self.__dict__.values()))
+
+    def columns(self, kept: list[int]) -> PlaneFit:
+        """The candidates of these columns."""
+        return PlaneFit(*(v[:, kept] for v in self.__dict__.values()))
+
+    def penalised(self) -> Float:
+        """(N, C) cost in pixels, raised where the plane lies behind the camera."""
+        behind = self.inverse_depth <= 0
+        penalty = 1.0 + 0.5 * self.parallax * np.abs(self.inverse_depth)
+        return self.cost + np.where(behind, penalty, 0.0)
 
 
 def fit_planes(
@@ -104,3 +121,37 @@ def fit_planes(
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = np.where(mu[..., :1] != 0, mu[..., 1:] / mu[..., :1], 0.0)
     return PlaneFit(mu[..., 0], np.clip(slope, -max_slope, max_slope), cost, parallax)
+
+
+@dataclass(frozen=True)
+class Views:
+    """What the fits need of every superpixel.
+
+    Attributes:
+        ray: (N, S, 3) rays of sampled pixels.
+        target: (N, S, 3) rays of their flow targets (next camera).
+        weight: (N, S) confidence.
+        anchor: (N, 3) anchor rays.
+        radius: (N,) reach in ray units.
+        focal: (fx, fy) of the next camera, pixels.
+    """
+
+    ray: Float
+    target: Float
+    weight: Float
+    anchor: Float
+    radius: Float
+    focal: tuple[float, float]
+
+    def fit(self, motions: list[Motion]) -> PlaneFit:
+        """Planes of every superpixel under each of M motions."""
+        shape = (len(self.ray), len(motions))
+        R = np.broadcast_to(np.stack([m.R for m in motions]), (*shape, 3, 3))
+        t = np.broadcast_to(np.stack([m.t for m in motions]), (*shape, 3))
+        return self.fit_own(R, t)
+
+    def fit_own(self, R: Float, t: Float) -> PlaneFit:
+        """Planes under own motions R (N, C, 3, 3), t (N, C, 3)."""
+        return fit_planes(
+            R, t, self.ray, self.target, self.weight, self.anchor, self.radius, self.focal
+        )

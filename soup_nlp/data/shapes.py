@@ -1,0 +1,247 @@
+"""Surfaces that a ray can hit: where, with which normal, and which of their points are one matter.
+
+Every shape knows which of its points are the same matter in both frames (`material` and `place`),
+which is the identity for rigid shapes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import DataError
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+NEAR = 1e-6
+"""Hits closer than this depth are ignored, unit of length."""
+
+
+class Shape:
+    """A surface in its own coordinates; `frame` is 0 for the reference and 1 for the next frame.
+
+    Rigid shapes only implement `intersect`, `normals` and `corners`.
+    """
+
+    rigid = True
+
+    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
+        """Smallest ray parameter > NEAR (N,) of rays (N, 3) from `origin` (3,), inf for a miss."""
+        raise NotImplementedError
+
+    def normals(self, points: Float, frame: int) -> Float:
+        """Unit normals (N, 3) at surface points (N, 3)."""
+        raise NotImplementedError
+
+    def corners(self) -> Float | None:
+        """Points (M, 3) whose convex hull contains the shape in both frames; None if unbounded."""
+        raise NotImplementedError
+
+    def material(self, points: Float, frame: int) -> Float:
+        """Material coordinates (N, 3) of surface points (N, 3) in a frame."""
+        return points
+
+    def place(self, material: Float, frame: int) -> Float:
+        """Where material coordinates (N, 3) lie in a frame, (N, 3)."""
+        return material
+
+    def chart(self, material: Float) -> Float:
+        """Two coordinates (N, 2) along the surface, unit of length, for painted patterns."""
+        return material[:, :2]
+
+
+def _corner_points(half: tuple[float, float, float]) -> Float:
+    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
+    return signs * np.asarray(half)
+
+
+def _first_hit(*roots: Float) -> Float:
+    """The smallest root > NEAR of each ray; NaN and inf are misses."""
+    return np.minimum.reduce([np.where(root > NEAR, root, np.inf) for root in roots])
+
+
+@dataclass(frozen=True)
+class Plane(Shape):
+    """The plane z = 0, normal -z; seen from both sides. Bounded by `half` in x and y, or infinite.
+
+    Attributes:
+        half: Half sizes along x and y, unit of length; `inf` for no bound.
+    """
+
+    half: tuple[float, float] = (np.inf, np.inf)
+
+    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
+        """See `Shape`."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = -origin[2] / rays[:, 2]
+            inside = (abs(origin[0] + t * rays[:, 0]) <= self.half[0]) & (
+                abs(origin[1] + t * rays[:, 1]) <= self.half[1]
+            )
+        return np.where(inside, _first_hit(t), np.inf)
+
+    def normals(self, points: Float, frame: int) -> Float:
+        """See `Shape`."""
+        return np.broadcast_to([0.0, 0.0, -1.0], points.shape)
+
+    def corners(self) -> Float | None:
+        """See `Shape`."""
+        return _corner_points((*self.half, 0.0)) if np.isfinite(self.half).all() else None
+
+
+@dataclass(frozen=True)
+class Box(Shape):
+    """A box centred on the origin.
+
+    Attributes:
+        half: Half sizes along x, y and z, unit of length.
+    """
+
+    half: tuple[float, float, float]
+
+    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
+        """See `Shape`."""
+        half = np.asarray(self.half)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # one contiguous row per axis: much faster than reducing over rows of three
+            a, b = ((sign * half - origin)[:, None] / rays.T for sign in (-1, 1))
+        # fmin and fmax let a ray within a face (0/0) be decided by the other axes
+        enter = np.fmax.reduce(np.fmin(a, b))
+        leave = np.fmin.reduce(np.fmax(a, b))
+        return np.where(enter <= leave, _first_hit(enter, leave), np.inf)
+
+    def _face(self, points: Float) -> Int:
+        return np.argmax(abs(points) / np.asarray(self.half), axis=1)
+
+    def normals(self, points: Float, frame: int) -> Float:
+        """See `Shape`."""
+        face = self._face(points)
+        rows = np.arange(len(points))
+        out = np.zeros(points.shape)
+        out[rows, face] = np.sign(points[rows, face])
+        return out
+
+    def corners(self) -> Float:
+        """See `Shape`."""
+        return _corner_points(self.half)
+
+    def chart(self, material: Float) -> Float:
+        """See `Shape`; y runs along y on the four sides."""
+        face = self._face(material)
+        across = np.where(face == 0, material[:, 2], material[:, 0])
+        down = np.where(face == 1, material[:, 2], material[:, 1])
+        return np.stack([across, down], axis=1)
+
+
+@dataclass(frozen=True)
+class Sphere(Shape):
+    """A sphere around the origin.
+
+    Attributes:
+        radius: Unit of length.
+    """
+
+    radius: float
+
+    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
+        """See `Shape`."""
+        a = np.einsum("ni,ni->n", rays, rays)
+        b = rays @ origin
+        c = origin @ origin - self.radius**2
+        with np.errstate(invalid="ignore"):
+            root = np.sqrt(b * b - a * c)
+        return _first_hit((-b - root) / a, (-b + root) / a)
+
+    def normals(self, points: Float, frame: int) -> Float:
+        """See `Shape`."""
+        return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+    def corners(self) -> Float:
+        """See `Shape`."""
+        return _corner_points((self.radius,) * 3)
+
+
+@dataclass(frozen=True)
+class Sheet(Shape):
+    """A rectangular sheet bent into a circular cylinder, differently in each frame, isometrically.
+
+    Material coordinates are (x, y, 0) on the flat sheet. Bending about the direction at `angle`
+    from the y axis keeps lengths along the sheet: it is developable. With positive curvature the
+    sides bend towards +z.
+
+    Attributes:
+        half: Half sizes along the material axes x and y, unit of length.
+        curvature: Curvature (1 / unit of length) in the reference and in the next frame; 0 is flat.
+        angle: Direction of the bending axis in both frames, radians from y towards -x.
+    """
+
+    half: tuple[float, float]
+    curvature: tuple[float, float]
+    angle: tuple[float, float] = (0.0, 0.0)
+
+    rigid = False
+
+    def __post_init__(self) -> None:
+        reach = float(np.hypot(*self.half))
+        if max(abs(k) for k in self.curvature) * reach > 0.9 * np.pi:
+            raise DataError(
+                "sheet is bent so far that it meets itself",
+                where="Sheet.curvature",
+                found=self.curvature,
+                expected=f"|curvature| <= {0.9 * np.pi / reach:.3g}",
+            )
+
+    def _turn(self, points: Float, angle: float) -> Float:
+        c, s = np.cos(angle), np.sin(angle)
+        return points @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
+        """See `Shape`; the cylinder is `k (x^2 + z^2) = 2 z`, which stays sound for k = 0."""
+        k = self.curvature[frame]
+        o = self._turn(origin[None], -self.angle[frame])[0]
+        d = self._turn(rays, -self.angle[frame])
+        a = k * (d[:, 0] ** 2 + d[:, 2] ** 2)
+        b = k * (o[0] * d[:, 0] + o[2] * d[:, 2]) - d[:, 2]
+        c = k * (o[0] ** 2 + o[2] ** 2) - 2 * o[2]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            q = -(b + np.copysign(np.sqrt(b * b - a * c), b))
+            roots = (q / a, c / q)
+        return _first_hit(*(self._on_sheet(origin, rays, t, frame) for t in roots))
+
+    def _on_sheet(self, origin: Float, rays: Float, t: Float, frame: int) -> Float:
+        """The ray parameters `t` (N,), NaN where the point lies beyond the edge of the sheet."""
+        with np.errstate(invalid="ignore"):
+            material = self.material(origin + t[:, None] * rays, frame)
+            inside = (abs(material[:, :2]) <= np.asarray(self.half)).all(axis=1)
+        return np.where(inside, t, np.nan)
+
+    def material(self, points: Float, frame: int) -> Float:
+        """See `Shape`: unroll the cylinder."""
+        k = self.curvature[frame]
+        p = self._turn(points, -self.angle[frame])
+        arc = np.arctan2(k * p[:, 0], 1 - k * p[:, 2]) / k if k else p[:, 0]
+        flat = np.stack([arc, p[:, 1], np.zeros(len(p))], axis=1)
+        return self._turn(flat, self.angle[frame])
+
+    def place(self, material: Float, frame: int) -> Float:
+        """See `Shape`: roll the flat sheet up."""
+        k = self.curvature[frame]
+        p = self._turn(material, -self.angle[frame])
+        # np.sinc(x) = sin(pi x) / (pi x) is exact at 0
+        half_angle = 0.5 * k * p[:, 0] / np.pi
+        x = p[:, 0] * np.sinc(2 * half_angle)
+        z = 0.5 * k * p[:, 0] ** 2 * np.sinc(half_angle) ** 2
+        return self._turn(np.stack([x, p[:, 1], z], axis=1), self.angle[frame])
+
+    def normals(self, points: Float, frame: int) -> Float:
+        """See `Shape`; -z at the centre."""
+        k = self.curvature[frame]
+        p = self._turn(points, -self.angle[frame])
+        n = np.stack([k * p[:, 0], np.zeros(len(p)), k * p[:, 2] - 1], axis=1)
+        return self._turn(n / np.linalg.norm(n, axis=1, keepdims=True), self.angle[frame])
+
+    def corners(self) -> Float:
+        """See `Shape`."""
+        return _corner_points((float(np.hypot(*self.half)),) * 3)

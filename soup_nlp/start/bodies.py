@@ -1,0 +1,122 @@
+"""Bodies, groups of superpixels that move as one: pieces, borrowed depths, contact scales."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.camera import rays
+from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.soup import Soup
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+def components(mask: NDArray[np.bool_], seg: Segmentation) -> Int:
+    """(N,) component of every superpixel of a mask over the neighbour pairs, -1 outside."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    i, k = seg.pairs.T
+    both = mask[i] & mask[k]
+    n = len(mask)
+    graph = coo_matrix((np.ones(int(both.sum())), (i[both], k[both])), shape=(n, n))
+    _, piece = connected_components(graph, directed=False)
+    return np.where(mask, piece, -1)
+
+
+def bodies(label: Int, seg: Segmentation) -> Int:
+    """Groups that share one scale: a dominant motion, or a piece of superpixels of their own.
+
+    Args:
+        label: (N,) index of the dominant motion, -1 for a motion of the superpixel's own.
+        seg: Superpixels and graphs.
+
+    Returns:
+        (N,) index of the body.
+    """
+    own = label < 0
+    if not own.any():
+        return label
+    piece = components(own, seg)
+    _, piece = np.unique(np.where(own, piece, -1), return_inverse=True)
+    return np.where(own, label.max() + piece, label)
+
+
+def borrow(
+    mu: Float, slope: Float, label: Int, weak: NDArray[np.bool_], seg: Segmentation
+) -> tuple[Float, Float]:
+    """Weak superpixels take the median inverse depth of strong neighbours of their motion.
+
+    Args:
+        mu: (N,) inverse depth at the anchor, in units of |t|.
+        slope: (N, 2) relative change of it at the superpixel's radius; 0 where borrowed.
+        label: (N,) index of the motion.
+        weak: (N,) whose depth is not to be trusted.
+        seg: Superpixels and graphs.
+
+    Returns:
+        mu and slope with what was borrowed.
+    """
+    from scipy.spatial import cKDTree
+
+    mu, slope = mu.copy(), slope.copy()
+    for c in np.unique(label[weak]) if weak.any() else []:
+        own = np.flatnonzero(weak & (label == c))
+        strong = np.flatnonzero(~weak & (label == c))
+        if not len(strong):
+            strong = np.flatnonzero(~weak)
+        if not len(strong):
+            continue
+        k = min(5, len(strong))
+        _, near = cKDTree(seg.anchors[strong]).query(seg.anchors[own], k=k)
+        mu[own] = np.median(mu[strong][near.reshape(len(own), k)], axis=1)
+        slope[own] = 0.0
+    return mu, slope
+
+
+def contact_scales(
+    soup: Soup, label: Int, seg: Segmentation, K_ref: Float, quantile: float = 0.25
+) -> Float:
+    """(N,) relative scale of every body, such that bodies touch what is around them.
+
+    A body hides what is behind it: along its outline its depth is at most its neighbours', with
+    equality where it touches. So its scale is a low quantile of the depth ratios there. Bodies
+    are joined to the placed ones in the order of their contact length.
+
+    Args:
+        soup: Planes, every motion in its own scale.
+        label: (N,) index of the body.
+        seg: Superpixels and graphs.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        quantile: Of the depth ratios along the outline.
+    """
+    count = int(label.max()) + 1
+    log_scale = np.zeros(count)
+    if count == 1 or not len(seg.pairs):
+        return np.ones(len(soup))
+    i, k = seg.pairs.T
+    ray = rays(K_ref, seg.boundary.mean(axis=1))
+    zi = soup.distance[i] / np.maximum(-np.sum(soup.n[i] * ray, axis=1), 1e-3)
+    zk = soup.distance[k] / np.maximum(-np.sum(soup.n[k] * ray, axis=1), 1e-3)
+    across = label[i] != label[k]
+    a = np.concatenate([label[i][across], label[k][across]])
+    b = np.concatenate([label[k][across], label[i][across]])
+    ratio = np.log(np.concatenate([(zk / zi)[across], (zi / zk)[across]]))
+    contact = np.tile(seg.boundary_length[across], 2).astype(float)
+    placed = np.zeros(count, bool)
+    placed[np.argmax(np.bincount(label, minlength=count))] = True
+    while not placed.all():
+        touch = ~placed[a] & placed[b]
+        if not touch.any():
+            break
+        length = np.bincount(a[touch], contact[touch], minlength=count)
+        c = int(np.argmax(length))
+        mine = touch & (a == c)
+        value = ratio[mine] + log_scale[b[mine]]
+        order = np.argsort(value)
+        share = np.cumsum(contact[mine][order]) / contact[mine].sum()
+        log_scale[c] = value[order][np.searchsorted(share, quantile)]
+        placed[c] = True
+    return np.exp(log_scale)[label]

@@ -1,0 +1,34 @@
+"""What a problem file says about the start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class StartOptions:
+    """How the start is made.
+
+    Attributes:
+        samples: Pixels per superpixel.
+        dominant: Dominant motions looked for.
+        threshold_px: Inlier distance of a dominant motion.
+        smoothness: Pixels of error that a motion unlike all neighbours' must gain.
+        min_parallax_px: Below this the depth of a superpixel is borrowed.
+        rounds: Rounds of proposals from unexplained pieces, and from neighbours.
+        unexplained_px: A superpixel whose error is below this has no need of another motion.
+        pieces: At most this many unexplained pieces are looked at in a round.
+        piece_size: A piece has at least this many superpixels.
+        seed: Of sampling and RANSAC.
+    """
+
+    samples: int = 40
+    dominant: int = 5
+    threshold_px: float = 1.0
+    smoothness: float = 0.5
+    min_parallax_px: float = 0.25
+    rounds: int = 3
+    unexplained_px: float = 0.1
+    pieces: int = 6
+    piece_size: int = 4
+    seed: int = 0

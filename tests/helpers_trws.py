@@ -1,0 +1,145 @@
+"""Plain loops of the original TRW-S, brute force, linear programs and random problems."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+from scipy.sparse import coo_array
+
+from soup_nlp.refine.trws import TRWSResult
+
+FOREVER = {"gap": -1.0, "stagnation": -1.0}
+seeds = st.integers(0, 2**32 - 1)
+
+
+def textbook(unary, edges, tables, sequence, iterations):
+    """TRW_S-v1.3, general type, node by node: bounds, energies and labels of every iteration."""
+    rank = {int(v): k for k, v in enumerate(sequence)}
+    arcs = []  # tail, head, table with the tail first: the original swaps ends the same way
+    for (a, b), table in zip(edges, tables):
+        arcs.append((a, b, table) if rank[a] < rank[b] else (b, a, table.T))
+    ahead = {v: [e for e, arc in enumerate(arcs) if arc[0] == v] for v in rank}
+    behind = {v: [e for e, arc in enumerate(arcs) if arc[1] == v] for v in rank}
+    message = [np.zeros(arc[2].shape[0]) for arc in arcs]  # towards the tail, to begin with
+
+    def belief(v):
+        total = unary[v].copy()
+        for e in ahead[v] + behind[v]:
+            total += message[e]
+        return total
+
+    def gamma(v):
+        return 1.0 / max(len(ahead[v]), len(behind[v]))
+
+    bounds, energies, labellings = [], [], []
+    for _ in range(iterations):
+        for v in sequence:
+            total = belief(v)
+            for e in ahead[v]:
+                table = arcs[e][2]
+                out = np.empty(table.shape[1])
+                for x in range(table.shape[1]):
+                    out[x] = min(
+                        gamma(v) * total[y] - message[e][y] + table[y, x] for y in range(len(total))
+                    )
+                message[e] = out - out.min()
+        bound = 0.0
+        for v in reversed(sequence):
+            total = belief(v)
+            bound += total.min()
+            total -= total.min()
+            for e in behind[v]:
+                table = arcs[e][2]
+                out = np.empty(table.shape[0])
+                for y in range(table.shape[0]):
+                    out[y] = min(
+                        gamma(v) * total[x] - message[e][x] + table[y, x] for x in range(len(total))
+                    )
+                bound += out.min()
+                message[e] = out - out.min()
+        labels = np.zeros(len(unary), int)
+        energy = 0.0
+        for v in sequence:
+            exact = unary[v].copy()
+            for e in behind[v]:
+                exact += arcs[e][2][labels[arcs[e][0]]]
+            total = exact.copy()
+            for e in ahead[v]:
+                total += message[e]
+            labels[v] = total.argmin()
+            energy += exact[labels[v]]
+        bounds.append(bound)
+        energies.append(energy)
+        labellings.append(labels)
+    return np.array(bounds), np.array(energies), labellings
+
+
+def random_edges(rng, n, count):
+    """Distinct node pairs in random directions."""
+    pairs = np.array(list(itertools.combinations(range(n), 2)), dtype=int).reshape(-1, 2)
+    pairs = rng.permutation(pairs)[:count]
+    return np.where(rng.random((len(pairs), 1)) < 0.5, pairs, pairs[:, ::-1])
+
+
+def ragged(rng, n, count, most=5, scale=1.0):
+    """Random problem with different label counts: unary list, edges, table list."""
+    counts = rng.integers(1, most + 1, n)
+    edges = random_edges(rng, n, count)
+    unary = [scale * rng.normal(size=k) for k in counts]
+    return unary, edges, [scale * rng.normal(size=(counts[a], counts[b])) for a, b in edges]
+
+
+def dense(rng, n, count, size):
+    """Random problem with equal label counts: unary array, edges, table array."""
+    edges = random_edges(rng, n, count)
+    return rng.normal(size=(n, size)), edges, rng.normal(size=(len(edges), size, size))
+
+
+def brute(unary, edges, tables):
+    """Least energy over all labellings."""
+    return min(
+        sum(u[x] for u, x in zip(unary, labels))
+        + sum(t[labels[a], labels[b]] for (a, b), t in zip(edges, tables))
+        for labels in itertools.product(*(range(len(u)) for u in unary))
+    )
+
+
+def local_polytope(unary, edges, tables):
+    """Optimum of the linear program over the local polytope, by HiGHS."""
+    starts = np.concatenate([[0], np.cumsum([len(u) for u in unary])])
+    at = int(starts[-1])
+    cost = [np.asarray(u, float) for u in unary]
+    row, column, value, right = [], [], [], []
+    for i, u in enumerate(unary):
+        row += [len(right)] * len(u)
+        column += list(range(starts[i], starts[i] + len(u)))
+        value += [1.0] * len(u)
+        right.append(1.0)
+    for (a, b), table in zip(edges, tables):
+        index = at + np.arange(table.size).reshape(table.shape)
+        at += table.size
+        cost.append(table.ravel())
+        for node, lines in ((a, index), (b, index.T)):
+            for x, line in enumerate(lines):
+                row += [len(right)] * (len(line) + 1)
+                column += [*line.tolist(), int(starts[node]) + x]
+                value += [1.0] * len(line) + [-1.0]
+                right.append(0.0)
+    matrix = coo_array((value, (row, column)), shape=(len(right), at)).tocsr()
+    solved = linprog(np.concatenate(cost), A_eq=matrix, b_eq=right, bounds=(0, None))
+    assert solved.status == 0
+    return solved.fun
+
+
+def random_tree(rng, n):
+    """Edges of a random tree, nodes shuffled."""
+    name = rng.permutation(n)
+    return np.array([(name[rng.integers(k)], name[k]) for k in range(1, n)])
+
+
+def rises(result: TRWSResult, slack: float = 1e-10) -> bool:
+    scale = max(1.0, abs(result.energy))
+    return bool((np.diff(result.bound_history) >= -slack * scale).all())

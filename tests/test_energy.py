@@ -1,0 +1,283 @@
+"""The exact energy: invariances, values by hand, pixel samples, degenerate problems."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_formulation import TERMS, UNITS, WORLDS, form, tiny, world
+from helpers_model import (
+    GAUGES,
+    HEIGHT,
+    K_NEXT,
+    K_REF,
+    PAPER,
+    WIDTH,
+    Tiny,
+    random_soup,
+    value,
+    weights_for,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from soup_nlp.data.pair import Flow
+from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model import plain
+from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels, sample_pixels
+from soup_nlp.model.formulation import build_matrix_nlp
+
+# --- invariances ---------------------------------------------------------------------------------
+
+
+def energies(soup: Soup, data: EnergyData, weights: Weights) -> np.ndarray:
+    e = plain.energy(soup, data, weights)
+    return np.array([e[k] for k in TERMS])
+
+
+@pytest.mark.parametrize("units", UNITS)
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000), scale=st.floats(1e-3, 1e3))
+def test_energy_knows_no_global_scale_and_no_gauge(units, seed, scale):
+    problem, weights = tiny(units), weights_for(units)
+    soup = random_soup(seed, 12)
+    c = np.random.default_rng(seed).uniform(0.1, 10, 12)
+    expected = energies(soup, problem.data, weights)
+    for twin in (
+        replace(soup, lam=scale * soup.lam),
+        replace(soup, d=scale * soup.d, t=scale * soup.t),
+        Soup(c * soup.lam, soup.n, soup.d / c, soup.R, soup.t / c[:, None]),
+        soup.normalised(),
+    ):
+        np.testing.assert_allclose(energies(twin, problem.data, weights), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("at_anchors", [True, False])
+@pytest.mark.parametrize("units", UNITS)
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000))
+def test_a_rigid_motion_of_the_next_camera_changes_the_projection_only(units, at_anchors, seed):
+    """X'' = Q X' + s: distances of all motions and points of the next frame stay."""
+    problem, weights = tiny(units, at_anchors), replace(weights_for(units), sigma_proj=np.inf)
+    soup = random_soup(seed, 12)
+    rng = np.random.default_rng(seed)
+    Q, s = rotation.exp(rng.normal(0, 0.3, 3)), rng.normal(0, 0.3, 3)
+    moved = replace(soup, R=Q @ soup.R, t=soup.t @ Q.T + s / soup.lam[:, None])
+    before, after = (energies(x, problem.data, weights) for x in (soup, moved))
+    np.testing.assert_allclose(after[[0, 2, 3]], before[[0, 2, 3]], rtol=1e-9)
+    assert after[1] != pytest.approx(before[1], rel=1e-3)
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000))
+def test_turning_the_reference_frame_with_all_its_rays_changes_nothing(seed):
+    """X -> Q X: rays, normals and rotations turn together. Depth along z alone would not stand it,
+    so lengths here are in the paper's unit."""
+    problem, weights = tiny("paper", True), weights_for("paper")
+    soup, data = random_soup(seed, 12), problem.data
+    Q = rotation.exp(np.random.default_rng(seed).normal(0, 0.5, 3))
+    turned = replace(soup, n=soup.n @ Q.T, R=soup.R @ Q.T)
+    rays = {name: getattr(data, name) @ Q.T for name in ("anchor_ray", "pixel_ray", "boundary_ray")}
+    np.testing.assert_allclose(
+        energies(turned, replace(data, **rays), weights),
+        energies(soup, data, weights),
+        rtol=1e-9,
+    )
+
+
+def test_the_order_of_the_superpixels_does_not_matter():
+    # every anchor is a neighbour of every other: fewer would be chosen among equally near ones
+    problem, weights = Tiny(neighbours=11), weights_for("paper")
+    order = np.random.default_rng(0).permutation(12)
+    rank = np.argsort(order).astype(np.int32)
+    seg = build_segmentation(
+        rank[problem.seg.labels], problem.image, neighbours=11, boundary_samples=2
+    )
+    data = build_energy_data(seg, problem.flow, K_REF, K_NEXT, 3, 0)
+    s = problem.soup
+    soup = Soup(s.lam[order], s.n[order], s.d[order], s.R[order], s.t[order])
+    np.testing.assert_allclose(
+        energies(soup, data, weights), energies(s, problem.data, weights), rtol=1e-12
+    )
+
+
+def test_local_units_make_every_edge_blind_to_its_own_scale():
+    """Both superpixels of an edge twice as far: its energy stays, while others' does not."""
+    problem, weights = tiny("pixels", True), weights_for("pixels", truncated=False)
+    i, k = problem.seg.edges[0]
+    lam = problem.soup.lam.copy()
+    lam[[i, k]] *= 2
+    twice = replace(problem.soup, lam=lam)
+    a = plain.arap(problem.soup, problem.data, weights)
+    b = plain.arap(twice, problem.data, weights)
+    assert b[0] == pytest.approx(a[0], rel=1e-12)
+    touched = np.isin(problem.seg.edges, [i, k]).any(axis=1)
+    np.testing.assert_allclose(b[~touched], a[~touched], rtol=1e-12)
+    assert (b[touched][1:] != a[touched][1:]).all()
+
+
+# --- energy by hand ------------------------------------------------------------------------------
+
+
+def test_two_superpixels_by_hand():
+    """Two fronto-parallel planes at depths 1 and 3, both moved sideways, by 0.1 and 0.3."""
+    labels = np.zeros((4, 8), np.int32)
+    labels[:, 4:] = 1
+    K = camera.intrinsics(10.0, 10.0, 3.5, 1.5)
+    image = np.zeros((4, 8, 3), np.uint8)
+    seg = build_segmentation(labels, image, neighbours=1, beta=0.1, boundary_samples=None)
+    flow = Flow(np.zeros((4, 8, 2), np.float32), np.ones((4, 8), np.float32), "zero")
+    data = build_energy_data(seg, flow, K, K, None)
+    D, T = np.array([1.0, 3.0]), np.array([[0.1, 0, 0], [0.3, 0, 0]])
+    lam = np.array([0.5, 0.5])
+    soup = Soup(
+        lam, np.tile([0, 0, -1.0], (2, 1)), D / lam, np.tile(np.eye(3), (2, 1, 1)), T / lam[:, None]
+    )
+    w = replace(PAPER, arap=1, proj=1, cont=1, orient=1, sigma_cont=0.2, sigma_orient=0.5)
+    e = plain.energy(soup, data, w)
+    mean = 2.0  # of the plane distances: the length unit
+    anchor = np.array([[-0.2, 0, 1], [0.2, 0, 1]])  # centroids 1.5 and 5.5 of columns about 3.5
+    X = D[:, None] * anchor
+    stretch = abs(np.linalg.norm(X[0] - X[1]) - np.linalg.norm(X[0] + T[0] - X[1] - T[1]))
+    w1 = 2 * np.exp(-0.1 * 4)
+    assert e["arap"] == pytest.approx(w1 * (0.2 + stretch) / mean)
+    assert e["proj"] == pytest.approx(2 * 1.0)  # both move by one pixel
+    rays = np.array([[0.0, (v - 1.5) / 10, 1] for v in range(4)])
+    gap = np.linalg.norm(2 * rays) / mean  # four boundary points, stacked
+    after = np.linalg.norm(2 * rays + [0.2, 0, 0]) / mean
+    w4 = 2 * 4  # one colour: four neighbours, both directions
+    assert e["cont"] == pytest.approx(w4 * (gap + min(after, 0.2)))
+    assert e["orient"] == 0
+
+
+def test_pixel_units_by_hand():
+    """At depth Z under a baseline T: a turn costs focal x angle, a motion gap g costs focal g / Z,
+    a depth gap g costs the parallax focal (g / Z) (T / Z)."""
+    Z, T, g = 2.0, 0.1, 1e-4
+    soup, data = world("fronto-parallel, sideways", "pixels", False)
+    soup = replace(soup, lam=soup.lam.copy(), R=soup.R.copy(), t=soup.t.copy())
+    base = np.linalg.norm(WORLDS["fronto-parallel, sideways"][1][:3, 3])
+    assert base == pytest.approx(np.hypot(T, 0.03))
+    focal = 90.0
+    here = 5
+    edge = (data.edges == here).any(axis=1)
+    wide = replace(PAPER, sigma_cont=np.inf)
+    arap = data.edge_weight * edge
+    turned = soup.R.copy()
+    angle = 1e-3
+    turned[here] = turned[here] @ rotation.exp([0, 0, angle])
+    # |R_i - R_k|_F = sqrt(8) sin(angle / 2); turning about z leaves the camera's own motion
+    e = plain.arap(replace(soup, R=turned), data, wide)
+    rotating = focal * np.sqrt(8) * np.sin(angle / 2)
+    np.testing.assert_array_less(arap * rotating - 1e-9, e)
+    assert np.median(e[edge] / (arap[edge] * rotating)) == pytest.approx(1, abs=0.5)
+    moved = soup.t.copy()
+    moved[here] += [0, 0, g / soup.lam[here]]
+    gap = plain.arap(replace(soup, t=moved), data, wide)
+    at_least = arap * focal * g / Z
+    assert (gap >= at_least - 1e-9).all()
+    assert (gap <= 2 * at_least + 1e-9).all()
+    assert gap[edge].min() > 0
+    # deeper by g, with the motion unchanged: both frames' gaps are g along the rays
+    deeper = replace(soup, d=np.where(np.arange(12) == here, soup.d * (1 + g / Z), soup.d))
+    cont = plain.continuity(deeper, data, wide)
+    pair = (data.pairs == here).any(axis=1)
+    length = np.linalg.norm(data.boundary_ray, axis=2)
+    whole = np.sqrt(np.sum(length**2, axis=1)) * data.pair_factor
+    parallax = focal * (g / Z) * (base / Z)
+    expected = 2 * data.pair_weight * pair * whole * parallax
+    np.testing.assert_allclose(cont, expected, rtol=1e-3, atol=1e-9)
+
+
+def test_a_camera_at_rest_counts_half_a_pixel_of_parallax():
+    data = world("at rest", "pixels", False)[1]
+    focal = float(data.K_next[0, 0])
+    np.testing.assert_allclose(data.pair_unit, 1 / 0.5)
+    np.testing.assert_allclose(data.edge_unit, 1 / focal)
+    assert data.local_units
+
+
+def test_sampled_boundaries_stand_for_the_whole():
+    """With constant gaps the sampled Frobenius norm, times its factor, is that of all points."""
+    soup = random_soup(0, 12, spread=0.0)
+    lam = soup.lam * np.random.default_rng(0).uniform(0.8, 1.2, 12)
+    soup = replace(soup, lam=lam)
+    few = plain.continuity(soup, Tiny(boundary_samples=3).data, PAPER)
+    every = plain.continuity(soup, Tiny(boundary_samples=None).data, PAPER)
+    np.testing.assert_allclose(few, every, rtol=0.02)
+
+
+# --- samples -------------------------------------------------------------------------------------
+
+
+def test_sampled_pixels_are_distinct_confident_and_from_their_superpixel():
+    problem = tiny()
+    index, there = sample_pixels(problem.seg.labels, problem.flow, 9, 0)
+    confidence = problem.flow.confidence.ravel()
+    for i in range(12):
+        mine = index[i][there[i]]
+        assert len(set(mine.tolist())) == len(mine) == 9
+        assert (problem.seg.labels.ravel()[mine] == i).all()
+        assert (confidence[mine] > 0).all()
+    again, _ = sample_pixels(problem.seg.labels, problem.flow, 9, 0)
+    np.testing.assert_array_equal(index, again)
+    other, _ = sample_pixels(problem.seg.labels, problem.flow, 9, 1)
+    assert (index != other).any()
+
+
+def test_all_pixels_are_taken_where_none_is_asked_for():
+    problem = tiny()
+    index, there = sample_pixels(problem.seg.labels, problem.flow, None, 0)
+    found = np.sort(index[there])
+    np.testing.assert_array_equal(found, np.flatnonzero(problem.flow.confidence.ravel() > 0))
+
+
+def test_superpixels_without_flow_take_no_pixels_and_have_no_projection():
+    problem = tiny()
+    confidence = problem.flow.confidence.copy()
+    confidence[problem.seg.labels == 5] = 0
+    flow = Flow(problem.flow.uv, confidence, "test")
+    data = build_energy_data(problem.seg, flow, K_REF, K_NEXT, 6)
+    assert (data.pixel_weight[5] == 0).all()
+    assert (data.pixel_weight[4] > 0).all()
+    error = plain.reprojection(problem.soup, data, PAPER)
+    assert error[5] == 0
+    nlp, _ = build_matrix_nlp(problem.soup, data, PAPER, form())
+    assert np.isfinite(value(nlp, nlp.x0)[0])
+
+
+def test_confidence_zero_everywhere_leaves_a_valid_problem():
+    problem = tiny()
+    flow = Flow(problem.flow.uv, np.zeros((HEIGHT, WIDTH), np.float32), "nothing")
+    data = build_energy_data(problem.seg, flow, K_REF, K_NEXT, 6)
+    nlp, _ = build_matrix_nlp(problem.soup, data, PAPER, form())
+    e = plain.energy(problem.soup, data, PAPER)
+    assert e["proj"] == 0
+    assert np.isfinite(value(nlp, nlp.x0)[0])
+
+
+def test_one_superpixel_is_a_valid_problem():
+    image = np.zeros((16, 16, 3), np.uint8)
+    seg = build_segmentation(np.zeros((16, 16), np.int32), image)
+    K = camera.intrinsics(20.0, 20.0, 7.5, 7.5)
+    flow = Flow(np.ones((16, 16, 2), np.float32), np.ones((16, 16), np.float32), "ones")
+    soup = random_soup(0, 1)
+    data = in_pixels(build_energy_data(seg, flow, K, K, 6), soup, seg)
+    for gauge in GAUGES:
+        nlp, _ = build_matrix_nlp(soup, data, PAPER, form(gauge=gauge))
+        e = plain.energy(soup, data, PAPER)
+        assert e["arap"] == e["cont"] == e["orient"] == 0
+        assert value(nlp, nlp.x0)[0] == pytest.approx(e["total"], rel=0.1)
+        assert value(nlp, nlp.x0)[1][: 6 + 1] == pytest.approx(0, abs=1e-12)
+
+
+def test_records_print_themselves():
+    problem = tiny()
+    assert str(problem.data).startswith("EnergyData(12 superpixels x 3 pixels, ")
+    assert str(problem.seg).startswith("Segmentation(12 superpixels of 64x48, K = 4, ")
+    arrays = problem.data.arrays()
+    assert arrays["edges"].shape == problem.seg.edges.shape
+    assert all(isinstance(v, np.ndarray) for v in arrays.values())

@@ -1,0 +1,280 @@
+"""What TRW-S takes and when it ends: forms of tables, options, interruption, wrong inputs."""
+
+from __future__ import annotations
+
+import itertools
+import tracemalloc
+
+import numpy as np
+import pytest
+from helpers_trws import FOREVER, dense, ragged, seeds
+from hypothesis import given, settings
+
+from soup_nlp.errors import ModelError
+from soup_nlp.refine.trws import mrf_energy, solve_trws
+
+# --- forms of input ---------------------------------------------------------------------------
+
+
+def test_functions_lists_and_arrays_agree(monkeypatch):
+    monkeypatch.setattr("soup_nlp.refine.trws.CALL_BYTES", 5 * 4 * 4 * 8)
+    monkeypatch.setattr("soup_nlp.refine.trws_order.CALL_BYTES", 5 * 4 * 4 * 8)
+    rng = np.random.default_rng(7)
+    unary, edges, tables = dense(rng, 12, 30, 4)
+    asked: list[int] = []
+
+    def pairwise(ids):
+        asked.append(len(ids))
+        return tables[ids]
+
+    plain = solve_trws(unary, edges, tables, max_iter=4, polish=True, **FOREVER)
+    before = tables.copy()
+    for form, keep in ((list(tables), True), (pairwise, True), (pairwise, False)):
+        other = solve_trws(unary, edges, form, max_iter=4, polish=True, keep_tables=keep, **FOREVER)
+        np.testing.assert_array_equal(other.bound_history, plain.bound_history)
+        np.testing.assert_array_equal(other.energy_history, plain.energy_history)
+        np.testing.assert_array_equal(other.labels, plain.labels)
+        assert other.energy == pytest.approx(plain.energy, abs=1e-12)
+    assert max(asked) == 5
+    np.testing.assert_array_equal(tables, before)
+
+
+def test_padded_function_with_different_label_counts():
+    rng = np.random.default_rng(8)
+    unary, edges, tables = ragged(rng, 8, 15)
+    size = max(len(u) for u in unary)
+
+    def pairwise(ids):
+        out = np.full((len(ids), size, size), -1e3)  # nonsense where there is no label
+        for k, e in enumerate(ids):
+            out[k, : tables[e].shape[0], : tables[e].shape[1]] = tables[e]
+        return out
+
+    plain = solve_trws(unary, edges, tables, max_iter=5, **FOREVER)
+    for keep in (True, False):
+        other = solve_trws(unary, edges, pairwise, max_iter=5, keep_tables=keep, **FOREVER)
+        np.testing.assert_array_equal(other.bound_history, plain.bound_history)
+        np.testing.assert_array_equal(other.labels, plain.labels)
+
+
+def test_an_infinite_unary_cost_forbids_a_label():
+    rng = np.random.default_rng(9)
+    unary, edges, tables = dense(rng, 7, 12, 4)
+    allowed = rng.random((7, 4)) < 0.6
+    allowed[np.arange(7), rng.integers(0, 4, 7)] = True
+    short = [u[keep] for u, keep in zip(unary, allowed)]
+    cut = [t[np.ix_(allowed[a], allowed[b])] for (a, b), t in zip(edges, tables)]
+    plain = solve_trws(short, edges, cut, max_iter=6, **FOREVER)
+    other = solve_trws(np.where(allowed, unary, np.inf), edges, tables, max_iter=6, **FOREVER)
+    np.testing.assert_allclose(other.bound_history, plain.bound_history, rtol=1e-12)
+    assert other.energy == pytest.approx(plain.energy)
+    assert allowed[np.arange(7), other.labels].all()
+
+
+def test_parallel_edges_are_added_up():
+    rng = np.random.default_rng(10)
+    unary, edges, tables = dense(rng, 6, 8, 3)
+    twice = np.concatenate([edges, edges[[2, 5]], edges[[2, 7], ::-1]])
+    extra = rng.normal(size=(4, 3, 3))
+    both = np.concatenate([tables, extra])
+    summed = tables.copy()
+    summed[[2, 5]] += extra[:2]
+    summed[[2, 7]] += extra[2:].transpose(0, 2, 1)
+    plain = solve_trws(unary, edges, summed, max_iter=5, **FOREVER)
+    other = solve_trws(unary, twice, both, max_iter=5, **FOREVER)
+    np.testing.assert_allclose(other.bound_history, plain.bound_history, rtol=1e-12)
+    assert other.energy == mrf_energy(other.labels, unary, twice, both)
+    assert other.energy == pytest.approx(plain.energy)
+    with pytest.raises(ModelError, match="Parallel"):
+        solve_trws(unary, twice, lambda ids: both[ids], keep_tables=False)
+
+
+def test_no_edges_lone_nodes_and_single_labels():
+    unary = [np.array([2.0, 1.0]), np.array([3.0]), np.array([0.5, 0.5, 4.0])]
+    alone = solve_trws(unary, np.zeros((0, 2), int), [])
+    assert (alone.energy, alone.lower_bound, alone.status) == (4.5, 4.5, "gap")
+    assert alone.labels.tolist() == [1, 0, 0]
+    assert (alone.iterations, alone.ties) == (1, 1)
+    joined = solve_trws(unary, np.array([[1, 0]]), [np.array([[5.0, 7.0]])])
+    assert joined.energy == joined.lower_bound == pytest.approx(10.5)
+    for empty in (np.zeros((0, 3, 3)), lambda ids: np.zeros((len(ids), 3, 3))):
+        assert solve_trws(np.eye(3), [], empty).energy == 0.0
+
+
+def test_tables_of_the_working_type_are_not_copied():
+    rng = np.random.default_rng(11)
+    unary, edges, tables = dense(rng, 60, 400, 40)
+    tracemalloc.start()
+    solve_trws(unary, edges, tables, max_iter=2, **FOREVER)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < tables.nbytes
+
+
+# --- options ----------------------------------------------------------------------------------
+
+
+def test_never_worse_than_the_initial_labels():
+    rng = np.random.default_rng(12)
+    unary, edges, tables = dense(rng, 6, 15, 3)
+    grid = itertools.product(range(3), repeat=6)
+    best = min(grid, key=lambda x: mrf_energy(np.array(x), unary, edges, tables))
+    least = mrf_energy(np.array(best), unary, edges, tables)
+    for dtype in (np.float64, np.float32):
+        result = solve_trws(
+            unary, edges, tables, init_labels=np.array(best), max_iter=1, dtype=dtype, **FOREVER
+        )
+        assert result.energy == least
+        assert result.labels.tolist() == list(best)
+        assert result.best_history[0] <= result.energy_history[0]
+
+
+def test_polish_ends_where_no_single_node_helps():
+    rng = np.random.default_rng(13)
+    unary, edges, tables = dense(rng, 10, 40, 4)
+    rough = solve_trws(unary, edges, tables, max_iter=1, **FOREVER)
+    result = solve_trws(unary, edges, tables, max_iter=1, polish=True, **FOREVER)
+    assert result.energy <= rough.energy
+    for v, x in itertools.product(range(10), range(4)):
+        moved = result.labels.copy()
+        moved[v] = x
+        assert mrf_energy(moved, unary, edges, tables) >= result.energy - 1e-9
+
+
+def test_stops():
+    rng = np.random.default_rng(14)
+    unary, edges, tables = dense(rng, 12, 50, 4)
+    few = solve_trws(unary, edges, tables, max_iter=3, **FOREVER)
+    assert (few.status, few.iterations) == ("iterations", 3)
+    assert len(few.bound_history) == len(few.energy_history) == len(few.best_history) == 3
+    loose = solve_trws(unary, edges, tables, gap=10.0)
+    assert (loose.status, loose.iterations) == ("gap", 1)
+    stuck = solve_trws(unary, edges, tables, gap=-1.0, max_iter=5000, patience=4)
+    assert stuck.status == "stagnation"
+    rise = stuck.bound_history[-1] - stuck.bound_history[-5]
+    assert rise <= 1e-7 * max(1.0, abs(stuck.bound_history[-1]))
+    assert stuck.best_history[-1] == stuck.best_history[-5]
+
+
+@pytest.mark.parametrize("how", ["interrupt", "answer"])
+def test_interruption_keeps_the_best(how):
+    rng = np.random.default_rng(15)
+    unary, edges, tables = dense(rng, 12, 50, 4)
+    seen = []
+
+    def callback(iteration, bound, energy, best):
+        seen.append((bound, energy, best))
+        if iteration == 3:
+            if how == "interrupt":
+                raise KeyboardInterrupt
+            return True
+        return None
+
+    result = solve_trws(unary, edges, tables, callback=callback, **FOREVER)
+    assert (result.status, result.iterations) == ("interrupted", 3)
+    columns = [result.bound_history, result.energy_history, result.best_history]
+    np.testing.assert_array_equal(np.array(seen).T, columns)
+    assert result.energy == pytest.approx(result.best_history[-1])
+
+
+def test_interruption_in_the_first_pass():
+    rng = np.random.default_rng(16)
+    unary, edges, tables = dense(rng, 5, 6, 3)
+    calls = []
+
+    def pairwise(ids):
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return tables[ids]
+
+    result = solve_trws(unary, edges, pairwise, keep_tables=False)
+    assert (result.status, result.iterations) == ("interrupted", 0)
+    assert result.lower_bound == -np.inf
+    assert result.labels.tolist() == unary.argmin(1).tolist()
+
+
+def test_result_is_frozen():
+    result = solve_trws(np.eye(2), [], np.zeros((0, 2, 2)))
+    with pytest.raises(AttributeError):
+        result.energy = 0.0
+
+
+# --- energy -----------------------------------------------------------------------------------
+
+
+@given(seeds)
+@settings(max_examples=15, deadline=None)
+def test_energy_is_a_plain_sum(seed):
+    rng = np.random.default_rng(seed)
+    unary, edges, tables = dense(rng, 7, 12, 3)
+    labels = rng.integers(0, 3, 7)
+    total = sum(unary[i, x] for i, x in enumerate(labels))
+    total += sum(t[labels[a], labels[b]] for (a, b), t in zip(edges, tables))
+    for form in (tables, list(tables), lambda ids: tables[ids]):
+        assert mrf_energy(labels, unary, edges, form) == pytest.approx(total, abs=1e-12)
+
+
+# --- wrong inputs -----------------------------------------------------------------------------
+
+GOOD = {
+    "unary": np.zeros((3, 2)),
+    "edges": np.array([[0, 1], [1, 2]]),
+    "tables": np.zeros((2, 2, 2)),
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        ({"unary": np.zeros((0, 2))}, "unary"),
+        ({"unary": np.zeros(3)}, "unary[0]"),
+        ({"unary": np.array([[0, 1], [np.nan, 0], [0, 0]])}, "unary[1]"),
+        ({"unary": np.array([[0, 1], [0, 0], [-np.inf, 0]])}, "unary[2]"),
+        ({"unary": np.array([[0, 1], [0, 0], [np.inf, np.inf]])}, "unary[2]"),
+        ({"unary": np.full((3, 2), 1e300), "dtype": np.float32}, "unary"),
+        ({"edges": np.array([[0, 1], [1, 3]])}, "edges[1]"),
+        ({"edges": np.array([[-1, 1], [1, 2]])}, "edges[0]"),
+        ({"edges": np.array([[0, 1], [2, 2]])}, "edges[1]"),
+        ({"edges": np.array([[0.0, 1.0], [1.0, 2.0]])}, "edges"),
+        ({"edges": np.array([0, 1, 2])}, "edges"),
+        ({"tables": np.zeros((2, 2, 3))}, "pairwise"),
+        ({"tables": np.zeros((1, 2, 2))}, "pairwise"),
+        ({"tables": np.full((2, 2, 2), np.inf)}, "pairwise[0]"),
+        ({"tables": np.full((2, 2, 2), 1e300), "dtype": np.float32}, "pairwise[0]"),
+        ({"tables": np.where(np.arange(2) == 1, np.nan, 0.0) * np.ones((2, 2, 2))}, "pairwise[0]"),
+        ({"tables": [np.zeros((2, 2))]}, "pairwise"),
+        ({"tables": [np.zeros((2, 2)), np.zeros((2, 3))]}, "pairwise[1]"),
+        ({"tables": lambda ids: np.zeros((1, 2, 2))}, "pairwise(edges 0 to 1)"),
+        ({"tables": lambda ids: np.full((len(ids), 2, 2), np.nan)}, "pairwise[0]"),
+        ({"order": "colors"}, "order"),
+        ({"order": np.array([0, 1, 1])}, "order"),
+        ({"order": np.array([0, 1])}, "order"),
+        ({"dtype": np.int32}, "dtype"),
+        ({"max_iter": 0}, "max_iter"),
+        ({"patience": 0}, "patience"),
+        ({"init_labels": np.array([0, 1, 2])}, "init_labels"),
+        ({"init_labels": np.array([0.0, 1.0, 1.0])}, "init_labels"),
+    ],
+)
+def test_wrong_inputs_are_named(change, where):
+    case = {**GOOD, **change}
+    with pytest.raises(ModelError) as caught:
+        solve_trws(case.pop("unary"), case.pop("edges"), case.pop("tables"), **case)
+    assert caught.value.where == where
+    assert caught.value.found is not None
+    assert caught.value.expected is not None
+
+
+def test_a_function_that_is_not_finite_is_caught_when_not_kept():
+    with pytest.raises(ModelError, match="overflow"):
+        solve_trws(
+            GOOD["unary"],
+            GOOD["edges"],
+            lambda ids: np.full((len(ids), 2, 2), np.nan),
+            keep_tables=False,
+        )
+    with pytest.raises(ModelError, match="wrong shape"):
+        solve_trws(GOOD["unary"], GOOD["edges"], lambda ids: np.zeros((3, 2, 2)), keep_tables=False)
+    with pytest.raises(ModelError, match="labels"):
+        mrf_energy(np.zeros(2, int), GOOD["unary"], GOOD["edges"], GOOD["tables"])
