@@ -25,6 +25,7 @@ RANGES: Mapping[str, tuple[float | None, float | None]] = {
     **dict.fromkeys(("leak_arap", "presolve_theta", "theta", "occluded_confidence"), (0, 1)),
     **dict.fromkeys(("samples", "dominant", "pieces", "piece_size"), (1, None)),
     "presolve_iterations": (1, None),
+    "polish_rounds": (1, None),
     "depth_ratio": (1, None),
     "min_facing": (0, 0.5),
     "finest_scale": (0, 5),

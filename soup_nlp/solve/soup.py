@@ -42,6 +42,7 @@ class SolverOptions:
         stagnation: Reweighted stages end at this relative change of f, twice in a row; the last
             at a tenth of it.
         polish_iterations: Limit of the polish with the exact Hessian; 0 leaves it out.
+        polish_rounds: Polishes at most; before each but the first the last stage is taken up again.
         presolve_tol: Dual infeasibility that ends the polish.
         eps: Smoothing of the constrained NLP.
         max_iter: Iteration limit of the constrained NLP.
@@ -56,10 +57,11 @@ class SolverOptions:
     presolve_theta: float = 0.0
     presolve_ridge: float = 1e-2
     stagnation: float = 1e-4
-    polish_iterations: int = 40
+    polish_iterations: int = 20
+    polish_rounds: int = 4
     presolve_tol: float = 1e-6
     eps: float = 0.03
-    max_iter: int = 60
+    max_iter: int = 30
     tol: float = 1e-6
     max_seconds: float = 600.0
     ipopt: Mapping[str, Any] = field(default_factory=dict)
@@ -154,7 +156,7 @@ def solve_soup(
     mark = time.perf_counter()
     warm: dict[str, Any] = {}
     smooth = form.norm == "smooth" and form.truncation == "smooth"
-    if smooth and soup is presolved and o.polish_iterations and stages[-1].converged:
+    if smooth and soup is presolved and o.polish_iterations and _near(stages[-1]):
         warm = warm_start(nlp, data, soup, stages[-1].lam_g)
     stage = Ipopt(nlp, {**(WARM if warm else {}), **o.ipopt})(
         x0=nlp.x0,
@@ -186,6 +188,11 @@ def solve_soup(
         description=str(nlp),
         seconds=seconds,
     )
+
+
+def _near(stage: Stage) -> bool:
+    """Whether a polish has come so near that its multipliers are worth starting from."""
+    return stage.converged or bool(stage.history["inf_du"][-1] < 1.0)
 
 
 def _presolve(
@@ -231,8 +238,15 @@ def _presolve(
             return layout.unpack(x)
     if o.polish_iterations:
         exact = replace(tangent, hessian="exact")
-        ipopt = Ipopt(build_tangent_nlp(start, data, weights, exact)[0])
-        x = stage(ipopt, "presolve polish", o.eps, max_iter=o.polish_iterations)
+        newton = Ipopt(build_tangent_nlp(start, data, weights, exact)[0])
+        limits = {"max_iter": o.presolve_iterations, "stagnation": 0.01 * o.stagnation}
+        for again in range(o.polish_rounds):
+            if again:
+                # a few superpixels on the way to another minimum stop Newton's method for all
+                x = stage(ipopt, f"presolve {o.eps:g} again", o.eps, **limits)
+            x = stage(newton, "presolve polish", o.eps, max_iter=o.polish_iterations)
+            if stages[-1].converged or stop.is_set():
+                break
     return layout.unpack(x)
 
 
