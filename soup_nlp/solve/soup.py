@@ -31,7 +31,9 @@ class SolverOptions:
     The presolve reweights (theta = 0: the quadratic model lies above every norm, so that full
     steps descend) until the energy stagnates, then polishes with the exact Hessian, which
     converges quadratically from there; with theta > 0 throughout, a few superpixels cut the step
-    of all others and the tail takes hundreds of iterations.
+    of all others and the tail takes hundreds of iterations. Where the polish itself is held up by
+    superpixels that are still on their way (its inertia correction grows for all), reweighting
+    takes them there and the polish is tried again.
 
     Attributes:
         presolve: Run the tangent presolve; off, the constrained NLP starts from the start.
