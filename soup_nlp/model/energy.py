@@ -18,10 +18,6 @@ Int = NDArray[np.int64]
 TERMS = ("arap", "proj", "cont", "orient")
 
 
-LEAST_BODY = 4
-"""Superpixels that make a body."""
-
-
 @dataclass(frozen=True)
 class Weights:
     """Constants of E = E_arap + alpha1 E_proj + alpha2 E_cont + alpha3 E_orient.
@@ -209,17 +205,13 @@ def between_bodies(data: EnergyData, body: NDArray[np.int64], factor: float) -> 
     As-rigid-as-possible holds inside a body. Across bodies it pulls a body that the camera's
     motion explains at a wrong depth to that depth: with equal motions such an edge costs nothing.
 
-    Smaller groups than LEAST_BODY are no bodies: loosened, they have too little to hold them.
-
     Args:
         data: Data of the pair.
         body: (N,) group of every superpixel, as the start finds them.
         factor: 1 is the paper's energy.
     """
     i, k = data.edges.T
-    large = np.bincount(body)[body] >= LEAST_BODY
-    across = (body[i] != body[k]) & large[i] & large[k]
-    return replace(data, edge_weight=np.where(across, factor, 1.0) * data.edge_weight)
+    return replace(data, edge_weight=np.where(body[i] == body[k], 1.0, factor) * data.edge_weight)
 
 
 def in_pixels(

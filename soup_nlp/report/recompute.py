@@ -207,8 +207,7 @@ def data_errors(tree: Mapping[str, Any], beta: float, across: float) -> dict[str
     directed = np.unique(np.minimum(own, near) * n + np.maximum(own, near))
     body = tree["start"]["body"]
     weight = seg["edge_multiplicity"] * np.exp(-beta * gap)
-    large = np.bincount(body)[body] >= 4
-    weight[(body[i] != body[k]) & large[i] & large[k]] *= across
+    weight[body[i] != body[k]] *= across
     return {
         "anchors": _gap(centre, seg["anchors"]),
         "anchor rays": _gap(rays(centre), e["anchor_ray"]),
