@@ -22,10 +22,9 @@ UNLIMITED = (None, None)
 
 RANGES: Mapping[str, tuple[float | None, float | None]] = {
     **dict.fromkeys(("eps", "tol", "presolve_tol", "max_seconds"), (1e-12, None)),
-    **dict.fromkeys(("leak_arap", "presolve_theta", "theta", "occluded_confidence"), (0, 1)),
+    **dict.fromkeys(("leak_arap", "theta", "occluded_confidence"), (0, 1)),
     **dict.fromkeys(("samples", "dominant", "pieces", "piece_size"), (1, None)),
     "presolve_iterations": (1, None),
-    "polish_rounds": (1, None),
     "depth_ratio": (1, None),
     "min_facing": (0, 0.5),
     "finest_scale": (0, 5),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ from soup_nlp.config import make_problem
 from soup_nlp.model import plain
 from soup_nlp.model.energy import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.solve import yardstick
+from soup_nlp.solve import factor, yardstick
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.soup import SolverOptions, solve_soup
 from soup_nlp.solve.yardstick import Yardstick, lbfgs, levenberg_marquardt
@@ -109,11 +110,24 @@ def test_factorisations_agree():
     upper = sparse.csc_matrix((np.arange(H.nnz, dtype=float), H.indices, H.indptr), H.shape)
     b = rng.normal(size=30)
     full = (J.T @ J).toarray()
-    methods = [yardstick._superlu(upper), yardstick.factorisation(upper)[1]]
-    for solve in methods:
+    diagonal = factor.diagonal_places(upper)
+    methods = [factor.superlu(upper), factor.factorisation(upper)[1]]
+    with contextlib.suppress(ImportError):
+        methods.append(factor.cholmod(upper))
+    for factorise in methods:
         for scale, damping in ((1.0, 0.1), (2.0, 0.7)):
             expected = np.linalg.solve(scale * full + damping * np.eye(30), b)
-            np.testing.assert_allclose(solve(scale * nonzeros, damping)(b), expected, atol=1e-10)
+            damped = scale * nonzeros
+            damped[diagonal] += damping
+            back = factorise(damped)
+            np.testing.assert_allclose(back(b), expected, atol=1e-10)
+            np.testing.assert_allclose(back(2 * b), 2 * expected, atol=1e-10)
+
+
+def test_a_matrix_without_its_diagonal_is_refused():
+    upper = factor.numbered(np.array([0, 0]), np.array([0, 1]), 2)
+    with pytest.raises(ValueError, match="diagonal"):
+        factor.diagonal_places(upper)
 
 
 @pytest.mark.parametrize("method", [levenberg_marquardt, lbfgs])

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import plain
 from soup_nlp.model.energy import EnergyData, Weights
-from soup_nlp.model.formulation import Formulation, build_matrix_nlp, build_tangent_nlp
+from soup_nlp.model.formulation import Formulation, build_matrix_nlp
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
+from soup_nlp.solve.descent import Descent, Phase
 from soup_nlp.solve.ipopt import Ipopt, Listener, Stage
 from soup_nlp.solve.kkt import residuals
+from soup_nlp.solve.tangent import TangentProblem
 from soup_nlp.solve.warm import WARM, warm_start
 
 Float = NDArray[np.float64]
@@ -28,24 +30,18 @@ Float = NDArray[np.float64]
 class SolverOptions:
     """Stages of a solve; eps are smoothing widths in the energy's units (pixels by default).
 
-    The presolve reweights (theta = 0: the quadratic model lies above every norm, so that full
-    steps descend) until the energy stagnates, then polishes with the exact Hessian, which
-    converges quadratically from there; with theta > 0 throughout, a few superpixels cut the step
-    of all others and the tail takes hundreds of iterations. Where the polish itself is held up by
-    superpixels that are still on their way (its inertia correction grows for all), reweighting
-    takes them there and the polish is tried again.
+    The presolve descends on the tangent (`solve.descent`): reweighted with smaller and smaller
+    smoothing until the energy stagnates, since that quadratic model lies above every norm and
+    full steps descend; then with the exact Hessian, which converges quadratically. Ipopt takes
+    the constrained NLP from there, its multipliers included.
 
     Attributes:
         presolve: Run the tangent presolve; off, the constrained NLP starts from the start.
-        presolve_eps: Continuation of the presolve, large to small.
-        presolve_iterations: Limit of each reweighted stage.
-        presolve_theta: theta of its Gauss-Newton Hessian; 0 is reweighted least squares.
-        presolve_ridge: ridge of that Hessian.
-        stagnation: Reweighted stages end at this relative change of f, twice in a row; the last
-            at a tenth of it.
-        polish_iterations: Limit of the polish with the exact Hessian; 0 leaves it out.
-        polish_rounds: Polishes at most; before each but the first the last stage is taken up again.
-        presolve_tol: Dual infeasibility that ends the polish.
+        presolve_eps: Continuation of the reweighted phases, large to small.
+        presolve_iterations: Limit of each of them.
+        stagnation: They end at this relative change of f, twice in a row; the last at a tenth.
+        polish_iterations: Limit of the phase with the exact Hessian, at `eps`; 0 leaves it out.
+        presolve_tol: Dual infeasibility that ends the presolve.
         eps: Smoothing of the constrained NLP.
         max_iter: Iteration limit of the constrained NLP.
         tol: Tolerance of the constrained NLP.
@@ -55,12 +51,9 @@ class SolverOptions:
 
     presolve: bool = True
     presolve_eps: tuple[float, ...] = (0.1, 0.03)
-    presolve_iterations: int = 40
-    presolve_theta: float = 0.0
-    presolve_ridge: float = 1e-2
+    presolve_iterations: int = 60
     stagnation: float = 1e-4
-    polish_iterations: int = 20
-    polish_rounds: int = 4
+    polish_iterations: int = 60
     presolve_tol: float = 1e-6
     eps: float = 0.03
     max_iter: int = 30
@@ -78,7 +71,7 @@ class Solution:
             that has the lower exact energy, with rounding-size constraint violations retracted.
         status: Ipopt's status of the constrained NLP, or why it was stopped.
         converged: Its claim.
-        stages: Every call of Ipopt in order; the last is the constrained NLP.
+        stages: Phases of the presolve, then Ipopt's of the constrained NLP.
         energy_start: Exact energy by term of the start.
         energy: Exact energy by term of the solution.
         residuals: Largest violation by kind of constraint, recomputed from the arrays, and the
@@ -145,7 +138,19 @@ def solve_soup(
     soup, presolved = start, None
     stages: list[Stage] = []
     if o.presolve:
-        presolved = _presolve(start, data, weights, form, o, stages, listener, stop, say, log_file)
+        presolved = _presolve(
+            start,
+            data,
+            weights,
+            form,
+            o,
+            stages,
+            say,
+            deadline=begin + 0.7 * o.max_seconds,
+            listener=listener,
+            stop=stop,
+            log_file=log_file,
+        )
         soup = presolved
         seconds["presolve"] = time.perf_counter() - begin
     if plain.energy(soup, data, weights)["total"] > plain.energy(start, data, weights)["total"]:
@@ -193,7 +198,7 @@ def solve_soup(
 
 
 def _near(stage: Stage) -> bool:
-    """Whether a polish has come so near that its multipliers are worth starting from."""
+    """Whether the presolve has come so near that its multipliers are worth starting from."""
     return stage.converged or bool(stage.history["inf_du"][-1] < 1.0)
 
 
@@ -204,52 +209,36 @@ def _presolve(
     form: Formulation,
     o: SolverOptions,
     stages: list[Stage],
-    listener: Listener | None,
-    stop: threading.Event,
     say: Callable[[str], None],
-    log_file: str | None,
+    **watch: Any,
 ) -> Soup:
-    tangent = replace(form, norm="smooth", truncation="smooth", theta=o.presolve_theta)
-    tangent = replace(tangent, hessian="gauss-newton", ridge=o.presolve_ridge)
-    begin = time.perf_counter()
-    nlp, layout = build_tangent_nlp(start, data, weights, tangent)
-    x = nlp.x0
-
-    def stage(ipopt: Ipopt, name: str, eps: float, **limits: Any) -> Float:
-        done = ipopt(
-            x0=x,
-            p=ipopt.nlp.with_theta(eps=eps, eps_pixel=eps),
+    problem = TangentProblem(start, data, weights, form)
+    descent = Descent(problem, **watch)
+    steps = len(o.presolve_eps)
+    # barriers from 1e-3 down to 1e-5 while the norms are reweighted, 1e-8 for the KKT point
+    barriers = np.geomspace(1e-3, 1e-5, steps) if steps > 1 else np.array([1e-5])
+    phases = [
+        Phase(
+            name=f"presolve {eps:g}",
+            hessian="gauss-newton",
+            eps=eps,
+            barrier=float(barrier),
+            iterations=o.presolve_iterations,
+            stagnation=o.stagnation * (0.1 if k == steps - 1 else 1.0),
             tol=o.presolve_tol,
-            seconds=max(0.0, 0.7 * o.max_seconds - (time.perf_counter() - begin)),
-            stage=name,
-            listener=listener,
-            stop=stop,
-            log_file=log_file,
-            **limits,
         )
-        stages.append(done)
-        say(str(done))
-        return done.x
-
-    ipopt = Ipopt(nlp)
-    for k, eps in enumerate(o.presolve_eps):
-        share = 0.1 if k == len(o.presolve_eps) - 1 else 1.0
-        limits = {"max_iter": o.presolve_iterations, "stagnation": share * o.stagnation}
-        x = stage(ipopt, f"presolve {eps:g}", eps, **limits)
-        if stop.is_set():
-            return layout.unpack(x)
+        for k, (eps, barrier) in enumerate(zip(o.presolve_eps, barriers))
+    ]
     if o.polish_iterations:
-        exact = replace(tangent, hessian="exact")
-        newton = Ipopt(build_tangent_nlp(start, data, weights, exact)[0])
-        limits = {"max_iter": o.presolve_iterations, "stagnation": 0.01 * o.stagnation}
-        for again in range(o.polish_rounds):
-            if again:
-                # a few superpixels on the way to another minimum stop Newton's method for all
-                x = stage(ipopt, f"presolve {o.eps:g} again", o.eps, **limits)
-            x = stage(newton, "presolve polish", o.eps, max_iter=o.polish_iterations)
-            if stages[-1].converged or stop.is_set():
-                break
-    return layout.unpack(x)
+        phases.append(
+            Phase("presolve polish", "exact", o.eps, 1e-8, o.polish_iterations, 0.0, o.presolve_tol)
+        )
+    for phase in phases:
+        stages.append(descent.run(phase))
+        say(str(stages[-1]))
+        if stages[-1].status in ("Interrupted", "Time_Limit"):
+            break
+    return problem.layout.unpack(descent.x)
 
 
 def _multipliers(nlp: NLP, layout: MatrixLayout, stage: Stage) -> dict[str, Float]:

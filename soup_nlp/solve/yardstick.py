@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import minimize
-from scipy.sparse.linalg import splu
 
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import plain
@@ -27,10 +26,10 @@ from soup_nlp.model.energy import EnergyData, Weights
 from soup_nlp.model.formulation import Formulation, build_tangent_nlp
 from soup_nlp.model.layout import TangentLayout
 from soup_nlp.model.nlp import NLP, to_scipy
+from soup_nlp.solve.factor import diagonal_places, factorisation
 from soup_nlp.solve.ipopt import Listener, Progress
 
 Float = NDArray[np.float64]
-Solve = Callable[[Float, float], Callable[[Float], Float]]
 
 EPS = (1.0, 0.3, 0.1, 0.03, 0.01)
 """Continuation of the smoothing widths, large to small, in the energy's units (pixels)."""
@@ -180,70 +179,6 @@ class _Record:
         return Yardstick(name, soup, energy, iterations, seconds, cpu, history, status)
 
 
-def _cholmod(upper: sparse.csc_matrix) -> Solve:
-    """Factorise with CHOLMOD as cvxopt brings it; the symbolic analysis is made once."""
-    # an extra: absent, the import fails here and SuperLU takes over
-    import cvxopt
-    from cvxopt import cholmod
-
-    n = upper.shape[0]
-    # cvxopt reads the lower triangle by columns: where each of its nonzeros stands in ours
-    numbered = sparse.csc_matrix((upper.data + 1, upper.indices, upper.indptr), shape=(n, n))
-    lower = numbered.T.tocsc()
-    lower.sort_indices()
-    place = lower.data.astype(np.int64) - 1
-    column = np.repeat(np.arange(n), np.diff(lower.indptr))
-    diagonal = np.flatnonzero(lower.indices == column)
-    assert len(diagonal) == n, "the normal matrix has its whole diagonal"
-    A = cvxopt.spmatrix(1.0, lower.indices.tolist(), column.tolist(), (n, n))
-    factor = cholmod.symbolic(A)
-
-    def solve(nonzeros: Float, damping: float) -> Callable[[Float], Float]:
-        values = nonzeros[place]
-        values[diagonal] += damping
-        A.V = cvxopt.matrix(values)
-        cholmod.numeric(A, factor)
-
-        def back(b: Float) -> Float:
-            out = cvxopt.matrix(b)
-            cholmod.solve(factor, out)
-            return np.array(out).ravel()
-
-        return back
-
-    return solve
-
-
-def _superlu(upper: sparse.csc_matrix) -> Solve:
-    """Factorise with scipy's SuperLU, a symmetric ordering and no pivoting off the diagonal."""
-    rows, columns = upper.indices, np.repeat(np.arange(upper.shape[0]), np.diff(upper.indptr))
-
-    def solve(nonzeros: Float, damping: float) -> Callable[[Float], Float]:
-        U = sparse.csc_matrix((nonzeros, (rows, columns)), shape=upper.shape)
-        full = U + sparse.triu(U, 1).T + damping * sparse.identity(upper.shape[0])
-        lu = splu(
-            full.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-        return lu.solve
-
-    return solve
-
-
-def factorisation(upper: sparse.csc_matrix) -> tuple[str, Solve]:
-    """CHOLMOD where cvxopt is installed, else SuperLU.
-
-    Args:
-        upper: (n, n) upper triangle whose values number its nonzeros in storage order.
-
-    Returns:
-        Its name, and a function (nonzeros, damping) -> (b -> (H + damping I)^-1 b).
-    """
-    try:
-        return "CHOLMOD", _cholmod(upper)
-    except ImportError:
-        return "SuperLU", _superlu(upper)
-
-
 def levenberg_marquardt(
     start: Soup,
     data: EnergyData,
@@ -281,7 +216,7 @@ def levenberg_marquardt(
     problem = _Tangent(start, data, weights, form)
     stop = stop or threading.Event()
     library, factorise = factorisation(problem.upper)
-    a = problem.simplex
+    a, diagonal = problem.simplex, diagonal_places(problem.upper)
     x = problem.project(problem.nlp.x0)
     record.note(problem.layout.unpack(x))
     count, status = 0, "Converged"
@@ -300,7 +235,9 @@ def levenberg_marquardt(
                 status = "Iteration_Limit" if last else status
                 break
             count += 1
-            back = factorise(H, damping)
+            damped = H.copy()
+            damped[diagonal] += damping
+            back = factorise(damped)
             u, v = back(gradient), back(a)
             h = -u + v * (a @ u) / (a @ v)
             trial = problem.project(x + h)

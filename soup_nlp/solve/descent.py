@@ -1,0 +1,373 @@
+"""Condensed primal-dual Newton on the tangent: what reaches the minimum before Ipopt finishes.
+
+Every iteration solves one symmetric positive definite system of 9 N unknowns,
+
+    (H + diag(mu_i) + sum_r z_r / c_r dc_r dc_r^T) h + nu a = -(df - sum_r b / c_r dc_r)
+    a . h = 0
+
+with slacks c, their multipliers z, gradients d and the barrier b. Slacks depend on one superpixel
+each, so eliminating them costs no fill; Ipopt, which keeps them, factorises an indefinite system
+of twice the size. H is at first the reweighted Gauss-Newton majorant of the norms, whose full
+steps descend, then the exact Hessian.
+
+Nothing is decided for all superpixels at once: damping mu_i, fraction to the boundary and
+shortened steps are each superpixel's own, so that a few that are on their way to another minimum
+do not hold up the others. Energies cost a tenth of an iteration, so a step is doubled as long
+as that pays: bodies slide along valleys of equal re-projection error in a few iterations.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.solve.factor import diagonal_places, factorisation
+from soup_nlp.solve.ipopt import Listener, Progress, Stage
+from soup_nlp.solve.tangent import HessianKind, TangentProblem
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+DAMPING = (1e-7, 1e6)
+"""Least and most damping mu of a superpixel; scales, slopes, radians, shares of depth."""
+HELD = 1e-3
+"""Least damping of a superpixel whose step went too far."""
+TO_BOUNDARY = 0.99
+BLENDS = (0.0, 0.1, 0.3, 1.0)
+"""Shares of the majorant in the exact Hessian, tried until the direction is one of descent."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One setting of smoothing, Hessian and barrier, and what ends it.
+
+    Attributes:
+        name: For progress.
+        hessian: "gauss-newton" (the reweighted majorant) or "exact".
+        eps: Smoothing width, pixels.
+        barrier: b of `f - b sum log c`.
+        iterations: Limit.
+        stagnation: Ends when f falls by less than this share, twice in a row.
+        tol: Ends when dual infeasibility is below; "Solve_Succeeded".
+    """
+
+    name: str
+    hessian: HessianKind
+    eps: float
+    barrier: float
+    iterations: int
+    stagnation: float
+    tol: float
+
+
+class _Point(NamedTuple):
+    """A point with everything that is known of it."""
+
+    x: Float
+    f: float
+    merit: float
+    slack: Float
+    jacobian: Float
+
+
+class Descent:
+    """A descent from the start of a tangent problem, phase by phase."""
+
+    def __init__(
+        self,
+        problem: TangentProblem,
+        *,
+        deadline: float = np.inf,
+        listener: Listener | None = None,
+        stop: threading.Event | None = None,
+        log_file: str | None = None,
+    ) -> None:
+        """Prepare; nothing is solved.
+
+        Args:
+            problem: Energy and slacks.
+            deadline: Of time.perf_counter().
+            listener: Called at every iteration.
+            stop: Set it to end at the next iteration.
+            log_file: A line of every iteration is appended here.
+        """
+        self.problem = problem
+        self.deadline, self.listener = deadline, listener
+        self.stop = stop or threading.Event()
+        self.log_file = log_file
+        self.library, self._factorise = factorisation(problem.upper)
+        self._diagonal = diagonal_places(problem.upper)
+        n = problem.layout.count
+        self.x = self._inside(problem.nlp.x0)
+        self.z: Float | None = None
+        self.damping = np.full(n, 1e-2)
+        simplex = np.zeros((n, 9))
+        simplex[:, 0] = problem.share
+        self._a = simplex.ravel()
+
+    def _inside(self, x: Float) -> Float:
+        """x with slopes shrunk until every slack is positive."""
+        x = self.problem.normalise(x)
+        for _ in range(200):
+            out = (self.problem.slacks(x)[0] <= 0).any(axis=1)
+            if not out.any():
+                break
+            x.reshape(-1, 9)[out, 1:3] *= 0.9
+        return x
+
+    def _point(self, x: Float, phase: Phase, floor: Float | None = None) -> _Point | None:
+        """Energy and slacks at x; None where a slack is below `floor`."""
+        slack, jacobian = self.problem.slacks(x)
+        if (slack <= (0.0 if floor is None else floor)).any():
+            return None
+        f = self.problem.value(x)
+        merit = f - phase.barrier * float(np.log(slack).sum())
+        return _Point(x, f, merit if np.isfinite(merit) else np.inf, slack, jacobian)
+
+    def run(self, phase: Phase) -> Stage:
+        """Descend until the phase ends; x, multipliers and damping stay for the next one."""
+        begin = time.perf_counter()
+        problem = self.problem
+        problem.smoothing(phase.eps)
+        at = self._point(self.x, phase)
+        assert at is not None, "the iterate is inside its bounds"
+        if self.z is None:
+            self.z = phase.barrier / at.slack
+        self.damping = np.minimum(self.damping, 1e-2 if phase.hessian != "exact" else 1e-4)
+        gradient = problem.gradient(at.x)
+        fresh, blend, small = True, 0.0, 0
+        history: list[tuple[float, ...]] = []
+        status = "Maximum_Iterations_Exceeded"
+        nu = 0.0
+        for iteration in range(phase.iterations + 1):
+            nu, dual = self._dual(gradient, at.jacobian)
+            gap = float((at.slack * self.z).max())
+            history.append((at.f, dual, gap, float(np.median(self.damping)), 0.0))
+            self._tell(phase, iteration, history[-1], begin)
+            if dual <= phase.tol and gap <= max(phase.tol, 2 * phase.barrier):
+                status = "Solve_Succeeded"
+            elif small >= 2:
+                status = "Stagnated"
+            elif self.stop.is_set():
+                status = "Interrupted"
+            elif time.perf_counter() > self.deadline:
+                status = "Time_Limit"
+            elif iteration < phase.iterations:
+                if fresh:
+                    curvature = self._curvature(at, phase.hessian)
+                h, H, blend = self._newton(at, curvature, blend, gradient, phase)
+                moved, length = self._search(at, h, H, gradient, phase)
+                fresh = moved is not None
+                if moved is not None:
+                    fell = at.f - moved.f
+                    small = small + 1 if fell <= phase.stagnation * abs(at.f) else 0
+                    self._step_multipliers(at, h, phase, moved)
+                    at, self.x = moved, moved.x
+                    gradient = problem.gradient(at.x)
+                history[-1] = (*history[-1][:4], length)
+                continue
+            break
+        columns = np.array(history).T
+        lam_x, lam_g = problem.multipliers(self.z, nu)
+        return Stage(
+            name=phase.name,
+            status=status,
+            converged=status == "Solve_Succeeded",
+            x=at.x,
+            lam_x=lam_x,
+            lam_g=lam_g,
+            objective=at.f,
+            iterations=iteration,
+            seconds=time.perf_counter() - begin,
+            history={
+                "obj": columns[0],
+                "inf_pr": np.zeros(len(history)),
+                "inf_du": columns[1],
+                "mu": columns[2],
+                "regularization_size": columns[3],
+                "alpha_pr": columns[4],
+            },
+            calls={},
+        )
+
+    def _tell(self, phase: Phase, iteration: int, row: tuple[float, ...], begin: float) -> None:
+        now = time.perf_counter() - begin
+        if self.listener:
+            self.listener(Progress(phase.name, iteration, row[0], 0.0, now))
+        if self.log_file:
+            with open(self.log_file, "a") as log:
+                if not iteration:
+                    log.write(f"\n{phase.name}: {phase.hessian} Hessian, {self.library}\n")
+                    log.write("iter    objective    inf_du   compl  damping\n")
+                log.write("{:4d} {:14.7e} {:.2e} {:.2e} {:.2e}\n".format(iteration, *row[:4]))
+
+    def _dual(self, gradient: Float, jacobian: Float) -> tuple[float, float]:
+        """Multiplier of the simplex by least squares, and the dual infeasibility."""
+        assert self.z is not None
+        rest = gradient.reshape(-1, 9).copy()
+        rest[:, :3] -= np.einsum("nrc,nr->nc", jacobian, self.z)
+        a = self._a
+        nu = -float(a @ rest.ravel()) / float(a @ a)
+        return nu, float(np.abs(rest.ravel() + nu * a).max())
+
+    def _curvature(self, at: _Point, kind: HessianKind) -> tuple[Float, Float]:
+        """Hessian to use and the majorant, both with the condensed slacks."""
+        assert self.z is not None
+        inner = np.einsum("nrc,nr,nrd->ncd", at.jacobian, self.z / at.slack, at.jacobian)
+        condensed = np.zeros((len(inner), 9, 9))
+        condensed[:, :3, :3] = inner
+        own = condensed[:, self.problem.triangle[0], self.problem.triangle[1]]
+        out = []
+        for each in dict.fromkeys((kind, "gauss-newton")):
+            H = self.problem.hessian(at.x, self.z, each)
+            H[self.problem.block] += own
+            out.append(H)
+        return out[0], out[-1]
+
+    def _newton(
+        self,
+        at: _Point,
+        curvature: tuple[Float, Float],
+        blend: float,
+        gradient: Float,
+        phase: Phase,
+    ) -> tuple[Float, Float, float]:
+        """Step of the damped system, with as much of the majorant as makes it descend.
+
+        Args:
+            at: Point.
+            curvature: Hessian and majorant.
+            blend: Share of the majorant to begin with.
+            gradient: Of f.
+            phase: Hessian and barrier.
+
+        Returns:
+            The step, the undamped nonzeros, and the share to begin with next time.
+        """
+        exact, majorant = curvature
+        damping = np.repeat(self.damping, 9)
+        right = gradient.reshape(-1, 9).copy()
+        right[:, :3] -= np.einsum("nrc,nr->nc", at.jacobian, phase.barrier / at.slack)
+        shares = [blend, *(s for s in BLENDS if s > blend)] if phase.hessian == "exact" else [1.0]
+        h = np.zeros_like(at.x)
+        for share in shares:
+            H = majorant if share == 1.0 else (1 - share) * exact + share * majorant
+            damped = H.copy()
+            damped[self._diagonal] += damping
+            try:
+                back = self._factorise(damped)
+            except ArithmeticError:
+                continue
+            u, v = back(right.ravel()), back(self._a)
+            h = -u + v * (self._a @ u) / (self._a @ v)
+            # a library without a word on definiteness: curvature along the step tells
+            # (Chiang and Zavala 2016)
+            curved = float(h @ self._times(H, h)) + float(damping @ h**2)
+            if np.isfinite(h).all() and curved > 0 and float(right.ravel() @ h) <= 0:
+                break
+        return h, H, share / 3 if share > 0.02 else 0.0
+
+    def _times(self, H: Float, h: Float) -> Float:
+        U = self.problem.upper.copy()
+        U.data = H
+        return np.asarray(U @ h + U.T @ h - H[self._diagonal] * h)
+
+    def _search(
+        self, at: _Point, h: Float, H: Float, gradient: Float, phase: Phase
+    ) -> tuple[_Point | None, float]:
+        """Step to a lower merit: shorter where a superpixel goes too far, longer while it pays.
+
+        Returns:
+            The point or None, and the shortest share of h that a superpixel went. Damping is
+            changed for the next step.
+        """
+        along = np.einsum("nrc,nc->nr", at.jacobian, h.reshape(-1, 9)[:, :3])
+        with np.errstate(divide="ignore"):
+            reach = np.where(along < 0, -at.slack / along, np.inf).min(axis=1)
+        length = np.minimum(1.0, TO_BOUNDARY * reach)
+        scale = np.abs(_own(h, self._times(H, h))) + np.abs(_own(h, gradient))
+        scale += 1e-5 * abs(at.f) / len(scale)
+        before = _own(h, gradient)
+        far, calm = np.zeros(len(scale), bool), np.zeros(len(scale), bool)
+        eager = calm
+        moved: _Point | None = None
+        for attempt in range(4):
+            trial, length = self._try(at, h, length, phase)
+            slope = _own(h, self.problem.gradient(trial.x))
+            # past its minimum along the step, by more than the quadratic model allows
+            here = ~(slope <= 0.5 * scale)
+            far |= here
+            calm = slope <= 0.1 * scale
+            # still going down at half the first rate: the step was short
+            eager = (slope < 0.5 * before) & (slope < -0.02 * scale)
+            if trial.merit < at.merit + 1e-13 * abs(at.merit):
+                moved = self._longer(at, trial, h, length, eager & ~far, before, phase)
+                break
+            some = here if here.any() and attempt < 2 else np.ones_like(here)
+            length = np.where(some, 0.25 * length, length)
+        raised = np.clip(self.damping * (4 if moved else 8), HELD, DAMPING[1])
+        kept = self.damping if moved or far.any() else np.maximum(8 * self.damping, HELD)
+        if moved:
+            fall = np.where(eager, 16.0, np.where(calm, 4.0, 1.0))
+            kept = np.maximum(kept / fall, DAMPING[0])
+        self.damping = np.where(far, raised, kept)
+        return moved, float(length.min())
+
+    def _try(self, at: _Point, h: Float, length: Float, phase: Phase) -> tuple[_Point, Float]:
+        """The point at these shares of h, halved where a slack would vanish."""
+        length = length.copy()
+        for _ in range(40):
+            step = length[:, None] * h.reshape(-1, 9)
+            x = self.problem.normalise(at.x + step.ravel())
+            point = self._point(x, phase, floor=1e-3 * at.slack)
+            if point is not None:
+                return point, length
+            short = (self.problem.slacks(x)[0] <= 1e-3 * at.slack).any(axis=1)
+            length[short] *= 0.5
+        return at, np.zeros_like(length)
+
+    def _longer(
+        self,
+        at: _Point,
+        moved: _Point,
+        h: Float,
+        length: Float,
+        eager: Bool,
+        before: Float,
+        phase: Phase,
+    ) -> _Point:
+        """Double the step while the merit falls: of all, then of those still going down."""
+        for some in (np.ones_like(eager), eager):
+            for _ in range(7):
+                if not some.any():
+                    break
+                longer = np.where(some, 2 * length, length)
+                x = self.problem.normalise(at.x + (longer[:, None] * h.reshape(-1, 9)).ravel())
+                trial = self._point(x, phase, floor=1e-3 * at.slack)
+                if trial is None or not trial.merit < moved.merit:
+                    break
+                moved, length = trial, longer
+                if some is eager:
+                    some = eager = eager & (_own(h, self.problem.gradient(x)) < 0.5 * before)
+        return moved
+
+    def _step_multipliers(self, at: _Point, h: Float, phase: Phase, moved: _Point) -> None:
+        """Newton's step of the slacks' multipliers, kept near barrier / slack."""
+        assert self.z is not None
+        z, b = self.z, phase.barrier
+        along = np.einsum("nrc,nc->nr", at.jacobian, h.reshape(-1, 9)[:, :3])
+        step = b / at.slack - z - z / at.slack * along
+        with np.errstate(divide="ignore"):
+            reach = np.where(step < 0, -z / step, np.inf).min(axis=1)
+        z = z + np.minimum(1.0, TO_BOUNDARY * reach)[:, None] * step
+        self.z = np.clip(z, 1e-8 * b / moved.slack, 1e8 * b / moved.slack)
+
+
+def _own(h: Float, other: Float) -> Float:
+    """(N,) inner products of every superpixel's share of two vectors (9 N,)."""
+    return np.einsum("nc,nc->n", h.reshape(-1, 9), other.reshape(-1, 9))

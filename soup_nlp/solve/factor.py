@@ -1,0 +1,106 @@
+"""Factorisation of sparse symmetric positive definite matrices by the library that is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Back = Callable[[Float], Float]
+Factorise = Callable[[Float], Back]
+"""Nonzeros of the upper triangle -> (b -> H^-1 b). Raises ArithmeticError where a library sees
+that the matrix is not positive definite."""
+
+
+def numbered(rows: Int, columns: Int, size: int) -> sparse.csc_matrix:
+    """(size, size) matrix whose values number its nonzeros in storage order.
+
+    Args:
+        rows: Row of every nonzero; columns ascending, rows ascending in a column.
+        columns: Column of every nonzero.
+        size: Rows and columns.
+    """
+    start = np.searchsorted(columns, np.arange(size + 1))
+    return sparse.csc_matrix((np.arange(len(rows), dtype=float), rows, start), (size, size))
+
+
+def diagonal_places(upper: sparse.csc_matrix) -> Int:
+    """(n,) where the diagonal stands among the nonzeros of a `numbered` matrix.
+
+    Raises:
+        ValueError: A diagonal entry is no nonzero.
+    """
+    columns = np.repeat(np.arange(upper.shape[1]), np.diff(upper.indptr))
+    places = np.flatnonzero(upper.indices == columns)
+    if len(places) != upper.shape[0]:
+        raise ValueError("the matrix has no whole diagonal among its nonzeros")
+    return places
+
+
+def cholmod(upper: sparse.csc_matrix) -> Factorise:
+    """CHOLMOD as cvxopt brings it (an extra); the symbolic analysis is made once.
+
+    Raises:
+        ImportError: cvxopt is not installed.
+    """
+    import cvxopt
+    from cvxopt import cholmod as library
+
+    n = upper.shape[0]
+    # cvxopt reads the lower triangle by columns: where each of its nonzeros stands in ours
+    lower = sparse.csc_matrix((upper.data + 1, upper.indices, upper.indptr), (n, n)).T.tocsc()
+    lower.sort_indices()
+    place = lower.data.astype(np.int64) - 1
+    column = np.repeat(np.arange(n), np.diff(lower.indptr))
+    A = cvxopt.spmatrix(1.0, lower.indices.tolist(), column.tolist(), (n, n))
+    factor = library.symbolic(A)
+
+    def factorise(nonzeros: Float) -> Back:
+        A.V = cvxopt.matrix(nonzeros[place])
+        library.numeric(A, factor)
+
+        def back(b: Float) -> Float:
+            out = cvxopt.matrix(b)
+            library.solve(factor, out)
+            return np.array(out).ravel()
+
+        return back
+
+    return factorise
+
+
+def superlu(upper: sparse.csc_matrix) -> Factorise:
+    """scipy's SuperLU, a symmetric ordering and no pivoting off the diagonal."""
+    rows, columns = upper.indices, np.repeat(np.arange(upper.shape[0]), np.diff(upper.indptr))
+    options: dict[str, Any] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+
+    def factorise(nonzeros: Float) -> Back:
+        U = sparse.csc_matrix((nonzeros, (rows, columns)), shape=upper.shape)
+        full = U + sparse.triu(U, 1).T
+        return splu(full.tocsc(), "MMD_AT_PLUS_A", **options).solve
+
+    return factorise
+
+
+def factorisation(upper: sparse.csc_matrix) -> tuple[str, Factorise]:
+    """CHOLMOD where cvxopt is installed (the extra "fast"), else SuperLU, five times slower.
+
+    CasADi brings MUMPS, twice as slow as CHOLMOD; it is not used since CasADi lets it print when
+    it is taken down.
+
+    Args:
+        upper: (n, n) upper triangle whose values number its nonzeros in storage order.
+
+    Returns:
+        Its name, and the function that factorises.
+    """
+    try:
+        return "CHOLMOD", cholmod(upper)
+    except ImportError:
+        return "SuperLU", superlu(upper)

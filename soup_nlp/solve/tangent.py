@@ -1,0 +1,146 @@
+"""The presolve's energy as a descent method wants it: numbers, blocks and slacks per superpixel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy import EnergyData, Weights
+from soup_nlp.model.formulation import Formulation, build_tangent_nlp
+from soup_nlp.model.nlp import NLP
+from soup_nlp.solve.buffered import Buffered
+from soup_nlp.solve.factor import numbered
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+HessianKind = Literal["gauss-newton", "exact"]
+
+
+class TangentProblem:
+    """min f(x) with slacks c(x) >= 0 of every superpixel by itself, and the simplex.
+
+    Slacks (N, R) are rim visibility (concave in the slopes, so the set is convex) and the bounds of
+    scale and slopes; they depend on the first three of a superpixel's nine variables.
+
+    Attributes:
+        nlp: The tangent NLP with the reweighted Gauss-Newton Hessian.
+        layout: Turns its vectors into soups.
+        share: (N,) coefficients of the simplex row, `share . scale = 1`.
+        upper: (9 N, 9 N) pattern of Hessians, upper triangle, its values number the nonzeros.
+        block: (N, 45) nonzeros of every superpixel's own triangle, in the order of `triangle`.
+        triangle: (2, 45) rows and columns of that triangle.
+    """
+
+    def __init__(self, start: Soup, data: EnergyData, weights: Weights, form: Formulation) -> None:
+        # theta = 0 and no ridge: reweighted least squares, sum c psi / s J^T J
+        smooth = replace(form, norm="smooth", truncation="smooth", theta=0.0, ridge=0.0)
+        majorant = replace(smooth, hessian="gauss-newton+constraints")
+        self.nlp, self.layout = build_tangent_nlp(start, data, weights, majorant)
+        exact = build_tangent_nlp(start, data, weights, replace(smooth, hessian="exact"))[0]
+        nlp, n = self.nlp, self.layout.count
+        rows = {g.kernel.name: g.table.rows for g in nlp.groups}
+        self._visible = rows["t_visible"]
+        self._simplex = int(rows["t_simplex"][0, 0])
+        self.share = nlp.groups[self._group("t_simplex")].table.data[:, 0]
+        self._lower, self._upper = nlp.lbx.reshape(-1, 9), nlp.ubx.reshape(-1, 9)
+        self._bound = nlp.lbg[self._visible]
+        self._p = nlp.p
+
+        x, p = nlp.oracle.mx_in()
+        self._f = Buffered(ca.Function("f", [x, p], [nlp.oracle(x, p)[0]]))
+        self._gradient, self._rows = Buffered(nlp.grad_f), Buffered(nlp.jac_g)
+        self._hessian = {
+            "gauss-newton": Buffered(nlp.hess_lag),
+            "exact": Buffered(exact.hess_lag),
+        }
+        row, _ = _triplet(nlp.jac_g.sparsity_out(1))
+        # two slopes a row of visibility, found by its row
+        order = np.argsort(row, kind="stable")
+        first = np.searchsorted(row[order], self._visible)
+        self._slopes = order[first[..., None] + np.arange(2)]
+        self.triangle = np.array(np.triu_indices(9))
+        self._pattern(nlp, exact, n)
+
+    def _group(self, name: str) -> int:
+        return [g.kernel.name for g in self.nlp.groups].index(name)
+
+    def _pattern(self, nlp: NLP, exact: NLP, n: int) -> None:
+        """Union of both Hessians' patterns, and where the nonzeros of each stand in it."""
+        r, c = self.triangle
+        own = 9 * np.arange(n)[:, None]
+        keys = [((own + c) * nlp.nx + own + r).ravel()]
+        for hessian in (nlp.hess_lag, exact.hess_lag):
+            row, column = _triplet(hessian.sparsity_out(0))
+            keys.append(column * nlp.nx + row)
+        unique, place = np.unique(np.concatenate(keys), return_inverse=True)
+        block, majorant, newton = np.split(place.ravel(), np.cumsum([len(k) for k in keys])[:-1])
+        self.block: Int = block.reshape(n, -1)
+        self._place = {"gauss-newton": majorant, "exact": newton}
+        self.upper: sparse.csc_matrix = numbered(unique % nlp.nx, unique // nlp.nx, nlp.nx)
+
+    def smoothing(self, eps: float) -> None:
+        """Set both smoothing widths, pixels."""
+        self._p = self.nlp.with_theta(eps=eps, eps_pixel=eps)
+
+    def value(self, x: Float) -> float:
+        """Smoothed energy."""
+        return float(self._f(x, self._p)[0][0])
+
+    def gradient(self, x: Float) -> Float:
+        """Gradient of the smoothed energy, (9 N,)."""
+        return self._gradient(x, self._p)[1].copy()
+
+    def hessian(self, x: Float, z: Float, kind: HessianKind) -> Float:
+        """Nonzeros (in the order of `upper`) of the Hessian of `f - z . c`.
+
+        Args:
+            x: (9 N,) point.
+            z: (N, R) multipliers of the slacks.
+            kind: "exact", or "gauss-newton" for f's reweighted stand-in.
+        """
+        lam_f, lam_g = self._lam(z)
+        out = np.zeros(self.upper.nnz)
+        out[self._place[kind]] = self._hessian[kind](x, self._p, lam_f, lam_g)[0]
+        return out
+
+    def slacks(self, x: Float) -> tuple[Float, Float]:
+        """Slacks (N, R) and their derivatives by scale and slopes (N, R, 3)."""
+        g, jacobian = self._rows(x, self._p)
+        a, (n, count) = x.reshape(-1, 9), self._visible.shape
+        J = np.zeros((n, count + 5, 3))
+        J[:, :count, 1:] = jacobian[self._slopes]
+        J[:, count:] = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, -1]]
+        low, high = a[:, :3] - self._lower[:, :3], self._upper[:, 1:3] - a[:, 1:3]
+        return np.column_stack([g[self._visible] - self._bound, low, high]), J
+
+    def normalise(self, x: Float) -> Float:
+        """The same soup with its scales on the simplex."""
+        a = x.reshape(-1, 9).copy()
+        a[:, 0] /= self.share @ a[:, 0]
+        return a.ravel()
+
+    def _lam(self, z: Float) -> tuple[float, Float]:
+        lam_g = np.zeros(self.nlp.ng)
+        lam_g[self._visible] = -z[:, : self._visible.shape[1]]
+        return 1.0, lam_g
+
+    def multipliers(self, z: Float, nu: float) -> tuple[Float, Float]:
+        """lam_x (9 N,) and lam_g of the NLP, from those of slacks and simplex."""
+        lam_g = self._lam(z)[1]
+        lam_g[self._simplex] = nu
+        lam_x = np.zeros((len(z), 9))
+        bound = z[:, self._visible.shape[1] :]
+        lam_x[:, :3] = -bound[:, :3]
+        lam_x[:, 1:3] += bound[:, 3:]
+        return lam_x.ravel(), lam_g
+
+
+def _triplet(pattern: ca.Sparsity) -> tuple[Int, Int]:
+    row, column = pattern.get_triplet()
+    return np.asarray(row, np.int64), np.asarray(column, np.int64)

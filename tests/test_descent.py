@@ -1,0 +1,178 @@
+"""The presolve's descent: numbers against differences, KKT points against Ipopt, honest ends."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soup_nlp.cases import Case, prepare
+from soup_nlp.config import make_problem
+from soup_nlp.model.formulation import Formulation, build_tangent_nlp
+from soup_nlp.solve import descent as descent_module
+from soup_nlp.solve.buffered import Buffered
+from soup_nlp.solve.descent import Descent, Phase
+from soup_nlp.solve.factor import superlu
+from soup_nlp.solve.ipopt import Ipopt
+from soup_nlp.solve.kkt import optimality
+from soup_nlp.solve.tangent import TangentProblem
+
+FORM = Formulation(compiled=False)
+PHASES = (
+    Phase("first", "gauss-newton", 0.3, 1e-3, 60, 1e-4, 1e-6),
+    Phase("second", "gauss-newton", 0.1, 1e-5, 60, 1e-5, 1e-6),
+)
+LAST = Phase("last", "exact", 0.1, 1e-8, 60, 0.0, 1e-6)
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
+    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+
+
+@pytest.fixture(scope="module")
+def problem(case) -> TangentProblem:
+    return TangentProblem(case.soup, case.data, case.weights, FORM)
+
+
+@pytest.fixture(scope="module")
+def solved(problem):
+    runner = Descent(problem)
+    stages = [runner.run(p) for p in (*PHASES, LAST)]
+    return runner, stages
+
+
+def inner_point(problem: TangentProblem) -> np.ndarray:
+    """A point off the start, inside all slacks."""
+    rng = np.random.default_rng(3)
+    x = Descent(problem).x
+    return problem.normalise(x * (1 + 0.01 * rng.normal(size=x.shape)))
+
+
+# --- the numbers of the problem ------------------------------------------------------------------
+
+
+def test_gradient_and_exact_hessian_are_derivatives(problem):
+    problem.smoothing(0.2)
+    x = inner_point(problem)
+    rng = np.random.default_rng(4)
+    h = rng.normal(size=x.shape)
+    step = 1e-6
+    slope = (problem.value(x + step * h) - problem.value(x - step * h)) / (2 * step)
+    assert problem.gradient(x) @ h == pytest.approx(slope, rel=1e-5)
+    z = rng.uniform(0.1, 1.0, problem.slacks(x)[0].shape)
+
+    def lagrangian(x):
+        _, jacobian = problem.slacks(x)
+        out = problem.gradient(x).reshape(-1, 9).copy()
+        out[:, :3] -= np.einsum("nrc,nr->nc", jacobian, z)
+        return out.ravel()
+
+    U = problem.upper.copy()
+    U.data = problem.hessian(x, z, "exact")
+    product = U @ h + U.T @ h - U.diagonal() * h
+    expected = (lagrangian(x + step * h) - lagrangian(x - step * h)) / (2 * step)
+    np.testing.assert_allclose(product, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_the_stand_in_lies_above_every_norm(problem, case):
+    # quadratic model with the stand-in >= f wherever residuals are linear: translations
+    problem.smoothing(0.2)
+    x = Descent(problem).x
+    z = np.zeros_like(problem.slacks(x)[0])
+    U = problem.upper.copy()
+    U.data = problem.hessian(x, z, "gauss-newton")
+    assert np.linalg.eigvalsh((U + U.T - np.diag(U.diagonal())).astype(float)).min() > -1e-8
+    rng = np.random.default_rng(5)
+    for size in (1e-4, 1e-3, 1e-2):
+        h = np.zeros_like(x).reshape(-1, 9)
+        h[:, 6:] = size * rng.normal(size=(len(h), 3))
+        h = h.ravel()
+        model = problem.gradient(x) @ h + 0.5 * (2 * h @ (U @ h) - U.diagonal() @ h**2)
+        assert problem.value(x + h) - problem.value(x) <= model + 1e-3 * abs(model)
+
+
+def test_slacks_have_the_derivatives_they_claim(problem):
+    x = inner_point(problem)
+    slack, jacobian = problem.slacks(x)
+    assert (slack > 0).all()
+    for c in range(3):
+        h = np.zeros_like(x).reshape(-1, 9)
+        h[:, c] = 1e-6
+        up, down = problem.slacks(x + h.ravel())[0], problem.slacks(x - h.ravel())[0]
+        np.testing.assert_allclose(jacobian[..., c], (up - down) / 2e-6, atol=1e-7)
+
+
+def test_a_buffered_function_checks_what_it_is_given(problem):
+    buffered = Buffered(problem.nlp.grad_f)
+    f, gradient = buffered(problem.nlp.x0, problem.nlp.p)
+    expected = problem.nlp.grad_f(problem.nlp.x0, problem.nlp.p)
+    assert f[0] == float(expected[0])
+    np.testing.assert_array_equal(gradient, np.asarray(expected[1]).ravel())
+    with pytest.raises(ValueError, match="input 0 has 2 nonzeros, expected"):
+        buffered(np.zeros(2), problem.nlp.p)
+
+
+# --- where it ends -------------------------------------------------------------------------------
+
+
+def test_it_ends_at_a_kkt_point(problem, solved):
+    _, stages = solved
+    last = stages[-1]
+    assert last.status == "Solve_Succeeded"
+    assert last.converged
+    p = problem.nlp.with_theta(eps=LAST.eps, eps_pixel=LAST.eps)
+    at = optimality(replace(problem.nlp, p=p), last.x, last.lam_x, last.lam_g)
+    assert at["dual_infeasibility"] < 1e-5
+    assert at["complementarity"] < 1e-5
+    g = np.asarray(problem.nlp.oracle(last.x, p)[1]).ravel()
+    assert (g >= problem.nlp.lbg - 1e-9).all()
+    assert (g <= problem.nlp.ubg + 1e-9).all()
+
+
+def test_ipopt_stays_where_it_ends(case, solved):
+    last = solved[1][-1]
+    smooth = replace(FORM, hessian="exact", eps=LAST.eps, eps_pixel=LAST.eps)
+    nlp, _ = build_tangent_nlp(case.soup, case.data, case.weights, smooth)
+    stage = Ipopt(nlp)(x0=last.x, max_iter=30, tol=1e-6)
+    assert stage.converged
+    assert stage.objective == pytest.approx(last.objective, rel=1e-6)
+    np.testing.assert_allclose(stage.x, last.x, atol=1e-3)
+
+
+def test_the_energy_never_rises_within_a_phase(solved):
+    for stage, phase in zip(solved[1], (*PHASES, LAST)):
+        f = stage.history["obj"]
+        # f - b log c falls; f alone may rise by what the barrier gives
+        assert (np.diff(f) <= 2e3 * phase.barrier).all()
+        assert f[-1] < f[0] or stage.iterations == 0
+        assert len(f) == stage.iterations + 1
+
+
+def test_superlu_ends_at_the_same_point(problem, solved, monkeypatch):
+    monkeypatch.setattr(descent_module, "factorisation", lambda upper: ("SuperLU", superlu(upper)))
+    runner = Descent(problem)
+    last = [runner.run(p) for p in (*PHASES, LAST)][-1]
+    assert runner.library == "SuperLU"
+    assert last.converged
+    assert last.objective == pytest.approx(solved[1][-1].objective, rel=1e-3)
+
+
+def test_limits_and_interruption_keep_the_iterate(problem, tmp_path):
+    log = tmp_path / "solve.log"
+    seen = []
+    runner = Descent(problem, listener=seen.append, log_file=str(log))
+    three = runner.run(replace(PHASES[0], iterations=3, stagnation=0.0))
+    assert (three.status, three.iterations) == ("Maximum_Iterations_Exceeded", 3)
+    assert [p.iteration for p in seen] == [0, 1, 2, 3]
+    assert three.objective < seen[0].objective
+    assert "first: gauss-newton Hessian" in log.read_text()
+    stop = threading.Event()
+    stop.set()
+    assert Descent(problem, stop=stop).run(PHASES[0]).status == "Interrupted"
+    late = Descent(problem, deadline=0.0).run(PHASES[0])
+    assert (late.status, late.iterations) == ("Time_Limit", 0)
+    assert np.isfinite(late.x).all()
