@@ -169,6 +169,9 @@ class Descent:
                     self._step_multipliers(at, h, phase, moved)
                     at, self.x = moved, moved.x
                     gradient = problem.gradient(at.x)
+                else:
+                    # the majorant's steps descend
+                    blend = min(1.0, max(BLENDS[1], 9 * blend))
                 history[-1] = (*history[-1][:4], length)
                 continue
             break
@@ -305,7 +308,7 @@ class Descent:
             calm = slope <= 0.1 * scale
             # still going down at half the first rate: the step was short
             eager = (slope < 0.5 * before) & (slope < -0.02 * scale)
-            if trial.merit < at.merit + 1e-13 * abs(at.merit):
+            if trial.merit < at.merit + 1e-12 * abs(at.merit):
                 moved = self._longer(at, trial, h, length, eager & ~far, before, phase)
                 break
             some = here if here.any() and attempt < 2 else np.ones_like(here)
