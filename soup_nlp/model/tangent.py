@@ -72,7 +72,8 @@ def build_tangent_nlp(
     b.add_ridge(np.ones(9 * n))
     lower, upper = np.full((n, 9), -np.inf), np.full((n, 9), np.inf)
     lower[:, 0] = 1e-3
-    lower[:, 1:3], upper[:, 1:3] = -0.99 * form.depth_ratio, 0.99 * form.depth_ratio
+    # wide: visibility bounds the slopes, as in the constrained NLP, which has no such box
+    lower[:, 1:3], upper[:, 1:3] = -20 * form.depth_ratio, 20 * form.depth_ratio
     extra = b.nx - 9 * n
     x0 = np.concatenate([_visible(layout.pack(soup), off, form.depth_ratio), np.zeros(extra)])
     nlp = b.finish(

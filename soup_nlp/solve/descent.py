@@ -133,6 +133,7 @@ class Descent:
         """Descend until the phase ends; x, multipliers and damping stay for the next one."""
         begin = time.perf_counter()
         problem = self.problem
+        calls = problem.calls()
         problem.smoothing(phase.eps)
         at = self._point(self.x, phase)
         assert at is not None, "the iterate is inside its bounds"
@@ -195,7 +196,7 @@ class Descent:
                 "regularization_size": columns[3],
                 "alpha_pr": columns[4],
             },
-            calls={},
+            calls={k: v - calls[k] for k, v in problem.calls().items()},
         )
 
     def _tell(self, phase: Phase, iteration: int, row: tuple[float, ...], begin: float) -> None:

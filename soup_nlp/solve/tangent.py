@@ -125,6 +125,15 @@ class TangentProblem:
         a[:, 0] /= self.share @ a[:, 0]
         return a.ravel()
 
+    def calls(self) -> dict[str, float]:
+        """Seconds so far in f, grad_f, jac_g (with g) and hess_lag."""
+        return {
+            "f": self._f.seconds,
+            "grad_f": self._gradient.seconds,
+            "jac_g": self._rows.seconds,
+            "hess_lag": sum(h.seconds for h in self._hessian.values()),
+        }
+
     def _lam(self, z: Float) -> tuple[float, Float]:
         lam_g = np.zeros(self.nlp.ng)
         lam_g[self._visible] = -z[:, : self._visible.shape[1]]
