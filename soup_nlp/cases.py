@@ -119,10 +119,12 @@ def build_energy(
     assert pair.flow is not None
     e = problem.energy
     pixels = None if e.pixel_samples == "all" else e.pixel_samples
+    bends = start.bending and e.units == "pixel"
+    form = e.bending if bends else e
     data = build_energy_data(
-        seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, e.arap_at_anchors
+        seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, bends or e.arap_at_anchors
     )
     data = between_bodies(data, start.body, e.arap_across)
     if e.units == "pixel":
-        data = in_pixels(data, start.soup, seg, e.rotation_px)
-    return data, Weights(**e.weights.model_dump())
+        data = in_pixels(data, start.soup, seg, form.rotation_px)
+    return data, Weights(**form.weights.model_dump())

@@ -80,6 +80,22 @@ class FlowConfig(Strict):
     dis: DisConfig = DisConfig()
 
 
+class BendingConfig(Strict):
+    """The energy where the start finds that surfaces bend, always in pixels.
+
+    Bending is a difference of rotations that keeps lengths: E_arap compares motions at the
+    anchors, where a surface that bends hangs together, and its rotations count for next to
+    nothing. The relief is then held by lengths, continuity and orientation.
+
+    Attributes:
+        rotation_px: Pixels per radian of rotation difference.
+        weights: Factors of the terms and their truncations.
+    """
+
+    rotation_px: Positive = 1e-3
+    weights: EnergyWeights = EnergyWeights(orient=2.0, sigma_arap=1.0, leak_arap=0.05)
+
+
 class EnergyConfig(Strict):
     """The energy.
 
@@ -91,6 +107,7 @@ class EnergyConfig(Strict):
         rotation_px: Pixels per radian of rotation difference; null for the focal length.
         pixel_samples: Pixels per superpixel in E_proj, or all.
         weights: Factors of the terms and their truncations.
+        bending: What replaces rotation_px, arap_at_anchors and weights where surfaces bend.
     """
 
     units: Literal["pixel", "paper"] = "pixel"
@@ -99,6 +116,7 @@ class EnergyConfig(Strict):
     rotation_px: Positive | None = None
     pixel_samples: Annotated[int, Field(ge=1)] | Literal["all"] = 16
     weights: EnergyWeights = EnergyWeights()
+    bending: BendingConfig = BendingConfig()
 
 
 class Expected(Strict):

@@ -107,6 +107,10 @@ def result_tree(run: Run) -> Tree:
             "borrowed": Array(run.start.borrowed, "1", "plane or motion from neighbours", "N"),
             "motion": Array(run.start.motion, "1", "dominant motion, -1 for its own", "N"),
             "body": Array(run.start.body, "1", "group that seems to move as one", "N"),
+            "bending_share": Array(
+                np.float64(run.start.bending_share), "1", "moves otherwise than most of its surface"
+            ),
+            "bending": Array(np.float64(run.start.bending), "1", "surfaces are taken to bend"),
         },
         "solution": _soup(run.soup),
         "nlp": _soup(run.solution.soup),

@@ -15,15 +15,20 @@ Int = NDArray[np.int64]
 
 def components(mask: NDArray[np.bool_], seg: Segmentation) -> Int:
     """(N,) component of every superpixel of a mask over the neighbour pairs, -1 outside."""
+    i, k = seg.pairs.T
+    return np.where(mask, joined(mask[i] & mask[k], seg), -1)
+
+
+def joined(hold: NDArray[np.bool_], seg: Segmentation) -> Int:
+    """(N,) component of every superpixel where only the neighbour pairs (P,) of `hold` count."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    i, k = seg.pairs.T
-    both = mask[i] & mask[k]
-    n = len(mask)
-    graph = coo_matrix((np.ones(int(both.sum())), (i[both], k[both])), shape=(n, n))
+    n = len(seg)
+    i, k = seg.pairs[hold].T
+    graph = coo_matrix((np.ones(len(i)), (i, k)), shape=(n, n))
     _, piece = connected_components(graph, directed=False)
-    return np.where(mask, piece, -1)
+    return np.asarray(piece, np.int64)
 
 
 def bodies(label: Int, seg: Segmentation) -> Int:

@@ -19,6 +19,9 @@ class StartOptions:
         unexplained_px: A superpixel whose error is below this has no need of another motion.
         pieces: At most this many unexplained pieces are looked at in a round.
         piece_size: A piece has at least this many superpixels.
+        bending: Surfaces are taken to bend where more than this share of the superpixels moves
+            otherwise than most of its own surface; 1 for never.
+        tear_px: Where the flow of two neighbours differs by more, a surface ends.
         seed: Of sampling and RANSAC.
     """
 
@@ -31,4 +34,6 @@ class StartOptions:
     unexplained_px: float = 0.1
     pieces: int = 6
     piece_size: int = 4
+    bending: float = 0.25
+    tear_px: float = 1.0
     seed: int = 0

@@ -13,6 +13,7 @@ from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy import sample_pixels
+from soup_nlp.start.bending import bending_share, constant_depth
 from soup_nlp.start.bodies import bodies, borrow, contact_scales
 from soup_nlp.start.choice import (
     dominant,
@@ -45,6 +46,8 @@ class Start:
         body: (N,) group that seems to move as one and shares one scale: a dominant motion, or a
             connected piece of superpixels with motions of their own.
         motions: The dominant motions.
+        bending_share: Share of the superpixels that move otherwise than most of their surface.
+        bending: Whether surfaces are taken to bend: all are one body at a constant depth.
     """
 
     soup: Soup
@@ -54,11 +57,14 @@ class Start:
     motion: Int
     body: Int
     motions: list[Motion]
+    bending_share: float = 0.0
+    bending: bool = False
 
     def __str__(self) -> str:
         return (
             f"Start({len(self.soup)} superpixels, {len(self.motions)} dominant motions, median"
-            f" error {np.median(self.error):.2f} px, {int(self.borrowed.sum())} borrowed)"
+            f" error {np.median(self.error):.2f} px, {int(self.borrowed.sum())} borrowed"
+            + (f", {self.bending_share:.0%} bending)" if self.bending else ")")
         )
 
 
@@ -137,9 +143,14 @@ def propose(
     mu, slope = borrow(mu, slope, label, weak, seg)
     soup = _soup(mu, slope, R, t, anchor, radius)
     body = bodies(label, seg)
+    share = bending_share(views, seg, rays(K_ref, seg.boundary), body, o.tear_px)
+    if share > o.bending:
+        soup, error = constant_depth(views)
+        none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
+        return Start(soup, error, parallax, every, none, none + 1, motions, share, True)
     scale = contact_scales(soup, body, seg, K_ref)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t).normalised()
-    return Start(soup, own.cost[:, 0], parallax, weak, label, body, motions)
+    return Start(soup, own.cost[:, 0], parallax, weak, label, body, motions, share)
 
 
 def _fill_poor(

@@ -1,0 +1,105 @@
+"""Surfaces that bend: how to tell them from bodies that move apart, and where to start with them.
+
+A rigid body that moves by itself tears the flow along its outline. A bending surface does not: its
+flow is continuous, and yet one rigid motion does not explain it. Cut into rigid pieces, each with a
+parallax of its own, it gets depths that have nothing to do with its shape.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry import rotation
+from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.start.bodies import joined
+from soup_nlp.start.planes import Views
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+def bending_share(
+    views: Views, seg: Segmentation, boundary_ray: Float, body: Int, tear_px: float
+) -> float:
+    """Share of the superpixels that move otherwise than most of the surface they belong to.
+
+    A surface is what hangs together by neighbours between whom the flow does not tear. It is
+    near 0 where every surface is one rigid body, near 1 where surfaces need many.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        seg: Superpixels and graphs.
+        boundary_ray: (P, B, 3) rays of the shared boundaries, reference frame.
+        body: (N,) group that moves as one rigid body.
+        tear_px: A larger jump of the flow across a boundary is a tear, pixels.
+    """
+    if not len(seg.pairs):
+        return 0.0
+    surface = joined(flow_jump(views, seg.pairs, boundary_ray) < tear_px, seg)
+    count = np.zeros((int(surface.max()) + 1, int(body.max()) + 1))
+    np.add.at(count, (surface, body), 1.0)
+    return float(1.0 - count.max(axis=1).sum() / len(seg))
+
+
+def flow_jump(views: Views, pairs: Int, boundary_ray: Float) -> Float:
+    """(P,) pixels by which the affine flows of two neighbours differ on their boundary, mean.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        pairs: (P, 2) neighbours.
+        boundary_ray: (P, B, 3) rays of the shared boundaries, reference frame.
+    """
+    fit = _affine(views)
+
+    def target(j: Int) -> Float:
+        off = (boundary_ray - views.anchor[j][:, None])[..., :2] / views.radius[j][:, None, None]
+        return fit[j][:, None, 0] + off @ fit[j][:, 1:]
+
+    i, k = pairs.T
+    return np.linalg.norm(target(i) - target(k), axis=-1).mean(axis=1)
+
+
+def _affine(views: Views, noise: float = 0.1, rounds: int = 8) -> Float:
+    """(N, 3, 2) robust affine map from offsets in radii to targets in pixels."""
+    off = (views.ray - views.anchor[:, None])[..., :2] / views.radius[:, None, None]
+    basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
+    target = views.target[..., :2] * np.asarray(views.focal)
+    # without confident pixels any affine map will do: the ridge makes it one
+    w = views.weight + 1e-6
+    fit = np.zeros((len(basis), 3, 2))
+    for _ in range(rounds):
+        right = (basis * w[..., None]).transpose(0, 2, 1)
+        fit = np.linalg.solve(right @ basis + 1e-9 * np.eye(3), right @ target)
+        error = np.linalg.norm(basis @ fit - target, axis=2)
+        w = (views.weight + 1e-6) / np.sqrt(error**2 + noise**2)
+    return fit
+
+
+def constant_depth(views: Views) -> tuple[Soup, Float]:
+    """Every superpixel at depth 1 in both frames, facing the camera, turned in the image plane.
+
+    Two views of a bending surface leave its relief to be found by the energy: a start without
+    relief favours none.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+
+    Returns:
+        The soup, mean plane distance 1, and (N,) its mean re-projection error in pixels.
+    """
+    w = views.weight + 1e-9
+    total = w.sum(axis=1)
+    a, b = (np.sum(w[..., None] * v, axis=1) / total[:, None] for v in (views.ray, views.target))
+    spread = (w[..., None] * (views.target - b[:, None])).transpose(0, 2, 1)
+    M = spread @ (views.ray - a[:, None])
+    # Procrustes; equal depths leave a turn about the optical axis
+    angle = np.arctan2(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1])
+    R = rotation.exp(angle[:, None] * np.array([0.0, 0.0, 1.0]))
+    T = b - np.einsum("nij,nj->ni", R, a)
+    moved = views.ray @ R.transpose(0, 2, 1) + T[:, None]
+    miss = (moved[..., :2] / moved[..., 2:] - views.target[..., :2]) * np.asarray(views.focal)
+    error = np.sum(views.weight * np.linalg.norm(miss, axis=2), axis=1) / total
+    n = np.tile([0.0, 0.0, -1.0], (len(R), 1))
+    return Soup(np.ones(len(R)), n, np.ones(len(R)), R, T).normalised(), error

@@ -1,0 +1,47 @@
+"""Surfaces that bend are told from bodies that move apart, and solved without rigid pieces."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soup_nlp.cases import Case, prepare
+from soup_nlp.config import make_problem
+from soup_nlp.geometry.soup import reconstruct
+from soup_nlp.report.metrics import depth_metrics
+from soup_nlp.solve.soup import solve_soup
+
+
+def case(scene: str, *overrides: str) -> Case:
+    raw = {
+        "input": {"kind": "scene", "scene": scene, "seed": 0, "width": 512, "height": 218},
+        "flow": {"source": "truth"},
+        "segmentation": {"superpixels": 150},
+    }
+    return prepare(make_problem(raw, overrides))
+
+
+@pytest.mark.parametrize("scene", ["street", "room", "orbit"])
+def test_rigid_bodies_do_not_bend(scene):
+    start = case(scene).start
+    assert not start.bending
+    assert start.bending_share < 0.2
+
+
+def test_sheet_bends_and_can_be_told_not_to():
+    c = case("sheet")
+    assert c.start.bending
+    assert c.start.bending_share > 0.35
+    assert c.data.arap_at_anchors
+    assert (c.start.body == 0).all()
+    np.testing.assert_allclose(c.soup.depth_at(c.data.anchor_ray), 1.0, rtol=1e-9)
+    assert not case("sheet", "start.bending=1.0").start.bending
+
+
+def test_sheet_is_better_than_a_constant_depth():
+    c = case("sheet")
+    answer = solve_soup(c.soup, c.data, c.weights, c.formulation(), c.options)
+    z = reconstruct(answer.soup, c.segmentation.labels, c.pair.K_ref, c.pair.K_next).depth_ref
+    gt = c.pair.truth.depth_ref
+    constant = depth_metrics(np.ones_like(gt), gt).mre
+    assert depth_metrics(z, gt).mre < 0.6 * constant
