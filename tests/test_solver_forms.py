@@ -76,7 +76,7 @@ def optimal_extras(nlp: NLP) -> np.ndarray:
     x[list(slack.values())] = 0.0
     g = dict(zip(nlp.g_names(), value(nlp, x)[1]))
     for name, i in slack.items():
-        # s^2 - |v|^2 at s = 0
+        # s^2 - |v|^2 - eps^2 at s = 0
         x[i] = np.sqrt(max(0.0, -g[f"epigraph_{name}"]))
     index = list(switch.values())
     x[index] = (gradient(nlp, x)[index] < 0).astype(float)
@@ -88,7 +88,8 @@ def optimal_extras(nlp: NLP) -> np.ndarray:
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_epigraph_and_lifted_at_their_optimum_are_the_exact_energy(gauge, units, truncated):
     problem, weights = tiny(units), weights_for(units, truncated)
-    nlp, _ = problem.nlp(weights, form(gauge=gauge, norm="epigraph", truncation="lifted"))
+    sharp = form(gauge=gauge, norm="epigraph", truncation="lifted", eps=0.0, eps_pixel=0.0)
+    nlp, _ = problem.nlp(weights, sharp)
     exact = plain.energy(problem.soup, problem.data, weights)
     x = optimal_extras(nlp)
     f, g = value(nlp, x)
@@ -119,9 +120,20 @@ def test_lifted_alone_at_its_optimum_is_the_exact_energy_as_eps_vanishes(units):
 def test_epigraph_alone_at_its_optimum_is_the_exact_energy_without_truncations():
     problem = tiny()
     weights = replace(PAPER, sigma_cont=np.inf, orient=0.0)
-    nlp, _ = problem.nlp(weights, form(norm="epigraph"))
+    nlp, _ = problem.nlp(weights, form(norm="epigraph", eps=0.0, eps_pixel=0.0))
     exact = plain.energy(problem.soup, problem.data, weights)["total"]
     assert value(nlp, optimal_extras(nlp))[0] == pytest.approx(exact, rel=1e-10)
+
+
+@pytest.mark.parametrize("units", UNITS)
+def test_epigraph_at_its_optimum_is_the_smooth_form(units):
+    problem, weights = tiny(units), weights_for(units)
+    one, _ = problem.nlp(weights, form(norm="epigraph", eps=0.2, eps_pixel=0.1))
+    two, _ = problem.nlp(weights, form(eps=0.2, eps_pixel=0.1))
+    smooth = value(two, two.x0)[0]
+    assert value(one, optimal_extras(one))[0] == pytest.approx(smooth, rel=1e-12)
+    # the slacks start there
+    assert value(one, one.x0)[0] == pytest.approx(smooth, rel=1e-12)
 
 
 def test_orientation_can_do_without_truncation():

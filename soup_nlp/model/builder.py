@@ -207,13 +207,13 @@ def _fill(kernel: Kernel, table: Table, extra: Int, x0: Float, theta: Float) -> 
     slacks = [j for j in extra if kernel.x[int(j)].name().startswith("s_")]
     switches = [j for j in extra if kernel.x[int(j)].name().startswith("z_")]
     if slacks and kernel.constraints is not None:
-        # constraint is s^2 - |v|^2, so at s = 0 its negative is |v|^2
+        # constraint is s^2 - |v|^2 - eps^2, so at s = 0 its negative is s^2 at the best s
         con = ca.Function("c", [kernel.x, kernel.row, kernel.theta], [kernel.constraints])
         local = x0[table.index].copy()
         local[:, slacks] = 0.0
         value = np.asarray(con.map(size)(local.T, table.data.T, th)).reshape(len(slacks), size)
         for j, v in zip(slacks, value):
-            x0[table.index[:, j]] = np.sqrt(np.maximum(-v, 0.0)) + 1e-6
+            x0[table.index[:, j]] = np.sqrt(np.maximum(-v, 1e-12))
     if switches and kernel.objective is not None:
         # the objective is linear in a switch: its slope says which end is better
         slope = ca.gradient(kernel.objective, kernel.x)

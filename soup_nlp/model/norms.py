@@ -103,9 +103,10 @@ def solver_form(
         y, dy = square / 2, ca.SX(1.0)
         outer = ca.mtimes(J.T, J)
     elif slack is not None:
-        y, dy = slack, ca.SX(1.0)
+        # the smooth norm's own epigraph: both have one solution, and eps = 0 is the exact norm
+        y, dy = slack - norm.eps, ca.SX(1.0)
         outer = ca.SX(x.numel(), x.numel())
-        constraint = slack**2 - square
+        constraint = slack**2 - square - norm.eps**2
     else:
         root = ca.sqrt(square + norm.eps**2)
         y, dy = root - norm.eps, 1 / root

@@ -14,7 +14,9 @@ class Formulation:
 
     Attributes:
         gauge: "unit-offset", "unit-translation" or "free".
-        norm: "smooth" (sqrt(|v|^2 + eps^2) - eps) or "epigraph" (slack s, |v|^2 <= s^2).
+        norm: "smooth" (sqrt(|v|^2 + eps^2) - eps) or "epigraph" (slack s in the objective as
+            s - eps, |v|^2 + eps^2 <= s^2): one minimum; with eps = 0 the latter is the exact norm,
+            but has no independent gradients where a norm is 0.
         truncation: "smooth" or "lifted" (z in [0, 1], exact).
         hessian: "exact", "gauss-newton" or "gauss-newton+constraints".
         eps: Smoothing of lengths and rotations, in the energy's unit (pixels by default).

@@ -166,8 +166,13 @@ def solve_soup(
     say(str(nlp))
     mark = time.perf_counter()
     warm: dict[str, Any] = {}
-    smooth = form.norm == "smooth" and form.truncation == "smooth"
-    if smooth and soup is presolved and o.polish_iterations and _near(stages[-1]):
+    # the lifted truncation has another solution than the presolve's
+    if (
+        form.truncation == "smooth"
+        and soup is presolved
+        and o.polish_iterations
+        and _near(stages[-1])
+    ):
         warm = warm_start(nlp, data, soup, stages[-1].lam_g)
     stage = Ipopt(nlp, {**(WARM if warm else {}), **o.ipopt})(
         x0=nlp.x0,

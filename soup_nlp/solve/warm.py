@@ -53,6 +53,12 @@ def warm_start(nlp: NLP, data: EnergyData, soup: Soup, lam_tangent: Float) -> di
     visible = next(g for g in nlp.groups if g.kernel.name == "visible").table.rows
     lam_g[visible[:, 1:]] = rim / facing[:, None]
     _, gradient = nlp.grad_f(nlp.x0, nlp.p)
+    # an epigraph's slack s is in no other row than s^2 >= |v|^2 + eps^2
+    for group in nlp.groups:
+        slacks = [i for i in range(group.kernel.nx) if group.kernel.x[i].name().startswith("s_")]
+        for slack, row in zip(slacks, group.table.rows.T):
+            s = group.table.index[:, slack]
+            lam_g[row] = -np.asarray(gradient).ravel()[s] / (2 * nlp.x0[s])
     J = to_scipy(nlp.jac_g(nlp.x0, nlp.p)[1]).tocsr()
     force = np.asarray(gradient).ravel() + J.T @ lam_g
     equal = np.flatnonzero(nlp.lbg == nlp.ubg)
