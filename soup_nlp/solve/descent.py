@@ -300,6 +300,9 @@ class Descent:
         far, calm = np.zeros(len(scale), bool), np.zeros(len(scale), bool)
         eager = calm
         moved: _Point | None = None
+        # where a step promises next to nothing, energies are equal but for rounding
+        promised = -0.5 * float(gradient @ h)
+        rounding = (1e-10 if promised < 1e-9 * abs(at.f) else 1e-12) * abs(at.merit)
         for attempt in range(4):
             trial, length = self._try(at, h, length, phase)
             slope = _own(h, self.problem.gradient(trial.x))
@@ -309,7 +312,7 @@ class Descent:
             calm = slope <= 0.1 * scale
             # still going down at half the first rate: the step was short
             eager = (slope < 0.5 * before) & (slope < -0.02 * scale)
-            if trial.merit < at.merit + 1e-12 * abs(at.merit):
+            if trial.merit < at.merit + rounding:
                 moved = self._longer(at, trial, h, length, eager & ~far, before, phase)
                 break
             some = here if here.any() and attempt < 2 else np.ones_like(here)

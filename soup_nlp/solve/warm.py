@@ -64,7 +64,8 @@ def warm_start(nlp: NLP, data: EnergyData, soup: Soup, lam_tangent: Float) -> di
     equal = np.flatnonzero(nlp.lbg == nlp.ubg)
     A = J[equal]
     gram = (A @ A.T).tocsc()
-    lam_g[equal] = splu(gram + 1e-12 * sparse.identity(len(equal), format="csc")).solve(
-        -(A @ force)
-    )
+    solve = splu(gram + 1e-12 * sparse.identity(len(equal), format="csc")).solve
+    # the squared system loses half the digits: refined until stationarity has them all
+    for _ in range(3):
+        lam_g[equal] -= solve(A @ (force + A.T @ lam_g[equal]))
     return {"lam_x0": np.zeros(nlp.nx), "lam_g0": lam_g}
