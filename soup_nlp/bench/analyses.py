@@ -48,7 +48,8 @@ def _over(key: str, values: Sequence[object]) -> dict[str, Overrides]:
 
 
 def _without(*terms: str) -> Overrides:
-    return tuple(f"energy.weights.{t}=0.0" for t in terms)
+    # where surfaces bend, weights of their own are in force
+    return tuple(f"energy.{w}.{t}=0.0" for t in terms for w in ("weights", "bending.weights"))
 
 
 _ALL = (
