@@ -21,23 +21,30 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.solve.factor import diagonal_places, factorisation
 from soup_nlp.solve.ipopt import Listener, Progress, Stage
+from soup_nlp.solve.search import (
+    TO_BOUNDARY,
+    Move,
+    Point,
+    Search,
+    along,
+    evaluate,
+    inside,
+    reach,
+)
 from soup_nlp.solve.tangent import HessianKind, TangentProblem
 
 Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 DAMPING = (1e-7, 1e6)
 """Least and most damping mu of a superpixel; scales, slopes, radians, shares of depth."""
 HELD = 1e-3
 """Least damping of a superpixel whose step went too far."""
-TO_BOUNDARY = 0.99
 BLENDS = (0.0, 0.1, 0.3, 1.0)
 """Shares of the majorant in the exact Hessian, tried until the direction is one of descent."""
 
@@ -63,16 +70,6 @@ class Phase:
     iterations: int
     stagnation: float
     tol: float
-
-
-class _Point(NamedTuple):
-    """A point with everything that is known of it."""
-
-    x: Float
-    f: float
-    merit: float
-    slack: Float
-    jacobian: Float
 
 
 class Descent:
@@ -103,31 +100,12 @@ class Descent:
         self.library, self._factorise = factorisation(problem.upper)
         self._diagonal = diagonal_places(problem.upper)
         n = problem.layout.count
-        self.x = self._inside(problem.nlp.x0)
+        self.x = inside(problem, problem.nlp.x0)
         self.z: Float | None = None
         self.damping = np.full(n, 1e-2)
         simplex = np.zeros((n, 9))
         simplex[:, 0] = problem.share
         self._a = simplex.ravel()
-
-    def _inside(self, x: Float) -> Float:
-        """x with slopes shrunk until every slack is positive."""
-        x = self.problem.normalise(x)
-        for _ in range(200):
-            out = (self.problem.slacks(x)[0] <= 0).any(axis=1)
-            if not out.any():
-                break
-            x.reshape(-1, 9)[out, 1:3] *= 0.9
-        return x
-
-    def _point(self, x: Float, phase: Phase, floor: Float | None = None) -> _Point | None:
-        """Energy and slacks at x; None where a slack is below `floor`."""
-        slack, jacobian = self.problem.slacks(x)
-        if (slack <= (0.0 if floor is None else floor)).any():
-            return None
-        f = self.problem.value(x)
-        merit = f - phase.barrier * float(np.log(slack).sum())
-        return _Point(x, f, merit if np.isfinite(merit) else np.inf, slack, jacobian)
 
     def run(self, phase: Phase) -> Stage:
         """Descend until the phase ends; x, multipliers and damping stay for the next one."""
@@ -135,7 +113,7 @@ class Descent:
         problem = self.problem
         calls = problem.calls()
         problem.smoothing(phase.eps)
-        at = self._point(self.x, phase)
+        at = evaluate(problem, self.x, phase.barrier)
         assert at is not None, "the iterate is inside its bounds"
         if self.z is None:
             self.z = phase.barrier / at.slack
@@ -162,7 +140,9 @@ class Descent:
                 if fresh:
                     curvature = self._curvature(at, phase.hessian)
                 h, H, blend = self._newton(at, curvature, blend, gradient, phase)
-                moved, length = self._search(at, h, H, gradient, phase)
+                move = Search(problem, at, h, phase.barrier).run(gradient, self._times(H, h))
+                self._adapt(move)
+                moved = move.point
                 fresh = moved is not None
                 if moved is not None:
                     fell = at.f - moved.f
@@ -173,7 +153,7 @@ class Descent:
                 else:
                     # the majorant's steps descend
                     blend = min(1.0, max(BLENDS[1], 9 * blend))
-                history[-1] = (*history[-1][:4], length)
+                history[-1] = (*history[-1][:4], float(move.length.min()))
                 continue
             break
         columns = np.array(history).T
@@ -219,7 +199,7 @@ class Descent:
         nu = -float(a @ rest.ravel()) / float(a @ a)
         return nu, float(np.abs(rest.ravel() + nu * a).max())
 
-    def _curvature(self, at: _Point, kind: HessianKind) -> tuple[Float, Float]:
+    def _curvature(self, at: Point, kind: HessianKind) -> tuple[Float, Float]:
         """Hessian to use and the majorant, both with the condensed slacks."""
         assert self.z is not None
         inner = np.einsum("nrc,nr,nrd->ncd", at.jacobian, self.z / at.slack, at.jacobian)
@@ -235,7 +215,7 @@ class Descent:
 
     def _newton(
         self,
-        at: _Point,
+        at: Point,
         curvature: tuple[Float, Float],
         blend: float,
         gradient: Float,
@@ -281,100 +261,21 @@ class Descent:
         U.data = H
         return np.asarray(U @ h + U.T @ h - H[self._diagonal] * h)
 
-    def _search(
-        self, at: _Point, h: Float, H: Float, gradient: Float, phase: Phase
-    ) -> tuple[_Point | None, float]:
-        """Step to a lower merit: shorter where a superpixel goes too far, longer while it pays.
-
-        Returns:
-            The point or None, and the shortest share of h that a superpixel went. Damping is
-            changed for the next step.
-        """
-        along = np.einsum("nrc,nc->nr", at.jacobian, h.reshape(-1, 9)[:, :3])
-        with np.errstate(divide="ignore"):
-            reach = np.where(along < 0, -at.slack / along, np.inf).min(axis=1)
-        length = np.minimum(1.0, TO_BOUNDARY * reach)
-        scale = np.abs(_own(h, self._times(H, h))) + np.abs(_own(h, gradient))
-        scale += 1e-5 * abs(at.f) / len(scale)
-        before = _own(h, gradient)
-        far, calm = np.zeros(len(scale), bool), np.zeros(len(scale), bool)
-        eager = calm
-        moved: _Point | None = None
-        # where a step promises next to nothing, energies are equal but for rounding
-        promised = -0.5 * float(gradient @ h)
-        rounding = (1e-10 if promised < 1e-9 * abs(at.f) else 1e-12) * abs(at.merit)
-        for attempt in range(4):
-            trial, length = self._try(at, h, length, phase)
-            slope = _own(h, self.problem.gradient(trial.x))
-            # past its minimum along the step, by more than the quadratic model allows
-            here = ~(slope <= 0.5 * scale)
-            far |= here
-            calm = slope <= 0.1 * scale
-            # still going down at half the first rate: the step was short
-            eager = (slope < 0.5 * before) & (slope < -0.02 * scale)
-            if trial.merit < at.merit + rounding:
-                moved = self._longer(at, trial, h, length, eager & ~far, before, phase)
-                break
-            some = here if here.any() and attempt < 2 else np.ones_like(here)
-            length = np.where(some, 0.25 * length, length)
-        raised = np.clip(self.damping * (4 if moved else 8), HELD, DAMPING[1])
-        kept = self.damping if moved or far.any() else np.maximum(8 * self.damping, HELD)
+    def _adapt(self, move: Move) -> None:
+        """Damping of every superpixel by how its step went."""
+        moved, damping = move.point is not None, self.damping
+        raised = np.clip(damping * (4 if moved else 8), HELD, DAMPING[1])
         if moved:
-            fall = np.where(eager, 16.0, np.where(calm, 4.0, 1.0))
-            kept = np.maximum(kept / fall, DAMPING[0])
-        self.damping = np.where(far, raised, kept)
-        return moved, float(length.min())
+            fall = np.where(move.eager, 16.0, np.where(move.calm, 4.0, 1.0))
+            damping = np.maximum(damping / fall, DAMPING[0])
+        elif not move.far.any():
+            damping = np.maximum(8 * damping, HELD)
+        self.damping = np.where(move.far, raised, damping)
 
-    def _try(self, at: _Point, h: Float, length: Float, phase: Phase) -> tuple[_Point, Float]:
-        """The point at these shares of h, halved where a slack would vanish."""
-        length = length.copy()
-        for _ in range(40):
-            step = length[:, None] * h.reshape(-1, 9)
-            x = self.problem.normalise(at.x + step.ravel())
-            point = self._point(x, phase, floor=1e-3 * at.slack)
-            if point is not None:
-                return point, length
-            short = (self.problem.slacks(x)[0] <= 1e-3 * at.slack).any(axis=1)
-            length[short] *= 0.5
-        return at, np.zeros_like(length)
-
-    def _longer(
-        self,
-        at: _Point,
-        moved: _Point,
-        h: Float,
-        length: Float,
-        eager: Bool,
-        before: Float,
-        phase: Phase,
-    ) -> _Point:
-        """Double the step while the merit falls: of all, then of those still going down."""
-        for some in (np.ones_like(eager), eager):
-            for _ in range(7):
-                if not some.any():
-                    break
-                longer = np.where(some, 2 * length, length)
-                x = self.problem.normalise(at.x + (longer[:, None] * h.reshape(-1, 9)).ravel())
-                trial = self._point(x, phase, floor=1e-3 * at.slack)
-                if trial is None or not trial.merit < moved.merit:
-                    break
-                moved, length = trial, longer
-                if some is eager:
-                    some = eager = eager & (_own(h, self.problem.gradient(x)) < 0.5 * before)
-        return moved
-
-    def _step_multipliers(self, at: _Point, h: Float, phase: Phase, moved: _Point) -> None:
+    def _step_multipliers(self, at: Point, h: Float, phase: Phase, moved: Point) -> None:
         """Newton's step of the slacks' multipliers, kept near barrier / slack."""
         assert self.z is not None
         z, b = self.z, phase.barrier
-        along = np.einsum("nrc,nc->nr", at.jacobian, h.reshape(-1, 9)[:, :3])
-        step = b / at.slack - z - z / at.slack * along
-        with np.errstate(divide="ignore"):
-            reach = np.where(step < 0, -z / step, np.inf).min(axis=1)
-        z = z + np.minimum(1.0, TO_BOUNDARY * reach)[:, None] * step
+        step = b / at.slack - z - z / at.slack * along(at.jacobian, h)
+        z = z + np.minimum(1.0, TO_BOUNDARY * reach(z, step))[:, None] * step
         self.z = np.clip(z, 1e-8 * b / moved.slack, 1e8 * b / moved.slack)
-
-
-def _own(h: Float, other: Float) -> Float:
-    """(N,) inner products of every superpixel's share of two vectors (9 N,)."""
-    return np.einsum("nc,nc->n", h.reshape(-1, 9), other.reshape(-1, 9))

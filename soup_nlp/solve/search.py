@@ -1,0 +1,171 @@
+"""Search along a step of the presolve, superpixel by superpixel.
+
+A step that is too long for a few superpixels is shortened for those alone; one that still goes
+down at its end is doubled, for all and then for those that still descend. Energies cost a tenth of
+an iteration.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.solve.tangent import TangentProblem
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+TO_BOUNDARY = 0.99
+"""Share of the way to where a slack vanishes that a step may go."""
+LEAST_SLACK = 1e-3
+"""A slack keeps at least this share of itself."""
+TRIES = 4
+
+
+class Point(NamedTuple):
+    """A point with what is known of it.
+
+    Attributes:
+        x: (9 N,) variables.
+        f: Smoothed energy.
+        merit: f - barrier x sum log slack.
+        slack: (N, R) slacks.
+        jacobian: (N, R, 3) their derivatives by scale and slopes.
+    """
+
+    x: Float
+    f: float
+    merit: float
+    slack: Float
+    jacobian: Float
+
+
+class Move(NamedTuple):
+    """What came of a step.
+
+    Attributes:
+        point: Where it led, or None: refused at every length.
+        length: (N,) share of the step that every superpixel went.
+        far: (N,) its superpixels that went past their minimum.
+        calm: (N,) those that ended where the quadratic model says.
+        eager: (N,) those that went down to the end: the step was short for them.
+    """
+
+    point: Point | None
+    length: Float
+    far: Bool
+    calm: Bool
+    eager: Bool
+
+
+def own(h: Float, other: Float) -> Float:
+    """(N,) inner products of every superpixel's share of two vectors (9 N,)."""
+    return np.einsum("nc,nc->n", h.reshape(-1, 9), other.reshape(-1, 9))
+
+
+def reach(value: Float, change: Float) -> Float:
+    """(N,) share of a change (N, R) at which the first positive value (N, R) would vanish."""
+    with np.errstate(divide="ignore"):
+        return np.where(change < 0, -value / change, np.inf).min(axis=1)
+
+
+def along(jacobian: Float, h: Float) -> Float:
+    """(N, R) changes of the slacks along a step (9 N,)."""
+    return np.einsum("nrc,nc->nr", jacobian, h.reshape(-1, 9)[:, :3])
+
+
+def inside(problem: TangentProblem, x: Float) -> Float:
+    """x on the simplex, with slopes shrunk until every slack is positive."""
+    x = problem.normalise(x)
+    for _ in range(200):
+        out = (problem.slacks(x)[0] <= 0).any(axis=1)
+        if not out.any():
+            break
+        x.reshape(-1, 9)[out, 1:3] *= 0.9
+    return x
+
+
+def evaluate(
+    problem: TangentProblem, x: Float, barrier: float, floor: Float | float = 0.0
+) -> Point | None:
+    """Energy and slacks at x; None where a slack is not above `floor`."""
+    slack, jacobian = problem.slacks(x)
+    if (slack <= floor).any():
+        return None
+    f = problem.value(x)
+    merit = f - barrier * float(np.log(slack).sum())
+    return Point(x, f, merit if np.isfinite(merit) else np.inf, slack, jacobian)
+
+
+class Search:
+    """The search along one step from one point."""
+
+    def __init__(self, problem: TangentProblem, at: Point, h: Float, barrier: float) -> None:
+        self.problem, self.at, self.h, self.barrier = problem, at, h, barrier
+
+    def _at(self, length: Float) -> Float:
+        return self.problem.normalise(self.at.x + (length[:, None] * self.h.reshape(-1, 9)).ravel())
+
+    def _slope(self, x: Float) -> Float:
+        return own(self.h, self.problem.gradient(x))
+
+    def run(self, gradient: Float, bent: Float) -> Move:
+        """Find a lower merit.
+
+        Args:
+            gradient: (9 N,) of f at the point.
+            bent: (9 N,) Hessian times step.
+        """
+        at, h = self.at, self.h
+        length = np.minimum(1.0, TO_BOUNDARY * reach(at.slack, along(at.jacobian, h)))
+        before = own(h, gradient)
+        scale = np.abs(own(h, bent)) + np.abs(before) + 1e-5 * abs(at.f) / len(length)
+        # where a step promises next to nothing, energies are equal but for rounding
+        promised = -0.5 * float(gradient @ h)
+        rounding = (1e-10 if promised < 1e-9 * abs(at.f) else 1e-12) * abs(at.merit)
+        far = np.zeros(len(length), bool)
+        calm = eager = far
+        for attempt in range(TRIES):
+            trial, length = self._feasible(length)
+            slope = self._slope(trial.x)
+            # past its minimum along the step, by more than the quadratic model allows
+            here = ~(slope <= 0.5 * scale)
+            far = far | here
+            calm = (slope <= 0.1 * scale) & ~far
+            # still going down at half the first rate
+            eager = (slope < 0.5 * before) & (slope < -0.02 * scale) & ~far
+            if trial.merit < at.merit + rounding:
+                return Move(self._longer(trial, length, eager, before), length, far, calm, eager)
+            some = here if here.any() and attempt < TRIES // 2 else np.ones_like(here)
+            length = np.where(some, 0.25 * length, length)
+        return Move(None, length, far, calm, eager)
+
+    def _feasible(self, length: Float) -> tuple[Point, Float]:
+        """The point at these lengths, halved where a slack would vanish."""
+        length, floor = length.copy(), LEAST_SLACK * self.at.slack
+        for _ in range(40):
+            x = self._at(length)
+            point = evaluate(self.problem, x, self.barrier, floor)
+            if point is not None:
+                return point, length
+            length[(self.problem.slacks(x)[0] <= floor).any(axis=1)] *= 0.5
+        return self.at, np.zeros_like(length)
+
+    def _longer(self, moved: Point, length: Float, eager: Bool, before: Float) -> Point:
+        """Double the step while the merit falls: of all, then of those still going down."""
+        for every in (True, False):
+            some = np.ones_like(eager) if every else eager
+            for _ in range(7):
+                if not some.any():
+                    break
+                longer = np.where(some, 2 * length, length)
+                x = self._at(longer)
+                trial = evaluate(self.problem, x, self.barrier, LEAST_SLACK * self.at.slack)
+                if trial is None or not trial.merit < moved.merit:
+                    break
+                moved, length = trial, longer
+                if not every:
+                    some = some & (self._slope(x) < 0.5 * before)
+        return moved
