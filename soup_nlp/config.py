@@ -93,7 +93,7 @@ class BendingConfig(Strict):
     """
 
     rotation_px: Positive = 1e-3
-    weights: EnergyWeights = EnergyWeights(orient=2.0, sigma_arap=1.0, leak_arap=0.05)
+    weights: EnergyWeights = EnergyWeights(cont=0.05, orient=2.0, sigma_arap=1.0, leak_arap=0.05)
 
 
 class EnergyConfig(Strict):

@@ -20,27 +20,32 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-def bending_share(
-    views: Views, seg: Segmentation, boundary_ray: Float, body: Int, tear_px: float
-) -> float:
-    """Share of the superpixels that move otherwise than most of the surface they belong to.
-
-    A surface is what hangs together by neighbours between whom the flow does not tear. It is
-    near 0 where every surface is one rigid body, near 1 where surfaces need many.
+def surfaces(views: Views, seg: Segmentation, boundary_ray: Float, tear_px: float) -> Int:
+    """(N,) surface of every superpixel: what hangs together where the flow does not tear.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
         seg: Superpixels and graphs.
         boundary_ray: (P, B, 3) rays of the shared boundaries, reference frame.
-        body: (N,) group that moves as one rigid body.
         tear_px: A larger jump of the flow across a boundary is a tear, pixels.
     """
     if not len(seg.pairs):
-        return 0.0
-    surface = joined(flow_jump(views, seg.pairs, boundary_ray) < tear_px, seg)
+        return np.arange(len(seg))
+    return joined(flow_jump(views, seg.pairs, boundary_ray) < tear_px, seg)
+
+
+def bending_share(surface: Int, body: Int) -> float:
+    """Share of the superpixels that move otherwise than most of the surface they belong to.
+
+    It is near 0 where every surface is one rigid body, near 1 where surfaces need many.
+
+    Args:
+        surface: (N,) surface of every superpixel.
+        body: (N,) group that moves as one rigid body.
+    """
     count = np.zeros((int(surface.max()) + 1, int(body.max()) + 1))
     np.add.at(count, (surface, body), 1.0)
-    return float(1.0 - count.max(axis=1).sum() / len(seg))
+    return float(1.0 - count.max(axis=1).sum() / len(surface))
 
 
 def flow_jump(views: Views, pairs: Int, boundary_ray: Float) -> Float:

@@ -13,7 +13,7 @@ from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy import sample_pixels
-from soup_nlp.start.bending import bending_share, constant_depth
+from soup_nlp.start.bending import bending_share, constant_depth, surfaces
 from soup_nlp.start.bodies import bodies, borrow, contact_scales
 from soup_nlp.start.choice import (
     dominant,
@@ -143,7 +143,8 @@ def propose(
     mu, slope = borrow(mu, slope, label, weak, seg)
     soup = _soup(mu, slope, R, t, anchor, radius)
     body = bodies(label, seg)
-    share = bending_share(views, seg, rays(K_ref, seg.boundary), body, o.tear_px)
+    surface = surfaces(views, seg, rays(K_ref, seg.boundary), o.tear_px)
+    share = bending_share(surface, body)
     if share > o.bending:
         soup, error = constant_depth(views)
         none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
