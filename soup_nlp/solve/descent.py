@@ -140,7 +140,8 @@ class Descent:
                 if fresh:
                     curvature = self._curvature(at, phase.hessian)
                 h, H, blend = self._newton(at, curvature, blend, gradient, phase)
-                move = Search(problem, at, h, phase.barrier).run(gradient, self._times(H, h))
+                search = Search(problem, at, h, phase.barrier)
+                move = search.run(gradient, self._times(H, h))
                 self._adapt(move)
                 moved = move.point
                 fresh = moved is not None
@@ -149,7 +150,7 @@ class Descent:
                     small = small + 1 if fell <= phase.stagnation * abs(at.f) else 0
                     self._step_multipliers(at, h, phase, moved)
                     at, self.x = moved, moved.x
-                    gradient = problem.gradient(at.x)
+                    gradient = search.gradient(at.x)
                 else:
                     # the majorant's steps descend
                     blend = min(1.0, max(BLENDS[1], 9 * blend))

@@ -83,7 +83,10 @@ def superlu(upper: sparse.csc_matrix) -> Factorise:
     def factorise(nonzeros: Float) -> Back:
         U = sparse.csc_matrix((nonzeros, (rows, columns)), shape=upper.shape)
         full = U + sparse.triu(U, 1).T
-        return splu(full.tocsc(), "MMD_AT_PLUS_A", **options).solve
+        try:
+            return splu(full.tocsc(), "MMD_AT_PLUS_A", **options).solve
+        except RuntimeError as error:
+            raise ArithmeticError(str(error)) from error
 
     return factorise
 

@@ -104,12 +104,19 @@ class Search:
 
     def __init__(self, problem: TangentProblem, at: Point, h: Float, barrier: float) -> None:
         self.problem, self.at, self.h, self.barrier = problem, at, h, barrier
+        self._known: tuple[Float, Float] | None = None
+
+    def gradient(self, x: Float) -> Float:
+        """Gradient of f at a point of the search (9 N,); that of the last one asked is kept."""
+        if self._known is None or self._known[0] is not x:
+            self._known = x, self.problem.gradient(x)
+        return self._known[1]
 
     def _at(self, length: Float) -> Float:
         return self.problem.normalise(self.at.x + (length[:, None] * self.h.reshape(-1, 9)).ravel())
 
     def _slope(self, x: Float) -> Float:
-        return own(self.h, self.problem.gradient(x))
+        return own(self.h, self.gradient(x))
 
     def run(self, gradient: Float, bent: Float) -> Move:
         """Find a lower merit.

@@ -44,11 +44,11 @@ class TangentProblem:
         self.nlp, self.layout = build_tangent_nlp(start, data, weights, majorant)
         exact = build_tangent_nlp(start, data, weights, replace(smooth, hessian="exact"))[0]
         nlp, n = self.nlp, self.layout.count
-        rows = {g.kernel.name: g.table.rows for g in nlp.groups}
-        self._visible = rows["t_visible"]
-        self._simplex = int(rows["t_simplex"][0, 0])
-        self.share = nlp.groups[self._group("t_simplex")].table.data[:, 0]
-        self._lower, self._upper = nlp.lbx.reshape(-1, 9), nlp.ubx.reshape(-1, 9)
+        tables = {g.kernel.name: g.table for g in nlp.groups}
+        self._visible = tables["t_visible"].rows
+        self._simplex = int(tables["t_simplex"].rows[0, 0])
+        self.share = tables["t_simplex"].data[:, 0]
+        self._low, self._high = nlp.lbx.reshape(-1, 9), nlp.ubx.reshape(-1, 9)
         self._bound = nlp.lbg[self._visible]
         self._p = nlp.p
 
@@ -66,9 +66,6 @@ class TangentProblem:
         self._slopes = order[first[..., None] + np.arange(2)]
         self.triangle = np.array(np.triu_indices(9))
         self._pattern(nlp, exact, n)
-
-    def _group(self, name: str) -> int:
-        return [g.kernel.name for g in self.nlp.groups].index(name)
 
     def _pattern(self, nlp: NLP, exact: NLP, n: int) -> None:
         """Union of both Hessians' patterns, and where the nonzeros of each stand in it."""
@@ -104,9 +101,8 @@ class TangentProblem:
             z: (N, R) multipliers of the slacks.
             kind: "exact", or "gauss-newton" for f's reweighted stand-in.
         """
-        lam_f, lam_g = self._lam(z)
         out = np.zeros(self.upper.nnz)
-        out[self._place[kind]] = self._hessian[kind](x, self._p, lam_f, lam_g)[0]
+        out[self._place[kind]] = self._hessian[kind](x, self._p, 1.0, self._lam_g(z))[0]
         return out
 
     def slacks(self, x: Float) -> tuple[Float, Float]:
@@ -116,7 +112,7 @@ class TangentProblem:
         J = np.zeros((n, count + 5, 3))
         J[:, :count, 1:] = jacobian[self._slopes]
         J[:, count:] = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, -1]]
-        low, high = a[:, :3] - self._lower[:, :3], self._upper[:, 1:3] - a[:, 1:3]
+        low, high = a[:, :3] - self._low[:, :3], self._high[:, 1:3] - a[:, 1:3]
         return np.column_stack([g[self._visible] - self._bound, low, high]), J
 
     def normalise(self, x: Float) -> Float:
@@ -134,14 +130,14 @@ class TangentProblem:
             "hess_lag": sum(h.seconds for h in self._hessian.values()),
         }
 
-    def _lam(self, z: Float) -> tuple[float, Float]:
+    def _lam_g(self, z: Float) -> Float:
         lam_g = np.zeros(self.nlp.ng)
         lam_g[self._visible] = -z[:, : self._visible.shape[1]]
-        return 1.0, lam_g
+        return lam_g
 
     def multipliers(self, z: Float, nu: float) -> tuple[Float, Float]:
         """lam_x (9 N,) and lam_g of the NLP, from those of slacks and simplex."""
-        lam_g = self._lam(z)[1]
+        lam_g = self._lam_g(z)
         lam_g[self._simplex] = nu
         lam_x = np.zeros((len(z), 9))
         bound = z[:, self._visible.shape[1] :]
