@@ -16,6 +16,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Gauge = Literal["unit-offset", "unit-translation", "free"]
 GAUGES: tuple[Gauge, ...] = ("unit-offset", "unit-translation", "free")
+Chart = Literal["depth", "inverse-depth"]
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,12 @@ class MatrixLayout:
 
 @dataclass(frozen=True)
 class TangentLayout:
-    """Variables of the presolve about a base soup: `lam s w t` per superpixel.
+    """Variables of the presolve about a base soup: `lam s w q` per superpixel (`views`).
+
+    Chart "inverse-depth" has `rho = 1 / lam` and `rho s` in the place of scale and slopes: the
+    inverse-depth plane itself. Superpixels on one plane stay on one plane along a straight line, so
+    that steps are not bent out of valleys of equal continuity. In "depth" the length unit is
+    linear.
 
     Attributes:
         anchor: (N, 3) anchor rays.
@@ -118,6 +124,7 @@ class TangentLayout:
         share: (N,) weights c of the length unit.
         depth: (N,) Z0, depth of the anchors in the base, in that unit.
         R0: (N, 3, 3) base rotations.
+        chart: "depth" or "inverse-depth".
     """
 
     anchor: Float
@@ -125,13 +132,14 @@ class TangentLayout:
     share: Float
     depth: Float
     R0: Float
+    chart: Chart = "depth"
 
     @classmethod
-    def about(cls, soup: Soup, data: EnergyData) -> TangentLayout:
+    def about(cls, soup: Soup, data: EnergyData, chart: Chart = "depth") -> TangentLayout:
         """Layout whose base is the soup, its rotations made exactly orthogonal."""
         depth = soup.normalised(data.share).depth_at(data.anchor_ray)
         R0 = rotation.nearest(soup.R)
-        return cls(data.anchor_ray, data.radius, data.share, depth, R0)
+        return cls(data.anchor_ray, data.radius, data.share, depth, R0, chart)
 
     @property
     def count(self) -> int:
@@ -153,23 +161,29 @@ class TangentLayout:
         angle = np.linalg.norm(w, axis=1, keepdims=True)
         # Cayley vector of the same rotation: 2 tan(angle / 2) along the axis
         w = w * np.where(angle > 1e-12, 2 * np.tan(angle / 2) / np.maximum(angle, 1e-12), 1.0)
-        t = s.translation / depth[:, None]
-        return np.column_stack([depth / self.depth, slope, w, t]).ravel()
+        q = s.translation / depth[:, None] + np.einsum("nij,nj->ni", s.R, self.anchor)
+        a = np.column_stack([depth / self.depth, slope, w, q])
+        if self.chart == "inverse-depth":
+            a[:, :3] = np.column_stack([np.ones(len(a)), slope]) / a[:, :1]
+        return a.ravel()
 
     def unpack(self, x: Float) -> Soup:
         """Feasible soup (SO(3), unit normals, simplex) of a vector."""
-        a = np.asarray(x, float).reshape(-1, 9)
+        a = np.array(x, float).reshape(-1, 9)
+        if self.chart == "inverse-depth":
+            a[:, :3] = np.column_stack([np.ones(len(a)), a[:, 1:3]]) / a[:, :1]
         s = a[:, 1:3] / self.radius[:, None]
         m = np.column_stack([s, 1 - np.sum(s * self.anchor[:, :2], axis=1)])
         length = np.linalg.norm(m, axis=1)
         depth = a[:, 0] * self.depth
         D = depth / length
         R = rotation.nearest(self.R0 @ rotation.cayley(a[:, 3:6]))
-        T = depth[:, None] * a[:, 6:9]
+        T = depth[:, None] * (a[:, 6:9] - np.einsum("nij,nj->ni", R, self.anchor))
         raw = Soup(D, -m / length[:, None], np.ones(len(D)), R, T / D[:, None])
         return raw.normalised(self.share)
 
     def names(self) -> list[str]:
         """Readable names in order."""
-        own = ["lam", "s1", "s2", "w1", "w2", "w3", "t1", "t2", "t3"]
+        plane = ["lam", "s1", "s2"] if self.chart == "depth" else ["rho", "g1", "g2"]
+        own = [*plane, "w1", "w2", "w3", "q1", "q2", "q3"]
         return [f"{s}[{i}]" for i in range(self.count) for s in own]

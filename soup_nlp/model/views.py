@@ -62,22 +62,31 @@ def matrix_view(x: ca.SX, gauge: str, offset: ca.SX) -> View:
 TANGENT_SIZE = 9
 
 
-def tangent_view(x: ca.SX, anchor: ca.SX, radius: ca.SX, depth: ca.SX, R0: ca.SX) -> View:
+def tangent_view(
+    x: ca.SX, anchor: ca.SX, radius: ca.SX, depth: ca.SX, R0: ca.SX, chart: str = "depth"
+) -> View:
     """View of the presolve's variables of one superpixel.
 
     `1 / Z(r) = (1 + s . (r - r_a) / h) / Z`, Z = lam Z0 the depth of the anchor; rotation
-    `R0 Cayley(w)`, `X' = R X + Z t`.
+    `R = R0 Cayley(w)` about the anchor: `X' = R (X - Z r_a) + Z q`. A rotation about the camera
+    would carry the superpixel across the image and leave the way back to the translation, exact
+    to first order only.
 
     Args:
-        x: (9x1) `lam s w t`: relative scale, slopes (2), rotation (3), translation / Z (3).
+        x: (9x1) `lam s w q`: relative scale, slopes (2), rotation (3), moved anchor / Z (3); chart
+            "inverse-depth" has `rho = 1 / lam` and `rho s`.
         anchor: (3x1) anchor ray r_a.
         radius: h, ray units.
         depth: Z0, depth of the anchor in the base.
         R0: (9x1) base rotation by columns.
+        chart: "depth" or "inverse-depth".
     """
-    lam, s, w, t = x[0], x[1:3], x[3:6], x[6:9]
+    lam, s, w, q = x[0], x[1:3], x[3:6], x[6:9]
+    if chart == "inverse-depth":
+        lam, s = 1 / lam, s / lam
     m = ca.vertcat(s / radius, 1 - ca.dot(s, anchor[0:2]) / radius)
     h = w / 2
     W = ca.skew(h)
     C = ca.SX.eye(3) + (2 / (1 + ca.dot(h, h))) * (W + W @ W)
-    return View(lam=lam * depth, m=m, n=-m / ca.norm_2(m), R=ca.reshape(R0, 3, 3) @ C, t=t)
+    R = ca.reshape(R0, 3, 3) @ C
+    return View(lam=lam * depth, m=m, n=-m / ca.norm_2(m), R=R, t=q - R @ anchor)

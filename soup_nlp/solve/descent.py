@@ -20,12 +20,15 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.solve.factor import diagonal_places, factorisation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.solve.factor import Back, diagonal_places, factorisation
 from soup_nlp.solve.ipopt import Listener, Progress, Stage
 from soup_nlp.solve.search import (
     TO_BOUNDARY,
@@ -35,6 +38,8 @@ from soup_nlp.solve.search import (
     along,
     evaluate,
     inside,
+    merit,
+    merit_gradient,
     reach,
 )
 from soup_nlp.solve.tangent import HessianKind, TangentProblem
@@ -59,8 +64,10 @@ class Phase:
         eps: Smoothing width, pixels.
         barrier: b of `f - b sum log c`.
         iterations: Limit.
-        stagnation: Ends when f falls by less than this share, twice in a row.
+        stagnation: Ends when the merit falls by less than this share of f, twice in a row.
         tol: Ends when dual infeasibility is below; "Solve_Succeeded".
+        highest: Barrier far from the solution: a superpixel slides along a bent boundary only with
+            room to it. It follows 1e-6 of the dual infeasibility down to `barrier`.
     """
 
     name: str
@@ -70,6 +77,23 @@ class Phase:
     iterations: int
     stagnation: float
     tol: float
+    highest: float = 0.0
+
+
+class Step(NamedTuple):
+    """A step of the damped system.
+
+    Attributes:
+        h: (9 N,) the step.
+        H: Nonzeros of its matrix without damping.
+        blend: Share of the majorant to begin with next time.
+        newton: Step for another gradient of the merit.
+    """
+
+    h: Float
+    H: Float
+    blend: float
+    newton: Callable[[Float], Float]
 
 
 class Descent:
@@ -79,6 +103,7 @@ class Descent:
         self,
         problem: TangentProblem,
         *,
+        after: Descent | None = None,
         deadline: float = np.inf,
         listener: Listener | None = None,
         stop: threading.Event | None = None,
@@ -88,6 +113,8 @@ class Descent:
 
         Args:
             problem: Energy and slacks.
+            after: A descent in another chart, whose soup is this problem's base: its point,
+                multipliers and damping are where this one begins.
             deadline: Of time.perf_counter().
             listener: Called at every iteration.
             stop: Set it to end at the next iteration.
@@ -100,12 +127,25 @@ class Descent:
         self.library, self._factorise = factorisation(problem.upper)
         self._diagonal = diagonal_places(problem.upper)
         n = problem.layout.count
-        self.x = inside(problem, problem.nlp.x0)
+        self.x: Float = problem.nlp.x0
         self.z: Float | None = None
-        self.damping = np.full(n, 1e-2)
-        simplex = np.zeros((n, 9))
-        simplex[:, 0] = problem.share
-        self._a = simplex.ravel()
+        self.damping: Float = np.full(n, 1e-2)
+        if after:
+            # at their base charts agree to first order
+            self.x, self.z, self.damping = problem.layout.pack(after.soup), after.z, after.damping
+        self.x = inside(problem, self.x)
+
+    @property
+    def soup(self) -> Soup:
+        """Where it is."""
+        return self.problem.layout.unpack(self.x)
+
+    @property
+    def rim(self) -> Float:
+        """(N, V) multipliers of rim visibility, its rows divided by the facing of the anchor."""
+        assert self.z is not None
+        own = self.z[:, : self.problem.rims]
+        return own if self.problem.layout.chart == "depth" else own * self.x[::9, None]
 
     def run(self, phase: Phase) -> Stage:
         """Descend until the phase ends; x, multipliers and damping stay for the next one."""
@@ -120,6 +160,7 @@ class Descent:
         self.damping = np.minimum(self.damping, 1e-2 if phase.hessian != "exact" else 1e-4)
         gradient = problem.gradient(at.x)
         fresh, blend, small = True, 0.0, 0
+        barrier = max(phase.highest, phase.barrier)
         history: list[tuple[float, ...]] = []
         status = "Maximum_Iterations_Exceeded"
         nu = 0.0
@@ -137,18 +178,21 @@ class Descent:
             elif time.perf_counter() > self.deadline:
                 status = "Time_Limit"
             elif iteration < phase.iterations:
+                barrier = max(phase.barrier, min(barrier, 1e-6 * dual))
+                at = at._replace(merit=merit(at.f, at.slack, barrier))
                 if fresh:
                     curvature = self._curvature(at, phase.hessian)
-                h, H, blend = self._newton(at, curvature, blend, gradient, phase)
-                search = Search(problem, at, h, phase.barrier)
-                move = search.run(gradient, self._times(H, h))
+                step = self._newton(at, curvature, blend, gradient, barrier, phase.hessian)
+                h, blend = step.h, step.blend
+                search = Search(problem, at, h, barrier, step.newton)
+                move = search.run(gradient, self._times(step.H, h))
                 self._adapt(move)
                 moved = move.point
                 fresh = moved is not None
                 if moved is not None:
-                    fell = at.f - moved.f
+                    fell = at.merit - moved.merit
                     small = small + 1 if fell <= phase.stagnation * abs(at.f) else 0
-                    self._step_multipliers(at, h, phase, moved)
+                    self._step_multipliers(at, h, barrier, moved)
                     at, self.x = moved, moved.x
                     gradient = search.gradient(at.x)
                 else:
@@ -192,13 +236,16 @@ class Descent:
                 log.write("{:4d} {:14.7e} {:.2e} {:.2e} {:.2e}\n".format(iteration, *row[:4]))
 
     def _dual(self, gradient: Float, jacobian: Float) -> tuple[float, float]:
-        """Multiplier of the simplex by least squares, and the dual infeasibility."""
+        """Multiplier of the simplex and the dual infeasibility.
+
+        The multiplier is what a growth of the whole soup is worth: near 0 far from the solution as
+        well where E does not depend on scale, which one by least squares is not.
+        """
         assert self.z is not None
         rest = gradient.reshape(-1, 9).copy()
         rest[:, :3] -= np.einsum("nrc,nr->nc", jacobian, self.z)
-        a = self._a
-        nu = -float(a @ rest.ravel()) / float(a @ a)
-        return nu, float(np.abs(rest.ravel() + nu * a).max())
+        nu = -float(self.problem.growth(self.x) @ rest.ravel())
+        return nu, float(np.abs(rest.ravel() + nu * self.problem.length(self.x)).max())
 
     def _curvature(self, at: Point, kind: HessianKind) -> tuple[Float, Float]:
         """Hessian to use and the majorant, both with the condensed slacks."""
@@ -220,8 +267,9 @@ class Descent:
         curvature: tuple[Float, Float],
         blend: float,
         gradient: Float,
-        phase: Phase,
-    ) -> tuple[Float, Float, float]:
+        barrier: float,
+        kind: HessianKind,
+    ) -> Step:
         """Step of the damped system, with as much of the majorant as makes it descend.
 
         Args:
@@ -229,17 +277,14 @@ class Descent:
             curvature: Hessian and majorant.
             blend: Share of the majorant to begin with.
             gradient: Of f.
-            phase: Hessian and barrier.
-
-        Returns:
-            The step, the undamped nonzeros, and the share to begin with next time.
+            barrier: b of the merit.
+            kind: Of the Hessian.
         """
         exact, majorant = curvature
         damping = np.repeat(self.damping, 9)
-        right = gradient.reshape(-1, 9).copy()
-        right[:, :3] -= np.einsum("nrc,nr->nc", at.jacobian, phase.barrier / at.slack)
-        shares = [blend, *(s for s in BLENDS if s > blend)] if phase.hessian == "exact" else [1.0]
-        h = np.zeros_like(at.x)
+        right, a = merit_gradient(at, gradient, barrier), self.problem.length(at.x)
+        shares = [blend, *(s for s in BLENDS if s > blend)] if kind == "exact" else [1.0]
+        h, newton = np.zeros_like(at.x), _held(np.zeros_like, a)
         for share in shares:
             H = majorant if share == 1.0 else (1 - share) * exact + share * majorant
             damped = H.copy()
@@ -248,14 +293,14 @@ class Descent:
                 back = self._factorise(damped)
             except ArithmeticError:
                 continue
-            u, v = back(right.ravel()), back(self._a)
-            h = -u + v * (self._a @ u) / (self._a @ v)
+            newton = _held(back, a)
+            h = newton(right)
             # a library without a word on definiteness: curvature along the step tells
             # (Chiang and Zavala 2016)
             curved = float(h @ self._times(H, h)) + float(damping @ h**2)
-            if np.isfinite(h).all() and curved > 0 and float(right.ravel() @ h) <= 0:
+            if np.isfinite(h).all() and curved > 0 and float(right @ h) <= 0:
                 break
-        return h, H, share / 3 if share > 0.02 else 0.0
+        return Step(h, H, share / 3 if share > 0.02 else 0.0, newton)
 
     def _times(self, H: Float, h: Float) -> Float:
         U = self.problem.upper.copy()
@@ -273,10 +318,21 @@ class Descent:
             damping = np.maximum(8 * damping, HELD)
         self.damping = np.where(move.far, raised, damping)
 
-    def _step_multipliers(self, at: Point, h: Float, phase: Phase, moved: Point) -> None:
+    def _step_multipliers(self, at: Point, h: Float, barrier: float, moved: Point) -> None:
         """Newton's step of the slacks' multipliers, kept near barrier / slack."""
         assert self.z is not None
-        z, b = self.z, phase.barrier
+        z, b = self.z, barrier
         step = b / at.slack - z - z / at.slack * along(at.jacobian, h)
         z = z + np.minimum(1.0, TO_BOUNDARY * reach(z, step))[:, None] * step
         self.z = np.clip(z, 1e-8 * b / moved.slack, 1e8 * b / moved.slack)
+
+
+def _held(back: Back, a: Float) -> Callable[[Float], Float]:
+    """Newton's step for a gradient, in the plane `a . h = 0`."""
+    v = back(a)
+
+    def newton(gradient: Float) -> Float:
+        u = back(gradient)
+        return np.asarray(-u + v * (a @ u) / (a @ v))
+
+    return newton

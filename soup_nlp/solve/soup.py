@@ -15,7 +15,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import plain
 from soup_nlp.model.energy import EnergyData, Weights
 from soup_nlp.model.formulation import Formulation, build_matrix_nlp
-from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.layout import Chart, MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.descent import Descent, Phase
 from soup_nlp.solve.ipopt import Ipopt, Listener, Stage
@@ -24,6 +24,10 @@ from soup_nlp.solve.tangent import TangentProblem
 from soup_nlp.solve.warm import WARM, warm_start
 
 Float = NDArray[np.float64]
+
+
+STOPPED = ("Interrupted", "Time_Limit")
+"""Status of a stage after which no other begins."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +144,7 @@ def solve_soup(
     soup, presolved = start, None
     stages: list[Stage] = []
     if o.presolve:
-        presolved = _presolve(
+        presolved, rim = _presolve(
             start,
             data,
             weights,
@@ -173,7 +177,7 @@ def solve_soup(
         and o.polish_iterations
         and _near(stages[-1])
     ):
-        warm = warm_start(nlp, data, soup, stages[-1].lam_g)
+        warm = warm_start(nlp, data, soup, rim)
     stage = Ipopt(nlp, {**(WARM if warm else {}), **o.ipopt})(
         x0=nlp.x0,
         **warm,
@@ -222,9 +226,8 @@ def _presolve(
     stages: list[Stage],
     say: Callable[[str], None],
     **watch: Any,
-) -> Soup:
-    problem = TangentProblem(start, data, weights, form)
-    descent = Descent(problem, **watch)
+) -> tuple[Soup, Float]:
+    """The presolve's soup, and its multipliers of rim visibility."""
     steps = len(o.presolve_eps)
     # barriers from 1e-3 down to 1e-5 while the norms are reweighted, 1e-8 for the KKT point
     barriers = np.geomspace(1e-3, 1e-5, steps) if steps > 1 else np.array([1e-5])
@@ -240,16 +243,32 @@ def _presolve(
         )
         for k, (eps, barrier) in enumerate(zip(o.presolve_eps, barriers))
     ]
-    if o.polish_iterations:
-        phases.append(
-            Phase("presolve polish", "exact", o.eps, 1e-8, o.polish_iterations, 0.0, o.presolve_tol)
-        )
+    problem = TangentProblem(start, data, weights, form, ("gauss-newton",))
+    descent = Descent(problem, **watch)
     for phase in phases:
         stages.append(descent.run(phase))
         say(str(stages[-1]))
-        if stages[-1].status in ("Interrupted", "Time_Limit"):
-            break
-    return problem.layout.unpack(descent.x)
+        if stages[-1].status in STOPPED:
+            return descent.soup, descent.rim
+    if o.polish_iterations:
+        # on inverse depths the superpixels of a plane move with it in straight lines; reweighting
+        # on depths ends at lower energies. The paper's units need a length unit that is linear.
+        chart: Chart = "inverse-depth" if data.local_units else "depth"
+        problem = TangentProblem(descent.soup, data, weights, form, chart=chart)
+        descent = Descent(problem, after=descent, **watch)
+        polish = Phase(
+            name="presolve polish",
+            hessian="exact",
+            eps=o.eps,
+            barrier=1e-8,
+            iterations=o.polish_iterations,
+            stagnation=0.0,
+            tol=o.presolve_tol,
+            highest=1e-5,
+        )
+        stages.append(descent.run(polish))
+        say(str(stages[-1]))
+    return descent.soup, descent.rim
 
 
 def _multipliers(nlp: NLP, layout: MatrixLayout, stage: Stage) -> dict[str, Float]:

@@ -32,23 +32,20 @@ WARM: Mapping[str, Any] = {
 """Ipopt options that leave a given start where it is."""
 
 
-def warm_start(nlp: NLP, data: EnergyData, soup: Soup, lam_tangent: Float) -> dict[str, Float]:
+def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, Float]:
     """Start multipliers of the constrained NLP at the presolve's solution.
 
     Args:
         nlp: The constrained NLP, started at `soup`.
         data: Numbers of the energy.
         soup: The presolve's answer.
-        lam_tangent: (1 + N V,) multipliers of the presolve: simplex, then rim visibility.
+        rim: (N, V) multipliers of visibility of the rim pixels, rows divided by the anchor's facing
+            (`Descent.rim`).
 
     Returns:
-        lam_x0, lam_g0. Visibility: the presolve's rows are the constrained NLP's divided by the
-        anchor's facing, so the multipliers are as well. Equalities: least squares of
-        stationarity.
+        lam_x0, lam_g0. The equalities' multipliers are the least squares of stationarity.
     """
-    n, rims = len(data), data.rim_ray.shape[1] - 1
     lam_g = np.zeros(nlp.ng)
-    rim = lam_tangent[1 : 1 + n * rims].reshape(n, rims)
     facing = -np.einsum("nc,nc->n", soup.n, data.anchor_ray)
     visible = next(g for g in nlp.groups if g.kernel.name == "visible").table.rows
     lam_g[visible[:, 1:]] = rim / facing[:, None]
