@@ -10,16 +10,20 @@ import pytest
 
 from soup_nlp.cases import Case, prepare
 from soup_nlp.config import make_problem
+from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.formulation import Formulation, build_tangent_nlp
+from soup_nlp.model.layout import Chart
 from soup_nlp.solve import descent as descent_module
 from soup_nlp.solve.buffered import Buffered
 from soup_nlp.solve.descent import Descent, Phase
 from soup_nlp.solve.factor import superlu
 from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.kkt import optimality
+from soup_nlp.solve.search import Search, along, evaluate, reach
 from soup_nlp.solve.tangent import TangentProblem
 
 FORM = Formulation(compiled=False)
+INVERSE: Chart = "inverse-depth"
 PHASES = (
     Phase("first", "gauss-newton", 0.3, 1e-3, 60, 1e-4, 1e-6),
     Phase("second", "gauss-newton", 0.1, 1e-5, 60, 1e-5, 1e-6),
@@ -33,9 +37,9 @@ def case() -> Case:
     return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
 
 
-@pytest.fixture(scope="module")
-def problem(case) -> TangentProblem:
-    return TangentProblem(case.soup, case.data, case.weights, FORM)
+@pytest.fixture(scope="module", params=["depth", "inverse-depth"])
+def problem(case, request) -> TangentProblem:
+    return TangentProblem(case.soup, case.data, case.weights, FORM, chart=request.param)
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +110,48 @@ def test_slacks_have_the_derivatives_they_claim(problem):
         np.testing.assert_allclose(jacobian[..., c], (up - down) / 2e-6, atol=1e-7)
 
 
+def test_growth_changes_the_length_unit_alone(problem):
+    problem.smoothing(0.2)
+    x = inner_point(problem)
+    growth, step = problem.growth(x), 1e-6
+    assert problem.length(x) @ growth == pytest.approx(1, rel=1e-12)
+    grown = x + step * growth
+    # E does not depend on the scale of the scene in units of pixels
+    assert problem.value(grown) == pytest.approx(problem.value(x), rel=1e-12)
+    np.testing.assert_allclose(problem.normalise(grown), x, atol=1e-11)
+    row = problem.nlp.jac_g(x, problem.nlp.p)[1].sparse()[problem.nlp.lbg == problem.nlp.ubg]
+    np.testing.assert_allclose(row.toarray().ravel(), problem.length(x), rtol=1e-12)
+
+
+def test_a_turn_of_a_superpixel_leaves_its_anchor_where_it_is(problem, case):
+    x = inner_point(problem).reshape(-1, 9)
+    turned = x.copy()
+    turned[:, 3:6] += 0.1
+
+    def anchors(x):
+        soup = problem.layout.unpack(x.ravel())
+        X = soup.depth_at(case.data.anchor_ray)[:, None] * case.data.anchor_ray
+        return np.einsum("nij,nj->ni", soup.R, X) + soup.translation
+
+    np.testing.assert_allclose(anchors(turned), anchors(x), rtol=1e-12)
+
+
+def test_a_plane_moves_in_straight_lines_on_inverse_depths(case):
+    problem = TangentProblem(case.soup, case.data, case.weights, FORM, ("gauss-newton",), INVERSE)
+    layout, n = problem.layout, len(case.data)
+
+    def on_plane(m):
+        length = np.linalg.norm(m)
+        soup = case.soup
+        normal, D = np.tile(-m / length, (n, 1)), np.full(n, 1 / length)
+        x = layout.pack(Soup(D, normal, np.ones(n), soup.R, soup.translation / D[:, None]))
+        # pack brings to the length unit; undone, rho is linear in m
+        return x.reshape(-1, 9)[:, :3] / np.sum(layout.share * D)
+
+    a, b = np.array([0.1, 0.0, 0.5]), np.array([0.0, -0.2, 0.3])
+    np.testing.assert_allclose(on_plane(a + b), on_plane(a) + on_plane(b), rtol=1e-10)
+
+
 def test_a_buffered_function_checks_what_it_is_given(problem):
     buffered = Buffered(problem.nlp.grad_f)
     f, gradient = buffered(problem.nlp.x0, problem.nlp.p)
@@ -117,6 +163,41 @@ def test_a_buffered_function_checks_what_it_is_given(problem):
 
 
 # --- where it ends -------------------------------------------------------------------------------
+
+
+def test_another_chart_begins_where_the_first_ended(case):
+    first = Descent(TangentProblem(case.soup, case.data, case.weights, FORM))
+    for phase in PHASES:
+        first.run(phase)
+    problem = TangentProblem(first.soup, case.data, case.weights, FORM, chart=INVERSE)
+    second = Descent(problem, after=first)
+    for p in (first.problem, problem):
+        p.smoothing(LAST.eps)
+    assert problem.value(second.x) == pytest.approx(first.problem.value(first.x), rel=1e-9)
+    np.testing.assert_allclose(second.rim, first.rim, rtol=1e-9)
+    here, there = problem.slacks(second.x)[0], first.problem.slacks(first.x)[0]
+    # visibility is one and the same at the base; bounds are each chart's own
+    np.testing.assert_allclose(here[:, : problem.rims], there[:, : problem.rims], atol=1e-9)
+    last = second.run(LAST)
+    assert last.converged
+    assert last.objective <= first.problem.value(first.x)
+
+
+def test_a_second_step_leads_back_into_a_bent_valley(problem):
+    """The same matrix takes back most of what a step along stiff norms has cost."""
+    runner = Descent(problem)
+    for phase in PHASES:
+        runner.run(phase)
+    problem.smoothing(LAST.eps)
+    at = evaluate(problem, runner.x, 1e-8)
+    gradient = problem.gradient(at.x)
+    curvature = runner._curvature(at, "exact")
+    step = runner._newton(at, curvature, 0.0, gradient, 1e-8, "exact")
+    search = Search(problem, at, step.h, 1e-8, step.newton)
+    trial, _ = search._feasible(np.minimum(1.0, 0.99 * reach(at.slack, along(at.jacobian, step.h))))
+    back = search._corrected(trial)
+    assert back is not None
+    assert back.merit - at.merit < max(0.5 * (trial.merit - at.merit), trial.merit - at.merit)
 
 
 def test_it_ends_at_a_kkt_point(problem, solved):
@@ -133,10 +214,10 @@ def test_it_ends_at_a_kkt_point(problem, solved):
     assert (g <= problem.nlp.ubg + 1e-9).all()
 
 
-def test_ipopt_stays_where_it_ends(case, solved):
+def test_ipopt_stays_where_it_ends(case, problem, solved):
     last = solved[1][-1]
     smooth = replace(FORM, hessian="exact", eps=LAST.eps, eps_pixel=LAST.eps)
-    nlp, _ = build_tangent_nlp(case.soup, case.data, case.weights, smooth)
+    nlp, _ = build_tangent_nlp(case.soup, case.data, case.weights, smooth, problem.layout.chart)
     stage = Ipopt(nlp)(x0=last.x, max_iter=30, tol=1e-6)
     assert stage.converged
     assert stage.objective == pytest.approx(last.objective, rel=1e-6)

@@ -38,11 +38,12 @@ def test_pack_and_unpack_are_inverse_of_each_other(gauge, seed):
         np.testing.assert_allclose(np.linalg.norm(back.t, axis=1) / 6, x[-1], rtol=1e-12)
 
 
+@pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
 @settings(max_examples=20)
 @given(seed=st.integers(0, 10_000))
-def test_tangent_pack_and_unpack_are_inverse_of_each_other(seed):
+def test_tangent_pack_and_unpack_are_inverse_of_each_other(chart, seed):
     problem = tiny()
-    layout = TangentLayout.about(problem.soup, problem.data)
+    layout = TangentLayout.about(problem.soup, problem.data, chart)
     soup = random_soup(seed, len(problem.seg))
     assert_same_soup(layout.unpack(layout.pack(soup)), soup.normalised(), 1e-11)
 

@@ -95,10 +95,11 @@ def test_exact_kernels_equal_plain_numpy_term_by_term(gauge, units, at_anchors, 
             assert e == pytest.approx(expected[term], rel=EXACT[term]), term
 
 
+@pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
 @pytest.mark.parametrize("units", UNITS)
-def test_tangent_kernels_equal_plain_numpy_term_by_term(units):
+def test_tangent_kernels_equal_plain_numpy_term_by_term(units, chart):
     problem, weights = tiny(units), weights_for(units)
-    nlp, layout = build_tangent_nlp(problem.soup, problem.data, weights, form(units))
+    nlp, layout = build_tangent_nlp(problem.soup, problem.data, weights, form(units), chart)
     rng = np.random.default_rng(0)
     for size in (0.0, 0.05):
         x = layout.pack(problem.soup) * (1 + size * rng.normal(size=nlp.nx))
