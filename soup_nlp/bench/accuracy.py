@@ -143,6 +143,7 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
         "stages": dict(result.seconds),
         "iterations": sum(stage.iterations for stage in s.stages),
         "parallax_px": float(np.median(result.start.parallax)),
+        "bending_share": float(result.start.bending_share),
         "flow_error": flow_error(result.pair),
         "metrics": {},
     }
