@@ -347,7 +347,9 @@ def test_published_numbers_are_marked():
     metrics |= {"rigid": {"mre": 0.025, "coverage": 0.6}, "solution_rigid": {"mre": 0.02}}
     assert "beats every rival on 1 of 1" in report("T", [row])
     metrics["solution_rigid"]["mre"] = 0.026
-    assert "beats every rival on 0 of 1" in report("T", [row])
+    text = report("T", [row])
+    assert "beats every rival on 0 of 1" in text
+    assert "| p | dis | paper | rigid | 0.0250 | 0.0260 | 60.0% | -0.0010 |" in text
     assert set(RIVALS) <= set(METHODS)
 
 

@@ -1,0 +1,42 @@
+"""What tests of .nl files share: the file as CasADi reads it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+
+class ReadBack:
+    """A .nl file as CasADi reads it: sizes, bounds, start and derivatives of its own."""
+
+    def __init__(self, path: Path) -> None:
+        builder = ca.NlpBuilder()
+        builder.import_nl(str(path), {})
+        self.x0 = np.array(builder.x_init)
+        self.lbx, self.ubx = np.array(builder.x_lb), np.array(builder.x_ub)
+        self.lbg, self.ubg = np.array(builder.g_lb), np.array(builder.g_ub)
+        x = ca.vertcat(*builder.x)
+        f, g = builder.f, ca.vertcat(*builder.g)
+        # SX is quicker to differentiate
+        plain = ca.Function("nl", [x], [f, ca.densify(g)]).expand()
+        s = ca.SX.sym("x", x.numel())
+        lam_f, lam_g = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", g.numel())
+        f, g = plain(s)
+        self._inputs = [s, lam_f, lam_g]
+        self._lagrangian = lam_f * f + (ca.dot(lam_g, g) if g.numel() else 0)
+        self.values = ca.Function("v", [s], [f, g, ca.gradient(f, s), ca.jacobian(g, s)])
+
+    def hess(self, *at: object) -> ca.DM:
+        """Lagrangian's Hessian at (x, lam_f, lam_g)."""
+        H = ca.hessian(self._lagrangian, self._inputs[0])[0]
+        return ca.Function("h", self._inputs, [H])(*at)
+
+
+def close(found: object, expected: object) -> None:
+    """Equal to 1e-12 of the largest number."""
+    a = np.asarray(found, float)
+    b = np.asarray(expected, float).reshape(a.shape)
+    assert np.isfinite(a).all()
+    assert np.abs(a - b).max(initial=0.0) <= 1e-12 * max(1.0, np.abs(b).max(initial=0.0))
