@@ -16,7 +16,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.model import plain
 from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
-from soup_nlp.refine.costs import Particles, anchor_depth, unary_costs
+from soup_nlp.refine.costs import Particles, anchor_depth
 from soup_nlp.refine.local import Local, fit_motion, neighbours
 from soup_nlp.refine.mppbp import RefineOptions, refine_soup
 from soup_nlp.refine.particles import BORROWED, COMMON, KINDS, WALKS, Proposer
@@ -104,23 +104,11 @@ def test_every_proposal_is_feasible_by_construction(kind):
 def test_a_step_of_scale_leaves_the_anchors_target_and_a_turn_about_it_too():
     tiny = Tiny("pixels")
     before = anchor_targets(Particles.of(tiny.soup), tiny.data)
-    for kind in ("walk_scale", "walk_pivot", "common_scale"):
+    for kind in ("walk_scale", "walk_pivot"):
         p = proposer(tiny).propose(tiny.soup, {kind: 5}).particles
         assert np.abs(anchor_targets(p, tiny.data) - before).max() < 1e-9, kind
     p = proposer(tiny).propose(tiny.soup, {"walk_motion": 5}).particles
     assert np.abs(anchor_targets(p, tiny.data) - before).max() > 0.05
-
-
-def test_a_common_scale_keeps_every_pixels_target():
-    tiny = Tiny("pixels", samples=8)
-    weights = Weights()
-    before, _ = unary_costs(Particles.of(tiny.soup), tiny.data, weights)
-    p = proposer(tiny).propose(tiny.soup, {"common_scale": 3}).particles
-    after, _ = unary_costs(p, tiny.data, weights)
-    assert np.allclose(after, before, rtol=1e-10)
-    Z = anchor_depth(p, tiny.data.anchor_ray) / tiny.soup.depth_at(tiny.data.anchor_ray)[:, None]
-    assert np.allclose(Z, Z[:1])
-    assert (np.abs(Z[0] - 1) > 1e-4).all()
 
 
 def test_a_step_is_about_so_many_pixels():

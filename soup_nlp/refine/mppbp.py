@@ -43,7 +43,6 @@ SHARES: Mapping[str, float] = {
     "walk_pivot": 2,
     "walk_scale": 3,
     "walk_all": 2,
-    "common_scale": 3,
     "common_motion": 2,
     "neighbour_plane": 3,
     "neighbour_motion": 3,

@@ -26,7 +26,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 WALKS = ("walk_plane", "walk_motion", "walk_pivot", "walk_scale", "walk_all")
-COMMON = ("common_scale", "common_motion")
+COMMON = ("common_motion",)
 BORROWED = (
     "neighbour_plane",
     "neighbour_motion",
@@ -176,14 +176,7 @@ class Proposer:
         return Local(Z, g, R, T * scale[..., None]), step
 
     # --- moves that all superpixels are offered alike: a body moves as one ---------------------
-
-    def _common_scale(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, Float]:
-        base = now.repeated(count)
-        step = self.spread.draw(kind, (count,), self.rng)
-        sign = np.where(np.arange(count) % 2, -1.0, 1.0)
-        scale = np.exp(np.clip(0.05 * step, 0, 1.4) * sign)
-        step = np.broadcast_to(step, base.Z.shape)
-        return Local(base.Z * scale, base.g, base.R, base.T * scale[:, None]), step
+    # no common scale: E of a body by its scale is flat, and lower where its depth is wrong
 
     def _common_motion(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, Float]:
         """Motions that many share, fitted again to the flow of their superpixels' present planes.
