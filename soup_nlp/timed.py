@@ -25,7 +25,6 @@ from soup_nlp.cases import Case, prepare
 from soup_nlp.config import Problem, dump_problem, make_problem
 from soup_nlp.errors import SoupError
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
-from soup_nlp.inputs import load_flow_of
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.pipeline import Run
 from soup_nlp.report.folder import prepare_folder, write_folder, write_text
@@ -168,14 +167,8 @@ def _last(values: Float | None) -> float | None:
 
 def _prepare(problem: Problem, clocks: Clocks) -> Case:
     """`cases.prepare` with a lap a stage."""
-    order = iter(("load", "segmentation", "start"))
-    case = prepare(problem, say=lambda line: clocks.lap(next(order)))
+    case = prepare(problem, lap=clocks.lap)
     clocks.lap("weights")
-    # the flow is a part of loading: once more, to know its share
-    with clocks.stage("flow"):
-        load_flow_of(problem, case.pair)
-    for seconds in (clocks.wall, clocks.cpu):
-        seconds["load"] = max(0.0, seconds["load"] - seconds["flow"])
     return case
 
 
