@@ -71,8 +71,9 @@ class Solution:
     """What the constrained NLP ended with.
 
     Attributes:
-        soup: Solution: Ipopt's answer (best iterate when not converged), or the presolve's where
-            that has the lower exact energy, with rounding-size constraint violations retracted.
+        soup: Solution: Ipopt's answer (best iterate when not converged), or the presolve's or the
+            start where that has the lower exact energy, with rounding-size constraint violations
+            retracted.
         status: Ipopt's status of the constrained NLP, or why it was stopped.
         converged: Its claim.
         stages: Phases of the presolve, then Ipopt's of the constrained NLP.
@@ -160,7 +161,10 @@ def solve_soup(
         soup = presolved
         seconds["presolve"] = time.perf_counter() - begin
     cpu.append(time.process_time())
-    if plain.energy(soup, data, weights)["total"] > plain.energy(start, data, weights)["total"]:
+    energies = [plain.energy(s, data, weights)["total"] for s in (start, soup)]
+    near = bool(stages) and _near(stages[-1])
+    # where the presolve has come near its minimum, smoothing alone may have raised the exact energy
+    if energies[1] > energies[0] and not near:
         soup = start
     mark = time.perf_counter()
     nlp, layout = build_matrix_nlp(soup, data, weights, replace(form, eps=o.eps, eps_pixel=o.eps))
@@ -171,12 +175,7 @@ def solve_soup(
     mark = time.perf_counter()
     warm: dict[str, Any] = {}
     # the lifted truncation has another solution than the presolve's
-    if (
-        form.truncation == "smooth"
-        and soup is presolved
-        and o.polish_iterations
-        and _near(stages[-1])
-    ):
+    if form.truncation == "smooth" and soup is presolved and o.polish_iterations and near:
         warm = warm_start(nlp, data, soup, rim)
     stage = Ipopt(nlp, {**(WARM if warm else {}), **o.ipopt})(
         x0=nlp.x0,
@@ -193,9 +192,10 @@ def solve_soup(
     cpu.append(time.process_time())
     stages.append(stage)
     say(str(stage))
-    final = layout.unpack(stage.x).retracted()
-    if plain.energy(final, data, weights)["total"] > plain.energy(soup, data, weights)["total"]:
-        final = soup.normalised(data.share).retracted()
+    found = (layout.unpack(stage.x), soup.normalised(data.share), start.normalised(data.share))
+    final = min(
+        (s.retracted() for s in found), key=lambda s: plain.energy(s, data, weights)["total"]
+    )
     return Solution(
         soup=final,
         status=stage.status,
