@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from soup_nlp.cases import prepare
 from soup_nlp.config import Problem, make_problem
 from soup_nlp.data.pair import Pair
@@ -47,8 +45,8 @@ class Run:
         solution: What the constrained NLP ended with, before any refinement.
         answer: Ipopt's own answer to the constrained NLP (the best iterate where it did not
             converge), before anything is made of it: constraints hold to its tolerance only.
-        delivered: What `solution.soup` is made of: "constrained NLP", "presolve" where that has
-            the lower exact energy, or "start" where the NLP was skipped.
+        delivered: What `solution.soup` is made of: "constrained NLP", "presolve" or
+            "start" where that has the lower exact energy, "start" where the NLP was skipped.
         start_reconstruction: Dense 3D of the start.
         reconstruction: Dense 3D of `soup`.
         rigid: One rigid motion for the whole image; None without truth or where none fits.
@@ -155,8 +153,7 @@ def run(
     else:
         solution = nlp(start.soup)
         answer = MatrixLayout(data.share, form.gauge).unpack(solution.stages[-1].x)
-        own = np.array_equal(answer.retracted().lam, solution.soup.lam)
-        delivered = "constrained NLP" if own else "presolve"
+        delivered = solution.delivered
         lap("nlp")
     refined = None
     if refine.enabled:

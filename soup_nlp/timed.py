@@ -181,7 +181,6 @@ def _run(case: Case, solution: Solution, clocks: Clocks) -> Run:
         metrics = score(case.pair, before, after, rigid, expected.scale, expected.cap)
     gauge = case.formulation().gauge
     answer = MatrixLayout(case.data.share, gauge).unpack(solution.stages[-1].x)
-    own = np.array_equal(answer.retracted().lam, solution.soup.lam)
     return Run(
         problem=case.problem,
         pair=case.pair,
@@ -191,7 +190,7 @@ def _run(case: Case, solution: Solution, clocks: Clocks) -> Run:
         weights=case.weights,
         solution=solution,
         answer=answer,
-        delivered="constrained NLP" if own else "presolve",
+        delivered=solution.delivered,
         start_reconstruction=before,
         reconstruction=after,
         rigid=rigid,

@@ -86,6 +86,7 @@ class Solution:
         description: The NLP as it prints itself.
         seconds: Wall time of "presolve", "build" ("compile" is a part of it) and "solve".
         cpu_seconds: CPU time of this process in the same.
+        delivered: What `soup` is: "constrained NLP", "presolve" or "start".
     """
 
     soup: Soup
@@ -100,6 +101,7 @@ class Solution:
     description: str = field(repr=False)
     seconds: Mapping[str, float]
     cpu_seconds: Mapping[str, float] = field(default_factory=dict)
+    delivered: str = "constrained NLP"
 
     def __str__(self) -> str:
         return (
@@ -192,10 +194,10 @@ def solve_soup(
     cpu.append(time.process_time())
     stages.append(stage)
     say(str(stage))
-    found = (layout.unpack(stage.x), soup.normalised(data.share), start.normalised(data.share))
-    final = min(
-        (s.retracted() for s in found), key=lambda s: plain.energy(s, data, weights)["total"]
-    )
+    found = {"constrained NLP": layout.unpack(stage.x), "presolve": soup, "start": start}
+    found = {k: s.normalised(data.share).retracted() for k, s in found.items()}
+    delivered = min(found, key=lambda k: plain.energy(found[k], data, weights)["total"])
+    final = found[delivered]
     return Solution(
         soup=final,
         status=stage.status,
@@ -209,6 +211,7 @@ def solve_soup(
         description=str(nlp),
         seconds=seconds,
         cpu_seconds=dict(zip(("presolve", "build", "solve"), np.diff(cpu).tolist())),
+        delivered=delivered,
     )
 
 
