@@ -13,6 +13,7 @@ from soup_nlp.config import make_problem
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.formulation import Formulation, build_tangent_nlp
 from soup_nlp.model.layout import Chart
+from soup_nlp.model.nlp import other_hessian
 from soup_nlp.solve import descent as descent_module
 from soup_nlp.solve.buffered import Buffered
 from soup_nlp.solve.descent import Descent, Phase
@@ -82,6 +83,19 @@ def test_gradient_and_exact_hessian_are_derivatives(problem):
     np.testing.assert_allclose(product, expected, atol=1e-4 * np.abs(expected).max())
 
 
+def test_the_exact_hessian_beside_the_stand_in_is_the_program_of_its_own(problem, case):
+    form = replace(FORM, norm="smooth", hessian="exact", theta=0.0, ridge=0.0)
+    chart = problem.layout.chart
+    nlp = build_tangent_nlp(case.soup, case.data, case.weights, form, chart)[0]
+    other = other_hessian(problem.nlp, "exact", compiled=False)
+    rng = np.random.default_rng(6)
+    args = (inner_point(problem), nlp.p, 1.0, rng.normal(size=nlp.ng))
+    one, two = nlp.hess_lag(*args), other(*args)
+    assert one.sparsity() == two.sparsity()
+    np.testing.assert_array_equal(one.nonzeros(), two.nonzeros())
+    assert problem.nlp.hess_lag.sparsity_out(0).nnz() <= one.sparsity().nnz()
+
+
 def test_the_stand_in_lies_above_every_norm(problem, case):
     # quadratic model with the stand-in >= f wherever residuals are linear: translations
     problem.smoothing(0.2)
@@ -137,7 +151,7 @@ def test_a_turn_of_a_superpixel_leaves_its_anchor_where_it_is(problem, case):
 
 
 def test_a_plane_moves_in_straight_lines_on_inverse_depths(case):
-    problem = TangentProblem(case.soup, case.data, case.weights, FORM, ("gauss-newton",), INVERSE)
+    problem = TangentProblem(case.soup, case.data, case.weights, FORM, False, INVERSE)
     layout, n = problem.layout, len(case.data)
 
     def on_plane(m):

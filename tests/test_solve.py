@@ -365,3 +365,16 @@ def test_the_constrained_nlp_starts_at_the_presolves_kkt_point(room):
     assert done.stages[-1].history["inf_du"][0] < 1e-2
     assert done.stages[-1].iterations <= 3
     assert done.residuals["dual_infeasibility"] < 1e-5
+
+
+def test_a_start_of_less_exact_energy_keeps_the_nlp_at_the_presolves_kkt_point(room, solved):
+    # wide smoothing raises the exact energy above that of a start that was solved with less
+    first = solved["unit-offset"].soup
+    options = replace(OPTIONS, presolve_eps=(0.3,), eps=0.3, tol=1e-6)
+    again = solve_soup(first, room.data, WEIGHTS, form(), options)
+    assert again.converged, again.status
+    assert again.stages[-1].history["inf_du"][0] < 1e-2
+    assert again.stages[-1].iterations <= 3
+    assert again.delivered == "start"
+    assert again.energy["total"] == pytest.approx(again.energy_start["total"], rel=1e-9)
+    assert_constraints(again, room.data)

@@ -6,6 +6,7 @@ which is the identity for rigid shapes.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ NEAR = 1e-6
 """Hits closer than this depth are ignored, unit of length."""
 
 
-class Shape:
+class Shape(ABC):
     """A surface in its own coordinates; `frame` is 0 for the reference and 1 for the next frame.
 
     Rigid shapes only implement `intersect`, `normals` and `corners`.
@@ -28,17 +29,17 @@ class Shape:
 
     rigid = True
 
+    @abstractmethod
     def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
         """Smallest ray parameter > NEAR (N,) of rays (N, 3) from `origin` (3,), inf for a miss."""
-        raise NotImplementedError
 
+    @abstractmethod
     def normals(self, points: Float, frame: int) -> Float:
         """Unit normals (N, 3) at surface points (N, 3)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def corners(self) -> Float | None:
         """Points (M, 3) whose convex hull contains the shape in both frames; None if unbounded."""
-        raise NotImplementedError
 
     def material(self, points: Float, frame: int) -> Float:
         """Material coordinates (N, 3) of surface points (N, 3) in a frame."""

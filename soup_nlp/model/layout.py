@@ -163,15 +163,12 @@ class TangentLayout:
         w = w * np.where(angle > 1e-12, 2 * np.tan(angle / 2) / np.maximum(angle, 1e-12), 1.0)
         q = s.translation / depth[:, None] + np.einsum("nij,nj->ni", s.R, self.anchor)
         a = np.column_stack([depth / self.depth, slope, w, q])
-        if self.chart == "inverse-depth":
-            a[:, :3] = np.column_stack([np.ones(len(a)), slope]) / a[:, :1]
-        return a.ravel()
+        return (_turned(a) if self.chart == "inverse-depth" else a).ravel()
 
     def unpack(self, x: Float) -> Soup:
         """Feasible soup (SO(3), unit normals, simplex) of a vector."""
-        a = np.array(x, float).reshape(-1, 9)
-        if self.chart == "inverse-depth":
-            a[:, :3] = np.column_stack([np.ones(len(a)), a[:, 1:3]]) / a[:, :1]
+        a = np.asarray(x, float).reshape(-1, 9)
+        a = _turned(a) if self.chart == "inverse-depth" else a
         s = a[:, 1:3] / self.radius[:, None]
         m = np.column_stack([s, 1 - np.sum(s * self.anchor[:, :2], axis=1)])
         length = np.linalg.norm(m, axis=1)
@@ -187,3 +184,8 @@ class TangentLayout:
         plane = ["lam", "s1", "s2"] if self.chart == "depth" else ["rho", "g1", "g2"]
         own = [*plane, "w1", "w2", "w3", "q1", "q2", "q3"]
         return [f"{s}[{i}]" for i in range(self.count) for s in own]
+
+
+def _turned(a: Float) -> Float:
+    """(N, 9) variables of the other chart; twice is the same again."""
+    return np.column_stack([1 / a[:, 0], a[:, 1:3] / a[:, :1], a[:, 3:]])

@@ -198,38 +198,13 @@ def assemble(
     groups = tuple(g for g in groups if g.size)
     nx, ng = len(x0), len(lbg)
     made = [g.kernel.functions(hessian) for g in groups]
-    every = [f for functions in made for f in functions.values()]
     compile_begin = time.perf_counter()
-    fast = compile_functions(every) if compiled else {f.name(): f for f in every}
+    made = _compiled(made) if compiled else made
     compile_seconds = time.perf_counter() - compile_begin
 
-    x = ca.MX.sym("x", nx)
-    p = ca.MX.sym("p", len(theta) + sum(g.table.data.size for g in groups))
-    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", ng)
-    th = p[: len(theta)]
-    local: list[dict[str, ca.MX]] = []
-    offset = len(theta)
-    for group, functions in zip(groups, made):
-        size, np_ = group.table.data.shape
-        xe = ca.reshape(x[_constant(group.table.index)], group.kernel.nx, size)
-        pe = ca.reshape(p[offset : offset + size * np_], np_, size)
-        offset += size * np_
-        args = [xe, pe, ca.repmat(th, 1, size)]
-        values = {}
-        for key, function in functions.items():
-            extra = []
-            if key == "hess":
-                nc = group.kernel.nc
-                lam_c = (
-                    ca.reshape(lam_g[_constant(group.table.rows)], nc, size)
-                    if nc
-                    else ca.MX(0, size)
-                )
-                extra = [ca.repmat(lam_f, 1, size), lam_c]
-            mapped = fast[function.name()].map(size)
-            values[key] = ca.vec(mapped(*args, *extra))
-        local.append(values)
-
+    symbols = _symbols(nx, ng, len(theta) + sum(g.table.data.size for g in groups))
+    x, p = symbols[:2]
+    local = _mapped(groups, made, len(theta), *symbols)
     f = ca.MX(0.0)
     grad = ca.MX.zeros(nx)
     g = ca.MX.zeros(ng)
@@ -252,19 +227,6 @@ def assemble(
         entries = ca.vertcat(*(v["jac"] for _, v in constrained))
         jac = ca.MX(pattern, _sum_into(pattern.nnz(), np.concatenate(places), entries))
 
-    hess = ca.MX(nx, nx)
-    curved = [(grp, v) for grp, v in zip(groups, local) if "hess" in v]
-    if curved:
-        rows, columns = [], []
-        for group, _ in curved:
-            r, c = group.kernel.hessian_pattern(hessian)
-            a, b = group.table.index[:, r].ravel(), group.table.index[:, c].ravel()
-            rows.append(np.minimum(a, b))
-            columns.append(np.maximum(a, b))
-        pattern, places = _pattern((nx, nx), rows, columns)
-        entries = ca.vertcat(*(v["hess"] for _, v in curved))
-        hess = ca.MX(pattern, _sum_into(pattern.nnz(), np.concatenate(places), entries))
-
     data = [grp.table.data.ravel() for grp in groups]
     return NLP(
         name=name,
@@ -279,18 +241,103 @@ def assemble(
         oracle=ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]),
         grad_f=ca.Function("nlp_grad_f", [x, p], [f, grad], ["x", "p"], ["f", "grad_f_x"]),
         jac_g=ca.Function("nlp_jac_g", [x, p], [g, jac], ["x", "p"], ["g", "jac_g_x"]),
-        hess_lag=ca.Function(
-            "nlp_hess_l",
-            [x, p, lam_f, lam_g],
-            [hess],
-            ["x", "p", "lam_f", "lam_g"],
-            ["triu_hess_gamma_x_x"],
-        ),
+        hess_lag=_hessian(groups, local, hessian, *symbols),
         hessian=hessian,
         x_names=x_names,
         g_names=g_names,
         build_seconds=time.perf_counter() - begin,
         compile_seconds=compile_seconds,
+    )
+
+
+def other_hessian(nlp: NLP, hessian: str, compiled: bool = True) -> ca.Function:
+    """An NLP's `hess_lag` of another kind, without assembling the rest of it again.
+
+    Args:
+        nlp: The NLP.
+        hessian: One of HESSIANS.
+        compiled: Use the C compiler where there is one.
+    """
+    made = [g.kernel.functions(hessian) for g in nlp.groups]
+    made = [{k: f for k, f in functions.items() if k == "hess"} for functions in made]
+    symbols = _symbols(nlp.nx, nlp.ng, len(nlp.p))
+    local = _mapped(nlp.groups, _compiled(made) if compiled else made, len(nlp.theta), *symbols)
+    return _hessian(nlp.groups, local, hessian, *symbols)
+
+
+def _symbols(nx: int, ng: int, np_: int) -> tuple[ca.MX, ca.MX, ca.MX, ca.MX]:
+    """x, p, lam_f, lam_g."""
+    return ca.MX.sym("x", nx), ca.MX.sym("p", np_), ca.MX.sym("lam_f"), ca.MX.sym("lam_g", ng)
+
+
+def _compiled(made: list[dict[str, ca.Function]]) -> list[dict[str, ca.Function]]:
+    fast = compile_functions([f for functions in made for f in functions.values()])
+    return [{k: fast[f.name()] for k, f in functions.items()} for functions in made]
+
+
+def _mapped(
+    groups: tuple[Group, ...],
+    made: list[dict[str, ca.Function]],
+    thetas: int,
+    x: ca.MX,
+    p: ca.MX,
+    lam_f: ca.MX,
+    lam_g: ca.MX,
+) -> list[dict[str, ca.MX]]:
+    """Every group's functions over its table, element by element in one column."""
+    th, offset = p[:thetas], thetas
+    out: list[dict[str, ca.MX]] = []
+    for group, functions in zip(groups, made):
+        size, np_ = group.table.data.shape
+        xe = ca.reshape(x[_constant(group.table.index)], group.kernel.nx, size)
+        pe = ca.reshape(p[offset : offset + size * np_], np_, size)
+        offset += size * np_
+        args = [xe, pe, ca.repmat(th, 1, size)]
+        values = {}
+        for key, function in functions.items():
+            extra = []
+            if key == "hess":
+                nc = group.kernel.nc
+                lam_c = (
+                    ca.reshape(lam_g[_constant(group.table.rows)], nc, size)
+                    if nc
+                    else ca.MX(0, size)
+                )
+                extra = [ca.repmat(lam_f, 1, size), lam_c]
+            values[key] = ca.vec(function.map(size)(*args, *extra))
+        out.append(values)
+    return out
+
+
+def _hessian(
+    groups: tuple[Group, ...],
+    local: list[dict[str, ca.MX]],
+    hessian: str,
+    x: ca.MX,
+    p: ca.MX,
+    lam_f: ca.MX,
+    lam_g: ca.MX,
+) -> ca.Function:
+    """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian."""
+    nx = x.numel()
+    hess = ca.MX(nx, nx)
+    curved = [(grp, v) for grp, v in zip(groups, local) if "hess" in v]
+    if curved:
+        rows, columns = [], []
+        for group, _ in curved:
+            r, c = group.kernel.hessian_pattern(hessian)
+            a, b = group.table.index[:, r].ravel(), group.table.index[:, c].ravel()
+            rows.append(np.minimum(a, b))
+            columns.append(np.maximum(a, b))
+        pattern, places = _pattern((nx, nx), rows, columns)
+        entries = ca.vertcat(*(v["hess"] for _, v in curved))
+        hess = ca.MX(pattern, _sum_into(pattern.nnz(), np.concatenate(places), entries))
+    return ca.Function(
+        "nlp_hess_l",
+        [x, p, lam_f, lam_g],
+        [hess],
+        ["x", "p", "lam_f", "lam_g"],
+        ["triu_hess_gamma_x_x"],
     )
 
 

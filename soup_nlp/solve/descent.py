@@ -38,6 +38,7 @@ from soup_nlp.solve.search import (
     along,
     evaluate,
     inside,
+    less_forces,
     merit,
     merit_gradient,
     reach,
@@ -242,10 +243,9 @@ class Descent:
         well where E does not depend on scale, which one by least squares is not.
         """
         assert self.z is not None
-        rest = gradient.reshape(-1, 9).copy()
-        rest[:, :3] -= np.einsum("nrc,nr->nc", jacobian, self.z)
-        nu = -float(self.problem.growth(self.x) @ rest.ravel())
-        return nu, float(np.abs(rest.ravel() + nu * self.problem.length(self.x)).max())
+        rest = less_forces(gradient, jacobian, self.z)
+        nu = -float(self.problem.growth(self.x) @ rest)
+        return nu, float(np.abs(rest + nu * self.problem.length(self.x)).max())
 
     def _curvature(self, at: Point, kind: HessianKind) -> tuple[Float, Float]:
         """Hessian to use and the majorant, both with the condensed slacks."""

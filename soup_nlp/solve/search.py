@@ -80,8 +80,13 @@ def along(jacobian: Float, h: Float) -> Float:
 
 def merit_gradient(at: Point, gradient: Float, barrier: float) -> Float:
     """(9 N,) gradient of `f - barrier sum log slack` at a point, from that of f."""
+    return less_forces(gradient, at.jacobian, barrier / at.slack)
+
+
+def less_forces(gradient: Float, jacobian: Float, force: Float) -> Float:
+    """(9 N,) gradient less the forces (N, R) of the slacks, whose derivatives are (N, R, 3)."""
     out = gradient.reshape(-1, 9).copy()
-    out[:, :3] -= np.einsum("nrc,nr->nc", at.jacobian, barrier / at.slack)
+    out[:, :3] -= np.einsum("nrc,nr->nc", jacobian, force)
     return out.ravel()
 
 

@@ -163,10 +163,13 @@ def solve_soup(
         soup = presolved
         seconds["presolve"] = time.perf_counter() - begin
     cpu.append(time.process_time())
-    energies = [plain.energy(s, data, weights)["total"] for s in (start, soup)]
+
+    def energy(soup: Soup) -> float:
+        return plain.energy(soup, data, weights)["total"]
+
     near = bool(stages) and _near(stages[-1])
     # where the presolve has come near its minimum, smoothing alone may have raised the exact energy
-    if energies[1] > energies[0] and not near:
+    if not near and energy(soup) > energy(start):
         soup = start
     mark = time.perf_counter()
     nlp, layout = build_matrix_nlp(soup, data, weights, replace(form, eps=o.eps, eps_pixel=o.eps))
@@ -194,10 +197,10 @@ def solve_soup(
     cpu.append(time.process_time())
     stages.append(stage)
     say(str(stage))
-    found = {"constrained NLP": layout.unpack(stage.x), "presolve": soup, "start": start}
-    found = {k: s.normalised(data.share).retracted() for k, s in found.items()}
-    delivered = min(found, key=lambda k: plain.energy(found[k], data, weights)["total"])
-    final = found[delivered]
+    found = {"constrained NLP": layout.unpack(stage.x), "presolve": presolved, "start": start}
+    ends = {k: s.normalised(data.share).retracted() for k, s in found.items() if s is not None}
+    delivered = min(ends, key=lambda k: energy(ends[k]))
+    final = ends[delivered]
     return Solution(
         soup=final,
         status=stage.status,
@@ -246,7 +249,7 @@ def _presolve(
         )
         for k, (eps, barrier) in enumerate(zip(o.presolve_eps, barriers))
     ]
-    problem = TangentProblem(start, data, weights, form, ("gauss-newton",))
+    problem = TangentProblem(start, data, weights, form, exact=False)
     descent = Descent(problem, **watch)
     for phase in phases:
         stages.append(descent.run(phase))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -15,6 +15,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy import EnergyData, Weights
 from soup_nlp.model.formulation import Formulation, build_tangent_nlp
 from soup_nlp.model.layout import Chart
+from soup_nlp.model.nlp import other_hessian
 from soup_nlp.solve.buffered import Buffered
 from soup_nlp.solve.factor import numbered
 
@@ -45,7 +46,7 @@ class TangentProblem:
         data: EnergyData,
         weights: Weights,
         form: Formulation,
-        kinds: Sequence[HessianKind] = ("gauss-newton", "exact"),
+        exact: bool = True,
         chart: Chart = "depth",
     ) -> None:
         """Build the program.
@@ -55,18 +56,23 @@ class TangentProblem:
             data: Pixels, graphs and weights of the pair.
             weights: Constants of the energy.
             form: Visibility, and whether kernels are compiled.
-            kinds: Hessians that will be asked for; the first is always the majorant.
+            exact: Also make the exact Hessian.
             chart: Of the coordinates, see TangentLayout.
         """
         # theta = 0 and no ridge: reweighted least squares, sum c psi / s J^T J
-        smooth = replace(form, norm="smooth", truncation="smooth", theta=0.0, ridge=0.0)
-        majorant = replace(smooth, hessian="gauss-newton+constraints")
+        majorant = replace(
+            form,
+            norm="smooth",
+            truncation="smooth",
+            hessian="gauss-newton+constraints",
+            theta=0.0,
+            ridge=0.0,
+        )
         self.nlp, self.layout = build_tangent_nlp(start, data, weights, majorant, chart)
         nlp = self.nlp
         hessians: dict[HessianKind, ca.Function] = {"gauss-newton": nlp.hess_lag}
-        if "exact" in kinds:
-            newton = replace(smooth, hessian="exact")
-            hessians["exact"] = build_tangent_nlp(start, data, weights, newton, chart)[0].hess_lag
+        if exact:
+            hessians["exact"] = other_hessian(nlp, "exact", form.compiled)
         tables = {g.kernel.name: g.table for g in nlp.groups}
         self._visible = tables["t_visible"].rows
         self.rims = self._visible.shape[1]
@@ -84,7 +90,7 @@ class TangentProblem:
         # derivatives of a row of visibility, by slopes and in "inverse-depth" by rho: found by row
         order = np.argsort(row, kind="stable")
         first = np.searchsorted(row[order], self._visible)
-        self._slopes = order[first[..., None] + np.arange(2 if chart == "depth" else 3)]
+        self._entries = order[first[..., None] + np.arange(2 if chart == "depth" else 3)]
         self.triangle = np.array(np.triu_indices(9))
         self._pattern(hessians)
 
@@ -132,7 +138,7 @@ class TangentProblem:
         g, jacobian = self._rows(x, self._p)
         a, n, count = x.reshape(-1, 9), self.layout.count, self.rims
         J = np.zeros((n, count + 5, 3))
-        own = jacobian[self._slopes]
+        own = jacobian[self._entries]
         J[:, :count, 3 - own.shape[2] :] = own
         J[:, count:] = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, -1]]
         low, high = a[:, :3] - self._low[:, :3], self._high[:, 1:3] - a[:, 1:3]
