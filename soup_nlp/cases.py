@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from soup_nlp.config import Problem
+from soup_nlp.data.flow_borders import follow_flow
 from soup_nlp.data.flow_robust import reweighted
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.geometry.superpixels import segment
+from soup_nlp.geometry.superpixels import Labels, segment
 from soup_nlp.inputs import load_flow_of, load_pair
 from soup_nlp.model.energy import EnergyData, Weights, between_bodies, build_energy_data, in_pixels
 from soup_nlp.model.formulation import Formulation, build_matrix_nlp
@@ -87,7 +88,7 @@ def prepare(
     lap("flow")
     say(str(pair))
     s = problem.segmentation
-    labels = segment(pair.image_ref, s.superpixels, s.method, s.compactness, s.smoothing_px)
+    labels = superpixels(problem, pair)
     if problem.flow.reweight_px is not None:
         flow = reweighted(flow, labels, problem.flow.reweight_px)
         pair = pair.with_flow(flow)
@@ -110,6 +111,14 @@ def prepare(
     once = replace(stages, presolve=True, max_iter=1)
     answer = solve_soup(start.soup, data, weights, case.formulation(), once, say=say)
     return replace(case, soup=answer.soup)
+
+
+def superpixels(problem: Problem, pair: Pair) -> Labels:
+    """The superpixels that a problem asks for, on a pair that carries its flow."""
+    assert pair.flow is not None
+    s = problem.segmentation
+    labels = segment(pair.image_ref, s.superpixels, s.method, s.compactness, s.smoothing_px)
+    return labels if s.follow_flow_px is None else follow_flow(labels, pair.flow, s.follow_flow_px)
 
 
 def build_energy(

@@ -47,6 +47,8 @@ class SegmentationConfig(Strict):
         method: slic, or grid (the paper's worst case).
         compactness: SLIC's balance of colour and distance.
         smoothing_px: Gaussian pre-smoothing of SLIC, pixels.
+        follow_flow_px: A pixel on a border goes to the neighbour whose affine flow is nearer to its
+            own by more than this, pixels; null leaves the borders to the image alone.
         neighbours: K of the K-NN graph, less than the number of superpixels.
         beta: Fall-off of w1, w2 with distance, 1/pixel.
         beta_colour: Fall-off of w4 with colour difference, colours in [0, 1].
@@ -57,6 +59,7 @@ class SegmentationConfig(Strict):
     method: Literal["slic", "grid"] = "slic"
     compactness: Positive = 10.0
     smoothing_px: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    follow_flow_px: Positive | None = 1.0
     neighbours: Annotated[int, Field(ge=1)] = 15
     beta: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.02
     beta_colour: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0

@@ -26,7 +26,7 @@ ALLOWED = {
     "compare": {"errors", "geometry", "model", "solve", "report", "export"},
     # tables, plots and gates over many runs of whole problems
     "bench": {"errors", "data", "geometry", "model", "start", "solve", "refine", "report"}
-    | {"config", "inputs", "pipeline"},
+    | {"cases", "config", "inputs", "pipeline"},
 }
 """Rooms in their order. Modules beside the rooms (cli, config ...) may import every room; no room
 may import them, but for `errors`."""

@@ -80,8 +80,12 @@ _ALL = (
     ),
     Analysis(
         "pattern",
-        "SLIC against a regular grid",
-        _over("segmentation.method", ("slic", "grid")),
+        "SLIC against a regular grid, with borders that follow the flow and without",
+        {
+            f"{method}{words}": (f"segmentation.method={method}", *over)
+            for method in ("slic", "grid")
+            for words, over in (("", ()), (", image alone", ("segmentation.follow_flow_px=null",)))
+        },
         "superpixels",
     ),
     Analysis(

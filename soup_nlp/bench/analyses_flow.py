@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 
 from soup_nlp.bench.accuracy import Job, Row, clean, flow_error, head
 from soup_nlp.bench.accuracy_table import mean, show, table
+from soup_nlp.cases import superpixels
 from soup_nlp.data.flow_robust import reweighted
 from soup_nlp.errors import DataError
-from soup_nlp.geometry.superpixels import segment
 from soup_nlp.inputs import load_flow_of, load_pair
 
 COLUMNS = {
@@ -38,8 +38,7 @@ def measure_flow(job: Job) -> Row:
         pair = load_pair(problem)
         flow = load_flow_of(problem, pair)
         if problem.flow.reweight_px is not None:
-            s = problem.segmentation
-            labels = segment(pair.image_ref, s.superpixels, s.method, s.compactness, s.smoothing_px)
+            labels = superpixels(problem, pair.with_flow(flow))
             flow = reweighted(flow, labels, problem.flow.reweight_px)
         error = flow_error(pair.with_flow(flow))
         if error is None:

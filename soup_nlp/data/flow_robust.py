@@ -1,6 +1,8 @@
-"""Robust re-weighting of a flow inside superpixels: pixels that disagree with theirs count less."""
+"""Affine flow of every superpixel, fitted robustly, and the pixels that disagree with it."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,95 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class AffineFlow:
+    """What a small plane that moves rigidly does nearly: an affine flow for every superpixel.
+
+    Attributes:
+        coefficients: (N, 3, 2) of (1, (u - u0) / size, (v - v0) / size) -> flow, pixels.
+        centre: (N, 2) u0, v0.
+        size: (N,) root of the number of sure pixels.
+        known: (N,) False where a superpixel has fewer than six of them, and its fit means nothing.
+    """
+
+    coefficients: Float
+    centre: Float
+    size: Float
+    known: NDArray[np.bool_]
+
+    def basis(self, which: Ints, u: NDArray[np.integer], v: NDArray[np.integer]) -> Float:
+        """(P, 3) the three functions at pixels of superpixels `which` (P,)."""
+        du, dv = u - self.centre[which, 0], v - self.centre[which, 1]
+        return np.stack([np.ones(len(which)), du / self.size[which], dv / self.size[which]], axis=1)
+
+    def miss(self, which: Ints, u: NDArray[np.integer], v: NDArray[np.integer], uv: Float) -> Float:
+        """(P,) pixels between flows (P, 2) at pixels and what superpixels `which` (P,) do there."""
+        own = np.einsum("pa,pac->pc", self.basis(which, u, v), self.coefficients[which])
+        return np.where(self.known[which], np.linalg.norm(uv - own, axis=1), np.inf)
+
+
+def fit_affine(
+    flow: Flow, labels: NDArray[np.integer], scale_px: float, rounds: int = 8
+) -> tuple[AffineFlow, Float]:
+    """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
+
+    The first weights are by the distance from the superpixel's median flow: least squares would
+    lay a slope across two motions and suspect neither.
+
+    Args:
+        flow: Flow with confidence, which multiplies the weights.
+        labels: (H, W) superpixel labels 0..N-1.
+        scale_px: Residual, pixels, below which nothing is suspected; s is at least this, and at
+            least the superpixel's own spread (1.48 times the weighted mean absolute residual).
+        rounds: Re-weighted fits.
+
+    Returns:
+        The fits, and the last weights of the pixels of positive confidence (P,).
+
+    Raises:
+        DataError: sizes differ, or the scale is not positive.
+    """
+    if labels.shape != flow.confidence.shape:
+        raise DataError(
+            "labels and flow differ in size", found=labels.shape, expected=flow.confidence.shape
+        )
+    if not scale_px > 0:
+        raise DataError("scale of residuals must be positive", found=scale_px, expected="> 0 px")
+    n = int(labels.max()) + 1
+    v, u = np.nonzero(flow.confidence > 0)
+    which = labels[v, u].astype(np.int64)
+    base = flow.confidence[v, u].astype(np.float64)
+    total = np.maximum(np.bincount(which, base, n), 1e-30)
+    centre = np.stack([np.bincount(which, base * x, n) / total for x in (u, v)], axis=1)
+    count = np.bincount(which, minlength=n)
+    # coordinates of the size of one, whatever the superpixel's
+    fit = AffineFlow(np.zeros((n, 3, 2)), centre, np.sqrt(np.maximum(count, 1)), count >= 6)
+    X = fit.basis(which, u, v)
+    Y = flow.uv[v, u].astype(np.float64)
+    r = np.linalg.norm(Y - np.stack([_medians(which, y, n) for y in Y.T], axis=1)[which], axis=1)
+    s = np.maximum(1.48 * _medians(which, r, n), scale_px)
+    weight = 1.0 / (1.0 + (r / s[which]) ** 2)
+    for _ in range(rounds):
+        C = _weighted(which, X, Y, base * weight, n)
+        r = np.linalg.norm(Y - np.einsum("pa,pac->pc", X, C[which]), axis=1)
+        mass = np.maximum(np.bincount(which, base * weight, n), 1e-30)
+        spread = 1.48 * np.bincount(which, base * weight * r, n) / mass
+        s = np.maximum(spread, scale_px)
+        weight = 1.0 / (1.0 + (r / s[which]) ** 2)
+    return AffineFlow(C, fit.centre, fit.size, fit.known), weight
+
+
+def _medians(which: Ints, values: Float, n: int) -> Float:
+    """(N,) lower median of the values (P,) of every superpixel; 0 where it has none."""
+    order = np.lexsort((values, which))
+    count = np.bincount(which, minlength=n)
+    middle = np.cumsum(count) - count + np.maximum(count - 1, 0) // 2
+    if not len(order):
+        return np.zeros(n)
+    return np.where(count > 0, values[order][np.minimum(middle, len(order) - 1)], 0.0)
 
 
 def reweighted(
@@ -16,10 +107,7 @@ def reweighted(
 ) -> Flow:
     """The same flow with confidence lowered where it departs from its superpixel's motion.
 
-    A small plane that moves rigidly has a nearly affine flow. One is fitted to every superpixel by
-    iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`, r the distance
-    of a pixel's flow from the fit and s the larger of `scale_px` and the superpixel's own spread
-    (1.48 times the weighted mean absolute residual); the last weights multiply the confidence.
+    The last weights of the superpixels' affine fits multiply the confidence.
 
     Args:
         flow: Flow with confidence.
@@ -33,39 +121,15 @@ def reweighted(
     Raises:
         DataError: sizes differ, or the scale is not positive.
     """
-    if labels.shape != flow.confidence.shape:
-        raise DataError(
-            "labels and flow differ in size", found=labels.shape, expected=flow.confidence.shape
-        )
-    if not scale_px > 0:
-        raise DataError("scale of residuals must be positive", found=scale_px, expected="> 0 px")
-    n = int(labels.max()) + 1
+    _, weight = fit_affine(flow, labels, scale_px, rounds)
     used = flow.confidence > 0
-    which = labels[used].astype(np.int64)
-    v, u = (x[used].astype(np.float64) for x in np.mgrid[: labels.shape[0], : labels.shape[1]])
-    base = flow.confidence[used].astype(np.float64)
-    total = np.maximum(np.bincount(which, base, n), 1e-30)
-    centre = [np.bincount(which, base * x, n) / total for x in (u, v)]
-    # coordinates of the size of one, whatever the superpixel's
-    size = np.sqrt(np.maximum(np.bincount(which, minlength=n), 1))
-    X = np.stack(
-        [np.ones_like(u), *((x - c[which]) / size[which] for x, c in zip((u, v), centre))], axis=1
-    )
-    Y = flow.uv[used].astype(np.float64)
-    weight = np.ones_like(base)
-    for _ in range(rounds):
-        fit = _affine(which, X, Y, base * weight, n)
-        r = np.linalg.norm(Y - np.einsum("pa,pac->pc", X, fit[which]), axis=1)
-        mass = np.maximum(np.bincount(which, base * weight, n), 1e-30)
-        spread = 1.48 * np.bincount(which, base * weight * r, n) / mass
-        s = np.maximum(spread, scale_px)
-        weight = 1.0 / (1.0 + (r / s[which]) ** 2)
     confidence = flow.confidence.copy()
-    confidence[used] = np.maximum(base * weight, np.finfo(np.float32).tiny).astype(np.float32)
+    lowered = flow.confidence[used].astype(np.float64) * weight
+    confidence[used] = np.maximum(lowered, np.finfo(np.float32).tiny).astype(np.float32)
     return Flow(flow.uv, np.minimum(confidence, flow.confidence), flow.source)
 
 
-def _affine(which: NDArray[np.int64], X: Float, Y: Float, w: Float, n: int) -> Float:
+def _weighted(which: Ints, X: Float, Y: Float, w: Float, n: int) -> Float:
     """(N, 3, 2) weighted affine fits."""
     A = np.empty((n, 3, 3))
     for a in range(3):

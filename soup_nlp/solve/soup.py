@@ -54,12 +54,12 @@ class SolverOptions:
     """
 
     presolve: bool = True
-    presolve_eps: tuple[float, ...] = (0.1, 0.03)
+    presolve_eps: tuple[float, ...] = (0.1, 0.03, 0.01)
     presolve_iterations: int = 60
     stagnation: float = 1e-4
-    polish_iterations: int = 60
+    polish_iterations: int = 100
     presolve_tol: float = 1e-6
-    eps: float = 0.03
+    eps: float = 0.01
     max_iter: int = 30
     tol: float = 1e-6
     max_seconds: float = 600.0

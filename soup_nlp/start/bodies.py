@@ -82,7 +82,7 @@ def borrow(
 
 
 def contact_scales(
-    soup: Soup, label: Int, seg: Segmentation, K_ref: Float, quantile: float = 0.25
+    soup: Soup, label: Int, seg: Segmentation, K_ref: Float, quantile: float = 0.2
 ) -> Float:
     """(N,) relative scale of every body, such that bodies touch what is around them.
 

@@ -1,0 +1,112 @@
+"""Superpixels that end where the flow breaks: borders found, nothing else touched."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from soup_nlp.bench.truth import true_soup
+from soup_nlp.cases import prepare
+from soup_nlp.config import make_problem
+from soup_nlp.data.flow_borders import follow_flow
+from soup_nlp.data.flow_robust import fit_affine
+from soup_nlp.data.pair import Flow
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.superpixels import segment
+
+HEIGHT, WIDTH, EDGE = 48, 64, 26
+"""EDGE is inside a column of cells of 8 pixels."""
+
+
+def two_motions(jump: float = 3.0, noise: float = 0.0) -> Flow:
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(float)
+    uv = np.stack([0.02 * u - 1, 0.01 * v + 0.5], axis=-1)
+    uv[:, EDGE:, 0] += jump
+    uv += np.random.default_rng(2).normal(0, noise, uv.shape)
+    return Flow(uv.astype(np.float32), np.ones((HEIGHT, WIDTH), np.float32), "two motions")
+
+
+def grid() -> np.ndarray:
+    return segment(np.zeros((HEIGHT, WIDTH, 3), np.uint8), 48, "grid")
+
+
+def assert_partition(labels: np.ndarray) -> int:
+    assert labels.dtype == np.int32
+    n = int(labels.max()) + 1
+    for i in range(n):
+        assert ndimage.label(labels == i)[1] == 1, i
+    return n
+
+
+def mixed(labels: np.ndarray) -> int:
+    """Superpixels with pixels on both sides."""
+    return len(np.intersect1d(labels[:, :EDGE], labels[:, EDGE:]))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_borders_move_to_the_break_and_no_other(noise):
+    before = grid()
+    assert mixed(before) == 6
+    after = follow_flow(before, two_motions(noise=noise))
+    assert mixed(after) == 0
+    assert assert_partition(after) == 48
+    far = np.ones(WIDTH, bool)
+    far[16:40] = False
+    np.testing.assert_array_equal(after[:, far], before[:, far])
+
+
+@pytest.mark.parametrize(("jump", "margin"), [(0.0, 1.0), (0.9, 1.0), (3.0, 3.1)])
+def test_borders_stay_where_little_is_won(jump, margin):
+    np.testing.assert_array_equal(follow_flow(grid(), two_motions(jump), margin), grid())
+
+
+def test_pixels_without_confidence_stay():
+    flow = two_motions()
+    flow.confidence[:24] = 0
+    after = follow_flow(grid(), flow)
+    np.testing.assert_array_equal(after[:24], grid()[:24])
+    assert mixed(after[24:]) == 0
+
+
+def test_a_superpixel_without_flow_attracts_nothing():
+    before, flow = grid(), two_motions(0.0)
+    # what an unknown fit would say: flow 0, exactly what the pixels around have
+    flow.uv[:] = 0
+    hole = before == before[20, 20]
+    flow.confidence[hole] = 0
+    flow.uv[hole] = 50
+    np.testing.assert_array_equal(follow_flow(before, flow), before)
+    fit, weight = fit_affine(flow, before, 0.25)
+    assert not fit.known[before[20, 20]]
+    assert fit.known.sum() == 47
+    assert len(weight) == (~hole).sum()
+
+
+def test_flow_without_sense_still_leaves_a_partition():
+    uv = np.random.default_rng(3).uniform(-20, 20, (HEIGHT, WIDTH, 2)).astype(np.float32)
+    flow = Flow(uv, np.ones((HEIGHT, WIDTH), np.float32), "noise")
+    n = assert_partition(follow_flow(grid(), flow))
+    # no piece below a quarter of the mean area stays
+    assert 1 <= n <= 4 * 48
+
+
+def test_labels_of_another_size_are_refused():
+    with pytest.raises(DataError, match="differ in size"):
+        follow_flow(grid()[1:], two_motions())
+
+
+def test_a_problem_has_fewer_mixed_superpixels_with_it_than_without():
+    scene = {"kind": "scene", "scene": "orbit", "seed": 3, "width": 384, "height": 164}
+    share = {}
+    for margin in (1.0, None):
+        cut = {"superpixels": 300, "follow_flow_px": margin}
+        case = prepare(
+            make_problem({"input": scene, "flow": {"source": "truth"}, "segmentation": cut})
+        )
+        share[margin] = float((true_soup(case.pair, case.segmentation).purity < 0.95).mean())
+        if margin is None:
+            np.testing.assert_array_equal(
+                case.segmentation.labels, segment(case.pair.image_ref, 300)
+            )
+    assert share[1.0] < 0.25 * share[None]
