@@ -13,7 +13,14 @@ from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import Labels, segment
 from soup_nlp.inputs import load_flow_of, load_pair
-from soup_nlp.model.energy import EnergyData, Weights, between_bodies, build_energy_data, in_pixels
+from soup_nlp.model.energy import (
+    EnergyData,
+    Weights,
+    across_tears,
+    between_bodies,
+    build_energy_data,
+    in_pixels,
+)
 from soup_nlp.model.formulation import Formulation, build_matrix_nlp
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
@@ -134,6 +141,8 @@ def build_energy(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, bends or e.arap_at_anchors
     )
     data = between_bodies(data, start.body, e.arap_across)
+    if bends:
+        data = across_tears(data, start.surface, e.bending.cont_across)
     if e.units == "pixel":
         data = in_pixels(data, start.soup, seg, form.rotation_px)
     return data, Weights(**form.weights.model_dump())

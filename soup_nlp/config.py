@@ -92,11 +92,13 @@ class BendingConfig(Strict):
 
     Attributes:
         rotation_px: Pixels per radian of rotation difference.
+        cont_across: Factor of E_cont where the flow tears; 1 is the paper's.
         weights: Factors of the terms and their truncations.
     """
 
     rotation_px: Positive = 1e-3
-    weights: EnergyWeights = EnergyWeights(cont=0.05, orient=2.0, sigma_arap=1.0, leak_arap=0.05)
+    cont_across: Annotated[float, Field(ge=0, le=1)] = 0.01
+    weights: EnergyWeights = EnergyWeights(cont=0.05, orient=4.0, sigma_arap=1.0, leak_arap=0.05)
 
 
 class EnergyConfig(Strict):

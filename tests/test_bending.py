@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from soup_nlp.bench.truth import true_soup
 from soup_nlp.cases import Case, prepare
 from soup_nlp.config import make_problem
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.report.metrics import depth_metrics
 from soup_nlp.solve.soup import solve_soup
+
+CONT_ACROSS = "energy.bending.cont_across"
 
 
 def case(scene: str, *overrides: str) -> Case:
@@ -45,3 +48,18 @@ def test_sheet_is_better_than_a_constant_depth():
     gt = c.pair.truth.depth_ref
     constant = depth_metrics(np.ones_like(gt), gt).mre
     assert depth_metrics(z, gt).mre < 0.6 * constant
+
+
+def test_gaps_where_the_flow_tears_are_not_closed():
+    c, closed = case("sheet"), case("sheet", f"{CONT_ACROSS}=1.0")
+    i, k = c.data.pairs.T
+    torn = c.start.surface[i] != c.start.surface[k]
+    assert 0 < torn.sum() < 0.2 * len(torn)
+    np.testing.assert_allclose(
+        c.data.pair_weight, np.where(torn, 0.01, 1.0) * closed.data.pair_weight, rtol=1e-12
+    )
+    # the tears are the outline of the sheet
+    body = true_soup(c.pair, c.segmentation).body
+    assert (body[i] != body[k])[torn].mean() > 0.9
+    rigid = [case("street", *over).data.pair_weight for over in ((), (f"{CONT_ACROSS}=1.0",))]
+    np.testing.assert_array_equal(*rigid)

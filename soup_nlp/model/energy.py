@@ -214,6 +214,21 @@ def between_bodies(data: EnergyData, body: NDArray[np.int64], factor: float) -> 
     return replace(data, edge_weight=np.where(body[i] == body[k], 1.0, factor) * data.edge_weight)
 
 
+def across_tears(data: EnergyData, surface: NDArray[np.int64], factor: float) -> EnergyData:
+    """The same data with E_cont's weights times `factor` from one surface to another.
+
+    Where the flow tears, two surfaces pass each other: their gap in depth is nothing to close.
+
+    Args:
+        data: Data of the pair.
+        surface: (N,) surface of every superpixel, as the start finds them.
+        factor: 1 is the paper's energy.
+    """
+    i, k = data.pairs.T
+    held = np.where(surface[i] == surface[k], 1.0, factor)
+    return replace(data, pair_weight=held * data.pair_weight)
+
+
 def in_pixels(
     data: EnergyData, soup: Soup, seg: Segmentation, rotation_px: float | None = None
 ) -> EnergyData:

@@ -46,6 +46,7 @@ class Start:
         body: (N,) group that seems to move as one and shares one scale: a dominant motion, or a
             connected piece of superpixels with motions of their own.
         motions: The dominant motions.
+        surface: (N,) group that hangs together: the flow does not tear inside it.
         bending_share: Share of the superpixels that move otherwise than most of their surface.
         bending: Whether surfaces are taken to bend: all are one body at a constant depth.
     """
@@ -57,6 +58,7 @@ class Start:
     motion: Int
     body: Int
     motions: list[Motion]
+    surface: Int
     bending_share: float = 0.0
     bending: bool = False
 
@@ -148,10 +150,10 @@ def propose(
     if share > o.bending:
         soup, error = constant_depth(views)
         none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
-        return Start(soup, error, parallax, every, none, none + 1, motions, share, True)
+        return Start(soup, error, parallax, every, none, none + 1, motions, surface, share, True)
     scale = contact_scales(soup, body, seg, K_ref)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t).normalised()
-    return Start(soup, own.cost[:, 0], parallax, weak, label, body, motions, share)
+    return Start(soup, own.cost[:, 0], parallax, weak, label, body, motions, surface, share)
 
 
 def _fill_poor(
