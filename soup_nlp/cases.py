@@ -145,4 +145,8 @@ def build_energy(
         data = across_tears(data, start.surface, e.bending.cont_across)
     if e.units == "pixel":
         data = in_pixels(data, start.soup, seg, form.rotation_px)
-    return data, Weights(**form.weights.model_dump())
+    weights = Weights(**form.weights.model_dump())
+    if bends:
+        # on the same relief 1 - cos between neighbours falls as 1 / N
+        weights = replace(weights, orient=weights.orient * len(seg) / 1000)
+    return data, weights

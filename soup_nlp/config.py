@@ -27,6 +27,11 @@ from soup_nlp.start.propose import StartOptions
 
 # smoothing belongs to the solver's stages, the seed to the problem
 EnergyWeights: Any = mirror(Weights, "EnergyWeights")
+BendingWeights: Any = mirror(
+    Weights,
+    "BendingWeights",
+    defaults={"cont": 0.05, "orient": 4.0, "sigma_arap": 1.0, "leak_arap": 0.05},
+)
 StartConfig: Any = mirror(StartOptions, "StartConfig", leave_out=("seed",))
 FormulationConfig: Any = mirror(
     Formulation,
@@ -93,12 +98,13 @@ class BendingConfig(Strict):
     Attributes:
         rotation_px: Pixels per radian of rotation difference.
         cont_across: Factor of E_cont where the flow tears; 1 is the paper's.
-        weights: Factors of the terms and their truncations.
+        weights: Factors of the terms and their truncations; orient is that of 1,000 superpixels and
+            grows with their number.
     """
 
     rotation_px: Positive = 1e-3
     cont_across: Annotated[float, Field(ge=0, le=1)] = 0.01
-    weights: EnergyWeights = EnergyWeights(cont=0.05, orient=4.0, sigma_arap=1.0, leak_arap=0.05)
+    weights: BendingWeights = BendingWeights()
 
 
 class EnergyConfig(Strict):

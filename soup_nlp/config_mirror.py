@@ -48,6 +48,7 @@ def mirror(
     *,
     leave_out: tuple[str, ...] = (),
     choices: Mapping[str, tuple[str, ...]] | None = None,
+    defaults: Mapping[str, float] | None = None,
 ) -> type[Strict]:
     """Strict model with the fields, defaults and descriptions of a dataclass or a function.
 
@@ -56,10 +57,12 @@ def mirror(
         name: Of the model.
         leave_out: Fields that a problem file does not set.
         choices: Allowed words of fields that are plain strings in the source.
+        defaults: Other defaults than the source's; a problem file that sets one field of the
+            section keeps those of the others.
     """
     hints = typing.get_type_hints(source)
     made: dict[str, Any] = {}
-    for key, default in _defaults(source).items():
+    for key, default in {**_defaults(source), **(defaults or {})}.items():
         if key not in leave_out:
             words = (choices or {}).get(key)
             kind = Literal.__getitem__(words) if words else _kind(key, hints[key], default)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -41,13 +43,22 @@ def test_sheet_bends_and_can_be_told_not_to():
     assert not case("sheet", "start.bending=1.0").start.bending
 
 
-def test_sheet_is_better_than_a_constant_depth():
-    c = case("sheet")
+@pytest.mark.parametrize("count", [100, 300])
+def test_sheet_is_better_than_a_constant_depth(count):
+    c = case("sheet", f"segmentation.superpixels={count}")
     answer = solve_soup(c.soup, c.data, c.weights, c.formulation(), c.options)
     z = reconstruct(answer.soup, c.segmentation.labels, c.pair.K_ref, c.pair.K_next).depth_ref
     gt = c.pair.truth.depth_ref
     constant = depth_metrics(np.ones_like(gt), gt).mre
     assert depth_metrics(z, gt).mre < 0.6 * constant
+
+
+def test_one_weight_that_is_set_leaves_those_of_the_others():
+    own, set_ = (
+        case("sheet", *over).weights for over in ((), ("energy.bending.weights.orient=2.0",))
+    )
+    assert set_ == replace(own, orient=0.5 * own.orient)
+    assert own.cont == 0.05
 
 
 def test_gaps_where_the_flow_tears_are_not_closed():
