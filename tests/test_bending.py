@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from soup_nlp.bench.truth import true_soup
 from soup_nlp.cases import Case, prepare
+from soup_nlp.cli import main
 from soup_nlp.config import make_problem
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.report.metrics import depth_metrics
 from soup_nlp.solve.soup import solve_soup
 
+SHEET = Path(__file__).parent.parent / "problems" / "sheet.yaml"
 CONT_ACROSS = "energy.bending.cont_across"
 
 
@@ -74,3 +77,13 @@ def test_gaps_where_the_flow_tears_are_not_closed():
     assert (body[i] != body[k])[torn].mean() > 0.9
     rigid = [case("street", *over).data.pair_weight for over in ((), (f"{CONT_ACROSS}=1.0",))]
     np.testing.assert_array_equal(*rigid)
+
+
+def test_every_claim_of_a_bending_result_holds(tmp_path, capsys):
+    over = ["segmentation.superpixels=60", "segmentation.neighbours=6", "refine.enabled=false"]
+    size = ["input.width=256", "input.height=109", "expected.mre_at_most=null"]
+    sets = [word for item in (*over, *size) for word in ("--set", item)]
+    out = tmp_path / "sheet"
+    main(["solve", str(SHEET), "--out", str(out), *sets])
+    assert "bending)" in (out / "log.txt").read_text()
+    assert main(["check", str(out)]) == 0, capsys.readouterr().out

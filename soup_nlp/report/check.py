@@ -121,11 +121,13 @@ def _rows(
     yield from _labels(claims, attrs, config)
     settings = yaml.safe_load(str(attrs["config"]))
     weights = {k: float(v) for k, v in tree["weights"].items()}
-    own = settings["energy"]
+    own = settings["energy"]["weights"]
     if settings["energy"]["units"] == "pixel" and bool(tree["start"].get("bending", False)):
-        own = settings["energy"]["bending"]
+        own = dict(settings["energy"]["bending"]["weights"])
+        # there it is that of 1,000 superpixels
+        own["orient"] *= len(tree["start"]["body"]) / 1000
     for key in ("arap", "proj", "cont", "orient"):
-        yield _same(f"weight {key}", own["weights"][key], weights[key])
+        yield _same(f"weight {key}", own[key], weights[key])
     beta, across = settings["segmentation"]["beta"], settings["energy"]["arap_across"]
     for name, gap in recompute.data_errors(tree, float(beta), float(across)).items():
         yield Row(f"data {name}", 0.0, gap, RELATIVE, gap <= RELATIVE)
