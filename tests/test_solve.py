@@ -378,14 +378,3 @@ def test_a_start_of_less_exact_energy_keeps_the_nlp_at_the_presolves_kkt_point(r
     assert again.delivered == "start"
     assert again.energy["total"] == pytest.approx(again.energy_start["total"], rel=1e-9)
     assert_constraints(again, room.data)
-
-
-def test_rounding_that_keeps_the_tolerance_away_ends_the_solve(room, tmp_path):
-    # stiff superpixels of real pairs stay at some 1e-6 however long Ipopt goes on
-    log = tmp_path / "ipopt.log"
-    options = replace(OPTIONS, tol=1e-6, ipopt={"print_user_options": "yes"})
-    assert room.solve(options, log_file=str(log)).status == "Solve_Succeeded"
-    used = {w[0]: w[2:] for w in map(str.split, log.read_text().splitlines()) if "=" in w[1:2]}
-    assert float(used["acceptable_tol"][0]) == pytest.approx(1e-5)
-    assert used["acceptable_tol"][1] == used["acceptable_iter"][1] == "yes"
-    assert int(used["acceptable_iter"][0]) == 3

@@ -48,8 +48,7 @@ class SolverOptions:
         presolve_tol: Dual infeasibility that ends the presolve.
         eps: Smoothing of the constrained NLP.
         max_iter: Iteration limit of the constrained NLP.
-        tol: Tolerance of the constrained NLP. Where rounding keeps three iterations in a row
-            between it and ten times it, that is the end: "Solved_To_Acceptable_Level".
+        tol: Tolerance of the constrained NLP.
         max_seconds: Time limit of all stages together.
         ipopt: Further Ipopt options of the constrained NLP.
     """
@@ -183,8 +182,7 @@ def solve_soup(
     # the lifted truncation has another solution than the presolve's
     if form.truncation == "smooth" and soup is presolved and o.polish_iterations and near:
         warm = warm_start(nlp, data, soup, rim)
-    settle = {"acceptable_tol": 10 * o.tol, "acceptable_iter": 3}
-    stage = Ipopt(nlp, {**settle, **(WARM if warm else {}), **o.ipopt})(
+    stage = Ipopt(nlp, {**(WARM if warm else {}), **o.ipopt})(
         x0=nlp.x0,
         **warm,
         max_iter=o.max_iter,
