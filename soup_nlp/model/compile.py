@@ -9,7 +9,7 @@ import platform
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import casadi as ca
@@ -64,23 +64,42 @@ def compile_functions(
     for f in functions:
         generator.add(f)
     source = generator.dump()
-    key = hashlib.sha256("\0".join([source, compiler, *FLAGS, _cpu()]).encode()).hexdigest()[:24]
+    library = shared_library(source, lambda: source, compiler)
+    return {name: ca.external(name, str(library)) for name in plain} if library else plain
+
+
+def shared_library(
+    content: str, source: Callable[[], str], compiler: str | None = None
+) -> Path | None:
+    """A shared library of C code, from the cache where its content was compiled before.
+
+    Args:
+        content: What the source depends on.
+        source: Writes it.
+        compiler: Path of the C compiler; default `find_compiler()`.
+
+    Returns:
+        Path; None without a compiler that works (logged).
+    """
+    compiler = compiler or find_compiler()
+    if compiler is None:
+        return None
+    key = hashlib.sha256("\0".join([content, compiler, *FLAGS, _cpu()]).encode()).hexdigest()[:24]
     try:
-        library = _build(source, key, compiler)
+        return _build(source, key, compiler)
     except (OSError, subprocess.SubprocessError) as error:
         log.warning("compiling the kernels failed, using CasADi's virtual machine: %s", error)
-        return plain
-    return {name: ca.external(name, str(library)) for name in plain}
+        return None
 
 
-def _build(source: str, key: str, compiler: str) -> Path:
+def _build(source: Callable[[], str], key: str, compiler: str) -> Path:
     folder = cache_dir()
     folder.mkdir(parents=True, exist_ok=True)
     library = folder / f"kernels-{key}.so"
     if not library.exists():
         with tempfile.TemporaryDirectory(dir=folder) as work:
             c_file, made = Path(work) / "kernels.c", Path(work) / library.name
-            c_file.write_text(source)
+            c_file.write_text(source())
             subprocess.run(
                 [compiler, *FLAGS, str(c_file), "-o", str(made), "-lm"],
                 check=True,

@@ -108,23 +108,25 @@ def elements(
     superpixel = np.repeat(np.arange(n), s)
     used = data.pixel_weight.ravel() > 0
     owner = superpixel[used][:, None]
+    # intrinsics are data, so that kernels compiled once serve every camera
+    K = ca.sparsify(ca.DM(data.K_next[:2]))
     fields, columns = base(
         {
             "weight": w.proj * data.pixel_weight.ravel()[used],
             "sigma": full(int(used.sum()), w.sigma_proj),
             "ray": data.pixel_ray.reshape(-1, 3)[used],
             "target": data.pixel_target.reshape(-1, 2)[used],
+            "K": np.tile(K.nonzeros(), (len(owner), 1)),
         },
         owner,
     )
-    K = ca.DM(data.K_next)
     out["proj"] = Element(
         1,
         fields,
         columns,
         owner,
         lambda v, row, _, eps: terms.reprojection(
-            v[0], row, eps, K, bool(np.isfinite(w.sigma_proj))
+            v[0], row, eps, K.sparsity(), bool(np.isfinite(w.sigma_proj))
         ),
     )
     pairs, b = data.pairs, data.boundary_ray.shape[1]

@@ -77,23 +77,30 @@ class Kernel:
             Functions "f" and "grad" (x, row, theta), "con" and "jac" (same), "hess"
             (x, row, theta, lam_f, lam_c); absent where there is nothing to compute.
         """
-        args = [self.x, self.row, self.theta]
-        lam_f, lam_c = ca.SX.sym("lam_f"), ca.SX.sym("lam_c", self.nc)
-        out: dict[str, list[ca.SX]] = {}
+        second = self.second_order(hessian)
+        return {**self.first_order(), **({"hess": second} if second else {})}
+
+    def first_order(self) -> dict[str, ca.Function]:
+        """The functions without "hess"."""
+        out: dict[str, ca.SX] = {}
         if self.objective is not None:
-            out["f"] = [self.objective]
-            out["grad"] = [ca.densify(ca.gradient(self.objective, self.x))]
+            out["f"] = self.objective
+            out["grad"] = ca.densify(ca.gradient(self.objective, self.x))
         if self.constraints is not None:
-            out["con"] = [ca.densify(self.constraints)]
-            out["jac"] = [_nonzeros(ca.jacobian(self.constraints, self.x))]
+            out["con"] = ca.densify(self.constraints)
+            out["jac"] = _nonzeros(ca.jacobian(self.constraints, self.x))
+        args = [self.x, self.row, self.theta]
+        return {k: ca.Function(f"{self.name}_{k}", args, ca.cse([v])) for k, v in out.items()}
+
+    def second_order(self, hessian: str, suffix: str = "") -> ca.Function | None:
+        """The function "hess" alone, None where it is 0; its name ends with the suffix."""
+        lam_f, lam_c = ca.SX.sym("lam_f"), ca.SX.sym("lam_c", self.nc)
         H = self._hessian(hessian, lam_f, lam_c)
-        if H.nnz():
-            out["hess"] = [_nonzeros(H)]
-        made = {}
-        for key, value in out.items():
-            inputs = [*args, lam_f, lam_c] if key == "hess" else args
-            made[key] = ca.Function(f"{self.name}_{key}", inputs, ca.cse(value))
-        return made
+        if not H.nnz():
+            return None
+        args = [self.x, self.row, self.theta, lam_f, lam_c]
+        name = f"{self.name}_hess{suffix}"
+        return ca.Function(name, args, ca.cse([_nonzeros(H)]))
 
     def jacobian_pattern(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """(row, column) of every nonzero of the local Jacobian, in storage order."""

@@ -1,10 +1,10 @@
-"""The NLP record and its assembly from kernels and tables."""
+"""The NLP record: kernels, tables, bounds; its functions are assembled when first asked for."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from soup_nlp.errors import ModelError
-from soup_nlp.model.compile import compile_functions
+from soup_nlp.model.assemble import Functions, assemble_functions
 from soup_nlp.model.kernel import HESSIANS, Group
 
 Float = NDArray[np.float64]
@@ -29,13 +29,9 @@ class NLP:
         lbg, ubg: (ng,) constraint bounds.
         p: (np,) parameter values: theta, then the data of every group, element by element.
         theta: Names of the leading entries of p.
-        oracle: (x, p) -> f, g.
-        grad_f: (x, p) -> f, gradient.
-        jac_g: (x, p) -> g, Jacobian (ng x nx sparse).
-        hess_lag: (x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian.
-        hessian: Kind of that Hessian (kernel.HESSIANS).
+        hessian: Kind of the Hessian (kernel.HESSIANS).
         x_names, g_names: Functions that make the readable names, on demand.
-        build_seconds: Time to assemble, compile_seconds of which in the C compiler.
+        compiled: Use the C compiler where there is one.
     """
 
     name: str
@@ -47,15 +43,37 @@ class NLP:
     ubg: Float
     p: Float
     theta: tuple[str, ...]
-    oracle: ca.Function
-    grad_f: ca.Function
-    jac_g: ca.Function
-    hess_lag: ca.Function
     hessian: str
     x_names: Callable[[], list[str]]
     g_names: Callable[[], list[str]]
-    build_seconds: float
-    compile_seconds: float
+    compiled: bool = True
+
+    @cached_property
+    def functions(self) -> Functions:
+        """What a solver calls; assembled (seconds at real sizes) by the first access."""
+        return assemble_functions(
+            self.groups, self.nx, self.ng, len(self.theta), self.hessian, self.compiled
+        )
+
+    @property
+    def oracle(self) -> ca.Function:
+        """(x, p) -> f, g."""
+        return self.functions.oracle
+
+    @property
+    def grad_f(self) -> ca.Function:
+        """(x, p) -> f, gradient."""
+        return self.functions.grad_f
+
+    @property
+    def jac_g(self) -> ca.Function:
+        """(x, p) -> g, Jacobian (ng x nx sparse)."""
+        return self.functions.jac_g
+
+    @property
+    def hess_lag(self) -> ca.Function:
+        """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian."""
+        return self.functions.hess_lag
 
     @property
     def nx(self) -> int:
@@ -108,7 +126,7 @@ class NLP:
         ):
             share = nnz / cells if cells else 0.0
             lines.append(f"  {label:<11} {nnz:>9} nonzeros, {share:.3%} of {cells}")
-        lines.append(f"  Hessian kind: {self.hessian}; built in {self.build_seconds:.2f} s")
+        lines.append(f"  Hessian kind: {self.hessian}; built in {self.functions.seconds:.2f} s")
         lines += [f"  {g.kernel.name:<12} {g.size:>7} x {g.kernel}" for g in self.groups]
         return "\n".join(lines)
 
@@ -133,33 +151,6 @@ def _bound_bars(label: str, lower: Float, upper: Float) -> list[str]:
     return out
 
 
-def _pattern(
-    shape: tuple[int, int], rows: list[NDArray[np.int64]], columns: list[NDArray[np.int64]]
-) -> tuple[ca.Sparsity, list[NDArray[np.int64]]]:
-    """Sparsity of the union of triplets, and where each group's triplets stand in it."""
-    key = [c * shape[0] + r for r, c in zip(rows, columns)]
-    unique, place = np.unique(np.concatenate(key), return_inverse=True)
-    column_start = np.searchsorted(unique, np.arange(shape[1] + 1) * shape[0])
-    pattern = ca.Sparsity(
-        shape[0], shape[1], column_start.tolist(), (unique % shape[0]).tolist(), True
-    )
-    return pattern, np.split(place.ravel(), np.cumsum([len(k) for k in key])[:-1])
-
-
-def _sum_into(size: int, index: NDArray[np.int64], local: ca.MX) -> ca.MX:
-    """(size,) sums of local entries at their places: out[index[j]] += local[j].
-
-    It is the transposed derivative of `out -> out[index]`, which CasADi runs as one loop; a
-    constant 0/1 matrix times `local` takes twenty times as long to make and twice to apply.
-    """
-    out = ca.MX.sym("out", size)
-    return ca.jtimes(out[_constant(index)], out, local, True)
-
-
-def _constant(index: NDArray[np.int64]) -> list[int]:
-    return index.astype(np.int64).ravel().tolist()
-
-
 def assemble(
     name: str,
     groups: tuple[Group, ...],
@@ -175,7 +166,7 @@ def assemble(
     g_names: Callable[[], list[str]],
     compiled: bool = True,
 ) -> NLP:
-    """Build the NLP's functions: map every kernel over its table, scatter by constant matrices.
+    """The NLP of kernels and tables.
 
     Args:
         name: For reports.
@@ -191,43 +182,14 @@ def assemble(
         x_names: Makes the variables' names.
         g_names: Makes the constraints' names.
         compiled: Use the C compiler where there is one.
+
+    Raises:
+        ModelError: no such Hessian.
     """
     if hessian not in HESSIANS:
         raise ModelError("unknown Hessian", found=hessian, expected=", ".join(HESSIANS))
-    begin = time.perf_counter()
     groups = tuple(g for g in groups if g.size)
-    nx, ng = len(x0), len(lbg)
-    made = [g.kernel.functions(hessian) for g in groups]
-    compile_begin = time.perf_counter()
-    made = _compiled(made) if compiled else made
-    compile_seconds = time.perf_counter() - compile_begin
-
-    symbols = _symbols(nx, ng, len(theta) + sum(g.table.data.size for g in groups))
-    x, p = symbols[:2]
-    local = _mapped(groups, made, len(theta), *symbols)
-    f = ca.MX(0.0)
-    grad = ca.MX.zeros(nx)
-    g = ca.MX.zeros(ng)
-    objective = [(grp, v) for grp, v in zip(groups, local) if "f" in v]
-    constrained = [(grp, v) for grp, v in zip(groups, local) if "con" in v]
-    for group, values in objective:
-        f += ca.sum1(values["f"])
-        grad += _sum_into(nx, group.table.index, values["grad"])
-    for group, values in constrained:
-        g += _sum_into(ng, group.table.rows, values["con"])
-
-    jac = ca.MX(ng, nx)
-    if constrained:
-        rows, columns = [], []
-        for group, _ in constrained:
-            r, c = group.kernel.jacobian_pattern()
-            rows.append(group.table.rows[:, r].ravel())
-            columns.append(group.table.index[:, c].ravel())
-        pattern, places = _pattern((ng, nx), rows, columns)
-        entries = ca.vertcat(*(v["jac"] for _, v in constrained))
-        jac = ca.MX(pattern, _sum_into(pattern.nnz(), np.concatenate(places), entries))
-
-    data = [grp.table.data.ravel() for grp in groups]
+    data = [g.table.data.ravel() for g in groups]
     return NLP(
         name=name,
         groups=groups,
@@ -238,106 +200,10 @@ def assemble(
         ubg=ubg,
         p=np.concatenate([np.array(list(theta.values()), float), *data]),
         theta=tuple(theta),
-        oracle=ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]),
-        grad_f=ca.Function("nlp_grad_f", [x, p], [f, grad], ["x", "p"], ["f", "grad_f_x"]),
-        jac_g=ca.Function("nlp_jac_g", [x, p], [g, jac], ["x", "p"], ["g", "jac_g_x"]),
-        hess_lag=_hessian(groups, local, hessian, *symbols),
         hessian=hessian,
         x_names=x_names,
         g_names=g_names,
-        build_seconds=time.perf_counter() - begin,
-        compile_seconds=compile_seconds,
-    )
-
-
-def other_hessian(nlp: NLP, hessian: str, compiled: bool = True) -> ca.Function:
-    """An NLP's `hess_lag` of another kind, without assembling the rest of it again.
-
-    Args:
-        nlp: The NLP.
-        hessian: One of HESSIANS.
-        compiled: Use the C compiler where there is one.
-    """
-    made = [g.kernel.functions(hessian) for g in nlp.groups]
-    made = [{k: f for k, f in functions.items() if k == "hess"} for functions in made]
-    symbols = _symbols(nlp.nx, nlp.ng, len(nlp.p))
-    local = _mapped(nlp.groups, _compiled(made) if compiled else made, len(nlp.theta), *symbols)
-    return _hessian(nlp.groups, local, hessian, *symbols)
-
-
-def _symbols(nx: int, ng: int, np_: int) -> tuple[ca.MX, ca.MX, ca.MX, ca.MX]:
-    """x, p, lam_f, lam_g."""
-    return ca.MX.sym("x", nx), ca.MX.sym("p", np_), ca.MX.sym("lam_f"), ca.MX.sym("lam_g", ng)
-
-
-def _compiled(made: list[dict[str, ca.Function]]) -> list[dict[str, ca.Function]]:
-    fast = compile_functions([f for functions in made for f in functions.values()])
-    return [{k: fast[f.name()] for k, f in functions.items()} for functions in made]
-
-
-def _mapped(
-    groups: tuple[Group, ...],
-    made: list[dict[str, ca.Function]],
-    thetas: int,
-    x: ca.MX,
-    p: ca.MX,
-    lam_f: ca.MX,
-    lam_g: ca.MX,
-) -> list[dict[str, ca.MX]]:
-    """Every group's functions over its table, element by element in one column."""
-    th, offset = p[:thetas], thetas
-    out: list[dict[str, ca.MX]] = []
-    for group, functions in zip(groups, made):
-        size, np_ = group.table.data.shape
-        xe = ca.reshape(x[_constant(group.table.index)], group.kernel.nx, size)
-        pe = ca.reshape(p[offset : offset + size * np_], np_, size)
-        offset += size * np_
-        args = [xe, pe, ca.repmat(th, 1, size)]
-        values = {}
-        for key, function in functions.items():
-            extra = []
-            if key == "hess":
-                nc = group.kernel.nc
-                lam_c = (
-                    ca.reshape(lam_g[_constant(group.table.rows)], nc, size)
-                    if nc
-                    else ca.MX(0, size)
-                )
-                extra = [ca.repmat(lam_f, 1, size), lam_c]
-            values[key] = ca.vec(function.map(size)(*args, *extra))
-        out.append(values)
-    return out
-
-
-def _hessian(
-    groups: tuple[Group, ...],
-    local: list[dict[str, ca.MX]],
-    hessian: str,
-    x: ca.MX,
-    p: ca.MX,
-    lam_f: ca.MX,
-    lam_g: ca.MX,
-) -> ca.Function:
-    """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian."""
-    nx = x.numel()
-    hess = ca.MX(nx, nx)
-    curved = [(grp, v) for grp, v in zip(groups, local) if "hess" in v]
-    if curved:
-        rows, columns = [], []
-        for group, _ in curved:
-            r, c = group.kernel.hessian_pattern(hessian)
-            a, b = group.table.index[:, r].ravel(), group.table.index[:, c].ravel()
-            rows.append(np.minimum(a, b))
-            columns.append(np.maximum(a, b))
-        pattern, places = _pattern((nx, nx), rows, columns)
-        entries = ca.vertcat(*(v["hess"] for _, v in curved))
-        hess = ca.MX(pattern, _sum_into(pattern.nnz(), np.concatenate(places), entries))
-    return ca.Function(
-        "nlp_hess_l",
-        [x, p, lam_f, lam_g],
-        [hess],
-        ["x", "p", "lam_f", "lam_g"],
-        ["triu_hess_gamma_x_x"],
+        compiled=compiled,
     )
 
 

@@ -44,10 +44,13 @@ def _nearness(Xa: ca.SX, Xb: ca.SX) -> ca.SX:
     return ca.sqrt(ca.sqrt((a * a + b * b) / 2))
 
 
-def reprojection(a: View, row: Row, eps: ca.SX, K_next: ca.DM, truncated: bool) -> list[Norm]:
-    """E_proj of one pixel, Eq. 3: distance of homography and flow target, pixels."""
-    y = ca.SX(K_next) @ a.transfer(row["ray"])
-    error = y[0:2] / y[2] - row["target"]
+def reprojection(a: View, row: Row, eps: ca.SX, K: ca.Sparsity, truncated: bool) -> list[Norm]:
+    """E_proj of one pixel, Eq. 3: distance of homography and flow target, pixels.
+
+    `K` is where the first two rows of the next frame's intrinsics are not 0; "K" their values.
+    """
+    y = a.transfer(row["ray"])
+    error = ca.SX(K, row["K"]) @ (y / y[2]) - row["target"]
     return [Norm("reprojection", row["weight"], error, eps, row["sigma"] if truncated else None)]
 
 

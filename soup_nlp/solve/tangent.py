@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -15,8 +13,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy import EnergyData, Weights
 from soup_nlp.model.formulation import Formulation, build_tangent_nlp
 from soup_nlp.model.layout import Chart
-from soup_nlp.model.nlp import other_hessian
-from soup_nlp.solve.buffered import Buffered
+from soup_nlp.model.sums import make_sums
 from soup_nlp.solve.factor import numbered
 
 Float = NDArray[np.float64]
@@ -36,6 +33,7 @@ class TangentProblem:
         share: (N,) coefficients of the simplex row, `share . scale = 1` (scale = 1 / rho).
         rims: V, rim pixels of a superpixel.
         upper: (9 N, 9 N) pattern of Hessians, upper triangle, its values number the nonzeros.
+        sums: Its values and derivatives.
         block: (N, 45) nonzeros of every superpixel's own triangle, in the order of `triangle`.
         triangle: (2, 45) rows and columns of that triangle.
     """
@@ -69,10 +67,14 @@ class TangentProblem:
             ridge=0.0,
         )
         self.nlp, self.layout = build_tangent_nlp(start, data, weights, majorant, chart)
-        nlp = self.nlp
-        hessians: dict[HessianKind, ca.Function] = {"gauss-newton": nlp.hess_lag}
-        if exact:
-            hessians["exact"] = other_hessian(nlp, "exact", form.compiled)
+        nlp, n = self.nlp, self.layout.count
+        self._kinds = {"gauss-newton": nlp.hessian, **({"exact": "exact"} if exact else {})}
+        self.triangle = np.array(np.triu_indices(9))
+        own, (r, c) = 9 * np.arange(n)[:, None], self.triangle
+        self.sums = make_sums(nlp, list(self._kinds.values()), (own + r, own + c))
+        upper = self.sums.upper
+        self.block: Int = upper.places[-1].reshape(n, -1)
+        self.upper: sparse.csc_matrix = numbered(upper.rows, upper.columns, nlp.nx)
         tables = {g.kernel.name: g.table for g in nlp.groups}
         self._visible = tables["t_visible"].rows
         self.rims = self._visible.shape[1]
@@ -80,46 +82,23 @@ class TangentProblem:
         self.share = tables["t_simplex"].data[:, 0]
         self._low, self._high = nlp.lbx.reshape(-1, 9), nlp.ubx.reshape(-1, 9)
         self._bound = nlp.lbg[self._visible]
-        self._p = nlp.p
-
-        x, p = nlp.oracle.mx_in()
-        self._f = Buffered(ca.Function("f", [x, p], [nlp.oracle(x, p)[0]]))
-        self._gradient, self._rows = Buffered(nlp.grad_f), Buffered(nlp.jac_g)
-        self._hessian = {kind: Buffered(h) for kind, h in hessians.items()}
-        row, _ = _triplet(nlp.jac_g.sparsity_out(1))
         # derivatives of a row of visibility, by slopes and in "inverse-depth" by rho: found by row
+        row = self.sums.jacobian.rows
         order = np.argsort(row, kind="stable")
         first = np.searchsorted(row[order], self._visible)
         self._entries = order[first[..., None] + np.arange(2 if chart == "depth" else 3)]
-        self.triangle = np.array(np.triu_indices(9))
-        self._pattern(hessians)
-
-    def _pattern(self, hessians: Mapping[HessianKind, ca.Function]) -> None:
-        """Union of the Hessians' patterns, and where the nonzeros of each stand in it."""
-        r, c = self.triangle
-        nx, n = self.nlp.nx, self.layout.count
-        own = 9 * np.arange(n)[:, None]
-        keys = [((own + c) * nx + own + r).ravel()]
-        for hessian in hessians.values():
-            row, column = _triplet(hessian.sparsity_out(0))
-            keys.append(column * nx + row)
-        unique, place = np.unique(np.concatenate(keys), return_inverse=True)
-        block, *rest = np.split(place.ravel(), np.cumsum([len(k) for k in keys])[:-1])
-        self.block: Int = block.reshape(n, -1)
-        self._place = dict(zip(hessians, rest))
-        self.upper: sparse.csc_matrix = numbered(unique % nx, unique // nx, nx)
 
     def smoothing(self, eps: float) -> None:
         """Set both smoothing widths, pixels."""
-        self._p = self.nlp.with_theta(eps=eps, eps_pixel=eps)
+        self.sums.p = self.nlp.with_theta(eps=eps, eps_pixel=eps)
 
     def value(self, x: Float) -> float:
         """Smoothed energy."""
-        return float(self._f(x, self._p)[0][0])
+        return self.sums.value(x)
 
     def gradient(self, x: Float) -> Float:
         """Gradient of the smoothed energy, (9 N,)."""
-        return self._gradient(x, self._p)[1].copy()
+        return self.sums.gradient(x)
 
     def hessian(self, x: Float, z: Float, kind: HessianKind) -> Float:
         """Nonzeros (in the order of `upper`) of the Hessian of `f - z . c`.
@@ -129,13 +108,11 @@ class TangentProblem:
             z: (N, R) multipliers of the slacks.
             kind: "exact", or "gauss-newton" for f's reweighted stand-in.
         """
-        out = np.zeros(self.upper.nnz)
-        out[self._place[kind]] = self._hessian[kind](x, self._p, 1.0, self._lam_g(z))[0]
-        return out
+        return self.sums.hessian(self._kinds[kind], x, self._lam_g(z))
 
     def slacks(self, x: Float) -> tuple[Float, Float]:
         """Slacks (N, R) and their derivatives by scale and slopes (N, R, 3)."""
-        g, jacobian = self._rows(x, self._p)
+        g, jacobian = self.sums.constraints(x)
         a, n, count = x.reshape(-1, 9), self.layout.count, self.rims
         J = np.zeros((n, count + 5, 3))
         own = jacobian[self._entries]
@@ -171,12 +148,7 @@ class TangentProblem:
 
     def calls(self) -> dict[str, float]:
         """Seconds so far in f, grad_f, jac_g (with g) and hess_lag."""
-        return {
-            "f": self._f.seconds,
-            "grad_f": self._gradient.seconds,
-            "jac_g": self._rows.seconds,
-            "hess_lag": sum(h.seconds for h in self._hessian.values()),
-        }
+        return dict(self.sums.seconds)
 
     def _lam_g(self, z: Float) -> Float:
         lam_g = np.zeros(self.nlp.ng)
@@ -192,8 +164,3 @@ class TangentProblem:
         lam_x[:, :3] = -bound[:, :3]
         lam_x[:, 1:3] += bound[:, 3:]
         return lam_x.ravel(), lam_g
-
-
-def _triplet(pattern: ca.Sparsity) -> tuple[Int, Int]:
-    row, column = pattern.get_triplet()
-    return np.asarray(row, np.int64), np.asarray(column, np.int64)

@@ -1,0 +1,222 @@
+"""Assembly of an NLP's functions: every kernel mapped over its table, scattered into place."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.model.compile import compile_functions
+from soup_nlp.model.kernel import Group
+
+Int = NDArray[np.int64]
+
+
+class Pattern(NamedTuple):
+    """Union of the nonzeros of many elements.
+
+    Attributes:
+        shape: Of the matrix.
+        rows, columns: Of every nonzero, by columns.
+        places: For each set of elements, where its nonzeros stand, element by element.
+    """
+
+    shape: tuple[int, int]
+    rows: Int
+    columns: Int
+    places: list[Int]
+
+    @classmethod
+    def of(cls, shape: tuple[int, int], triplets: Sequence[tuple[Int, Int]]) -> Pattern:
+        """Of the (rows, columns) of each set of elements."""
+        keys = [(columns * shape[0] + rows).ravel() for rows, columns in triplets]
+        unique, place = np.unique(np.concatenate(keys), return_inverse=True)
+        places = np.split(place.ravel(), np.cumsum([len(k) for k in keys])[:-1])
+        return cls(shape, unique % shape[0], unique // shape[0], places)
+
+    def sparsity(self) -> ca.Sparsity:
+        """For CasADi."""
+        start = np.searchsorted(self.columns, np.arange(self.shape[1] + 1))
+        return ca.Sparsity(*self.shape, start.tolist(), self.rows.tolist(), True)
+
+
+def jacobian_triplet(group: Group) -> tuple[Int, Int]:
+    """(E, nnz) row and column in g's Jacobian of every nonzero of a group's elements."""
+    r, c = group.kernel.jacobian_pattern()
+    return group.table.rows[:, r], group.table.index[:, c]
+
+
+def hessian_triplet(group: Group, local: tuple[Int, Int]) -> tuple[Int, Int]:
+    """(E, nnz) row and column in the upper triangle of the Hessian, of an element's nonzeros."""
+    r, c = local
+    a, b = group.table.index[:, r], group.table.index[:, c]
+    return np.minimum(a, b), np.maximum(a, b)
+
+
+def _sum_into(size: int, index: Int, local: ca.MX) -> ca.MX:
+    """(size,) sums of local entries at their places: out[index[j]] += local[j].
+
+    It is the transposed derivative of `out -> out[index]`, which CasADi runs as one loop; a
+    constant 0/1 matrix times `local` takes twenty times as long to make and twice to apply.
+    """
+    out = ca.MX.sym("out", size)
+    return ca.jtimes(out[_constant(index)], out, local, True)
+
+
+def _constant(index: Int) -> list[int]:
+    return index.astype(np.int64).ravel().tolist()
+
+
+class Functions(NamedTuple):
+    """What a solver calls.
+
+    Attributes:
+        oracle: (x, p) -> f, g.
+        grad_f: (x, p) -> f, gradient.
+        jac_g: (x, p) -> g, Jacobian (ng x nx sparse).
+        hess_lag: (x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian.
+        seconds: Time to assemble, compile_seconds of which in the C compiler.
+    """
+
+    oracle: ca.Function
+    grad_f: ca.Function
+    jac_g: ca.Function
+    hess_lag: ca.Function
+    seconds: float
+    compile_seconds: float
+
+
+def assemble_functions(
+    groups: Sequence[Group], nx: int, ng: int, thetas: int, hessian: str, compiled: bool = True
+) -> Functions:
+    """Map every kernel over its table and scatter what it gives.
+
+    Args:
+        groups: Kernels and tables, none of them empty.
+        nx: Variables.
+        ng: Constraints.
+        thetas: Shared parameters, which lead p; the data of every group follow.
+        hessian: One of kernel.HESSIANS.
+        compiled: Use the C compiler where there is one.
+    """
+    begin = time.perf_counter()
+    made = [g.kernel.functions(hessian) for g in groups]
+    compile_begin = time.perf_counter()
+    made = _compiled(made) if compiled else made
+    compile_seconds = time.perf_counter() - compile_begin
+
+    symbols = _Symbols.of(nx, ng, thetas + sum(g.table.data.size for g in groups))
+    x, p = symbols.x, symbols.p
+    local = _mapped(groups, made, thetas, symbols)
+    f = ca.MX(0.0)
+    grad = ca.MX.zeros(nx)
+    g = ca.MX.zeros(ng)
+    objective = [(grp, v) for grp, v in zip(groups, local) if "f" in v]
+    constrained = [(grp, v) for grp, v in zip(groups, local) if "con" in v]
+    for group, values in objective:
+        f += ca.sum1(values["f"])
+        grad += _sum_into(nx, group.table.index, values["grad"])
+    for group, values in constrained:
+        g += _sum_into(ng, group.table.rows, values["con"])
+
+    jac = ca.MX(ng, nx)
+    if constrained:
+        pattern = Pattern.of((ng, nx), [jacobian_triplet(group) for group, _ in constrained])
+        jac = _matrix(pattern, [v["jac"] for _, v in constrained])
+    return Functions(
+        oracle=ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]),
+        grad_f=ca.Function("nlp_grad_f", [x, p], [f, grad], ["x", "p"], ["f", "grad_f_x"]),
+        jac_g=ca.Function("nlp_jac_g", [x, p], [g, jac], ["x", "p"], ["g", "jac_g_x"]),
+        hess_lag=_hessian(groups, local, hessian, symbols),
+        seconds=time.perf_counter() - begin,
+        compile_seconds=compile_seconds,
+    )
+
+
+def other_hessian(
+    groups: Sequence[Group], nx: int, ng: int, thetas: int, hessian: str, compiled: bool = True
+) -> ca.Function:
+    """`hess_lag` alone, of any kind; arguments as of `assemble_functions`."""
+    second = [g.kernel.second_order(hessian) for g in groups]
+    made = [{"hess": h} if h else {} for h in second]
+    symbols = _Symbols.of(nx, ng, thetas + sum(g.table.data.size for g in groups))
+    local = _mapped(groups, _compiled(made) if compiled else made, thetas, symbols)
+    return _hessian(groups, local, hessian, symbols)
+
+
+class _Symbols(NamedTuple):
+    x: ca.MX
+    p: ca.MX
+    lam_f: ca.MX
+    lam_g: ca.MX
+
+    @classmethod
+    def of(cls, nx: int, ng: int, np_: int) -> _Symbols:
+        sym = ca.MX.sym
+        return cls(sym("x", nx), sym("p", np_), sym("lam_f"), sym("lam_g", ng))
+
+
+def _compiled(made: list[dict[str, ca.Function]]) -> list[dict[str, ca.Function]]:
+    fast = compile_functions([f for functions in made for f in functions.values()])
+    return [{k: fast[f.name()] for k, f in functions.items()} for functions in made]
+
+
+def _mapped(
+    groups: Sequence[Group],
+    made: list[dict[str, ca.Function]],
+    thetas: int,
+    symbols: _Symbols,
+) -> list[dict[str, ca.MX]]:
+    """Every group's functions over its table, element by element in one column."""
+    x, p, lam_f, lam_g = symbols
+    th, offset = p[:thetas], thetas
+    out: list[dict[str, ca.MX]] = []
+    for group, functions in zip(groups, made):
+        size, np_ = group.table.data.shape
+        xe = ca.reshape(x[_constant(group.table.index)], group.kernel.nx, size)
+        pe = ca.reshape(p[offset : offset + size * np_], np_, size)
+        offset += size * np_
+        args = [xe, pe, ca.repmat(th, 1, size)]
+        values = {}
+        for key, function in functions.items():
+            extra = []
+            if key == "hess":
+                nc = group.kernel.nc
+                lam_c = (
+                    ca.reshape(lam_g[_constant(group.table.rows)], nc, size)
+                    if nc
+                    else ca.MX(0, size)
+                )
+                extra = [ca.repmat(lam_f, 1, size), lam_c]
+            values[key] = ca.vec(function.map(size)(*args, *extra))
+        out.append(values)
+    return out
+
+
+def _hessian(
+    groups: Sequence[Group], local: list[dict[str, ca.MX]], hessian: str, symbols: _Symbols
+) -> ca.Function:
+    """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian."""
+    nx = symbols.x.numel()
+    hess = ca.MX(nx, nx)
+    curved = [(grp, v) for grp, v in zip(groups, local) if "hess" in v]
+    if curved:
+        triplets = [hessian_triplet(g, g.kernel.hessian_pattern(hessian)) for g, _ in curved]
+        pattern = Pattern.of((nx, nx), triplets)
+        hess = _matrix(pattern, [v["hess"] for _, v in curved])
+    return ca.Function(
+        "nlp_hess_l",
+        list(symbols),
+        [hess],
+        ["x", "p", "lam_f", "lam_g"],
+        ["triu_hess_gamma_x_x"],
+    )
+
+
+def _matrix(pattern: Pattern, local: list[ca.MX]) -> ca.MX:
+    places = np.concatenate(pattern.places)
+    return ca.MX(pattern.sparsity(), _sum_into(len(pattern.rows), places, ca.vertcat(*local)))

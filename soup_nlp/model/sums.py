@@ -1,0 +1,239 @@
+"""An NLP's sums as numpy arrays: value, gradient, constraints and Hessians of several kinds.
+
+The same numbers by two ways: kernels on vectors of elements (`lanes`) where a C compiler is, else
+the NLP's CasADi functions. Ipopt and exports take the functions; the presolve, which evaluates a
+hundred times as often, takes these.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.model.assemble import Pattern, hessian_triplet, jacobian_triplet, other_hessian
+from soup_nlp.model.buffered import Buffered
+from soup_nlp.model.kernel import Group
+from soup_nlp.model.lanes import Lanes, NoLanesError, Summed, compile_lanes, in_lanes, summing
+from soup_nlp.model.nlp import NLP
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+log = logging.getLogger(__name__)
+
+
+class Timer(dict[str, float]):
+    """Wall time in what a Sums does, seconds."""
+
+    def __init__(self) -> None:
+        super().__init__(dict.fromkeys(("f", "grad_f", "jac_g", "hess_lag"), 0.0))
+
+    @contextmanager
+    def of(self, what: str) -> Iterator[None]:
+        """Add the time of a `with` block."""
+        begin = time.perf_counter()
+        yield
+        self[what] += time.perf_counter() - begin
+
+
+class Sums(Protocol):
+    """f, g and their derivatives.
+
+    Attributes:
+        p: Parameters of the NLP; may be set to others.
+        jacobian: Of g; its places do not matter.
+        upper: Union of the Hessians' upper triangles and of what the caller wants besides, whose
+            places are the last.
+        seconds: Spent in "f", "grad_f", "jac_g" (with g) and "hess_lag".
+    """
+
+    p: Float
+    jacobian: Pattern
+    upper: Pattern
+    seconds: Timer
+
+    def value(self, x: Float) -> float:
+        """f at x (nx,)."""
+        ...
+
+    def gradient(self, x: Float) -> Float:
+        """Gradient of f (nx,)."""
+        ...
+
+    def constraints(self, x: Float) -> tuple[Float, Float]:
+        """g (ng,) and the nonzeros of its Jacobian, in the order of `jacobian`."""
+        ...
+
+    def hessian(self, kind: str, x: Float, lam_g: Float) -> Float:
+        """Nonzeros of the Hessian of `f + lam_g . g`, in the order of `upper`."""
+        ...
+
+
+def make_sums(nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int]) -> Sums:
+    """The sums of an NLP by the fastest way there is.
+
+    Args:
+        nlp: The NLP.
+        hessians: Kinds of Hessian (kernel.HESSIANS); not empty.
+        besides: Rows and columns of further nonzeros of the upper triangle.
+    """
+    if nlp.compiled:
+        try:
+            return LaneSums(nlp, hessians, besides)
+        except NoLanesError as error:
+            log.info("no machine code on vectors: %s", error)
+    return FunctionSums(nlp, hessians, besides)
+
+
+class FunctionSums:
+    """Sums by the NLP's CasADi functions."""
+
+    def __init__(self, nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int]) -> None:
+        """Assemble them; arguments as of `make_sums`."""
+        self.p, self.seconds = nlp.p, Timer()
+        sizes = nlp.nx, nlp.ng, len(nlp.theta)
+        functions = {
+            kind: nlp.hess_lag
+            if kind == nlp.hessian
+            else other_hessian(nlp.groups, *sizes, kind, nlp.compiled)
+            for kind in hessians
+        }
+        x, p = nlp.oracle.mx_in()
+        self._f = Buffered(ca.Function("f", [x, p], [nlp.oracle(x, p)[0]]))
+        self._gradient, self._rows = Buffered(nlp.grad_f), Buffered(nlp.jac_g)
+        self._hessian = {kind: Buffered(h) for kind, h in functions.items()}
+        self.jacobian = Pattern.of((nlp.ng, nlp.nx), [_triplet(nlp.jac_g.sparsity_out(1))])
+        own = [_triplet(h.sparsity_out(0)) for h in functions.values()]
+        self.upper = Pattern.of((nlp.nx, nlp.nx), [*own, besides])
+        self._places = dict(zip(functions, self.upper.places))
+
+    def value(self, x: Float) -> float:
+        """See Sums."""
+        with self.seconds.of("f"):
+            return float(self._f(x, self.p)[0][0])
+
+    def gradient(self, x: Float) -> Float:
+        """See Sums."""
+        with self.seconds.of("grad_f"):
+            return self._gradient(x, self.p)[1].copy()
+
+    def constraints(self, x: Float) -> tuple[Float, Float]:
+        """See Sums."""
+        with self.seconds.of("jac_g"):
+            g, jacobian = self._rows(x, self.p)
+            return g.copy(), jacobian.copy()
+
+    def hessian(self, kind: str, x: Float, lam_g: Float) -> Float:
+        """See Sums."""
+        with self.seconds.of("hess_lag"):
+            out = np.zeros(len(self.upper.rows))
+            out[self._places[kind]] = self._hessian[kind](x, self.p, 1.0, lam_g)[0]
+            return out
+
+
+class LaneSums:
+    """Sums by kernels on vectors of elements."""
+
+    def __init__(self, nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int]) -> None:
+        """Compile them or take them from the cache; arguments as of `make_sums`.
+
+        Raises:
+            NoLanesError: That is not possible here.
+        """
+        self.p, self.seconds = nlp.p, Timer()
+        self._sizes = nlp.nx, nlp.ng, len(nlp.theta)
+        nx, ng = nlp.nx, nlp.ng
+        made: list[dict[str, ca.Function]] = []
+        for group in nlp.groups:
+            functions = group.kernel.first_order()
+            for k, kind in enumerate(hessians):
+                hessian = group.kernel.second_order(kind, str(k))
+                functions |= {kind: hessian} if hessian else {}
+            made.append(functions)
+        library = compile_lanes([f for functions in made for f in functions.values()])
+        kinds = [[k for k in hessians if k in functions] for functions in made]
+        unions = [_union(g, own) for g, own in zip(nlp.groups, kinds)]
+        with_rows = [g for g in nlp.groups if g.kernel.nc]
+        self.jacobian = Pattern.of((ng, nx), [jacobian_triplet(g) for g in with_rows])
+        self.upper = Pattern.of((nx, nx), [*(u.triplet for u in unions), besides])
+        jacobian_places = iter(self.jacobian.places)
+        self._terms: dict[str, list[Summed]] = {}
+        for group, functions, union, upper in zip(nlp.groups, made, unions, self.upper.places):
+            table, size = group.table, group.size
+            lanes = Lanes.of(table)
+            place = {"f": np.zeros((size, 1)), "grad": table.index, "con": table.rows}
+            if "jac" in functions:
+                place["jac"] = next(jacobian_places).reshape(size, -1)
+            for kind, which in union.parts.items():
+                place[kind] = upper.reshape(size, -1)[:, which]
+            for key, function in functions.items():
+                where = in_lanes(place[key], np.int32, fill=self._size(key))
+                term = Summed(summing(library, function), lanes, where)
+                self._terms.setdefault(key, []).append(term)
+
+    def _size(self, key: str) -> int:
+        nx, ng, _ = self._sizes
+        sizes = {"f": 1, "grad": nx, "con": ng, "jac": len(self.jacobian.rows)}
+        return sizes.get(key, len(self.upper.rows))
+
+    def _sum(self, key: str, x: Float, lam_g: Float | None = None) -> Float:
+        # one entry more, for what fills the last block
+        out = np.zeros(self._size(key) + 1)
+        theta = np.ascontiguousarray(self.p[: self._sizes[2]])
+        for term in self._terms.get(key, []):
+            term.add(out, x, theta, 1.0, lam_g)
+        return out[:-1]
+
+    def value(self, x: Float) -> float:
+        """See Sums."""
+        with self.seconds.of("f"):
+            return float(self._sum("f", x)[0])
+
+    def gradient(self, x: Float) -> Float:
+        """See Sums."""
+        with self.seconds.of("grad_f"):
+            return self._sum("grad", x)
+
+    def constraints(self, x: Float) -> tuple[Float, Float]:
+        """See Sums."""
+        with self.seconds.of("jac_g"):
+            return self._sum("con", x), self._sum("jac", x)
+
+    def hessian(self, kind: str, x: Float, lam_g: Float) -> Float:
+        """See Sums."""
+        with self.seconds.of("hess_lag"):
+            return self._sum(kind, x, lam_g)
+
+
+class _Union(NamedTuple):
+    """Nonzeros of an element's Hessians of several kinds.
+
+    Attributes:
+        triplet: (E, k) rows and columns of the elements'.
+        parts: Which of the k are in each kind, in its storage order.
+    """
+
+    triplet: tuple[Int, Int]
+    parts: dict[str, Int]
+
+
+def _union(group: Group, kinds: Sequence[str]) -> _Union:
+    local = [group.kernel.hessian_pattern(kind) for kind in kinds]
+    if not local:
+        none = np.zeros((group.size, 0), np.int64)
+        return _Union((none, none), {})
+    union = Pattern.of((group.kernel.nx, group.kernel.nx), local)
+    triplet = hessian_triplet(group, (union.rows, union.columns))
+    return _Union(triplet, dict(zip(kinds, union.places)))
+
+
+def _triplet(pattern: ca.Sparsity) -> tuple[Int, Int]:
+    row, column = pattern.get_triplet()
+    return np.asarray(row, np.int64), np.asarray(column, np.int64)
