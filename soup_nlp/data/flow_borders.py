@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from soup_nlp.data.flow_robust import fit_affine
+from soup_nlp.data.flow_robust import fit_affine, refit_affine
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.superpixels import Labels, split_components
 
@@ -49,12 +50,17 @@ def follow_flow(
     """
     current = labels.astype(np.int64)
     count = int(current.max()) + 1
+    fit, _ = fit_affine(flow, current, scale_px, rounds=5)
+    changed = np.zeros(count, bool)
+    near = np.ones(current.shape, bool)
     for sweep in range(sweeps):
-        if sweep % refit == 0:
-            fit, _ = fit_affine(flow, current, scale_px, rounds=5)
+        if changed.any() and sweep % refit == 0:
+            fit = refit_affine(fit, flow, current, changed, scale_px, rounds=5)
+            changed[:], near[:] = False, True
         framed = np.pad(current, 1, mode="edge")
         sides = (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
-        border = np.any([side != current for side in sides], axis=0) & (flow.confidence > 0)
+        # a pixel whose surroundings are those of the last sweep stays where it stayed
+        border = near & (flow.confidence > 0) & np.any([side != current for side in sides], axis=0)
         v, u = np.nonzero(border)
         own, uv = current[v, u], flow.uv[v, u].astype(np.float64)
         best, least = own.copy(), fit.miss(own, u, v, uv) - margin_px
@@ -63,7 +69,12 @@ def follow_flow(
             miss = fit.miss(other, u, v, uv)
             better = (miss < least) & (other != own)
             best[better], least[better] = other[better], miss[better]
-        if (best == own).all():
+        moved = best != own
+        if not moved.any():
             break
-        current[v, u] = best
+        changed[own[moved]] = changed[best[moved]] = True
+        current[v[moved], u[moved]] = best[moved]
+        near[:] = False
+        near[v[moved], u[moved]] = True
+        near = ndimage.binary_dilation(near)
     return split_components(current.astype(np.int32), int(min_fraction * current.size / count))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,9 +68,42 @@ def fit_affine(
         )
     if not scale_px > 0:
         raise DataError("scale of residuals must be positive", found=scale_px, expected="> 0 px")
-    n = int(labels.max()) + 1
     v, u = np.nonzero(flow.confidence > 0)
-    which = labels[v, u].astype(np.int64)
+    return _fit(flow, labels[v, u].astype(np.int64), u, v, int(labels.max()) + 1, scale_px, rounds)
+
+
+def refit_affine(
+    fit: AffineFlow,
+    flow: Flow,
+    labels: NDArray[np.integer],
+    changed: NDArray[np.bool_],
+    scale_px: float,
+    rounds: int = 8,
+) -> AffineFlow:
+    """The fits of `fit_affine`, some of them made before.
+
+    Args:
+        fit: Right where nothing changed.
+        flow: Flow with confidence.
+        labels: (H, W) superpixel labels 0..N-1.
+        changed: (N,) superpixels to fit.
+        scale_px: Residual, pixels, below which nothing is suspected.
+        rounds: Re-weighted fits.
+    """
+    v, u = np.nonzero((flow.confidence > 0) & changed[labels])
+    number = np.cumsum(changed) - 1
+    new, _ = _fit(flow, number[labels[v, u]], u, v, int(changed.sum()), scale_px, rounds)
+    merged = []
+    for old, own in zip(astuple(fit), astuple(new)):
+        merged.append(old.copy())
+        merged[-1][changed] = own
+    return AffineFlow(*merged)
+
+
+def _fit(
+    flow: Flow, which: Ints, u: Ints, v: Ints, n: int, scale_px: float, rounds: int
+) -> tuple[AffineFlow, Float]:
+    """Fits of n superpixels to pixels (P,) and the last weights, see `fit_affine`."""
     base = flow.confidence[v, u].astype(np.float64)
     total = np.maximum(np.bincount(which, base, n), 1e-30)
     centre = np.stack([np.bincount(which, base * x, n) / total for x in (u, v)], axis=1)
@@ -82,6 +115,7 @@ def fit_affine(
     r = np.linalg.norm(Y - np.stack([_medians(which, y, n) for y in Y.T], axis=1)[which], axis=1)
     s = np.maximum(1.48 * _medians(which, r, n), scale_px)
     weight = 1.0 / (1.0 + (r / s[which]) ** 2)
+    C = fit.coefficients
     for _ in range(rounds):
         C = _weighted(which, X, Y, base * weight, n)
         r = np.linalg.norm(Y - np.einsum("pa,pac->pc", X, C[which]), axis=1)

@@ -58,7 +58,8 @@ def cholmod(upper: sparse.csc_matrix) -> Factorise:
     lower.sort_indices()
     place = lower.data.astype(np.int64) - 1
     column = np.repeat(np.arange(n), np.diff(lower.indptr))
-    A = cvxopt.spmatrix(1.0, lower.indices.tolist(), column.tolist(), (n, n))
+    places = (cvxopt.matrix(i.astype(np.int64)) for i in (lower.indices, column))
+    A = cvxopt.spmatrix(1.0, *places, (n, n))
     factor = library.symbolic(A)
 
     def factorise(nonzeros: Float) -> Back:

@@ -2,7 +2,7 @@
 
 A step that is too long for a few superpixels is shortened for those alone; one that still goes
 down at its end is doubled, for all and then for those that still descend. Energies cost a tenth of
-an iteration. A step that leaves the floor of a bent valley is led back by a second one with the
+an iteration. A step that leaves the floor of a bent valley is led back by further ones with the
 same matrix.
 """
 
@@ -24,6 +24,10 @@ TO_BOUNDARY = 0.99
 LEAST_SLACK = 1e-3
 """A slack keeps at least this share of itself."""
 TRIES = 4
+CORRECTIONS = 6
+"""Most steps with one matrix that follow the first."""
+WORTH = 0.05
+"""Share of the fall so far that another one must bring."""
 
 
 class Point(NamedTuple):
@@ -196,16 +200,26 @@ class Search:
         return Move(None, length, far, calm, eager)
 
     def _corrected(self, trial: Point) -> Point | None:
-        """The trial after a second step with the same matrix: back to the floor of a bent valley.
+        """The trial after further steps with the same matrix: back to the floor of a bent valley.
 
         Norms that are nearly zero are stiff: a step along a valley of theirs leaves it by its
-        square, and would have to be short without.
+        square, and would have to be short without. A step costs a tenth of a factorisation.
         """
-        right = merit_gradient(trial, self.gradient(trial.x), self.barrier)
-        c = self.newton(right)
-        length = np.minimum(1.0, TO_BOUNDARY * reach(trial.slack, along(trial.jacobian, c)))
-        x = self.problem.normalise(trial.x + (length[:, None] * c.reshape(-1, 9)).ravel())
-        return evaluate(self.problem, x, self.barrier, LEAST_SLACK * self.at.slack)
+        best = None
+        for _ in range(CORRECTIONS):
+            right = merit_gradient(trial, self.gradient(trial.x), self.barrier)
+            c = self.newton(right)
+            length = np.minimum(1.0, TO_BOUNDARY * reach(trial.slack, along(trial.jacobian, c)))
+            x = self.problem.normalise(trial.x + (length[:, None] * c.reshape(-1, 9)).ravel())
+            moved = evaluate(self.problem, x, self.barrier, LEAST_SLACK * self.at.slack)
+            if moved is None:
+                return best
+            if best is not None:
+                fell = best.merit - moved.merit
+                if not fell > WORTH * abs(self.at.merit - best.merit):
+                    return moved if fell > 0 else best
+            best = trial = moved
+        return best
 
     def _feasible(self, length: Float) -> tuple[Point, Float]:
         """The point at these lengths, halved where a slack would vanish."""
