@@ -103,10 +103,9 @@ def measure(spec: Spec) -> dict[str, Any]:
     clocks = Clocks()
     problem = problem_of(spec)
     case = _prepare(problem, clocks)
-    children = _children()
     with clocks.stage("nlp"):
         solution = solve_soup(case.soup, case.data, case.weights, case.formulation(), case.options)
-    clocks.cpu["compiler"] = _children() - children
+    clocks.cpu["compiler"] = solution.seconds["compile"]
     run = _run(case, solution, clocks)
     with clocks.stage("output"), tempfile.TemporaryDirectory() as folder:
         write_folder(prepare_folder(folder), run, dump_problem(problem), "")
@@ -150,12 +149,6 @@ def measure(spec: Spec) -> dict[str, Any]:
         "peak_bytes": peak,
         "yardstick": {kind: _yardstick(case, kind) for kind in spec.yardsticks},
     }
-
-
-def _children() -> float:
-    """CPU seconds of ended child processes: the C compiler's."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def _last(values: Float | None) -> float | None:

@@ -11,7 +11,6 @@ import pytest
 from soup_nlp.cases import Case, prepare
 from soup_nlp.config import make_problem
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.assemble import other_hessian
 from soup_nlp.model.buffered import Buffered
 from soup_nlp.model.formulation import Formulation, build_tangent_nlp
 from soup_nlp.model.layout import Chart
@@ -87,7 +86,7 @@ def test_the_exact_hessian_beside_the_stand_in_is_the_program_of_its_own(problem
     form = replace(FORM, norm="smooth", hessian="exact", theta=0.0, ridge=0.0)
     chart = problem.layout.chart
     nlp = build_tangent_nlp(case.soup, case.data, case.weights, form, chart)[0]
-    other = other_hessian(nlp.groups, nlp.nx, nlp.ng, len(nlp.theta), "exact", compiled=False)
+    other = problem.nlp.other_hessian("exact")
     rng = np.random.default_rng(6)
     args = (inner_point(problem), nlp.p, 1.0, rng.normal(size=nlp.ng))
     one, two = nlp.hess_lag(*args), other(*args)

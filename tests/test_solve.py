@@ -374,7 +374,7 @@ def test_a_start_of_less_exact_energy_keeps_the_nlp_at_the_presolves_kkt_point(r
     again = solve_soup(first, room.data, WEIGHTS, form(), options)
     assert again.converged, again.status
     assert again.stages[-1].history["inf_du"][0] < 1e-2
-    assert again.stages[-1].iterations <= 3
+    assert again.stages[-1].iterations <= 5
     assert again.delivered == "start"
     assert again.energy["total"] == pytest.approx(again.energy_start["total"], rel=1e-9)
     assert_constraints(again, room.data)

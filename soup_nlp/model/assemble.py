@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -33,10 +32,11 @@ class Pattern(NamedTuple):
     @classmethod
     def of(cls, shape: tuple[int, int], triplets: Sequence[tuple[Int, Int]]) -> Pattern:
         """Of the (rows, columns) of each set of elements."""
-        keys = [(columns * shape[0] + rows).ravel() for rows, columns in triplets]
+        empty = np.zeros(0, np.int64)
+        keys = [empty, *((columns * shape[0] + rows).ravel() for rows, columns in triplets)]
         unique, place = np.unique(np.concatenate(keys), return_inverse=True)
         places = np.split(place.ravel(), np.cumsum([len(k) for k in keys])[:-1])
-        return cls(shape, unique % shape[0], unique // shape[0], places)
+        return cls(shape, unique % shape[0], unique // shape[0], places[1:])
 
     def sparsity(self) -> ca.Sparsity:
         """For CasADi."""
@@ -71,27 +71,34 @@ def _constant(index: Int) -> list[int]:
     return index.astype(np.int64).ravel().tolist()
 
 
+def hessian_pattern(groups: Sequence[Group], nx: int, hessian: str) -> Pattern:
+    """Of the upper triangle of the Lagrangian's Hessian; places for every group.
+
+    Args:
+        groups: Kernels and tables.
+        nx: Variables.
+        hessian: One of kernel.HESSIANS.
+    """
+    local = [g.kernel.hessian_pattern(hessian) for g in groups]
+    return Pattern.of((nx, nx), [hessian_triplet(g, own) for g, own in zip(groups, local)])
+
+
 class Functions(NamedTuple):
-    """What a solver calls.
+    """What a solver calls, but the Hessian.
 
     Attributes:
         oracle: (x, p) -> f, g.
         grad_f: (x, p) -> f, gradient.
         jac_g: (x, p) -> g, Jacobian (ng x nx sparse).
-        hess_lag: (x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian.
-        seconds: Time to assemble, compile_seconds of which in the C compiler.
     """
 
     oracle: ca.Function
     grad_f: ca.Function
     jac_g: ca.Function
-    hess_lag: ca.Function
-    seconds: float
-    compile_seconds: float
 
 
 def assemble_functions(
-    groups: Sequence[Group], nx: int, ng: int, thetas: int, hessian: str, compiled: bool = True
+    groups: Sequence[Group], nx: int, ng: int, thetas: int, compiled: bool = True
 ) -> Functions:
     """Map every kernel over its table and scatter what it gives.
 
@@ -100,15 +107,10 @@ def assemble_functions(
         nx: Variables.
         ng: Constraints.
         thetas: Shared parameters, which lead p; the data of every group follow.
-        hessian: One of kernel.HESSIANS.
         compiled: Use the C compiler where there is one.
     """
-    begin = time.perf_counter()
-    made = [g.kernel.functions(hessian) for g in groups]
-    compile_begin = time.perf_counter()
+    made = [g.kernel.first_order() for g in groups]
     made = _compiled(made) if compiled else made
-    compile_seconds = time.perf_counter() - compile_begin
-
     symbols = _Symbols.of(nx, ng, thetas + sum(g.table.data.size for g in groups))
     x, p = symbols.x, symbols.p
     local = _mapped(groups, made, thetas, symbols)
@@ -131,21 +133,40 @@ def assemble_functions(
         oracle=ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]),
         grad_f=ca.Function("nlp_grad_f", [x, p], [f, grad], ["x", "p"], ["f", "grad_f_x"]),
         jac_g=ca.Function("nlp_jac_g", [x, p], [g, jac], ["x", "p"], ["g", "jac_g_x"]),
-        hess_lag=_hessian(groups, local, hessian, symbols),
-        seconds=time.perf_counter() - begin,
-        compile_seconds=compile_seconds,
     )
 
 
-def other_hessian(
-    groups: Sequence[Group], nx: int, ng: int, thetas: int, hessian: str, compiled: bool = True
+def assemble_hessian(
+    groups: Sequence[Group],
+    pattern: Pattern,
+    ng: int,
+    thetas: int,
+    hessian: str,
+    compiled: bool = True,
 ) -> ca.Function:
-    """`hess_lag` alone, of any kind; arguments as of `assemble_functions`."""
+    """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian.
+
+    Args:
+        groups: Kernels and tables, none of them empty.
+        pattern: From `hessian_pattern`.
+        ng: Constraints.
+        thetas: Shared parameters, which lead p.
+        hessian: One of kernel.HESSIANS.
+        compiled: Use the C compiler where there is one.
+    """
     second = [g.kernel.second_order(hessian) for g in groups]
     made = [{"hess": h} if h else {} for h in second]
+    nx = pattern.shape[0]
     symbols = _Symbols.of(nx, ng, thetas + sum(g.table.data.size for g in groups))
     local = _mapped(groups, _compiled(made) if compiled else made, thetas, symbols)
-    return _hessian(groups, local, hessian, symbols)
+    entries = [v["hess"] for v in local if "hess" in v]
+    return ca.Function(
+        "nlp_hess_l",
+        list(symbols),
+        [_matrix(pattern, entries) if entries else ca.MX(nx, nx)],
+        ["x", "p", "lam_f", "lam_g"],
+        ["triu_hess_gamma_x_x"],
+    )
 
 
 class _Symbols(NamedTuple):
@@ -161,8 +182,12 @@ class _Symbols(NamedTuple):
 
 
 def _compiled(made: list[dict[str, ca.Function]]) -> list[dict[str, ca.Function]]:
-    fast = compile_functions([f for functions in made for f in functions.values()])
-    return [{k: fast[f.name()] for k, f in functions.items()} for functions in made]
+    out = []
+    for functions in made:
+        # a library for every kernel, so that another of one leaves the others in the cache
+        fast = compile_functions(list(functions.values())) if functions else {}
+        out.append({k: fast[f.name()] for k, f in functions.items()})
+    return out
 
 
 def _mapped(
@@ -195,26 +220,6 @@ def _mapped(
             values[key] = ca.vec(function.map(size)(*args, *extra))
         out.append(values)
     return out
-
-
-def _hessian(
-    groups: Sequence[Group], local: list[dict[str, ca.MX]], hessian: str, symbols: _Symbols
-) -> ca.Function:
-    """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian."""
-    nx = symbols.x.numel()
-    hess = ca.MX(nx, nx)
-    curved = [(grp, v) for grp, v in zip(groups, local) if "hess" in v]
-    if curved:
-        triplets = [hessian_triplet(g, g.kernel.hessian_pattern(hessian)) for g, _ in curved]
-        pattern = Pattern.of((nx, nx), triplets)
-        hess = _matrix(pattern, [v["hess"] for _, v in curved])
-    return ca.Function(
-        "nlp_hess_l",
-        list(symbols),
-        [hess],
-        ["x", "p", "lam_f", "lam_g"],
-        ["triu_hess_gamma_x_x"],
-    )
 
 
 def _matrix(pattern: Pattern, local: list[ca.MX]) -> ca.MX:

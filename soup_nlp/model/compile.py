@@ -6,6 +6,7 @@ import hashlib
 import logging
 import os
 import platform
+import resource
 import shutil
 import subprocess
 import tempfile
@@ -31,6 +32,12 @@ def find_compiler() -> str | None:
     """The C compiler to use: $CC, else cc, gcc or clang on the PATH; None when there is none."""
     names = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
     return next((path for name in names if (path := shutil.which(name))), None)
+
+
+def compiler_seconds() -> float:
+    """CPU seconds of child processes that have ended: the C compiler's."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _cpu() -> str:

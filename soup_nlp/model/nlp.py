@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from soup_nlp.errors import ModelError
-from soup_nlp.model.assemble import Functions, assemble_functions
+from soup_nlp.model.assemble import (
+    Functions,
+    Pattern,
+    assemble_functions,
+    assemble_hessian,
+    hessian_pattern,
+)
 from soup_nlp.model.kernel import HESSIANS, Group
 
 Float = NDArray[np.float64]
@@ -50,10 +56,26 @@ class NLP:
 
     @cached_property
     def functions(self) -> Functions:
-        """What a solver calls; assembled (seconds at real sizes) by the first access."""
-        return assemble_functions(
-            self.groups, self.nx, self.ng, len(self.theta), self.hessian, self.compiled
-        )
+        """What a solver calls but the Hessian; assembled (a second) by the first access."""
+        return assemble_functions(self.groups, self.nx, self.ng, len(self.theta), self.compiled)
+
+    @cached_property
+    def hessian_pattern(self) -> Pattern:
+        """Of the Hessian's upper triangle."""
+        return hessian_pattern(self.groups, self.nx, self.hessian)
+
+    @cached_property
+    def hess_lag(self) -> ca.Function:
+        """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian; by itself, since
+        assembling it takes seconds at real sizes."""
+        return self.other_hessian(self.hessian)
+
+    def other_hessian(self, hessian: str) -> ca.Function:
+        """`hess_lag` of any kind."""
+        own = hessian == self.hessian
+        pattern = self.hessian_pattern if own else hessian_pattern(self.groups, self.nx, hessian)
+        sizes = self.ng, len(self.theta)
+        return assemble_hessian(self.groups, pattern, *sizes, hessian, self.compiled)
 
     @property
     def oracle(self) -> ca.Function:
@@ -69,11 +91,6 @@ class NLP:
     def jac_g(self) -> ca.Function:
         """(x, p) -> g, Jacobian (ng x nx sparse)."""
         return self.functions.jac_g
-
-    @property
-    def hess_lag(self) -> ca.Function:
-        """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian."""
-        return self.functions.hess_lag
 
     @property
     def nx(self) -> int:
@@ -93,7 +110,7 @@ class NLP:
     @property
     def nnzh(self) -> int:
         """Nonzeros of the Hessian's upper triangle."""
-        return int(self.hess_lag.nnz_out(0))
+        return len(self.hessian_pattern.rows)
 
     def with_theta(self, **values: float) -> Float:
         """p with other theta entries."""
@@ -126,7 +143,7 @@ class NLP:
         ):
             share = nnz / cells if cells else 0.0
             lines.append(f"  {label:<11} {nnz:>9} nonzeros, {share:.3%} of {cells}")
-        lines.append(f"  Hessian kind: {self.hessian}; built in {self.functions.seconds:.2f} s")
+        lines.append(f"  Hessian kind: {self.hessian}")
         lines += [f"  {g.kernel.name:<12} {g.size:>7} x {g.kernel}" for g in self.groups]
         return "\n".join(lines)
 

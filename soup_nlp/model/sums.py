@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.model.assemble import Pattern, hessian_triplet, jacobian_triplet, other_hessian
+from soup_nlp.model.assemble import Pattern, hessian_triplet, jacobian_triplet
 from soup_nlp.model.buffered import Buffered
 from soup_nlp.model.kernel import Group
 from soup_nlp.model.lanes import Lanes, NoLanesError, Summed, compile_lanes, in_lanes, summing
@@ -27,6 +27,8 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 log = logging.getLogger(__name__)
+
+_NOTHING = np.zeros(0, np.int64), np.zeros(0, np.int64)
 
 
 class Timer(dict[str, float]):
@@ -71,12 +73,12 @@ class Sums(Protocol):
         """g (ng,) and the nonzeros of its Jacobian, in the order of `jacobian`."""
         ...
 
-    def hessian(self, kind: str, x: Float, lam_g: Float) -> Float:
-        """Nonzeros of the Hessian of `f + lam_g . g`, in the order of `upper`."""
+    def hessian(self, kind: str, x: Float, lam_g: Float, lam_f: float = 1.0) -> Float:
+        """Nonzeros of the Hessian of `lam_f f + lam_g . g`, in the order of `upper`."""
         ...
 
 
-def make_sums(nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int]) -> Sums:
+def make_sums(nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int] | None = None) -> Sums:
     """The sums of an NLP by the fastest way there is.
 
     Args:
@@ -84,6 +86,7 @@ def make_sums(nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int]) -> Su
         hessians: Kinds of Hessian (kernel.HESSIANS); not empty.
         besides: Rows and columns of further nonzeros of the upper triangle.
     """
+
     if nlp.compiled:
         try:
             return LaneSums(nlp, hessians, besides)
@@ -95,14 +98,13 @@ def make_sums(nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int]) -> Su
 class FunctionSums:
     """Sums by the NLP's CasADi functions."""
 
-    def __init__(self, nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int]) -> None:
+    def __init__(
+        self, nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int] | None = None
+    ) -> None:
         """Assemble them; arguments as of `make_sums`."""
         self.p, self.seconds = nlp.p, Timer()
-        sizes = nlp.nx, nlp.ng, len(nlp.theta)
         functions = {
-            kind: nlp.hess_lag
-            if kind == nlp.hessian
-            else other_hessian(nlp.groups, *sizes, kind, nlp.compiled)
+            kind: nlp.hess_lag if kind == nlp.hessian else nlp.other_hessian(kind)
             for kind in hessians
         }
         x, p = nlp.oracle.mx_in()
@@ -111,7 +113,7 @@ class FunctionSums:
         self._hessian = {kind: Buffered(h) for kind, h in functions.items()}
         self.jacobian = Pattern.of((nlp.ng, nlp.nx), [_triplet(nlp.jac_g.sparsity_out(1))])
         own = [_triplet(h.sparsity_out(0)) for h in functions.values()]
-        self.upper = Pattern.of((nlp.nx, nlp.nx), [*own, besides])
+        self.upper = Pattern.of((nlp.nx, nlp.nx), [*own, besides or _NOTHING])
         self._places = dict(zip(functions, self.upper.places))
 
     def value(self, x: Float) -> float:
@@ -130,19 +132,31 @@ class FunctionSums:
             g, jacobian = self._rows(x, self.p)
             return g.copy(), jacobian.copy()
 
-    def hessian(self, kind: str, x: Float, lam_g: Float) -> Float:
+    def hessian(self, kind: str, x: Float, lam_g: Float, lam_f: float = 1.0) -> Float:
         """See Sums."""
         with self.seconds.of("hess_lag"):
             out = np.zeros(len(self.upper.rows))
-            out[self._places[kind]] = self._hessian[kind](x, self.p, 1.0, lam_g)[0]
+            out[self._places[kind]] = self._hessian[kind](x, self.p, lam_f, lam_g)[0]
             return out
 
 
 class LaneSums:
     """Sums by kernels on vectors of elements."""
 
-    def __init__(self, nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int]) -> None:
-        """Compile them or take them from the cache; arguments as of `make_sums`.
+    def __init__(
+        self,
+        nlp: NLP,
+        hessians: Sequence[str],
+        besides: tuple[Int, Int] | None = None,
+        first_order: bool = True,
+    ) -> None:
+        """Compile them or take them from the cache.
+
+        Args:
+            nlp: See `make_sums`.
+            hessians: See `make_sums`.
+            besides: See `make_sums`.
+            first_order: False for Hessians alone.
 
         Raises:
             NoLanesError: That is not possible here.
@@ -152,20 +166,26 @@ class LaneSums:
         nx, ng = nlp.nx, nlp.ng
         made: list[dict[str, ca.Function]] = []
         for group in nlp.groups:
-            functions = group.kernel.first_order()
+            functions = group.kernel.first_order() if first_order else {}
             for k, kind in enumerate(hessians):
                 hessian = group.kernel.second_order(kind, str(k))
                 functions |= {kind: hessian} if hessian else {}
             made.append(functions)
-        library = compile_lanes([f for functions in made for f in functions.values()])
+        # a library for every kernel, so that another of one leaves the others in the cache
+        libraries = [compile_lanes(list(functions.values())) for functions in made]
         kinds = [[k for k in hessians if k in functions] for functions in made]
         unions = [_union(g, own) for g, own in zip(nlp.groups, kinds)]
-        with_rows = [g for g in nlp.groups if g.kernel.nc]
+        with_rows = [g for g, functions in zip(nlp.groups, made) if "jac" in functions]
         self.jacobian = Pattern.of((ng, nx), [jacobian_triplet(g) for g in with_rows])
-        self.upper = Pattern.of((nx, nx), [*(u.triplet for u in unions), besides])
+        if list(hessians) == [nlp.hessian] and besides is None:
+            self.upper = nlp.hessian_pattern
+        else:
+            self.upper = Pattern.of((nx, nx), [*(u.triplet for u in unions), besides or _NOTHING])
         jacobian_places = iter(self.jacobian.places)
         self._terms: dict[str, list[Summed]] = {}
-        for group, functions, union, upper in zip(nlp.groups, made, unions, self.upper.places):
+        for group, functions, library, union, upper in zip(
+            nlp.groups, made, libraries, unions, self.upper.places
+        ):
             table, size = group.table, group.size
             lanes = Lanes.of(table)
             place = {"f": np.zeros((size, 1)), "grad": table.index, "con": table.rows}
@@ -183,12 +203,12 @@ class LaneSums:
         sizes = {"f": 1, "grad": nx, "con": ng, "jac": len(self.jacobian.rows)}
         return sizes.get(key, len(self.upper.rows))
 
-    def _sum(self, key: str, x: Float, lam_g: Float | None = None) -> Float:
+    def _sum(self, key: str, x: Float, lam_g: Float | None = None, lam_f: float = 1.0) -> Float:
         # one entry more, for what fills the last block
         out = np.zeros(self._size(key) + 1)
         theta = np.ascontiguousarray(self.p[: self._sizes[2]])
         for term in self._terms.get(key, []):
-            term.add(out, x, theta, 1.0, lam_g)
+            term.add(out, x, theta, lam_f, lam_g)
         return out[:-1]
 
     def value(self, x: Float) -> float:
@@ -206,10 +226,10 @@ class LaneSums:
         with self.seconds.of("jac_g"):
             return self._sum("con", x), self._sum("jac", x)
 
-    def hessian(self, kind: str, x: Float, lam_g: Float) -> Float:
+    def hessian(self, kind: str, x: Float, lam_g: Float, lam_f: float = 1.0) -> Float:
         """See Sums."""
         with self.seconds.of("hess_lag"):
-            return self._sum(kind, x, lam_g)
+            return self._sum(kind, x, lam_g, lam_f)
 
 
 class _Union(NamedTuple):

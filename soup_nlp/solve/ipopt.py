@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
+from soup_nlp.solve.hessian import fast_hessian
 
 Float = NDArray[np.float64]
 
@@ -210,6 +211,8 @@ class Ipopt:
     def __init__(self, nlp: NLP, options: Mapping[str, Any] | None = None) -> None:
         self.nlp = nlp
         self.options = dict(options or {})
+        # CasADi does not keep a callback alive
+        self.hess_lag = fast_hessian(nlp)
 
     def _solver(self, watch: _Watch, max_iter: int, tol: float, log_file: str | None) -> Any:
         nlp = self.nlp
@@ -230,7 +233,7 @@ class Ipopt:
             "ipopt": ipopt,
             "grad_f": nlp.grad_f,
             "jac_g": nlp.jac_g,
-            "hess_lag": nlp.hess_lag,
+            "hess_lag": self.hess_lag,
             "iteration_callback": watch,
             "print_time": False,
             "calc_lam_p": False,

@@ -1,0 +1,226 @@
+"""Sums on vectors of elements: equal to CasADi's, at every size, and honest where impossible."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from soup_nlp.cases import Case, prepare
+from soup_nlp.config import make_problem
+from soup_nlp.model import compile as compiling
+from soup_nlp.model.formulation import Formulation, build_matrix_nlp
+from soup_nlp.model.kernel import Group, Kernel, Table
+from soup_nlp.model.lanes import LANES, NoLanesError, compile_lanes, in_lanes
+from soup_nlp.model.layout import Chart
+from soup_nlp.model.nlp import NLP, assemble
+from soup_nlp.model.sums import FunctionSums, LaneSums, make_sums
+from soup_nlp.solve.hessian import LaneHessian, fast_hessian
+from soup_nlp.solve.ipopt import Ipopt
+from soup_nlp.solve.tangent import TangentProblem
+
+needs_compiler = pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("SOUP_NLP_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
+    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+
+
+def close(a, b, rtol=1e-9):
+    a, b = np.asarray(a), np.asarray(b)
+    np.testing.assert_allclose(a, b, rtol=0, atol=rtol * np.abs(b).max(initial=1e-300))
+
+
+def squares(elements: int, compiled: bool = True) -> NLP:
+    """sum_e 3 w_e (x_e^2 + x_e x_0 + x_0^2) subject to x_e^2 x_0 >= 0 for every element e."""
+    x, row, theta = ca.SX.sym("x", 2), ca.SX.sym("w"), ca.SX.sym("theta")
+    kernel = Kernel(
+        "squares",
+        x,
+        row,
+        theta,
+        objective=theta * row * (x[0] ** 2 + x[0] * x[1] + x[1] ** 2),
+        constraints=x[0] ** 2 * x[1],
+    )
+    e = np.arange(elements)
+    table = Table(
+        np.column_stack([e + 1, 0 * e]), np.linspace(1.0, 2.0, elements)[:, None], e[:, None]
+    )
+    n = elements + 1
+    return assemble(
+        "squares",
+        (Group(kernel, table),),
+        x0=np.linspace(0.5, 1.5, n),
+        lbx=np.full(n, -np.inf),
+        ubx=np.full(n, np.inf),
+        lbg=np.zeros(elements),
+        ubg=np.full(elements, np.inf),
+        theta={"theta": 3.0},
+        hessian="exact",
+        x_names=lambda: [f"x[{i}]" for i in range(n)],
+        g_names=lambda: [f"g[{i}]" for i in range(elements)],
+        compiled=compiled,
+    )
+
+
+# --- the same numbers ----------------------------------------------------------------------------
+
+
+@needs_compiler
+@pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
+def test_vectors_and_functions_give_the_same_presolve(case, chart: Chart):
+    args = case.soup, case.data, case.weights
+    fast = TangentProblem(*args, Formulation(compiled=True), chart=chart)
+    slow = TangentProblem(*args, Formulation(compiled=False), chart=chart)
+    assert isinstance(fast.sums, LaneSums)
+    assert isinstance(slow.sums, FunctionSums)
+    np.testing.assert_array_equal(fast.block, slow.block)
+    np.testing.assert_array_equal(fast.upper.indices, slow.upper.indices)
+    rng = np.random.default_rng(1)
+    x = fast.nlp.x0 * (1 + 0.01 * rng.normal(size=fast.nlp.nx))
+    z = rng.uniform(0.1, 1.0, fast.slacks(x)[0].shape)
+    for eps in (0.1, 0.01):
+        fast.smoothing(eps)
+        slow.smoothing(eps)
+        assert fast.value(x) == pytest.approx(slow.value(x), rel=1e-12)
+        close(fast.gradient(x), slow.gradient(x))
+        for a, b in zip(fast.slacks(x), slow.slacks(x)):
+            close(a, b)
+        for kind in ("gauss-newton", "exact"):
+            close(fast.hessian(x, z, kind), slow.hessian(x, z, kind))
+
+
+@needs_compiler
+@pytest.mark.parametrize("elements", [1, LANES - 1, LANES, LANES + 1, 3 * LANES + 2])
+def test_tables_of_every_size(elements):
+    nlp, other = squares(elements), squares(elements, compiled=False)
+    fast, slow = LaneSums(nlp, ["exact"]), FunctionSums(other, ["exact"])
+    x, lam = nlp.x0, np.linspace(-1, 1, elements)
+    assert fast.value(x) == pytest.approx(slow.value(x), rel=1e-14)
+    close(fast.gradient(x), slow.gradient(x), 1e-14)
+    for a, b in zip(fast.constraints(x), slow.constraints(x)):
+        close(a, b, 1e-14)
+    close(fast.hessian("exact", x, lam, 0.5), slow.hessian("exact", x, lam, 0.5), 1e-14)
+    assert all(seconds > 0 for seconds in fast.seconds.values())
+
+
+@needs_compiler
+def test_what_the_caller_wants_besides_stands_in_the_pattern():
+    nlp = squares(5)
+    corner = np.array([2]), np.array([4])
+    sums = LaneSums(nlp, ["exact"], corner)
+    (place,) = sums.upper.places[-1]
+    assert (sums.upper.rows[place], sums.upper.columns[place]) == (2, 4)
+    assert sums.hessian("exact", nlp.x0, np.ones(5))[place] == 0
+
+
+@needs_compiler
+def test_other_parameters_are_used():
+    nlp = squares(5)
+    sums = LaneSums(nlp, ["exact"])
+    before = sums.value(nlp.x0)
+    sums.p = nlp.with_theta(theta=6.0)
+    assert sums.value(nlp.x0) == pytest.approx(2 * before, rel=1e-14)
+
+
+@needs_compiler
+def test_every_operation_has_casadis_value():
+    a, b = ca.SX.sym("a"), ca.SX.sym("b")
+    body = ca.vertcat(
+        a + b - a * b / (2 + b),
+        -a,
+        a**2 + 2 * a + 1 / (3 + a),
+        ca.sqrt(4 + a),
+        ca.fmax(a, b) - ca.fmin(a, 0.5),
+        ca.fabs(b),
+        ca.if_else(a < b, a, b),
+        ca.if_else(a <= b, 1, a),
+        ca.logic_not(a < b),
+        1.5,
+    )
+    f = ca.Function("every", [a, b, ca.SX(0, 1)], [body])
+    library = compile_lanes([f])
+    rng = np.random.default_rng(2)
+    x, data = rng.normal(size=(LANES, 1)), rng.normal(size=(LANES, 1))
+    place = np.arange(LANES * 10).reshape(LANES, 10)
+    index, places = in_lanes(np.arange(LANES)[:, None], np.int32), in_lanes(place, np.int32)
+    out, none, lanes = np.zeros(LANES * 10), np.zeros(1), in_lanes(data)
+    pointers = [ctypes.c_void_p(q.ctypes.data) for q in (x, index, lanes, none)]
+    rest = [ctypes.c_void_p(q.ctypes.data) for q in (none, index, places, out)]
+    library.every_sum(ctypes.c_long(1), *pointers, ctypes.c_double(1.0), *rest)
+    expected = [np.asarray(f(*pair, [])).ravel() for pair in zip(x.ravel(), data.ravel())]
+    np.testing.assert_allclose(out.reshape(LANES, 10), expected, rtol=1e-14)
+
+
+@needs_compiler
+def test_the_hessian_that_ipopt_takes_is_the_programs(case):
+    form = Formulation()
+    nlp, _ = build_matrix_nlp(case.soup, case.data, case.weights, form)
+    rng = np.random.default_rng(3)
+    args = nlp.x0, nlp.with_theta(eps=0.05), 0.7, rng.normal(size=nlp.ng)
+    fast = fast_hessian(nlp)
+    assert isinstance(fast, LaneHessian)
+    one, two = fast(*args), nlp.hess_lag(*args)
+    assert one.sparsity() == two.sparsity()
+    close(one.nonzeros(), two.nonzeros())
+    assert fast.nnz_out(0) == nlp.nnzh
+
+
+@needs_compiler
+def test_ipopt_converges_with_it():
+    stage = Ipopt(squares(9))(x0=np.full(10, 0.7), tol=1e-8)
+    assert stage.converged
+    assert stage.objective == pytest.approx(0.0, abs=1e-6)
+
+
+# --- the cache, and where there is no way --------------------------------------------------------
+
+
+@needs_compiler
+def test_kernels_serve_another_camera(case, own_cache):
+    TangentProblem(case.soup, case.data, case.weights, Formulation())
+    before = sorted(p.name for p in own_cache.glob("*"))
+    K = case.data.K_next * np.array([[1.1], [1.2], [1.0]])
+    other = TangentProblem(
+        case.soup, replace(case.data, K_next=K), case.weights, Formulation(), exact=True
+    )
+    assert isinstance(other.sums, LaneSums)
+    assert sorted(p.name for p in own_cache.glob("*")) == before
+
+
+@needs_compiler
+def test_an_operation_without_a_twin_is_refused(own_cache):
+    x, nothing = ca.SX.sym("x"), ca.SX(0, 1)
+    with pytest.raises(NoLanesError, match="waves: operation"):
+        compile_lanes([ca.Function("waves", [x, nothing, nothing], [ca.sin(x)])])
+
+
+def test_without_a_compiler_functions_do_it(own_cache, monkeypatch, caplog):
+    monkeypatch.setenv("CC", "/bin/false")
+    nlp = squares(5)
+    with caplog.at_level(logging.INFO):
+        sums = make_sums(nlp, ["exact"])
+    assert isinstance(sums, FunctionSums)
+    assert "no machine code on vectors" in caplog.text
+    assert not isinstance(fast_hessian(nlp), LaneHessian)
+    assert sums.value(nlp.x0) == pytest.approx(float(nlp.oracle(nlp.x0, nlp.p)[0]), rel=1e-14)
+
+
+@needs_compiler
+def test_a_library_that_does_not_load_is_no_way(monkeypatch, tmp_path):
+    broken = tmp_path / "broken.so"
+    broken.write_text("not a library")
+    monkeypatch.setattr("soup_nlp.model.lanes.shared_library", lambda key, source: broken)
+    assert isinstance(make_sums(squares(5), ["exact"]), FunctionSums)
