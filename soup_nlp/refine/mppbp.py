@@ -83,7 +83,7 @@ class RefineOptions:
     particles: int = 50
     keep: float = 0.25
     depth_reach: float = 2.0
-    trws_iterations: int = 30
+    trws_iterations: int = 15
     trws_gap: float = 1e-4
     stagnation: float = 0.0
     max_seconds: float = 300.0
