@@ -136,6 +136,15 @@ def test_other_parameters_are_used():
 
 
 @needs_compiler
+def test_lengths_are_checked_before_machine_code_reads():
+    sums = LaneSums(squares(5), ["exact"])
+    with pytest.raises(ValueError, match="x has 2 entries, expected 6"):
+        sums.value(np.zeros(2))
+    with pytest.raises(ValueError, match="lam_g has 1 entries, expected 5"):
+        sums.hessian("exact", np.zeros(6), np.zeros(1))
+
+
+@needs_compiler
 def test_every_operation_has_casadis_value():
     a, b = ca.SX.sym("a"), ca.SX.sym("b")
     body = ca.vertcat(

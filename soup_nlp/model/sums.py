@@ -86,7 +86,6 @@ def make_sums(nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int] | None
         hessians: Kinds of Hessian (kernel.HESSIANS); not empty.
         besides: Rows and columns of further nonzeros of the upper triangle.
     """
-
     if nlp.compiled:
         try:
             return LaneSums(nlp, hessians, besides)
@@ -171,10 +170,10 @@ class LaneSums:
                 hessian = group.kernel.second_order(kind, str(k))
                 functions |= {kind: hessian} if hessian else {}
             made.append(functions)
-        # a library for every kernel, so that another of one leaves the others in the cache
-        libraries = [compile_lanes(list(functions.values())) for functions in made]
-        kinds = [[k for k in hessians if k in functions] for functions in made]
-        unions = [_union(g, own) for g, own in zip(nlp.groups, kinds)]
+        unions = [
+            _union(group, [k for k in hessians if k in functions])
+            for group, functions in zip(nlp.groups, made)
+        ]
         with_rows = [g for g, functions in zip(nlp.groups, made) if "jac" in functions]
         self.jacobian = Pattern.of((ng, nx), [jacobian_triplet(g) for g in with_rows])
         if list(hessians) == [nlp.hessian] and besides is None:
@@ -183,9 +182,9 @@ class LaneSums:
             self.upper = Pattern.of((nx, nx), [*(u.triplet for u in unions), besides or _NOTHING])
         jacobian_places = iter(self.jacobian.places)
         self._terms: dict[str, list[Summed]] = {}
-        for group, functions, library, union, upper in zip(
-            nlp.groups, made, libraries, unions, self.upper.places
-        ):
+        for group, functions, union, upper in zip(nlp.groups, made, unions, self.upper.places):
+            # a library for every kernel, so that another of one leaves the others in the cache
+            library = compile_lanes(list(functions.values()))
             table, size = group.table, group.size
             lanes = Lanes.of(table)
             place = {"f": np.zeros((size, 1)), "grad": table.index, "con": table.rows}
@@ -204,11 +203,13 @@ class LaneSums:
         return sizes.get(key, len(self.upper.rows))
 
     def _sum(self, key: str, x: Float, lam_g: Float | None = None, lam_f: float = 1.0) -> Float:
+        nx, ng, thetas = self._sizes
+        x, lam = _vector("x", x, nx), lam_g if lam_g is None else _vector("lam_g", lam_g, ng)
+        theta = _vector("p", self.p[:thetas], thetas)
         # one entry more, for what fills the last block
         out = np.zeros(self._size(key) + 1)
-        theta = np.ascontiguousarray(self.p[: self._sizes[2]])
         for term in self._terms.get(key, []):
-            term.add(out, x, theta, lam_f, lam_g)
+            term.add(out, x, theta, lam_f, lam)
         return out[:-1]
 
     def value(self, x: Float) -> float:
@@ -230,6 +231,17 @@ class LaneSums:
         """See Sums."""
         with self.seconds.of("hess_lag"):
             return self._sum(kind, x, lam_g, lam_f)
+
+
+def _vector(name: str, values: Float, size: int) -> Float:
+    """What C may read; machine code sees no lengths.
+
+    Raises:
+        ValueError: Another length.
+    """
+    if len(values) != size:
+        raise ValueError(f"{name} has {len(values)} entries, expected {size}")
+    return np.ascontiguousarray(values, dtype=float)
 
 
 class _Union(NamedTuple):
