@@ -20,6 +20,9 @@ WORDS = {
     "Skipped": "refined from the start, no NLP",
     "Interrupted": "interrupted, best iterate kept",
     "Infeasible_Problem_Detected": "not converged: no feasible point nearby, best iterate kept",
+    "Error_In_Step_Computation": "not converged: no further step is found, best iterate kept",
+    "Search_Direction_Becomes_Too_Small": "not converged: steps are of rounding size, best iterate"
+    " kept",
     "Restoration_Failed": "not converged: feasibility could not be restored, best iterate kept",
 }
 TITLES = {"nlp": "NLP alone", "rigid": "one rigid motion", "constant": "constant depth"}
