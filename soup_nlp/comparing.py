@@ -69,8 +69,9 @@ class _Maker:
             nlp, layout = self.case.nlp(self.form)
             second, _ = self.case.nlp(replace(self.form, hessian="gauss-newton+constraints"))
             self._built = Task(
-                nlp=nlp,
-                gauss_newton=second,
+                # a solver's time is its own
+                nlp=nlp.assembled(),
+                gauss_newton=second.assembled(),
                 layout=layout,
                 soup=self.case.soup,
                 data=self.case.data,

