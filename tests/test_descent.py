@@ -53,7 +53,7 @@ def inner_point(problem: TangentProblem) -> np.ndarray:
     """A point off the start, inside all slacks."""
     rng = np.random.default_rng(3)
     x = Descent(problem).x
-    return problem.normalise(x * (1 + 0.01 * rng.normal(size=x.shape)))
+    return problem.normalise(x + 0.01 * rng.normal(size=x.shape))
 
 
 # --- the numbers of the problem ------------------------------------------------------------------

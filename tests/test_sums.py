@@ -19,7 +19,7 @@ from soup_nlp.model.lanes import LANES, NoLanesError, compile_lanes, in_lanes
 from soup_nlp.model.layout import Chart
 from soup_nlp.model.nlp import NLP, assemble
 from soup_nlp.model.sums import FunctionSums, LaneSums, make_sums
-from soup_nlp.solve.hessian import LaneHessian, fast_hessian
+from soup_nlp.solve.hessian import LagrangianHessian
 from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.tangent import TangentProblem
 
@@ -173,14 +173,13 @@ def test_every_operation_has_casadis_value():
     np.testing.assert_allclose(out.reshape(LANES, 10), expected, rtol=1e-14)
 
 
-@needs_compiler
-def test_the_hessian_that_ipopt_takes_is_the_programs(case):
-    form = Formulation()
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_hessian_that_ipopt_takes_is_the_programs(case, compiled):
+    form = Formulation(compiled=compiled)
     nlp, _ = build_matrix_nlp(case.soup, case.data, case.weights, form)
     rng = np.random.default_rng(3)
     args = nlp.x0, nlp.with_theta(eps=0.05), 0.7, rng.normal(size=nlp.ng)
-    fast = fast_hessian(nlp)
-    assert isinstance(fast, LaneHessian)
+    fast = LagrangianHessian(nlp)
     one, two = fast(*args), nlp.hess_lag(*args)
     assert one.sparsity() == two.sparsity()
     close(one.nonzeros(), two.nonzeros())
@@ -232,7 +231,6 @@ def test_without_a_compiler_functions_do_it(own_cache, monkeypatch, caplog):
         sums = make_sums(nlp, ["exact"])
     assert isinstance(sums, FunctionSums)
     assert "no machine code on vectors" in caplog.text
-    assert not isinstance(fast_hessian(nlp), LaneHessian)
     assert sums.value(nlp.x0) == pytest.approx(float(nlp.oracle(nlp.x0, nlp.p)[0]), rel=1e-14)
 
 

@@ -66,6 +66,7 @@ def elements(
                 extra[f"radius_{a}"] = layout.radius[i]
                 extra[f"depth_{a}"] = layout.depth[i]
                 extra[f"R0_{a}"] = layout.R0[i].transpose(0, 2, 1).reshape(-1, 9)
+                extra[f"t0_{a}"] = layout.t0[i]
             else:
                 extra[f"offset_{a}"] = layout.offset[i]
         merged = {**columns, **extra}

@@ -124,6 +124,7 @@ class TangentLayout:
         share: (N,) weights c of the length unit.
         depth: (N,) Z0, depth of the anchors in the base, in that unit.
         R0: (N, 3, 3) base rotations.
+        t0: (N, 3) base translations / Z0.
         chart: "depth" or "inverse-depth".
     """
 
@@ -132,14 +133,16 @@ class TangentLayout:
     share: Float
     depth: Float
     R0: Float
+    t0: Float
     chart: Chart = "depth"
 
     @classmethod
     def about(cls, soup: Soup, data: EnergyData, chart: Chart = "depth") -> TangentLayout:
         """Layout whose base is the soup, its rotations made exactly orthogonal."""
-        depth = soup.normalised(data.share).depth_at(data.anchor_ray)
-        R0 = rotation.nearest(soup.R)
-        return cls(data.anchor_ray, data.radius, data.share, depth, R0, chart)
+        s = soup.normalised(data.share)
+        depth = s.depth_at(data.anchor_ray)
+        R0, t0 = rotation.nearest(soup.R), s.translation / depth[:, None]
+        return cls(data.anchor_ray, data.radius, data.share, depth, R0, t0, chart)
 
     @property
     def count(self) -> int:
@@ -161,7 +164,8 @@ class TangentLayout:
         angle = np.linalg.norm(w, axis=1, keepdims=True)
         # Cayley vector of the same rotation: 2 tan(angle / 2) along the axis
         w = w * np.where(angle > 1e-12, 2 * np.tan(angle / 2) / np.maximum(angle, 1e-12), 1.0)
-        q = s.translation / depth[:, None] + np.einsum("nij,nj->ni", s.R, self.anchor)
+        q = s.translation / depth[:, None] - self.t0
+        q += np.einsum("nij,nj->ni", s.R - self.R0, self.anchor)
         a = np.column_stack([depth / self.depth, slope, w, q])
         return (_turned(a) if self.chart == "inverse-depth" else a).ravel()
 
@@ -175,7 +179,8 @@ class TangentLayout:
         depth = a[:, 0] * self.depth
         D = depth / length
         R = rotation.nearest(self.R0 @ rotation.cayley(a[:, 3:6]))
-        T = depth[:, None] * (a[:, 6:9] - np.einsum("nij,nj->ni", R, self.anchor))
+        t = self.t0 + (a[:, 6:9] - np.einsum("nij,nj->ni", R - self.R0, self.anchor))
+        T = depth[:, None] * t
         raw = Soup(D, -m / length[:, None], np.ones(len(D)), R, T / D[:, None])
         return raw.normalised(self.share)
 

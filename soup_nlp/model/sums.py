@@ -78,17 +78,23 @@ class Sums(Protocol):
         ...
 
 
-def make_sums(nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int] | None = None) -> Sums:
+def make_sums(
+    nlp: NLP,
+    hessians: Sequence[str],
+    besides: tuple[Int, Int] | None = None,
+    first_order: bool = True,
+) -> Sums:
     """The sums of an NLP by the fastest way there is.
 
     Args:
         nlp: The NLP.
         hessians: Kinds of Hessian (kernel.HESSIANS); not empty.
         besides: Rows and columns of further nonzeros of the upper triangle.
+        first_order: False where Hessians alone are wanted.
     """
     if nlp.compiled:
         try:
-            return LaneSums(nlp, hessians, besides)
+            return LaneSums(nlp, hessians, besides, first_order)
         except NoLanesError as error:
             log.info("no machine code on vectors: %s", error)
     return FunctionSums(nlp, hessians, besides)
@@ -155,7 +161,7 @@ class LaneSums:
             nlp: See `make_sums`.
             hessians: See `make_sums`.
             besides: See `make_sums`.
-            first_order: False for Hessians alone.
+            first_order: See `make_sums`.
 
         Raises:
             NoLanesError: That is not possible here.

@@ -38,9 +38,8 @@ def build_tangent_nlp(
     b = Builder(form, 9 * n)
 
     def view(x: ca.SX, row: dict[str, ca.SX], a: int) -> View:
-        return tangent_view(
-            x, row[f"anchor_{a}"], row[f"radius_{a}"], row[f"depth_{a}"], row[f"R0_{a}"], chart
-        )
+        base = {k: row[f"{k}_{a}"] for k in ("anchor", "radius", "depth", "R0", "t0")}
+        return tangent_view(x, **base, chart=chart)
 
     for name, element in elements(data, weights, layout).items():
         b.add_norms(f"t_{name}", element.placed(layout), view, 9)

@@ -25,14 +25,13 @@ def arap(
     weight, unit = row["weight"], row["unit"]
     if local:
         unit = unit / _nearness(Xa, Xb)
-    Ya, Yb = a.move(Xa), b.move(Xb)
     gap = a.lam * a.t - b.lam * b.t
     if at_anchors:
-        gap = gap + (a.R - b.R) @ ((Xa + Xb) / 2)
+        gap = gap + a.turn_from(b) @ ((Xa + Xb) / 2)
     # |Xa - Xb| is smooth wherever two anchors differ, so it needs no slack of its own
-    stretch = ca.sqrt(ca.sumsqr(Xa - Xb) + 1e-12) - ca.sqrt(ca.sumsqr(Ya - Yb) + 1e-12)
+    stretch = ca.sqrt(ca.sumsqr(Xa - Xb) + 1e-12) - ca.sqrt(ca.sumsqr(a.apart(Xa, b, Xb)) + 1e-12)
     return [
-        Norm("rotation", weight, row["turn"] * ca.vec(a.R - b.R), eps, sigma, leak=leak),
+        Norm("rotation", weight, row["turn"] * ca.vec(a.turn_from(b)), eps, sigma, leak=leak),
         Norm("translation", weight, gap / unit, eps, sigma, leak=leak),
         Norm("distance", weight, stretch / unit, eps, sigma, leak=leak),
     ]
@@ -70,7 +69,7 @@ def continuity(
         ray = row["rays"][3 * j : 3 * j + 3]
         Xa, Xb = a.point(ray), b.point(ray)
         before.append(Xa - Xb)
-        after.append(a.move(Xa) - b.move(Xb))
+        after.append(a.apart(Xa, b, Xb))
     f = row["factor"]
     if local:
         f = f * _nearness(a.point(row["ray_i"]), b.point(row["ray_k"]))

@@ -6,7 +6,7 @@ three gauges, or tangent coordinates about a base) says how its variables make o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 
@@ -19,15 +19,26 @@ class View:
         lam: Scale (1x1): reference point of ray r is `lam r / (m . r)`.
         m: (3x1) inverse-depth plane of unit scale, `m = -n / d`.
         n: (3x1) unit normal that faces the camera.
-        R: (3x3) rotation.
+        turn: (3x3) what variables add to the rotation.
         t: (3x1) translation of unit scale: `X' = R X + lam t`.
+        R0: (3x3) the rest of the rotation, constant; nothing, unless a view has a base.
     """
 
     lam: ca.SX
     m: ca.SX
     n: ca.SX
-    R: ca.SX
+    turn: ca.SX
     t: ca.SX
+    R0: ca.SX = field(default_factory=lambda: ca.SX(3, 3))
+
+    @property
+    def R(self) -> ca.SX:
+        """(3x3) rotation."""
+        return self.R0 + self.turn
+
+    def turn_from(self, other: View) -> ca.SX:
+        """(3x3) difference of two rotations: small numbers are subtracted, not those near 1."""
+        return (self.R0 - other.R0) + (self.turn - other.turn)
 
     def point(self, ray: ca.SX) -> ca.SX:
         """Reference-frame point (3x1) of a ray (3x1)."""
@@ -36,6 +47,11 @@ class View:
     def move(self, point: ca.SX) -> ca.SX:
         """Next-frame point of a reference-frame point."""
         return self.R @ point + self.lam * self.t
+
+    def apart(self, point: ca.SX, other: View, others: ca.SX) -> ca.SX:
+        """`self.move(point) - other.move(others)`, as a sum of small differences."""
+        turned = self.R @ (point - others) + self.turn_from(other) @ others
+        return turned + (self.lam * self.t - other.lam * other.t)
 
     def transfer(self, ray: ca.SX) -> ca.SX:
         """Next-frame ray (3x1, free length) of a reference ray: the homography without K."""
@@ -56,29 +72,38 @@ def matrix_view(x: ca.SX, gauge: str, offset: ca.SX) -> View:
         d, rest = offset, x[4:]
     else:
         d, rest = x[4], x[5:]
-    return View(lam=lam, m=-n / d, n=n, R=ca.reshape(rest[0:9], 3, 3), t=rest[9:12])
+    return View(lam=lam, m=-n / d, n=n, turn=ca.reshape(rest[0:9], 3, 3), t=rest[9:12])
 
 
 TANGENT_SIZE = 9
 
 
 def tangent_view(
-    x: ca.SX, anchor: ca.SX, radius: ca.SX, depth: ca.SX, R0: ca.SX, chart: str = "depth"
+    x: ca.SX,
+    anchor: ca.SX,
+    radius: ca.SX,
+    depth: ca.SX,
+    R0: ca.SX,
+    t0: ca.SX,
+    chart: str = "depth",
 ) -> View:
     """View of the presolve's variables of one superpixel.
 
     `1 / Z(r) = (1 + s . (r - r_a) / h) / Z`, Z = lam Z0 the depth of the anchor; rotation
-    `R = R0 Cayley(w)` about the anchor: `X' = R (X - Z r_a) + Z q`. A rotation about the camera
-    would carry the superpixel across the image and leave the way back to the translation, exact
-    to first order only.
+    `R = R0 Cayley(w)` about the anchor: `X' = R (X - Z r_a) + Z (q0 + q)`, `q0 = R0 r_a + t0`. A
+    rotation about the camera would carry the superpixel across the image and leave the way back to
+    the translation, exact to first order only. Turn and shift are counted from the base, so that
+    differences of two superpixels are those of small numbers: of numbers near 1, rounding alone
+    would hold the dual infeasibility near 1e-7, where depths differ much near 1e-6.
 
     Args:
-        x: (9x1) `lam s w q`: relative scale, slopes (2), rotation (3), moved anchor / Z (3); chart
-            "inverse-depth" has `rho = 1 / lam` and `rho s`.
+        x: (9x1) `lam s w q`: relative scale, slopes (2), rotation (3), shift of the moved anchor
+            / Z (3); chart "inverse-depth" has `rho = 1 / lam` and `rho s`.
         anchor: (3x1) anchor ray r_a.
         radius: h, ray units.
         depth: Z0, depth of the anchor in the base.
         R0: (9x1) base rotation by columns.
+        t0: (3x1) translation / Z0 in the base.
         chart: "depth" or "inverse-depth".
     """
     lam, s, w, q = x[0], x[1:3], x[3:6], x[6:9]
@@ -87,6 +112,7 @@ def tangent_view(
     m = ca.vertcat(s / radius, 1 - ca.dot(s, anchor[0:2]) / radius)
     h = w / 2
     W = ca.skew(h)
-    C = ca.SX.eye(3) + (2 / (1 + ca.dot(h, h))) * (W + W @ W)
-    R = ca.reshape(R0, 3, 3) @ C
-    return View(lam=lam * depth, m=m, n=-m / ca.norm_2(m), R=R, t=q - R @ anchor)
+    base = ca.reshape(R0, 3, 3)
+    turn = base @ ((2 / (1 + ca.dot(h, h))) * (W + W @ W))
+    t = t0 + (q - turn @ anchor)
+    return View(lam=lam * depth, m=m, n=-m / ca.norm_2(m), turn=turn, t=t, R0=base)

@@ -51,6 +51,8 @@ DAMPING = (1e-7, 1e6)
 """Least and most damping mu of a superpixel; scales, slopes, radians, shares of depth."""
 HELD = 1e-3
 """Least damping of a superpixel whose step went too far."""
+FASTER = 0.1
+"""A step beyond the tolerance is kept where the dual infeasibility falls to this share."""
 BLENDS = (0.0, 0.1, 0.3, 1.0)
 """Shares of the majorant in the exact Hessian, tried until the direction is one of descent."""
 
@@ -67,6 +69,7 @@ class Phase:
         iterations: Limit.
         stagnation: Ends when the merit falls by less than this share of f, twice in a row.
         tol: Ends when dual infeasibility is below; "Solve_Succeeded".
+        beyond: Whether steps go on after that while each makes the dual infeasibility a tenth.
         highest: Barrier far from the solution: a superpixel slides along a bent boundary only with
             room to it. It follows 1e-6 of the dual infeasibility down to `barrier`.
     """
@@ -78,6 +81,7 @@ class Phase:
     iterations: int
     stagnation: float
     tol: float
+    beyond: bool = False
     highest: float = 0.0
 
 
@@ -163,6 +167,7 @@ class Descent:
         fresh, blend, small = True, 0.0, 0
         barrier = max(phase.highest, phase.barrier)
         history: list[tuple[float, ...]] = []
+        reached: tuple[float, Point, Float, tuple[float, ...]] | None = None
         status = "Maximum_Iterations_Exceeded"
         nu = 0.0
         for iteration in range(phase.iterations + 1):
@@ -170,7 +175,16 @@ class Descent:
             gap = float((at.slack * self.z).max())
             history.append((at.f, dual, gap, float(np.median(self.damping)), 0.0))
             self._tell(phase, iteration, history[-1], begin)
-            if dual <= phase.tol and gap <= max(phase.tol, 2 * phase.barrier):
+            good = dual <= phase.tol and gap <= max(phase.tol, 2 * phase.barrier)
+            if reached and not (good and dual < FASTER * reached[0]):
+                # the last step was one too many
+                _, at, self.z, history[-1] = reached
+                self.x, good = at.x, True
+                nu, _ = self._dual(problem.gradient(at.x), at.jacobian)
+                reached = None
+            elif good and phase.beyond and iteration < phase.iterations:
+                reached, good = (dual, at, self.z, history[-1]), False
+            if good:
                 status = "Solve_Succeeded"
             elif small >= 2:
                 status = "Stagnated"

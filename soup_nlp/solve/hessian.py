@@ -1,46 +1,29 @@
-"""The Lagrangian's Hessian as Ipopt takes it, by the fastest way there is."""
+"""The Lagrangian's Hessian as Ipopt takes it, made when it is first asked for."""
 
 from __future__ import annotations
 
-import logging
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
 
-from soup_nlp.model.lanes import NoLanesError
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.sums import LaneSums
-
-log = logging.getLogger(__name__)
+from soup_nlp.model.sums import Sums, make_sums
 
 
-def fast_hessian(nlp: NLP) -> ca.Function:
-    """`hess_lag` of an NLP on vectors of elements; its own where that is impossible.
+class LagrangianHessian(ca.Callback):
+    """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian.
 
-    Assembling CasADi's takes as long as all of Ipopt's iterations from a good start.
+    It is that of the NLP's tables: of p only the leading parameters theta are read. A start that
+    is a KKT point needs none, and assembling CasADi's takes as long as Ipopt's iterations.
     """
-    if nlp.compiled:
-        try:
-            return LaneHessian(nlp)
-        except NoLanesError as error:
-            log.info("no machine code on vectors: %s", error)
-    return nlp.hess_lag
-
-
-class LaneHessian(ca.Callback):
-    """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian; the kernels' data are
-    those of the NLP, whatever p says beyond its leading parameters theta."""
 
     def __init__(self, nlp: NLP) -> None:
-        """Compile it or take it from the cache.
-
-        Raises:
-            NoLanesError: That is not possible here.
-        """
+        """Prepare; nothing is assembled but the pattern."""
         ca.Callback.__init__(self)
         self._nlp = nlp
-        self._sums = LaneSums(nlp, [nlp.hessian], first_order=False)
-        self._pattern = self._sums.upper.sparsity()
+        self._sums: Sums | None = None
+        self._pattern = nlp.hessian_pattern.sparsity()
         self.construct("nlp_hess_l", {})
 
     def get_n_in(self) -> int:
@@ -67,10 +50,17 @@ class LaneHessian(ca.Callback):
         """Pattern of the Hessian."""
         return self._pattern
 
-    def eval(self, arg: list[ca.DM]) -> list[ca.DM]:
-        """Its value."""
-        thetas = len(self._nlp.theta)
-        self._sums.p = np.asarray(arg[1][:thetas]).ravel()
-        x, lam_g = (np.ascontiguousarray(np.asarray(arg[i]).ravel()) for i in (0, 3))
-        values = self._sums.hessian(self._nlp.hessian, x, lam_g, float(arg[2]))
-        return [ca.DM(self._pattern, values)]
+    def has_eval_buffer(self) -> bool:
+        """Numbers come and go as buffers, without CasADi's own matrices."""
+        return True
+
+    def eval_buffer(self, arg: Sequence[memoryview], res: Sequence[memoryview]) -> int:
+        """Its nonzeros."""
+        nlp = self._nlp
+        if self._sums is None:
+            self._sums = make_sums(nlp, [nlp.hessian], first_order=False)
+        x, p, lam_f, lam_g = (np.frombuffer(a, dtype=float) for a in arg)
+        self._sums.p = np.concatenate([p[: len(nlp.theta)], nlp.p[len(nlp.theta) :]])
+        out = np.frombuffer(res[0], dtype=float)
+        out[:] = self._sums.hessian(nlp.hessian, x, lam_g, float(lam_f[0]))
+        return 0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
-from soup_nlp.solve.hessian import fast_hessian
+from soup_nlp.solve.hessian import LagrangianHessian
 
 Float = NDArray[np.float64]
 
@@ -212,7 +212,7 @@ class Ipopt:
         self.nlp = nlp
         self.options = dict(options or {})
         # CasADi does not keep a callback alive
-        self.hess_lag = fast_hessian(nlp)
+        self.hess_lag = LagrangianHessian(nlp)
 
     def _solver(self, watch: _Watch, max_iter: int, tol: float, log_file: str | None) -> Any:
         nlp = self.nlp

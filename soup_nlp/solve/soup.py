@@ -238,7 +238,7 @@ def _presolve(
 ) -> tuple[Soup, Float]:
     """The presolve's soup, and its multipliers of rim visibility."""
     steps = len(o.presolve_eps)
-    # barriers from 1e-3 down to 1e-5 while the norms are reweighted, 1e-8 for the KKT point
+    # barriers from 1e-3 down to 1e-5 while the norms are reweighted, 1e-10 for the KKT point
     barriers = np.geomspace(1e-3, 1e-5, steps) if steps > 1 else np.array([1e-5])
     phases = [
         Phase(
@@ -269,10 +269,11 @@ def _presolve(
             name="presolve polish",
             hessian="exact",
             eps=o.eps,
-            barrier=1e-8,
+            barrier=1e-10,
             iterations=o.polish_iterations,
             stagnation=0.0,
             tol=o.presolve_tol,
+            beyond=True,
             highest=1e-5,
         )
         stages.append(descent.run(polish))

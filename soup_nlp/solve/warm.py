@@ -22,7 +22,7 @@ Float = NDArray[np.float64]
 
 WARM: Mapping[str, Any] = {
     "warm_start_init_point": "yes",
-    "mu_init": 1e-8,
+    "mu_init": 1e-10,
     "warm_start_bound_push": 1e-10,
     "warm_start_bound_frac": 1e-10,
     "warm_start_slack_bound_push": 1e-10,
