@@ -15,10 +15,11 @@ from soup_nlp.model.buffered import Buffered
 from soup_nlp.model.formulation import Formulation, build_tangent_nlp
 from soup_nlp.model.layout import Chart
 from soup_nlp.solve import descent as descent_module
-from soup_nlp.solve.descent import Descent, Phase
+from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.factor import superlu
 from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.kkt import optimality
+from soup_nlp.solve.phase import Phase
 from soup_nlp.solve.search import Search, along, evaluate, reach
 from soup_nlp.solve.tangent import TangentProblem
 
@@ -225,6 +226,28 @@ def test_it_ends_at_a_kkt_point(problem, solved):
     g = np.asarray(problem.nlp.oracle(last.x, p)[1]).ravel()
     assert (g >= problem.nlp.lbg - 1e-9).all()
     assert (g <= problem.nlp.ubg + 1e-9).all()
+
+
+def test_steps_go_on_beyond_the_tolerance_while_they_pay(problem):
+    def end(**options):
+        runner = Descent(problem)
+        for phase in PHASES:
+            runner.run(phase)
+        return runner, runner.run(replace(LAST, barrier=1e-10, **options))
+
+    _, plain = end()
+    runner, beyond = end(beyond=True)
+    assert plain.converged
+    assert beyond.converged
+    assert beyond.history["inf_du"][-1] <= plain.history["inf_du"][-1]
+    assert beyond.history["mu"][-1] <= plain.history["mu"][-1]
+    assert beyond.iterations > plain.iterations
+    # what is delivered is the point of the last row
+    problem.smoothing(LAST.eps)
+    at = evaluate(problem, runner.x, 1e-10)
+    np.testing.assert_array_equal(beyond.x, runner.x)
+    _, dual = runner._dual(problem.gradient(runner.x), at.jacobian)
+    assert dual == beyond.history["inf_du"][-1]
 
 
 def test_ipopt_stays_where_it_ends(case, problem, solved):

@@ -30,6 +30,7 @@ from soup_nlp.model.formulation import Formulation, build_matrix_nlp, build_tang
 from soup_nlp.model.kernel import HESSIANS, Kernel
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.norms import Norm, smooth_min, solver_form
+from soup_nlp.model.views import tangent_view
 
 UNITS = ("paper", "pixels")
 NORMS = ("smooth", "epigraph")
@@ -323,6 +324,10 @@ def test_machine_code_of_the_presolve_equals_the_virtual_machine(own_cache):
     assert_twins(fast, slow, wiggle(slow, 9 * layout.count, 1, 0.05))
 
 
+CUTS = [0, 3, 4, 5, 14, 17]
+"""Of the base of a tangent view: anchor, radius, depth, R0, t0."""
+
+
 def squares() -> Kernel:
     x, theta = ca.SX.sym("x", 2), ca.SX.sym("theta", 0)
     return Kernel("squares", x, ca.SX.sym("row", 0), theta, objective=ca.sumsqr(x))
@@ -357,3 +362,28 @@ def test_a_whole_nlp_is_built_without_a_compiler(own_cache, monkeypatch):
     nlp, layout = build_matrix_nlp(problem.soup, problem.data, weights, form(compiled=True))
     other, _ = build_matrix_nlp(problem.soup, problem.data, weights, form(compiled=False))
     assert_twins(nlp, other, wiggle(nlp, layout.size, 1, 0.02))
+
+
+# --- views ---------------------------------------------------------------------------------------
+
+
+def test_what_two_views_differ_by_is_the_difference_of_both():
+    x, base = ca.SX.sym("x", 18), ca.SX.sym("base", 34)
+    views = [
+        tangent_view(x[9 * a : 9 * a + 9], *ca.vertsplit(base[17 * a : 17 * a + 17], CUTS))
+        for a in range(2)
+    ]
+    a, b = views
+    points = a.point(ca.SX([0.1, 0.2, 1])), b.point(ca.SX([0.3, -0.1, 1]))
+    pairs = [
+        (a.turn_from(b), a.R - b.R),
+        (a.apart(points[0], b, points[1]), a.move(points[0]) - b.move(points[1])),
+    ]
+    rng = np.random.default_rng(8)
+    turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0].ravel() for _ in range(2)]
+    bases = [np.concatenate([[0.1, -0.2, 1, 0.05, 2.0], R, rng.normal(size=3)]) for R in turns]
+    values = np.tile([1.1, 0.2, -0.1] + [0.3] * 6, 2), np.concatenate(bases)
+    for one, other in pairs:
+        f = ca.Function("f", [x, base], [one, other])
+        p, q = f(*values)
+        np.testing.assert_allclose(np.asarray(p), np.asarray(q), atol=1e-13)

@@ -365,8 +365,8 @@ def test_the_constrained_nlp_starts_at_the_presolves_kkt_point(room):
     # the presolve's multipliers, brought over, leave Ipopt next to nothing to do
     done = room.solve(options=replace(OPTIONS, tol=1e-6))
     assert done.stages[-2].converged
-    assert done.stages[-1].history["inf_du"][0] < 1e-2
-    assert done.stages[-1].iterations <= 3
+    assert done.stages[-1].history["inf_du"][0] < 1e-5
+    assert done.stages[-1].iterations <= 1
     assert done.residuals["dual_infeasibility"] < 1e-5
 
 

@@ -21,7 +21,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +29,7 @@ from numpy.typing import NDArray
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.solve.factor import Back, diagonal_places, factorisation
 from soup_nlp.solve.ipopt import Listener, Progress, Stage
+from soup_nlp.solve.phase import FASTER, Phase, Reached
 from soup_nlp.solve.search import (
     TO_BOUNDARY,
     Move,
@@ -51,38 +51,8 @@ DAMPING = (1e-7, 1e6)
 """Least and most damping mu of a superpixel; scales, slopes, radians, shares of depth."""
 HELD = 1e-3
 """Least damping of a superpixel whose step went too far."""
-FASTER = 0.1
-"""A step beyond the tolerance is kept where the dual infeasibility falls to this share."""
 BLENDS = (0.0, 0.1, 0.3, 1.0)
 """Shares of the majorant in the exact Hessian, tried until the direction is one of descent."""
-
-
-@dataclass(frozen=True)
-class Phase:
-    """One setting of smoothing, Hessian and barrier, and what ends it.
-
-    Attributes:
-        name: For progress.
-        hessian: "gauss-newton" (the reweighted majorant) or "exact".
-        eps: Smoothing width, pixels.
-        barrier: b of `f - b sum log c`.
-        iterations: Limit.
-        stagnation: Ends when the merit falls by less than this share of f, twice in a row.
-        tol: Ends when dual infeasibility is below; "Solve_Succeeded".
-        beyond: Whether steps go on after that while each makes the dual infeasibility a tenth.
-        highest: Barrier far from the solution: a superpixel slides along a bent boundary only with
-            room to it. It follows 1e-6 of the dual infeasibility down to `barrier`.
-    """
-
-    name: str
-    hessian: HessianKind
-    eps: float
-    barrier: float
-    iterations: int
-    stagnation: float
-    tol: float
-    beyond: bool = False
-    highest: float = 0.0
 
 
 class Step(NamedTuple):
@@ -167,7 +137,7 @@ class Descent:
         fresh, blend, small = True, 0.0, 0
         barrier = max(phase.highest, phase.barrier)
         history: list[tuple[float, ...]] = []
-        reached: tuple[float, Point, Float, tuple[float, ...]] | None = None
+        reached: Reached | None = None
         status = "Maximum_Iterations_Exceeded"
         nu = 0.0
         for iteration in range(phase.iterations + 1):
@@ -176,46 +146,50 @@ class Descent:
             history.append((at.f, dual, gap, float(np.median(self.damping)), 0.0))
             self._tell(phase, iteration, history[-1], begin)
             good = dual <= phase.tol and gap <= max(phase.tol, 2 * phase.barrier)
-            if reached and not (good and dual < FASTER * reached[0]):
-                # the last step was one too many
-                _, at, self.z, history[-1] = reached
-                self.x, good = at.x, True
-                nu, _ = self._dual(problem.gradient(at.x), at.jacobian)
-                reached = None
-            elif good and phase.beyond and iteration < phase.iterations:
-                reached, good = (dual, at, self.z, history[-1]), False
+            if reached and not (good and dual < FASTER * reached.dual):
+                break
             if good:
-                status = "Solve_Succeeded"
-            elif small >= 2:
+                reached = Reached(dual, at, self.z, history[-1])
+            if good and not phase.beyond:
+                break
+            if small >= 2:
                 status = "Stagnated"
-            elif self.stop.is_set():
+                break
+            if self.stop.is_set():
                 status = "Interrupted"
-            elif time.perf_counter() > self.deadline:
+                break
+            if time.perf_counter() > self.deadline:
                 status = "Time_Limit"
-            elif iteration < phase.iterations:
-                barrier = max(phase.barrier, min(barrier, 1e-6 * dual))
-                at = at._replace(merit=merit(at.f, at.slack, barrier))
-                if fresh:
-                    curvature = self._curvature(at, phase.hessian)
-                step = self._newton(at, curvature, blend, gradient, barrier, phase.hessian)
-                h, blend = step.h, step.blend
-                search = Search(problem, at, h, barrier, step.newton)
-                move = search.run(gradient, self._times(step.H, h))
-                self._adapt(move)
-                moved = move.point
-                fresh = moved is not None
-                if moved is not None:
-                    fell = at.merit - moved.merit
-                    small = small + 1 if fell <= phase.stagnation * abs(at.f) else 0
-                    self._step_multipliers(at, h, barrier, moved)
-                    at, self.x = moved, moved.x
-                    gradient = search.gradient(at.x)
-                else:
-                    # the majorant's steps descend
-                    blend = min(1.0, max(BLENDS[1], 9 * blend))
-                history[-1] = (*history[-1][:4], float(move.length.min()))
-                continue
-            break
+                break
+            if iteration == phase.iterations:
+                break
+            barrier = max(phase.barrier, min(barrier, 1e-6 * dual))
+            at = at._replace(merit=merit(at.f, at.slack, barrier))
+            if fresh:
+                curvature = self._curvature(at, phase.hessian)
+            step = self._newton(at, curvature, blend, gradient, barrier, phase.hessian)
+            h, blend = step.h, step.blend
+            search = Search(problem, at, h, barrier, step.newton)
+            move = search.run(gradient, self._times(step.H, h))
+            self._adapt(move)
+            moved = move.point
+            fresh = moved is not None
+            if moved is not None:
+                fell = at.merit - moved.merit
+                small = small + 1 if fell <= phase.stagnation * abs(at.f) else 0
+                self._step_multipliers(at, h, barrier, moved)
+                at, self.x = moved, moved.x
+                gradient = search.gradient(at.x)
+            else:
+                # the majorant's steps descend
+                blend = min(1.0, max(BLENDS[1], 9 * blend))
+            history[-1] = (*history[-1][:4], float(move.length.min()))
+        if reached:
+            status = "Solve_Succeeded"
+            # the last step may have been one too many
+            _, at, self.z, history[-1] = reached
+            self.x = at.x
+            nu, _ = self._dual(problem.gradient(at.x), at.jacobian)
         columns = np.array(history).T
         lam_x, lam_g = problem.multipliers(self.z, nu)
         return Stage(

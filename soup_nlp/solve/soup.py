@@ -18,9 +18,10 @@ from soup_nlp.model.energy import EnergyData, Weights
 from soup_nlp.model.formulation import Formulation, build_matrix_nlp
 from soup_nlp.model.layout import Chart, MatrixLayout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.solve.descent import Descent, Phase
+from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.ipopt import Ipopt, Listener, Stage
 from soup_nlp.solve.kkt import residuals
+from soup_nlp.solve.phase import Phase
 from soup_nlp.solve.tangent import TangentProblem
 from soup_nlp.solve.warm import WARM, warm_start
 

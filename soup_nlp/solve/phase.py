@@ -1,0 +1,61 @@
+"""A phase of the presolve: what it minimises, and what ends it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.solve.search import Point
+from soup_nlp.solve.tangent import HessianKind
+
+Float = NDArray[np.float64]
+
+FASTER = 0.1
+"""A step beyond the tolerance is kept where the dual infeasibility falls to this share."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One setting of smoothing, Hessian and barrier, and what ends it.
+
+    Attributes:
+        name: For progress.
+        hessian: "gauss-newton" (the reweighted majorant) or "exact".
+        eps: Smoothing width, pixels.
+        barrier: b of `f - b sum log c`.
+        iterations: Limit.
+        stagnation: Ends when the merit falls by less than this share of f, twice in a row.
+        tol: Ends when dual infeasibility is below; "Solve_Succeeded".
+        beyond: Whether steps go on after that while each makes the dual infeasibility a tenth.
+        highest: Barrier far from the solution: a superpixel slides along a bent boundary only with
+            room to it. It follows 1e-6 of the dual infeasibility down to `barrier`.
+    """
+
+    name: str
+    hessian: HessianKind
+    eps: float
+    barrier: float
+    iterations: int
+    stagnation: float
+    tol: float
+    beyond: bool = False
+    highest: float = 0.0
+
+
+class Reached(NamedTuple):
+    """A point within the tolerance.
+
+    Attributes:
+        dual: Its dual infeasibility.
+        at: It.
+        z: (N, R) multipliers there.
+        row: Of the history.
+    """
+
+    dual: float
+    at: Point
+    z: Float
+    row: tuple[float, ...]
