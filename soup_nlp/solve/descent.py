@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.solve.factor import Back, diagonal_places, factorisation
 from soup_nlp.solve.ipopt import Listener, Progress, Stage
-from soup_nlp.solve.phase import FASTER, Phase, Reached
+from soup_nlp.solve.phase import Phase, Reached
 from soup_nlp.solve.search import (
     TO_BOUNDARY,
     Move,
@@ -146,11 +146,10 @@ class Descent:
             history.append((at.f, dual, gap, float(np.median(self.damping)), 0.0))
             self._tell(phase, iteration, history[-1], begin)
             good = dual <= phase.tol and gap <= max(phase.tol, 2 * phase.barrier)
-            if reached and not (good and dual < FASTER * reached.dual):
-                break
-            if good:
-                reached = Reached(dual, at, self.z, history[-1])
-            if good and not phase.beyond:
+            enough = reached is not None and not (good and reached.less(dual, gap))
+            if good and (reached is None or not enough or dual < reached.dual):
+                reached = Reached(dual, gap, at, self.z, history[-1])
+            if enough or (good and not phase.beyond):
                 break
             if small >= 2:
                 status = "Stagnated"
@@ -187,7 +186,7 @@ class Descent:
         if reached:
             status = "Solve_Succeeded"
             # the last step may have been one too many
-            _, at, self.z, history[-1] = reached
+            _, _, at, self.z, history[-1] = reached
             self.x = at.x
             nu, _ = self._dual(problem.gradient(at.x), at.jacobian)
         columns = np.array(history).T

@@ -13,8 +13,8 @@ from soup_nlp.solve.tangent import HessianKind
 
 Float = NDArray[np.float64]
 
-FASTER = 0.1
-"""A step beyond the tolerance is kept where the dual infeasibility falls to this share."""
+FASTER = 0.3
+"""Steps beyond the tolerance go on while dual infeasibility or gap fall to this share."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ class Phase:
         iterations: Limit.
         stagnation: Ends when the merit falls by less than this share of f, twice in a row.
         tol: Ends when dual infeasibility is below; "Solve_Succeeded".
-        beyond: Whether steps go on after that while each makes the dual infeasibility a tenth.
+        beyond: Whether steps go on after that while each makes the dual infeasibility or the gap
+            FASTER times as large.
         highest: Barrier far from the solution: a superpixel slides along a bent boundary only with
             room to it. It follows 1e-6 of the dual infeasibility down to `barrier`.
     """
@@ -50,12 +51,18 @@ class Reached(NamedTuple):
 
     Attributes:
         dual: Its dual infeasibility.
+        gap: Its largest slack times multiplier.
         at: It.
         z: (N, R) multipliers there.
         row: Of the history.
     """
 
     dual: float
+    gap: float
     at: Point
     z: Float
     row: tuple[float, ...]
+
+    def less(self, dual: float, gap: float) -> bool:
+        """Whether the next point is worth a step beyond it."""
+        return dual < FASTER * self.dual or gap < FASTER * self.gap
