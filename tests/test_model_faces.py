@@ -377,6 +377,7 @@ def test_what_two_views_differ_by_is_the_difference_of_both():
     points = a.point(ca.SX([0.1, 0.2, 1])), b.point(ca.SX([0.3, -0.1, 1]))
     pairs = [
         (a.turn_from(b), a.R - b.R),
+        (a.drift_from(b), a.lam * a.t - b.lam * b.t),
         (a.apart(points[0], b, points[1]), a.move(points[0]) - b.move(points[1])),
     ]
     rng = np.random.default_rng(8)

@@ -25,7 +25,7 @@ def arap(
     weight, unit = row["weight"], row["unit"]
     if local:
         unit = unit / _nearness(Xa, Xb)
-    gap = a.lam * a.t - b.lam * b.t
+    gap = a.drift_from(b)
     if at_anchors:
         gap = gap + a.turn_from(b) @ ((Xa + Xb) / 2)
     # |Xa - Xb| is smooth wherever two anchors differ, so it needs no slack of its own

@@ -21,7 +21,9 @@ class View:
         n: (3x1) unit normal that faces the camera.
         turn: (3x3) what variables add to the rotation.
         t: (3x1) translation of unit scale: `X' = R X + lam t`.
-        R0: (3x3) the rest of the rotation, constant; nothing, unless a view has a base.
+        drift: (3x1) what variables add to the translation `lam t`.
+        R0, T0: (3x3), (3x1) the rest of rotation and translation, constant; nothing, unless a view
+            has a base.
     """
 
     lam: ca.SX
@@ -29,7 +31,9 @@ class View:
     n: ca.SX
     turn: ca.SX
     t: ca.SX
+    drift: ca.SX
     R0: ca.SX = field(default_factory=lambda: ca.SX(3, 3))
+    T0: ca.SX = field(default_factory=lambda: ca.SX(3, 1))
 
     @property
     def R(self) -> ca.SX:
@@ -39,6 +43,10 @@ class View:
     def turn_from(self, other: View) -> ca.SX:
         """(3x3) difference of two rotations: small numbers are subtracted, not those near 1."""
         return (self.R0 - other.R0) + (self.turn - other.turn)
+
+    def drift_from(self, other: View) -> ca.SX:
+        """(3x1) difference of two translations `lam t`, likewise."""
+        return (self.T0 - other.T0) + (self.drift - other.drift)
 
     def point(self, ray: ca.SX) -> ca.SX:
         """Reference-frame point (3x1) of a ray (3x1)."""
@@ -51,7 +59,7 @@ class View:
     def apart(self, point: ca.SX, other: View, others: ca.SX) -> ca.SX:
         """`self.move(point) - other.move(others)`, as a sum of small differences."""
         turned = self.R @ (point - others) + self.turn_from(other) @ others
-        return turned + (self.lam * self.t - other.lam * other.t)
+        return turned + self.drift_from(other)
 
     def transfer(self, ray: ca.SX) -> ca.SX:
         """Next-frame ray (3x1, free length) of a reference ray: the homography without K."""
@@ -72,7 +80,8 @@ def matrix_view(x: ca.SX, gauge: str, offset: ca.SX) -> View:
         d, rest = offset, x[4:]
     else:
         d, rest = x[4], x[5:]
-    return View(lam=lam, m=-n / d, n=n, turn=ca.reshape(rest[0:9], 3, 3), t=rest[9:12])
+    t = rest[9:12]
+    return View(lam=lam, m=-n / d, n=n, turn=ca.reshape(rest[0:9], 3, 3), t=t, drift=lam * t)
 
 
 TANGENT_SIZE = 9
@@ -114,5 +123,14 @@ def tangent_view(
     W = ca.skew(h)
     base = ca.reshape(R0, 3, 3)
     turn = base @ ((2 / (1 + ca.dot(h, h))) * (W + W @ W))
-    t = t0 + (q - turn @ anchor)
-    return View(lam=lam * depth, m=m, n=-m / ca.norm_2(m), turn=turn, t=t, R0=base)
+    shift = q - turn @ anchor
+    return View(
+        lam=lam * depth,
+        m=m,
+        n=-m / ca.norm_2(m),
+        turn=turn,
+        t=t0 + shift,
+        drift=depth * ((lam - 1) * t0 + lam * shift),
+        R0=base,
+        T0=depth * t0,
+    )
