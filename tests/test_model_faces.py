@@ -339,7 +339,7 @@ def test_without_a_working_compiler_kernels_run_in_the_virtual_machine(
 ):
     monkeypatch.setenv("CC", cc)
     with caplog.at_level(logging.INFO):
-        functions = list(squares().functions("exact").values())
+        functions = list(squares().first_order().values())
         made = compiling.compile_functions(functions)
     assert set(made) == {f.name() for f in functions}
     assert float(made["squares_f"]([3.0, 4.0], [], [])) == 25.0
@@ -351,7 +351,7 @@ def test_an_unusable_cache_folder_costs_speed_only(tmp_path, monkeypatch, caplog
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
     monkeypatch.setenv("SOUP_NLP_CACHE", str(blocked))
-    made = compiling.compile_functions(list(squares().functions("exact").values()), "/bin/false")
+    made = compiling.compile_functions(list(squares().first_order().values()), "/bin/false")
     assert float(made["squares_f"]([3.0, 4.0], [], [])) == 25.0
     assert "failed" in caplog.text
 

@@ -131,7 +131,7 @@ def test_other_parameters_are_used():
     nlp = squares(5)
     sums = LaneSums(nlp, ["exact"])
     before = sums.value(nlp.x0)
-    sums.p = nlp.with_theta(theta=6.0)
+    sums.theta = np.array([6.0])
     assert sums.value(nlp.x0) == pytest.approx(2 * before, rel=1e-14)
 
 

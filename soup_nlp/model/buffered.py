@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +17,11 @@ class Buffered:
 
     Attributes:
         function: The function.
-        seconds: Wall time of all calls so far.
     """
 
     def __init__(self, function: ca.Function) -> None:
         # the buffer refers to the function, which must live as long
         self.function = function
-        self.seconds = 0.0
         self._buffer, self._evaluate = function.buffer()
         self._out = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
         for i, out in enumerate(self._out):
@@ -40,7 +36,6 @@ class Buffered:
         Raises:
             ValueError: An argument has another number of nonzeros than the input.
         """
-        begin = time.perf_counter()
         held = [np.ascontiguousarray(a, dtype=float).ravel() for a in arguments]
         for i, a in enumerate(held):
             if len(a) != self.function.nnz_in(i):
@@ -50,5 +45,4 @@ class Buffered:
                 )
             self._buffer.set_arg(i, memoryview(a.data))
         self._evaluate()
-        self.seconds += time.perf_counter() - begin
         return self._out

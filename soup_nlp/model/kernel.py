@@ -67,21 +67,13 @@ class Kernel:
             H += ca.hessian(ca.dot(lam_c, self.constraints), self.x)[0]
         return ca.sparsify(ca.triu(H))
 
-    def functions(self, hessian: str) -> dict[str, ca.Function]:
-        """Value, gradient, Jacobian nonzeros and triu-Hessian nonzeros of one element.
-
-        Args:
-            hessian: One of HESSIANS.
+    def first_order(self) -> dict[str, ca.Function]:
+        """Value, gradient, constraints and Jacobian nonzeros of one element.
 
         Returns:
-            Functions "f" and "grad" (x, row, theta), "con" and "jac" (same), "hess"
-            (x, row, theta, lam_f, lam_c); absent where there is nothing to compute.
+            Functions "f" and "grad", "con" and "jac" of (x, row, theta); absent where there is
+            nothing to compute.
         """
-        second = self.second_order(hessian)
-        return {**self.first_order(), **({"hess": second} if second else {})}
-
-    def first_order(self) -> dict[str, ca.Function]:
-        """The functions without "hess"."""
         out: dict[str, ca.SX] = {}
         if self.objective is not None:
             out["f"] = self.objective
@@ -93,7 +85,15 @@ class Kernel:
         return {k: ca.Function(f"{self.name}_{k}", args, ca.cse([v])) for k, v in out.items()}
 
     def second_order(self, hessian: str, suffix: str = "") -> ca.Function | None:
-        """The function "hess" alone, None where it is 0; its name ends with the suffix."""
+        """Nonzeros of the triu-Hessian of one element.
+
+        Args:
+            hessian: One of HESSIANS.
+            suffix: Of the function's name, which ends with "_hess" otherwise.
+
+        Returns:
+            Function of (x, row, theta, lam_f, lam_c); None where it is 0.
+        """
         lam_f, lam_c = ca.SX.sym("lam_f"), ca.SX.sym("lam_c", self.nc)
         H = self._hessian(hessian, lam_f, lam_c)
         if not H.nnz():

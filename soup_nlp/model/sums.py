@@ -49,14 +49,14 @@ class Sums(Protocol):
     """f, g and their derivatives.
 
     Attributes:
-        p: Parameters of the NLP; may be set to others.
+        theta: Values of the NLP's leading parameters; may be set to others.
         jacobian: Of g; its places do not matter.
         upper: Union of the Hessians' upper triangles and of what the caller wants besides, whose
             places are the last.
         seconds: Spent in "f", "grad_f", "jac_g" (with g) and "hess_lag".
     """
 
-    p: Float
+    theta: Float
     jacobian: Pattern
     upper: Pattern
     seconds: Timer
@@ -107,11 +107,12 @@ class FunctionSums:
         self, nlp: NLP, hessians: Sequence[str], besides: tuple[Int, Int] | None = None
     ) -> None:
         """Assemble them; arguments as of `make_sums`."""
-        self.p, self.seconds = nlp.p, Timer()
+        self.theta, self.seconds = nlp.p[: len(nlp.theta)], Timer()
         functions = {
             kind: nlp.hess_lag if kind == nlp.hessian else nlp.other_hessian(kind)
             for kind in hessians
         }
+        self._p = nlp.p.copy()
         x, p = nlp.oracle.mx_in()
         self._f = Buffered(ca.Function("f", [x, p], [nlp.oracle(x, p)[0]]))
         self._gradient, self._rows = Buffered(nlp.grad_f), Buffered(nlp.jac_g)
@@ -121,27 +122,31 @@ class FunctionSums:
         self.upper = Pattern.of((nlp.nx, nlp.nx), [*own, besides or _NOTHING])
         self._places = dict(zip(functions, self.upper.places))
 
+    def _parameters(self) -> Float:
+        self._p[: len(self.theta)] = self.theta
+        return self._p
+
     def value(self, x: Float) -> float:
         """See Sums."""
         with self.seconds.of("f"):
-            return float(self._f(x, self.p)[0][0])
+            return float(self._f(x, self._parameters())[0][0])
 
     def gradient(self, x: Float) -> Float:
         """See Sums."""
         with self.seconds.of("grad_f"):
-            return self._gradient(x, self.p)[1].copy()
+            return self._gradient(x, self._parameters())[1].copy()
 
     def constraints(self, x: Float) -> tuple[Float, Float]:
         """See Sums."""
         with self.seconds.of("jac_g"):
-            g, jacobian = self._rows(x, self.p)
+            g, jacobian = self._rows(x, self._parameters())
             return g.copy(), jacobian.copy()
 
     def hessian(self, kind: str, x: Float, lam_g: Float, lam_f: float = 1.0) -> Float:
         """See Sums."""
         with self.seconds.of("hess_lag"):
             out = np.zeros(len(self.upper.rows))
-            out[self._places[kind]] = self._hessian[kind](x, self.p, lam_f, lam_g)[0]
+            out[self._places[kind]] = self._hessian[kind](x, self._parameters(), lam_f, lam_g)[0]
             return out
 
 
@@ -166,7 +171,7 @@ class LaneSums:
         Raises:
             NoLanesError: That is not possible here.
         """
-        self.p, self.seconds = nlp.p, Timer()
+        self.theta, self.seconds = nlp.p[: len(nlp.theta)], Timer()
         self._sizes = nlp.nx, nlp.ng, len(nlp.theta)
         nx, ng = nlp.nx, nlp.ng
         made: list[dict[str, ca.Function]] = []
@@ -211,7 +216,7 @@ class LaneSums:
     def _sum(self, key: str, x: Float, lam_g: Float | None = None, lam_f: float = 1.0) -> Float:
         nx, ng, thetas = self._sizes
         x, lam = _vector("x", x, nx), lam_g if lam_g is None else _vector("lam_g", lam_g, ng)
-        theta = _vector("p", self.p[:thetas], thetas)
+        theta = _vector("theta", self.theta, thetas)
         # one entry more, for what fills the last block
         out = np.zeros(self._size(key) + 1)
         for term in self._terms.get(key, []):

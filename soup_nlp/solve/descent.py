@@ -147,8 +147,8 @@ class Descent:
             self._tell(phase, iteration, history[-1], begin)
             good = dual <= phase.tol and gap <= max(phase.tol, 2 * phase.barrier)
             enough = reached is not None and not (good and reached.less(dual, gap))
-            if good and (reached is None or not enough or dual < reached.dual):
-                reached = Reached(dual, gap, at, self.z, history[-1])
+            if good and (reached is None or not enough or dual < reached.row[1]):
+                reached = Reached(at, self.z, history[-1])
             if enough or (good and not phase.beyond):
                 break
             if small >= 2:
@@ -186,7 +186,7 @@ class Descent:
         if reached:
             status = "Solve_Succeeded"
             # the last step may have been one too many
-            _, _, at, self.z, history[-1] = reached
+            at, self.z, history[-1] = reached
             self.x = at.x
             nu, _ = self._dual(problem.gradient(at.x), at.jacobian)
         columns = np.array(history).T

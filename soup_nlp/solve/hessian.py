@@ -60,7 +60,7 @@ class LagrangianHessian(ca.Callback):
         if self._sums is None:
             self._sums = make_sums(nlp, [nlp.hessian], first_order=False)
         x, p, lam_f, lam_g = (np.frombuffer(a, dtype=float) for a in arg)
-        self._sums.p = np.concatenate([p[: len(nlp.theta)], nlp.p[len(nlp.theta) :]])
+        self._sums.theta = p[: len(nlp.theta)].copy()
         out = np.frombuffer(res[0], dtype=float)
         out[:] = self._sums.hessian(nlp.hessian, x, lam_g, float(lam_f[0]))
         return 0

@@ -50,19 +50,15 @@ class Reached(NamedTuple):
     """A point within the tolerance.
 
     Attributes:
-        dual: Its dual infeasibility.
-        gap: Its largest slack times multiplier.
         at: It.
         z: (N, R) multipliers there.
-        row: Of the history.
+        row: Of the history: f, dual infeasibility, gap and what does not matter here.
     """
 
-    dual: float
-    gap: float
     at: Point
     z: Float
     row: tuple[float, ...]
 
     def less(self, dual: float, gap: float) -> bool:
         """Whether the next point is worth a step beyond it."""
-        return dual < FASTER * self.dual or gap < FASTER * self.gap
+        return dual < FASTER * self.row[1] or gap < FASTER * self.row[2]

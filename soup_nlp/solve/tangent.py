@@ -90,7 +90,8 @@ class TangentProblem:
 
     def smoothing(self, eps: float) -> None:
         """Set both smoothing widths, pixels."""
-        self.sums.p = self.nlp.with_theta(eps=eps, eps_pixel=eps)
+        theta = self.nlp.with_theta(eps=eps, eps_pixel=eps)
+        self.sums.theta = theta[: len(self.nlp.theta)]
 
     def value(self, x: Float) -> float:
         """Smoothed energy."""
