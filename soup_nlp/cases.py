@@ -17,6 +17,7 @@ from soup_nlp.model.energy import (
     EnergyData,
     Weights,
     across_tears,
+    at_occlusions,
     between_bodies,
     build_energy_data,
     in_pixels,
@@ -141,6 +142,7 @@ def build_energy(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, bends or e.arap_at_anchors
     )
     data = between_bodies(data, start.body, e.arap_across)
+    data = at_occlusions(data, start.soup, start.body, e.occlusion_gap, e.cont_occluded)
     if bends:
         data = across_tears(data, start.surface, e.bending.cont_across)
     if e.units == "pixel":

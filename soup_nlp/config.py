@@ -115,6 +115,9 @@ class EnergyConfig(Strict):
         arap_at_anchors: Motion difference at the anchors instead of the camera's origin.
         arap_across: Factor of E_arap between superpixels that the start gives to different bodies;
             1 is the paper's.
+        cont_occluded: Factor of E_cont where one of these bodies hides another; 1 is the paper's.
+        occlusion_gap: It does where the start leaves a larger gap in depth between them, relative
+            to the farther side.
         rotation_px: Pixels per radian of rotation difference; null for the focal length.
         pixel_samples: Pixels per superpixel in E_proj, or all.
         weights: Factors of the terms and their truncations.
@@ -124,6 +127,8 @@ class EnergyConfig(Strict):
     units: Literal["pixel", "paper"] = "pixel"
     arap_at_anchors: bool = False
     arap_across: Annotated[float, Field(ge=0, le=1)] = 0.1
+    cont_occluded: Annotated[float, Field(ge=0, le=1)] = 0.1
+    occlusion_gap: Annotated[float, Field(ge=0, lt=1)] = 0.2
     rotation_px: Positive | None = None
     pixel_samples: Annotated[int, Field(ge=1)] | Literal["all"] = 16
     weights: EnergyWeights = EnergyWeights()

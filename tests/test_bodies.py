@@ -1,4 +1,4 @@
-"""E_arap between bodies: who recedes gains little, and edges of two bodies weigh less."""
+"""Bodies: who recedes gains little, edges of two bodies weigh less, gaps they leave stay open."""
 
 from __future__ import annotations
 
@@ -12,7 +12,14 @@ from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import plain
-from soup_nlp.model.energy import Weights, between_bodies, build_energy_data, in_pixels
+from soup_nlp.model.energy import (
+    Weights,
+    at_occlusions,
+    between_bodies,
+    build_energy_data,
+    in_pixels,
+)
+from soup_nlp.start.bodies import contact_scales
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 
@@ -66,3 +73,70 @@ def test_a_body_gains_little_by_receding(world, factor):
     assert (near >= gap * (1 - 1e-12)).all()
     assert (near <= 2 * gap * (1 + 1e-12)).all()
     assert (plain.arap(away, data, weights)[across] >= 2**-0.25 * gap * (1 - 1e-12)).all()
+
+
+def test_pairs_of_two_bodies_weigh_less_where_one_hides_the_other(world):
+    """Of the right body's outline the lower half touches the left one; the upper is in front."""
+    seg, soup, body, data = world
+    upper = seg.anchors[:, 1] < 8
+    z = np.where((body == 1) & upper, 0.7, 1.0)
+    soup = replace(soup, d=soup.d * z)
+    i, k = seg.pairs.T
+    across = body[i] != body[k]
+    hidden = across & (upper[i] | upper[k])
+    assert hidden.sum() == 1
+    assert across.sum() == 2
+    less = at_occlusions(data, soup, body, 0.2, 0.1)
+    np.testing.assert_array_equal(less.pair_weight, np.where(hidden, 0.1, 1.0) * data.pair_weight)
+    np.testing.assert_array_equal(less.edge_weight, data.edge_weight)
+    same = {
+        "gap is no larger": at_occlusions(data, soup, body, 0.31, 0.1),
+        "one body": at_occlusions(data, soup, 0 * body, 0.2, 0.1),
+        "the paper's": at_occlusions(data, soup, body, 0.2, 1.0),
+    }
+    for why, one in same.items():
+        np.testing.assert_array_equal(one.pair_weight, data.pair_weight, err_msg=why)
+
+
+@pytest.mark.parametrize(("upright", "scale"), [(True, 2.0), (False, 1.0)])
+def test_a_body_stands_on_what_is_below_it(upright, scale):
+    """Nine planes: a body of unknown scale amid a wall, on the ground, half behind a near thing.
+
+    True depth of the body is that of the ground below it; its own unit says 1.
+    """
+    v, u = np.mgrid[0:24, 0:24]
+    seg = build_segmentation(
+        (v // 8 * 3 + u // 8).astype(np.int32), np.zeros((24, 24, 3), np.uint8), neighbours=4
+    )
+    wall, near, own, ground = 4.0, 1.0, 1.0, 2.0
+    z = np.array([wall, wall, wall, near, own, wall, ground, ground, ground])
+    soup = Soup(
+        np.full(9, 1 / 9),
+        np.tile([0, 0, -1.0], (9, 1)),
+        9 * z,
+        np.tile(np.eye(3), (9, 1, 1)),
+        np.ones((9, 3)),
+    )
+    label = (np.arange(9) == 4).astype(np.int64)
+    found = contact_scales(soup, label, seg, K, upright)
+    np.testing.assert_allclose(found, np.where(label == 1, scale, 1.0), rtol=1e-12)
+
+
+def test_a_body_with_nothing_below_it_touches_its_outline():
+    """The lower edge of the image cuts it off: a low quantile of the depth ratios around it."""
+    v, u = np.mgrid[0:16, 0:24]
+    seg = build_segmentation(
+        (v // 8 * 3 + u // 8).astype(np.int32), np.zeros((16, 24, 3), np.uint8), neighbours=4
+    )
+    z = np.array([4.0, 6.0, 4.0, 3.0, 1.0, 3.5])
+    every = np.ones(6)
+    soup = Soup(
+        every / 6,
+        np.tile([0, 0, -1.0], (6, 1)),
+        6 * z,
+        np.tile(np.eye(3), (6, 1, 1)),
+        np.ones((6, 3)),
+    )
+    label = (np.arange(6) == 4).astype(np.int64)
+    found = contact_scales(soup, label, seg, K)
+    np.testing.assert_allclose(found, np.where(label == 1, 3.0, 1.0), rtol=1e-12)

@@ -109,6 +109,23 @@ def test_check_holds_and_catches_tampering(solved, capsys):
     assert check_folder(solved).ok
 
 
+@pytest.mark.parametrize("row", ["edge", "pair"])
+def test_check_makes_the_weights_of_edges_and_pairs_again(row, tmp_path):
+    """On a scene with bodies, where both depend on the start."""
+    street = str(PROBLEMS[0].parent / "street.yaml")
+    assert main(["solve", street, "--out", str(tmp_path), *SMALL, "--no-refine"]) == 0
+    assert check_folder(tmp_path).ok
+    with h5py.File(tmp_path / "result.h5", "a") as file:
+        body = file["start/body"][:]
+        i, k = file[f"energy/{row}s"][:].T
+        across = np.flatnonzero(body[i] != body[k])
+        assert len(across)
+        weight = file[f"energy/{row}_weight"][:]
+        weight[across[0]] *= 2
+        file[f"energy/{row}_weight"][...] = weight
+    assert any(r.name == f"data {row} weights" and not r.ok for r in check_folder(tmp_path).rows)
+
+
 def test_evaluate_scores_against_a_file(solved, tmp_path, capsys):
     with h5py.File(solved / "result.h5") as file:
         np.save(tmp_path / "gt.npy", 7.0 * file["depth/ref"][:])

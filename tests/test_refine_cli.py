@@ -24,6 +24,7 @@ SMALL = [
     "--set", "input.width=160", "--set", "input.height=96",
     "--set", "segmentation.superpixels=30", "--set", "segmentation.neighbours=6",
     "--set", "flow.source=truth", "--set", "refine.rounds=3", "--set", "refine.particles=20",
+    "--set", "refine.stagnation=0",
 ]  # fmt: skip
 TERMS = ("total", "arap", "proj", "cont", "orient")
 

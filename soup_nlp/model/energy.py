@@ -214,6 +214,29 @@ def between_bodies(data: EnergyData, body: NDArray[np.int64], factor: float) -> 
     return replace(data, edge_weight=np.where(body[i] == body[k], 1.0, factor) * data.edge_weight)
 
 
+def at_occlusions(
+    data: EnergyData, soup: Soup, body: NDArray[np.int64], gap: float, factor: float
+) -> EnergyData:
+    """The same data with E_cont's weights times `factor` where one body hides another.
+
+    A body in front touches what is behind it along a part of its outline alone, where the start
+    has brought both together. The gaps along the rest are real; closing them moves the body away
+    from the camera, and nothing else fixes its scale.
+
+    Args:
+        data: Data of the pair.
+        soup: Start, its bodies scaled to where they touch.
+        body: (N,) group of every superpixel, as the start finds them.
+        gap: Smallest gap in depth that is one, relative to the farther side.
+        factor: 1 is the paper's energy.
+    """
+    i, k = data.pairs.T
+    ray = data.boundary_ray.mean(axis=1)
+    zi, zk = (-soup.distance[j] / np.sum(soup.n[j] * ray, axis=1) for j in (i, k))
+    hidden = (body[i] != body[k]) & (np.minimum(zi, zk) < (1 - gap) * np.maximum(zi, zk))
+    return replace(data, pair_weight=np.where(hidden, factor, 1.0) * data.pair_weight)
+
+
 def across_tears(data: EnergyData, surface: NDArray[np.int64], factor: float) -> EnergyData:
     """The same data with E_cont's weights times `factor` from one surface to another.
 

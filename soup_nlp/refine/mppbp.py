@@ -85,7 +85,7 @@ class RefineOptions:
     depth_reach: float = 2.0
     trws_iterations: int = 15
     trws_gap: float = 1e-4
-    stagnation: float = 0.0
+    stagnation: float = 1e-3
     max_seconds: float = 300.0
     float32: bool = False
     polish: bool = False

@@ -128,8 +128,7 @@ def _rows(
         own["orient"] *= len(tree["start"]["body"]) / 1000
     for key in ("arap", "proj", "cont", "orient"):
         yield _same(f"weight {key}", own[key], weights[key])
-    beta, across = settings["segmentation"]["beta"], settings["energy"]["arap_across"]
-    for name, gap in recompute.data_errors(tree, float(beta), float(across)).items():
+    for name, gap in recompute.data_errors(tree, settings).items():
         yield Row(f"data {name}", 0.0, gap, RELATIVE, gap <= RELATIVE)
     for which in ("start", "nlp", "solution"):
         found = recompute.energy(_state(tree, which), tree["energy"], weights)

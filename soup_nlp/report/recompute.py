@@ -173,13 +173,12 @@ def at_points(z: Float, points: Float) -> tuple[Float, Float]:
     return out, points[:, 2]
 
 
-def data_errors(tree: Mapping[str, Any], beta: float, across: float) -> dict[str, float]:
-    """How far the stored numbers of the energy are from labels, flow and cameras.
+def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, float]:
+    """How far the stored numbers of the energy are from labels, flow, cameras and the start.
 
     Args:
         tree: Arrays of result.h5.
-        beta: Fall-off of w1, w2, 1/pixel.
-        across: Factor of an edge between two bodies of the start.
+        settings: The merged problem, as stored.
 
     Returns:
         Largest absolute difference by name; 0 is agreement.
@@ -206,8 +205,8 @@ def data_errors(tree: Mapping[str, Any], beta: float, across: float) -> dict[str
     own, near = np.repeat(np.arange(n), seg["knn"].shape[1]), seg["knn"].ravel()
     directed = np.unique(np.minimum(own, near) * n + np.maximum(own, near))
     body = tree["start"]["body"]
-    weight = seg["edge_multiplicity"] * np.exp(-beta * gap)
-    weight[body[i] != body[k]] *= across
+    weight = seg["edge_multiplicity"] * np.exp(-float(settings["segmentation"]["beta"]) * gap)
+    weight[body[i] != body[k]] *= float(settings["energy"]["arap_across"])
     return {
         "anchors": _gap(centre, seg["anchors"]),
         "anchor rays": _gap(rays(centre), e["anchor_ray"]),
@@ -217,7 +216,23 @@ def data_errors(tree: Mapping[str, Any], beta: float, across: float) -> dict[str
         "pixel targets": _gap(target, e["pixel_target"][used]),
         "K-NN edges": float(len(np.setxor1d(directed, i * n + k))),
         "edge weights": _gap(weight, e["edge_weight"]),
+        "pair weights": _gap(_pair_weights(tree, settings["energy"]), e["pair_weight"]),
     }
+
+
+def _pair_weights(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Float:
+    """w4 of the image, less where one body of the start hides another and where the flow tears."""
+    start, seg = tree["start"], tree["segmentation"]
+    weight = seg["pair_weight"].copy()
+    middle = tree["energy"]["boundary_ray"].mean(1, keepdims=True)
+    i, k = tree["energy"]["pairs"].T
+    z = np.stack([lift(start, middle, who)[0][:, 0, 2] for who in (i, k)])
+    open_gap = z.min(0) < (1 - float(form["occlusion_gap"])) * z.max(0)
+    weight[open_gap & (start["body"][i] != start["body"][k])] *= float(form["cont_occluded"])
+    if form["units"] == "pixel" and bool(start["bending"]):
+        torn = start["surface"][i] != start["surface"][k]
+        weight[torn] *= float(form["bending"]["cont_across"])
+    return np.asarray(weight)
 
 
 def _gap(a: Float, b: Float) -> float:

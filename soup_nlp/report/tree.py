@@ -27,7 +27,7 @@ _ENERGY: Mapping[str, tuple[str, str, str]] = {
     "rotation_scale": ("1", "", "factor of |R_i - R_k|"),
     "pairs": ("1", "P,2", "neighbours i < k that share boundary"),
     "boundary_ray": ("1", "P,B,3", "rays of the sampled shared boundary points"),
-    "pair_weight": ("1", "P", "w4, both directions folded"),
+    "pair_weight": ("1", "P", "w4, both directions folded, less where one body hides another"),
     "pair_factor": ("1", "P", "sqrt(boundary length / B): stands for the whole boundary"),
     "pair_unit": ("1", "P", "length unit of a pair, see local_units"),
     "pair_count": ("1", "P", "directed pairs folded into one (E_orient)"),
@@ -107,6 +107,7 @@ def result_tree(run: Run) -> Tree:
             "borrowed": Array(run.start.borrowed, "1", "plane or motion from neighbours", "N"),
             "motion": Array(run.start.motion, "1", "dominant motion, -1 for its own", "N"),
             "body": Array(run.start.body, "1", "group that seems to move as one", "N"),
+            "surface": Array(run.start.surface, "1", "group within which no flow tears", "N"),
             "bending_share": Array(
                 np.float64(run.start.bending_share), "1", "moves otherwise than most of its surface"
             ),
@@ -205,6 +206,7 @@ def _segmentation(run: Run) -> dict[str, Array]:
         ),
         "boundary": Array(s.boundary, "px", "sampled shared boundary points (u, v)", "P,B,2"),
         "boundary_length": Array(s.boundary_length, "px", "shared boundary before sampling", "P"),
+        "pair_weight": Array(s.pair_weight, "1", "w4 of the pairs, of the image alone", "P"),
         "rim": Array(s.rim, "px", "extreme pixels (u, v) by direction", "N,V,2"),
     }
 

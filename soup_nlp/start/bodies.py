@@ -81,21 +81,30 @@ def borrow(
     return mu, slope
 
 
+OUTLINE, GROUND = 0.2, 0.4
+"""Quantiles of the depth ratios along a body's outline, and along what lies below it."""
+BELOW = 0.5
+"""Cosine of the angle to the vertical up to which a neighbour lies below."""
+
+
 def contact_scales(
-    soup: Soup, label: Int, seg: Segmentation, K_ref: Float, quantile: float = 0.2
+    soup: Soup, label: Int, seg: Segmentation, K_ref: Float, upright: bool = True
 ) -> Float:
     """(N,) relative scale of every body, such that bodies touch what is around them.
 
-    A body hides what is behind it: along its outline its depth is at most its neighbours', with
-    equality where it touches. So its scale is a low quantile of the depth ratios there. Bodies
-    are joined to the placed ones in the order of their contact length.
+    A body stands on what is below it: in an upright image its scale is the middle of the depth
+    ratios along the lower part of its outline. Where none of that is seen (less than a tenth of
+    the outline), or nothing is known of the vertical: a body hides what is behind it, so its depth
+    is at most its neighbours', with equality where it touches, and its scale is a low quantile of
+    the depth ratios all around. Bodies are joined to the placed ones in the order of their contact
+    length.
 
     Args:
         soup: Planes, every motion in its own scale.
         label: (N,) index of the body.
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
-        quantile: Of the depth ratios along the outline.
+        upright: Whether the image's columns run down.
     """
     count = int(label.max()) + 1
     log_scale = np.zeros(count)
@@ -110,6 +119,9 @@ def contact_scales(
     b = np.concatenate([label[k][across], label[i][across]])
     ratio = np.log(np.concatenate([(zk / zi)[across], (zi / zk)[across]]))
     contact = np.tile(seg.boundary_length[across], 2).astype(float)
+    way = (seg.anchors[k] - seg.anchors[i])[across]
+    down = way[:, 1] / np.linalg.norm(way, axis=1)
+    below = np.concatenate([down, -down]) > (BELOW if upright else np.inf)
     placed = np.zeros(count, bool)
     placed[np.argmax(np.bincount(label, minlength=count))] = True
     while not placed.all():
@@ -119,9 +131,12 @@ def contact_scales(
         length = np.bincount(a[touch], contact[touch], minlength=count)
         c = int(np.argmax(length))
         mine = touch & (a == c)
-        value = ratio[mine] + log_scale[b[mine]]
+        ground = mine & below
+        seen = contact[ground].sum() >= 0.1 * contact[mine].sum()
+        use, quantile = (ground, GROUND) if seen else (mine, OUTLINE)
+        value = ratio[use] + log_scale[b[use]]
         order = np.argsort(value)
-        share = np.cumsum(contact[mine][order]) / contact[mine].sum()
+        share = np.cumsum(contact[use][order]) / contact[use].sum()
         log_scale[c] = value[order][np.searchsorted(share, quantile)]
         placed[c] = True
     return np.exp(log_scale)[label]

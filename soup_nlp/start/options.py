@@ -22,6 +22,8 @@ class StartOptions:
         bending: Surfaces are taken to bend where more than this share of the superpixels moves
             otherwise than most of its own surface; 1 for never.
         tear_px: Where the flow of two neighbours differs by more, a surface ends.
+        upright: The image's columns run down: bodies stand on what is below them. Off, a body is
+            scaled to touch whatever it touches first.
         seed: Of sampling and RANSAC.
     """
 
@@ -36,4 +38,5 @@ class StartOptions:
     piece_size: int = 4
     bending: float = 0.25
     tear_px: float = 1.0
+    upright: bool = True
     seed: int = 0

@@ -151,7 +151,7 @@ def propose(
         soup, error = constant_depth(views)
         none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
         return Start(soup, error, parallax, every, none, none + 1, motions, surface, share, True)
-    scale = contact_scales(soup, body, seg, K_ref)
+    scale = contact_scales(soup, body, seg, K_ref, o.upright)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t).normalised()
     return Start(soup, own.cost[:, 0], parallax, weak, label, body, motions, surface, share)
 
