@@ -122,6 +122,25 @@ def test_a_body_stands_on_what_is_below_it(upright, scale):
     np.testing.assert_allclose(found, np.where(label == 1, scale, 1.0), rtol=1e-12)
 
 
+def test_a_car_has_room_between_its_wheels():
+    """Of what lies below the lowest counts most: the wheels' ground, not what is seen under it."""
+    z = np.array([[9.0] * 5, [9, 1, 1, 1, 9], [9, 1, 3, 1, 9], [2.0] * 5])
+    own = np.zeros((4, 5), bool)
+    own[1, 1:4] = own[2, [1, 3]] = True
+    v, u = np.mgrid[0:32, 0:40]
+    seg = build_segmentation(
+        (v // 8 * 5 + u // 8).astype(np.int32), np.zeros((32, 40, 3), np.uint8), neighbours=4
+    )
+    every = np.ones(20)
+    normals = np.tile([0, 0, -1.0], (20, 1))
+    soup = Soup(
+        every / 20, normals, 20 * z.ravel(), np.tile(np.eye(3), (20, 1, 1)), np.ones((20, 3))
+    )
+    label = own.ravel().astype(np.int64)
+    found = contact_scales(soup, label, seg, K)
+    np.testing.assert_allclose(found, np.where(label == 1, 2.0, 1.0), rtol=1e-12)
+
+
 def test_a_body_with_nothing_below_it_touches_its_outline():
     """The lower edge of the image cuts it off: a low quantile of the depth ratios around it."""
     v, u = np.mgrid[0:16, 0:24]

@@ -93,10 +93,11 @@ def contact_scales(
     """(N,) relative scale of every body, such that bodies touch what is around them.
 
     A body stands on what is below it: in an upright image its scale is the middle of the depth
-    ratios along the lower part of its outline. Where none of that is seen (less than a tenth of
-    the outline), or nothing is known of the vertical: a body hides what is behind it, so its depth
-    is at most its neighbours', with equality where it touches, and its scale is a low quantile of
-    the depth ratios all around. Bodies are joined to the placed ones in the order of their contact
+    ratios where a neighbour lies below, which count by the square of how low they are in the body
+    (a car has room between its wheels). Where none of that is seen (less than a tenth of the
+    outline), or nothing is known of the vertical: a body hides what is behind it, so its depth is
+    at most its neighbours', with equality where it touches, and its scale is a low quantile of the
+    depth ratios all around. Bodies are joined to the placed ones in the order of their contact
     length.
 
     Args:
@@ -122,6 +123,7 @@ def contact_scales(
     way = (seg.anchors[k] - seg.anchors[i])[across]
     down = way[:, 1] / np.linalg.norm(way, axis=1)
     below = np.concatenate([down, -down]) > (BELOW if upright else np.inf)
+    height = np.tile(seg.boundary[across, :, 1].mean(axis=1), 2)
     placed = np.zeros(count, bool)
     placed[np.argmax(np.bincount(label, minlength=count))] = True
     while not placed.all():
@@ -134,9 +136,13 @@ def contact_scales(
         ground = mine & below
         seen = contact[ground].sum() >= 0.1 * contact[mine].sum()
         use, quantile = (ground, GROUND) if seen else (mine, OUTLINE)
+        weight = contact[use]
+        if seen:
+            top = seg.anchors[label == c, 1].min()
+            weight = weight * np.square(np.maximum(height[use] - top, 1.0))
         value = ratio[use] + log_scale[b[use]]
         order = np.argsort(value)
-        share = np.cumsum(contact[use][order]) / contact[use].sum()
+        share = np.cumsum(weight[order]) / weight.sum()
         log_scale[c] = value[order][np.searchsorted(share, quantile)]
         placed[c] = True
     return np.exp(log_scale)[label]
