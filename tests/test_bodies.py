@@ -98,17 +98,20 @@ def test_pairs_of_two_bodies_weigh_less_where_one_hides_the_other(world):
         np.testing.assert_array_equal(one.pair_weight, data.pair_weight, err_msg=why)
 
 
-@pytest.mark.parametrize(("upright", "scale"), [(True, 2.0), (False, 1.0)])
-def test_a_body_stands_on_what_is_below_it(upright, scale):
+@pytest.mark.parametrize(
+    ("upright", "ground", "scale"), [(True, 2.0, 2.0), (False, 2.0, 1.0), (True, 40.0, 4.0)]
+)
+def test_a_body_stands_on_what_is_below_it(upright, ground, scale):
     """Nine planes: a body of unknown scale amid a wall, on the ground, half behind a near thing.
 
-    True depth of the body is that of the ground below it; its own unit says 1.
+    True depth of the body is that of the ground below it; its own unit says 1. A ground that is
+    beyond most of what the body hides is none.
     """
     v, u = np.mgrid[0:24, 0:24]
     seg = build_segmentation(
         (v // 8 * 3 + u // 8).astype(np.int32), np.zeros((24, 24, 3), np.uint8), neighbours=4
     )
-    wall, near, own, ground = 4.0, 1.0, 1.0, 2.0
+    wall, near, own = 4.0, 1.0, 1.0
     z = np.array([wall, wall, wall, near, own, wall, ground, ground, ground])
     soup = Soup(
         np.full(9, 1 / 9),

@@ -81,8 +81,9 @@ def borrow(
     return mu, slope
 
 
-OUTLINE, GROUND = 0.2, 0.4
-"""Quantiles of the depth ratios along a body's outline, and along what lies below it."""
+OUTLINE, GROUND, MOST = 0.2, 0.4, 0.6
+"""Quantiles of the depth ratios along a body's outline, along what lies below it, and the one of
+the outline that the latter's may reach."""
 BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 
@@ -94,11 +95,11 @@ def contact_scales(
 
     A body stands on what is below it: in an upright image its scale is the middle of the depth
     ratios where a neighbour lies below, which count by the square of how low they are in the body
-    (a car has room between its wheels). Where none of that is seen (less than a tenth of the
-    outline), or nothing is known of the vertical: a body hides what is behind it, so its depth is
-    at most its neighbours', with equality where it touches, and its scale is a low quantile of the
-    depth ratios all around. Bodies are joined to the placed ones in the order of their contact
-    length.
+    (a car has room between its wheels). A body hides what is behind it, so its depth is at most its
+    neighbours': the scale is bounded by what most of the outline allows, should the superpixels
+    below be wrong ones. Where none are seen (less than a tenth of the outline), or nothing is known
+    of the vertical, a body touches what it touches first: a low quantile of the depth ratios all
+    around. Bodies are joined to the placed ones in the order of their contact length.
 
     Args:
         soup: Planes, every motion in its own scale.
@@ -134,15 +135,21 @@ def contact_scales(
         c = int(np.argmax(length))
         mine = touch & (a == c)
         ground = mine & below
-        seen = contact[ground].sum() >= 0.1 * contact[mine].sum()
-        use, quantile = (ground, GROUND) if seen else (mine, OUTLINE)
-        weight = contact[use]
-        if seen:
-            top = seg.anchors[label == c, 1].min()
-            weight = weight * np.square(np.maximum(height[use] - top, 1.0))
-        value = ratio[use] + log_scale[b[use]]
-        order = np.argsort(value)
-        share = np.cumsum(weight[order]) / weight.sum()
-        log_scale[c] = value[order][np.searchsorted(share, quantile)]
+        value = ratio + log_scale[b]
+        if contact[ground].sum() >= 0.1 * contact[mine].sum():
+            low = np.maximum(height - seg.anchors[label == c, 1].min(), 1.0)
+            log_scale[c] = min(
+                _quantile(value[ground], (contact * low**2)[ground], GROUND),
+                _quantile(value[mine], contact[mine], MOST),
+            )
+        else:
+            log_scale[c] = _quantile(value[mine], contact[mine], OUTLINE)
         placed[c] = True
     return np.exp(log_scale)[label]
+
+
+def _quantile(value: Float, weight: Float, share: float) -> float:
+    """The value up to which a share of the weight lies."""
+    order = np.argsort(value)
+    below = np.cumsum(weight[order]) / weight.sum()
+    return float(value[order][np.searchsorted(below, share)])
