@@ -91,9 +91,10 @@ def row(scene: str, both: dict[str, Any], alone: dict[str, Any]) -> str:
 def write(out: Path, superpixels: int, lines: list[str], polish: list[str]) -> None:
     """Write table.md whole."""
     head = [
-        f"Flow by DIS, {superpixels} superpixels wanted, K = 15, 50 particles, 10 rounds; MRE after"
-        " median scale, no cap. Both = NLP, then refinement. The gap is how far the choice of the"
-        " last round can be from the best one among its particles. Seconds: wall time of the"
+        f"Flow by DIS, {superpixels} superpixels wanted, K = 15, 50 particles, at most 10"
+        " rounds; MRE after median scale, no cap. Both = NLP, then refinement. The gap is how"
+        " far the choice of the last round can be from the best one among its particles. Seconds:"
+        " wall time of the"
         " refinement of both; memory: peak of the whole process, with and without the NLP."
         f" {date.today()}, {platform.machine()}, a shared machine.",
         "",

@@ -98,67 +98,59 @@ def test_pairs_of_two_bodies_weigh_less_where_one_hides_the_other(world):
         np.testing.assert_array_equal(one.pair_weight, data.pair_weight, err_msg=why)
 
 
+def scales(z, own, **options):
+    """Scales found for fronto-parallel squares at depths z (r, c), of which `own` are a body.
+
+    Its own unit says 1; everything else is at its true depth.
+    """
+    rows, columns = np.shape(z)
+    v, u = np.mgrid[0 : 8 * rows, 0 : 8 * columns]
+    image = np.zeros((*v.shape, 3), np.uint8)
+    labels = (v // 8 * columns + u // 8).astype(np.int32)
+    seg = build_segmentation(labels, image, neighbours=4)
+    n = rows * columns
+    facing, still = np.tile([0, 0, -1.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
+    soup = Soup(np.full(n, 1 / n), facing, n * np.ravel(z), still, np.ones((n, 3)))
+    found = contact_scales(soup, np.ravel(own).astype(np.int64), seg, K, **options)
+    return found.reshape(rows, columns)
+
+
 @pytest.mark.parametrize(
     ("upright", "ground", "scale"), [(True, 2.0, 2.0), (False, 2.0, 1.0), (True, 40.0, 4.0)]
 )
 def test_a_body_stands_on_what_is_below_it(upright, ground, scale):
-    """Nine planes: a body of unknown scale amid a wall, on the ground, half behind a near thing.
+    """Amid a wall, on the ground, half behind a near thing.
 
-    True depth of the body is that of the ground below it; its own unit says 1. A ground that is
-    beyond most of what the body hides is none.
+    A ground that is beyond most of what the body hides is none.
     """
-    v, u = np.mgrid[0:24, 0:24]
-    seg = build_segmentation(
-        (v // 8 * 3 + u // 8).astype(np.int32), np.zeros((24, 24, 3), np.uint8), neighbours=4
-    )
-    wall, near, own = 4.0, 1.0, 1.0
-    z = np.array([wall, wall, wall, near, own, wall, ground, ground, ground])
-    soup = Soup(
-        np.full(9, 1 / 9),
-        np.tile([0, 0, -1.0], (9, 1)),
-        9 * z,
-        np.tile(np.eye(3), (9, 1, 1)),
-        np.ones((9, 3)),
-    )
-    label = (np.arange(9) == 4).astype(np.int64)
-    found = contact_scales(soup, label, seg, K, upright)
-    np.testing.assert_allclose(found, np.where(label == 1, scale, 1.0), rtol=1e-12)
+    own = np.zeros((3, 3), bool)
+    own[1, 1] = True
+    z = np.array([[4.0, 4, 4], [1, 1, 4], [ground] * 3])
+    found = scales(z, own, upright=upright)
+    np.testing.assert_allclose(found, np.where(own, scale, 1.0), rtol=1e-12)
 
 
 def test_a_car_has_room_between_its_wheels():
     """Of what lies below the lowest counts most: the wheels' ground, not what is seen under it."""
-    z = np.array([[9.0] * 5, [9, 1, 1, 1, 9], [9, 1, 3, 1, 9], [2.0] * 5])
-    own = np.zeros((4, 5), bool)
-    own[1, 1:4] = own[2, [1, 3]] = True
-    v, u = np.mgrid[0:32, 0:40]
-    seg = build_segmentation(
-        (v // 8 * 5 + u // 8).astype(np.int32), np.zeros((32, 40, 3), np.uint8), neighbours=4
-    )
-    every = np.ones(20)
-    normals = np.tile([0, 0, -1.0], (20, 1))
-    soup = Soup(
-        every / 20, normals, 20 * z.ravel(), np.tile(np.eye(3), (20, 1, 1)), np.ones((20, 3))
-    )
-    label = own.ravel().astype(np.int64)
-    found = contact_scales(soup, label, seg, K)
-    np.testing.assert_allclose(found, np.where(label == 1, 2.0, 1.0), rtol=1e-12)
+    z = np.array([[9.0] * 5, [9, 1, 1, 1, 9], [9, 1, 3, 1, 9], [2] * 5])
+    own = z == 1
+    np.testing.assert_allclose(scales(z, own), np.where(own, 2.0, 1.0), rtol=1e-12)
 
 
 def test_a_body_with_nothing_below_it_touches_its_outline():
     """The lower edge of the image cuts it off: a low quantile of the depth ratios around it."""
-    v, u = np.mgrid[0:16, 0:24]
-    seg = build_segmentation(
-        (v // 8 * 3 + u // 8).astype(np.int32), np.zeros((16, 24, 3), np.uint8), neighbours=4
-    )
-    z = np.array([4.0, 6.0, 4.0, 3.0, 1.0, 3.5])
-    every = np.ones(6)
-    soup = Soup(
-        every / 6,
-        np.tile([0, 0, -1.0], (6, 1)),
-        6 * z,
-        np.tile(np.eye(3), (6, 1, 1)),
-        np.ones((6, 3)),
-    )
-    label = (np.arange(6) == 4).astype(np.int64)
-    found = contact_scales(soup, label, seg, K)
-    np.testing.assert_allclose(found, np.where(label == 1, 3.0, 1.0), rtol=1e-12)
+    z = np.array([[4.0, 6, 4], [3, 1, 3.5]])
+    own = z == 1
+    np.testing.assert_allclose(scales(z, own), np.where(own, 3.0, 1.0), rtol=1e-12)
+
+
+def test_depths_across_pairs_are_those_of_both_planes(world):
+    seg, soup, _, _ = world
+    ray = camera.rays(K, seg.boundary.mean(axis=1))
+    for side, z in enumerate(soup.depth_across(seg.pairs, ray)):
+        who = seg.pairs[:, side]
+        own = [soup.depth_at(np.tile(r, (len(soup), 1)))[w] for r, w in zip(ray, who)]
+        np.testing.assert_allclose(z, own, rtol=1e-14)
+    edge_on = replace(soup, n=np.tile([0, 1.0, 0], (len(soup), 1)))
+    z = edge_on.depth_across(seg.pairs, np.tile([0, 1.0, 1], (len(seg.pairs), 1)))
+    np.testing.assert_allclose(z, edge_on.distance[seg.pairs.T] / 1e-3, rtol=1e-14)

@@ -25,10 +25,21 @@ SCHEDULE = (0.1, 0.03)
 FORM = Formulation(compiled=False)
 
 
+def small(**settings: object) -> Case:
+    scene = {"kind": "scene", "scene": "street", "seed": 0, "width": 256, "height": 128}
+    problem = {"input": scene, "segmentation": {"superpixels": 60}, **settings}
+    return prepare(make_problem(problem))
+
+
 @pytest.fixture(scope="module")
 def case() -> Case:
-    scene = {"kind": "scene", "scene": "street", "seed": 0, "width": 256, "height": 128}
-    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+    return small()
+
+
+@pytest.fixture(scope="module")
+def far() -> Case:
+    """The same with bodies that start further away: their scale is that of their outline."""
+    return small(start={"upright": False}, energy={"cont_occluded": 1.0})
 
 
 @pytest.fixture(scope="module")
@@ -57,13 +68,13 @@ def test_levenberg_marquardt_lowers_the_energy(case, lm):
     assert str(lm).startswith("levenberg-marquardt")
 
 
-def test_lbfgs_lowers_the_energy(case):
-    y = lbfgs(case.soup, case.data, case.weights, FORM, eps=SCHEDULE, iterations=60)
-    check(case, y)
+def test_lbfgs_lowers_the_energy(far):
+    y = lbfgs(far.soup, far.data, far.weights, FORM, eps=SCHEDULE, iterations=60)
+    check(far, y)
     assert y.name == "l-bfgs"
     assert y.status == "Iteration_Limit"
     assert y.iterations <= 120
-    assert y.energy["total"] < 0.95 * y.history[0, 1]
+    assert y.energy["total"] < 0.9 * y.history[0, 1]
 
 
 def test_ipopt_and_levenberg_marquardt_agree(case, lm):

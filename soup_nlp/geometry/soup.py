@@ -11,6 +11,7 @@ from soup_nlp.geometry.camera import pixel_grid, project, rays
 from soup_nlp.geometry.rotation import nearest
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,14 @@ class Soup:
         """z (N, ...) of rays (N, ..., 3) on their own superpixel's plane (FORMULATION)."""
         facing = -np.einsum("nc,n...c->n...", self.n, ray)
         return self.distance.reshape(-1, *[1] * (ray.ndim - 2)) / facing
+
+    def depth_across(self, pairs: Int, ray: Float) -> Float:
+        """(2, P) z of rays (P, 3) on the planes of both superpixels of every pair (P, 2).
+
+        A plane that faces its ray by less than 1e-3 is taken to face it by that.
+        """
+        facing = np.maximum(-np.einsum("psc,pc->sp", self.n[pairs], ray), 1e-3)
+        return np.asarray(self.distance[pairs.T] / facing)
 
     def points(self, ray: Float) -> Float:
         """Reference-frame points (N, ..., 3) of rays (N, ..., 3)."""

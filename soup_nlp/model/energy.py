@@ -231,9 +231,8 @@ def at_occlusions(
         factor: 1 is the paper's energy.
     """
     i, k = data.pairs.T
-    ray = data.boundary_ray.mean(axis=1)
-    zi, zk = (-soup.distance[j] / np.sum(soup.n[j] * ray, axis=1) for j in (i, k))
-    hidden = (body[i] != body[k]) & (np.minimum(zi, zk) < (1 - gap) * np.maximum(zi, zk))
+    z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
+    hidden = (body[i] != body[k]) & (z.min(axis=0) < (1 - gap) * z.max(axis=0))
     return replace(data, pair_weight=np.where(hidden, factor, 1.0) * data.pair_weight)
 
 

@@ -64,7 +64,7 @@ class RefineOptions:
     Attributes:
         enabled: Refine at all.
         from_start: Refine the start: the NLP is skipped.
-        rounds: Rounds of particles.
+        rounds: Most rounds of particles.
         particles: Labels of every superpixel, the current belief among them.
         keep: Share of the particles that stays for the next round.
         depth_reach: A new depth is at most this many times the upper quartile of the neighbours'

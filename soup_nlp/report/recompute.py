@@ -224,9 +224,10 @@ def _pair_weights(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Float:
     """w4 of the image, less where one body of the start hides another and where the flow tears."""
     start, seg = tree["start"], tree["segmentation"]
     weight = seg["pair_weight"].copy()
-    middle = tree["energy"]["boundary_ray"].mean(1, keepdims=True)
+    middle = tree["energy"]["boundary_ray"].mean(1)
     i, k = tree["energy"]["pairs"].T
-    z = np.stack([lift(start, middle, who)[0][:, 0, 2] for who in (i, k)])
+    facing = [np.maximum(-(start["n"][who] * middle).sum(1), 1e-3) for who in (i, k)]
+    z = np.stack([(start["lam"] * start["d"])[who] / f for who, f in zip((i, k), facing)])
     open_gap = z.min(0) < (1 - float(form["occlusion_gap"])) * z.max(0)
     weight[open_gap & (start["body"][i] != start["body"][k])] *= float(form["cont_occluded"])
     if form["units"] == "pixel" and bool(start["bending"]):

@@ -113,9 +113,7 @@ def contact_scales(
     if count == 1 or not len(seg.pairs):
         return np.ones(len(soup))
     i, k = seg.pairs.T
-    ray = rays(K_ref, seg.boundary.mean(axis=1))
-    zi = soup.distance[i] / np.maximum(-np.sum(soup.n[i] * ray, axis=1), 1e-3)
-    zk = soup.distance[k] / np.maximum(-np.sum(soup.n[k] * ray, axis=1), 1e-3)
+    zi, zk = soup.depth_across(seg.pairs, rays(K_ref, seg.boundary.mean(axis=1)))
     across = label[i] != label[k]
     a = np.concatenate([label[i][across], label[k][across]])
     b = np.concatenate([label[k][across], label[i][across]])
@@ -149,7 +147,4 @@ def contact_scales(
 
 
 def _quantile(value: Float, weight: Float, share: float) -> float:
-    """The value up to which a share of the weight lies."""
-    order = np.argsort(value)
-    below = np.cumsum(weight[order]) / weight.sum()
-    return float(value[order][np.searchsorted(below, share)])
+    return float(np.quantile(value, share, weights=weight, method="inverted_cdf"))
