@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.sparse import coo_array
 
-from soup_nlp.refine.trws import TRWSResult
+from soup_nlp.mrf.trws import TRWSResult
 
 FOREVER = {"gap": -1.0, "stagnation": -1.0}
 seeds = st.integers(0, 2**32 - 1)

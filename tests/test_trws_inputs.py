@@ -11,14 +11,14 @@ from helpers_trws import FOREVER, dense, ragged, seeds
 from hypothesis import given, settings
 
 from soup_nlp.errors import ModelError
-from soup_nlp.refine.trws import mrf_energy, solve_trws
+from soup_nlp.mrf.trws import mrf_energy, solve_trws
 
 # --- forms of input ---------------------------------------------------------------------------
 
 
 def test_functions_lists_and_arrays_agree(monkeypatch):
-    monkeypatch.setattr("soup_nlp.refine.trws.CALL_BYTES", 5 * 4 * 4 * 8)
-    monkeypatch.setattr("soup_nlp.refine.trws_order.CALL_BYTES", 5 * 4 * 4 * 8)
+    monkeypatch.setattr("soup_nlp.mrf.trws.CALL_BYTES", 5 * 4 * 4 * 8)
+    monkeypatch.setattr("soup_nlp.mrf.trws_order.CALL_BYTES", 5 * 4 * 4 * 8)
     rng = np.random.default_rng(7)
     unary, edges, tables = dense(rng, 12, 30, 4)
     asked: list[int] = []

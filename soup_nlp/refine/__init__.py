@@ -1,1 +1,1 @@
-"""Discrete refinement: particles and TRW-S."""
+"""Discrete refinement: particles, chosen by TRW-S."""

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import plain
 from soup_nlp.model.energy import EnergyData, Weights
+from soup_nlp.mrf.trws import TRWSResult, solve_trws
 from soup_nlp.refine.costs import PairCosts, Particles, feasible, unary_costs
 from soup_nlp.refine.local import neighbours
 from soup_nlp.refine.particles import COMMON, KINDS, WALKS, Proposals, Proposer
 from soup_nlp.refine.select import conditional_costs, diverse, upright, within_reach
-from soup_nlp.refine.trws import TRWSResult, solve_trws
 from soup_nlp.solve.ipopt import Listener, Progress
 
 Float = NDArray[np.float64]

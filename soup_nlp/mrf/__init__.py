@@ -1,0 +1,1 @@
+"""Discrete labellings: pairwise energies minimised by TRW-S; knows nothing of soups."""
