@@ -11,27 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bodies import joined
 from soup_nlp.start.planes import Views
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
-
-def surfaces(views: Views, seg: Segmentation, boundary_ray: Float, tear_px: float) -> Int:
-    """(N,) surface of every superpixel: what hangs together where the flow does not tear.
-
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        seg: Superpixels and graphs.
-        boundary_ray: (P, B, 3) rays of the shared boundaries, reference frame.
-        tear_px: A larger jump of the flow across a boundary is a tear, pixels.
-    """
-    if not len(seg.pairs):
-        return np.arange(len(seg))
-    return joined(flow_jump(views, seg.pairs, boundary_ray) < tear_px, seg)
 
 
 def bending_share(surface: Int, body: Int) -> float:

@@ -49,10 +49,18 @@ def bodies(label: Int, seg: Segmentation) -> Int:
     return np.where(own, label.max() + piece, label)
 
 
+SHORTEST = 1e-4
+"""Least length of a translation, relative to the one that a motion's borrowed depths ask for."""
+
+
 def borrow(
     mu: Float, slope: Float, label: Int, weak: NDArray[np.bool_], seg: Segmentation
-) -> tuple[Float, Float]:
+) -> tuple[Float, Float, Float]:
     """Weak superpixels take the median inverse depth of strong neighbours of their motion.
+
+    A motion without any strong superpixel (of what a camera at rest sees at rest) borrows from
+    those of others. Its translation is shortened then, by as much as its own inverse depths are
+    smaller: at the borrowed depths it would move what stands still.
 
     Args:
         mu: (N,) inverse depth at the anchor, in units of |t|.
@@ -62,23 +70,26 @@ def borrow(
         seg: Superpixels and graphs.
 
     Returns:
-        mu and slope with what was borrowed.
+        mu and slope with what was borrowed, and (N,) the length of each translation.
     """
     from scipy.spatial import cKDTree
 
-    mu, slope = mu.copy(), slope.copy()
+    mu, slope, length = mu.copy(), slope.copy(), np.ones(len(mu))
     for c in np.unique(label[weak]) if weak.any() else []:
         own = np.flatnonzero(weak & (label == c))
         strong = np.flatnonzero(~weak & (label == c))
-        if not len(strong):
+        alone = not len(strong)
+        if alone:
             strong = np.flatnonzero(~weak)
         if not len(strong):
             continue
         k = min(5, len(strong))
         _, near = cKDTree(seg.anchors[strong]).query(seg.anchors[own], k=k)
-        mu[own] = np.median(mu[strong][near.reshape(len(own), k)], axis=1)
-        slope[own] = 0.0
-    return mu, slope
+        borrowed = np.median(mu[strong][near.reshape(len(own), k)], axis=1)
+        if alone:
+            length[own] = np.clip(np.median(mu[own]) / np.median(borrowed), SHORTEST, 1.0)
+        mu[own], slope[own] = borrowed, 0.0
+    return mu, slope, length
 
 
 OUTLINE, GROUND, MOST = 0.2, 0.4, 0.6

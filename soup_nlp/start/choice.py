@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.start.bodies import components
 from soup_nlp.start.epipolar import Motion, estimate, repeated
 from soup_nlp.start.local import fit_translation, neighbourhood, refine_motion
@@ -118,114 +122,137 @@ def select(cost: Float, noise: float, o: StartOptions) -> list[int]:
     return kept
 
 
-def smooth_choice(cost: Float, seg: Segmentation, gain: float, rounds: int = 10) -> Int:
-    """Labels by iterated conditional modes: cost plus `gain` x share of unlike neighbours.
+def smooth_choice(cost: Float, near: Float, seg: Segmentation, price: float) -> Int:
+    """Label of every superpixel: its cost, plus `price` where neighbours differ; by TRW-S.
+
+    A superpixel unlike all its neighbours pays about twice the price, one neighbour counts by its
+    share of the outlines and by how near it is.
 
     Args:
-        cost: (N, M) error of each superpixel under each motion, pixels.
+        cost: (N, M) cost of each superpixel under each label, pixels; +inf forbids one.
+        near: (P,) how much two neighbours should be alike, 0 to 1.
         seg: Superpixels and graphs.
-        gain: Pixels that a label unlike all neighbours' must gain.
-        rounds: At most this many sweeps.
+        price: Pixels.
 
     Returns:
-        (N,) motion of every superpixel.
+        (N,) label of every superpixel.
     """
-    m = cost.shape[1]
-    label = np.argmin(cost, axis=1)
-    if m == 1:
-        return label
-    near = seg.knn[:, : min(8, seg.knn.shape[1])]
-    for _ in range(rounds):
-        alike = np.stack([(label[near] == c).mean(axis=1) for c in range(m)], axis=1)
-        new = np.argmin(cost + gain * (1 - alike), axis=1)
-        if np.array_equal(new, label):
-            break
-        label = new
-    return label
+    n, m = cost.shape
+    if m == 1 or not len(seg.pairs):
+        return np.argmin(cost, axis=1)
+    i, k = seg.pairs.T
+    length = seg.boundary_length.astype(float)
+    outline = np.bincount(i, length, n) + np.bincount(k, length, n)
+    weight = price * near * length * (1 / outline[i] + 1 / outline[k])
+    tables = weight[:, None, None] * (1 - np.eye(m))
+    return solve_trws(cost, seg.pairs, tables, max_iter=50).labels
+
+
+def hanging_together(jump: Float, o: StartOptions) -> Float:
+    """(P,) how much two neighbours belong together, from 1 where their flow does not jump to 0.
+
+    Args:
+        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
+        o: Where a surface ends.
+    """
+    return np.exp(-2 * jump / o.tear_px)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Motion and plane that every superpixel has taken.
+
+    Attributes:
+        R: (N, 3, 3) rotations.
+        t: (N, 3) unit translations.
+        fit: Planes (N, 1) under them.
+        label: (N,) index of each motion, -1 for one of the superpixel's own. Superpixels of one
+            index have the same R and t.
+    """
+
+    R: Float
+    t: Float
+    fit: PlaneFit
+    label: Int
+
+    @property
+    def error(self) -> Float:
+        """(N,) penalised re-projection error, pixels."""
+        return self.fit.penalised()[:, 0]
+
+    def taking(self, at: Int, R: Float, t: Float, fit: PlaneFit, label: Int | int) -> Choice:
+        """With superpixels `at` (K,) having other motions, planes (K, 1) and indices."""
+
+        def put(old: Any, new: Any) -> Any:
+            out = old.copy()
+            out[at] = new
+            return out
+
+        planes = [put(a, b) for a, b in zip(vars(self.fit).values(), vars(fit).values())]
+        return Choice(put(self.R, R), put(self.t, t), PlaneFit(*planes), put(self.label, label))
+
+    def renumbered(self) -> tuple[Choice, list[Motion]]:
+        """The motions that are shared, the commonest first, and the choice with their indices."""
+        shared, first, inverse, count = np.unique(
+            self.label, return_index=True, return_inverse=True, return_counts=True
+        )
+        order = np.argsort(-np.where(shared < 0, 0, count), kind="stable")
+        order = order[shared[order] >= 0]
+        number = np.full(len(shared), -1)
+        number[order] = np.arange(len(order))
+        motions = [Motion(self.R[first[c]], self.t[first[c]]) for c in order]
+        return replace(self, label=number[inverse.ravel()]), motions
 
 
 def of_neighbourhoods(
-    views: Views,
-    seg: Segmentation,
-    R: Float,
-    t: Float,
-    own: PlaneFit,
-    best: Float,
-    label: Int,
-    noise: float,
-    o: StartOptions,
-) -> tuple[Float, Float, PlaneFit, Float, Int]:
+    views: Views, seg: Segmentation, choice: Choice, noise: float, o: StartOptions
+) -> Choice:
     """Motions of every superpixel's own neighbourhood and of its neighbours', where they pay.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
         seg: Superpixels and graphs.
-        R: (N, 3, 3) rotations so far.
-        t: (N, 3) unit translations so far.
-        own: Planes (N, 1) under them.
-        best: (N,) their penalised error, pixels.
-        label: (N,) index of each motion, -1 for one of the superpixel's own.
+        choice: What they have so far.
         noise: Flow noise, pixels.
         o: Least gain and rounds.
 
     Returns:
-        R, t, own, best and label with what was adopted.
+        The choice with what was adopted.
     """
     n, k = seg.knn.shape
     if k == 0:
-        return R, t, own, best, label
+        return choice
     gain = max(2 * noise, o.unexplained_px)
     for size in (8, 24):
-        if not (best > gain).any():
+        if not (choice.error > gain).any():
             break
         near = np.column_stack([np.arange(n), seg.knn[:, : min(size, k)]])
         step = max(1, near.shape[1] * views.ray.shape[1] // 200)
         r, q, w = (
             neighbourhood(v[:, ::step], near) for v in (views.ray, views.target, views.weight)
         )
+        R, t = choice.R, choice.t
         t1 = fit_translation(R, r, q, w, views.focal[0], max(noise, 0.1))
         R2, t2 = refine_motion(R, t, r, q, w, views.focal[0], max(noise, 0.1))
         R3, t3 = refine_motion(R, t1, r, q, w, views.focal[0], max(noise, 0.1))
-        Rs = np.stack([R, R2, R3], axis=1)
-        ts = np.stack([t1, t2, t3], axis=1)
-        R, t, own, best, label = _adopt(views, Rs, ts, R, t, own, best, label, gain)
+        Rs, ts = np.stack([R, R2, R3], axis=1), np.stack([t1, t2, t3], axis=1)
+        choice = _adopt(views, Rs, ts, choice, gain)
     for _ in range(o.rounds):
-        if not (best > gain).any():
+        if not (choice.error > gain).any():
             break
         near = seg.knn[:, : min(6, k)]
-        R, t, own, best, label = _adopt(
-            views, R[near], t[near], R, t, own, best, label, gain, label[near]
-        )
-    return R, t, own, best, label
+        choice = _adopt(views, choice.R[near], choice.t[near], choice, gain, choice.label[near])
+    return choice
 
 
 def _adopt(
-    views: Views,
-    Rs: Float,
-    ts: Float,
-    R: Float,
-    t: Float,
-    own: PlaneFit,
-    best: Float,
-    label: Int,
-    gain: float,
-    labels: Int | None = None,
-) -> tuple[Float, Float, PlaneFit, Float, Int]:
+    views: Views, Rs: Float, ts: Float, choice: Choice, gain: float, labels: Int | None = None
+) -> Choice:
     """Take the best candidate (N, C) where it lowers the error by more than `gain` pixels."""
     fit = views.fit_own(Rs, ts)
     cost = fit.penalised()
     c = np.argmin(cost, axis=1)
-    every = np.arange(len(R))
-    better = cost[every, c] + gain < best
-    new = fit.pick((every, c))
-    own = PlaneFit(
-        *(
-            np.where(better.reshape(-1, *[1] * (a.ndim - 1)), b, a)
-            for a, b in zip(own.__dict__.values(), new.__dict__.values())
-        )
-    )
-    R = np.where(better[:, None, None], Rs[every, c], R)
-    t = np.where(better[:, None], ts[every, c], t)
-    best = np.where(better, cost[every, c], best)
-    taken = labels[every, c] if labels is not None else np.full(len(R), -1)
-    return R, t, own, best, np.where(better, taken, label)
+    at = np.flatnonzero(cost[np.arange(len(c)), c] + gain < choice.error)
+    take = at, c[at]
+    taken = labels[take] if labels is not None else -1
+    return choice.taking(at, Rs[take], ts[take], fit.pick(take), taken)

@@ -13,7 +13,7 @@ class StartOptions:
         samples: Pixels per superpixel.
         dominant: Dominant motions looked for.
         threshold_px: Inlier distance of a dominant motion.
-        smoothness: Pixels of error that a motion unlike all neighbours' must gain.
+        smoothness: Pixels that a border between motions must gain, where the flow does not jump.
         min_parallax_px: Below this the depth of a superpixel is borrowed.
         rounds: Rounds of proposals from unexplained pieces, and from neighbours.
         unexplained_px: A superpixel whose error is below this has no need of another motion.

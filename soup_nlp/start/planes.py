@@ -155,3 +155,8 @@ class Views:
         return fit_planes(
             R, t, self.ray, self.target, self.weight, self.anchor, self.radius, self.focal
         )
+
+    def some(self, at: Int) -> Views:
+        """Those of superpixels `at`."""
+        ray, target, weight = self.ray[at], self.target[at], self.weight[at]
+        return Views(ray, target, weight, self.anchor[at], self.radius[at], self.focal)

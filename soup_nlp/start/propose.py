@@ -13,17 +13,20 @@ from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy import sample_pixels
-from soup_nlp.start.bending import bending_share, constant_depth, surfaces
-from soup_nlp.start.bodies import bodies, borrow, contact_scales
+from soup_nlp.start.bending import bending_share, constant_depth, flow_jump
+from soup_nlp.start.bodies import bodies, borrow, contact_scales, joined
 from soup_nlp.start.choice import (
+    Choice,
     dominant,
     flow_noise,
+    hanging_together,
     of_neighbourhoods,
     of_pieces,
     select,
     smooth_choice,
 )
 from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.gather import gather
 from soup_nlp.start.options import StartOptions
 from soup_nlp.start.planes import Views
 
@@ -86,6 +89,73 @@ def propose(
         DataError: fewer than 8 pixels have a usable flow.
     """
     o = options or StartOptions()
+    views, poor = look(seg, flow, K_ref, K_next, o)
+    motions = dominant(views, o)
+    fit = views.fit(motions)
+    cost = fit.penalised()
+    noise = flow_noise(cost)
+    # what no motion explains yet, piece by piece
+    for _ in range(o.rounds):
+        extra = of_pieces(views, seg, motions, cost, noise, o)
+        if not extra:
+            break
+        motions = motions + extra
+        fit = views.fit(motions)
+        cost = fit.penalised()
+        kept = select(cost, noise, o)
+        motions, fit, cost = [motions[c] for c in kept], fit.columns(kept), cost[:, kept]
+        noise = flow_noise(cost)
+    # the dominant motion is preferred where another is not clearly better
+    prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * o.unexplained_px))
+    jump = flow_jump(views, seg.pairs, rays(K_ref, seg.boundary))
+    label = smooth_choice(
+        np.minimum(cost + prefer, 5.0), hanging_together(jump, o), seg, o.smoothness
+    )
+    R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
+    choice = Choice(R, t, fit.pick((np.arange(len(seg)), label)), label)
+    choice = of_neighbourhoods(views, seg, choice, noise, o)
+    choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
+    own, label = choice.fit, choice.label
+    mu, slope, parallax = own.inverse_depth[:, 0], own.slope[:, 0], own.parallax[:, 0]
+    parallax = parallax * np.abs(mu)
+    weak = (mu <= 0) | (parallax < o.min_parallax_px) | (own.cost[:, 0] > 3.0) | poor
+    weak |= views.weight.sum(axis=1) < 2.0
+    if weak.all():
+        # little parallax everywhere is still some, until it is the rounding of the flow
+        weak = ~np.isfinite(mu) | (mu <= 0) | (parallax < 0.02)
+    if weak.all():
+        n = len(seg)
+        mu, slope, weak = np.ones(n), np.zeros((n, 2)), np.ones(n, bool)
+    mu, slope, length = borrow(mu, slope, label, weak, seg)
+    t = choice.t * length[:, None]
+    soup = _soup(mu, slope, choice.R, t, views.anchor, views.radius)
+    body = bodies(label, seg)
+    surface = joined(jump < o.tear_px, seg)
+    share = bending_share(surface, body)
+    if share > o.bending:
+        soup, error = constant_depth(views)
+        none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
+        return Start(soup, error, parallax, every, none, none + 1, motions, surface, share, True)
+    scale = contact_scales(soup, body, seg, K_ref, o.upright)
+    soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t).normalised()
+    return Start(soup, own.cost[:, 0], parallax, weak, label, body, motions, surface, share)
+
+
+def look(
+    seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: StartOptions
+) -> tuple[Views, NDArray[np.bool_]]:
+    """Rays and targets of sampled pixels, and (N,) which superpixels took a neighbour's.
+
+    Args:
+        seg: Superpixels and graphs.
+        flow: Flow with confidence.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        K_next: (3, 3) intrinsics of the next frame.
+        o: Samples and seed.
+
+    Raises:
+        DataError: fewer than 8 pixels have a usable flow.
+    """
     width = seg.labels.shape[1]
     index, there = sample_pixels(seg.labels, flow, o.samples, o.seed)
     if there.sum() < 8:
@@ -107,53 +177,7 @@ def propose(
     radius = np.maximum(radius, 1.0 / K_ref[0, 0])
     focal = (float(K_next[0, 0]), float(K_next[1, 1]))
 
-    views = Views(ray, target, weight, anchor, radius, focal)
-    motions = dominant(views, o)
-    fit = views.fit(motions)
-    cost = fit.penalised()
-    noise = flow_noise(cost)
-    # what no motion explains yet, piece by piece
-    for _ in range(o.rounds):
-        extra = of_pieces(views, seg, motions, cost, noise, o)
-        if not extra:
-            break
-        motions = motions + extra
-        fit = views.fit(motions)
-        cost = fit.penalised()
-        kept = select(cost, noise, o)
-        motions, fit, cost = [motions[c] for c in kept], fit.columns(kept), cost[:, kept]
-        noise = flow_noise(cost)
-    # the dominant motion is preferred where another is not clearly better
-    prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * o.unexplained_px))
-    label = smooth_choice(cost + prefer, seg, o.smoothness)
-    R = np.stack([m.R for m in motions])[label]
-    t = np.stack([m.t for m in motions])[label]
-    take = np.arange(len(seg)), label
-    own = fit.pick(take)
-    best = cost[take]
-    R, t, own, best, label = of_neighbourhoods(views, seg, R, t, own, best, label, noise, o)
-    mu, slope, parallax = own.inverse_depth[:, 0], own.slope[:, 0], own.parallax[:, 0]
-    parallax = parallax * np.abs(mu)
-    weak = (mu <= 0) | (parallax < o.min_parallax_px) | (own.cost[:, 0] > 3.0) | poor
-    weak |= weight.sum(axis=1) < 2.0
-    if weak.all():
-        # little parallax everywhere is still some, until it is the rounding of the flow
-        weak = ~np.isfinite(mu) | (mu <= 0) | (parallax < 0.02)
-    if weak.all():
-        n = len(seg)
-        mu, slope, weak = np.ones(n), np.zeros((n, 2)), np.ones(n, bool)
-    mu, slope = borrow(mu, slope, label, weak, seg)
-    soup = _soup(mu, slope, R, t, anchor, radius)
-    body = bodies(label, seg)
-    surface = surfaces(views, seg, rays(K_ref, seg.boundary), o.tear_px)
-    share = bending_share(surface, body)
-    if share > o.bending:
-        soup, error = constant_depth(views)
-        none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
-        return Start(soup, error, parallax, every, none, none + 1, motions, surface, share, True)
-    scale = contact_scales(soup, body, seg, K_ref, o.upright)
-    soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t).normalised()
-    return Start(soup, own.cost[:, 0], parallax, weak, label, body, motions, surface, share)
+    return Views(ray, target, weight, anchor, radius, focal), poor
 
 
 def _fill_poor(

@@ -1,0 +1,207 @@
+"""Bodies take one motion each: torn ones are gathered, halves of them come back, the rest stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_model import corner_scene, cut_by_part, motion, with_true_flow
+
+from soup_nlp.data.raycast import render
+from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.mrf.trws import mrf_energy
+from soup_nlp.start.bending import flow_jump
+from soup_nlp.start.bodies import borrow
+from soup_nlp.start.choice import Choice, hanging_together, smooth_choice
+from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.gather import gather
+from soup_nlp.start.propose import StartOptions, look, propose
+
+WIDTH, HEIGHT = 192, 144
+K = camera.intrinsics(180.0, 180.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+CAMERA = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
+WEDGE = motion((0, 3, 0), (-0.15, 0.02, 0.1))
+OPTIONS = StartOptions()
+
+
+@pytest.fixture(scope="module")
+def world():
+    """A wedge that moves in a room: views, superpixels, jumps, true body and motions."""
+    scene = corner_scene(CAMERA, WEDGE, turn=10)
+    pair = with_true_flow(render(scene, K, HEIGHT, WIDTH))
+    labels, _ = cut_by_part(scene, pair, 100)
+    seg = build_segmentation(labels, pair.image_ref, neighbours=10)
+    views, _ = look(seg, pair.flow, K, K, OPTIONS)
+    jump = flow_jump(views, seg.pairs, camera.rays(K, seg.boundary))
+    body = np.array([np.bincount(pair.truth.bodies[labels == i]).argmax() for i in range(len(seg))])
+    return views, seg, jump, body, unit(pair.truth.motions)
+
+
+def unit(M: np.ndarray) -> list[Motion]:
+    return [Motion(m[:3, :3], m[:3, 3] / np.linalg.norm(m[:3, 3])) for m in M]
+
+
+def chosen(views, motions: list[Motion], label: np.ndarray) -> Choice:
+    fit = views.fit(motions)
+    R, t = (np.stack([getattr(m, a) for m in motions])[label] for a in ("R", "t"))
+    return Choice(R, t, fit.pick((np.arange(len(label)), label)), label)
+
+
+def turned(m: Motion, degrees: float, axis: int) -> Motion:
+    """Another motion that small patches hardly tell from `m`."""
+    R = rotation.exp(np.radians(degrees) * np.eye(3)[axis])
+    t = m.t + 0.2 * np.eye(3)[axis]
+    return Motion(R @ m.R, t / np.linalg.norm(t))
+
+
+def agreement(choice: Choice, body: np.ndarray) -> tuple[float, float]:
+    """Share of wedge and of room that have the commonest motion of theirs."""
+    shares = []
+    for b in (1, 0):
+        own = choice.label[body == b]
+        shares.append(np.unique(own, return_counts=True)[1].max() / len(own))
+    return shares[0], shares[1]
+
+
+def off(choice: Choice, body: np.ndarray, m: Motion) -> float:
+    """Median angle in degrees between the wedge's rotation and the true one."""
+    turn = rotation.log(np.swapaxes(choice.R[body == 1], 1, 2) @ m.R)
+    return float(np.median(np.degrees(np.linalg.norm(turn, axis=1))))
+
+
+def test_a_torn_body_is_gathered(world):
+    views, seg, jump, body, (room, wedge) = world
+    torn = [room, turned(wedge, 0.4, 0), turned(wedge, -0.4, 1), turned(wedge, 0.4, 2)]
+    part = 1 + np.arange(len(seg)) % 3
+    before = chosen(views, torn, np.where(body == 1, part, 0))
+    assert agreement(before, body)[0] < 0.5
+    after = gather(views, seg, jump, before, 0.05, OPTIONS)
+    assert min(agreement(after, body)) > 0.85
+    assert off(after, body, wedge) < 0.3
+    assert off(after, body, wedge) < off(before, body, wedge)
+    assert np.median(after.error[body == 1]) < np.median(before.error[body == 1])
+
+
+def test_superpixels_with_motions_of_their_own_are_gathered(world):
+    views, seg, jump, body, (room, wedge) = world
+    rng = np.random.default_rng(0)
+    motions, label = [room], np.zeros(len(seg), int)
+    for i in np.flatnonzero(body == 1):
+        motions.append(turned(wedge, rng.uniform(-0.5, 0.5), int(rng.integers(3))))
+        label[i] = len(motions) - 1
+    before = chosen(views, motions, label)
+    before = replace(before, label=np.where(body == 1, -1, 0))
+    after = gather(views, seg, jump, before, 0.05, OPTIONS)
+    assert min(agreement(after, body)) > 0.85
+    assert off(after, body, wedge) < 0.3
+    gathered, motions = after.renumbered()
+    assert len(motions) == 2
+    assert set(np.unique(gathered.label)) <= {-1, 0, 1}
+    assert np.bincount(gathered.label + 1)[1] > np.bincount(gathered.label + 1)[2]
+    for c, m in enumerate(motions):
+        np.testing.assert_array_equal(
+            gathered.R[gathered.label == c], m.R[None].repeat((gathered.label == c).sum(), axis=0)
+        )
+
+
+def test_half_a_body_with_the_rooms_motion_comes_back(world):
+    views, seg, jump, body, (room, wedge) = world
+    left = seg.anchors[:, 0] < np.median(seg.anchors[body == 1, 0])
+    before = chosen(views, [room, wedge], np.where((body == 1) & left, 1, 0))
+    assert agreement(before, body)[0] < 0.7
+    after = gather(views, seg, jump, before, 0.05, OPTIONS)
+    assert min(agreement(after, body)) > 0.85
+
+
+def test_one_rigid_world_stays_as_it_is(world):
+    views, seg, jump, body, (room, _) = world
+    before = chosen(views, [room], np.zeros(len(body), int))
+    after = gather(views, seg, jump, before, 0.05, OPTIONS)
+    np.testing.assert_array_equal(after.R, before.R)
+    np.testing.assert_array_equal(after.label, before.label)
+
+
+def test_without_a_shared_motion_there_is_nothing_to_gather(world):
+    views, seg, jump, body, (room, _) = world
+    before = replace(chosen(views, [room], 0 * body), label=np.full(len(body), -1))
+    assert gather(views, seg, jump, before, 0.05, OPTIONS) is before
+    same, motions = before.renumbered()
+    assert motions == []
+    assert (same.label == -1).all()
+
+
+def test_neighbours_agree_unless_the_flow_jumps(world):
+    _, seg, jump, body, _ = world
+    rng = np.random.default_rng(1)
+    n = len(seg)
+    # each body prefers its own label by 0.3 pixels, a fifth of the superpixels the wrong one
+    wrong = rng.random(n) < 0.2
+    cost = np.where(np.arange(2) == np.where(wrong, 1 - body, body)[:, None], 0.0, 0.3)
+    near = hanging_together(jump, OPTIONS)
+    assert near.max() <= 1
+    assert near[jump > 3 * OPTIONS.tear_px].max() < 0.01
+    label = smooth_choice(cost, near, seg, 0.5)
+    assert (label == body).mean() > 0.95
+    # without a price each takes its own; a high price leaves one
+    np.testing.assert_array_equal(smooth_choice(cost, near, seg, 0.0), np.argmin(cost, axis=1))
+    assert len(np.unique(smooth_choice(cost, np.ones_like(near), seg, 1e3))) == 1
+    # no single change is better
+    i, k = seg.pairs.T
+    length = seg.boundary_length.astype(float)
+    rim = np.bincount(i, length, n) + np.bincount(k, length, n)
+    weight = 0.5 * near * length * (1 / rim[i] + 1 / rim[k])
+    tables = weight[:, None, None] * (1 - np.eye(2))
+    best = mrf_energy(label, cost, seg.pairs, tables)
+    for s in range(n):
+        other = label.copy()
+        other[s] = 1 - other[s]
+        assert mrf_energy(other, cost, seg.pairs, tables) >= best - 1e-9
+
+
+def test_one_label_is_the_only_choice(world):
+    seg = world[1]
+    assert (smooth_choice(np.ones((len(seg), 1)), np.ones(len(seg.pairs)), seg, 1.0) == 0).all()
+
+
+def test_what_stands_still_is_not_moved_by_borrowed_depths(world):
+    seg = world[1]
+    n = len(seg)
+    label = (np.arange(n) % 2).astype(np.int64)
+    mu = np.where(label == 1, 0.5, 0.001)
+    slope = np.ones((n, 2))
+    weak = label == 0
+    new, flat, length = borrow(mu, slope, label, weak, seg)
+    np.testing.assert_array_equal(new, 0.5)
+    assert (flat[weak] == 0).all()
+    assert (flat[~weak] == 1).all()
+    # depth 2 and translation 0.002 move the image as depth 1000 and translation 1 do
+    np.testing.assert_allclose(length, np.where(weak, 0.002, 1.0), rtol=1e-12)
+    # a motion with strong superpixels keeps its length
+    weak[0], label[0] = True, 1
+    assert borrow(mu, slope, label, weak, seg)[2][0] == 1.0
+    # inverse depths behind the camera shorten it to the least there is
+    assert borrow(np.where(label == 1, 0.5, -0.1), slope, label, weak, seg)[2].min() == 1e-4
+
+
+def test_a_camera_at_rest_starts_near_its_flow(monkeypatch):
+    """The room has no parallax; the depths that it borrows must not throw it across the image."""
+    scene = corner_scene(np.eye(4), WEDGE, turn=10)
+    pair = with_true_flow(render(scene, K, HEIGHT, WIDTH))
+    labels, _ = cut_by_part(scene, pair, 100)
+    seg = build_segmentation(labels, pair.image_ref, neighbours=10)
+
+    def shift() -> np.ndarray:
+        start = propose(seg, pair.flow, K, K)
+        anchor = camera.rays(K, seg.anchors)
+        X = start.soup.depth_at(anchor)[:, None] * anchor
+        X = np.einsum("nij,nj->ni", start.soup.R, X) + start.soup.translation
+        uv = (X / X[:, 2:]) @ K[:2].T
+        return np.linalg.norm(uv - seg.anchors, axis=1)[start.borrowed]
+
+    here = shift()
+    assert len(here) > 20
+    assert np.median(here) < 0.1
+    monkeypatch.setattr("soup_nlp.start.bodies.SHORTEST", 1.0)
+    assert np.median(shift()) > 1.0
