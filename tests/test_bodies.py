@@ -19,7 +19,7 @@ from soup_nlp.model.energy import (
     build_energy_data,
     in_pixels,
 )
-from soup_nlp.start.bodies import contact_scales
+from soup_nlp.start.bodies import contact_scales, depth_from_inside
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 
@@ -115,6 +115,11 @@ def scales(z, own, **options):
     return found.reshape(rows, columns)
 
 
+def thrice(cells):
+    """Three superpixels of each, both ways: all have some behind them."""
+    return np.repeat(np.repeat(cells, 3, axis=0), 3, axis=1)
+
+
 @pytest.mark.parametrize(
     ("upright", "ground", "scale"), [(True, 2.0, 2.0), (False, 2.0, 1.0), (True, 40.0, 4.0)]
 )
@@ -123,9 +128,8 @@ def test_a_body_stands_on_what_is_below_it(upright, ground, scale):
 
     A ground that is beyond most of what the body hides is none.
     """
-    own = np.zeros((3, 3), bool)
-    own[1, 1] = True
-    z = np.array([[4.0, 4, 4], [1, 1, 4], [ground] * 3])
+    own = thrice([[0, 0, 0], [0, 1, 0], [0, 0, 0]]) > 0
+    z = thrice([[1.0, 4, 4], [1, 1, 4], [1, ground, ground]])
     found = scales(z, own, upright=upright)
     np.testing.assert_allclose(found, np.where(own, scale, 1.0), rtol=1e-12)
 
@@ -139,7 +143,7 @@ def test_a_car_has_room_between_its_wheels():
 
 def test_a_body_with_nothing_below_it_touches_its_outline():
     """The lower edge of the image cuts it off: a low quantile of the depth ratios around it."""
-    z = np.array([[4.0, 6, 4], [3, 1, 3.5]])
+    z = thrice([[4.0, 6, 4], [3, 1, 3.5]])
     own = z == 1
     np.testing.assert_allclose(scales(z, own), np.where(own, 3.0, 1.0), rtol=1e-12)
 
@@ -154,3 +158,37 @@ def test_depths_across_pairs_are_those_of_both_planes(world):
     edge_on = replace(soup, n=np.tile([0, 1.0, 0], (len(soup), 1)))
     z = edge_on.depth_across(seg.pairs, np.tile([0, 1.0, 1], (len(seg.pairs), 1)))
     np.testing.assert_allclose(z, edge_on.distance[seg.pairs.T] / 1e-3, rtol=1e-14)
+
+
+def test_blurred_outlines_are_seen_through(world):
+    """Superpixels on both sides of an outline have wrong depths, those behind them right ones."""
+    z = np.full((9, 9), 4.0)
+    own = np.zeros((9, 9), bool)
+    own[2:7, 2:7] = True
+    z[own] = 1.0
+    grown = np.pad(own, 1)
+    near = sum(np.roll(grown, s, axis) for s in (-1, 1) for axis in (0, 1))[1:-1, 1:-1]
+    # nothing is behind the corners
+    z[own & (near == 3)] = 1.6
+    z[~own & (near > 0)] = 2.0
+    np.testing.assert_allclose(scales(z, own), np.where(own, 4.0, 1.0), rtol=1e-12)
+
+
+def test_depths_from_inside_follow_slanted_planes(world):
+    """On one plane all superpixels agree, own or not; the extrapolation is exact."""
+    seg, soup, body, _ = world
+    n = np.tile(np.array([0.1, 0.2, -1.0]) / np.linalg.norm([0.1, 0.2, -1.0]), (len(soup), 1))
+    one = replace(soup, n=n)
+    i, k = seg.pairs.T
+    across = body[i] != body[k]
+    ray = camera.rays(K, seg.boundary[across].mean(axis=1))
+    exact = one.depth_across(seg.pairs[across], ray)
+    assert np.ptp(exact) > 0
+    np.testing.assert_allclose(depth_from_inside(one, body, seg, K), exact, rtol=1e-12)
+    # one superpixel of an outline off its plane changes nothing: its neighbours inside answer
+    off = one.lam.copy()
+    off[np.flatnonzero(body == 1)[0]] *= 3
+    assert np.isin(np.flatnonzero(body == 1)[0], seg.pairs[across])
+    np.testing.assert_allclose(
+        depth_from_inside(replace(one, lam=off), body, seg, K), exact, rtol=1e-12
+    )

@@ -124,11 +124,11 @@ def contact_scales(
     if count == 1 or not len(seg.pairs):
         return np.ones(len(soup))
     i, k = seg.pairs.T
-    zi, zk = soup.depth_across(seg.pairs, rays(K_ref, seg.boundary.mean(axis=1)))
     across = label[i] != label[k]
+    zi, zk = depth_from_inside(soup, label, seg, K_ref)
     a = np.concatenate([label[i][across], label[k][across]])
     b = np.concatenate([label[k][across], label[i][across]])
-    ratio = np.log(np.concatenate([(zk / zi)[across], (zi / zk)[across]]))
+    ratio = np.log(np.concatenate([zk / zi, zi / zk]))
     contact = np.tile(seg.boundary_length[across], 2).astype(float)
     way = (seg.anchors[k] - seg.anchors[i])[across]
     down = way[:, 1] / np.linalg.norm(way, axis=1)
@@ -155,6 +155,39 @@ def contact_scales(
             log_scale[c] = _quantile(value[mine], contact[mine], OUTLINE)
         placed[c] = True
     return np.exp(log_scale)[label]
+
+
+def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -> Float:
+    """(2, B) depth of both bodies at each of the B pairs that join two, by planes further inside.
+
+    Flow is blurred across an outline, and so are the planes of the superpixels along it. Those
+    behind them know better: the median of their planes, drawn out to the boundary. Where there are
+    none, the superpixel's own.
+
+    Args:
+        soup: Planes.
+        label: (N,) index of the body.
+        seg: Superpixels and graphs.
+        K_ref: (3, 3) intrinsics of the reference frame.
+    """
+    i, k = seg.pairs.T
+    across = label[i] != label[k]
+    pairs, ray = seg.pairs[across], rays(K_ref, seg.boundary[across].mean(axis=1))
+    outline = np.zeros(len(soup), bool)
+    outline[pairs] = True
+    behind: list[list[int]] = [[] for _ in range(len(soup))]
+    for a, b in seg.pairs[~across]:
+        if not outline[b]:
+            behind[a].append(b)
+        if not outline[a]:
+            behind[b].append(a)
+    depth = soup.depth_across(pairs, ray)
+    for side, p in np.ndindex(depth.shape):
+        inner = behind[pairs[p, side]]
+        if inner:
+            own = np.column_stack([inner, inner])
+            depth[side, p] = 1 / np.median(1 / soup.depth_across(own, ray[[p] * len(inner)])[0])
+    return depth
 
 
 def _quantile(value: Float, weight: Float, share: float) -> float:

@@ -77,7 +77,9 @@ def _one_motion_each(
     piece = joined(mover[i] & mover[k] & whole, seg)
     for c in np.unique(piece[mover]):
         at = np.flatnonzero(mover & (piece == c))
-        if len(at) < o.piece_size:
+        held = np.unique(choice.label[at])
+        # one motion already, and what a few pixels would change in it is not to be trusted
+        if len(at) < o.piece_size or (len(held) == 1 and held[0] >= 0):
             continue
         R, t = _candidates(views, choice, at, R_main, noise, o)
         shape = len(at), len(R)
