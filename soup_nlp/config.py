@@ -126,9 +126,9 @@ class EnergyConfig(Strict):
 
     units: Literal["pixel", "paper"] = "pixel"
     arap_at_anchors: bool = False
-    arap_across: Annotated[float, Field(ge=0, le=1)] = 0.1
-    cont_occluded: Annotated[float, Field(ge=0, le=1)] = 0.1
-    occlusion_gap: Annotated[float, Field(ge=0, lt=1)] = 0.2
+    arap_across: Annotated[float, Field(ge=0, le=1)] = 0.03
+    cont_occluded: Annotated[float, Field(ge=0, le=1)] = 0.03
+    occlusion_gap: Annotated[float, Field(ge=0, lt=1)] = 0.1
     rotation_px: Positive | None = None
     pixel_samples: Annotated[int, Field(ge=1)] | Literal["all"] = 16
     weights: EnergyWeights = EnergyWeights()
