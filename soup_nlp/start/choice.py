@@ -180,6 +180,11 @@ class Choice:
         """(N,) penalised re-projection error, pixels."""
         return self.fit.penalised()[:, 0]
 
+    @property
+    def parallax(self) -> Float:
+        """(N,) pixels that each translation moves the anchor."""
+        return self.fit.parallax[:, 0] * np.abs(self.fit.inverse_depth[:, 0])
+
     def taking(self, at: Int, R: Float, t: Float, fit: PlaneFit, label: Int | int) -> Choice:
         """With superpixels `at` (K,) having other motions, planes (K, 1) and indices."""
 

@@ -114,10 +114,16 @@ def propose(
     R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
     choice = Choice(R, t, fit.pick((np.arange(len(seg)), label)), label)
     choice = of_neighbourhoods(views, seg, choice, noise, o)
+    surface = joined(jump < o.tear_px, seg)
+    share = bending_share(surface, bodies(choice.label, seg))
+    if share > o.bending:
+        soup, error = constant_depth(views)
+        none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
+        parallax = choice.parallax
+        return Start(soup, error, parallax, every, none, none + 1, motions, surface, share, True)
     choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
-    own, label = choice.fit, choice.label
-    mu, slope, parallax = own.inverse_depth[:, 0], own.slope[:, 0], own.parallax[:, 0]
-    parallax = parallax * np.abs(mu)
+    own, label, parallax = choice.fit, choice.label, choice.parallax
+    mu, slope = own.inverse_depth[:, 0], own.slope[:, 0]
     weak = (mu <= 0) | (parallax < o.min_parallax_px) | (own.cost[:, 0] > 3.0) | poor
     weak |= views.weight.sum(axis=1) < 2.0
     if weak.all():
@@ -130,12 +136,6 @@ def propose(
     t = choice.t * length[:, None]
     soup = _soup(mu, slope, choice.R, t, views.anchor, views.radius)
     body = bodies(label, seg)
-    surface = joined(jump < o.tear_px, seg)
-    share = bending_share(surface, body)
-    if share > o.bending:
-        soup, error = constant_depth(views)
-        none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
-        return Start(soup, error, parallax, every, none, none + 1, motions, surface, share, True)
     scale = contact_scales(soup, body, seg, K_ref, o.upright)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t).normalised()
     return Start(soup, own.cost[:, 0], parallax, weak, label, body, motions, surface, share)
