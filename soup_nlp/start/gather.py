@@ -100,8 +100,8 @@ def _candidates(
 ) -> tuple[Float, Float]:
     """(C, 3, 3), (C, 3) motions that superpixels `at` may share, fitted to all their pixels.
 
-    A translation beside the main rotation and the motions that some of them have, as they are and
-    refined, and the motion of their own essential matrix.
+    A translation beside the main rotation, as it is and refined; the motions that some of them have,
+    refined; the motion of their own essential matrix.
     """
     step = max(1, len(at) * views.ray.shape[1] // PIXELS)
     r, q = (v[at].reshape(-1, 3)[::step] for v in (views.ray, views.target))
@@ -116,7 +116,7 @@ def _candidates(
     R, t = (np.stack([getattr(m, name) for m in start]) for name in ("R", "t"))
     rs, qs, ws = (np.broadcast_to(v, (len(start), *v.shape)) for v in (r, q, w))
     R, t = refine_motion(R, t, rs, qs, ws, focal, near)
-    found = list(start)
+    found = start[:1]
     own = estimate(r, q, w, focal, max(3 * noise, 0.3), o.seed)
     if own is not None:
         found.append(own)
