@@ -100,8 +100,8 @@ def _candidates(
 ) -> tuple[Float, Float]:
     """(C, 3, 3), (C, 3) motions that superpixels `at` may share, fitted to all their pixels.
 
-    A translation beside the main rotation, as it is and refined; the motions that some of them have,
-    refined; the motion of their own essential matrix.
+    A translation beside the main rotation, as it is and refined; the motions that some of them
+    have, refined; the motion of their own essential matrix.
     """
     step = max(1, len(at) * views.ray.shape[1] // PIXELS)
     r, q = (v[at].reshape(-1, 3)[::step] for v in (views.ray, views.target))
