@@ -60,13 +60,13 @@ class Soup:
         facing = -np.einsum("nc,n...c->n...", self.n, ray)
         return self.distance.reshape(-1, *[1] * (ray.ndim - 2)) / facing
 
-    def depth_across(self, pairs: Int, ray: Float) -> Float:
-        """(2, P) z of rays (P, 3) on the planes of both superpixels of every pair (P, 2).
+    def depth_across(self, who: Int, ray: Float) -> Float:
+        """(S, P) z of rays (P, 3) on the planes of the superpixels in each row (P, S), as of pairs.
 
         A plane that faces its ray by less than 1e-3 is taken to face it by that.
         """
-        facing = np.maximum(-np.einsum("psc,pc->sp", self.n[pairs], ray), 1e-3)
-        return np.asarray(self.distance[pairs.T] / facing)
+        facing = np.maximum(-np.einsum("psc,pc->sp", self.n[who], ray), 1e-3)
+        return np.asarray(self.distance[who.T] / facing)
 
     def points(self, ray: Float) -> Float:
         """Reference-frame points (N, ..., 3) of rays (N, ..., 3)."""

@@ -185,8 +185,8 @@ def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -
     for side, p in np.ndindex(depth.shape):
         inner = behind[pairs[p, side]]
         if inner:
-            own = np.column_stack([inner, inner])
-            depth[side, p] = 1 / np.median(1 / soup.depth_across(own, ray[[p] * len(inner)])[0])
+            there = soup.depth_across(np.array([inner]), ray[p : p + 1])
+            depth[side, p] = 1 / np.median(1 / there)
     return depth
 
 

@@ -20,6 +20,15 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
+CLIP = 3.0
+"""Errors count at most this many pixels where motions are compared."""
+
+
+def least_gain(noise: float, o: StartOptions) -> float:
+    """Pixels of error that another motion has to be better by, given the noise of the flow."""
+    return max(2 * noise, o.unexplained_px)
+
+
 def dominant(views: Views, o: StartOptions) -> list[Motion]:
     """Motions that many pixels share, the commonest first; at least one.
 
@@ -108,8 +117,8 @@ def select(cost: Float, noise: float, o: StartOptions) -> list[int]:
     Returns:
         Columns that are kept, the best motion first.
     """
-    clipped = np.minimum(cost, 3.0)
-    gain = max(2 * noise, o.unexplained_px)
+    clipped = np.minimum(cost, CLIP)
+    gain = least_gain(noise, o)
     kept = [int(np.argmin(clipped.sum(axis=0)))]
     while len(kept) < clipped.shape[1]:
         best = clipped[:, kept].min(axis=1)
@@ -227,7 +236,7 @@ def of_neighbourhoods(
     n, k = seg.knn.shape
     if k == 0:
         return choice
-    gain = max(2 * noise, o.unexplained_px)
+    gain = least_gain(noise, o)
     for size in (8, 24):
         if not (choice.error > gain).any():
             break

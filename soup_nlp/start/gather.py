@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.start.bodies import joined
-from soup_nlp.start.choice import Choice, hanging_together, smooth_choice
+from soup_nlp.start.choice import CLIP, Choice, hanging_together, least_gain, smooth_choice
 from soup_nlp.start.epipolar import Motion, estimate
 from soup_nlp.start.local import fit_translation, refine_motion
 from soup_nlp.start.options import StartOptions
@@ -28,8 +28,6 @@ AGREE = 0.7
 TEARS = (1.0, 0.5, 0.25)
 """Jumps of the flow that part two bodies, relative to the one that ends a surface; the smaller ones
 where no motion explains what hangs together by the larger ones."""
-CLIP = 3.0
-"""Errors count at most this many pixels."""
 
 
 def gather(
@@ -50,7 +48,7 @@ def gather(
     """
     if not (choice.label >= 0).any():
         return choice
-    gain = max(2 * noise, o.unexplained_px)
+    gain = least_gain(noise, o)
     for tear in TEARS:
         choice = _one_motion_each(views, seg, jump < tear * o.tear_px, choice, noise, gain, o)
     return _spread(views, seg, jump, choice, gain, o)

@@ -108,9 +108,9 @@ def propose(
     # the dominant motion is preferred where another is not clearly better
     prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * o.unexplained_px))
     jump = flow_jump(views, seg.pairs, rays(K_ref, seg.boundary))
-    label = smooth_choice(
-        np.minimum(cost + prefer, 5.0), hanging_together(jump, o), seg, o.smoothness
-    )
+    # beyond 5 pixels one motion is as wrong as another
+    cost = np.minimum(cost + prefer, 5.0)
+    label = smooth_choice(cost, hanging_together(jump, o), seg, o.smoothness)
     R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
     choice = Choice(R, t, fit.pick((np.arange(len(seg)), label)), label)
     choice = of_neighbourhoods(views, seg, choice, noise, o)
@@ -176,7 +176,6 @@ def look(
     radius = np.linalg.norm((rim - anchor[:, None])[..., :2], axis=-1).max(axis=1)
     radius = np.maximum(radius, 1.0 / K_ref[0, 0])
     focal = (float(K_next[0, 0]), float(K_next[1, 1]))
-
     return Views(ray, target, weight, anchor, radius, focal), poor
 
 
