@@ -370,6 +370,16 @@ def test_the_constrained_nlp_starts_at_the_presolves_kkt_point(room):
     assert done.residuals["dual_infeasibility"] < 1e-5
 
 
+def test_it_does_so_where_visibility_binds(room):
+    # planes that would slant more than they may: their rows of visibility have forces
+    narrow = form(depth_ratio=1.05)
+    done = room.solve(options=replace(OPTIONS, tol=1e-6), f=narrow)
+    assert done.stages[-2].converged
+    assert done.stages[-1].history["inf_du"][0] < 1e-5
+    assert done.stages[-1].iterations <= 1
+    assert np.abs(done.multipliers["lam_g_visible"]).max() > 1e-2
+
+
 def test_a_start_of_less_exact_energy_keeps_the_nlp_at_the_presolves_kkt_point(room, solved):
     # wide smoothing raises the exact energy above that of a start that was solved with less
     first = solved["unit-offset"].soup

@@ -48,7 +48,7 @@ def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, 
     lam_g = np.zeros(nlp.ng)
     facing = -np.einsum("nc,nc->n", soup.n, data.anchor_ray)
     visible = next(g for g in nlp.groups if g.kernel.name == "visible").table.rows
-    lam_g[visible[:, 1:]] = rim / facing[:, None]
+    lam_g[visible[:, 1:]] = -rim / facing[:, None]
     _, gradient = nlp.grad_f(nlp.x0, nlp.p)
     # an epigraph's slack s is in no other row than s^2 >= |v|^2 + eps^2
     for group in nlp.groups:
