@@ -24,6 +24,9 @@ TO_BOUNDARY = 0.99
 LEAST_SLACK = 1e-3
 """A slack keeps at least this share of itself."""
 TRIES = 4
+SHORTER = 0.25
+"""A step that was too long goes on with this share of it: those for which it was too long, then all
+superpixels alike."""
 CORRECTIONS = 6
 """Most steps with one matrix that follow the first."""
 WORTH = 0.05
@@ -172,7 +175,7 @@ class Search:
         # where a step promises next to nothing, energies are equal but for rounding
         promised = -0.5 * float(gradient @ h)
         rounding = (1e-10 if promised < 1e-9 * abs(at.f) else 1e-12) * abs(at.merit)
-        far = np.zeros(len(length), bool)
+        far, whole = np.zeros(len(length), bool), length
         calm = eager = far
         for attempt in range(TRIES):
             trial, length = self._feasible(length)
@@ -195,8 +198,11 @@ class Search:
                 return Move(moved, length, far, calm, eager)
             if falls:
                 return Move(self._longer(trial, length, eager, before), length, far, calm, eager)
-            some = here if here.any() and attempt < TRIES // 2 else np.ones_like(here)
-            length = np.where(some, 0.25 * length, length)
+            if here.any() and attempt < TRIES // 2:
+                length = np.where(here, SHORTER * length, length)
+            else:
+                # neighbours whose steps differ pull at the stiff norms between them
+                length, whole = SHORTER * whole, SHORTER * whole
         return Move(None, length, far, calm, eager)
 
     def _corrected(self, trial: Point) -> Point | None:
