@@ -214,6 +214,64 @@ def test_a_second_step_leads_back_into_a_bent_valley(problem):
     assert back.merit - at.merit < max(0.5 * (trial.merit - at.merit), trial.merit - at.merit)
 
 
+class Chain:
+    """Superpixels that stiff norms hold together; past 0.3 each pays more than it gained."""
+
+    def __init__(self, n: int) -> None:
+        self.n = n
+
+    def normalise(self, x):
+        return x
+
+    def slacks(self, x):
+        return np.ones((self.n, 1)), np.zeros((self.n, 1, 3))
+
+    def parts(self, x):
+        a = x[6::9]
+        # the first one's wall is the steepest, so that it is found alone
+        wall = np.where(np.arange(self.n) == 0, 100.0, 2.0)
+        return a, np.diff(a), wall
+
+    def value(self, x):
+        a, apart, wall = self.parts(x)
+        return float(np.sum(np.maximum(a - 0.3, 0) * wall - a) + 1e4 * np.sum(apart**2))
+
+    def gradient(self, x):
+        a, apart, wall = self.parts(x)
+        out = np.zeros_like(x)
+        out[6::9] = np.where(a > 0.3, wall, 0.0) - 1.0
+        out[6::9] += 2e4 * (np.append(0, apart) - np.append(apart, 0))
+        return out
+
+
+@pytest.mark.parametrize("n", [3, 10])
+def test_a_step_too_long_for_one_is_shortened_for_all_where_that_one_alone_does_not_do(n):
+    chain = Chain(n)
+    x, h = np.zeros(9 * n), np.zeros(9 * n)
+    h[6::9] = 1.0
+    at = evaluate(chain, x, 1e-8)
+    gradient = chain.gradient(x)
+    # a Hessian for which h is Newton's step
+    move = Search(chain, at, h, 1e-8, np.zeros_like).run(gradient, -gradient)
+    assert move.point is not None
+    assert move.point.f < at.f
+    np.testing.assert_array_equal(move.length, 0.25)
+
+
+def test_slopes_are_in_no_edge_but_a_neighbours(problem, case):
+    # E_arap knows anchors alone, whose depth is a variable: 7 of 9 coordinates, a smaller factor
+    U, n = problem.upper.tocoo(), len(case.data)
+    i, k = U.row // 9, U.col // 9
+    neighbours = {tuple(p) for p in np.sort(case.data.pairs, axis=1)}
+    edges = {tuple(p) for p in np.sort(case.data.edges, axis=1)} - neighbours
+    assert edges
+    between = np.bincount(i * n + k, minlength=n * n)
+    assert {int(between[a * n + b]) for a, b in edges} == {49}
+    assert {int(between[a * n + b]) for a, b in neighbours} == {81}
+    slope = np.isin(U.row % 9, (1, 2)) | np.isin(U.col % 9, (1, 2))
+    assert not edges & set(zip(i[slope].tolist(), k[slope].tolist()))
+
+
 def test_it_ends_at_a_kkt_point(problem, solved):
     _, stages = solved
     last = stages[-1]

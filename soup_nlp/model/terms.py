@@ -21,7 +21,7 @@ def arap(
 ) -> list[Norm]:
     """E_arap of an edge, Eq. 1: rotation, translation and distance of the anchors."""
     sigma, leak = (row["sigma"], row["leak"]) if truncated else (None, 0.0)
-    Xa, Xb = a.point(row["ray_i"]), b.point(row["ray_k"])
+    Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
     weight, unit = row["weight"], row["unit"]
     if local:
         unit = unit / _nearness(Xa, Xb)
@@ -72,7 +72,7 @@ def continuity(
         after.append(a.apart(Xa, b, Xb))
     f = row["factor"]
     if local:
-        f = f * _nearness(a.point(row["ray_i"]), b.point(row["ray_k"]))
+        f = f * _nearness(a.anchor(row["ray_i"]), b.anchor(row["ray_k"]))
     return [
         Norm(
             "gap_ref",

@@ -24,6 +24,8 @@ class View:
         drift: (3x1) what variables add to the translation `lam t`.
         R0, T0: (3x3), (3x1) the rest of rotation and translation, constant; nothing, unless a view
             has a base.
+        depth: (1x1) depth of the anchor where it is a variable: `lam / (m . r)` is the same there,
+            but its Hessian does not know that slopes leave it as it is. None elsewhere.
     """
 
     lam: ca.SX
@@ -34,6 +36,7 @@ class View:
     drift: ca.SX
     R0: ca.SX = field(default_factory=lambda: ca.SX(3, 3))
     T0: ca.SX = field(default_factory=lambda: ca.SX(3, 1))
+    depth: ca.SX | None = None
 
     @property
     def R(self) -> ca.SX:
@@ -51,6 +54,10 @@ class View:
     def point(self, ray: ca.SX) -> ca.SX:
         """Reference-frame point (3x1) of a ray (3x1)."""
         return self.lam / ca.dot(self.m, ray) * ray
+
+    def anchor(self, ray: ca.SX) -> ca.SX:
+        """`point` of the anchor's own ray."""
+        return self.point(ray) if self.depth is None else self.depth * ray
 
     def move(self, point: ca.SX) -> ca.SX:
         """Next-frame point of a reference-frame point."""
@@ -133,4 +140,5 @@ def tangent_view(
         drift=depth * ((lam - 1) * t0 + lam * shift),
         R0=base,
         T0=depth * t0,
+        depth=lam * depth,
     )
