@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.model.assemble import Pattern, hessian_triplet, jacobian_triplet
+from soup_nlp.model.assemble import Entries, Pattern, hessian_entries, jacobian_entries
 from soup_nlp.model.buffered import Buffered
 from soup_nlp.model.kernel import Group
 from soup_nlp.model.lanes import Lanes, NoLanesError, Summed, compile_lanes, in_lanes, summing
@@ -28,7 +28,7 @@ Int = NDArray[np.int64]
 
 log = logging.getLogger(__name__)
 
-_NOTHING = np.zeros(0, np.int64), np.zeros(0, np.int64)
+_NOTHING = Entries(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 class Timer(dict[str, float]):
@@ -117,9 +117,9 @@ class FunctionSums:
         self._f = Buffered(ca.Function("f", [x, p], [nlp.oracle(x, p)[0]]))
         self._gradient, self._rows = Buffered(nlp.grad_f), Buffered(nlp.jac_g)
         self._hessian = {kind: Buffered(h) for kind, h in functions.items()}
-        self.jacobian = Pattern.of((nlp.ng, nlp.nx), [_triplet(nlp.jac_g.sparsity_out(1))])
-        own = [_triplet(h.sparsity_out(0)) for h in functions.values()]
-        self.upper = Pattern.of((nlp.nx, nlp.nx), [*own, besides or _NOTHING])
+        self.jacobian = Pattern.of((nlp.ng, nlp.nx), [_entries(nlp.jac_g.sparsity_out(1))])
+        own = [_entries(h.sparsity_out(0)) for h in functions.values()]
+        self.upper = Pattern.of((nlp.nx, nlp.nx), [*own, _besides(besides)])
         self._places = dict(zip(functions, self.upper.places))
 
     def _parameters(self) -> Float:
@@ -186,11 +186,11 @@ class LaneSums:
             for group, functions in zip(nlp.groups, made)
         ]
         with_rows = [g for g, functions in zip(nlp.groups, made) if "jac" in functions]
-        self.jacobian = Pattern.of((ng, nx), [jacobian_triplet(g) for g in with_rows])
+        self.jacobian = Pattern.of((ng, nx), [jacobian_entries(g) for g in with_rows])
         if list(hessians) == [nlp.hessian] and besides is None:
             self.upper = nlp.hessian_pattern
         else:
-            self.upper = Pattern.of((nx, nx), [*(u.triplet for u in unions), besides or _NOTHING])
+            self.upper = Pattern.of((nx, nx), [*(u.entries for u in unions), _besides(besides)])
         jacobian_places = iter(self.jacobian.places)
         self._terms: dict[str, list[Summed]] = {}
         for group, functions, union, upper in zip(nlp.groups, made, unions, self.upper.places):
@@ -259,24 +259,28 @@ class _Union(NamedTuple):
     """Nonzeros of an element's Hessians of several kinds.
 
     Attributes:
-        triplet: (E, k) rows and columns of the elements'.
+        entries: Where they stand, k an element.
         parts: Which of the k are in each kind, in its storage order.
     """
 
-    triplet: tuple[Int, Int]
-    parts: dict[str, Int]
+    entries: Entries
+    parts: dict[str, NDArray[np.integer]]
 
 
 def _union(group: Group, kinds: Sequence[str]) -> _Union:
     local = [group.kernel.hessian_pattern(kind) for kind in kinds]
     if not local:
         none = np.zeros((group.size, 0), np.int64)
-        return _Union((none, none), {})
-    union = Pattern.of((group.kernel.nx, group.kernel.nx), local)
-    triplet = hessian_triplet(group, (union.rows, union.columns))
-    return _Union(triplet, dict(zip(kinds, union.places)))
+        return _Union(Entries(none, none), {})
+    union = Pattern.of((group.kernel.nx, group.kernel.nx), [Entries(*own) for own in local])
+    entries = hessian_entries(group, (union.rows, union.columns))
+    return _Union(entries, dict(zip(kinds, union.places)))
 
 
-def _triplet(pattern: ca.Sparsity) -> tuple[Int, Int]:
+def _entries(pattern: ca.Sparsity) -> Entries:
     row, column = pattern.get_triplet()
-    return np.asarray(row, np.int64), np.asarray(column, np.int64)
+    return Entries(np.asarray(row, np.int64), np.asarray(column, np.int64))
+
+
+def _besides(nonzeros: tuple[Int, Int] | None) -> Entries:
+    return Entries(*nonzeros) if nonzeros else _NOTHING
