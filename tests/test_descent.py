@@ -214,6 +214,19 @@ def test_a_second_step_leads_back_into_a_bent_valley(problem):
     assert back.merit - at.merit < max(0.5 * (trial.merit - at.merit), trial.merit - at.merit)
 
 
+def test_rounding_of_what_is_far_away_does_not_reach_the_gradient(case):
+    # lengths between near and far, in units of the near: their difference is that of small numbers
+    s, far = case.soup, np.where(np.arange(len(case.soup)) % 2, 1.0, 60.0)
+    mixed = Soup(s.lam * far, s.n, s.d, s.R, s.t / far[:, None])
+    problem = TangentProblem(mixed, case.data, case.weights, FORM)
+    problem.smoothing(0.01)
+    x, rng = problem.nlp.x0, np.random.default_rng(0)
+    before = problem.gradient(x)
+    for _ in range(5):
+        rounded = x * (1 + np.finfo(float).eps * rng.choice([-1, 0, 1], size=x.shape))
+        assert np.abs(problem.gradient(rounded) - before).max() < 1e-9 * np.abs(before).max()
+
+
 class Chain:
     """Superpixels that stiff norms hold together; past 0.3 each pays more than it gained."""
 
@@ -256,6 +269,28 @@ def test_a_step_too_long_for_one_is_shortened_for_all_where_that_one_alone_does_
     assert move.point is not None
     assert move.point.f < at.f
     np.testing.assert_array_equal(move.length, 0.25)
+
+
+def test_a_step_to_the_minimum_is_not_doubled_for_a_fall_by_rounding():
+    class Noisy(Chain):
+        """A minimum at 1, and rounding by which the value falls beyond it."""
+
+        def value(self, x):
+            return 1e6 - 1e-9 * float(np.sum(x[6::9]))
+
+        def gradient(self, x):
+            out = np.zeros_like(x)
+            out[6::9] = 1e-8 * (x[6::9] - 1.0)
+            return out
+
+    flat = Noisy(2)
+    x, h = np.zeros(18), np.zeros(18)
+    h[6::9] = 1.0
+    gradient = flat.gradient(x)
+    at = evaluate(flat, x, 1e-12)
+    move = Search(flat, at, h, 1e-12, np.zeros_like).run(gradient, -gradient)
+    assert move.point is not None
+    np.testing.assert_array_equal(move.point.x, h)
 
 
 def test_slopes_are_in_no_edge_but_a_neighbours(problem, case):

@@ -28,8 +28,12 @@ def arap(
     gap = a.drift_from(b)
     if at_anchors:
         gap = gap + a.turn_from(b) @ ((Xa + Xb) / 2)
-    # |Xa - Xb| is smooth wherever two anchors differ, so it needs no slack of its own
-    stretch = ca.sqrt(ca.sumsqr(Xa - Xb) + 1e-12) - ca.sqrt(ca.sumsqr(a.apart(Xa, b, Xb)) + 1e-12)
+    # |Xa - Xb| is smooth wherever two anchors differ, so it needs no slack of its own. The lengths'
+    # difference comes from the small one of both vectors: lengths of what is far away, in units of
+    # the depth of something near, have rounding that held the dual infeasibility at 1e-5
+    before, change = Xa - Xb, a.parted(Xa, b, Xb)
+    lengths = [ca.sqrt(ca.sumsqr(v) + 1e-12) for v in (before, before + change)]
+    stretch = -ca.dot(change, 2 * before + change) / (lengths[0] + lengths[1])
     return [
         Norm("rotation", weight, row["turn"] * ca.vec(a.turn_from(b)), eps, sigma, leak=leak),
         Norm("translation", weight, gap / unit, eps, sigma, leak=leak),

@@ -68,6 +68,12 @@ class View:
         turned = self.R @ (point - others) + self.turn_from(other) @ others
         return turned + self.drift_from(other)
 
+    def parted(self, point: ca.SX, other: View, others: ca.SX) -> ca.SX:
+        """`self.apart(point, other, others) - (point - others)`, likewise."""
+        turn = (self.R0 - ca.DM.eye(3)) + self.turn
+        turned = turn @ (point - others) + self.turn_from(other) @ others
+        return turned + self.drift_from(other)
+
     def transfer(self, ray: ca.SX) -> ca.SX:
         """Next-frame ray (3x1, free length) of a reference ray: the homography without K."""
         return self.R @ ray + self.t * ca.dot(self.m, ray)

@@ -193,11 +193,13 @@ class Search:
                     # what went too far was the valley's bend, not the step
                     none = np.zeros_like(far)
                     return Move(bent_back, length, none, none, none)
-                longer = self._longer(trial, length, eager, before)
+                longer = self._longer(trial, length, eager, before, rounding)
                 moved = min(longer, bent_back, key=lambda point: point.merit)
                 return Move(moved, length, far, calm, eager)
             if falls:
-                return Move(self._longer(trial, length, eager, before), length, far, calm, eager)
+                return Move(
+                    self._longer(trial, length, eager, before, rounding), length, far, calm, eager
+                )
             if here.any() and attempt < TRIES // 2:
                 length = np.where(here, SHORTER * length, length)
             else:
@@ -238,8 +240,13 @@ class Search:
             length[(self.problem.slacks(x)[0] <= floor).any(axis=1)] *= 0.5
         return self.at, np.zeros_like(length)
 
-    def _longer(self, moved: Point, length: Float, eager: Bool, before: Float) -> Point:
-        """Double the step while the merit falls: of all, then of those still going down."""
+    def _longer(
+        self, moved: Point, length: Float, eager: Bool, before: Float, rounding: float
+    ) -> Point:
+        """Double the step while the merit falls: of all, then of those still going down.
+
+        A fall by rounding is none: twice a step to the minimum is where it began.
+        """
         for every in (True, False):
             some = np.ones_like(eager) if every else eager
             for _ in range(7):
@@ -248,7 +255,7 @@ class Search:
                 longer = np.where(some, 2 * length, length)
                 x = self._at(longer)
                 trial = evaluate(self.problem, x, self.barrier, LEAST_SLACK * self.at.slack)
-                if trial is None or not trial.merit < moved.merit:
+                if trial is None or not trial.merit < moved.merit - rounding:
                     break
                 moved, length = trial, longer
                 if not every:
