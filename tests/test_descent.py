@@ -335,6 +335,9 @@ def test_steps_go_on_beyond_the_tolerance_while_they_pay(problem):
     assert beyond.history["inf_du"][-1] <= LAST.tol
     assert beyond.history["mu"][-1] <= plain.history["mu"][-1]
     assert beyond.iterations > plain.iterations
+    # no step is made for what no step can better
+    done = (beyond.history["inf_du"] <= 0.03 * LAST.tol) & (beyond.history["mu"] <= 1.01e-10)
+    np.testing.assert_array_equal(np.flatnonzero(done), [beyond.iterations])
     # what is delivered is the point of the last row
     problem.smoothing(LAST.eps)
     at = evaluate(problem, runner.x, 1e-10)

@@ -149,7 +149,7 @@ class Descent:
             enough = reached is not None and not (good and reached.less(dual, gap))
             if good and (reached is None or not enough or dual < reached.row[1]):
                 reached = Reached(at, self.z, history[-1])
-            if enough or (good and not phase.beyond):
+            if enough or (good and not phase.beyond) or (reached and reached.done(phase)):
                 break
             if small >= 2:
                 status = "Stagnated"

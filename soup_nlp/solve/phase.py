@@ -15,6 +15,8 @@ Float = NDArray[np.float64]
 
 FASTER = 0.3
 """Steps beyond the tolerance go on while dual infeasibility or gap fall to this share."""
+FAR_BELOW = 0.03
+"""Share of the tolerance below which a dual infeasibility need not fall any more."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,11 @@ class Reached(NamedTuple):
     at: Point
     z: Float
     row: tuple[float, ...]
+
+    def done(self, phase: Phase) -> bool:
+        """Whether nothing is left to gain by another step: the gap is the barrier's own."""
+        _, dual, gap, *_ = self.row
+        return dual <= FAR_BELOW * phase.tol and gap <= 1.01 * phase.barrier
 
     def less(self, dual: float, gap: float) -> bool:
         """Whether the next point is worth a step beyond it."""
