@@ -28,7 +28,7 @@ Int = NDArray[np.int64]
 
 log = logging.getLogger(__name__)
 
-_NOTHING = Entries(np.zeros(0, np.int64), np.zeros(0, np.int64))
+_NOTHING = np.zeros(0, np.int64), np.zeros(0, np.int64)
 
 
 class Timer(dict[str, float]):
@@ -119,7 +119,7 @@ class FunctionSums:
         self._hessian = {kind: Buffered(h) for kind, h in functions.items()}
         self.jacobian = Pattern.of((nlp.ng, nlp.nx), [_entries(nlp.jac_g.sparsity_out(1))])
         own = [_entries(h.sparsity_out(0)) for h in functions.values()]
-        self.upper = Pattern.of((nlp.nx, nlp.nx), [*own, _besides(besides)])
+        self.upper = Pattern.of((nlp.nx, nlp.nx), [*own, Entries(*(besides or _NOTHING))])
         self._places = dict(zip(functions, self.upper.places))
 
     def _parameters(self) -> Float:
@@ -190,7 +190,8 @@ class LaneSums:
         if list(hessians) == [nlp.hessian] and besides is None:
             self.upper = nlp.hessian_pattern
         else:
-            self.upper = Pattern.of((nx, nx), [*(u.entries for u in unions), _besides(besides)])
+            every = [u.entries for u in unions]
+            self.upper = Pattern.of((nx, nx), [*every, Entries(*(besides or _NOTHING))])
         jacobian_places = iter(self.jacobian.places)
         self._terms: dict[str, list[Summed]] = {}
         for group, functions, union, upper in zip(nlp.groups, made, unions, self.upper.places):
@@ -264,7 +265,7 @@ class _Union(NamedTuple):
     """
 
     entries: Entries
-    parts: dict[str, NDArray[np.integer]]
+    parts: dict[str, Int]
 
 
 def _union(group: Group, kinds: Sequence[str]) -> _Union:
@@ -280,7 +281,3 @@ def _union(group: Group, kinds: Sequence[str]) -> _Union:
 def _entries(pattern: ca.Sparsity) -> Entries:
     row, column = pattern.get_triplet()
     return Entries(np.asarray(row, np.int64), np.asarray(column, np.int64))
-
-
-def _besides(nonzeros: tuple[Int, Int] | None) -> Entries:
-    return Entries(*nonzeros) if nonzeros else _NOTHING

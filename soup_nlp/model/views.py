@@ -65,12 +65,13 @@ class View:
 
     def apart(self, point: ca.SX, other: View, others: ca.SX) -> ca.SX:
         """`self.move(point) - other.move(others)`, as a sum of small differences."""
-        turned = self.R @ (point - others) + self.turn_from(other) @ others
-        return turned + self.drift_from(other)
+        return self._apart(self.R, point, other, others)
 
     def parted(self, point: ca.SX, other: View, others: ca.SX) -> ca.SX:
         """`self.apart(point, other, others) - (point - others)`, likewise."""
-        turn = (self.R0 - ca.DM.eye(3)) + self.turn
+        return self._apart((self.R0 - ca.DM.eye(3)) + self.turn, point, other, others)
+
+    def _apart(self, turn: ca.SX, point: ca.SX, other: View, others: ca.SX) -> ca.SX:
         turned = turn @ (point - others) + self.turn_from(other) @ others
         return turned + self.drift_from(other)
 

@@ -1,8 +1,8 @@
 """Search along a step of the presolve, superpixel by superpixel.
 
-A step that is too long for a few superpixels is shortened for those alone; one that still goes
-down at its end is doubled, for all and then for those that still descend. Energies cost a tenth of
-an iteration. A step that leaves the floor of a bent valley is led back by further ones with the
+A step that is too long for a few superpixels is shortened for those alone, and where that does not
+do, for all alike; one that still goes down at its end is doubled, for all and then for those that
+still descend. Energies cost a tenth of an iteration. A step that leaves the floor of a bent valley is led back by further ones with the
 same matrix.
 """
 
