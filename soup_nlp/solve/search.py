@@ -2,8 +2,8 @@
 
 A step that is too long for a few superpixels is shortened for those alone, and where that does not
 do, for all alike; one that still goes down at its end is doubled, for all and then for those that
-still descend. Energies cost a tenth of an iteration. A step that leaves the floor of a bent valley is led back by further ones with the
-same matrix.
+still descend. Energies cost a tenth of an iteration. A step that leaves the floor of a bent valley
+is led back by further ones with the same matrix.
 """
 
 from __future__ import annotations
