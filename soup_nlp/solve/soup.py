@@ -45,7 +45,7 @@ class SolverOptions:
         presolve: Run the tangent presolve; off, the constrained NLP starts from the start.
         presolve_eps: Continuation of the reweighted phases, large to small.
         presolve_iterations: Limit of each of them.
-        stagnation: They end at this relative change of f, twice in a row; the last at a tenth.
+        stagnation: They end at this relative change of f, twice in a row; the last at a hundredth.
         polish_iterations: Limit of the phase with the exact Hessian, at `eps`; 0 leaves it out.
         presolve_tol: Dual infeasibility that ends the presolve.
         eps: Smoothing of the constrained NLP.
@@ -58,7 +58,7 @@ class SolverOptions:
     presolve: bool = True
     presolve_eps: tuple[float, ...] = (0.1, 0.03, 0.01)
     presolve_iterations: int = 60
-    stagnation: float = 1e-4
+    stagnation: float = 1e-3
     polish_iterations: int = 100
     presolve_tol: float = 1e-6
     eps: float = 0.01
@@ -248,7 +248,7 @@ def _presolve(
             eps=eps,
             barrier=float(barrier),
             iterations=o.presolve_iterations,
-            stagnation=o.stagnation * (0.1 if k == steps - 1 else 1.0),
+            stagnation=o.stagnation * (0.01 if k == steps - 1 else 1.0),
             tol=o.presolve_tol,
         )
         for k, (eps, barrier) in enumerate(zip(o.presolve_eps, barriers))
