@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from rich.console import Console
 from soup_nlp.cli_bench import register as register_bench
 from soup_nlp.cli_export import register as register_export
 from soup_nlp.config import Problem, dump_problem, load_problem, make_problem
+from soup_nlp.data.flow import is_named
 from soup_nlp.data.scenes import SCENES
 from soup_nlp.errors import ConfigError, SoupError
 from soup_nlp.pipeline import evaluate as evaluate_folder
@@ -93,8 +95,23 @@ def solve(
     halves = {"refine.enabled=false": no_refine, "refine.from_start=true": no_nlp}
     overrides = [*(overrides or []), *(item for item, on in halves.items() if on)]
     if problem is not None:
-        if ref or next_ or intrinsics:
-            raise ConfigError("give a problem file or --ref/--next/--intrinsics, not both")
+        pair = {
+            "--ref": ref,
+            "--next": next_,
+            "--intrinsics": intrinsics,
+            "--intrinsics-next": intrinsics_next,
+            "--depth": depth,
+        }
+        if any(pair.values()):
+            raise ConfigError(
+                "a problem file says itself what its pair is",
+                found=f"{problem} and {', '.join(k for k, v in pair.items() if v)}",
+                expected="a problem file, or the options of a pair",
+                hint="--set input.KEY=VALUE changes the input of a problem file",
+            )
+        if flow:
+            # a path on the command line starts here, one in a problem file from the file
+            overrides = [f"flow.source={json.dumps(_flow_source(flow))}", *overrides]
         chosen = load_problem(problem, overrides)
     else:
         chosen = _from_options(ref, next_, intrinsics, intrinsics_next, flow, depth, overrides)
@@ -132,6 +149,13 @@ def _four(text: str, option: str) -> list[float]:
             "camera is not four numbers", where=option, found=text, expected="fx,fy,cx,cy"
         )
     return values
+
+
+def _flow_source(text: str) -> str:
+    """A flow source with its path, if it is one, from the working directory."""
+    if is_named(text) or not (Path(text).suffix or "/" in text):
+        return text
+    return str(Path(text).expanduser().resolve())
 
 
 def _from_options(
