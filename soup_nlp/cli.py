@@ -1,8 +1,9 @@
-"""The command line: exit code 0 good, 1 not converged or a claim fails, 2 bad input."""
+"""The command line: exit code 0 good, 1 not converged or a claim fails, 2 bad input, 130 Ctrl-C."""
 
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +18,8 @@ from soup_nlp.config import Problem, dump_problem, load_problem, make_problem
 from soup_nlp.data.flow import is_named
 from soup_nlp.data.scenes import SCENES
 from soup_nlp.errors import ConfigError, SoupError
+from soup_nlp.inputs import input_paths
+from soup_nlp.pipeline import StoppedError
 from soup_nlp.pipeline import evaluate as evaluate_folder
 from soup_nlp.pipeline import run as run_problem
 from soup_nlp.report.folder import prepare_folder, write_folder, write_text
@@ -30,6 +33,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.",
 )
+
+ABORTED = 130
+"""Exit code of what Ctrl-C ended without a result, as shells have it."""
 
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
 
@@ -58,6 +64,11 @@ class _Teller:
             self._clear()
             self.console.file.write(line[: max(1, self.console.width - 1)])
             self.console.file.flush()
+
+    def interrupted(self, line: str) -> None:
+        """A line from a signal handler, where Python's own streams must not be entered again."""
+        self.lines.append(line)
+        os.write(2, f"\n{line}\n".encode())
 
     def _clear(self) -> None:
         if self.live:
@@ -115,10 +126,11 @@ def solve(
         chosen = load_problem(problem, overrides)
     else:
         chosen = _from_options(ref, next_, intrinsics, intrinsics_next, flow, depth, overrides)
-    folder = prepare_folder(out)
+    folder = prepare_folder(out, input_paths(chosen))
     teller = _Teller(quiet)
-    try:
-        with interruptible() as stop:
+    interrupt = interruptible(teller.interrupted)
+    with interrupt as stop:
+        try:
             run = run_problem(
                 chosen,
                 listener=teller.iteration,
@@ -126,14 +138,18 @@ def solve(
                 say=teller.say,
                 ipopt_log=str(folder / "ipopt.log"),
             )
-    except BaseException as error:
-        teller.lines.append(f"failed: {error}")
-        write_text(folder / "log.txt", "\n".join(teller.lines) + "\n")
-        raise
-    files = write_folder(folder, run, dump_problem(chosen), "\n".join(teller.lines) + "\n")
-    # what a problem file expects holds for the file as it is
-    text = verdict(run, folder, files, None if overrides else chosen.expected.mre_at_most)
-    write_text(folder / "log.txt", "\n".join([*teller.lines, text]) + "\n")
+            if interrupt.aborted:
+                raise KeyboardInterrupt
+        except BaseException as error:
+            teller.lines.append(f"failed: {str(error) or type(error).__name__}")
+            write_text(folder / "log.txt", "\n".join(teller.lines) + "\n")
+            raise
+        # half a folder is of no use, and writing takes seconds
+        interrupt.deferred = True
+        files = write_folder(folder, run, dump_problem(chosen), "\n".join(teller.lines) + "\n")
+        # what a problem file expects holds for the file as it is
+        text = verdict(run, folder, files, None if overrides else chosen.expected.mre_at_most)
+        write_text(folder / "log.txt", "\n".join([*teller.lines, text]) + "\n")
     print(text)
     good = run.good and not (not overrides and missed(run))
     raise typer.Exit(0 if good else 1)
@@ -248,22 +264,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments; default sys.argv.
 
     Returns:
-        0 good, 1 not converged or a claim fails, 2 bad input.
+        0 good, 1 not converged (interrupted too) or a claim fails, 2 bad input, 130 interrupted
+        before there was anything to keep, or twice: no result is written.
     """
     try:
         code = app(args=list(argv) if argv is not None else None, standalone_mode=False)
-        return int(code or 0)
+        # the command line library makes this code of a KeyboardInterrupt
+        return _aborted() if code == ABORTED else int(code or 0)
+    except StoppedError as error:
+        print(error, file=sys.stderr)
+        return ABORTED
     except SoupError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except typer.Exit as done:
         return int(done.exit_code)
-    except KeyboardInterrupt:
-        print("interrupted before the solve began", file=sys.stderr)
-        return 1
+    except (KeyboardInterrupt, typer.Abort):
+        return _aborted()
     except Exception as error:
         # usage errors of the command line library carry their own message
         if hasattr(error, "format_message"):
             print(f"error: {error.format_message()}", file=sys.stderr)
             return 2
         raise
+
+
+def _aborted() -> int:
+    print("interrupted: no result is written", file=sys.stderr)
+    return ABORTED

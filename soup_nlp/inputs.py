@@ -29,6 +29,9 @@ from soup_nlp.geometry.camera import intrinsics
 
 Float = NDArray[np.float64]
 
+FILE_KEYS = ("ref", "next", "intrinsics", "intrinsics_next", "depth", "depth_next")
+"""Keys of an input of kind files that may name a file."""
+
 
 def load_pair(problem: Problem) -> Pair:
     """The frame pair of a problem, without its flow.
@@ -62,6 +65,14 @@ def load_pair(problem: Problem) -> Pair:
         else:
             pair = datasets.load_vkitti2(root, *where, step=source.step)
     return replace(pair, name=problem.name)
+
+
+def input_paths(problem: Problem) -> list[Path]:
+    """Files and folders that a problem reads; what is no file (a flow's name) is harmless here."""
+    source = problem.input
+    keys = (*FILE_KEYS, "path", "root")
+    named = [value for key in keys if isinstance(value := getattr(source, key, None), str)]
+    return [problem.path(name) for name in (*named, problem.flow.source)]
 
 
 def _load_files(problem: Problem, source: FilesInput) -> Pair:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from soup_nlp.cli import main
 from soup_nlp.data.formats import write_flo
 from soup_nlp.data.scenes import render_scene
+from soup_nlp.report.folder import MARK
 
 ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
 SMALL = [
@@ -37,3 +39,56 @@ def test_a_flow_goes_with_a_problem_file(tmp_path, monkeypatch):
     args = ["solve", ORBIT, "--out", "out", "-q", "--flow", "own flow.flo", *SMALL]
     assert main(args) in (0, 1)
     assert "own flow.flo" in json.loads((tmp_path / "out" / "summary.json").read_text())["flow"]
+
+
+def foreign(folder: Path) -> list[str]:
+    """A folder with the inputs of a pair, under names that results have too."""
+    pair = render_scene("orbit", 0, 160, 120)
+    folder.mkdir()
+    for name, image in (("frame_0", pair.image_ref), ("frame_1", pair.image_next)):
+        cv2.imwrite(str(folder / f"{name}.png"), image[..., ::-1])
+    np.savetxt(folder / "K.txt", pair.K_ref)
+    (folder / "pair.yaml").write_text("input: {kind: folder, path: .}\n")
+    return ["solve", str(folder / "pair.yaml"), "-q", *SMALL[4:]]
+
+
+def test_a_folder_of_inputs_is_no_output_folder(tmp_path, capsys):
+    args = foreign(tmp_path / "pair")
+    before = sorted(tmp_path.rglob("*"))
+    assert main([*args, "--out", str(tmp_path / "pair")]) == 2
+    assert "input's folder" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["flow.png", "config.yaml", "depth_ref.png"])
+def test_files_of_no_result_are_not_overwritten(name, tmp_path, capsys):
+    args = foreign(tmp_path / "pair")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("precious")
+    assert main([*args, "--out", str(tmp_path / "out")]) == 2
+    assert name in capsys.readouterr().err
+    assert [p.read_text() for p in (tmp_path / "out").iterdir()] == ["precious"]
+
+
+def test_an_input_in_a_result_folder_is_not_overwritten(tmp_path, capsys):
+    args = foreign(tmp_path / "pair")
+    out = tmp_path / "out"
+    assert main([*args, "--out", str(out)]) in (0, 1)
+    flow = ["--flow", str(out / "flow.png")]
+    assert main([*args, "--out", str(out), *flow]) == 2
+    assert "an input would be overwritten" in capsys.readouterr().err
+
+
+def test_a_result_folder_takes_the_next_result_and_is_no_input(tmp_path, capsys):
+    args = foreign(tmp_path / "pair")
+    out = tmp_path / "out"
+    assert main([*args, "--out", str(out)]) in (0, 1)
+    assert main([*args, "--out", str(out)]) in (0, 1)
+    assert main(["solve", str(out / "config.yaml"), "--out", str(out), "-q"]) in (0, 1)
+    # one that was made before there was a mark
+    (out / MARK).unlink()
+    assert main([*args, "--out", str(out)]) in (0, 1)
+    for path in (tmp_path / "pair").iterdir():
+        (out / path.name).write_bytes(path.read_bytes())
+    assert main(["solve", str(out / "pair.yaml"), "--out", str(tmp_path / "other")]) == 2
+    assert "holds a result" in capsys.readouterr().err
