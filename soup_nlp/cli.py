@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast, get_args
@@ -16,6 +17,7 @@ from soup_nlp.cli_bench import register as register_bench
 from soup_nlp.cli_export import register as register_export
 from soup_nlp.config import Problem, dump_problem, load_problem, make_problem
 from soup_nlp.data.flow import is_named
+from soup_nlp.data.formats_image import DataWarning
 from soup_nlp.data.scenes import SCENES
 from soup_nlp.errors import ConfigError, SoupError
 from soup_nlp.inputs import input_paths
@@ -65,6 +67,11 @@ class _Teller:
             self.console.file.write(line[: max(1, self.console.width - 1)])
             self.console.file.flush()
 
+    def warn(self, message: Warning | str, category: type[Warning], *where: object) -> None:
+        """What a reader doubts, as a line; warnings of libraries are for developers."""
+        if issubclass(category, DataWarning):
+            self.say(f"warning: {message}")
+
     def interrupted(self, line: str) -> None:
         """A line from a signal handler, where Python's own streams must not be entered again."""
         self.lines.append(line)
@@ -82,9 +89,11 @@ def solve(
     overrides: Set = None,
     ref: Annotated[str | None, typer.Option(help="Reference image.")] = None,
     next_: Annotated[str | None, typer.Option("--next", help="Next image.")] = None,
-    intrinsics: Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels.")] = None,
+    intrinsics: Annotated[
+        str | None, typer.Option(help="fx,fy,cx,cy in pixels, or a file.")
+    ] = None,
     intrinsics_next: Annotated[
-        str | None, typer.Option(help="fx,fy,cx,cy of the next frame, if they differ.")
+        str | None, typer.Option(help="The same of the next frame, if it differs.")
     ] = None,
     flow: Annotated[str | None, typer.Option(help=".flo, KITTI .png or .npy; default DIS.")] = None,
     depth: Annotated[str | None, typer.Option(help="True depth of the reference frame.")] = None,
@@ -129,7 +138,9 @@ def solve(
     folder = prepare_folder(out, input_paths(chosen))
     teller = _Teller(quiet)
     interrupt = interruptible(teller.interrupted)
-    with interrupt as stop:
+    with interrupt as stop, warnings.catch_warnings():
+        warnings.simplefilter("always", DataWarning)
+        warnings.showwarning = teller.warn
         try:
             run = run_problem(
                 chosen,
@@ -155,14 +166,20 @@ def solve(
     raise typer.Exit(0 if good else 1)
 
 
-def _four(text: str, option: str) -> list[float]:
+def _camera(text: str, option: str) -> list[float] | str:
+    """Four numbers, or the file that has them, as the key `intrinsics` of a problem file."""
     try:
         values = [float(x) for x in text.split(",")]
     except ValueError:
         values = []
+    if not values and Path(text).expanduser().is_file():
+        return text
     if len(values) != 4:
         raise ConfigError(
-            "camera is not four numbers", where=option, found=text, expected="fx,fy,cx,cy"
+            "camera is neither four numbers nor a file",
+            where=option,
+            found=text,
+            expected="fx,fy,cx,cy or a text file of 4 or 9 numbers",
         )
     return values
 
@@ -194,10 +211,10 @@ def _from_options(
         "kind": "files",
         "ref": ref,
         "next": next_,
-        "intrinsics": _four(intrinsics, "--intrinsics"),
+        "intrinsics": _camera(intrinsics, "--intrinsics"),
     }
     if intrinsics_next:
-        source["intrinsics_next"] = _four(intrinsics_next, "--intrinsics-next")
+        source["intrinsics_next"] = _camera(intrinsics_next, "--intrinsics-next")
     if depth:
         source["depth"] = depth
     raw: dict[str, Any] = {"name": Path(ref).stem, "input": source, "base": str(Path.cwd())}

@@ -24,7 +24,6 @@ from soup_nlp.data.formats import read_depth, read_image
 from soup_nlp.data.formats_camera import read_intrinsics
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.data.scenes import render_scene
-from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 
 Float = NDArray[np.float64]
@@ -47,7 +46,9 @@ def load_pair(problem: Problem) -> Pair:
     elif isinstance(source, FilesInput):
         pair = _load_files(problem, source)
     elif isinstance(source, FolderInput):
-        pair = datasets.load_folder(problem.path(source.path), source.depth_scale, source.unit)
+        pair = datasets.load_folder(
+            problem.path(source.path), source.depth_scale, source.unit, source.white
+        )
     elif isinstance(source, TumInput):
         pair = datasets.load_tum(problem.path(source.path), source.frame, source.step)
     elif isinstance(source, SintelInput):
@@ -76,14 +77,7 @@ def input_paths(problem: Problem) -> list[Path]:
 
 
 def _load_files(problem: Problem, source: FilesInput) -> Pair:
-    ref, next_ = read_image(problem.path(source.ref)), read_image(problem.path(source.next))
-    if ref.shape != next_.shape:
-        raise DataError(
-            "the two images differ in size",
-            where=f"{source.ref}, {source.next}",
-            found=f"{ref.shape[1]}x{ref.shape[0]} and {next_.shape[1]}x{next_.shape[0]}",
-            expected="the same size",
-        )
+    ref, next_ = (read_image(problem.path(x), source.white) for x in (source.ref, source.next))
     depths = [
         None if name is None else read_depth(problem.path(name), source.depth_scale)
         for name in (source.depth, source.depth_next)

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from soup_nlp.cli import main
+from soup_nlp.config import make_problem
 from soup_nlp.data.formats import write_flo
 from soup_nlp.data.scenes import render_scene
+from soup_nlp.inputs import load_pair
 from soup_nlp.report.folder import MARK
 
 ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
@@ -92,3 +94,50 @@ def test_a_result_folder_takes_the_next_result_and_is_no_input(tmp_path, capsys)
         (out / path.name).write_bytes(path.read_bytes())
     assert main(["solve", str(out / "pair.yaml"), "--out", str(tmp_path / "other")]) == 2
     assert "holds a result" in capsys.readouterr().err
+
+
+def test_images_may_differ_in_size(tmp_path, capsys):
+    foreign(tmp_path / "pair")
+    pair = render_scene("orbit", 0, 160, 120)
+    cut = str(tmp_path / "pair" / "cut.png")
+    cv2.imwrite(cut, pair.image_next[:110, :150, ::-1])
+    np.save(tmp_path / "cut.npy", pair.truth.depth_next[:110, :150])
+    options = ["--ref", str(tmp_path / "pair" / "frame_0.png"), "--next", cut]
+    # the camera is a file here, as it may be in a problem file
+    options += ["--intrinsics", str(tmp_path / "pair" / "K.txt")]
+    options += ["--set", f"input.depth_next={tmp_path / 'cut.npy'}"]
+    assert main(["solve", "--out", str(tmp_path / "out"), *options, *SMALL[4:]]) in (0, 1)
+    # only the next frame has a truth here
+    assert "next frame" in capsys.readouterr().out
+    assert main(["check", str(tmp_path / "out")]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["metrics"]["solution_next"]["coverage"] > 0.5
+    depth = cv2.imread(str(tmp_path / "out" / "depth_next.png"), cv2.IMREAD_UNCHANGED)
+    assert depth.shape == (110, 150)
+
+
+@pytest.mark.parametrize("white", [None, 4095])
+def test_a_picture_of_12_bits_names_its_key(white, tmp_path, capsys):
+    args = foreign(tmp_path / "pair")
+    for name in ("frame_0.png", "frame_1.png"):
+        path = str(tmp_path / "pair" / name)
+        cv2.imwrite(path, np.uint16(cv2.imread(path)) * 16)
+    args += [] if white is None else ["--set", f"input.white={white}"]
+    args.remove("-q")
+    assert main([*args, "--out", str(tmp_path / "out")]) in (0, 1)
+    error = capsys.readouterr().err
+    assert error.count("white: 4095") == (2 if white is None else 0)
+    log = (tmp_path / "out" / "log.txt").read_text()
+    assert ("warning: " in log) == (white is None)
+
+
+def test_white_reaches_files_too(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((64, 64, 3), 4095, np.uint16))
+    source = {
+        "kind": "files",
+        "ref": "a.png",
+        "next": "a.png",
+        "intrinsics": [60.0, 60.0, 32.0, 32.0],
+    }
+    problem = make_problem({"input": {**source, "white": 4095}, "base": str(tmp_path)})
+    assert load_pair(problem).image_ref.min() == 255

@@ -76,7 +76,9 @@ def _find(folder: Path, stems: tuple[str, ...], suffixes: tuple[str, ...]) -> Pa
     return None
 
 
-def load_folder(folder: PathLike, depth_scale: float = 1000.0, unit: str = "m") -> Pair:
+def load_folder(
+    folder: PathLike, depth_scale: float = 1000.0, unit: str = "m", white: int | None = None
+) -> Pair:
     """Load a pair from a plain folder.
 
     Files (the first that exists is taken, in this order; images may also be jpg, tif, ppm, bmp):
@@ -93,6 +95,7 @@ def load_folder(folder: PathLike, depth_scale: float = 1000.0, unit: str = "m") 
         folder: The folder.
         depth_scale: Values per `unit` of a 16-bit depth image, e.g. 1000 for mm read as metres.
         unit: Unit of length of the truth.
+        white: Value of a 16-bit image that is white, see `read_image`.
 
     Returns:
         Pair named after the folder.
@@ -130,8 +133,8 @@ def load_folder(folder: PathLike, depth_scale: float = 1000.0, unit: str = "m") 
         unit=unit,
     )
     return Pair(
-        image_ref=read_image(first),
-        image_next=read_image(second),
+        image_ref=read_image(first, white),
+        image_next=read_image(second, white),
         K_ref=K,
         K_next=read_intrinsics(K_next) if K_next.is_file() else K,
         truth=truth_or_none(truth),

@@ -165,7 +165,7 @@ def write_folder(folder: Path, run: Run, config: str, log: str) -> list[str]:
 def summary(run: Run) -> dict[str, Any]:
     """What summary.json holds; the keys are stable."""
     s = run.solution
-    constant = run.metrics["constant"].mre if run.metrics else np.nan
+    constant = run.metrics["constant"].mre if "constant" in run.metrics else np.nan
     facing = run.problem.formulation.min_facing
     return {
         "name": run.problem.name,
