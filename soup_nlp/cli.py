@@ -8,7 +8,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args
+from typing import Annotated, Any, TextIO, cast, get_args
 
 import typer
 from rich.console import Console
@@ -67,7 +67,15 @@ class _Teller:
             self.console.file.write(line[: max(1, self.console.width - 1)])
             self.console.file.flush()
 
-    def warn(self, message: Warning | str, category: type[Warning], *where: object) -> None:
+    def warn(
+        self,
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
         """What a reader doubts, as a line; warnings of libraries are for developers."""
         if issubclass(category, DataWarning):
             self.say(f"warning: {message}")

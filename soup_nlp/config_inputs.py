@@ -162,6 +162,18 @@ class TumInput(Strict):
     step: Step = 1
 
 
+class MemoryInput(Strict):
+    """A pair that was in memory: a problem with it tells runs apart, but cannot be solved again.
+
+    Attributes:
+        kind: Kind of input.
+        hash: Of the images, cameras and flow.
+    """
+
+    kind: Literal["memory"]
+    hash: str
+
+
 Input = Annotated[
     FilesInput
     | FolderInput
@@ -170,6 +182,7 @@ Input = Annotated[
     | SintelInput
     | KittiInput
     | VkittiInput
-    | TumInput,
+    | TumInput
+    | MemoryInput,
     Field(discriminator="kind"),
 ]

@@ -14,7 +14,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.errors import SoupError
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
-from soup_nlp.inputs import load_pair
+from soup_nlp.inputs import load_pair, pair_hash
 from soup_nlp.model import plain
 from soup_nlp.model.energy import EnergyData, Weights
 from soup_nlp.model.formulation import Formulation
@@ -252,6 +252,8 @@ def _polished(refined: Refined, again: Solution) -> Refined:
 def solve_pair(pair: Pair, **options: Any) -> Run:
     """Solve a pair that is in memory.
 
+    The problem of the run says so by a hash of the pair; its config.yaml cannot be solved again.
+
     Args:
         pair: Images, cameras, and a flow if there is one (else OpenCV DIS).
         options: Sections of a problem file, e.g. `segmentation={"superpixels": 500}`.
@@ -260,5 +262,6 @@ def solve_pair(pair: Pair, **options: Any) -> Run:
         ConfigError: an option is wrong.
         DataError: the pair cannot be used.
     """
-    raw = {"name": pair.name, "input": {"kind": "motorcycle"}, **options}
+    source = {"kind": "memory", "hash": pair_hash(pair)}
+    raw = {"name": pair.name, "input": source, **options}
     return run(make_problem(raw, where="solve_pair"), pair=pair)
