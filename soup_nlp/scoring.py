@@ -120,15 +120,24 @@ def evaluate(
         folder: Result folder.
         depth: .dpt, .npy, .pfm or 16-bit .png depth of the reference frame.
         scale: "median", "mre", "lsq" or "none".
-        cap: Truth beyond this depth is dropped.
+        cap: Truth beyond this depth is dropped, positive.
         depth_scale: Values per unit of length of a .png.
 
     Returns:
         Metrics by "solution", "start", "nlp" and "rigid" (if stored) and "constant".
 
     Raises:
-        DataError: a file is missing, sizes differ, or the truth knows no pixel.
+        DataError: the cap is not positive, a file is missing, sizes differ, or the truth knows no
+            pixel.
     """
+    # false for NaN too
+    if cap is not None and not cap > 0:
+        raise DataError(
+            "depth cap must be positive",
+            where="cap",
+            found=f"{cap:g}",
+            expected="a depth in the unit of the truth, such as 70",
+        )
     tree = read_h5(Path(folder) / "result.h5")
     depths = {k: require(tree, f"depth/{v}") for k, v in DEPTHS.items() if v in tree["depth"]}
     gt = read_depth(Path(depth), depth_scale)

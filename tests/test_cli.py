@@ -134,6 +134,10 @@ def test_evaluate_scores_against_a_file(solved, tmp_path, capsys):
     np.save(tmp_path / "gt.npy", np.ones((3, 3)))
     assert main(["evaluate", str(solved), "--depth", str(tmp_path / "gt.npy")]) == 2
     assert main(["evaluate", str(solved), "--depth", "x.npy", "--scale", "best"]) == 2
+    for cap in ("-1", "0", "nan"):
+        capsys.readouterr()
+        assert main(["evaluate", str(solved), "--depth", "x.npy", "--cap", cap]) == 2
+        assert "cap must be positive" in capsys.readouterr().err
 
 
 def test_a_solve_that_stops_early_is_a_result(tmp_path):

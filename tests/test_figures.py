@@ -20,7 +20,7 @@ from soup_nlp.report.colour import (
     depth_range,
     draw_superpixels,
 )
-from soup_nlp.report.figures import overview, overview_strip, write_depth_png16, write_png
+from soup_nlp.report.figures import overview, overview_strip, write_clipped_depth_png16, write_png
 from soup_nlp.report.metrics import depth_metrics
 
 
@@ -247,6 +247,18 @@ def test_overview_file(tmp_path):
     assert os.listdir(tmp_path) == ["o.png"]
 
 
+def test_a_white_panel_has_a_frame(tmp_path):
+    white = np.full((60, 100, 3), 255, np.uint8)
+    overview_strip(tmp_path / "o.png", [("", white)], "")
+    picture = cv2.imread(str(tmp_path / "o.png"))
+    dark = (picture < 230).all(2)
+    rows, columns = np.flatnonzero(dark.any(1)), np.flatnonzero(dark.any(0))
+    # as wide and high as the panel, and nothing within
+    assert abs(np.ptp(columns) - 420) < 4
+    assert abs(np.ptp(rows) - 252) < 4
+    assert not dark[rows[0] + 3 : rows[-1] - 2, columns[0] + 3 : columns[-1] - 2].any()
+
+
 def test_png_round_trip(tmp_path):
     rgb = np.random.default_rng(0).integers(0, 256, (5, 7, 3)).astype(np.uint8)
     write_png(tmp_path / "a.png", rgb)
@@ -261,7 +273,7 @@ def test_png_round_trip(tmp_path):
 def test_depth_png(tmp_path):
     path = tmp_path / "d.png"
     z = np.array([[1.0, 2.5, np.nan], [1e-9, 1e9, -1.0]])
-    assert write_depth_png16(path, z, 1000) == 1000.0
+    assert write_clipped_depth_png16(path, z, 1000) == 1000.0
     back = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert back.dtype == np.uint16
     np.testing.assert_array_equal(back, [[1000, 2500, 0], [1, 65535, 0]])
@@ -270,12 +282,12 @@ def test_depth_png(tmp_path):
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e5])
 def test_depth_png_chooses_a_scale(tmp_path, unit):
     z = unit * np.random.default_rng(0).uniform(1, 10, (20, 30))
-    scale = write_depth_png16(tmp_path / "d.png", z)
+    scale = write_clipped_depth_png16(tmp_path / "d.png", z)
     back = cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED)
     assert np.log2(scale) == round(np.log2(scale))
     np.testing.assert_allclose(back / scale, z, atol=0.51 / scale, rtol=1e-3)
     assert back.max() > 32767
-    assert write_depth_png16(tmp_path / "d.png", np.full((2, 2), np.nan)) > 0
+    assert write_clipped_depth_png16(tmp_path / "d.png", np.full((2, 2), np.nan)) > 0
 
 
 @pytest.mark.parametrize(
@@ -290,7 +302,7 @@ def test_depth_png_chooses_a_scale(tmp_path, unit):
         (lambda: colourise_error(np.zeros((2, 2)), 0.0), "limit"),
         (lambda: colourise_normals(np.zeros((2, 2))), "shape"),
         (lambda: draw_superpixels(np.zeros((2, 2, 3), np.uint8), np.zeros((2, 3), int)), "labels"),
-        (lambda: write_depth_png16("x.png", np.ones((2, 2)), -1.0), "scale"),
+        (lambda: write_clipped_depth_png16("x.png", np.ones((2, 2)), -1.0), "scale"),
     ],
 )
 def test_bad_input(call, words):

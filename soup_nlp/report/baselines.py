@@ -10,10 +10,10 @@ from scipy.ndimage import distance_transform_edt
 
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.start import epipolar
 
 Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MIN_CORRESPONDENCES = 8
 """Fewest pixels with flow for which a motion is looked for."""
@@ -115,7 +115,8 @@ def rigid_depth(
             found=count,
             expected=f"at least {MIN_CORRESPONDENCES} with positive confidence",
         )
-    r, q = _rays(pair, flow, used)
+    at = pixel_grid(*pair.size)[used]
+    r, q = rays(pair.K_ref, at), rays(pair.K_next, at + flow.uv[used])
     weight = flow.confidence[used].astype(np.float64)
     focal = float(
         np.prod([pair.K_ref[0, 0], pair.K_ref[1, 1], pair.K_next[0, 0], pair.K_next[1, 1]]) ** 0.25
@@ -166,16 +167,6 @@ def _best_motion(
         if cost < lowest:
             best, lowest = motion, cost
     return best
-
-
-def _rays(pair: Pair, flow: Flow, used: Mask) -> tuple[Float, Float]:
-    """(M, 3) rays of the used pixels and of their targets, each by its own camera."""
-    v, u = np.nonzero(used)
-    one = np.ones(len(u))
-    uv = flow.uv[used].astype(np.float64)
-    r = np.stack([u, v, one], axis=1) @ np.linalg.inv(pair.K_ref).T
-    q = np.stack([u + uv[:, 0], v + uv[:, 1], one], axis=1) @ np.linalg.inv(pair.K_next).T
-    return np.asarray(r, np.float64), np.asarray(q, np.float64)
 
 
 def fill_nearest(depth: Float) -> Float:

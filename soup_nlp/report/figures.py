@@ -33,6 +33,7 @@ Panel = tuple[str, Image] | tuple[str, Image, Bar]
 """Caption, (H, W, 3) uint8 RGB picture and, where colours are numbers, their bar."""
 
 _DPI = 100
+_FRAME = 0.6  # points
 _BAR_HEIGHT = 0.2  # inches, of a row's line of colour bars
 
 
@@ -102,7 +103,10 @@ def overview_strip(
                 (left / width, bottom / height, panel_width / width, tall / height)
             )
             axes.imshow(image, interpolation="antialiased", aspect="auto")
-            axes.set_axis_off()
+            axes.set(xticks=[], yticks=[])
+            # a white panel has an end on white paper
+            for side in axes.spines.values():
+                side.set(linewidth=_FRAME, color="0.6")
             if len(panel) == 3:
                 _draw_bar(figure, panel[2], left, bottom - _BAR_HEIGHT, panel_width)
         top += row_height + caption_height + gap
@@ -224,10 +228,11 @@ def write_png(path: PathLike, rgb: Image) -> None:
     _encode(path, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 
 
-def write_depth_png16(path: PathLike, depth: Float, scale: float | None = None) -> float:
+def write_clipped_depth_png16(path: PathLike, depth: Float, scale: float | None = None) -> float:
     """Write a depth map as 16-bit PNG: value = round(depth * scale), 0 where unknown.
 
-    A known depth is at least 1 in the file; what exceeds 65535 is written as 65535.
+    A known depth is at least 1 in the file; what exceeds 65535 is written as 65535. Where a depth
+    that does not fit must be an error, as in a dataset, there is `data.formats.write_depth_png16`.
 
     Args:
         path: File to write; its folder must exist.

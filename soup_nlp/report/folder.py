@@ -19,7 +19,7 @@ from soup_nlp.report.colour import (
     depth_range,
     draw_superpixels,
 )
-from soup_nlp.report.figures import overview, write_depth_png16, write_png
+from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_png
 from soup_nlp.report.metrics import skill
 from soup_nlp.report.pointcloud import write_ply
 from soup_nlp.report.store import versions, write_h5, write_json
@@ -245,7 +245,7 @@ def _pictures(folder: Path, run: Run) -> dict[str, float]:
     scales = {}
     near, far = depth_range(rec.depth_ref)
     for name, depth in (("ref", rec.depth_ref), ("next", rec.depth_next)):
-        scales[name] = write_depth_png16(folder / f"depth_{name}.png", depth)
+        scales[name] = write_clipped_depth_png16(folder / f"depth_{name}.png", depth)
         write_png(folder / f"depth_{name}_colour.png", colourise_depth(depth, near, far))
     write_png(folder / "superpixels.png", draw_superpixels(pair.image_ref, labels))
     assert pair.flow is not None
