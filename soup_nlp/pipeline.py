@@ -139,7 +139,8 @@ def run(
         clock = now
         if stop is not None and stop.is_set() and stage in BEFORE_START:
             raise StoppedError(
-                "interrupted before there was a start: nothing to write", where=f"after the {stage}"
+                "interrupted before there was a start: nothing to write",
+                where=f"after stage {stage}",
             )
 
     case = prepare(problem, pair=pair, lap=lap, say=say)
