@@ -251,6 +251,7 @@ GOOD = {
         ({"order": np.array([0, 1, 1])}, "order"),
         ({"order": np.array([0, 1])}, "order"),
         ({"dtype": np.int32}, "dtype"),
+        ({"dtype": "text"}, "dtype"),
         ({"max_iter": 0}, "max_iter"),
         ({"patience": 0}, "patience"),
         ({"init_labels": np.array([0, 1, 2])}, "init_labels"),
@@ -278,3 +279,20 @@ def test_a_function_that_is_not_finite_is_caught_when_not_kept():
         solve_trws(GOOD["unary"], GOOD["edges"], lambda ids: np.zeros((3, 2, 2)), keep_tables=False)
     with pytest.raises(ModelError, match="labels"):
         mrf_energy(np.zeros(2, int), GOOD["unary"], GOOD["edges"], GOOD["tables"])
+
+
+@pytest.mark.parametrize(
+    ("tables", "where"),
+    [
+        (np.zeros((2, 3, 3)), "pairwise"),
+        (np.zeros((2, 1, 1)), "pairwise"),
+        (np.zeros((5, 2, 2)), "pairwise"),
+        ([np.zeros((2, 2))] * 5, "pairwise"),
+        ([np.zeros((2, 2)), np.zeros((1, 2))], "pairwise[1]"),
+        (lambda ids: np.zeros((len(ids), 1, 1)), "pairwise(edges 0 to 1)"),
+    ],
+)
+def test_the_energy_of_tables_of_the_wrong_shape_is_refused(tables, where):
+    with pytest.raises(ModelError) as caught:
+        mrf_energy(np.zeros(3, int), GOOD["unary"], GOOD["edges"], tables)
+    assert caught.value.where == where
