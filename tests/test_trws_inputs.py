@@ -129,6 +129,32 @@ def test_never_worse_than_the_initial_labels():
         assert result.best_history[0] <= result.energy_history[0]
 
 
+def test_initial_labels_come_back_where_rounding_took_worse_ones_for_better():
+    """In float32 the three costs are one, below the exact cost of the initial label."""
+    unary = np.array([[3.5, 3.0, 3.9]]) + 1e8
+    result = solve_trws(unary, [], [], init_labels=np.array([1]), dtype=np.float32)
+    assert result.energy == 1e8 + 3.0
+    assert result.labels.tolist() == [1]
+    assert result.ties == 0
+    # where float32 does tell them apart it is the best that is taken
+    result = solve_trws(unary - 1e8, [], [], init_labels=np.array([2]), dtype=np.float32)
+    assert (result.energy, result.labels.tolist()) == (3.0, [1])
+
+
+def test_as_long_as_the_best_energy_falls_nothing_stagnates():
+    """Whatever the bound does."""
+    late = 0
+    for seed in range(6):
+        unary, edges, tables = dense(np.random.default_rng(seed), 15, 80, 4)
+        best = solve_trws(unary, edges, tables, max_iter=12, **FOREVER).best_history
+        stuck = [k for k in range(1, 12) if best[k] >= best[k - 1]]
+        done = solve_trws(unary, edges, tables, max_iter=12, gap=-1, patience=1, stagnation=1e9)
+        assert done.status == "stagnation"
+        assert done.iterations == stuck[0] + 1
+        late += stuck[0] > 1
+    assert late
+
+
 def test_polish_ends_where_no_single_node_helps():
     rng = np.random.default_rng(13)
     unary, edges, tables = dense(rng, 10, 40, 4)
