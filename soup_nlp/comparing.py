@@ -17,14 +17,12 @@ from soup_nlp.compare.report import conclusion, page
 from soup_nlp.compare.runner import compare as run_all
 from soup_nlp.compare.solvers import available, find_solver
 from soup_nlp.compare.task import Limits, Task
+from soup_nlp.compare.verify import ENERGY_SLACK
 from soup_nlp.config import load_problem
 from soup_nlp.errors import ConfigError
 from soup_nlp.model import plain
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.report.folder import prepare_folder, write_text
-
-ENERGY_SLACK = 1e-3
-"""A solution's exact energy may be this share above the proposal's: the smoothing moves it."""
 
 Label = Mapping[str, Any]
 Maker = Callable[[Path], Task]
