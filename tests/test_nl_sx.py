@@ -182,6 +182,30 @@ def test_long_sums_do_not_nest(tmp_path):
     assert float(ReadBack(file.path).values(np.zeros(4000))[0]) == 4000
 
 
+@pytest.mark.parametrize(
+    ("operation", "make"),
+    [
+        ("sign", lambda a, b, c: ca.sign(a) * b),
+        ("sign", lambda a, b, c: ca.sign(a)),
+        ("floor", lambda a, b, c: ca.floor(a) * b),
+        ("ceil", lambda a, b, c: b + 3 * ca.ceil(a)),
+        ("lt", lambda a, b, c: (a > 0.5) * b),
+        ("not", lambda a, b, c: ca.logic_not(a) * b),
+        ("fmod", lambda a, b, c: ca.fmod(a, b)),
+        ("remainder", lambda a, b, c: ca.remainder(a, b)),
+        ("lt", lambda a, b, c: ca.if_else(a > 0.5, b, c) ** 2),
+        ("sign", lambda a, b, c: ca.exp(c) + ca.sign(ca.sqrt(a)) * 2),
+    ],
+)
+def test_parts_that_are_constant_in_pieces_are_said(operation, make, tmp_path):
+    x = ca.SX.sym("x", 3)
+    bad = make(x[0], x[1], x[2])
+    for problem in ({"f": bad}, {"f": x[0] ** 2, "g": ca.vertcat(x[1], bad)}):
+        with pytest.raises(ExportError, match=rf"(?s)cannot be written.*: {operation}$"):
+            write_sx_nl(tmp_path / "a.nl", {"x": x, **problem})
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_cannot_be_written_is_said(tmp_path):
     x, p = ca.SX.sym("x"), ca.SX.sym("p")
     with pytest.raises(ExportError, match=r"(?s)cannot be written.*floor"):
