@@ -1,11 +1,14 @@
-"""The command line: exit code 0 good, 1 not converged or a claim fails, 2 bad input."""
+"""The command line: exit code 0 good, 1 not converged or a claim fails, 2 bad input, 130 Ctrl-C."""
 
 from __future__ import annotations
 
+import json
+import os
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args
+from typing import Annotated, Any, TextIO, cast, get_args
 
 import typer
 from rich.console import Console
@@ -13,8 +16,12 @@ from rich.console import Console
 from soup_nlp.cli_bench import register as register_bench
 from soup_nlp.cli_export import register as register_export
 from soup_nlp.config import Problem, dump_problem, load_problem, make_problem
+from soup_nlp.data.flow import is_named
+from soup_nlp.data.formats_image import DataWarning
 from soup_nlp.data.scenes import SCENES
 from soup_nlp.errors import ConfigError, SoupError
+from soup_nlp.inputs import input_paths
+from soup_nlp.pipeline import StoppedError
 from soup_nlp.pipeline import evaluate as evaluate_folder
 from soup_nlp.pipeline import run as run_problem
 from soup_nlp.report.folder import prepare_folder, write_folder, write_text
@@ -28,6 +35,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.",
 )
+
+ABORTED = 130
+"""Exit code of what Ctrl-C ended without a result, as shells have it."""
 
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
 
@@ -57,6 +67,24 @@ class _Teller:
             self.console.file.write(line[: max(1, self.console.width - 1)])
             self.console.file.flush()
 
+    def warn(
+        self,
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        """What a reader doubts, as a line; warnings of libraries are for developers."""
+        if issubclass(category, DataWarning):
+            self.say(f"warning: {message}")
+
+    def interrupted(self, line: str) -> None:
+        """A line from a signal handler, where Python's own streams must not be entered again."""
+        self.lines.append(line)
+        os.write(2, f"\n{line}\n".encode())
+
     def _clear(self) -> None:
         if self.live:
             self.console.file.write("\r\x1b[2K")
@@ -69,9 +97,11 @@ def solve(
     overrides: Set = None,
     ref: Annotated[str | None, typer.Option(help="Reference image.")] = None,
     next_: Annotated[str | None, typer.Option("--next", help="Next image.")] = None,
-    intrinsics: Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels.")] = None,
+    intrinsics: Annotated[
+        str | None, typer.Option(help="fx,fy,cx,cy in pixels, or a file.")
+    ] = None,
     intrinsics_next: Annotated[
-        str | None, typer.Option(help="fx,fy,cx,cy of the next frame, if they differ.")
+        str | None, typer.Option(help="The same of the next frame, if it differs.")
     ] = None,
     flow: Annotated[str | None, typer.Option(help=".flo, KITTI .png or .npy; default DIS.")] = None,
     depth: Annotated[str | None, typer.Option(help="True depth of the reference frame.")] = None,
@@ -93,15 +123,33 @@ def solve(
     halves = {"refine.enabled=false": no_refine, "refine.from_start=true": no_nlp}
     overrides = [*(overrides or []), *(item for item, on in halves.items() if on)]
     if problem is not None:
-        if ref or next_ or intrinsics:
-            raise ConfigError("give a problem file or --ref/--next/--intrinsics, not both")
+        pair = {
+            "--ref": ref,
+            "--next": next_,
+            "--intrinsics": intrinsics,
+            "--intrinsics-next": intrinsics_next,
+            "--depth": depth,
+        }
+        if any(pair.values()):
+            raise ConfigError(
+                "a problem file says itself what its pair is",
+                found=f"{problem} and {', '.join(k for k, v in pair.items() if v)}",
+                expected="a problem file, or the options of a pair",
+                hint="--set input.KEY=VALUE changes the input of a problem file",
+            )
+        if flow:
+            # a path on the command line starts here, one in a problem file from the file
+            overrides = [f"flow.source={json.dumps(_flow_source(flow))}", *overrides]
         chosen = load_problem(problem, overrides)
     else:
         chosen = _from_options(ref, next_, intrinsics, intrinsics_next, flow, depth, overrides)
-    folder = prepare_folder(out)
+    folder = prepare_folder(out, input_paths(chosen))
     teller = _Teller(quiet)
-    try:
-        with interruptible() as stop:
+    interrupt = interruptible(teller.interrupted)
+    with interrupt as stop, warnings.catch_warnings():
+        warnings.simplefilter("always", DataWarning)
+        warnings.showwarning = teller.warn
+        try:
             run = run_problem(
                 chosen,
                 listener=teller.iteration,
@@ -109,29 +157,46 @@ def solve(
                 say=teller.say,
                 ipopt_log=str(folder / "ipopt.log"),
             )
-    except BaseException as error:
-        teller.lines.append(f"failed: {error}")
-        write_text(folder / "log.txt", "\n".join(teller.lines) + "\n")
-        raise
-    files = write_folder(folder, run, dump_problem(chosen), "\n".join(teller.lines) + "\n")
-    # what a problem file expects holds for the file as it is
-    text = verdict(run, folder, files, None if overrides else chosen.expected.mre_at_most)
-    write_text(folder / "log.txt", "\n".join([*teller.lines, text]) + "\n")
+            if interrupt.aborted:
+                raise KeyboardInterrupt
+        except BaseException as error:
+            teller.lines.append(f"failed: {str(error) or type(error).__name__}")
+            write_text(folder / "log.txt", "\n".join(teller.lines) + "\n")
+            raise
+        # half a folder is of no use, and writing takes seconds
+        interrupt.deferred = True
+        files = write_folder(folder, run, dump_problem(chosen), "\n".join(teller.lines) + "\n")
+        # what a problem file expects holds for the file as it is
+        text = verdict(run, folder, files, None if overrides else chosen.expected.mre_at_most)
+        write_text(folder / "log.txt", "\n".join([*teller.lines, text]) + "\n")
     print(text)
     good = run.good and not (not overrides and missed(run))
     raise typer.Exit(0 if good else 1)
 
 
-def _four(text: str, option: str) -> list[float]:
+def _camera(text: str, option: str) -> list[float] | str:
+    """Four numbers, or the file that has them, as the key `intrinsics` of a problem file."""
     try:
         values = [float(x) for x in text.split(",")]
     except ValueError:
         values = []
+    if not values and Path(text).expanduser().is_file():
+        return text
     if len(values) != 4:
         raise ConfigError(
-            "camera is not four numbers", where=option, found=text, expected="fx,fy,cx,cy"
+            "camera is neither four numbers nor a file",
+            where=option,
+            found=text,
+            expected="fx,fy,cx,cy or a text file of 4 or 9 numbers",
         )
     return values
+
+
+def _flow_source(text: str) -> str:
+    """A flow source with its path, if it is one, from the working directory."""
+    if is_named(text) or not (Path(text).suffix or "/" in text):
+        return text
+    return str(Path(text).expanduser().resolve())
 
 
 def _from_options(
@@ -154,10 +219,10 @@ def _from_options(
         "kind": "files",
         "ref": ref,
         "next": next_,
-        "intrinsics": _four(intrinsics, "--intrinsics"),
+        "intrinsics": _camera(intrinsics, "--intrinsics"),
     }
     if intrinsics_next:
-        source["intrinsics_next"] = _four(intrinsics_next, "--intrinsics-next")
+        source["intrinsics_next"] = _camera(intrinsics_next, "--intrinsics-next")
     if depth:
         source["depth"] = depth
     raw: dict[str, Any] = {"name": Path(ref).stem, "input": source, "base": str(Path.cwd())}
@@ -224,22 +289,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments; default sys.argv.
 
     Returns:
-        0 good, 1 not converged or a claim fails, 2 bad input.
+        0 good, 1 not converged (interrupted too) or a claim fails, 2 bad input, 130 interrupted
+        before there was anything to keep, or twice: no result is written.
     """
     try:
         code = app(args=list(argv) if argv is not None else None, standalone_mode=False)
-        return int(code or 0)
+        # the command line library makes this code of a KeyboardInterrupt
+        return _aborted() if code == ABORTED else int(code or 0)
+    except StoppedError as error:
+        print(error, file=sys.stderr)
+        return ABORTED
     except SoupError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except typer.Exit as done:
         return int(done.exit_code)
-    except KeyboardInterrupt:
-        print("interrupted before the solve began", file=sys.stderr)
-        return 1
+    except (KeyboardInterrupt, typer.Abort):
+        return _aborted()
     except Exception as error:
         # usage errors of the command line library carry their own message
         if hasattr(error, "format_message"):
             print(f"error: {error.format_message()}", file=sys.stderr)
             return 2
         raise
+
+
+def _aborted() -> int:
+    print("interrupted: no result is written", file=sys.stderr)
+    return ABORTED

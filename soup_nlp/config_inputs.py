@@ -12,6 +12,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Camera = Annotated[list[Finite], Field(min_length=4, max_length=4)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Index = Annotated[int, Field(ge=0)]
+White = Annotated[int, Field(ge=1, le=65535)]
 Step = Annotated[int, Field(ge=1)]
 
 
@@ -28,6 +29,7 @@ class FilesInput(Strict):
         depth_next: True depth of the next frame.
         depth_scale: Values per unit of length of a 16-bit .png depth.
         unit: Unit of the true depth.
+        white: Value of 16-bit images that is white, 4095 where they hold 12 bits; null for 65535.
     """
 
     kind: Literal["files"]
@@ -39,6 +41,7 @@ class FilesInput(Strict):
     depth_next: str | None = None
     depth_scale: Positive = 1000.0
     unit: str = "m"
+    white: White | None = None
 
 
 class FolderInput(Strict):
@@ -49,12 +52,14 @@ class FolderInput(Strict):
         path: The folder.
         depth_scale: Values per unit of length of a 16-bit .png depth.
         unit: Unit of the true depth.
+        white: Value of 16-bit images that is white, 4095 where they hold 12 bits; null for 65535.
     """
 
     kind: Literal["folder"]
     path: str
     depth_scale: Positive = 1000.0
     unit: str = "m"
+    white: White | None = None
 
 
 class MotorcycleInput(Strict):
@@ -157,6 +162,18 @@ class TumInput(Strict):
     step: Step = 1
 
 
+class MemoryInput(Strict):
+    """A pair that was in memory: a problem with it tells runs apart, but cannot be solved again.
+
+    Attributes:
+        kind: Kind of input.
+        hash: Of the images, cameras and flow.
+    """
+
+    kind: Literal["memory"]
+    hash: str
+
+
 Input = Annotated[
     FilesInput
     | FolderInput
@@ -165,6 +182,7 @@ Input = Annotated[
     | SintelInput
     | KittiInput
     | VkittiInput
-    | TumInput,
+    | TumInput
+    | MemoryInput,
     Field(discriminator="kind"),
 ]

@@ -11,9 +11,10 @@ from typing import Any
 from soup_nlp.cases import prepare
 from soup_nlp.config import Problem, make_problem
 from soup_nlp.data.pair import Pair
+from soup_nlp.errors import SoupError
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
-from soup_nlp.inputs import load_pair
+from soup_nlp.inputs import load_pair, pair_hash
 from soup_nlp.model import plain
 from soup_nlp.model.energy import EnergyData, Weights
 from soup_nlp.model.formulation import Formulation
@@ -28,7 +29,14 @@ from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.soup import Solution, solve_soup
 from soup_nlp.start.propose import Start
 
-__all__ = ["Run", "evaluate", "load_pair", "run", "solve_pair"]
+__all__ = ["Run", "StoppedError", "evaluate", "load_pair", "run", "solve_pair"]
+
+BEFORE_START = ("load", "flow", "segmentation")
+"""Stages at whose end there is no soup yet."""
+
+
+class StoppedError(SoupError):
+    """A run was told to stop before it had a start, which is the least that can be kept."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +120,13 @@ def run(
     Args:
         problem: See `config.load_problem`.
         pair: Images and cameras, instead of the problem's input; its flow is used when it has one.
-        listener: Called at every iteration of Ipopt.
-        stop: Set it to end with the best iterate.
+        listener: Called at every iteration of presolve, Ipopt and TRW-S.
+        stop: Set it to end with the best iterate, or after the stage where there is no start yet.
         say: Called with a line after every stage.
         ipopt_log: File for Ipopt's own log.
 
     Raises:
+        StoppedError: `stop` was set before there was a start.
         SoupError: the input cannot be used.
     """
     seconds: dict[str, float] = {}
@@ -128,6 +137,10 @@ def run(
         now = time.perf_counter()
         seconds[stage] = seconds.get(stage, 0.0) + now - clock
         clock = now
+        if stop is not None and stop.is_set() and stage in BEFORE_START:
+            raise StoppedError(
+                "interrupted before there was a start: nothing to write", where=f"after the {stage}"
+            )
 
     case = prepare(problem, pair=pair, lap=lap, say=say)
     pair, start, data, weights = case.pair, case.start, case.data, case.weights
@@ -239,6 +252,8 @@ def _polished(refined: Refined, again: Solution) -> Refined:
 def solve_pair(pair: Pair, **options: Any) -> Run:
     """Solve a pair that is in memory.
 
+    The problem of the run says so by a hash of the pair; its config.yaml cannot be solved again.
+
     Args:
         pair: Images, cameras, and a flow if there is one (else OpenCV DIS).
         options: Sections of a problem file, e.g. `segmentation={"superpixels": 500}`.
@@ -247,5 +262,6 @@ def solve_pair(pair: Pair, **options: Any) -> Run:
         ConfigError: an option is wrong.
         DataError: the pair cannot be used.
     """
-    raw = {"name": pair.name, "input": {"kind": "motorcycle"}, **options}
+    source = {"kind": "memory", "hash": pair_hash(pair)}
+    raw = {"name": pair.name, "input": source, **options}
     return run(make_problem(raw, where="solve_pair"), pair=pair)

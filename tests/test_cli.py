@@ -237,7 +237,8 @@ def solve_files(images: Path, out: Path, **changes: str) -> int:
     ("changes", "part"),
     [
         ({"ref": "missing.png"}, "missing.png"),
-        ({"next": "small.png"}, "differ in size"),
+        ({"intrinsics": "0.9,0.9,0.5,0.5"}, "normalised"),
+        ({"intrinsics": "a.png,b.png"}, "a file"),
         ({"intrinsics": "0,0,79.5,59.5"}, "focal"),
         ({"intrinsics": "-9,9,1,1"}, "focal"),
         ({"intrinsics": "nan,9,1,1"}, "finite"),

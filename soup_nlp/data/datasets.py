@@ -23,7 +23,7 @@ from soup_nlp.data.datasets_driving import (
     load_vkitti1,
     load_vkitti2,
 )
-from soup_nlp.data.datasets_layout import need, need_folder, truth_or_none
+from soup_nlp.data.datasets_layout import is_result, need, need_folder, truth_or_none
 from soup_nlp.data.datasets_sintel import load_sintel
 from soup_nlp.data.flow import leaves
 from soup_nlp.data.formats_camera import intrinsics, read_intrinsics
@@ -76,7 +76,9 @@ def _find(folder: Path, stems: tuple[str, ...], suffixes: tuple[str, ...]) -> Pa
     return None
 
 
-def load_folder(folder: PathLike, depth_scale: float = 1000.0, unit: str = "m") -> Pair:
+def load_folder(
+    folder: PathLike, depth_scale: float = 1000.0, unit: str = "m", white: int | None = None
+) -> Pair:
     """Load a pair from a plain folder.
 
     Files (the first that exists is taken, in this order; images may also be jpg, tif, ppm, bmp):
@@ -93,14 +95,24 @@ def load_folder(folder: PathLike, depth_scale: float = 1000.0, unit: str = "m") 
         folder: The folder.
         depth_scale: Values per `unit` of a 16-bit depth image, e.g. 1000 for mm read as metres.
         unit: Unit of length of the truth.
+        white: Value of a 16-bit image that is white, see `read_image`.
 
     Returns:
         Pair named after the folder.
 
     Raises:
-        DataError: a required file is missing, or a file is wrong for its format or its image.
+        DataError: a required file is missing, a file is wrong for its format or its image, or the
+            folder holds a result of a solve.
     """
     folder = need_folder(folder, FOLDER_LAYOUT)
+    if is_result(folder):
+        raise DataError(
+            "input folder holds a result, whose depth and flow would pass for truth",
+            where=folder,
+            found="summary.json of a solve",
+            expected="a folder with inputs only",
+            hint="move the frames, K.txt and the truth to a folder of their own",
+        )
     first = _find(folder, ("frame_0", "image_ref"), _IMAGES)
     second = _find(folder, ("frame_1", "image_next"), _IMAGES)
     first = need(first or folder / "frame_0.png", FOLDER_LAYOUT)
@@ -121,8 +133,8 @@ def load_folder(folder: PathLike, depth_scale: float = 1000.0, unit: str = "m") 
         unit=unit,
     )
     return Pair(
-        image_ref=read_image(first),
-        image_next=read_image(second),
+        image_ref=read_image(first, white),
+        image_next=read_image(second, white),
         K_ref=K,
         K_next=read_intrinsics(K_next) if K_next.is_file() else K,
         truth=truth_or_none(truth),

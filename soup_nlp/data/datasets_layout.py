@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from soup_nlp.data.formats_image import PathLike
@@ -53,6 +54,15 @@ def need_folder(path: PathLike, layout: str) -> Path:
             expected=f"a folder with {layout}",
         )
     return path
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder holds what a solve has written (its summary names the problem)."""
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(summary, dict) and "problem_hash" in summary
 
 
 def optional(path: Path) -> Path | None:

@@ -18,6 +18,7 @@ from soup_nlp.data.flow_check import SUPPORT, FloatMap, confidence_of, leaves, r
 from soup_nlp.data.flow_guided import guided_flow
 from soup_nlp.data.flow_learned import MODELS, learned_flow
 from soup_nlp.data.flow_noise import PREFIX, noise_level, noisy
+from soup_nlp.data.flow_options import PRESETS, check_dis_options
 from soup_nlp.data.flow_rlof import rlof_flow
 from soup_nlp.data.formats_flow import read_flow
 from soup_nlp.data.formats_image import PathLike
@@ -45,11 +46,6 @@ ENTRY_POINTS = "soup_nlp.flow"
 MIN_SIDE = 16
 """Smallest image side for DIS, pixels."""
 
-_PRESETS = {
-    "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
-    "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
-    "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
-}
 _FLAT = 1.0  # standard deviation, grey levels, below which an image holds nothing to match
 _WORK_SIDE = 64  # DIS gets images of at least this side; smaller ones are padded
 
@@ -117,7 +113,22 @@ def dis_flow(
         DataError: an image is not uint8, too small, or an option is out of range.
     """
     ref, nxt = _grey(image_ref, "image_ref"), _grey(image_next, "image_next")
-    _check_options(finest_scale, preset, patch_size, patch_stride, tau, limit, support, planes)
+    check_dis_options(
+        {
+            "finest_scale": finest_scale,
+            "preset": preset,
+            "patch_size": patch_size,
+            "patch_stride": patch_stride,
+            "refinement_iterations": refinement_iterations,
+            "alpha": alpha,
+            "delta": delta,
+            "gamma": gamma,
+            "tau": tau,
+            "limit": limit,
+            "support": support,
+            "planes": planes,
+        }
+    )
     height, width = ref.shape
     if min(float(ref.std()), float(nxt.std())) < _FLAT:
         zero = np.zeros((height, width), np.float32)
@@ -125,7 +136,7 @@ def dis_flow(
     if equalize:
         clahe = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8))
         ref, nxt = clahe.apply(ref), clahe.apply(nxt)
-    dis = cv2.DISOpticalFlow.create(_PRESETS[preset])
+    dis = cv2.DISOpticalFlow.create(PRESETS[preset])
     dis.setFinestScale(finest_scale)
     dis.setPatchSize(patch_size)
     dis.setPatchStride(patch_stride)
@@ -174,33 +185,6 @@ def _grey(image: Image, where: str) -> Image:
 def _pad(image: Image, rows: int, cols: int) -> Image:
     """The image with its last row and column repeated up to (rows, cols)."""
     return np.pad(image, ((0, rows - image.shape[0]), (0, cols - image.shape[1])), mode="edge")
-
-
-def _check_options(
-    finest_scale: int,
-    preset: str,
-    patch_size: int,
-    patch_stride: int,
-    tau: float,
-    limit: float,
-    support: int,
-    planes: int,
-) -> None:
-    checks: list[tuple[str, object, bool, str]] = [
-        ("finest_scale", finest_scale, 0 <= finest_scale <= 5, "0 to 5"),
-        ("preset", preset, preset in _PRESETS, ", ".join(_PRESETS)),
-        ("patch_size", patch_size, 4 <= patch_size <= 32, "4 to 32 pixels"),
-        ("patch_stride", patch_stride, 1 <= patch_stride <= patch_size, "1 to patch_size"),
-        ("tau", tau, tau > 0, "a positive number of pixels"),
-        ("limit", limit, 0 < limit < np.inf, "a positive number of pixels"),
-        ("support", support, support >= 1 and support % 2 == 1, "an odd number of pixels"),
-        ("planes", planes, 0 <= planes <= 20, "0 to 20"),
-    ]
-    for name, value, good, expected in checks:
-        if not good:
-            raise DataError(
-                "DIS option is out of range", where=name, found=value, expected=expected
-            )
 
 
 def flow_from_array(uv: NDArray[np.floating], source: str) -> Flow:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,13 @@ PathLike = str | os.PathLike[str]
 
 MAX_SIDE = 100_000
 """Largest width or height that a header may claim, pixels; more is taken for a damaged file."""
+
+DARK = 65535 // 3
+"""A 16-bit image whose largest value is below this is taken for one that may hold fewer bits."""
+
+
+class DataWarning(UserWarning):
+    """An input can be used, but may not be what it seems."""
 
 
 def read_bytes(path: PathLike, what: str) -> bytes:
@@ -248,6 +256,9 @@ def read_image(path: PathLike, white: int | None = None) -> NDArray[np.uint8]:
     Returns:
         (H, W, 3) uint8 RGB image, indexed [v, u].
 
+    Warns:
+        DataWarning: no `white` is given and a 16-bit image is dark throughout.
+
     Raises:
         DataError: the file is missing, not decodable, or neither 8- nor 16-bit.
     """
@@ -263,6 +274,8 @@ def read_image(path: PathLike, white: int | None = None) -> NDArray[np.uint8]:
             expected="1 (grey), 3 (RGB) or 4 (RGBA)",
         )
     if image.dtype == np.uint16:
+        if white is None:
+            _warn_dark(int(image.max()), path)
         scale = 255.0 / (65535 if white is None else white)
         image = np.minimum(np.rint(image * scale), 255).astype(np.uint8)
     elif image.dtype != np.uint8:
@@ -277,13 +290,25 @@ def read_image(path: PathLike, white: int | None = None) -> NDArray[np.uint8]:
     return np.ascontiguousarray(rgb)
 
 
+def _warn_dark(largest: int, path: PathLike) -> None:
+    """Say that a 16-bit image may hold fewer bits; it may be a dark scene: nothing is guessed."""
+    if 0 < largest < DARK:
+        full = 2 ** largest.bit_length() - 1
+        warnings.warn(
+            f"{path}: 16-bit image is dark, its largest value is {largest} of 65535; if its white"
+            f" is {full}, say so by the key white of the input (white: {full})",
+            DataWarning,
+            stacklevel=3,
+        )
+
+
 def read_mask(path: PathLike) -> NDArray[np.bool_]:
     """Read a black-and-white picture as (H, W) bool, True above half of the range.
 
     Raises:
         DataError: as `read_image`.
     """
-    return np.asarray(read_image(path)[:, :, 0] > 127)
+    return np.asarray(read_image(path, white=65535)[:, :, 0] > 127)
 
 
 Reader = Callable[[PathLike], NDArray[Any]]

@@ -11,6 +11,9 @@ from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
 
+SHORTEST = 0.05
+"""Focal length, in sides of the image, below which it cannot be in pixels (168 degrees of view)."""
+
 
 @dataclass(frozen=True)
 class Flow:
@@ -40,6 +43,16 @@ class Flow:
                 where=self.source,
                 found=self.confidence.shape,
                 expected=self.uv.shape[:2],
+            )
+        # false for NaN too
+        fits = (self.confidence >= 0) & (self.confidence <= 1)
+        if not fits.all():
+            raise DataError(
+                "flow confidence is out of range",
+                where=self.source,
+                found=f"{int((~fits).sum())} such pixels, {self.confidence[~fits][0]} the first",
+                expected="0 to 1",
+                hint="0 is for pixels that are not to be used",
             )
         if not np.isfinite(self.uv[self.confidence > 0]).all():
             raise DataError(
@@ -123,7 +136,11 @@ class Pair:
                     expected="uint8 (H, W, 3)",
                 )
         for what in ("K_ref", "K_next"):
-            check_intrinsics(getattr(self, what), what)
+            K = _matrix(getattr(self, what), what)
+            object.__setattr__(self, what, K)
+            check_intrinsics(K, what)
+        _check_focal(self.K_ref, self.image_ref, "K_ref")
+        _check_focal(self.K_next, self.image_next, "K_next")
         if self.flow is not None and self.flow.uv.shape[:2] != self.image_ref.shape[:2]:
             raise DataError(
                 "flow and reference image differ in size",
@@ -164,6 +181,30 @@ class Pair:
     def __str__(self) -> str:
         h, w = self.size
         return f"Pair({self.name}, {w}x{h}, {self.flow or 'no flow'}, {self.truth or 'no truth'})"
+
+
+def _matrix(K: object, where: str) -> Float:
+    """Intrinsics as an array, whatever rows of numbers they are given as."""
+    try:
+        return np.asarray(K, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            "intrinsics are no matrix of numbers", where=where, found=repr(K), expected="(3, 3)"
+        ) from error
+
+
+def _check_focal(K: Float, image: NDArray[np.uint8], where: str) -> None:
+    """Raise DataError for a focal length that no image of this size has."""
+    for focal, side, name in ((K[0, 0], image.shape[1], "fx"), (K[1, 1], image.shape[0], "fy")):
+        if focal < SHORTEST * side:
+            raise DataError(
+                "focal length is far too short for the image",
+                where=where,
+                found=f"{name} {focal:g} at {side} pixels",
+                expected="focal lengths in pixels, mostly 0.5 to 3 times the width",
+                hint="multiply normalised intrinsics by the image's size:"
+                " fx and cx by the width, fy and cy by the height",
+            )
 
 
 def check_intrinsics(K: Float, where: str) -> None:

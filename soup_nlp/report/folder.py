@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from soup_nlp.data.datasets_layout import is_result
 from soup_nlp.errors import DataError
 from soup_nlp.report.atomic import atomic_path
 from soup_nlp.report.colour import (
@@ -47,17 +49,31 @@ FILES = (
 """Files of a result folder; error.png is there with dense truth only."""
 
 
-def prepare_folder(folder: str | Path) -> Path:
+MARK = ".soup_nlp"
+"""Empty file by which a folder is known as one for results, from before its first file on."""
+
+
+def prepare_folder(folder: str | Path, inputs: Iterable[Path] | None = None) -> Path:
     """Make the output folder and prove that it can be written.
 
+    Args:
+        folder: The folder.
+        inputs: Files and folders of the problem that is solved into it, see `input_paths`; neither
+            these nor files that no solve has written are overwritten. None does not look.
+
     Raises:
-        DataError: it cannot.
+        DataError: it cannot be written, or holds what is not to be overwritten.
     """
     folder = Path(folder)
+    if inputs is not None:
+        _refuse_inputs(folder.resolve(), inputs)
+        _refuse_foreign(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
+        if inputs is not None:
+            (folder / MARK).touch()
         # Ipopt appends to its log, stage by stage
         (folder / "ipopt.log").unlink(missing_ok=True)
     except OSError as error:
@@ -68,6 +84,41 @@ def prepare_folder(folder: str | Path) -> Path:
             hint="choose another --out",
         ) from error
     return folder
+
+
+def _refuse_inputs(folder: Path, inputs: Iterable[Path]) -> None:
+    """Raise DataError where a result would overwrite, or lie among, what is solved."""
+    for place in inputs:
+        if place == folder:
+            raise DataError(
+                "output folder is the input's folder",
+                where=folder,
+                expected="a folder of its own: depth and flow of a result would pass for truth",
+                hint="choose another --out",
+            )
+        if place.parent == folder and place.name in FILES:
+            raise DataError(
+                "an input would be overwritten by the result",
+                where=folder,
+                found=place.name,
+                expected="a folder that holds none of the inputs under the name of a result's file",
+                hint="choose another --out",
+            )
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """Raise DataError where files have the names of a result's, but no solve has written them."""
+    if (folder / MARK).exists() or is_result(folder):
+        return
+    found = [name for name in FILES if (folder / name).exists()]
+    if found:
+        raise DataError(
+            "output folder holds files that would be overwritten and are of no earlier result",
+            where=folder,
+            found=", ".join(found),
+            expected="a new or empty folder, or that of an earlier result",
+            hint="choose another --out",
+        )
 
 
 def write_text(path: Path, text: str) -> None:
@@ -83,6 +134,8 @@ def write_text(path: Path, text: str) -> None:
 def write_folder(folder: Path, run: Run, config: str, log: str) -> list[str]:
     """Write every file of a run; summary.json comes last and says that the rest is there.
 
+    That of an earlier result goes first.
+
     Args:
         folder: Prepared folder.
         run: The run.
@@ -95,6 +148,7 @@ def write_folder(folder: Path, run: Run, config: str, log: str) -> list[str]:
     Raises:
         DataError: a file cannot be written.
     """
+    (folder / "summary.json").unlink(missing_ok=True)
     write_text(folder / "config.yaml", config)
     write_text(folder / "log.txt", log)
     write_h5(folder / "result.h5", result_tree(run), attributes(run, config))
@@ -111,7 +165,7 @@ def write_folder(folder: Path, run: Run, config: str, log: str) -> list[str]:
 def summary(run: Run) -> dict[str, Any]:
     """What summary.json holds; the keys are stable."""
     s = run.solution
-    constant = run.metrics["constant"].mre if run.metrics else np.nan
+    constant = run.metrics["constant"].mre if "constant" in run.metrics else np.nan
     facing = run.problem.formulation.min_facing
     return {
         "name": run.problem.name,

@@ -9,6 +9,7 @@ import numpy as np
 
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.report.store import Array, Tree
+from soup_nlp.solve.ipopt import Stage
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline import Run
@@ -36,7 +37,7 @@ _ENERGY: Mapping[str, tuple[str, str, str]] = {
     "local_units": ("1", "", "units are shares of the depths of two anchors, power mean -4"),
     "arap_at_anchors": ("1", "", "motion difference at the anchors, not at the camera"),
 }
-_HISTORY = {
+_IPOPT = {
     "obj": "objective of the solver's form",
     "inf_pr": "largest constraint violation",
     "inf_du": "largest dual infeasibility, scaled by Ipopt",
@@ -47,6 +48,15 @@ _HISTORY = {
     "alpha_du": "step size, multipliers",
     "ls_trials": "trial points of the line search",
 }
+_DESCENT = {
+    "obj": "objective of the phase",
+    "inf_pr": "0: the tangent has no constraint to violate",
+    "inf_du": "largest dual infeasibility",
+    "mu": "largest complementarity of rim visibility",
+    "regularization_size": "median damping of the superpixels",
+    "alpha_pr": "smallest step size of a superpixel",
+}
+"""History of a phase of the presolve, which keeps the keys of Ipopt's."""
 _ROUNDS = {
     "mrf_energy": "energy of the chosen labels in the MRF of the particles",
     "bound": "TRW-S's lower bound on every choice among the particles",
@@ -64,6 +74,7 @@ _TRUTH = {
     "occluded": ("H,W", "reference pixel is not visible in the next frame"),
     "bodies": ("H,W", "body of a reference pixel, -1 for none"),
     "motions": ("B,4,4", "next_from_ref of each body"),
+    "scene_flow": ("H,W,3", "true X' - X, each in its own frame's camera, NaN where unknown"),
     "points": ("M,3", "sparse truth: u and v in px, z in the unit of length"),
 }
 _TRUTH_UNITS = {"flow": "px", "occluded": "1", "bodies": "1"}
@@ -130,7 +141,7 @@ def result_tree(run: Run) -> Tree:
         },
         "iterations": {
             f"{k:02d}_{stage.name.replace(' ', '_').replace('/', '_')}": {
-                key: Array(value, "1", f"{_HISTORY.get(key, key)}, by iteration", "I")
+                key: Array(value, "1", f"{_history(stage).get(key, key)}, by iteration", "I")
                 for key, value in stage.history.items()
             }
             for k, stage in enumerate(run.solution.stages)
@@ -138,6 +149,11 @@ def result_tree(run: Run) -> Tree:
         "depth": depth,
         "truth": _truth(run),
     }
+
+
+def _history(stage: Stage) -> Mapping[str, str]:
+    """What the history of a stage is about."""
+    return _DESCENT if stage.name.startswith("presolve") else _IPOPT
 
 
 def _refine(run: Run) -> dict[str, Array]:

@@ -1,0 +1,50 @@
+"""An energy that is rounding alone is checked as such."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from soup_nlp.config import dump_problem
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.scenes import render_scene
+from soup_nlp.geometry.camera import pixel_grid, project, rays
+from soup_nlp.pipeline import Run, solve_pair
+from soup_nlp.report.check import check_folder
+from soup_nlp.report.folder import prepare_folder, write_folder
+
+OPTIONS = {"segmentation": {"superpixels": 100, "neighbours": 8}}
+
+
+def one_plane() -> Pair:
+    """A plane and a motion whose flow is exact: E can be brought down to rounding."""
+    shot = render_scene("orbit", 0, 320, 160)
+    uv = pixel_grid(*shot.size)
+    ray = rays(shot.K_ref, uv)
+    points = (2.0 / (ray @ [-0.1, -0.2, 0.97]))[..., None] * ray
+    turn = cv2.Rodrigues(np.array([0.01, 0.02, -0.005]))[0]
+    flow = project(shot.K_next, points @ turn.T + [0.2, 0.02, 0.1]) - uv
+    sure = np.ones(shot.size, np.float32)
+    return Pair(shot.image_ref, shot.image_next, shot.K_ref, shot.K_next, Flow(flow, sure, "exact"))
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    return solve_pair(one_plane(), **OPTIONS)
+
+
+def test_an_energy_of_rounding_holds(run, tmp_path):
+    write_folder(prepare_folder(tmp_path), run, dump_problem(run.problem), "")
+    assert run.energy["total"] < 1e-9
+    assert [row.name for row in check_folder(tmp_path).rows if not row.ok] == []
+    path = tmp_path / "summary.json"
+    claims = json.loads(Path(path).read_text())
+    # 1e-7 is far below a pixel, but no rounding of coordinates up to 320
+    for off, expected in ((3e-11, []), (1e-7, ["energy solution proj"])):
+        claims["energy"]["solution"]["proj"] += off
+        path.write_text(json.dumps(claims))
+        assert [row.name for row in check_folder(tmp_path).rows if not row.ok] == expected

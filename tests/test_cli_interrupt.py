@@ -1,0 +1,111 @@
+"""Ctrl-C in every stage of `solve`: said, obeyed, and never half a folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from soup_nlp import cases, cli
+from soup_nlp.pipeline import StoppedError, run
+from soup_nlp.report import folder as folders
+from soup_nlp.solve.ipopt import interruptible
+
+ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
+SMALL = [
+    "--set", "input.width=160", "--set", "input.height=120", "--set", "flow.source=truth",
+    "--set", "segmentation.superpixels=30", "--set", "segmentation.neighbours=5",
+]  # fmt: skip
+
+
+def solve(out: Path) -> int:
+    return cli.main(["solve", ORBIT, "--out", str(out), "-q", *SMALL])
+
+
+def ctrl_c(times: int = 1) -> None:
+    for _ in range(times):
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("stage", ["load_pair", "load_flow_of", "build_segmentation"])
+def test_before_a_start_it_ends_after_the_stage(stage, tmp_path, monkeypatch, capfd):
+    own = getattr(cases, stage)
+
+    def interrupted(*args, **kwargs):
+        ctrl_c()
+        return own(*args, **kwargs)
+
+    monkeypatch.setattr(cases, stage, interrupted)
+    assert solve(tmp_path / "out") == 130
+    error = capfd.readouterr().err
+    assert "interrupt received" in error
+    assert "before there was a start" in error
+    assert not (tmp_path / "out" / "summary.json").exists()
+    assert "interrupted" in (tmp_path / "out" / "log.txt").read_text()
+
+
+def test_a_second_one_aborts_and_says_so(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(cases, "load_flow_of", lambda *args: ctrl_c(2))
+    assert solve(tmp_path / "out") == 130
+    assert "no result is written" in capfd.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize("at", [cli._Teller.iteration, cases.propose])
+def test_once_there_is_a_start_the_best_iterate_is_written(at, tmp_path, monkeypatch, capfd):
+    pressed = []
+
+    def interrupted(*args, **kwargs):
+        if not pressed:
+            pressed.append(True)
+            ctrl_c()
+        return at(*args, **kwargs)
+
+    owner = cases if at is cases.propose else cli._Teller
+    monkeypatch.setattr(owner, at.__name__, interrupted)
+    assert solve(tmp_path) == 1
+    assert "interrupt received" in capfd.readouterr().err
+    assert json.loads((tmp_path / "summary.json").read_text())["status"] == "Interrupted"
+    assert all((tmp_path / name).is_file() for name in folders.FILES)
+
+
+def test_a_second_one_in_the_solver_aborts_too(tmp_path, monkeypatch, capfd):
+    def interrupted(self, progress):
+        if progress.stage == "constrained NLP":
+            ctrl_c()
+            ctrl_c()
+
+    monkeypatch.setattr(cli._Teller, "iteration", interrupted)
+    assert solve(tmp_path / "out") == 130
+    assert "no result is written" in capfd.readouterr().err
+    assert not (tmp_path / "out" / "summary.json").exists()
+
+
+def test_files_that_are_being_written_are_written(tmp_path, monkeypatch, capfd):
+    assert solve(tmp_path) == 0
+    own, seen = folders.write_h5, []
+
+    def interrupted(*args):
+        seen.append((tmp_path / "summary.json").exists())
+        ctrl_c(3)
+        own(*args)
+
+    monkeypatch.setattr(folders, "write_h5", interrupted)
+    assert solve(tmp_path) == 0
+    # the summary says that the rest is there, so the old one goes first
+    assert seen == [False]
+    assert all((tmp_path / name).is_file() for name in folders.FILES)
+    assert "files are being written" in capfd.readouterr().err
+
+
+def test_a_run_of_python_says_it_too():
+    problem = cli.load_problem(ORBIT, [word for word in SMALL if word != "--set"])
+    with interruptible() as stop:
+        ctrl_c()
+        with pytest.raises(StoppedError, match="load"):
+            run(problem, stop=stop)
+        with pytest.raises(KeyboardInterrupt):
+            ctrl_c()

@@ -1,0 +1,143 @@
+"""Options of `solve` that go, or do not go, with a problem file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from soup_nlp.cli import main
+from soup_nlp.config import make_problem
+from soup_nlp.data.formats import write_flo
+from soup_nlp.data.scenes import render_scene
+from soup_nlp.inputs import load_pair
+from soup_nlp.report.folder import MARK
+
+ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
+SMALL = [
+    "--set", "input.width=160", "--set", "input.height=120", "--set", "refine.enabled=false",
+    "--set", "segmentation.superpixels=30", "--set", "segmentation.neighbours=5",
+    "--set", "solver.presolve_iterations=10", "--set", "solver.max_iter=2",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "option", [("--depth", "truth.npy"), ("--intrinsics-next", "1,1,0,0"), ("--ref", "a.png")]
+)
+def test_options_of_a_pair_do_not_go_with_a_problem_file(option, tmp_path, capsys):
+    assert main(["solve", ORBIT, "--out", str(tmp_path / "out"), *option]) == 2
+    error = capsys.readouterr().err
+    assert option[0] in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_flow_goes_with_a_problem_file(tmp_path, monkeypatch):
+    flow = render_scene("orbit", 0, 160, 120).truth.flow.astype(np.float32)
+    write_flo(tmp_path / "own flow.flo", flow)
+    monkeypatch.chdir(tmp_path)
+    args = ["solve", ORBIT, "--out", "out", "-q", "--flow", "own flow.flo", *SMALL]
+    assert main(args) in (0, 1)
+    assert "own flow.flo" in json.loads((tmp_path / "out" / "summary.json").read_text())["flow"]
+
+
+def foreign(folder: Path) -> list[str]:
+    """A folder with the inputs of a pair, under names that results have too."""
+    pair = render_scene("orbit", 0, 160, 120)
+    folder.mkdir()
+    for name, image in (("frame_0", pair.image_ref), ("frame_1", pair.image_next)):
+        cv2.imwrite(str(folder / f"{name}.png"), image[..., ::-1])
+    np.savetxt(folder / "K.txt", pair.K_ref)
+    (folder / "pair.yaml").write_text("input: {kind: folder, path: .}\n")
+    return ["solve", str(folder / "pair.yaml"), "-q", *SMALL[4:]]
+
+
+def test_a_folder_of_inputs_is_no_output_folder(tmp_path, capsys):
+    args = foreign(tmp_path / "pair")
+    before = sorted(tmp_path.rglob("*"))
+    assert main([*args, "--out", str(tmp_path / "pair")]) == 2
+    assert "input's folder" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["flow.png", "config.yaml", "depth_ref.png"])
+def test_files_of_no_result_are_not_overwritten(name, tmp_path, capsys):
+    args = foreign(tmp_path / "pair")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("precious")
+    assert main([*args, "--out", str(tmp_path / "out")]) == 2
+    assert name in capsys.readouterr().err
+    assert [p.read_text() for p in (tmp_path / "out").iterdir()] == ["precious"]
+
+
+def test_an_input_in_a_result_folder_is_not_overwritten(tmp_path, capsys):
+    args = foreign(tmp_path / "pair")
+    out = tmp_path / "out"
+    assert main([*args, "--out", str(out)]) in (0, 1)
+    flow = ["--flow", str(out / "flow.png")]
+    assert main([*args, "--out", str(out), *flow]) == 2
+    assert "an input would be overwritten" in capsys.readouterr().err
+
+
+def test_a_result_folder_takes_the_next_result_and_is_no_input(tmp_path, capsys):
+    args = foreign(tmp_path / "pair")
+    out = tmp_path / "out"
+    assert main([*args, "--out", str(out)]) in (0, 1)
+    assert main([*args, "--out", str(out)]) in (0, 1)
+    assert main(["solve", str(out / "config.yaml"), "--out", str(out), "-q"]) in (0, 1)
+    # one that was made before there was a mark
+    (out / MARK).unlink()
+    assert main([*args, "--out", str(out)]) in (0, 1)
+    for path in (tmp_path / "pair").iterdir():
+        (out / path.name).write_bytes(path.read_bytes())
+    assert main(["solve", str(out / "pair.yaml"), "--out", str(tmp_path / "other")]) == 2
+    assert "holds a result" in capsys.readouterr().err
+
+
+def test_images_may_differ_in_size(tmp_path, capsys):
+    foreign(tmp_path / "pair")
+    pair = render_scene("orbit", 0, 160, 120)
+    cut = str(tmp_path / "pair" / "cut.png")
+    cv2.imwrite(cut, pair.image_next[:110, :150, ::-1])
+    np.save(tmp_path / "cut.npy", pair.truth.depth_next[:110, :150])
+    options = ["--ref", str(tmp_path / "pair" / "frame_0.png"), "--next", cut]
+    # the camera is a file here, as it may be in a problem file
+    options += ["--intrinsics", str(tmp_path / "pair" / "K.txt")]
+    options += ["--set", f"input.depth_next={tmp_path / 'cut.npy'}"]
+    assert main(["solve", "--out", str(tmp_path / "out"), *options, *SMALL[4:]]) in (0, 1)
+    # only the next frame has a truth here
+    assert "next frame" in capsys.readouterr().out
+    assert main(["check", str(tmp_path / "out")]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["metrics"]["solution_next"]["coverage"] > 0.5
+    depth = cv2.imread(str(tmp_path / "out" / "depth_next.png"), cv2.IMREAD_UNCHANGED)
+    assert depth.shape == (110, 150)
+
+
+@pytest.mark.parametrize("white", [None, 4095])
+def test_a_picture_of_12_bits_names_its_key(white, tmp_path, capsys):
+    args = foreign(tmp_path / "pair")
+    for name in ("frame_0.png", "frame_1.png"):
+        path = str(tmp_path / "pair" / name)
+        cv2.imwrite(path, np.uint16(cv2.imread(path)) * 16)
+    args += [] if white is None else ["--set", f"input.white={white}"]
+    args.remove("-q")
+    assert main([*args, "--out", str(tmp_path / "out")]) in (0, 1)
+    error = capsys.readouterr().err
+    assert error.count("white: 4095") == (2 if white is None else 0)
+    log = (tmp_path / "out" / "log.txt").read_text()
+    assert ("warning: " in log) == (white is None)
+
+
+def test_white_reaches_files_too(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((64, 64, 3), 4095, np.uint16))
+    source = {
+        "kind": "files",
+        "ref": "a.png",
+        "next": "a.png",
+        "intrinsics": [60.0, 60.0, 32.0, 32.0],
+    }
+    problem = make_problem({"input": {**source, "white": 4095}, "base": str(tmp_path)})
+    assert load_pair(problem).image_ref.min() == 255

@@ -1,0 +1,66 @@
+"""A pair in memory: its problem tells runs apart, and cannot be mistaken for another input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from soup_nlp.cli import main
+from soup_nlp.config import dump_problem, load_problem
+from soup_nlp.data.scenes import render_scene
+from soup_nlp.errors import ConfigError
+from soup_nlp.inputs import load_pair, pair_hash
+from soup_nlp.pipeline import Run, solve_pair
+from soup_nlp.report.check import check_folder
+from soup_nlp.report.folder import prepare_folder, write_folder
+
+SMALL = {
+    "segmentation": {"superpixels": 30, "neighbours": 5},
+    "flow": {"source": "truth"},
+    "refine": {"enabled": False},
+}
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    return solve_pair(render_scene("orbit", 0, 128, 96), **SMALL)
+
+
+def test_the_hash_is_that_of_the_pair(run):
+    pair = render_scene("orbit", 0, 128, 96)
+    assert run.problem.input.kind == "memory"
+    assert run.problem.input.hash == pair_hash(pair)
+    turned = replace(pair, image_next=np.ascontiguousarray(pair.image_next[::-1]))
+    longer = replace(pair, K_next=pair.K_next * [[1.1], [1], [1]])
+    assert len({pair_hash(p) for p in (pair, turned, longer, run.pair)}) == 4
+    assert pair_hash(replace(pair, name="other", truth=None)) == pair_hash(pair)
+
+
+def test_its_config_is_refused_before_anything_is_written(run, tmp_path, capsys):
+    out = tmp_path / "out"
+    write_folder(prepare_folder(out), run, dump_problem(run.problem), "")
+    assert check_folder(out).ok
+    problem = load_problem(out / "config.yaml")
+    assert problem.digest() == run.problem.digest()
+    with pytest.raises(ConfigError, match="in memory"):
+        load_pair(problem)
+    assert main(["solve", str(out / "config.yaml"), "--out", str(tmp_path / "new")]) == 2
+    assert run.problem.input.hash in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_every_array_of_truth_and_history_says_what_it_is(run, tmp_path):
+    write_folder(prepare_folder(tmp_path), run, dump_problem(run.problem), "")
+    with h5py.File(tmp_path / "result.h5") as file:
+        stored = file["truth/scene_flow"]
+        np.testing.assert_array_equal(stored[:], run.pair.truth.scene_flow)
+        assert stored.attrs["units"] == run.pair.truth.unit
+        for name, stage in file["iterations"].items():
+            said = stage["mu"].attrs["description"]
+            assert ("barrier" in said) == ("constrained" in name)
+            assert ("complementarity" in said) == ("presolve" in name)
+            damped = stage["regularization_size"].attrs["description"]
+            assert ("damping" in damped) == ("presolve" in name)
