@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,10 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.cases import Case, prepare
+from soup_nlp.compare.task import Limits
+from soup_nlp.compare.verify import ENERGY_SLACK, examine, violations
 from soup_nlp.config import dump_problem, load_problem
 from soup_nlp.errors import ConfigError, ExportError
-from soup_nlp.export.duals import bound_multipliers, least_squares_multipliers
 from soup_nlp.export.formats import FORMATS, write_casadi, write_start_h5
+from soup_nlp.export.manifest import (
+    MANIFEST,
+    NORMS,
+    STUB,
+    TRUNCATIONS,
+    kept_best,
+    read_manifest,
+    remove_stale,
+)
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.residuals import EQUATIONS, Kind, kind, residual_table
@@ -35,14 +44,12 @@ from soup_nlp.solve.soup import Solution
 
 Float = NDArray[np.float64]
 
-NORMS = ("smooth", "epigraph")
-TRUNCATIONS = ("smooth", "lifted")
-STUB = "soup"
-MANIFEST = "manifest.json"
 SAME = 1e-7
 """Relative difference of the objective at which an export is no longer the problem at hand."""
 KKT_LIMIT = 1e-6
-"""Largest violation of a constraint that a claim of success may have."""
+"""Largest violation of a constraint that a verified answer may have."""
+LIMITS = Limits()
+"""Of the other KKT residuals of a verified answer: those of `compare` as it comes."""
 
 
 def parse_formulation(text: str) -> dict[str, str]:
@@ -79,11 +86,13 @@ def export_case(
 ) -> dict[str, Any]:
     """Write soup.nl with names, problem.yaml and manifest.json into an existing folder.
 
+    Files of an earlier export there that this one does not write are removed.
+
     Args:
         case: Problem with its start.
         form: Gauge, norm and truncation; the Hessian that the files carry is exact.
         folder: Where the files go.
-        formats: Of FORMATS; nl is always written.
+        formats: Of FORMATS; nl is always written, and soup.h5 with casadi as well.
         presolved: The case starts at the presolve's answer (for the manifest).
 
     Returns:
@@ -103,6 +112,8 @@ def export_case(
     names = readable_names(nlp, layout)
     file = write_nl(folder / f"{STUB}.nl", nlp, names=names)
     files = [f"{STUB}.nl", f"{STUB}.col", f"{STUB}.row"]
+    best = kept_best(folder, file.sha256)
+    remove_stale(folder, files)
     if "casadi" in formats:
         files += write_casadi(folder, nlp)
     write_text(folder / "problem.yaml", dump_problem(case.problem))
@@ -127,10 +138,11 @@ def export_case(
         "objective_at_start": float(nlp.oracle(nlp.x0, nlp.p)[0]),
         "exact_energy_at_start": plain.energy(case.soup, case.data, case.weights),
         "fingerprint": _fingerprint(case, nlp, layout),
-        "best_known": _kept_best(folder, file.sha256),
+        "best_known": best,
         "files": files,
     }
-    if "h5" in formats:
+    # the functions are of no use without parameters, start and bounds
+    if "h5" in formats or "casadi" in formats:
         attrs = {k: manifest[k] for k in ("name", "problem_hash", "formulation", "smoothing")}
         write_start_h5(folder / f"{STUB}.h5", nlp, names, attrs)
         manifest["files"].append(f"{STUB}.h5")
@@ -144,15 +156,6 @@ def _fingerprint(case: Case, nlp: NLP, layout: MatrixLayout) -> dict[str, float]
     x[: layout.size] = layout.pack(case.start.soup)
     f, g = nlp.oracle(x, nlp.p)
     return {"objective": float(f), "constraints": float(np.linalg.norm(np.asarray(g)))}
-
-
-def _kept_best(folder: Path, sha256: str) -> dict[str, Any] | None:
-    """best_known of a manifest that is there already, if it is of the same file."""
-    try:
-        old = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        return old["best_known"] if old["nl"]["sha256"] == sha256 else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 @dataclass(frozen=True)
@@ -175,8 +178,8 @@ class Imported:
 def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Imported:
     """Read a .sol for an exported problem; energy and residuals are recomputed.
 
-    The multipliers are the solver's, or the least-squares ones where it gives none; those of the
-    bounds are what point and multipliers imply.
+    The multipliers are the solver's, or the least-squares ones where these balance better; those
+    of the bounds are what point and multipliers imply.
 
     Args:
         folder: Exported folder.
@@ -188,7 +191,7 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
         SoupError: the problem's input cannot be used.
     """
     folder = Path(folder)
-    manifest = _manifest(folder)
+    manifest = read_manifest(folder)
     case = prepare(load_problem(folder / "problem.yaml"))
     form = case.formulation(
         **manifest["formulation"], **manifest["smoothing"], hessian="exact", compiled=False
@@ -205,7 +208,9 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
                 hint="its images, its problem.yaml or the program have changed; export again",
             )
     answer = read_sol(sol, *_orders(folder, nlp, layout))
-    run = make_run(case, form, nlp, layout, answer, source=Path(sol).name)
+    # a point may be anything: what cannot be computed is infinite or NaN, and never verified
+    with np.errstate(all="ignore"):
+        run = make_run(case, form, nlp, layout, answer, source=Path(sol).name)
     best = manifest["best_known"]
     energy = run.solution.energy["total"]
     if renew and run.solution.converged and (best is None or energy < best["exact_energy"]):
@@ -216,16 +221,7 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
             "found_by": message,
         }
         write_json(folder / MANIFEST, manifest)
-    return Imported(run, answer, manifest, _violations(nlp, answer.x))
-
-
-def _violations(nlp: NLP, x: Float) -> dict[str, Float]:
-    """How far variables and rows are outside their bounds."""
-    g = np.asarray(nlp.oracle(x, nlp.p)[1]).ravel()
-    return {
-        "bounds": np.maximum(0.0, np.maximum(nlp.lbx - x, x - nlp.ubx)),
-        "rows": np.maximum(0.0, np.maximum(nlp.lbg - g, g - nlp.ubg)),
-    }
+    return Imported(run, answer, manifest, violations(nlp, answer.x))
 
 
 def sol_table(imported: Imported) -> list[Kind]:
@@ -234,25 +230,9 @@ def sol_table(imported: Imported) -> list[Kind]:
     state = {k: getattr(run.answer, k) for k in ("lam", "n", "d", "R", "t")}
     limits = dict.fromkeys(EQUATIONS, KKT_LIMIT)
     facing = run.problem.formulation.min_facing
-    rows = residual_table(state, run.data.rim_ray, facing, limits)
+    with np.errstate(all="ignore"):
+        rows = residual_table(state, run.data.rim_ray, facing, limits)
     return rows + [kind(k, v, KKT_LIMIT, False) for k, v in imported.violations.items()]
-
-
-def _manifest(folder: Path) -> dict[str, Any]:
-    try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        keys = ("formulation", "smoothing", "fingerprint", "best_known", "nl")
-        missing = [k for k in keys if k not in manifest]
-    except (OSError, ValueError) as error:
-        raise ExportError(
-            "manifest.json cannot be read",
-            where=folder,
-            found=error,
-            hint="soup-nlp export PROBLEM.yaml -o DIR makes one",
-        ) from error
-    if missing:
-        raise ExportError("manifest.json lacks entries", where=folder, found=missing)
-    return dict(manifest)
 
 
 def _orders(folder: Path, nlp: NLP, layout: MatrixLayout) -> tuple[Any, Any]:
@@ -264,7 +244,7 @@ def _orders(folder: Path, nlp: NLP, layout: MatrixLayout) -> tuple[Any, Any]:
         try:
             lines = path.read_text(encoding="utf-8").split()[: len(names)]
             order = np.array([place[name] for name in lines], np.int64)
-        except (OSError, KeyError) as error:
+        except (OSError, ValueError, KeyError) as error:
             raise ExportError("names of the file cannot be used", where=path, found=error) from None
         if len(np.unique(order)) != len(names):
             raise ExportError(
@@ -280,30 +260,40 @@ def _orders(folder: Path, nlp: NLP, layout: MatrixLayout) -> tuple[Any, Any]:
 def make_run(
     case: Case, form: Formulation, nlp: NLP, layout: MatrixLayout, answer: Sol, source: str
 ) -> Run:
-    """A run whose solution is a foreign solver's answer; nothing that it says is believed."""
-    outside = max(float(v.max(initial=0.0)) for v in _violations(nlp, answer.x).values())
-    lam_g = answer.lam_g if answer.lam_g is not None else least_squares_multipliers(nlp, answer.x)
-    lam_x = bound_multipliers(nlp, answer.x, lam_g)
+    """A run whose solution is a foreign solver's answer; nothing that it says is believed.
+
+    It converged when success is claimed, the recomputed KKT residuals are within LIMITS and
+    KKT_LIMIT, and the exact energy is not above the proposal's.
+    """
+    found = examine(nlp, answer.x, answer.lam_g)
+    r = found.residuals
     f = nlp.oracle(answer.x, nlp.p)[0]
-    good = answer.solved and outside <= KKT_LIMIT
-    status = "Solve_Succeeded" if good else f"{answer.status}, violation {outside:.1e}"
+    own = layout.unpack(answer.x)
+    soup = own.retracted()
+    start, energy = (plain.energy(s, case.data, case.weights) for s in (case.start.soup, soup))
+    good = (
+        answer.solved
+        and r.within(LIMITS)
+        and r.primal <= KKT_LIMIT
+        and energy["total"] <= (1 + ENERGY_SLACK) * start["total"]
+    )
+    off = f"violation {r.primal:.1e}, dual {r.dual:.1e}, compl. {r.complementarity:.1e}"
+    status = "Solve_Succeeded" if good else f"{answer.status}, {off}"
     stage = Stage(
         name=source,
         status=status,
         converged=good,
         x=answer.x,
-        lam_x=lam_x,
-        lam_g=lam_g,
+        lam_x=found.lam_x,
+        lam_g=found.lam_g,
         objective=float(f),
         iterations=0,
         seconds=0.0,
         history={},
         calls={},
     )
-    own = layout.unpack(answer.x)
-    soup = own.retracted()
     parts = {
-        f"lam_g_{group.kernel.name}": lam_g[np.unique(group.table.rows)]
+        f"lam_g_{group.kernel.name}": found.lam_g[np.unique(group.table.rows)]
         for group in nlp.groups
         if group.kernel.nc
     }
@@ -312,10 +302,10 @@ def make_run(
         status=status,
         converged=good,
         stages=(stage,),
-        energy_start=plain.energy(case.start.soup, case.data, case.weights),
-        energy=plain.energy(soup, case.data, case.weights),
+        energy_start=start,
+        energy=energy,
         residuals=residuals(nlp, soup, stage, case.data, form.min_facing),
-        multipliers={"lam_x": lam_x, **parts},
+        multipliers={"lam_x": found.lam_x, **parts},
         nlp=nlp.sizes(),
         description=str(nlp),
         seconds={},

@@ -144,7 +144,9 @@ def build_energy(
     data = between_bodies(data, start.body, e.arap_across)
     data = at_occlusions(data, start.soup, start.body, e.occlusion_gap, e.cont_occluded)
     if bends:
-        data = across_tears(data, start.surface, e.bending.cont_across)
+        b = e.bending
+        held = {"arap": b.arap_across, "cont": b.cont_across, "orient": b.orient_across}
+        data = across_tears(data, start.surface, **held)
     if e.units == "pixel":
         data = in_pixels(data, start.soup, seg, form.rotation_px)
     weights = Weights(**form.weights.model_dump())

@@ -7,6 +7,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from soup_nlp.artefact import (
@@ -20,6 +21,7 @@ from soup_nlp.artefact import (
 from soup_nlp.cases import prepare
 from soup_nlp.comparing import compare
 from soup_nlp.config import dump_problem, load_problem
+from soup_nlp.errors import ExportError
 from soup_nlp.export.formats import FORMATS
 from soup_nlp.export.residuals import residual_table, table_text
 from soup_nlp.report.check import LIMITS, check_folder
@@ -47,7 +49,8 @@ def export(
         list[int] | None, typer.Option(help="Wanted number, 50 to 2000; may be repeated.")
     ] = None,
     format_: Annotated[
-        list[str] | None, typer.Option("--format", help=f"{', '.join(FORMATS)}; may be repeated.")
+        list[str] | None,
+        typer.Option("--format", help=f"{', '.join(FORMATS)} (casadi has h5); may be repeated."),
     ] = None,
     presolve: Annotated[
         bool, typer.Option(help="Start where the tangent presolve ends, not at the proposal.")
@@ -59,9 +62,12 @@ def export(
 ) -> None:
     """Write the NLP for other solvers; several sizes or formulations make a folder each."""
     forms = [parse_formulation(text) for text in formulation or []] or [{}]
-    sizes: list[int | None] = [*(superpixels or ())] or [None]
+    # asked for twice is written once
+    sizes: list[int | None] = [*dict.fromkeys(superpixels or ())] or [None]
+    written = set()
     for size, form in product(sizes, forms):
-        words = [*(overrides or []), *([f"segmentation.superpixels={size}"] if size else [])]
+        own = [] if size is None else [f"segmentation.superpixels={size}"]
+        words = [*(overrides or []), *own]
         chosen = load_problem(problem, [*words, *(f"formulation.{k}={v}" for k, v in form.items())])
         if form is forms[0]:
             case = prepare(chosen, presolve)
@@ -69,7 +75,12 @@ def export(
         here = replace(case, problem=chosen)
         style = here.formulation()
         several = len(sizes) * len(forms) > 1
-        name = f"{chosen.name}-{len(case)}-{form_label(style).replace('/', '-')}"
+        # two sizes asked for may give the same number of superpixels
+        asked = chosen.segmentation.superpixels
+        name = f"{chosen.name}-{asked}-{form_label(style).replace('/', '-')}"
+        if name in written:
+            continue
+        written.add(name)
         folder = prepare_folder(out / name if several else out)
         manifest = export_case(here, style, folder, format_ or ["nl"], presolve)
         if not quiet:
@@ -91,6 +102,14 @@ def import_(
 ) -> None:
     """Make a result folder of a foreign solver's answer: depth maps, points, residuals."""
     imported = import_sol(folder, sol)
+    s = imported.run.solution
+    if not np.isfinite([*s.energy.values(), *s.residuals.values()]).all():
+        raise ExportError(
+            "the answer is no soup: its energy or residuals are not finite",
+            where=sol,
+            found=imported.sol.message.splitlines()[0] if imported.sol.message else None,
+            hint=f"soup-nlp check {sol} says what is wrong with it",
+        )
     target = prepare_folder(out or folder / "result")
     text = foreign_verdict(imported)
     run = imported.run
@@ -105,10 +124,12 @@ def foreign_verdict(imported: Imported) -> str:
     """What the solver says, and what is true of it."""
     s, sol = imported.run.solution, imported.sol
     word = "verified" if s.converged else "not verified" if sol.solved else "no success claimed"
+    start = imported.manifest["exact_energy_at_start"]["total"]
     said = sol.message.splitlines()[0] if sol.message else "no message"
     lines = [
         f"solver      {said} ({sol.status}, code {sol.code}): {word}",
-        f"energy      start {s.energy_start['total']:.6g}  solution {s.energy['total']:.6g}",
+        # where the solver started, which after a presolve is not where the soup came from
+        f"energy      start {start:.6g}  solution {s.energy['total']:.6g}",
         "residuals   " + "  ".join(f"{k} {v:.1e}" for k, v in s.residuals.items()),
     ]
     if imported.run.metrics:

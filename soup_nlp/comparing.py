@@ -17,14 +17,12 @@ from soup_nlp.compare.report import conclusion, page
 from soup_nlp.compare.runner import compare as run_all
 from soup_nlp.compare.solvers import available, find_solver
 from soup_nlp.compare.task import Limits, Task
+from soup_nlp.compare.verify import ENERGY_SLACK
 from soup_nlp.config import load_problem
 from soup_nlp.errors import ConfigError
 from soup_nlp.model import plain
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.report.folder import prepare_folder, write_text
-
-ENERGY_SLACK = 1e-3
-"""A solution's exact energy may be this share above the proposal's: the smoothing moves it."""
 
 Label = Mapping[str, Any]
 Maker = Callable[[Path], Task]
@@ -109,23 +107,30 @@ def compare(
             where="compare",
             found=f"{seconds:g} s, {iterations} iterations, tol {tol:g}, {memory:g} GiB",
         )
-    names = list(available()) if solvers == "all" else [s.strip() for s in solvers.split(",")]
+    wanted = available() if solvers == "all" else [w.strip() for w in solvers.split(",")]
+    names = list(dict.fromkeys(w for w in wanted if w))
+    if not names:
+        raise ConfigError("no solver is named", where="--solvers", found=solvers)
     for name in names:
         find_solver(name)
     forms = [parse_formulation(text) for text in formulation or []] or [{}]
     limits = Limits(seconds, iterations, tol, int(memory * 2**30))
+    sizes = [[f"segmentation.superpixels={n}"] for n in superpixels or ()] or [[]]
+    # a file that is wrong is found before hours of runs, not after
+    chosen = [load_problem(path, [*(overrides or []), *own]) for path in problems for own in sizes]
     folder = prepare_folder(out)
     rows: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory() as scratch:
-        for path in problems:
-            for size in [*(superpixels or ())] or [None]:
-                own = [f"segmentation.superpixels={size}"] if size else []
-                case = prepare(load_problem(path, [*(overrides or []), *own]), presolve)
-                tasks = make_tasks(case, forms, limits, presolve)
+    try:
+        with tempfile.TemporaryDirectory() as scratch:
+            for problem in chosen:
+                tasks = make_tasks(prepare(problem, presolve), forms, limits, presolve)
                 rows = run_all(tasks, names, limits, folder / "runs.jsonl", Path(scratch), print)
-    write_text(folder / "README.md", page(rows))
-    draw_profiles(folder / "profile.png", rows)
-    draw_curves(folder / "curves.png", rows)
+    finally:
+        # an input that cannot be used does not take the others' page away
+        if rows:
+            write_text(folder / "README.md", page(rows))
+            draw_profiles(folder / "profile.png", rows)
+            draw_curves(folder / "curves.png", rows)
     print("\n".join(conclusion(rows)))
     print(f"files       {folder}/: README.md, profile.png, curves.png, runs.jsonl")
     raise typer.Exit(0 if any(r["verified"] for r in rows) else 1)

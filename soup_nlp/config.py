@@ -97,13 +97,17 @@ class BendingConfig(Strict):
 
     Attributes:
         rotation_px: Pixels per radian of rotation difference.
-        cont_across: Factor of E_cont where the flow tears; 1 is the paper's.
+        arap_across: Factor of E_arap where the flow tears; 1 is the paper's, as of the others.
+        cont_across: Factor of E_cont there.
+        orient_across: Factor of E_orient there.
         weights: Factors of the terms and their truncations; orient is that of 1,000 superpixels and
             grows with their number.
     """
 
     rotation_px: Positive = 1e-3
+    arap_across: Annotated[float, Field(ge=0, le=1)] = 0.3
     cont_across: Annotated[float, Field(ge=0, le=1)] = 0.01
+    orient_across: Annotated[float, Field(ge=0, le=1)] = 0.3
     weights: BendingWeights = BendingWeights()
 
 

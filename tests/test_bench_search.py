@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from soup_nlp.bench import analyses
 from soup_nlp.bench.accuracy import Job, head
 from soup_nlp.bench.analyses import ANALYSES, run_analysis
 from soup_nlp.bench.analyses_energy import measure_energy
+from soup_nlp.bench.analyses_flow import plot_flow, text_flow
 from soup_nlp.bench.analyses_report import (
     plot_energy,
     plot_variants,
@@ -137,8 +139,25 @@ def test_search_refuses_what_cannot_be_right(tmp_path):
         search(SPACE, items(0), items(0), path, function=fake)
     with pytest.raises(ConfigError, match="no training pair"):
         search(SPACE, [], items(0), path, function=fake)
+    with pytest.raises(ConfigError, match="finalist"):
+        search(SPACE, items(0), items(1), path, finalists=0, function=fake)
     with pytest.raises(ConfigError):
         search([Parameter("energy.wieghts", "linear", ("0", "1"))], items(0), [], path)
+
+
+def of_suites(*suites: str, flows: tuple[str, ...] = ("dis",)) -> list[Item]:
+    """A pair of the same name in every suite."""
+    return [Item(s, s, "000027", f, {"kind": "motorcycle"}) for s in suites for f in flows]
+
+
+def test_pairs_of_one_name_in_two_suites_may_train_and_validate(tmp_path):
+    train, validation = of_suites("kitti2012"), of_suites("kitti2015")
+    path = tmp_path / "rows.jsonl"
+    found = search(SPACE, train, validation, path, trials=2, finalists=1, function=fake)
+    assert [t.rows[0]["suite"] for t in found.validation] == ["kitti2015"] * 2
+    with pytest.raises(ConfigError, match="both trains and validates") as caught:
+        search(SPACE, train, [*validation, *train], path, function=fake)
+    assert "kitti2012/000027" in str(caught.value)
 
 
 def test_loss_charges_failures_and_a_minimum_far_from_the_truth():
@@ -196,6 +215,40 @@ def test_tables_bear_failed_rows(tmp_path):
     assert "-" in next(line for line in text.splitlines() if line.startswith("| street"))
     plot_variants(tmp_path / "a.png", "K", "what", rows, numeric=True)
     assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+def cells(text: str, column: int = 0) -> list[str]:
+    return [line.split(" | ")[column].strip("| ") for line in text.splitlines() if "| " in line]
+
+
+def test_pairs_of_one_name_in_two_suites_are_told_apart(tmp_path, monkeypatch):
+    def rows_of(made: list[Item], *variants: str) -> list[dict]:
+        jobs = [Job(i, (f"segmentation.neighbours={v}",), v) for i in made for v in variants]
+        return [{**fake(j), "code": "c"} for j in jobs]
+
+    both = rows_of(of_suites("kitti2012", "kitti2015"), "4", "12")
+    text = text_variants("neighbours", "what", both)
+    for suite in ("kitti2012", "kitti2015"):
+        assert f"| {suite} 000027, dis | 0.0760 | 0.0600 |" in text
+    assert "mean of 2" in text
+    # where there is no other of that name the suite is not said
+    alone = text_variants("neighbours", "what", rows_of(of_suites("kitti2012"), "4", "12"))
+    assert "| 000027, dis | 0.0760 | 0.0600 |" in alone
+    error = {"mean": 1.0, "weighted_mean": 1.0, "median": 1.0, "over_3px": 0.0, "used": 1.0}
+    flows = [
+        {**row, "flow_error": {**error, "weighted_mean": float(k)}} for k, row in enumerate(both)
+    ]
+    names = cells(text_flow("flows", "what", flows))
+    assert names.count("kitti2012 000027") == names.count("kitti2015 000027") == 2
+    drawn, bar = [], Axes.bar
+
+    def seen(self, x, height, *args, **kwargs):
+        drawn.append(list(height))
+        return bar(self, x, height, *args, **kwargs)
+
+    monkeypatch.setattr(Axes, "bar", seen)
+    plot_flow(tmp_path / "f.png", flows)
+    assert drawn == [[0.0, 2.0], [1.0, 3.0]]
 
 
 def test_energy_at_the_truth(tmp_path):

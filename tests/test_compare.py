@@ -6,7 +6,7 @@ import json
 import os
 import signal
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import casadi as ca
@@ -207,7 +207,8 @@ def row(problem: str, solver: str, seconds: float, energy: float, verified: bool
         "seconds": seconds, "energy": energy, "verified": verified, "claimed": True,
         "energy_start": 9.0, "curve": [[0.1, 5.0], [seconds, energy]], "iterations": 3,
         "cpu_seconds": 1.0, "peak_bytes": 1 << 20, "status": "a | b", "machine": "m",
-        "versions": {"casadi": "3"}, "code": "1",
+        "versions": {"casadi": "3"}, "code": "1", "problem_hash": "0", "start": "presolve",
+        "limits": asdict(Limits()),
     }  # fmt: skip
 
 

@@ -15,6 +15,9 @@ from test_nl import ReadBack, close
 from soup_nlp.artefact import import_sol, parse_formulation
 from soup_nlp.cases import prepare
 from soup_nlp.cli import main
+from soup_nlp.compare.solvers import plugin
+from soup_nlp.compare.task import Limits, Task
+from soup_nlp.compare.verify import examine, kkt, violations
 from soup_nlp.config import load_problem
 from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.export.names import readable_names
@@ -103,8 +106,23 @@ def answer(folder: Path, name: str, move: float = 0.0, code: int = 0) -> Path:
     return folder / name
 
 
-def test_a_solution_becomes_depth_maps(exported, tmp_path, capsys):
-    sol = answer(exported, "good.sol")
+@pytest.fixture(scope="module")
+def optimum(exported, tmp_path_factory):
+    """Point and multipliers of a local minimum of the exported problem."""
+    case, nlp, layout, _, _ = problem_of(exported)
+    task = Task(
+        nlp, nlp, layout, case.soup, case.data, case.weights, case.formulation(),
+        Limits(seconds=60, iterations=500, tol=1e-6), tmp_path_factory.mktemp("optimum"),
+    )  # fmt: skip
+    found = plugin("ipopt-tuned", task)
+    assert found.claimed, found.status
+    return found.x, found.lam_g
+
+
+def test_a_solution_becomes_depth_maps(exported, optimum, tmp_path, capsys):
+    _, _, _, (v, r), _ = problem_of(exported)
+    sol = exported / "good.sol"
+    write_sol(sol, *optimum, v, r, "hand made", 0)
     out = tmp_path / "result"
     assert main(["import", str(exported), str(sol), "--out", str(out)]) == 0
     said = capsys.readouterr().out
@@ -118,7 +136,56 @@ def test_a_solution_becomes_depth_maps(exported, tmp_path, capsys):
     manifest = json.loads((exported / "manifest.json").read_text())
     assert manifest["best_known"]["found_by"] == "hand made"
     start = manifest["exact_energy_at_start"]["total"]
-    assert manifest["best_known"]["exact_energy"] == pytest.approx(start, rel=1e-9)
+    assert manifest["best_known"]["exact_energy"] < start
+
+
+def test_verified_means_optimal(exported, optimum, tmp_path, capsys):
+    _, nlp, _, (v, r), _ = problem_of(exported)
+    x, lam = optimum
+    before = (exported / "manifest.json").read_text()
+    # feasible, and nothing else
+    sol = answer(exported, "start.sol")
+    assert main(["import", str(exported), str(sol), "--out", str(tmp_path / "s")]) == 1
+    assert "(solved, code 0): not verified" in capsys.readouterr().out
+    assert (exported / "manifest.json").read_text() == before
+    # the point is what counts: multipliers that are wrong, or none, make it no worse
+    for given in (lam, None, -lam, np.full(nlp.ng, 1e300)):
+        write_sol(exported / "x.sol", x, given, v, r, "hand made", 0)
+        assert import_sol(exported, exported / "x.sol", renew=False).run.solution.converged
+    write_sol(exported / "x.sol", x, lam, v, r, "hand made", 400)
+    assert not import_sol(exported, exported / "x.sol", renew=False).run.solution.converged
+    write_sol(exported / "x.sol", x, np.full(nlp.ng, np.nan), v, r, "hand made", 0)
+    with pytest.raises(ExportError, match="not finite"):
+        import_sol(exported, exported / "x.sol", renew=False)
+
+
+def test_what_is_not_a_number_is_not_verified(exported, optimum):
+    _, nlp, _, _, _ = problem_of(exported)
+    x, lam = optimum
+    assert kkt(nlp, x, lam).within(Limits())
+    bad = x.copy()
+    bad[3] = np.nan
+    assert violations(nlp, bad)["bounds"].max() == np.inf
+    found = examine(nlp, bad, lam).residuals
+    assert (found.primal, found.dual, found.multipliers) == (np.inf, np.inf, "none")
+    assert not found.within(Limits())
+
+
+@pytest.mark.parametrize("size", [0.0, 1e20, 1e150, 1e300])
+def test_a_huge_point_is_checked_and_makes_no_result(size, exported, tmp_path, capsys):
+    _, nlp, _, (v, r), _ = problem_of(exported)
+    before = (exported / "manifest.json").read_text()
+    sol = exported / "huge.sol"
+    write_sol(sol, nlp.x0 * size, None, v, r, "hand made", 0)
+    assert main(["check", str(sol)]) == 1
+    said = capsys.readouterr().out
+    assert "FAIL rows" in said
+    assert "not verified" in said
+    code = main(["import", str(exported), str(sol), "--out", str(tmp_path / "r")])
+    # with an energy that is a number it is a result, if a bad one
+    assert code == (1 if size == 1e20 else 2)
+    assert (tmp_path / "r").exists() == (size == 1e20)
+    assert (exported / "manifest.json").read_text() == before
 
 
 def test_a_false_claim_is_not_believed(exported, tmp_path, capsys):

@@ -243,6 +243,22 @@ def test_the_nearest_surface_wins_the_splat():
     assert np.isnan(depth[0]).all()
 
 
+def test_what_does_not_move_is_splat_as_it_is():
+    v, u = np.mgrid[0:12, 0:16]
+    z = 2 + 0.1 * u + 0.05 * v
+    z[3:6, 4:8] = 1.0
+    target = np.stack([u, v], axis=-1).astype(float)
+    np.testing.assert_array_equal(splat_depth(target, z, (12, 16)), z)
+    np.testing.assert_array_equal(splat_depth(target + 0.3, z, (12, 16)), z)
+
+
+def test_cracks_of_a_stretched_surface_are_closed():
+    v, u = np.mgrid[0:12, 0:16]
+    target = 1.4 * np.stack([u, v], axis=-1)
+    depth = splat_depth(target, np.ones((12, 16)), (12, 16))
+    np.testing.assert_array_equal(depth, 1.0)
+
+
 def test_splat_ignores_what_is_outside_or_not_finite():
     target = np.array([[[-5.0, 0.0], [np.nan, 1.0], [100.0, 1.0], [1.0, 1.0]]])
     depth = splat_depth(target, np.ones((1, 4)), (3, 3))

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from soup_nlp.errors import DataError
+from soup_nlp.report import recompute
 from soup_nlp.report.metrics import (
-    PROTOCOLS,
     constant_depth_metrics,
     depth_metrics,
     sample_at_points,
@@ -68,9 +68,9 @@ def test_negative_and_infinite_estimates_cost_coverage_not_error():
 
 
 def test_printed_with_its_protocol_on_one_line():
-    text = str(depth_metrics([1.0, np.nan], [2.0, 2.0], **PROTOCOLS["eigen80"]))
+    text = str(PRESETS["sintel70"].score([1.0, np.nan], [2.0, 2.0]))
     assert "\n" not in text
-    for word in ("scale median = 2", "cap 80", "coverage 50.0%", "1 px"):
+    for word in ("scale median = 2", "cap 70", "coverage 50.0%", "1 px"):
         assert word in text
 
 
@@ -85,10 +85,29 @@ def test_as_dict_keys_are_stable():
         m.mre = 0.0  # type: ignore[misc]
 
 
-def test_protocols():
-    assert set(PROTOCOLS) == {"paper", "sintel70", "kitti", "eigen80", "best"}
-    for protocol in PROTOCOLS.values():
-        assert depth_metrics([1.0, 2.0], [2.0, 4.0], **protocol).mre == 0.0
+def test_a_preset_finds_no_error_in_a_scaled_truth():
+    truth = np.random.default_rng(0).uniform(1.0, 15.0, (40, 60))
+    assert {"paper", "sintel70", "kitti", "eigen80", "best"} <= set(PRESETS)
+    for name, convention in PRESETS.items():
+        scale = 1.0 if name == "metric" else 2.0
+        m = convention.score(truth / scale, truth)
+        assert m.mre == pytest.approx(0.0, abs=1e-12)
+        assert m.scale == pytest.approx(scale)
+
+
+def test_a_ratio_at_a_threshold_is_counted_as_the_result_folder_counts_it():
+    """The check of a result folder recounts the shares: both must say the same at the edge."""
+    truth = np.arange(1.0, 200.0)
+    for k in (1, 2, 3):
+        for z in (truth * 1.25**k, truth / 1.25**k):
+            m, other = (
+                depth_metrics(z, truth, scale="none"),
+                recompute.scores(z, truth, "none", None),
+            )
+            assert [m.delta1, m.delta2, m.delta3] == [other[f"delta{j}"] for j in (1, 2, 3)]
+    exact = [1.25, 1.25**2, 1.25**3]
+    m = depth_metrics(exact, np.ones(3), scale="none")
+    assert [m.delta1, m.delta2, m.delta3] == [0.0, 1 / 3, 2 / 3]
 
 
 @quick
@@ -205,6 +224,27 @@ def test_a_clamp_moves_scaled_estimates_only():
     assert held.coverage == 1.0
     with pytest.raises(DataError, match="no range"):
         depth_metrics([1.0], [1.0], clamp=(2.0, 1.0))
+
+
+def test_eigens_clamp_comes_after_the_scale():
+    """Median ratio 2: of 10, 20, 30, 60 become 20, 40, 60, 120, and the last is held at 80."""
+    truth = np.full((100, 200), np.nan)
+    estimate = np.full(truth.shape, np.nan)
+    for k, (z, gt) in enumerate([(10.0, 20.0), (20.0, 40.0), (30.0, 60.0), (60.0, 40.0)]):
+        estimate[60, 50 + k], truth[60, 50 + k] = z, gt
+    m = PRESETS["eigen80"].score(estimate, truth)
+    assert m.scale == 2.0
+    assert m.n_pixels == 4
+    assert m.mre == pytest.approx((80.0 - 40.0) / 40.0 / 4)
+    assert m.rmse == pytest.approx(np.sqrt((80.0 - 40.0) ** 2 / 4))
+    # from below: what is scaled to nothing is held at a millimetre
+    estimate[60, 53] = 1e-6
+    m = PRESETS["eigen80"].score(estimate, truth)
+    assert m.log_rmse == pytest.approx(np.log(40.0 / 1e-3) / 2)
+
+
+def test_the_cap_itself_counts():
+    assert PRESETS["sintel70"].mask([70.0, np.nextafter(70.0, 71.0), 0.0]).tolist() == [1, 0, 0]
 
 
 def test_presets_leave_out_what_they_say():

@@ -182,6 +182,30 @@ def test_long_sums_do_not_nest(tmp_path):
     assert float(ReadBack(file.path).values(np.zeros(4000))[0]) == 4000
 
 
+@pytest.mark.parametrize(
+    ("operation", "make"),
+    [
+        ("sign", lambda a, b, c: ca.sign(a) * b),
+        ("sign", lambda a, b, c: ca.sign(a)),
+        ("floor", lambda a, b, c: ca.floor(a) * b),
+        ("ceil", lambda a, b, c: b + 3 * ca.ceil(a)),
+        ("lt", lambda a, b, c: (a > 0.5) * b),
+        ("not", lambda a, b, c: ca.logic_not(a) * b),
+        ("fmod", lambda a, b, c: ca.fmod(a, b)),
+        ("remainder", lambda a, b, c: ca.remainder(a, b)),
+        ("lt", lambda a, b, c: ca.if_else(a > 0.5, b, c) ** 2),
+        ("sign", lambda a, b, c: ca.exp(c) + ca.sign(ca.sqrt(a)) * 2),
+    ],
+)
+def test_parts_that_are_constant_in_pieces_are_said(operation, make, tmp_path):
+    x = ca.SX.sym("x", 3)
+    bad = make(x[0], x[1], x[2])
+    for problem in ({"f": bad}, {"f": x[0] ** 2, "g": ca.vertcat(x[1], bad)}):
+        with pytest.raises(ExportError, match=rf"(?s)cannot be written.*: {operation}$"):
+            write_sx_nl(tmp_path / "a.nl", {"x": x, **problem})
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_cannot_be_written_is_said(tmp_path):
     x, p = ca.SX.sym("x"), ca.SX.sym("p")
     with pytest.raises(ExportError, match=r"(?s)cannot be written.*floor"):
@@ -193,3 +217,68 @@ def test_what_cannot_be_written_is_said(tmp_path):
     with pytest.raises(DataError, match="folder"):
         write_sx_nl(tmp_path / "none" / "a.nl", {"x": x, "f": x**2})
     assert not list(tmp_path.rglob("*.nl"))
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"x0": [np.nan, 1.0]}, "x0 is not finite"),
+        ({"x0": [1.0, np.inf]}, "x0 is not finite"),
+        ({"x0": [1.0, 2.0, 3.0]}, "x0 has a wrong length"),
+        ({"x0": np.ones((2, 2))}, "x0 has a wrong length"),
+        ({"x0": "start"}, "x0 is not a vector"),
+        ({"x0": ca.SX.sym("s", 2)}, "x0 is not a vector"),
+        ({"lbx": [np.nan, 1.0]}, "bounds of x"),
+        ({"ubx": np.nan}, "bounds of x"),
+        ({"lbx": [0.0, np.inf]}, "bounds of x"),
+        ({"ubx": [0.0, -np.inf]}, "bounds of x"),
+        ({"lbx": 1.0, "ubx": 0.5}, "bounds of x"),
+        ({"lbx": [0.0] * 3}, "lbx has a wrong length"),
+        ({"lbg": 2.0, "ubg": 1.0}, "bounds of g"),
+        ({"lbg": [np.nan]}, "bounds of g"),
+        ({"lam_g0": [1.0, 2.0]}, "lam_g0 has a wrong length"),
+        ({"lam_g0": [np.nan]}, "lam_g0 is not finite"),
+        ({"x_names": ["a"]}, "x_names"),
+        ({"x_names": ["a", "b", "c"]}, "x_names"),
+        ({"x_names": ["a", "b\nc"]}, "x_names is no name"),
+        ({"g_names": []}, "g_names"),
+    ],
+)
+def test_what_is_given_is_looked_at_before_writing(given, said, tmp_path):
+    x = ca.SX.sym("x", 2)
+    problem = {"x": x, "f": ca.sumsqr(x), "g": x[0] * x[1]}
+    with pytest.raises(ExportError, match=said):
+        write_sx_nl(tmp_path / "a.nl", problem, **given)
+    assert not list(tmp_path.iterdir())
+
+
+def test_problems_that_are_none(tmp_path):
+    x, m = ca.SX.sym("x", 2), ca.MX.sym("x", 2)
+    for problem, said in (
+        ({"x": m, "f": ca.sumsqr(m)}, "x of the NLP is not SX"),
+        ({"x": x, "f": ca.sumsqr(m)}, "f of the NLP is not SX"),
+        ({"x": x, "f": x}, "not a scalar"),
+        ({"x": x, "f": ca.SX(0, 1)}, "not a scalar"),
+        ({"x": 2 * x, "f": x[0]}, "not a vector of symbols"),
+        ({"x": ca.SX(0, 1), "f": ca.SX(1)}, "not a vector of symbols"),
+        ({"f": x[0]}, "form x, f, g"),
+        ({"x": x, "f": x[0], "G": x[1]}, "form x, f, g"),
+        ({"x": x, "f": x[0], "p": ca.SX.sym("p")}, "not variables"),
+    ):
+        with pytest.raises(ExportError, match=said):
+            write_sx_nl(tmp_path / "a.nl", problem)
+    assert not list(tmp_path.iterdir())
+
+
+def test_numbers_stand_for_all_entries(tmp_path):
+    x = ca.SX.sym("x", 3)
+    problem = {"x": x, "f": ca.sumsqr(x), "g": x[1:] * x[:2], "p": ca.SX(0, 1)}
+    file = write_sx_nl(
+        tmp_path / "a.nl", problem, x0=0.5, lbx=0, ubx=ca.DM([1, 2, 3]), lbg=-1, lam_g0=[1, 2]
+    )
+    back = ReadBack(file.path)
+    assert back.x0.tolist() == [0.5] * 3
+    assert back.lbx.tolist() == [0] * 3
+    assert back.ubx.tolist() == [(1, 2, 3)[k] for k in file.variables]
+    assert back.lbg.tolist() == [-1] * 2
+    assert "\nd2\n0 -1\n1 -2\n" in file.path.read_text()

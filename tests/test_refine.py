@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -283,13 +284,46 @@ def test_a_listener_hears_every_iteration_and_can_stop_within_a_round():
             stop.set()
 
     done = refine_soup(
-        tiny.soup, tiny.data, weights_for("pixels"), FEW, stop=stop, listener=listener
+        tiny.soup, tiny.data, weights_for("pixels"), FEW, seed=1, stop=stop, listener=listener
     )
     assert done.status == "interrupted"
     assert len(heard) == 2
     assert heard[0].startswith("refine 1")
     assert done.rounds[0].iterations == 2
     assert done.energy["total"] <= done.energy_begin["total"]
+
+
+def test_an_interrupt_within_a_round_ends_the_refinement():
+    """TRW-S keeps a KeyboardInterrupt to itself: the rounds must not go on after it."""
+    tiny = Tiny("pixels", samples=6)
+    heard: list[str] = []
+
+    def listener(progress: object) -> None:
+        heard.append(str(progress))
+        if len(heard) == 2:
+            raise KeyboardInterrupt
+
+    stop = threading.Event()
+    done = refine_soup(
+        tiny.soup, tiny.data, weights_for("pixels"), FEW, stop=stop, listener=listener
+    )
+    assert done.status == "interrupted"
+    assert len(heard) == 2
+    assert [r.status for r in done.rounds] == ["interrupted"]
+    assert done.energy["total"] <= done.energy_begin["total"]
+    assert not stop.is_set()
+
+
+def test_a_time_limit_within_a_round_is_no_interruption():
+    tiny = Tiny("pixels", samples=6)
+    o = replace(FEW, max_seconds=0.5)
+
+    def listener(progress: object) -> None:
+        time.sleep(0.55)
+
+    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, listener=listener)
+    assert done.status == "time limit"
+    assert [r.status for r in done.rounds] == ["interrupted"]
 
 
 def test_stagnation_ends_the_rounds():

@@ -138,3 +138,35 @@ def test_multipliers_of_a_foreign_optimum(tmp_path):
     away = sol.x + 0.01
     lam = least_squares_multipliers(nlp, away)
     assert max(optimality(nlp, away, bound_multipliers(nlp, away, lam), lam).values()) > 1e-2
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("objno 0 0", "objno 0 abc"),
+        ("Options\n3\n", "Options\nnan\n"),
+        ("Options\n3\n", "Options\n-3\n"),
+        ("Options\n3\n", "Options\n1e300\n"),
+        ("\n2\n2\n3\n3\n", "\n2\n2\n3.5\n3\n"),
+        ("suffix 4 2 13 0 0", "suffix 4 two 13 0 0"),
+        ("suffix 4 2 13 0 0", "suffix 4 -2 13 0 0"),
+        ("suffix 4 2 13 0 0", "suffix 4 2000000000 13 0 0"),
+        ("0 0.5\n", "0\n"),
+        ("0 0.5\n", "zero 0.5\n"),
+        ("0 0.5\n", "0 half\n"),
+        ("0 0.5\n", "3 0.5\n"),
+        ("0 0.5\n", "-1 0.5\n"),
+        ("-1.5\n", "nan\n"),
+        ("-1.5\n", "inf\n"),
+    ],
+)
+def test_malformed_files_are_errors_of_the_file(tmp_path, old, new):
+    assert old in TEXT
+    (tmp_path / "a.sol").write_text(TEXT.replace(old, new))
+    with pytest.raises(ExportError, match=r"a\.sol"):
+        read_sol(tmp_path / "a.sol", ORDER, ROWS)
+
+
+def test_a_message_that_says_options_is_read_back(tmp_path):
+    write_sol(tmp_path / "a.sol", np.ones(3), None, ORDER, ROWS, "one\n Options\ntwo", 0)
+    assert read_sol(tmp_path / "a.sol", ORDER, ROWS).message == 'one\n"Options"\ntwo'

@@ -129,6 +129,32 @@ def test_never_worse_than_the_initial_labels():
         assert result.best_history[0] <= result.energy_history[0]
 
 
+def test_initial_labels_come_back_where_rounding_took_worse_ones_for_better():
+    """In float32 the three costs are one, below the exact cost of the initial label."""
+    unary = np.array([[3.5, 3.0, 3.9]]) + 1e8
+    result = solve_trws(unary, [], [], init_labels=np.array([1]), dtype=np.float32)
+    assert result.energy == 1e8 + 3.0
+    assert result.labels.tolist() == [1]
+    assert result.ties == 0
+    # where float32 does tell them apart it is the best that is taken
+    result = solve_trws(unary - 1e8, [], [], init_labels=np.array([2]), dtype=np.float32)
+    assert (result.energy, result.labels.tolist()) == (3.0, [1])
+
+
+def test_as_long_as_the_best_energy_falls_nothing_stagnates():
+    """Whatever the bound does."""
+    late = 0
+    for seed in range(6):
+        unary, edges, tables = dense(np.random.default_rng(seed), 15, 80, 4)
+        best = solve_trws(unary, edges, tables, max_iter=12, **FOREVER).best_history
+        stuck = [k for k in range(1, 12) if best[k] >= best[k - 1]]
+        done = solve_trws(unary, edges, tables, max_iter=12, gap=-1, patience=1, stagnation=1e9)
+        assert done.status == "stagnation"
+        assert done.iterations == stuck[0] + 1
+        late += stuck[0] > 1
+    assert late
+
+
 def test_polish_ends_where_no_single_node_helps():
     rng = np.random.default_rng(13)
     unary, edges, tables = dense(rng, 10, 40, 4)
@@ -251,6 +277,7 @@ GOOD = {
         ({"order": np.array([0, 1, 1])}, "order"),
         ({"order": np.array([0, 1])}, "order"),
         ({"dtype": np.int32}, "dtype"),
+        ({"dtype": "text"}, "dtype"),
         ({"max_iter": 0}, "max_iter"),
         ({"patience": 0}, "patience"),
         ({"init_labels": np.array([0, 1, 2])}, "init_labels"),
@@ -278,3 +305,20 @@ def test_a_function_that_is_not_finite_is_caught_when_not_kept():
         solve_trws(GOOD["unary"], GOOD["edges"], lambda ids: np.zeros((3, 2, 2)), keep_tables=False)
     with pytest.raises(ModelError, match="labels"):
         mrf_energy(np.zeros(2, int), GOOD["unary"], GOOD["edges"], GOOD["tables"])
+
+
+@pytest.mark.parametrize(
+    ("tables", "where"),
+    [
+        (np.zeros((2, 3, 3)), "pairwise"),
+        (np.zeros((2, 1, 1)), "pairwise"),
+        (np.zeros((5, 2, 2)), "pairwise"),
+        ([np.zeros((2, 2))] * 5, "pairwise"),
+        ([np.zeros((2, 2)), np.zeros((1, 2))], "pairwise[1]"),
+        (lambda ids: np.zeros((len(ids), 1, 1)), "pairwise(edges 0 to 1)"),
+    ],
+)
+def test_the_energy_of_tables_of_the_wrong_shape_is_refused(tables, where):
+    with pytest.raises(ModelError) as caught:
+        mrf_energy(np.zeros(3, int), GOOD["unary"], GOOD["edges"], tables)
+    assert caught.value.where == where

@@ -36,9 +36,10 @@ KEPT = ("mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta
 """Errors that a row keeps, beside scale, coverage and skill."""
 
 CODE = (
-    *(f"{room}/*.py" for room in ("data", "geometry", "model", "start", "solve", "refine")),
+    *(f"{room}/*.py" for room in ("data", "geometry", "model", "mrf", "start", "solve", "refine")),
     *(f"report/{name}.py" for name in ("metrics", "protocols", "scene_flow", "baselines")),
     *(f"bench/{name}.py" for name in ("accuracy", "planes", "rivals", "truth")),
+    *(f"bench/analyses_{name}.py" for name in ("energy", "flow")),
     *("pipeline.py", "cases.py", "inputs.py", "scoring.py"),
 )
 """Sources that decide the numbers of a row: they make its code version."""

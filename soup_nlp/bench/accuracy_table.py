@@ -35,6 +35,15 @@ def show(value: Number, form: str = ".4f") -> str:
     return "-" if value is None else format(value, form)
 
 
+def pair_names(rows: Sequence[Row]) -> list[str]:
+    """The pair of every row; with its suite where another suite has a pair of that name."""
+    suites: dict[str, set[str]] = {}
+    for row in rows:
+        suites.setdefault(row["pair"], set()).add(row["suite"])
+    alone = {name for name, own in suites.items() if len(own) == 1}
+    return [r["pair"] if r["pair"] in alone else f"{r['suite']} {r['pair']}" for r in rows]
+
+
 def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> list[str]:
     """A Markdown table."""
     rule = ["---"] + ["---:"] * (len(head) - 1)

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from soup_nlp.bench.accuracy import Job, Row, clean, flow_error, head
-from soup_nlp.bench.accuracy_table import mean, show, table
+from soup_nlp.bench.accuracy_table import mean, pair_names, show, table
 from soup_nlp.cases import superpixels
 from soup_nlp.data.flow_robust import reweighted
 from soup_nlp.errors import DataError
@@ -57,7 +57,8 @@ def text_flow(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     lines = [f"# Analysis: {name}", "", f"{text[0].upper()}{text[1:]}. {note} Code {codes}.", ""]
     good = [r for r in rows if r.get("ok")]
     variants = list(dict.fromkeys(r["variant"] for r in good))
-    pairs = list(dict.fromkeys((r["suite"], r["pair"]) for r in good))
+    title = {(r["suite"], r["pair"]): name for name, r in zip(pair_names(good), good, strict=True)}
+    pairs = list(title)
     own = {(r["suite"], r["pair"], r["variant"]): r["flow_error"] for r in good}
     body = []
     complete = [p for p in pairs if all((*p, v) in own for v in variants)]
@@ -67,7 +68,7 @@ def text_flow(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     lines += [f"Mean of {len(complete)} pairs, pixels:", ""]
     lines += [*table(["source", *COLUMNS.values()], body), "", "By pair:", ""]
     body = [
-        [p[1], v, *(_shown(k, own[(*p, v)][k]) for k in COLUMNS)]
+        [title[p], v, *(_shown(k, own[(*p, v)][k]) for k in COLUMNS)]
         for p in pairs
         for v in variants
         if (*p, v) in own
@@ -87,14 +88,19 @@ def _shown(name: str, value: float | None) -> str:
 def plot_flow(path: Path, rows: Sequence[Row]) -> None:
     """Weighted error by pair, a bar a source."""
     good = [r for r in rows if r.get("ok")]
-    pairs = list(dict.fromkeys(r["pair"] for r in good))
+    names = pair_names(good)
+    pairs = list(dict.fromkeys(names))
     variants = list(dict.fromkeys(r["variant"] for r in good))
     figure = Figure(figsize=(max(5.0, 1.1 * len(pairs)), 4), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     ax = figure.add_subplot()
     width = 0.8 / max(1, len(variants))
     for k, v in enumerate(variants):
-        own = {r["pair"]: r["flow_error"]["weighted_mean"] for r in good if r["variant"] == v}
+        own = {
+            name: r["flow_error"]["weighted_mean"]
+            for name, r in zip(names, good, strict=True)
+            if r["variant"] == v
+        }
         x = np.arange(len(pairs)) + (k - (len(variants) - 1) / 2) * width
         ax.bar(x, [own.get(p, np.nan) for p in pairs], width, label=v)
     ax.set_xticks(np.arange(len(pairs)), pairs, rotation=30, ha="right", fontsize=7)

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from soup_nlp.bench.accuracy import Row
-from soup_nlp.bench.accuracy_table import get, mean, show, table
+from soup_nlp.bench.accuracy_table import get, mean, pair_names, show, table
 from soup_nlp.bench.analyses_energy import ABOVE, WORSE
 from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC, SOURCE
 from soup_nlp.model.energy import TERMS
@@ -22,8 +22,8 @@ from soup_nlp.report.protocols import preset
 COLOURS = {"arap": "#4477aa", "proj": "#66ccee", "cont": "#228833", "orient": "#ccbb44"}
 
 
-def _title(row: Row) -> str:
-    return f"{row['pair']}, {row['flow']}"
+def _titles(rows: Sequence[Row]) -> list[str]:
+    return [f"{name}, {row['flow']}" for name, row in zip(pair_names(rows), rows, strict=True)]
 
 
 def _variants(rows: Sequence[Row]) -> list[str]:
@@ -33,8 +33,8 @@ def _variants(rows: Sequence[Row]) -> list[str]:
 def _pairs(rows: Sequence[Row]) -> dict[str, dict[str, Row]]:
     """Rows by pair and variant."""
     out: dict[str, dict[str, Row]] = {}
-    for row in rows:
-        out.setdefault(_title(row), {})[row["variant"]] = row
+    for title, row in zip(_titles(rows), rows, strict=True):
+        out.setdefault(title, {})[row["variant"]] = row
     return out
 
 
@@ -109,18 +109,18 @@ def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> st
     lines = _head(name, text, rows, note)
     good = [r for r in rows if r.get("ok")]
     body, summary = [], []
-    for row in good:
+    for title, row in zip(_titles(good), good, strict=True):
         scores = row["metrics"][row["presets"][0]]
         for soup, e in row["energy"].items():
             terms = [f"{e[t]:.4g}" for t in ("total", *TERMS)]
             own = [show(scores[soup]["mre"]), show(scores[soup]["median_relative"])]
-            body.append([_title(row), soup, *terms, *own])
+            body.append([title, soup, *terms, *own])
         ratio = row["energy"]["truth"]["total"] / row["energy"]["solution"]["total"]
         last = list(scores)[-1]
         worse = scores[last]["median_relative"] - scores["truth"]["median_relative"]
         summary.append(
             [
-                *[_title(row), f"{ratio:.3f}", "yes" if ratio <= ABOVE else "no"],
+                *[title, f"{ratio:.3f}", "yes" if ratio <= ABOVE else "no"],
                 *[f"{worse:+.4f}", "yes" if worse <= WORSE else "no", f"{row['mixed']:.1%}"],
             ]
         )
@@ -181,7 +181,7 @@ def plot_energy(path: Path, rows: Sequence[Row]) -> None:
     lines = max(1, -(-len(good) // columns))
     figure = Figure(figsize=(2.4 * columns + 1, 3.2 * lines), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
-    for k, row in enumerate(good):
+    for k, (title, row) in enumerate(zip(_titles(good), good, strict=True)):
         ax = figure.add_subplot(lines, columns, k + 1)
         unit = row["energy"]["solution"]["total"] or 1.0
         soups = list(row["energy"])
@@ -193,7 +193,7 @@ def plot_energy(path: Path, rows: Sequence[Row]) -> None:
         ax.set_ylim(0, 1.1 * max(total for s, total in zip(soups, bottom) if s != "start"))
         ax.axhline(1.0, color="k", lw=0.5)
         ax.set_xticks(np.arange(len(soups)), soups, rotation=90, fontsize=7)
-        ax.set_title(_title(row), fontsize=7)
+        ax.set_title(title, fontsize=7)
         if k % columns == 0:
             ax.set_ylabel("E / E(solution)")
         if k == 0:

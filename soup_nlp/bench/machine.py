@@ -12,6 +12,12 @@ from soup_nlp.report.store import versions
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
+CODE = (
+    *(f"{room}/*.py" for room in ("data", "geometry", "model", "mrf", "start", "solve")),
+    *("cases.py", "inputs.py"),
+)
+"""Sources that a solve without refinement runs through: they make the code of its seconds."""
+
 
 def machine() -> dict[str, str]:
     """Processor, cores, memory, system and versions, as text."""
@@ -40,10 +46,8 @@ def _processor() -> str:
 @cache
 def code_version() -> str:
     """Hash of what a solve runs through; benchmarks, reports and commands are not part of it."""
-    rooms = ("data", "geometry", "start", "model", "solve")
     digest = hashlib.sha256()
-    for room in rooms:
-        for path in sorted((PACKAGE / room).glob("*.py")):
-            digest.update(f"{room}/{path.name}\0".encode())
-            digest.update(path.read_bytes())
+    for path in sorted({file for pattern in CODE for file in PACKAGE.glob(pattern)}):
+        digest.update(f"{path.relative_to(PACKAGE).as_posix()}\0".encode())
+        digest.update(path.read_bytes())
     return digest.hexdigest()[:12]

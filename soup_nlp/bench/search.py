@@ -214,8 +214,11 @@ def search(
         function: What measures a job, for tests.
 
     Raises:
-        ConfigError: pairs are missing or stand on both sides, or a parameter is wrong.
+        ConfigError: pairs are missing or stand on both sides, a parameter is wrong, or no trial
+            is to be validated.
     """
+    if finalists < 1:
+        raise ConfigError("no finalist", where="search", found=finalists, expected="at least 1")
     _check(space, train, validation)
 
     def scored(trial: Trial, items: Sequence[Item]) -> Trial:
@@ -238,9 +241,9 @@ def search(
 def _check(space: Sequence[Parameter], train: Sequence[Item], validation: Sequence[Item]) -> None:
     if not train:
         raise ConfigError("no training pair", where="search")
-    both = {i.name for i in train} & {i.name for i in validation}
+    both = {(i.suite, i.name) for i in train} & {(i.suite, i.name) for i in validation}
     if both:
-        raise ConfigError("a pair both trains and validates", found=sorted(both)[0])
+        raise ConfigError("a pair both trains and validates", found="/".join(min(both)))
     for p in space:
         for x in (0.0, 1.0):
             train[0].problem([f"{p.key}={p.at(x)}"])

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from soup_nlp.bench.accuracy import Row
-from soup_nlp.bench.accuracy_table import energy_ratio, get, mean, show, table
+from soup_nlp.bench.accuracy_table import energy_ratio, get, mean, pair_names, show, table
 from soup_nlp.bench.search import ABOVE, FAILED, LEAST, Found, Parameter, Trial, loss
 
 TOP = 10
@@ -133,12 +133,12 @@ def _trials(trials: Sequence[Trial], default: Trial) -> list[str]:
 def _by_pair(side: str, before: Sequence[Row], after: Sequence[Row]) -> list[str]:
     own = {_name(r): r for r in after}
     body = []
-    for row in before:
+    for pair, row in zip(pair_names(before), before, strict=True):
         other = own[_name(row)]
         main = row["presets"][0]
         body.append(
             [
-                *[f"{row['pair']}, {row['flow']}", side],
+                *[f"{pair}, {row['flow']}", side],
                 show(get(row, main, "constant")),
                 *[show(get(r, main, "solution")) for r in (row, other)],
                 *[f"{loss(r):.3f}" for r in (row, other)],

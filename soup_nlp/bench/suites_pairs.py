@@ -98,7 +98,7 @@ class Suite:
     source: str = ""
 
     def items(
-        self, root: Path, sequence: str, name: str, raw: dict[str, Any], o: Options, *needs: Path
+        self, sequence: str, name: str, raw: dict[str, Any], o: Options, *needs: Path
     ) -> Iterable[Item]:
         """One item a flow."""
         for flow in o.flows or self.flows:
@@ -186,7 +186,7 @@ def sintel(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
         for frame in spread(frames - 1, 24, 1):
             raw = {"kind": "sintel", "root": str(root), "scene": scene, "frame": frame}
             needs = [base / "clean" / scene / f"frame_{frame + k:04d}.png" for k in (0, 1)]
-            yield from suite.items(root, scene, f"{scene}-{frame:04d}", raw, o, *needs)
+            yield from suite.items(scene, f"{scene}-{frame:04d}", raw, o, *needs)
 
 
 def kitti(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
@@ -196,7 +196,7 @@ def kitti(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
     for k in range(count):
         raw = {"kind": suite.name, "root": str(root), "index": f"{k:06d}"}
         needs = [base / camera / f"{k:06d}_{frame}.png" for frame in (10, 11)]
-        yield from suite.items(root, suite.name, f"{k:06d}", raw, o, *needs)
+        yield from suite.items(suite.name, f"{k:06d}", raw, o, *needs)
 
 
 VKITTI_FRAMES = MappingProxyType({"0001": 447, "0002": 233, "0006": 270, "0018": 339})
@@ -225,11 +225,11 @@ def vkitti(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
                 folder = parts[-1] / world / "morning"
                 needs = [folder / f"{frame + k:05d}.png" for k in (0, 1)]
             name = f"{world}_morning-{frame:05d}"
-            yield from suite.items(root, f"{world}_morning", name, raw, o, *needs)
+            yield from suite.items(f"{world}_morning", name, raw, o, *needs)
 
 
 def kinect(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
     """Every folder pair_*."""
     for pair in sorted(root.glob("pair_*")):
         raw = {"kind": "folder", "path": str(pair), "unit": "mm", "depth_scale": 1.0}
-        yield from suite.items(root, suite.name, pair.name, raw, o, pair / "frame_0.png")
+        yield from suite.items(suite.name, pair.name, raw, o, pair / "frame_0.png")

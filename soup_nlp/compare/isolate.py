@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from soup_nlp.errors import SolverError
+from soup_nlp.errors import SolverError, SoupError
 
 GRACE = 5.0
 """Seconds beyond the time limit before a process that minds its own clock is killed."""
@@ -27,7 +27,7 @@ class Ended:
 
     Attributes:
         how: "returned", "raised", "killed: time", "killed: memory" or "crashed: SIGNAL".
-        value: What the function returned, or the last line of its exception.
+        value: What the function returned, or its exception in a line.
         seconds: Wall time of the process.
         cpu_seconds: CPU time of it and its children.
         peak_bytes: Largest resident size of it or a child; 0 where it could not say.
@@ -101,9 +101,8 @@ def _child(work: Callable[[], Any], target: Path, memory: int) -> None:
     except MemoryError:
         answer = ("killed: memory", None)
     except BaseException as error:
-        text = "".join(traceback.format_exception_only(error)).strip().splitlines()
-        memory_gone = any("bad_alloc" in line for line in text)
-        answer = ("killed: memory", None) if memory_gone else ("raised", text[-1] if text else "")
+        memory_gone = "bad_alloc" in str(error)
+        answer = ("killed: memory", None) if memory_gone else ("raised", _reason(error))
     peak = max(
         resource.getrusage(who).ru_maxrss
         for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
@@ -111,6 +110,17 @@ def _child(work: Callable[[], Any], target: Path, memory: int) -> None:
     part = target.with_suffix(".part")
     part.write_bytes(pickle.dumps((*answer, peak * 1024)))
     part.rename(target)
+
+
+def _reason(error: BaseException) -> str:
+    """An exception in a line."""
+    if isinstance(error, SoupError):
+        # its first line says what, those below say where and how to go on
+        found = "" if error.found is None else f", found {error.found}"
+        return f"{type(error).__name__}: {error.what}{found}"
+    # a library's message ends with its cause
+    text = "".join(traceback.format_exception_only(error)).strip().splitlines()
+    return text[-1] if text else type(error).__name__
 
 
 def _virtual_bytes() -> int:

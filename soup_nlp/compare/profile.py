@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -19,14 +20,56 @@ SHORTEST = 0.01
 """Seconds below which times are not told apart."""
 
 
-def problem_key(row: Row) -> tuple[str, int, str]:
-    """What makes a problem of the profile."""
-    return str(row["problem"]), int(row["superpixels"]), str(row["formulation"])
+class Problem(NamedTuple):
+    """What makes a problem of the profile: NLP, start and limits."""
+
+    problem: str
+    superpixels: int
+    formulation: str
+    start: str
+    tol: float
+    seconds: float
+    iterations: int
+    memory: int
+    problem_hash: str
 
 
-def cost_table(
-    rows: Sequence[Row], measure: str
-) -> tuple[list[tuple[str, int, str]], list[str], Float]:
+def problem_key(row: Row) -> Problem:
+    """The problem that a row is of."""
+    limits = row["limits"]
+    return Problem(
+        str(row["problem"]),
+        int(row["superpixels"]),
+        str(row["formulation"]),
+        str(row["start"]),
+        float(limits["tol"]),
+        float(limits["seconds"]),
+        int(limits["iterations"]),
+        int(limits["memory"]),
+        str(row["problem_hash"]),
+    )
+
+
+def problem_names(rows: Sequence[Row]) -> dict[Problem, str]:
+    """A name of every problem; start, limits or hash are in it where others differ in them only."""
+    keys = sorted({problem_key(r) for r in rows})
+    out = {}
+    for key in keys:
+        alike = [k for k in keys if k[:3] == key[:3]]
+        words = {
+            "start": f"from the {key.start}",
+            "tol": f"tol {key.tol:g}",
+            "seconds": f"{key.seconds:g} s",
+            "iterations": f"{key.iterations} iterations",
+            "memory": f"{key.memory / 2**30:g} GiB",
+            "problem_hash": key.problem_hash,
+        }
+        told = [text for name, text in words.items() if len({getattr(k, name) for k in alike}) > 1]
+        out[key] = f"{key.problem} ({', '.join(told)})" if told else key.problem
+    return out
+
+
+def cost_table(rows: Sequence[Row], measure: str) -> tuple[list[Problem], list[str], Float]:
     """Costs (problems, solvers) of the verified runs; infinite where there is none.
 
     Args:
@@ -82,13 +125,14 @@ def draw_profiles(path: Path, rows: Sequence[Row]) -> None:
         axes.set_ylim(-0.02, 1.05)
         axes.set_ylabel(f"share of {len(problems)} problems")
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=7, loc="lower right")
+        _legend(axes, fontsize=7, loc="lower right")
     _save(path, figure)
 
 
 def draw_curves(path: Path, rows: Sequence[Row]) -> None:
     """Picture of exact energy against time, a panel a problem; a dot where a run ended."""
-    problems = sorted({problem_key(r) for r in rows})
+    names = problem_names(rows)
+    problems = sorted(names)
     columns = min(2, len(problems)) or 1
     lines = -(-len(problems) // columns) or 1
     figure = Figure(figsize=(5.2 * columns, 3.4 * lines), layout="constrained")
@@ -107,12 +151,19 @@ def draw_curves(path: Path, rows: Sequence[Row]) -> None:
             axes.plot(*curve[-1], "o", color=line.get_color(), fillstyle=filled, ms=5)
         axes.axhline(start, color="0.6", lw=0.8, ls=":")
         axes.set_xscale("log")
-        axes.set_title(f"{problem[0]}, N = {problem[1]}, {problem[2]}", fontsize=8)
+        title = f"{names[problem]}, N = {problem.superpixels}, {problem.formulation}"
+        axes.set_title(title, fontsize=8)
         axes.set_xlabel("seconds")
         axes.set_ylabel("exact energy")
-        axes.legend(fontsize=6)
+        _legend(axes, fontsize=6)
         axes.grid(alpha=0.3)
     _save(path, figure)
+
+
+def _legend(axes: Axes, **style: Any) -> None:
+    """A legend, where something was drawn that has a name."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(**style)
 
 
 def _save(path: Path, figure: Figure) -> None:

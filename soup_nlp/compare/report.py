@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from soup_nlp.compare.profile import cost_table, problem_key
+from soup_nlp.compare.profile import cost_table, problem_key, problem_names
 
 Row = Mapping[str, Any]
 
+FEASIBLE = 1e-5
+"""Largest violation of a point whose energy counts."""
 LIMITS = (
     "Times are wall times of one run each, set-up included, on the machine named; where it was "
     "shared with other work, CPU seconds stand beside them.",
@@ -80,12 +82,13 @@ def conclusion(rows: Sequence[Row]) -> list[str]:
     ]
     if best:
         out[0] += f" Most problems ({solved.max()}): {', '.join(best)}."
+    names = problem_names(rows)
     for k, problem in enumerate(problems):
-        head = f"- {problem[0]}, N = {problem[1]}, {problem[2]}:"
+        head = f"- {names[problem]}, N = {problem.superpixels}, {problem.formulation}:"
         energies = [
             (float(r["energy"]), str(r["solver"]), float(r["seconds"]))
             for r in rows
-            if problem_key(r) == problem and r.get("primal") is not None and r["primal"] <= 1e-5
+            if problem_key(r) == problem and _feasible(r)
         ]
         if energies:
             value, who, when = min(energies)
@@ -110,6 +113,12 @@ def conclusion(rows: Sequence[Row]) -> list[str]:
             + (f"; not always those of {', '.join(false)}." if false else ".")
         )
     return out
+
+
+def _feasible(row: Row) -> bool:
+    """It has a point on the constraints, whose energy is a number."""
+    primal = row.get("primal")
+    return row.get("energy") is not None and primal is not None and primal <= FEASIBLE
 
 
 def by_solver(rows: Sequence[Row]) -> list[str]:
@@ -141,11 +150,14 @@ def by_run(rows: Sequence[Row]) -> list[str]:
         value = row.get(key)
         return "-" if value is None else format(value, form)
 
+    names = problem_names(rows)
     for row in sorted(rows, key=lambda r: (problem_key(r), not r["verified"], r["seconds"])):
         word = "yes" if row["verified"] else "claimed" if row["claimed"] else "no"
         steps = row["iterations"]
         cells = [
-            *map(str, problem_key(row)),
+            names[problem_key(row)],
+            str(row["superpixels"]),
+            str(row["formulation"]),
             str(row["solver"]),
             word,
             text(row, "energy", ".6g"),

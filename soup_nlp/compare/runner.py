@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache
@@ -107,7 +108,7 @@ def run_row(task: Task, label: Mapping[str, Any], solver: str) -> Row:
         row["curve"] = ended.value.curve
     if isinstance(ended.value, Answer):
         row |= _verified(task, ended.value, float(label["energy_limit"]))
-    elif len(points):
+    elif row["curve"]:
         # killed, but its iterates are there
         row |= {"energy": row["curve"][-1][1]}
     return dict(jsonable(row))
@@ -144,20 +145,24 @@ def _curve(task: Task, seconds: Float, points: Float) -> list[list[float]]:
 
 
 def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
+    # a claim that comes when the time is over is none
+    late = not answer.seconds <= task.limits.seconds
     row: Row = {
-        "status": answer.status,
-        "claimed": answer.claimed,
+        "status": f"over the time limit: {answer.status}" if late else answer.status,
+        "claimed": answer.claimed and answer.x is not None and not late,
         "iterations": answer.iterations,
         "seconds": answer.seconds,
-        "energy": _energy(task, answer.x),
     }
+    if answer.x is None:
+        return row
+    row["energy"] = _energy(task, answer.x)
     if not np.isfinite(answer.x).all():
         return row
     residuals = kkt(task.nlp, answer.x, answer.lam_g)
     row |= residuals.as_dict()
     row["objective"] = float(task.nlp.oracle(answer.x, task.nlp.p)[0])
     good = residuals.within(task.limits) and row["energy"] <= energy_limit
-    row["verified"] = bool(answer.claimed and good)
+    row["verified"] = bool(row["claimed"] and good)
     return row
 
 
@@ -187,11 +192,13 @@ def compare(
     code = code_version()
     for label, make in tasks:
         for solver in solvers:
-            folder = scratch / solver
-            folder.mkdir(parents=True, exist_ok=True)
             head = {**label, "solver": solver, "limits": asdict(limits), "code": code}
             if key_of(head) in done:
                 continue
+            done.add(key_of(head))
+            # a solver may be named by its path
+            folder = scratch / re.sub(r"[^\w-]+", "_", solver)
+            folder.mkdir(parents=True, exist_ok=True)
             row = run_row(make(folder), label, solver)
             rows.append(row)
             with atomic_path(path) as temporary:

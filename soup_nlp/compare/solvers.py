@@ -20,6 +20,7 @@ from soup_nlp.compare.task import Answer, Limits, Solver, Task, Trace
 from soup_nlp.errors import SolverError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import read_sol
+from soup_nlp.model.formulation import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.ipopt import DEFAULTS
 from soup_nlp.solve.yardstick import EPS, Yardstick, lbfgs, levenberg_marquardt
@@ -249,6 +250,9 @@ def executable(command: str, task: Task, options: tuple[str, ...] = ()) -> Answe
     """Solve with a program of the AMPL convention, `solver stub -AMPL key=value ...`."""
     begin = time.perf_counter()
     file = write_nl(task.folder / "soup.nl", task.nlp)
+    path = task.folder / "soup.sol"
+    # the folder may hold the answer to another problem
+    path.unlink(missing_ok=True)
     words = [command, "soup", "-AMPL", *options]
     with (task.folder / "solver.log").open("w") as log:
         try:
@@ -261,8 +265,7 @@ def executable(command: str, task: Task, options: tuple[str, ...] = ()) -> Answe
                 check=False,
             ).returncode
         except subprocess.TimeoutExpired:
-            return Answer(task.nlp.x0, None, "Time_Limit", False, -1, time.perf_counter() - begin)
-    path = task.folder / "soup.sol"
+            return Answer(None, None, "Time_Limit", False, -1, time.perf_counter() - begin)
     if not path.is_file():
         raise SolverError("solver wrote no .sol", where=Path(command).name, found=f"exit {code}")
     sol = read_sol(path, file.variables, file.rows)
@@ -294,7 +297,9 @@ def _ampl(name: str, task: Task, near: bool = False) -> Answer:
 
 
 def _find(name: str) -> str | None:
-    return shutil.which(name) or shutil.which(str(Path(sys.executable).parent / name))
+    found = shutil.which(name) or shutil.which(str(Path(sys.executable).parent / name))
+    # it runs in another folder than this one
+    return None if found is None else str(Path(found).absolute())
 
 
 def scip(task: Task) -> Answer:
@@ -319,7 +324,7 @@ def scip(task: Task) -> Answer:
     best = model.getBestSol()
     if best is None or not model.getNSols():
         status = f"{model.getStatus()}, no point"
-        return Answer(task.nlp.x0, None, status, False, -1, time.perf_counter() - begin)
+        return Answer(None, None, status, False, -1, time.perf_counter() - begin)
     x = np.empty(task.nlp.nx)
     for name in names:
         x[place[name]] = best[found[name]]
@@ -342,7 +347,8 @@ def yardstick(method: Callable[..., Yardstick], task: Task) -> Answer:
         eps=[*(e for e in EPS if e > last), last],
         seconds=0.8 * task.limits.seconds,
     )
-    x = task.nlp.x0.copy()
+    # slack variables and switches at their best for this soup
+    x = build_matrix_nlp(record.soup, task.data, task.weights, task.form)[0].x0.copy()
     x[: task.layout.size] = task.layout.pack(record.soup)
     history = np.asarray(record.history, float)
     return Answer(x, None, record.status, False, record.iterations, record.seconds, history)

@@ -71,7 +71,7 @@ class Answer:
     """What a solver says.
 
     Attributes:
-        x: (nx,) point.
+        x: (nx,) point, or None where it returned none.
         lam_g: (ng,) multipliers, or None.
         status: The solver's words.
         claimed: It claims an optimum.
@@ -80,7 +80,7 @@ class Answer:
         curve: (k, 2) seconds and exact energy, of solvers that record it themselves.
     """
 
-    x: Float
+    x: Float | None
     lam_g: Float | None
     status: str
     claimed: bool

@@ -25,8 +25,8 @@ def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
         backward: (H', W', 2) flow from the second to the first image, pixels.
 
     Returns:
-        (H, W) float32, pixels; infinite where the forward flow leaves the second image or is not
-        finite.
+        (H, W) float32, pixels; infinite where the forward flow leaves the second image and where
+        one of the two is not finite.
     """
     height, width = forward.shape[:2]
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -41,7 +41,7 @@ def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
         borderMode=cv2.BORDER_REPLICATE,
     )
     error = np.hypot(x + back[:, :, 0] - u, y + back[:, :, 1] - v)
-    error[~inside] = np.inf
+    error[~inside | ~np.isfinite(error)] = np.inf
     return np.asarray(error, dtype=np.float32)
 
 

@@ -21,7 +21,7 @@ def write_casadi(folder: Path, nlp: NLP) -> list[str]:
     """Write `oracle.casadi` and the other functions; `casadi.Function.load` reads them.
 
     The NLP must be built with `compiled=False`. Inputs are (x, p), for the Hessian (x, p, lam_f,
-    lam_g); p, x0 and the bounds are in soup.h5.
+    lam_g); p, x0 and the bounds are what `write_start_h5` writes.
 
     Returns:
         Names of the files.

@@ -18,7 +18,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.errors import ExportError
+from soup_nlp.export.checks import (
+    plain_problem,
+    require_bounds,
+    require_finite,
+    require_names,
+    vector,
+)
 from soup_nlp.export.program import Body, orders, take_apart
 from soup_nlp.export.segments import bounds, linear, start
 from soup_nlp.model.kernel import Group, Kernel, Table
@@ -83,7 +89,8 @@ def write_nl(
         names: Of variables and constraints; default the NLP's own, see `names.readable_names`.
 
     Raises:
-        ExportError: an operation has no opcode, or a number is not finite.
+        ExportError: an operation has no opcode, a number is not finite, bounds cross, or a vector
+            or names are of a wrong length.
         DataError: the folder cannot be written.
     """
     x_names, g_names = names or (nlp.x_names(), nlp.g_names())
@@ -107,21 +114,21 @@ def write_sx_nl(
     path: str | Path,
     problem: Mapping[str, ca.SX],
     *,
-    x0: Float | None = None,
-    lbx: Float | None = None,
-    ubx: Float | None = None,
-    lbg: Float | None = None,
-    ubg: Float | None = None,
+    x0: Float | float | None = None,
+    lbx: Float | float | None = None,
+    ubx: Float | float | None = None,
+    lbg: Float | float | None = None,
+    ubg: Float | float | None = None,
     x_names: Sequence[str] | None = None,
     g_names: Sequence[str] | None = None,
-    lam_g0: Float | None = None,
+    lam_g0: Float | float | None = None,
 ) -> NLFile:
     """Write any plain NLP of CasADi's nlpsol form.
 
     Args:
         path: The .nl file.
         problem: `x`, `f` and, if there are constraints, `g`, all SX; no parameters.
-        x0: (nx,) start, default 0.
+        x0: (nx,) start, default 0; here and below a number stands for all entries.
         lbx: (nx,) lower bounds, default none.
         ubx: (nx,) upper bounds, default none.
         lbg: (ng,) lower bounds of g, default none.
@@ -131,39 +138,28 @@ def write_sx_nl(
         lam_g0: (ng,) initial multipliers, see `write_nl`.
 
     Raises:
-        ExportError: as `write_nl`; or g has a free symbol.
+        ExportError: as `write_nl`; or the problem is not SX, has a free symbol, or its objective
+            is not a scalar.
 
     Example:
         >>> x = ca.SX.sym("x", 2)
         >>> rosenbrock = {"x": x, "f": (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2}
         >>> write_sx_nl("rosenbrock.nl", rosenbrock, x0=[-1.2, 1])  # doctest: +SKIP
     """
-    x, f = ca.vec(problem["x"]), problem.get("f", ca.SX(0))
-    g = ca.vec(problem.get("g", ca.SX(0, 1)))
+    x, f, g = plain_problem(problem, path)
     nx, ng = x.numel(), g.numel()
-    free = [s for s in ca.symvar(ca.vertcat(f, g)) if not ca.depends_on(x, s)]
-    if problem.get("p") is not None or free:
-        raise ExportError(
-            "NLP has symbols that are not variables",
-            where=path,
-            found=free if free else problem.get("p"),
-            hint="substitute numbers for the parameters first",
-        )
     none = ca.SX(0, 1)
     kernel = Kernel("nlp", x, none, none, objective=f, constraints=g if ng else None)
     table = Table(np.arange(nx)[None], np.zeros((1, 0)), np.arange(ng)[None])
 
-    def full(values: Float | None, n: int, default: float) -> Float:
-        return np.full(n, default) if values is None else np.asarray(values, float).reshape(n)
-
     return write_groups(
         path,
         (Group(kernel, table),),
-        x0=full(x0, nx, 0.0),
-        lbx=full(lbx, nx, -np.inf),
-        ubx=full(ubx, nx, np.inf),
-        lbg=full(lbg, ng, -np.inf),
-        ubg=full(ubg, ng, np.inf),
+        x0=vector("x0", x0, nx, 0.0, path),
+        lbx=vector("lbx", lbx, nx, -np.inf, path),
+        ubx=vector("ubx", ubx, nx, np.inf, path),
+        lbg=vector("lbg", lbg, ng, -np.inf, path),
+        ubg=vector("ubg", ubg, ng, np.inf, path),
         theta=np.zeros(0),
         x_names=x_names,
         g_names=g_names,
@@ -183,12 +179,25 @@ def write_groups(
     theta: Float,
     x_names: Sequence[str] | None = None,
     g_names: Sequence[str] | None = None,
-    lam_g0: Float | None = None,
+    lam_g0: Float | float | None = None,
     objective_name: str = "f",
 ) -> NLFile:
-    """Write sums of kernels over tables; see `write_nl`."""
+    """Write sums of kernels over tables; see `write_nl`.
+
+    Raises:
+        ExportError: as `write_nl`; nothing is written then.
+    """
     begin = time.perf_counter()
     path = Path(path)
+    x0 = vector("x0", x0, len(lbx), 0.0, path)
+    multipliers = None if lam_g0 is None else vector("lam_g0", lam_g0, len(lbg), 0.0, path)
+    if multipliers is not None:
+        require_finite("lam_g0", multipliers, path)
+    require_finite("x0", x0, path)
+    require_bounds("x", lbx, ubx, path)
+    require_bounds("g", lbg, ubg, path)
+    require_names("x_names", x_names, len(lbx), path)
+    require_names("g_names", g_names, len(lbg), path)
     program = take_apart(groups, len(x0), len(lbg), np.asarray(theta, float))
     variables, rows = orders(program)
     place = np.empty(len(variables), np.int64)
@@ -209,6 +218,7 @@ def write_groups(
     G.sort_indices()
     lbx, ubx, x0 = lbx[variables], ubx[variables], x0[variables]
     lbg, ubg = lbg[rows], ubg[rows]
+    duals = None if multipliers is None else multipliers[rows]
     ranges = np.isfinite(lbg) & np.isfinite(ubg) & (lbg != ubg)
     widest = [max(map(len, names or ()), default=0) for names in (g_names, x_names)]
     header = [
@@ -230,7 +240,7 @@ def write_groups(
         for lines in (
             header,
             body.segments(),
-            start(x0, lam_g0[rows] if lam_g0 is not None else None),
+            start(x0, duals),
             bounds("r", lbg, ubg),
             bounds("b", lbx, ubx),
             linear(J, G),

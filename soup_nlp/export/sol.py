@@ -16,6 +16,10 @@ from soup_nlp.report.atomic import atomic_path
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+COUNT_LIMIT = 2**31
+"""No count in a file is as large as this."""
+OPTIONS = "Options"
+"""Line that ends the message."""
 KINDS = ("variable", "constraint", "objective", "problem")
 CLASSES = ("solved", "uncertain", "infeasible", "unbounded", "limit", "failure")
 LOWER, UPPER = "ipopt_zL_out", "ipopt_zU_out"
@@ -87,7 +91,18 @@ class _Lines:
         return out
 
     def integers(self, count: int, expected: str) -> list[int]:
-        return [int(v) for v in self.numbers(count, expected)]
+        values = self.numbers(count, expected)
+        for value in values:
+            if not (value >= 0 and value == np.floor(value) and value < COUNT_LIMIT):
+                raise self.wrong(repr(float(value)), f"{expected}: a whole number, not negative")
+        return [int(v) for v in values]
+
+    def whole(self, word: str, expected: str) -> int:
+        """A whole number of the line that was read last."""
+        try:
+            return int(word)
+        except ValueError:
+            raise self.wrong(word, expected) from None
 
     def wrong(self, found: str, expected: str) -> ExportError:
         return ExportError(
@@ -112,12 +127,13 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
     """
     lines = _Lines(Path(path))
     message = []
-    while (line := lines.next("Options")) != "Options":
+    while (line := lines.next(OPTIONS)) != OPTIONS:
         message.append(line)
     (count,) = lines.integers(1, "number of options")
     # two more options say that a tolerance follows
     tolerance = count > 4
-    lines.integers(count - 2 * tolerance, "an option")
+    for _ in range(count - 2 * tolerance):
+        lines.next("an option")
     sizes = lines.integers(4, "number of constraints, duals, variables, values")
     if tolerance:
         lines.numbers(1, "tolerance")
@@ -137,16 +153,22 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
         )
     y = lines.numbers(sizes[1], "a dual value")
     z = lines.numbers(sizes[3], "a value of a variable")
-    if not np.isfinite(z).all():
-        raise ExportError("solution is not finite", where=path)
+    for values, what in ((z, "a value"), (y, "a dual")):
+        if not np.isfinite(values).all():
+            raise ExportError(
+                "solution is not finite",
+                where=path,
+                found=f"{what} is not a number or infinite",
+                hint="; ".join(m for m in message if m) or None,
+            )
     code = -1
     suffixes: dict[tuple[str, str], dict[int, float]] = {}
     while lines.at < len(lines.lines):
         words = lines.next("objno or suffix").split()
         if words[:1] == ["objno"] and len(words) >= 3:
-            code = int(words[2])
+            code = lines.whole(words[2], "objno, objective, code")
         elif words[:1] == ["suffix"] and len(words) >= 6:
-            suffixes.update(_suffix(lines, words))
+            suffixes.update(_suffix(lines, words, sizes))
         elif words:
             raise lines.wrong(" ".join(words), "objno or suffix")
     x = np.empty(len(variables))
@@ -165,15 +187,28 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
     )
 
 
-def _suffix(lines: _Lines, words: list[str]) -> Iterator[tuple[tuple[str, str], dict[int, float]]]:
-    kind, count, _, _, table = (int(w) for w in words[1:6])
+def _suffix(
+    lines: _Lines, words: list[str], sizes: list[int]
+) -> Iterator[tuple[tuple[str, str], dict[int, float]]]:
+    expected = "suffix, kind, entries, name length, table length, table lines"
+    kind, count, _, _, table = (lines.whole(w, expected) for w in words[1:6])
+    # rows and variables; there is one objective and one problem
+    owners = {0: sizes[2], 1: sizes[0]}.get(kind & 3, 1)
+    if min(kind, count, table) < 0 or count > owners:
+        raise lines.wrong(" ".join(words), f"{expected}; entries for {owners} at most")
     name = lines.next("name of a suffix")
     for _ in range(table):
         lines.next("table of a suffix")
     entries = {}
     for _ in range(count):
         pair = lines.next("entry of a suffix").split()
-        entries[int(pair[0])] = float(pair[1])
+        expected = f"entry of a suffix: index below {owners}, value"
+        if len(pair) != 2 or not 0 <= (index := lines.whole(pair[0], expected)) < owners:
+            raise lines.wrong(" ".join(pair), expected)
+        try:
+            entries[index] = float(pair[1])
+        except ValueError:
+            raise lines.wrong(" ".join(pair), expected) from None
     yield (KINDS[kind & 3], name), entries
 
 
@@ -206,13 +241,14 @@ def write_sol(
         lam_g: (ng,) multipliers in CasADi's sign, or None.
         variables: (nx,) order of the .nl file, see `NLFile`.
         rows: (ng,) order of the .nl file.
-        message: First lines; empty lines are left out.
+        message: First lines; empty lines are left out, and one that would end it is quoted.
         code: solve_result_num, 0 solved, 400 limit.
     """
     duals = [] if lam_g is None else [number(-v) for v in lam_g[rows].tolist()]
     head = [line for line in message.splitlines() if line.strip()]
+    head = [f'"{line.strip()}"' if line.strip() == OPTIONS else line for line in head]
     sizes = (len(rows), len(duals), len(variables), len(variables))
     values = [number(v) for v in np.asarray(x, float)[variables].tolist()]
-    lines = [*head, "", "Options", "3", "0", "1", "0", *map(str, sizes), *duals, *values]
+    lines = [*head, "", OPTIONS, "3", "0", "1", "0", *map(str, sizes), *duals, *values]
     with atomic_path(path) as temporary:
         temporary.write_text("\n".join([*lines, f"objno 0 {code}"]) + "\n", encoding="utf-8")

@@ -173,14 +173,21 @@ def splat_depth(target: Float, z: Float, size: tuple[int, int]) -> Float:
     """
     height, width = size
     ok = np.isfinite(target).all(-1) & (z > 0)
-    out = np.full(height * width, np.inf)
-    base = np.floor(target[ok])
-    # each source pixel covers its 2 x 2 footprint, so that cracks of a stretched surface close
-    for du in (0, 1):
-        for dv in (0, 1):
-            u, v = base[:, 0] + du, base[:, 1] + dv
+    at, z = target[ok], z[ok]
+
+    def nearest(corners: Float) -> Float:
+        """Least depth that lands on every pixel; corners (C, P, 2)."""
+        out = np.full(height * width, np.inf)
+        for u, v in corners.transpose(0, 2, 1):
             inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-            index = (v[inside] * width + u[inside]).astype(np.int64)
-            np.minimum.at(out, index, z[ok][inside])
+            np.minimum.at(out, (v[inside] * width + u[inside]).astype(np.int64), z[inside])
+        return out
+
+    out = nearest(np.floor(at + 0.5)[None])
+    # cracks of a stretched surface alone take what covers them: taken everywhere, a footprint of
+    # 2 x 2 pixels makes silhouettes grow and slanted surfaces nearer
+    footprint = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+    crack = np.isinf(out)
+    out[crack] = nearest(np.floor(at) + footprint[:, None])[crack]
     out[np.isinf(out)] = np.nan
     return out.reshape(height, width)

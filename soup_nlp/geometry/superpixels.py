@@ -77,12 +77,10 @@ def split_components(labels: Labels, min_size: int) -> Labels:
 
     A small piece takes the label of the nearest pixel (Euclidean) of a piece that stays.
     """
-    pieces = np.zeros(labels.shape, np.int32)
-    # equal-label components in one pass: label the image of each parity class is not enough, so
-    # connect pixels over a graph of equal neighbours
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
+    # all labels in one pass: components of the graph of equal neighbours
     index = np.arange(labels.size).reshape(labels.shape)
     right = labels[:, :-1] == labels[:, 1:]
     down = labels[:-1] == labels[1:]

@@ -73,7 +73,8 @@ class EnergyData:
         pair_factor: (P,) sqrt(boundary length / B): the sampled Frobenius norm times this stands
             for the norm over the whole boundary.
         pair_unit: (P,) length unit of the pair.
-        pair_count: (P,) 2: directed pairs folded into one (E_orient).
+        pair_count: (P,) weight of E_orient: 2, directed pairs folded into one, less where the flow
+            of a bending surface tears.
         rim_ray: (N, V, 3) rays where visibility is imposed, the anchor first.
         local_units: edge_unit and pair_unit are shares of the depth of the two anchors, mostly the
             nearer one (E is then independent of scale, term by term), instead of lengths.
@@ -236,19 +237,33 @@ def at_occlusions(
     return replace(data, pair_weight=np.where(hidden, factor, 1.0) * data.pair_weight)
 
 
-def across_tears(data: EnergyData, surface: NDArray[np.int64], factor: float) -> EnergyData:
-    """The same data with E_cont's weights times `factor` from one surface to another.
+def across_tears(
+    data: EnergyData,
+    surface: NDArray[np.int64],
+    *,
+    arap: float = 1.0,
+    cont: float = 1.0,
+    orient: float = 1.0,
+) -> EnergyData:
+    """The same data with terms times a factor each from one surface to another.
 
-    Where the flow tears, two surfaces pass each other: their gap in depth is nothing to close.
+    Where the flow tears, two surfaces pass each other: their gap in depth is nothing to close, they
+    need not move alike, nor face the same way. What ties them flattens the relief of both.
 
     Args:
         data: Data of the pair.
         surface: (N,) surface of every superpixel, as the start finds them.
-        factor: 1 is the paper's energy.
+        arap: Factor of E_arap; 1 is the paper's energy, as for the others.
+        cont: Factor of E_cont.
+        orient: Factor of E_orient.
     """
-    i, k = data.pairs.T
-    held = np.where(surface[i] == surface[k], 1.0, factor)
-    return replace(data, pair_weight=held * data.pair_weight)
+    torn, apart = (surface[a] != surface[b] for a, b in (data.pairs.T, data.edges.T))
+    return replace(
+        data,
+        edge_weight=np.where(apart, arap, 1.0) * data.edge_weight,
+        pair_weight=np.where(torn, cont, 1.0) * data.pair_weight,
+        pair_count=np.where(torn, orient, 1.0) * data.pair_count,
+    )
 
 
 def in_pixels(

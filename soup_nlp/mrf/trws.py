@@ -123,9 +123,7 @@ def solve_trws(
         ModelError: Inputs of the wrong shape, type or range, or not finite.
     """
     start = time.perf_counter()
-    work = np.dtype(dtype)
-    if work not in (np.dtype(np.float32), np.dtype(np.float64)):
-        fail("TRW-S cannot work in this type.", "dtype", work, "float64 or float32")
+    work = _working_type(dtype)
     for name, value in (("max_iter", max_iter), ("patience", patience)):
         if value < 1:
             fail("An option of TRW-S is too small.", name, value, "at least 1")
@@ -190,6 +188,7 @@ def mrf_energy(labels: np.ndarray, unary: Unary, edges: np.ndarray, pairwise: Pa
     at, to = x[pairs[:, 0]], x[pairs[:, 1]]
     total = float(costs[np.arange(len(x)), x].sum())
     if not callable(pairwise):
+        _check_tables(pairwise, pairs, counts)
         return total + math.fsum(float(pairwise[e][a, b]) for e, (a, b) in enumerate(zip(at, to)))
     step = max(1, CALL_BYTES // (8 * costs.shape[1] ** 2))
     for k in range(0, len(pairs), step):
@@ -197,6 +196,17 @@ def mrf_energy(labels: np.ndarray, unary: Unary, edges: np.ndarray, pairwise: Pa
         block = call_tables(pairwise, ids, costs.shape[1])
         total += float(block[ids - k, at[ids], to[ids]].sum(dtype=np.float64))
     return total
+
+
+def _working_type(dtype: type | np.dtype) -> np.dtype:
+    found: object = repr(dtype)
+    try:
+        found = out = np.dtype(dtype)
+        if out in (np.dtype(np.float32), np.dtype(np.float64)):
+            return out
+    except TypeError:
+        pass  # it names no type at all
+    fail("TRW-S cannot work in this type.", "dtype", found, "float64 or float32")
 
 
 class _Passes:
@@ -315,6 +325,23 @@ def _read_unary(unary: Unary) -> tuple[np.ndarray, np.ndarray]:
     return out, counts
 
 
+def _check_tables(
+    pairwise: np.ndarray | Sequence[np.ndarray], edges: np.ndarray, counts: np.ndarray
+) -> None:
+    """Fail where tables do not have the shapes that the edges and label counts ask for."""
+    n, size = len(edges), int(counts.max())
+    if isinstance(pairwise, np.ndarray):
+        if pairwise.shape != (n, size, size) and (n or pairwise.size):
+            fail("The tables have the wrong shape.", "pairwise", pairwise.shape, (n, size, size))
+        return
+    if len(pairwise) != n:
+        fail("The tables are not one an edge.", "pairwise", len(pairwise), n)
+    for e, (a, b) in enumerate(edges):
+        found, shape = np.shape(pairwise[e]), (int(counts[a]), int(counts[b]))
+        if found != shape:
+            fail("A table does not fit its edge's nodes.", f"pairwise[{e}]", found, shape)
+
+
 def _read_pairwise(
     pairwise: Pairwise, edges: np.ndarray, counts: np.ndarray, dtype: np.dtype, keep: bool
 ) -> np.ndarray | TableFunction:
@@ -329,18 +356,13 @@ def _read_pairwise(
         for ids in chunks:
             table[ids[0] : ids[-1] + 1] = call_tables(pairwise, ids, size)
     elif isinstance(pairwise, np.ndarray):
-        if pairwise.shape != (n, size, size) and (n or pairwise.size):
-            fail("The tables have the wrong shape.", "pairwise", pairwise.shape, (n, size, size))
+        _check_tables(pairwise, edges, counts)
         table = np.ascontiguousarray(pairwise.reshape(n, size, size), dtype)
     else:
-        if len(pairwise) != n:
-            fail("The tables are not one an edge.", "pairwise", len(pairwise), n)
+        _check_tables(pairwise, edges, counts)
         table = np.zeros((n, size, size), dtype)
         for e, (a, b) in enumerate(edges):
-            found, shape = np.shape(pairwise[e]), (int(counts[a]), int(counts[b]))
-            if found != shape:
-                fail("A table does not fit its edge's nodes.", f"pairwise[{e}]", found, shape)
-            table[e, : shape[0], : shape[1]] = pairwise[e]
+            table[e, : counts[a], : counts[b]] = pairwise[e]
     for ids in chunks:
         bad = ~np.isfinite(table[ids[0] : ids[-1] + 1]).all(axis=(1, 2))
         if bad.any():

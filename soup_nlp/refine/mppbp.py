@@ -206,7 +206,7 @@ def refine_soup(
     shares = dict(SHARES)
     kept: Particles | None = None
     rounds: list[Round] = []
-    status, slow = "rounds", 0
+    status, slow, interrupted = "rounds", 0, False
     for number in range(o.rounds):
         if stop.is_set() or time.perf_counter() > deadline:
             break
@@ -236,6 +236,8 @@ def refine_soup(
             polish=True,
             callback=watch,
         )
+        # TRW-S answers Ctrl-C too with the best labels so far: no further round then
+        interrupted = result.status == "interrupted" and time.perf_counter() <= deadline
         labels = result.labels
         new = p.soup(labels, data.share).retracted()
         new_energy = plain.energy(new, data, weights)
@@ -254,10 +256,12 @@ def refine_soup(
         if say:
             say(f"refine {number + 1}: {rounds[-1]}")
         slow = slow + 1 if before - energy["total"] < o.stagnation * abs(before) else 0
+        if interrupted:
+            break
         if slow >= 2:
             status = "stagnated"
             break
-    if stop.is_set():
+    if interrupted or stop.is_set():
         status = "interrupted"
     elif len(rounds) < o.rounds and status == "rounds":
         status = "time limit"

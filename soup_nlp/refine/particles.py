@@ -330,7 +330,8 @@ class Proposer:
             unit,
             d.pixel_ray,
             self.target,
-            d.pixel_weight,
+            # fits weigh their prior against confidences
+            d.pixel_weight * d.pixel_weight.shape[1],
             d.anchor_ray,
             d.radius,
             focal,

@@ -8,10 +8,8 @@ delta); MRE as in "Superpixel Soup" (mean relative error, the same number as Abs
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from types import MappingProxyType
-from typing import Any, Literal, TypedDict, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,25 +18,6 @@ from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
 Scale = Literal["median", "mre", "lsq", "none"]
-
-
-class Protocol(TypedDict):
-    """Keyword arguments of `depth_metrics` that make a protocol."""
-
-    scale: Scale
-    cap: float | None
-
-
-PROTOCOLS: Mapping[str, Protocol] = MappingProxyType(
-    {
-        "paper": Protocol(scale="median", cap=None),
-        "sintel70": Protocol(scale="median", cap=70.0),
-        "kitti": Protocol(scale="median", cap=None),
-        "eigen80": Protocol(scale="median", cap=80.0),
-        "best": Protocol(scale="mre", cap=None),
-    }
-)
-"""Named protocols, to be used as `depth_metrics(z, truth, **PROTOCOLS["paper"])`."""
 
 
 @dataclass(frozen=True)
@@ -138,8 +117,9 @@ def depth_metrics(
     z = s * z if clamp is None else np.clip(s * z, *clamp)
     gap = np.abs(gt - z)
     relative = gap / gt
-    log = np.abs(np.log(gt) - np.log(z))
-    delta = [float(np.mean(log < k * np.log(1.25))) for k in (1, 2, 3)]
+    log = np.log(gt) - np.log(z)
+    fold = np.maximum(gt / z, z / gt)
+    delta = [float(np.mean(fold < 1.25**k)) for k in (1, 2, 3)]
     return DepthMetrics(
         mre=float(np.mean(relative)),
         median_relative=float(np.median(relative)),

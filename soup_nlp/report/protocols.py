@@ -101,7 +101,7 @@ _ALL = (
     Preset("lsq", "lsq", text="least-squares scale, no cap"),
     Preset("metric", "none", text="as it is, no scale"),
     Preset("near20", cap=20.0, text="median scale, depth cap 20"),
-    Preset("sintel70", cap=70.0, text="two-view convention on Sintel: median scale, 0 < z < 70"),
+    Preset("sintel70", cap=70.0, text="two-view convention on Sintel: median scale, 0 < z <= 70"),
     Preset("kitti", text="KITTI uncapped: median scale over every true pixel"),
     Preset(
         "eigen80",

@@ -207,6 +207,10 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
     body = tree["start"]["body"]
     weight = seg["edge_multiplicity"] * np.exp(-float(settings["segmentation"]["beta"]) * gap)
     weight[body[i] != body[k]] *= float(settings["energy"]["arap_across"])
+    bending = settings["energy"]["bending"]
+    weight[_torn(tree, settings["energy"], "edges")] *= float(bending["arap_across"])
+    held = np.full(len(e["pairs"]), 2.0)
+    held[_torn(tree, settings["energy"], "pairs")] *= float(bending["orient_across"])
     return {
         "anchors": _gap(centre, seg["anchors"]),
         "anchor rays": _gap(rays(centre), e["anchor_ray"]),
@@ -216,6 +220,7 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
         "pixel targets": _gap(target, e["pixel_target"][used]),
         "K-NN edges": float(len(np.setxor1d(directed, i * n + k))),
         "edge weights": _gap(weight, e["edge_weight"]),
+        "pair counts": _gap(held, e["pair_count"]),
         "pair weights": _gap(_pair_weights(tree, settings["energy"]), e["pair_weight"]),
     }
 
@@ -230,10 +235,16 @@ def _pair_weights(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Float:
     z = np.stack([(start["lam"] * start["d"])[who] / f for who, f in zip((i, k), facing)])
     open_gap = z.min(0) < (1 - float(form["occlusion_gap"])) * z.max(0)
     weight[open_gap & (start["body"][i] != start["body"][k])] *= float(form["cont_occluded"])
-    if form["units"] == "pixel" and bool(start["bending"]):
-        torn = start["surface"][i] != start["surface"][k]
-        weight[torn] *= float(form["bending"]["cont_across"])
+    weight[_torn(tree, form, "pairs")] *= float(form["bending"]["cont_across"])
     return np.asarray(weight)
+
+
+def _torn(tree: Mapping[str, Any], form: Mapping[str, Any], graph: str) -> NDArray[np.bool_]:
+    """Which edges of a graph lead from one surface to another where surfaces bend."""
+    start = tree["start"]
+    i, k = tree["energy"][graph].T
+    bends = form["units"] == "pixel" and bool(start["bending"])
+    return np.asarray(bends & (start["surface"][i] != start["surface"][k]))
 
 
 def _gap(a: Float, b: Float) -> float:

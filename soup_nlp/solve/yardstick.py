@@ -188,7 +188,7 @@ def levenberg_marquardt(
     eps: Sequence[float] = EPS,
     iterations: int = 60,
     tol: float = 1e-5,
-    stagnation: float = 1e-4,
+    stagnation: float = 1e-3,
     seconds: float = np.inf,
     listener: Listener | None = None,
     stop: threading.Event | None = None,

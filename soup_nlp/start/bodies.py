@@ -42,11 +42,10 @@ def bodies(label: Int, seg: Segmentation) -> Int:
         (N,) index of the body.
     """
     own = label < 0
-    if not own.any():
-        return label
-    piece = components(own, seg)
-    _, piece = np.unique(np.where(own, piece, -1), return_inverse=True)
-    return np.where(own, label.max() + piece, label)
+    body = label.copy()
+    piece = components(own, seg)[own]
+    body[own] = label.max(initial=-1) + 1 + np.unique(piece, return_inverse=True)[1].ravel()
+    return body
 
 
 SHORTEST = 1e-4

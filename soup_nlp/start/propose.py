@@ -119,7 +119,7 @@ def propose(
     if share > o.bending:
         soup, error = constant_depth(views)
         none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
-        parallax = choice.parallax
+        parallax = _parallax(soup, views)
         return Start(soup, error, parallax, every, none, none + 1, motions, surface, share, True)
     choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
     own, label, parallax = choice.fit, choice.label, choice.parallax
@@ -130,9 +130,11 @@ def propose(
         # little parallax everywhere is still some, until it is the rounding of the flow
         weak = ~np.isfinite(mu) | (mu <= 0) | (parallax < 0.02)
     if weak.all():
-        n = len(seg)
-        mu, slope, weak = np.ones(n), np.zeros((n, 2)), np.ones(n, bool)
-    mu, slope, length = borrow(mu, slope, label, weak, seg)
+        # no depth is known: all are at one, where translations move the image as they did
+        length = np.where(mu > 0, mu, 0.0)
+        mu, slope = np.ones(len(seg)), np.zeros((len(seg), 2))
+    else:
+        mu, slope, length = borrow(mu, slope, label, weak, seg)
     t = choice.t * length[:, None]
     soup = _soup(mu, slope, choice.R, t, views.anchor, views.radius)
     body = bodies(label, seg)
@@ -194,6 +196,14 @@ def _fill_poor(
     index, there = index.copy(), there.copy()
     index[poor], there[poor] = index[rich[nearest]], there[rich[nearest]]
     return index, there, poor
+
+
+def _parallax(soup: Soup, views: Views) -> Float:
+    """(N,) pixels between where every anchor moves and where its rotation alone brings it."""
+    far = np.einsum("nij,nj->ni", soup.R, soup.points(views.anchor))
+    near = far + soup.translation
+    gap = near[:, :2] / near[:, 2:] - far[:, :2] / far[:, 2:]
+    return np.linalg.norm(gap * np.asarray(views.focal), axis=1)
 
 
 def _soup(mu: Float, slope: Float, R: Float, t: Float, anchor: Float, radius: Float) -> Soup:

@@ -1,0 +1,151 @@
+"""What is given to a writer, looked at before anything is written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import ExportError
+
+Float = NDArray[np.float64]
+
+
+def plain_problem(problem: Mapping[str, object], where: object) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """x (nx,), scalar f and g (ng,) of a problem in nlpsol's form.
+
+    Args:
+        problem: `x`, `f` and, if there are constraints, `g`; `p` may be there when it is empty.
+        where: File, for messages.
+
+    Raises:
+        ExportError: an entry is unknown, missing, no SX or of a wrong shape, or there are symbols
+            that are not variables.
+    """
+    unknown = sorted(set(problem) - {"x", "f", "g", "p"})
+    if unknown or problem.get("x") is None:
+        raise ExportError(
+            "NLP is not of the form x, f, g",
+            where=where,
+            found=", ".join(map(str, problem)),
+            expected="x, f and, if there are constraints, g",
+        )
+    x, f, g, p = (_expression(k, problem.get(k), where) for k in ("x", "f", "g", "p"))
+    if not x.numel() or not x.is_valid_input():
+        raise ExportError("x is not a vector of symbols", where=where, found=str(x)[:60])
+    if problem.get("f") is None:
+        f = ca.SX(0)
+    if f.numel() != 1:
+        raise ExportError(
+            "objective is not a scalar", where=where, found=f.shape, expected="(1, 1)"
+        )
+    x, g = ca.vec(x), ca.vec(g)
+    free = [s for s in ca.symvar(ca.vertcat(f, g)) if not ca.depends_on(x, s)]
+    if p.numel() or free:
+        raise ExportError(
+            "NLP has symbols that are not variables",
+            where=where,
+            found=free if free else p,
+            hint="substitute numbers for the parameters first",
+        )
+    return x, f, g
+
+
+def _expression(name: str, value: object, where: object) -> ca.SX:
+    """An entry as SX; none is empty."""
+    if value is None:
+        return ca.SX(0, 1)
+    try:
+        # numbers are expressions as well, MX is none
+        return ca.SX(value)
+    except (NotImplementedError, TypeError, RuntimeError):
+        raise ExportError(
+            f"{name} of the NLP is not SX",
+            where=where,
+            found=type(value).__name__,
+            expected="casadi.SX",
+            hint="Function.expand() makes SX of most MX expressions",
+        ) from None
+
+
+def vector(name: str, values: object, size: int, default: float, where: object) -> Float:
+    """(size,) numbers; a scalar stands for all, None for the default.
+
+    Raises:
+        ExportError: they are not numbers, or of another length.
+    """
+    if values is None:
+        return np.full(size, default)
+    try:
+        found = np.asarray(values, float)
+    except (TypeError, ValueError, RuntimeError, NotImplementedError):
+        raise ExportError(
+            f"{name} is not a vector of numbers", where=where, found=type(values).__name__
+        ) from None
+    if found.size == 1:
+        return np.full(size, found.item())
+    if found.size != size or found.size != max(found.shape, default=1):
+        raise ExportError(
+            f"{name} has a wrong length", where=where, found=found.shape, expected=f"({size},)"
+        )
+    return found.ravel()
+
+
+def require_finite(name: str, values: Float, where: object) -> None:
+    """Numbers without NaN and infinities.
+
+    Raises:
+        ExportError: an entry is not finite.
+    """
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        raise ExportError(
+            f"{name} is not finite", where=where, found=f"{values[bad[0]]} at entry {bad[0]}"
+        )
+
+
+def require_bounds(name: str, lower: Float, upper: Float, where: object) -> None:
+    """Bounds that some number satisfies.
+
+    Args:
+        name: "x" or "g".
+        lower: (n,) lower bounds.
+        upper: (n,) upper bounds.
+        where: File, for messages.
+
+    Raises:
+        ExportError: one is NaN, a lower one is +inf, an upper one -inf, or they cross.
+    """
+    # written so that NaN is bad
+    good = (lower <= upper) & (lower < np.inf) & (upper > -np.inf)
+    bad = np.flatnonzero(~good)
+    if len(bad):
+        k = int(bad[0])
+        raise ExportError(
+            f"bounds of {name} hold for no number",
+            where=where,
+            found=f"[{lower[k]}, {upper[k]}] at entry {k}",
+            expected=f"lb{name} <= ub{name}",
+        )
+
+
+def require_names(name: str, names: Sequence[str] | None, size: int, where: object) -> None:
+    """A name for everything, each a line of its own.
+
+    Raises:
+        ExportError: there are too few or too many, or one is empty or has a line break.
+    """
+    if names is None:
+        return
+    if len(names) != size:
+        raise ExportError(
+            f"{name} are not as many as there is to name",
+            where=where,
+            found=len(names),
+            expected=size,
+        )
+    for word in names:
+        if not isinstance(word, str) or len(word.splitlines()) != 1 or not word.strip():
+            raise ExportError(f"one of {name} is no name", where=where, found=repr(word)[:60])

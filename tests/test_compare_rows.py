@@ -1,0 +1,200 @@
+"""Rows of the comparison: what is no answer, what is late, and which problem a row is of."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_model import PAPER, Tiny
+from test_compare import LABEL, MANY, PROBLEMS, ROWS, row
+
+from soup_nlp.cases import Case, prepare
+from soup_nlp.cli import main
+from soup_nlp.compare.isolate import isolated
+from soup_nlp.compare.profile import cost_table, draw_curves, draw_profiles, problem_names
+from soup_nlp.compare.report import by_run, conclusion, page
+from soup_nlp.compare.runner import compare
+from soup_nlp.compare.solvers import executable, find_solver, yardstick
+from soup_nlp.compare.task import Answer, Limits, Task
+from soup_nlp.compare.verify import examine, violations
+from soup_nlp.config import Problem
+from soup_nlp.errors import DataError, SolverError
+from soup_nlp.export.sol import write_sol
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.solve.yardstick import levenberg_marquardt
+
+SMALL = [
+    "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",
+    "--set", "segmentation.neighbours=4", "--set", "energy.pixel_samples=4",
+]  # fmt: skip
+
+
+def make_task(folder: Path, **form: str) -> Task:
+    tiny = Tiny(neighbours=2, samples=3, boundary_samples=1)
+    style = Formulation(hessian="exact", eps=1.0, eps_pixel=1.0, compiled=False, **form)
+    nlp, layout = tiny.nlp(PAPER, style)
+    limits = Limits(seconds=20, iterations=200, tol=1e-5)
+    return Task(nlp, nlp, layout, tiny.soup, tiny.data, PAPER, style, limits, folder)
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory) -> Task:
+    return make_task(tmp_path_factory.mktemp("task"))
+
+
+def run(task: Task, names: list[str], folder: Path) -> list[dict]:
+    made = [(LABEL, lambda where: replace(task, folder=where))]
+    return compare(made, names, task.limits, folder / "r.jsonl", folder / "s", lambda line: None)
+
+
+def program(folder: Path, text: str) -> Path:
+    path = folder / "my solver"
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return path
+
+
+# --- answers -------------------------------------------------------------------------------------
+
+
+def test_the_start_is_not_the_answer_of_a_solver_that_gave_none(task, tmp_path):
+    mine = program(tmp_path, "exec sleep 30")
+    (found,) = run(replace(task, limits=replace(task.limits, seconds=1.0)), [str(mine)], tmp_path)
+    assert found["status"] == "over the time limit: Time_Limit"
+    assert not found["claimed"]
+    assert not {"energy", "primal", "dual", "complementarity"} & set(found)
+    assert not any("lowest exact energy" in line for line in conclusion([found]))
+    assert "| - | - | - | - |" in page([found]).replace(f"{found['energy_start']:.6g}", "-")
+
+
+def test_a_solver_named_by_its_path_has_a_folder_of_its_own(task, tmp_path, monkeypatch):
+    mine = program(tmp_path, "exit 3")
+    monkeypatch.chdir(tmp_path)
+    for name in (str(mine), f"./{mine.name}"):
+        (found,) = run(task, [name], tmp_path / str(len(name)))
+        assert found["solver"] == name
+        assert found["how"] == "raised"
+        assert found["status"] == "SolverError: solver wrote no .sol, found exit 3"
+    # nothing of the runs beside the program
+    assert not list(tmp_path.glob("*.pickle"))
+
+
+def test_an_old_answer_is_not_read_again(task, tmp_path):
+    here = replace(task, folder=tmp_path)
+    order = np.arange(task.nlp.nx), np.arange(task.nlp.ng)
+    write_sol(tmp_path / "soup.sol", task.nlp.x0, None, *order, "earlier", 0)
+    with pytest.raises(SolverError, match="wrote no"):
+        executable(str(program(tmp_path, "exit 0")), here)
+
+
+def test_a_solver_that_is_asked_for_twice_runs_once(task, tmp_path, monkeypatch):
+    calls = []
+
+    def find(name: str) -> Callable[[Task], Answer]:
+        calls.append(name)
+        return lambda given: Answer(given.nlp.x0, None, "start", False, 0, 0.1)
+
+    monkeypatch.setattr("soup_nlp.compare.runner.find_solver", find)
+    assert len(run(task, ["a", "a"], tmp_path)) == 1
+    assert calls == ["a"]
+
+
+def test_a_claim_after_the_limit_is_not_within_it(task, tmp_path, monkeypatch):
+    exact = find_solver("ipopt-tuned")(replace(task, folder=tmp_path))
+    rows = []
+    for seconds in (19.0, 21.0):
+        answer = replace(exact, seconds=seconds)
+        monkeypatch.setattr("soup_nlp.compare.runner.find_solver", lambda n, a=answer: lambda t: a)
+        rows += run(task, ["slow"], tmp_path / str(seconds))
+    assert [r["verified"] for r in rows] == [True, False]
+    assert [r["claimed"] for r in rows] == [True, False]
+    assert rows[1]["status"].startswith("over the time limit")
+
+
+@pytest.mark.parametrize(
+    "form", [{"norm": "epigraph"}, {"norm": "epigraph", "truncation": "lifted"}]
+)
+def test_a_yardstick_hands_back_a_point_of_the_epigraph_form(form, tmp_path):
+    task = make_task(tmp_path, **form)
+    task = replace(task, limits=replace(task.limits, seconds=2.0))
+    x = yardstick(levenberg_marquardt, task).x
+    assert x is not None
+    size = task.layout.size
+    assert np.abs(x[size:] - task.nlp.x0[size:]).max() > 1e-3
+    assert violations(task.nlp, x)["rows"].max() < 1e-6
+    # with the slack variables of the start it is off the constraints
+    stale = np.concatenate([x[:size], task.nlp.x0[size:]])
+    assert violations(task.nlp, stale)["rows"].max() > 1e-3
+    assert examine(task.nlp, x, None).residuals.primal < 1e-6
+
+
+def test_the_reason_of_a_failure_is_kept(tmp_path):
+    def bad() -> None:
+        raise SolverError("no licence", where="server", found="expired", hint="ask for one")
+
+    assert isolated(bad, tmp_path, 20, MANY).value == "SolverError: no licence, found expired"
+
+
+# --- problems ------------------------------------------------------------------------------------
+
+
+def test_problems_are_told_apart_where_they_differ():
+    loose = row("a", "one", 0.5, 8.0) | {"limits": row("a", "", 0, 0)["limits"] | {"tol": 1e-2}}
+    far = row("a", "two", 9.0, 2.0) | {"start": "proposal"}
+    other = row("b", "two", 9.0, 2.0) | {"problem_hash": "1"}
+    rows = [*ROWS, loose, far, other]
+    problems, _, cost = cost_table(rows, "time")
+    assert len(problems) == 5
+    # a looser run is not the quickest on the problem of the others
+    assert np.sort(cost[:, 0]).tolist()[:3] == [0.5, 1.0, 6.0]
+    assert list(problem_names(rows).values()) == [
+        "a (from the presolve, tol 0.0001)",
+        "a (from the presolve, tol 0.01)",
+        "a (from the proposal, tol 0.0001)",
+        "b (0)",
+        "b (1)",
+    ]
+    assert "**5 problems" in page(rows)
+    assert any(line.startswith("| a (from the proposal, tol 0.0001) | 10 | f |")
+               for line in by_run(rows))  # fmt: skip
+    # nothing to tell apart, nothing told
+    assert list(problem_names(ROWS).values()) == ["a", "b"]
+
+
+def test_pictures_of_nothing_verified_say_nothing(tmp_path):
+    failed = [row("a", "one", 1.0, 2.0, False) | {"curve": []}]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        draw_profiles(tmp_path / "p.png", failed)
+        draw_curves(tmp_path / "c.png", failed)
+
+
+def test_files_are_read_before_anything_runs(tmp_path, capsys):
+    words = ["-o", str(tmp_path), "--solvers", "lm,lm", "--seconds", "5", *SMALL]
+    orbit = str(PROBLEMS / "orbit.yaml")
+    assert main(["compare", orbit, "orbitt.yaml", "--superpixels", "9", *words]) == 2
+    assert main(["compare", orbit, "--superpixels", "9", "--superpixels", "0", *words]) == 2
+    assert "superpixels" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_input_that_cannot_be_used_leaves_the_others_page(tmp_path, monkeypatch, capsys):
+    calls = []
+
+    def second_fails(problem: Problem, presolve: bool) -> Case:
+        calls.append(problem)
+        if len(calls) == 2:
+            raise DataError("image is gone")
+        return prepare(problem, presolve)
+
+    monkeypatch.setattr("soup_nlp.comparing.prepare", second_fails)
+    orbit = str(PROBLEMS / "orbit.yaml")
+    words = ["--superpixels", "9", "--solvers", "lm,lm", "--seconds", "5", "--no-presolve"]
+    out = tmp_path / "out"
+    assert main(["compare", orbit, orbit, "-o", str(out), *words, *SMALL]) == 2
+    assert "1 runs" in (out / "README.md").read_text()
+    assert "image is gone" in capsys.readouterr().err

@@ -1,0 +1,64 @@
+"""Flow that tells nothing of depth, or nothing at all: the start says so and reproduces it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soup_nlp.data.flow_check import confidence_of, round_trip_error
+from soup_nlp.data.pair import Flow
+from soup_nlp.geometry import camera
+from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.model import plain
+from soup_nlp.model.energy import Weights, build_energy_data
+from soup_nlp.start.bodies import bodies
+from soup_nlp.start.propose import propose
+
+K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
+
+
+@pytest.fixture(scope="module")
+def tiles():
+    v, u = np.mgrid[0:120, 0:160]
+    labels = (v // 20 * 8 + u // 20).astype(np.int32)
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+    return build_segmentation(labels, noise, neighbours=6)
+
+
+def turned(angle: float) -> np.ndarray:
+    """Flow of a camera that turns about its vertical axis, pixels."""
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    uv = camera.pixel_grid(120, 160)
+    return camera.project(K, camera.rays(K, uv) @ R.T) - uv
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.02])
+def test_a_start_without_parallax_borrows_everything_and_keeps_to_the_flow(tiles, angle):
+    flow = Flow(turned(angle).astype(np.float32), np.ones((120, 160), np.float32), "turn")
+    start = propose(tiles, flow, K, K)
+    assert start.borrowed.all()
+    data = build_energy_data(tiles, flow, K, K)
+    error = plain.reprojection(start.soup, data, Weights())
+    assert error.max() < 1e-3
+    np.testing.assert_allclose(error, start.error, atol=1e-3)
+
+
+def test_pieces_are_numbered_after_the_motions_that_are_shared(tiles):
+    n = len(tiles)
+    own = np.full(n, -1)
+    np.testing.assert_array_equal(bodies(own, tiles), np.zeros(n))
+    left = tiles.anchors[:, 0] < 50
+    split = np.where(left, -1, 2)
+    np.testing.assert_array_equal(bodies(split, tiles), np.where(left, 3, 2))
+    middle = abs(tiles.anchors[:, 0] - 80) < 15
+    assert set(bodies(np.where(middle, 0, -1), tiles)) == {0, 1, 2}
+
+
+def test_one_pixel_without_a_way_back_costs_its_own_neighbourhood_alone():
+    forward, backward = np.zeros((2, 40, 60, 2), np.float32)
+    backward[20, 30] = np.nan
+    gap = round_trip_error(forward, backward)
+    assert np.isinf(gap[20, 30])
+    assert not np.isnan(gap).any()
+    assert (confidence_of(gap, support=5) == 1).mean() > 0.98

@@ -1,0 +1,144 @@
+"""Numbers of the refinement that its rounds would forgive: each is compared with what it means."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_model import Tiny, weights_for
+from test_refine import FEW, Planar
+
+from soup_nlp.geometry import rotation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model import plain
+from soup_nlp.mrf.trws import mrf_energy
+from soup_nlp.refine import mppbp
+from soup_nlp.refine.costs import PairCosts, Particles
+from soup_nlp.refine.local import Local, fit_motion, neighbours
+from soup_nlp.refine.mppbp import SHARES, RefineOptions, refine_soup
+from soup_nlp.refine.particles import KINDS, Proposer
+from soup_nlp.refine.select import upright
+
+
+def test_the_mrf_follows_the_exact_energy_when_the_length_unit_changes():
+    """In the paper's units every depth changes the unit of all: its price is in the unary costs."""
+    tiny = Tiny(samples=6)
+    weights = weights_for("paper", truncated=False)
+    best = tiny.soup.normalised(tiny.data.share).retracted()
+    pair_costs = PairCosts(tiny.data, weights)
+    now = Particles.of(best)
+    h = 1e-4
+    # particle 1: plane and translation grow together, and with them the unit
+    p = now.joined(Particles(now.n, (1 + h) * now.D, now.R, (1 + h) * now.T))
+    unary, pairwise = mppbp._costs(best, p, tiny.data, weights, pair_costs, RefineOptions())
+    slope = mppbp.length_slope(best, tiny.data, weights)
+    for chosen in ([0], [3, 7], range(6), range(len(best))):
+        labels = np.zeros(len(best), np.int64)
+        labels[list(chosen)] = 1
+        mrf = [
+            mrf_energy(x, unary, pair_costs.edges, np.asarray(pairwise, float))
+            for x in (0 * labels, labels)
+        ]
+        exact = [
+            plain.energy(p.soup(x, tiny.data.share).retracted(), tiny.data, weights)["total"]
+            for x in (0 * labels, labels)
+        ]
+        share = float(np.sum((tiny.data.share * best.distance)[list(chosen)]))
+        unit = share / float(np.sum(tiny.data.share * best.distance))
+        # to first order; what the unit adds is much more than what is neglected
+        assert abs(np.diff(mrf)[0] - np.diff(exact)[0]) < 0.02 * abs(slope * h * unit)
+
+
+def test_what_is_accepted_is_proposed_more_and_nothing_is_given_up():
+    tiny = Tiny("pixels")
+    proposer = Proposer(tiny.data, neighbours(tiny.data.edges, tiny.data.anchor_ray), 0)
+    kinds = list(SHARES)
+    drawn = proposer.propose(tiny.soup, {"walk_scale": 2, "walk_plane": 2})
+    labels = np.zeros(len(tiny.soup), np.int64)
+    shares = dict(SHARES)
+    done = mppbp.Round(
+        *({"total": 1.0}, 0.0, 0.0, 1, "gap", 0, True, 12),
+        proposed=dict.fromkeys(KINDS, 100),
+        accepted={k: 50 if k == "walk_scale" else 1 for k in KINDS},
+        seconds=0.0,
+    )
+    for _ in range(20):
+        mppbp._learn(proposer, shares, drawn, labels, done)
+    assert shares["walk_scale"] > 1.2 * SHARES["walk_scale"]
+    for k in kinds:
+        if k != "walk_scale":
+            assert 0.4 * SHARES[k] < shares[k] < 0.9 * SHARES[k], k
+    # where nothing at all is accepted nothing is learnt
+    before = dict(shares)
+    none = replace(done, accepted=dict.fromkeys(KINDS, 0))
+    mppbp._learn(proposer, shares, drawn, labels, none)
+    assert shares == before
+
+
+def test_only_slow_rounds_in_a_row_end_the_refinement(monkeypatch):
+    """A slow round, a fast one, two slow ones: it ends after the fourth."""
+    tiny = Tiny("pixels", samples=6)
+    totals = iter([100.0, 99.99, 50.0, 49.99, 49.98, 10.0, 5.0])
+    monkeypatch.setattr(
+        mppbp.plain, "energy", lambda *a: {"total": next(totals), "proj": 0.0, "arap": 0.0}
+    )
+    o = replace(FEW, rounds=6, stagnation=1e-2, particles=4, trws_iterations=1)
+    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o)
+    assert done.status == "stagnated"
+    assert [r.energy["total"] for r in done.rounds] == [99.99, 50.0, 49.99, 49.98]
+
+
+def test_a_refit_under_the_true_motion_finds_the_true_slope():
+    scene = Planar()
+    truth, data = scene.truth, scene.data
+    n = len(truth)
+    now = Local.of(truth, data.anchor_ray)
+    # planes parallel to the image at the true depth, true motion
+    flat = Local(now.Z, 0 * now.g, now.R, now.T).particles(data.anchor_ray)
+    soup = Soup(np.ones(n), flat.n[:, 0], flat.D[:, 0], flat.R[:, 0], flat.T[:, 0])
+    proposer = Proposer(data, neighbours(data.edges, data.anchor_ray), 0)
+    p = proposer.propose(soup, {"own_refit": 1}).particles
+    was, found = (
+        np.degrees(np.arccos(np.clip(np.sum(v * truth.n, axis=1), -1, 1)))
+        for v in (soup.n, p.n[:, 0])
+    )
+    assert np.median(was) > 12
+    assert np.median(found) < 0.4 * np.median(was)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_motion_of_exact_points_is_found_in_a_few_steps(seed):
+    rng = np.random.default_rng(seed)
+    X = rng.uniform([-1, -1, 2], [1, 1, 4], (60, 3))
+    begin = rotation.exp([0.2, -0.1, 0.8])
+    R, T = rotation.exp([0.03, -0.02, 0.05]) @ begin, np.array([0.1, -0.05, 0.2])
+    Y = X @ R.T + T
+    R1, T1 = fit_motion(begin, np.zeros(3), X, Y / Y[:, 2:], np.ones(60), 500.0)
+    assert np.abs(R1 - R).max() < 1e-6
+    assert np.abs(T1 - T).max() < 1e-6
+
+
+def test_a_plane_is_tilted_no_further_than_it_must_be():
+    """It keeps nearly all of the slope that visibility allows, and the depth at its anchor."""
+    tiny = Tiny("pixels")
+    data = tiny.data
+    rays = data.visibility_ray(5.0)
+    now = Local.of(tiny.soup, data.anchor_ray)
+    steep = np.tile([4.0, -3.0], (len(tiny.soup), 1, 1)) / data.radius[:, None, None]
+    p = Local(now.Z, steep, now.R, now.T).particles(data.anchor_ray)
+    made = Soup(np.ones(len(tiny.soup)), p.n[:, 0], p.D[:, 0], tiny.soup.R, tiny.soup.translation)
+
+    def facing(soup: Soup) -> np.ndarray:
+        return -np.einsum("nc,nvc->nv", soup.n, rays).max(axis=1)
+
+    assert (facing(made) < 0).all()
+    done = upright(made, data.anchor_ray, rays, 1e-3)
+    assert (facing(done) >= 1e-3 - 1e-6).all()
+    after = Local.of(done, data.anchor_ray)
+    np.testing.assert_allclose(after.Z, now.Z, rtol=1e-12)
+    kept = after.g[:, 0] / steep[:, 0]
+    np.testing.assert_allclose(kept[:, 0], kept[:, 1], rtol=1e-9)
+    assert (kept > 0.01).all()
+    more = Local(after.Z, after.g / 0.7, now.R, now.T).particles(data.anchor_ray)
+    assert (facing(replace(made, n=more.n[:, 0])) < 1e-3).all()

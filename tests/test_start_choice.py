@@ -1,0 +1,265 @@
+"""Who takes which motion, by made-up errors: what is asked of a motion, a body, a neighbour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from helpers_model import motion, plane_pose, plane_world
+
+from soup_nlp.data.pair import Flow
+from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.superpixels import segment
+from soup_nlp.start import choice as choosing
+from soup_nlp.start import gather as gathering
+from soup_nlp.start.bodies import borrow, contact_scales, depth_from_inside
+from soup_nlp.start.choice import Choice, of_neighbourhoods, of_pieces, select
+from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.planes import PlaneFit
+from soup_nlp.start.propose import StartOptions, propose
+
+OPTIONS = StartOptions()
+PER_RADIAN = 10.0
+"""Pixels of error by which a motion misses, per radian of its turn."""
+
+
+def cells(rows: int, columns: int) -> Segmentation:
+    """Squares of 8 pixels."""
+    v, u = np.mgrid[0 : 8 * rows, 0 : 8 * columns]
+    labels = (v // 8 * columns + u // 8).astype(np.int32)
+    return build_segmentation(labels, np.zeros((*v.shape, 3), np.uint8), neighbours=4)
+
+
+@dataclass
+class Turns:
+    """Stands for views where superpixels turn about the optical axis by known angles (N,)."""
+
+    true: np.ndarray
+    weight: np.ndarray | None = None
+    focal: tuple[float, float] = (100.0, 100.0)
+
+    def __post_init__(self) -> None:
+        n = len(self.true)
+        self.ray = self.target = np.zeros((n, 4, 3))
+        self.weight = np.ones((n, 4)) if self.weight is None else self.weight
+
+    def fit_own(self, R: np.ndarray, t: np.ndarray) -> PlaneFit:
+        miss = PER_RADIAN * np.abs(rotation.log(R)[..., 2] - self.true[:, None])
+        one = np.ones(miss.shape)
+        return PlaneFit(one, np.zeros((*miss.shape, 2)), miss, one)
+
+    def fit(self, motions: list[Motion]) -> PlaneFit:
+        R = np.stack([m.R for m in motions])
+        return self.fit_own(np.broadcast_to(R, (len(self.true), *R.shape)), np.zeros(3))
+
+    def some(self, at: np.ndarray) -> Turns:
+        return Turns(self.true[at])
+
+
+def turn(angle: float | np.ndarray) -> np.ndarray:
+    return rotation.exp(np.asarray(angle)[..., None] * np.array([0.0, 0.0, 1.0]))
+
+
+def taken(views: Turns, angle: np.ndarray, label: np.ndarray) -> Choice:
+    """Superpixels that turn by angles (N,)."""
+    R, t = turn(angle), np.tile([1.0, 0.0, 0.0], (len(angle), 1))
+    return Choice(R, t, views.fit_own(R[:, None], t[:, None]), label)
+
+
+# --- motions that are worth having ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("missing", [0, 1])
+def test_a_motion_is_kept_for_as_many_superpixels_as_make_a_piece(missing):
+    own = np.arange(30) < OPTIONS.piece_size - missing
+    cost = np.where(np.stack([own, ~own], axis=1), 2.0, 0.0)
+    assert select(cost, 0.05, OPTIONS) == ([0] if missing else [0, 1])
+
+
+@pytest.mark.parametrize(("confidence", "found"), [(1.0, True), (0.1, False)])
+def test_pieces_whose_flow_is_not_trusted_have_no_motion_of_their_own(
+    monkeypatch, confidence, found
+):
+    seg = cells(4, 6)
+    odd = seg.anchors[:, 0] > 24
+    views = Turns(np.zeros(24), np.where(odd[:, None], confidence, 1.0) * np.ones((24, 4)))
+    monkeypatch.setattr(choosing, "estimate", lambda *a: Motion(np.eye(3), np.array([0, 1.0, 0])))
+    monkeypatch.setattr(choosing, "fit_translation", lambda *a: np.array([[1.0, 0, 0]]))
+    cost = np.where(odd, 3.0, 0.0)[:, None]
+    main = [Motion(np.eye(3), np.array([1.0, 0, 0]))]
+    assert bool(of_pieces(views, seg, main, cost, 0.05, OPTIONS)) == found
+
+
+def test_a_motion_that_pays_goes_from_neighbour_to_neighbour(monkeypatch):
+    seg = cells(2, 12)
+    monkeypatch.setattr(choosing, "fit_translation", lambda R, *a: np.tile([1.0, 0, 0], (24, 1)))
+    monkeypatch.setattr(choosing, "refine_motion", lambda R, t, *a: (R, t))
+    first = np.arange(24) == 0
+    before = taken(Turns(np.zeros(24)), np.where(first, 0.0, 0.3), np.where(first, 0, 1))
+    count = []
+    for rounds in (0, 1, 3):
+        o = replace(OPTIONS, rounds=rounds)
+        after = of_neighbourhoods(Turns(np.zeros(24)), seg, before, 0.05, o)
+        np.testing.assert_array_equal(after.label == 0, after.error < 1e-9)
+        count.append(int((after.label == 0).sum()))
+    assert count[0] == 1
+    assert 1 < count[1] < count[2] < 24
+
+
+# --- bodies --------------------------------------------------------------------------------------
+
+
+def torn(seg: Segmentation, own: np.ndarray) -> np.ndarray:
+    """(P,) whether two neighbours lie on both sides of an outline."""
+    i, k = seg.pairs.T
+    return own[i] != own[k]
+
+
+def offered(monkeypatch, *angles: float) -> None:
+    """Let these motions be what superpixels may share."""
+    R, t = turn(np.array(angles)), np.tile([1.0, 0.0, 0.0], (len(angles), 1))
+    monkeypatch.setattr(gathering, "_candidates", lambda *a: (R, t))
+
+
+@pytest.mark.parametrize("enough", [True, False])
+def test_a_motion_that_many_of_a_body_contradict_is_not_the_bodys(monkeypatch, enough):
+    seg = cells(6, 10)
+    column = (seg.anchors[:, 0] // 8).astype(int)
+    body = column >= 6
+    agree = np.flatnonzero(body)
+    needed = int(np.ceil(gathering.AGREE * len(agree)))
+    agree = agree[: needed + 1 if enough else needed - 1]
+    true = np.where(body, 0.5, 0.0)
+    true[agree] = 0.2
+    views = Turns(true)
+    # everyone explains its own flow, with motions of its own
+    before = taken(views, true, np.where(body, -1, 0))
+    offered(monkeypatch, 0.2)
+    jump = np.where(torn(seg, body), 10.0, 0.0)
+    after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
+    assert (after.label[~body] == 0).all()
+    if enough:
+        assert (after.label[agree] > 0).all()
+        assert len(np.unique(after.label[agree])) == 1
+    else:
+        assert (after.label[body] == -1).all()
+
+
+def test_bodies_that_hang_together_by_a_small_tear_are_parted_there(monkeypatch):
+    """No motion explains both: the smaller jump between them is the outline then."""
+    seg = cells(6, 10)
+    column = (seg.anchors[:, 0] // 8).astype(int)
+    body = np.where(column >= 8, 2, np.where(column >= 6, 1, 0))
+    true = np.array([0.0, 0.3, -0.3])[body]
+    views = Turns(true)
+    before = taken(views, true + 0.02, np.where(body > 0, -1, 0))
+    offered(monkeypatch, 0.3, -0.3)
+    least, most = gathering.TEARS[-1], gathering.TEARS[0]
+    assert least < most
+    between = 0.5 * (least + most) * OPTIONS.tear_px
+    jump = np.where(torn(seg, body), between, 0.0)
+    jump[torn(seg, body > 0)] = 10.0
+    after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
+    for b in (1, 2):
+        assert len(np.unique(after.label[body == b])) == 1
+        assert after.error[body == b].max() < 1e-9
+        assert (after.label[body == b] > 0).all()
+    assert len(np.unique(after.label)) == 3
+
+
+def test_one_of_a_body_goes_with_its_neighbours():
+    """Alone it would rather have the main motion, by less than its outline costs."""
+    seg = cells(4, 9)
+    right = seg.anchors[:, 0] > 48
+    odd = np.argmax(seg.anchors @ [1.0, 0.1])
+    assert right[odd]
+    true = np.where(right, 0.2, 0.0)
+    true[odd] = 0.09
+    views = Turns(true)
+    label = np.where(right, 1, 0)
+    label[odd] = 0
+    before = taken(views, np.where(label == 1, 0.2, 0.0), label)
+    jump = np.where(torn(seg, right), 10.0, 0.0)
+    after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
+    np.testing.assert_array_equal(after.label, right)
+
+
+def test_between_motions_that_explain_the_same_the_main_one_is_taken():
+    seg = cells(4, 9)
+    right = seg.anchors[:, 0] > 48
+    # the other is better by a fifth of what would count as unexplained
+    middle = 0.1 + 0.1 * OPTIONS.unexplained_px / PER_RADIAN
+    views = Turns(np.where(right, middle, 0.0))
+    before = taken(views, np.where(right, 0.2, 0.0), right.astype(int))
+    jump = np.full(len(seg.pairs), 10.0)
+    after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
+    assert (after.label == 0).all()
+    # where it is clearly better it stays
+    views = Turns(np.where(right, 0.12, 0.0))
+    before = taken(views, np.where(right, 0.2, 0.0), right.astype(int))
+    after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
+    np.testing.assert_array_equal(after.label, right)
+
+
+# --- depths --------------------------------------------------------------------------------------
+
+
+def test_one_wild_neighbour_does_not_decide_a_borrowed_depth():
+    seg = cells(3, 3)
+    mu = np.full(9, 0.5)
+    mu[1], mu[4] = 50.0, 0.01
+    weak = np.arange(9) == 4
+    for wild in (50.0, 1e-3):
+        mu[1] = wild
+        new, _, _ = borrow(mu, np.zeros((9, 2)), np.zeros(9, int), weak, seg)
+        assert new[4] == 0.5
+        np.testing.assert_array_equal(new[~weak], mu[~weak])
+
+
+def facing(z: np.ndarray) -> Soup:
+    """Fronto-parallel planes at depths z (N,)."""
+    n = len(z)
+    still = np.tile(np.eye(3), (n, 1, 1))
+    return Soup(np.full(n, 1 / n), np.tile([0, 0, -1.0], (n, 1)), n * z, still, np.ones((n, 3)))
+
+
+K = camera.intrinsics(50.0, 50.0, 27.5, 19.5)
+
+
+def test_of_the_planes_behind_an_outline_one_wild_one_does_not_decide():
+    seg = cells(3, 3)
+    label = (np.arange(9) == 1).astype(int)
+    z = np.full(9, 4.0)
+    # the body is in the middle of the top row; behind the cell below it are three others
+    z[1], z[4], z[5] = 1.0, 2.0, 40.0
+    i, k = seg.pairs.T
+    across = seg.pairs[label[i] != label[k]]
+    depth = depth_from_inside(facing(z), label, seg, K)
+    below = np.flatnonzero((across == [1, 4]).all(axis=1))
+    assert below.size == 1
+    np.testing.assert_allclose(depth[:, below[0]], [1.0, 4.0], rtol=1e-12)
+
+
+def test_what_is_lowest_in_a_body_places_it():
+    """Two wheels stand on the ground; the wider gap between them shows something nearer."""
+    gap = [9.0, 1, 1.2, 1.2, 1.2, 1, 9]
+    ground = [2.0, 2, 1.2, 1.2, 1.2, 2, 2]
+    z = np.array([[9.0] * 7, [9, 1, 1, 1, 1, 1, 9], gap, ground, ground])
+    own = z == 1
+    found = contact_scales(facing(z.ravel()), own.ravel().astype(int), cells(5, 7), K)
+    np.testing.assert_allclose(found.reshape(z.shape), np.where(own, 2.0, 1.0), rtol=1e-12)
+
+
+def test_superpixels_of_hardly_any_confidence_borrow():
+    """Their flow is right here, but nothing says so."""
+    move = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
+    pair = plane_world(plane_pose(3.0, yaw=20), move, 96, 72)
+    seg = build_segmentation(segment(pair.image_ref, 30, "grid"), pair.image_ref, neighbours=8)
+    faint = np.isin(np.arange(len(seg)), [8, 9, 20])
+    confidence = np.where(faint[seg.labels], 0.01, 1.0)
+    start = propose(seg, Flow(pair.flow.uv, confidence, "test"), pair.K_ref, pair.K_next)
+    assert start.borrowed[faint].all()
+    assert start.borrowed[~faint].mean() < 0.2

@@ -1,0 +1,191 @@
+"""Formulas of the start on exact rays: motions, planes, borrowed depths and affine flows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soup_nlp.geometry import rotation
+from soup_nlp.start import epipolar
+from soup_nlp.start.bending import _affine, constant_depth
+from soup_nlp.start.epipolar import Motion, estimate, sampson
+from soup_nlp.start.local import fit_translation, refine_motion
+from soup_nlp.start.planes import PlaneFit, Views
+
+FOCAL = 200.0
+TURN, SHIFT = np.array([0.02, -0.03, 0.01]), np.array([0.5, 0.1, 0.2])
+
+
+def rigid(count: int, seed: int = 0, shift: np.ndarray = SHIFT) -> tuple[Motion, np.ndarray, ...]:
+    """A motion and the rays of points at depths 2 to 6 in both frames, exact."""
+    rng = np.random.default_rng(seed)
+    r = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), np.ones(count)])
+    m = Motion(rotation.exp(TURN), shift / np.linalg.norm(shift))
+    Y = rng.uniform(2, 6, (count, 1)) * r @ m.R.T + m.t
+    return m, r, Y / Y[:, 2:]
+
+
+def off(m: Motion, R: np.ndarray, t: np.ndarray) -> tuple[float, float]:
+    """Angles in radians between motions, of rotation and of translation."""
+    turn = float(np.linalg.norm(rotation.log(m.R.T @ R)))
+    return turn, float(np.arctan2(np.linalg.norm(np.cross(m.t, t)), m.t @ t))
+
+
+def perturbed(m: Motion, turn: float, tilt: float, seed: int = 1) -> Motion:
+    """Off by so many radians."""
+    a, b = np.random.default_rng(seed).normal(size=(2, 3))
+    side = np.cross(m.t, b)
+    t = np.cos(tilt) * m.t + np.sin(tilt) * side / np.linalg.norm(side)
+    return Motion(rotation.exp(turn * a / np.linalg.norm(a)) @ m.R, t)
+
+
+# --- motions of neighbourhoods -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_refinement_finds_the_motion_of_exact_rays(seed):
+    m, r, q = rigid(200, seed)
+    begin = perturbed(m, 0.009, 0.05, seed)
+    R, t = refine_motion(
+        begin.R[None], begin.t[None], r[None], q[None], np.ones((1, 200)), FOCAL, 0.1
+    )
+    turn, tilt = off(m, R[0], t[0])
+    assert turn < 2e-5
+    assert tilt < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("wrong", "priors", "weight"),
+    [((0.01, 0.0), (1e-4, 1e-6), 10.0), ((0.0, 0.05), (1e-6, 1e-3), 0.1)],
+)
+def test_a_prior_holds_what_the_pixels_hardly_determine(wrong, priors, weight):
+    """It pulls towards where the refinement began, however many steps are made."""
+    m, r, q = rigid(200)
+    begin = perturbed(m, *wrong)
+    moved = []
+    for rounds in (30, 600):
+        R, t = refine_motion(
+            *(begin.R[None], begin.t[None], r[None], q[None], np.full((1, 200), weight)),
+            *(FOCAL, 5.0, *priors, rounds),
+        )
+        moved.append(sum(off(begin, R[0], t[0])) / sum(wrong))
+    # the pixels' pull is there, and is not added up
+    assert 1e-4 < moved[1] < 0.2
+    assert moved[1] == pytest.approx(moved[0], rel=0.1)
+
+
+def test_translations_are_weighed_in_pixels_not_in_algebraic_distances():
+    """Near a forward epipole a pixel of noise is a small algebraic distance, far from it a large.
+
+    Weighed by it, the few pixels far away would decide alone.
+    """
+    rng = np.random.default_rng(0)
+    m, r, _ = rigid(60, shift=np.array([0.05, 0.0, 1.0]))
+    r[:55, :2] *= 0.1
+    Y = 3.0 * r @ m.R.T + m.t
+    many = 300
+    noisy = np.tile(Y / Y[:, 2:], (many, 1, 1))
+    noisy[..., :2] += rng.normal(0, 0.1 / FOCAL, (many, 60, 2))
+    R, rs = np.tile(m.R, (many, 1, 1)), np.tile(r, (many, 1, 1))
+    t = fit_translation(R, rs, noisy, np.ones((many, 60)), FOCAL, 0.1)
+    normal = np.cross(rs @ m.R.T, noisy)
+    plain = np.linalg.eigh(normal.transpose(0, 2, 1) @ normal)[1][:, :, 0]
+    plain *= np.sign(plain @ m.t)[:, None]
+    error, algebraic = (np.median([off(m, m.R, v)[1] for v in ts]) for ts in (t, plain))
+    assert error < 0.7 * algebraic
+
+
+def test_a_translation_puts_points_in_front():
+    for sign in (1.0, -1.0):
+        m, r, q = rigid(40, shift=sign * SHIFT)
+        t = fit_translation(m.R[None], r[None], q[None], np.ones((1, 40)), FOCAL, 0.1)
+        assert off(m, m.R, t[0])[1] < 1e-6
+
+
+# --- motions of the whole image ------------------------------------------------------------------
+
+
+def test_what_is_not_confident_does_not_bend_a_motion():
+    """Errors of half a pixel are within the noise: only confidence can tell them from the rest."""
+    m, r, q = rigid(200)
+    wrong = np.arange(200) % 2 == 0
+    q = q + np.where(wrong[:, None], [0.0, 0.5 / FOCAL, 0.0], 0.0)
+    weight = np.where(wrong, 1e-12, 1.0)
+    found = epipolar.refine(perturbed(m, 0.002, 0.01), r, q, weight, FOCAL)
+    turn, tilt = off(m, found.R, found.t)
+    assert turn < 1e-6
+    assert tilt < 1e-5
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_of_stacked_essential_matrices_the_one_that_explains_most_is_taken(monkeypatch, place):
+    m, r, q = rigid(100)
+    others = [perturbed(m, 0.3, 0.8, seed).essential() for seed in (5, 6)]
+    stack = np.concatenate(np.insert(np.stack(others), place, m.essential(), axis=0))
+    monkeypatch.setattr(epipolar.cv2, "findEssentialMat", lambda *a, **k: (stack, None))
+    monkeypatch.setattr(epipolar, "refine", lambda motion, *a: motion)
+    found = estimate(r, q, np.ones(100), FOCAL)
+    assert found is not None
+    assert np.abs(sampson(found.essential(), r, q, FOCAL)).max() < 1e-6
+    assert max(off(m, found.R, found.t)) < 1e-6
+
+
+# --- planes --------------------------------------------------------------------------------------
+
+
+def test_a_plane_behind_the_camera_costs_more_than_its_error():
+    mu = np.array([[0.5, -0.01, -0.5, 0.0]])
+    fit = PlaneFit(mu, np.zeros((1, 4, 2)), np.full((1, 4), 0.2), np.full((1, 4), 10.0))
+    cost = fit.penalised()[0]
+    assert cost[0] == 0.2
+    assert (cost[1:] >= 0.2 + 0.5).all()
+    # the more pixels it takes to bring it in front the more
+    assert cost[2] > cost[1] + 1.0
+
+
+def test_of_two_mirrored_translations_the_one_with_points_in_front_is_cheaper():
+    m, r, q = rigid(40)
+    views = Views(r[None], q[None], np.ones((1, 40)), np.array([[0.0, 0, 1]]), np.ones(1), (1.0, 1))
+    fit = replace(views, focal=(FOCAL, FOCAL)).fit([m, Motion(m.R, -m.t)])
+    assert fit.inverse_depth[0, 0] == pytest.approx(-fit.inverse_depth[0, 1], rel=0.2)
+    front, behind = fit.penalised()[0]
+    assert behind > front + 1.0
+
+
+# --- surfaces that bend --------------------------------------------------------------------------
+
+
+def flat_views(target: np.ndarray, off_centre: np.ndarray, weight: np.ndarray) -> Views:
+    """One superpixel around the optical axis, offsets and targets (S, 2) in ray units."""
+    one = np.ones((len(target), 1))
+    ray, there = np.hstack([off_centre, one]), np.hstack([target, one])
+    anchor, radius = np.array([[0.0, 0.0, 1.0]]), np.array([0.1])
+    return Views(ray[None], there[None], weight[None], anchor, radius, (FOCAL, FOCAL))
+
+
+def test_constant_depth_turns_with_the_image():
+    rng = np.random.default_rng(0)
+    at = rng.uniform(-0.1, 0.1, (40, 2))
+    c, s = np.cos(0.3), np.sin(0.3)
+    views = flat_views(at @ np.array([[c, s], [-s, c]]) + [0.05, -0.02], at, np.ones(40))
+    soup, error = constant_depth(views)
+    np.testing.assert_allclose(rotation.log(soup.R[0]), [0, 0, 0.3], atol=1e-9)
+    np.testing.assert_allclose(soup.translation[0], [0.05, -0.02, 0], atol=1e-9)
+    assert error[0] < 1e-9
+
+
+def test_an_affine_flow_is_not_pulled_by_some_wrong_pixels():
+    rng = np.random.default_rng(0)
+    at = rng.uniform(-0.1, 0.1, (40, 2))
+    M = np.array([[1.1, 0.2], [-0.1, 0.9]])
+    wrong = np.arange(40) % 5 == 0
+    target = at @ M + [0.02, 0.01] + np.where(wrong[:, None], 5 / FOCAL, 0.0)
+    fit = _affine(flat_views(target, at, np.ones(40)))[0]
+    np.testing.assert_allclose(fit[0], FOCAL * np.array([0.02, 0.01]), atol=0.1)
+    np.testing.assert_allclose(fit[1:], 0.1 * FOCAL * M, atol=0.1)
+    # what is not confident does not count at all
+    far = at @ M + [0.02, 0.01] + np.where(wrong[:, None], 0.5, 0.0)
+    fit = _affine(flat_views(far, at, np.where(wrong, 0.0, 1.0)))[0]
+    np.testing.assert_allclose(fit[1:], 0.1 * FOCAL * M, atol=1e-3)
