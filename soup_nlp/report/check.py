@@ -146,6 +146,7 @@ def _rows(
     yield from _rounds(claims, slack)
     yield from _constraints(claims, tree, weights)
     yield from _depth(tree)
+    yield _next_depth(tree)
     yield from _metrics(tree, claims["metrics"])
 
 
@@ -287,6 +288,26 @@ def _depth(tree: Mapping[str, Any]) -> Iterator[Row]:
         ok = off <= RELATIVE and lost <= 1e-4
         note = "" if lost <= 1e-4 else f"{lost:.1%} of the pixels are known in one only"
         yield Row(f"depth map {which}", 0.0, off, RELATIVE, ok, note=note)
+
+
+def _next_depth(tree: Mapping[str, Any]) -> Row:
+    """The stored depth of the next frame is where the stored planes and motions bring the first."""
+    depth = require(tree, "depth/next")
+    K_ref, K_next = require(tree, "input/K_ref"), require(tree, "input/K_next")
+    labels = require(tree, "segmentation/labels")
+    z, doubt = recompute.next_depth_map(
+        _state(tree, "solution"), labels, K_ref, K_next, (depth.shape[0], depth.shape[1])
+    )
+    sure = ~doubt
+    known = sure & np.isfinite(depth) & np.isfinite(z)
+    lost = float((np.isfinite(depth) != np.isfinite(z))[sure].mean()) if sure.any() else 0.0
+    off = float(np.abs(z[known] / depth[known] - 1).max(initial=0.0))
+    notes = {
+        f"{lost:.1%} of the pixels are known in one only": lost > 1e-4,
+        f"{doubt.mean():.1%} of the pixels hang on a rounding, not compared": doubt.mean() > 1e-3,
+    }
+    note = "; ".join(text for text, on in notes.items() if on)
+    return Row("depth map next", 0.0, off, RELATIVE, off <= RELATIVE and lost <= 1e-4, note=note)
 
 
 def _metrics(tree: Mapping[str, Any], claims: Mapping[str, Any]) -> Iterator[Row]:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+DOUBT = 1e-6
+"""Pixels within which of a border a target may be rounded to either side."""
 State = Mapping[str, Float]
 """lam (N,), n (N, 3), d (N,), R (N, 3, 3), t (N, 3) of a soup."""
 
@@ -124,6 +126,61 @@ def depth_map(s: State, labels: Int, K: Float) -> Float:
     with np.errstate(divide="ignore", invalid="ignore"):
         z = (s["lam"] * s["d"])[labels] / facing
     return np.where(facing > 1e-6, z, np.nan)
+
+
+def next_depth_map(
+    s: State, labels: Int, K_ref: Float, K_next: Float, size: tuple[int, int]
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Depth of the next frame, and where it hangs on the rounding of a target.
+
+    Every reference pixel goes to the pixel nearest to its target, the nearest surface wins; pixels
+    that are then still empty take the nearest surface among the 2 x 2 footprints that cover them.
+
+    Args:
+        s: Soup.
+        labels: (H, W) superpixel of every pixel.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        K_next: (3, 3) intrinsics of the next frame.
+        size: (H', W') of the next frame.
+
+    Returns:
+        (H', W') z, NaN where nothing lands; (H', W') True where a target lies so near to a border
+        between two pixels that either may take it.
+    """
+    z = depth_map(s, labels, K_ref).ravel()
+    v, u = (x.ravel() for x in np.mgrid[0 : labels.shape[0], 0 : labels.shape[1]])
+    who = labels.ravel()
+    X = z[:, None] * (np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K_ref).T)
+    Y = np.matmul(s["R"][who], X[..., None])[..., 0] + (s["lam"][:, None] * s["t"])[who]
+    Y = Y[Y[:, 2] > 0]
+    # farthest first: the last one to be written is the nearest
+    Y = Y[np.argsort(-Y[:, 2], kind="stable")]
+    image = Y @ K_next.T
+    at = image[:, :2] / image[:, 2:]
+
+    def inside(column: Float, row: Float) -> NDArray[np.bool_]:
+        return np.asarray((column >= 0) & (row >= 0) & (column < size[1]) & (row < size[0]))
+
+    def put(out: NDArray[Any], uv: Float, value: Any) -> None:
+        good = inside(uv[:, 0], uv[:, 1])
+        out[uv[good, 1].astype(int), uv[good, 0].astype(int)] = value[good]
+
+    nearest = np.full(size, np.nan)
+    put(nearest, np.floor(at + 0.5), Y[:, 2])
+    covered = np.full((4, *size), np.nan)
+    for k, corner in enumerate([(0, 0), (1, 0), (0, 1), (1, 1)]):
+        put(covered[k], np.floor(at) + corner, Y[:, 2])
+    empty = np.isnan(nearest)
+    filled = np.where(empty, np.fmin.reduce(covered), nearest)
+
+    either, crack = np.zeros(size, bool), np.zeros(size, bool)
+    beside = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+    for mark, shift in ((either, 0.5), (crack, 0.0)):
+        off = at + shift
+        near = (np.abs(off - np.round(off)) < DOUBT).any(1)
+        for step in beside:
+            put(mark, np.floor(at[near] + 0.5) + step, np.ones(int(near.sum()), bool))
+    return filled, either | (crack & empty)
 
 
 def scores(z: Float, gt: Float, rule: str, cap: float | None) -> dict[str, float]:
