@@ -25,6 +25,7 @@ from soup_nlp.bench.truth import true_soup
 from soup_nlp.cli import main
 from soup_nlp.config import make_problem
 from soup_nlp.data.flow import flow_from_truth
+from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.data.scenes import render_scene
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.graph import build_segmentation
@@ -110,6 +111,27 @@ def test_true_soup_is_the_truth_but_for_mixed_superpixels(street):
     np.testing.assert_allclose(again.soup.R, true.soup.R, atol=1e-6)
     with pytest.raises(DataError, match="motions or scene flow"):
         true_soup(pair.__class__(**{**vars(pair), "truth": other.__class__(depth_ref=gt)}), seg)
+
+
+def test_a_true_plane_seen_from_behind_somewhere_faces_the_camera():
+    """Its depth is known on the left only; drawn out to the right the plane passes the camera."""
+    height, width = 24, 48
+    u = np.arange(width) * np.ones((height, 1))
+    labels = (u >= 24).astype(np.int32)
+    inverse = np.where(u < 8, 0.5 - 0.05 * u, np.nan)
+    depth = np.where(labels == 1, 2.0, 1 / inverse)
+    black = np.zeros((height, width, 3), np.uint8)
+    truth = Truth(
+        depth_ref=depth, bodies=np.zeros((height, width), np.int32), motions=np.eye(4)[None]
+    )
+    pair = Pair(black, black, K, K, truth=truth)
+    true = true_soup(pair, build_segmentation(labels, black, neighbours=1))
+    assert true.known.all()
+    np.testing.assert_allclose(np.abs(true.soup.n), np.tile([0, 0, 1.0], (2, 1)), atol=1e-9)
+    ratio = true.soup.distance / true.soup.distance[1]
+    assert ratio[0] == pytest.approx(1 / np.median(inverse[:, :8]) / 2.0, rel=1e-9)
+    z = true.soup.depth_at(np.tile([(47 - 32) / 100, 0, 1.0], (2, 1)))
+    assert (z > 0).all()
 
 
 def test_the_truth_has_less_energy_than_a_shaken_truth(street):
