@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from soup_nlp.bench import accuracy, machine
 from soup_nlp.bench.accuracy import Job, clean, code_version, measure, settings_hash
 from soup_nlp.bench.accuracy_runner import Where, measure_all, read_rows
 from soup_nlp.bench.accuracy_table import report
-from soup_nlp.bench.analyses import ANALYSES
 from soup_nlp.bench.planes import fit_planes, plane_depth, points_as_map
 from soup_nlp.bench.published import COMPARISON, published
 from soup_nlp.bench.rivals import METHODS, RIVALS, unorganised
@@ -25,6 +21,7 @@ from soup_nlp.bench.truth import true_soup
 from soup_nlp.cli import main
 from soup_nlp.config import make_problem
 from soup_nlp.data.flow import flow_from_truth
+from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.data.scenes import render_scene
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.graph import build_segmentation
@@ -112,6 +109,27 @@ def test_true_soup_is_the_truth_but_for_mixed_superpixels(street):
         true_soup(pair.__class__(**{**vars(pair), "truth": other.__class__(depth_ref=gt)}), seg)
 
 
+def test_a_true_plane_seen_from_behind_somewhere_faces_the_camera():
+    """Its depth is known on the left only; drawn out to the right the plane passes the camera."""
+    height, width = 24, 48
+    u = np.arange(width) * np.ones((height, 1))
+    labels = (u >= 24).astype(np.int32)
+    inverse = np.where(u < 8, 0.5 - 0.05 * u, np.nan)
+    depth = np.where(labels == 1, 2.0, 1 / inverse)
+    black = np.zeros((height, width, 3), np.uint8)
+    truth = Truth(
+        depth_ref=depth, bodies=np.zeros((height, width), np.int32), motions=np.eye(4)[None]
+    )
+    pair = Pair(black, black, K, K, truth=truth)
+    true = true_soup(pair, build_segmentation(labels, black, neighbours=1))
+    assert true.known.all()
+    np.testing.assert_allclose(np.abs(true.soup.n), np.tile([0, 0, 1.0], (2, 1)), atol=1e-9)
+    ratio = true.soup.distance / true.soup.distance[1]
+    assert ratio[0] == pytest.approx(1 / np.median(inverse[:, :8]) / 2.0, rel=1e-9)
+    z = true.soup.depth_at(np.tile([(47 - 32) / 100, 0, 1.0], (2, 1)))
+    assert (z > 0).all()
+
+
 def test_the_truth_has_less_energy_than_a_shaken_truth(street):
     pair, seg = street
     data = build_energy_data(seg, flow_from_truth(pair), pair.K_ref, pair.K_next)
@@ -186,72 +204,6 @@ def test_settings_hash_is_the_same_on_every_pair():
     assert settings_hash(a) == settings_hash(b)
     assert settings_hash(a) != settings_hash(item().problem(["flow.source=truth"]))
     assert settings_hash(a) != settings_hash(item().problem(["energy.weights.cont=9.0"]))
-
-
-def imported(*begin: str) -> set[str]:
-    """Modules of the package that some of its modules import, themselves and theirs included."""
-    root = Path(accuracy.__file__).parents[1]
-    found, to_read = set(), {root / name for name in begin}
-    while to_read:
-        path = to_read.pop()
-        found.add(path.relative_to(root).as_posix())
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom):
-                assert node.level == 0
-                names = [str(node.module), *(f"{node.module}.{a.name}" for a in node.names)]
-            files = {root.parent / (name.replace(".", "/") + ".py") for name in names}
-            to_read |= {
-                f
-                for f in files
-                if f.is_file()
-                and f.is_relative_to(root)
-                and f.relative_to(root).as_posix() not in found
-            }
-    return found
-
-
-DECIDES_NOTHING = (
-    # settings are a row's own hash, the pair its key
-    *("config*.py", "bench/suites*.py"),
-    # written or printed from what is measured
-    *(f"report/{name}.py" for name in ("atomic", "colour", "figures", "folder", "pointcloud")),
-    *("report/store.py", "report/tree.py", "bench/accuracy_table.py", "bench/published.py"),
-    "errors.py",
-)
-"""What measuring imports without a number depending on it."""
-
-
-def matched(patterns: Sequence[str]) -> set[str]:
-    root = Path(accuracy.__file__).parents[1]
-    return {f.relative_to(root).as_posix() for pattern in patterns for f in root.glob(pattern)}
-
-
-def test_code_version_knows_every_source():
-    root = Path(accuracy.__file__).parents[1]
-    assert all(list(root.glob(p)) for p in (*accuracy.CODE, *machine.CODE, *DECIDES_NOTHING))
-    assert code_version().startswith("0.")
-    # every function that measures a row for an analysis
-    measures = {a.function.__module__ for a in ANALYSES.values()} | {measure.__module__}
-    begin = [m.removeprefix("soup_nlp.").replace(".", "/") + ".py" for m in measures]
-    hashed = matched(accuracy.CODE)
-    assert not matched(DECIDES_NOTHING) & hashed
-    assert imported("pipeline.py", *begin) - matched(DECIDES_NOTHING) <= hashed
-    # a timed run ends with the NLP: of the refinement it only reads the options
-    unused = matched((*DECIDES_NOTHING, "refine/*.py"))
-    assert imported("cases.py", "solve/soup.py") - unused <= matched(machine.CODE)
-
-
-def test_imports_are_followed_to_the_end():
-    found = imported("pipeline.py")
-    assert {
-        "pipeline.py",
-        "cases.py",
-        "start/choice.py",
-        "mrf/trws.py",
-        "mrf/trws_order.py",
-    } <= found
-    assert "cli.py" not in found
 
 
 def test_clean_leaves_plain_json():

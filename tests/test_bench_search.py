@@ -11,6 +11,7 @@ import pytest
 from matplotlib.axes import Axes
 
 from soup_nlp.bench import analyses
+from soup_nlp.bench import search as search_module
 from soup_nlp.bench.accuracy import Job, head
 from soup_nlp.bench.analyses import ANALYSES, run_analysis
 from soup_nlp.bench.analyses_energy import measure_energy
@@ -131,6 +132,18 @@ def test_search_finds_the_minimum_and_goes_on_where_it_was(tmp_path):
     assert "the gain holds" in text
     assert "`energy.weights.cont` | log | 1e-5 to 1e-1" in text
     assert "t000 (default)" in text
+
+
+def test_steps_beyond_the_end_of_a_range_turn_back():
+    """A best trial at an end is varied inside the range, not tried at the end again and again."""
+    best = Trial("t001", (), np.array([0.01, 0.99]), (fake(Job(items(0)[0])),))
+    units = np.array(
+        [search_module._next(k, 24, np.zeros((12, 2)), [best], 0) for k in range(13, 25)]
+    )
+    assert ((units > 0) & (units < 1)).all()
+    assert (units != best.unit).any(axis=0).all()
+    # none is thrown to the other end
+    assert np.abs(units - best.unit).max() < 0.9
 
 
 def test_search_refuses_what_cannot_be_right(tmp_path):

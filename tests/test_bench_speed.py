@@ -8,6 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+from scipy.stats import linregress
 
 from soup_nlp.bench import speed, speed_fit, speed_gate, speed_plot, speed_table
 from soup_nlp.bench.machine import machine
@@ -153,6 +154,16 @@ def test_exponents_are_found():
     assert np.isnan(speed_fit.fit([250, 500], [1.0, 2.0]).error)
     assert speed_fit.fit([250, 252], [1.0, 2.0]) is None
     assert speed_fit.fit([250], [1.0]) is None
+
+
+def test_the_error_of_an_exponent_is_the_regressions():
+    rng = np.random.default_rng(1)
+    n = np.array([250, 250, 500, 1000, 1000, 2000, 4000])
+    cost = n**1.2 * np.exp(rng.normal(0, 0.3, len(n)))
+    line = linregress(np.log(n), np.log(cost))
+    growth = speed_fit.fit(n, cost)
+    assert growth.exponent == pytest.approx(line.slope, rel=1e-12)
+    assert growth.error == pytest.approx(line.stderr, rel=1e-9)
 
 
 def test_growth_is_by_scene_and_neighbours():

@@ -303,10 +303,9 @@ def test_an_interrupt_within_a_round_ends_the_refinement():
         if len(heard) == 2:
             raise KeyboardInterrupt
 
-    stop = threading.Event()
-    done = refine_soup(
-        tiny.soup, tiny.data, weights_for("pixels"), FEW, stop=stop, listener=listener
-    )
+    # no round ends by its gap before the second iteration
+    o, stop = replace(FEW, trws_gap=-1.0), threading.Event()
+    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, stop=stop, listener=listener)
     assert done.status == "interrupted"
     assert len(heard) == 2
     assert [r.status for r in done.rounds] == ["interrupted"]
@@ -316,7 +315,7 @@ def test_an_interrupt_within_a_round_ends_the_refinement():
 
 def test_a_time_limit_within_a_round_is_no_interruption():
     tiny = Tiny("pixels", samples=6)
-    o = replace(FEW, max_seconds=0.5)
+    o = replace(FEW, trws_gap=-1.0, max_seconds=0.5)
 
     def listener(progress: object) -> None:
         time.sleep(0.55)

@@ -15,6 +15,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.start import choice as choosing
 from soup_nlp.start import gather as gathering
+from soup_nlp.start import propose as proposing
 from soup_nlp.start.bodies import borrow, contact_scales, depth_from_inside
 from soup_nlp.start.choice import Choice, of_neighbourhoods, of_pieces, select
 from soup_nlp.start.epipolar import Motion
@@ -263,3 +264,24 @@ def test_superpixels_of_hardly_any_confidence_borrow():
     start = propose(seg, Flow(pair.flow.uv, confidence, "test"), pair.K_ref, pair.K_next)
     assert start.borrowed[faint].all()
     assert start.borrowed[~faint].mean() < 0.2
+
+
+def test_the_main_motion_is_preferred_where_another_is_not_clearly_better(monkeypatch):
+    """It misses by a hundredth of a pixel; the true one comes second and is not taken."""
+    move = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
+    pair = plane_world(plane_pose(3.0, yaw=20), move, 96, 72)
+    seg = build_segmentation(segment(pair.image_ref, 30, "grid"), pair.image_ref, neighbours=8)
+    exact = Motion(move[:3, :3], move[:3, 3] / np.linalg.norm(move[:3, 3]))
+    near = Motion(turn(4e-4) @ exact.R, exact.t)
+    monkeypatch.setattr(proposing, "of_pieces", lambda *a: [])
+
+    def first_of(*motions: Motion) -> np.ndarray:
+        monkeypatch.setattr(proposing, "dominant", lambda *a: list(motions))
+        start = propose(seg, pair.flow, pair.K_ref, pair.K_next)
+        return np.abs(start.soup.R - motions[0].R).max(axis=(1, 2)) < 1e-9
+
+    assert first_of(near, exact).all()
+    assert first_of(exact, near).all()
+    # one that misses by much is not
+    far = Motion(turn(2e-2) @ exact.R, exact.t)
+    assert not first_of(far, exact).any()

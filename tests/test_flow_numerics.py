@@ -1,0 +1,48 @@
+"""What the choice between flows and the re-weighting of one do by construction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soup_nlp.data import flow_guided
+from soup_nlp.data.flow_guided import guided_flow
+from soup_nlp.data.flow_robust import fit_affine
+from soup_nlp.data.pair import Flow
+
+
+@pytest.mark.parametrize(("error", "taken"), [(0.2, False), (0.8, True)])
+def test_a_guided_flow_must_be_better_by_a_margin(monkeypatch, error, taken):
+    """Images without contrast: the round trip alone decides, and the new one's is exact."""
+    shape = (60, 80)
+    grey = np.full(shape, 128, np.uint8)
+
+    def constant(u: float) -> np.ndarray:
+        return np.full((*shape, 2), (u, 0.0), np.float32)
+
+    def match(a, b):
+        return constant(0.1), constant(-0.1)
+
+    monkeypatch.setattr(flow_guided, "dominant_homographies", lambda *a: [np.eye(3)])
+    first, back = constant(0.0), constant(error)
+    flow, gap = guided_flow(grey, grey, match, first, back, 1, margin_px=0.5)
+    inside = (slice(20, 40), slice(20, 60))
+    np.testing.assert_allclose(flow[inside][..., 0], 0.1 if taken else 0.0, atol=1e-6)
+    np.testing.assert_allclose(gap[inside], 0.0 if taken else error, atol=1e-4)
+
+
+def test_where_all_pixels_scatter_none_of_them_is_suspected():
+    """A superpixel's own spread is the scale, if it is above the one that is given."""
+    v, u = np.mgrid[0:40, 0:80].astype(float)
+    labels = (u >= 40).astype(np.int32)
+    uv = np.stack([0.1 * u, 0.05 * v], axis=-1)
+    rng = np.random.default_rng(0)
+    rough = (labels == 0)[..., None] * rng.normal(0, 2.0, uv.shape)
+    lone = (labels == 1) & (rng.random(labels.shape) < 0.02)
+    uv = uv + rough + np.where(lone, 2.0, 0.0)[..., None]
+    flow = Flow(uv.astype(np.float32), np.ones(labels.shape, np.float32), "test")
+    _, weight = fit_affine(flow, labels, 0.25)
+    weight = weight.reshape(labels.shape)
+    assert np.median(weight[labels == 0]) > 0.4
+    assert weight[lone].max() < 0.1
+    assert weight[(labels == 1) & ~lone].min() > 0.9
