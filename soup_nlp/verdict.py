@@ -34,6 +34,9 @@ DELIVERED = {
 OF_ANSWER = ("nlp_infeasibility", "dual_infeasibility", "complementarity")
 """Residuals of Ipopt's own answer; the others are those of the delivered soup."""
 
+GUESSED = 0.5
+"""Share of superpixels without a depth of their own from which the verdict says so."""
+
 PAD = " " * 12
 
 
@@ -68,6 +71,11 @@ def verdict(run: Run, folder: Path, files: Sequence[str], limit: float | None = 
     answer = "  ".join(f"{k} {s.residuals[k]:.1e}" for k in OF_ANSWER if k in s.residuals)
     if answer:
         lines.append(f"{PAD}Ipopt's answer: {answer}")
+    borrowed = float(run.start.borrowed.mean())
+    if borrowed >= GUESSED and not run.start.bending:
+        lines.append(
+            f"depth       {borrowed:.0%} of the superpixels have no parallax: theirs is a guess"
+        )
     if run.metrics:
         lines += [f"accuracy    {protocol(run.metrics)}"]
         lines += [PAD + line for line in accuracy(run.metrics)]

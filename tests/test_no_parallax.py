@@ -5,14 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from soup_nlp.config import make_problem
 from soup_nlp.data.flow_check import confidence_of, round_trip_error
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.model import plain
 from soup_nlp.model.energy import Weights, build_energy_data
+from soup_nlp.pipeline import run
 from soup_nlp.start.bodies import bodies
 from soup_nlp.start.propose import propose
+from soup_nlp.verdict import verdict
 
 K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
 
@@ -62,3 +65,15 @@ def test_one_pixel_without_a_way_back_costs_its_own_neighbourhood_alone():
     assert np.isinf(gap[20, 30])
     assert not np.isnan(gap).any()
     assert (confidence_of(gap, support=5) == 1).mean() > 0.98
+
+
+@pytest.mark.parametrize(("scene", "said"), [("still", True), ("orbit", False), ("sheet", False)])
+def test_the_verdict_says_where_depth_is_a_guess(scene, said, tmp_path):
+    raw = {
+        "input": {"kind": "scene", "scene": scene, "seed": 0, "width": 256, "height": 109},
+        "flow": {"source": "truth"},
+        "segmentation": {"superpixels": 60, "neighbours": 6},
+        "refine": {"enabled": False},
+    }
+    done = run(make_problem(raw))
+    assert ("a guess" in verdict(done, tmp_path, [])) == said
