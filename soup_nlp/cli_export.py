@@ -24,6 +24,7 @@ from soup_nlp.config import dump_problem, load_problem
 from soup_nlp.errors import ExportError
 from soup_nlp.export.formats import FORMATS
 from soup_nlp.export.residuals import residual_table, table_text
+from soup_nlp.inputs import input_paths
 from soup_nlp.report.check import LIMITS, check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.store import read_h5
@@ -110,9 +111,9 @@ def import_(
             found=imported.sol.message.splitlines()[0] if imported.sol.message else None,
             hint=f"soup-nlp check {sol} says what is wrong with it",
         )
-    target = prepare_folder(out or folder / "result")
-    text = foreign_verdict(imported)
     run = imported.run
+    target = prepare_folder(out or folder / "result", input_paths(run.problem))
+    text = foreign_verdict(imported)
     write_folder(target, run, dump_problem(run.problem), f"{imported.sol.message}\n{text}\n")
     print(text)
     print(f"files       {target}/")
