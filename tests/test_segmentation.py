@@ -56,6 +56,12 @@ def test_superpixels_of_noise_are_connected_and_not_tiny(count):
     assert np.median(np.bincount(labels.ravel())) > 0.3 * 60 * 80 / count
 
 
+@pytest.mark.parametrize("count", [60, 300])
+def test_fine_texture_does_not_cost_superpixels(count):
+    labels = segment(noise(120, 320), count)
+    assert 0.5 * count <= labels.max() + 1 <= 2 * count
+
+
 def test_an_image_of_one_colour_is_cut_into_a_grid():
     grey = np.full((48, 64, 3), 90, np.uint8)
     np.testing.assert_array_equal(segment(grey, 12, "slic"), segment(grey, 12, "grid"))

@@ -12,6 +12,9 @@ from soup_nlp.errors import DataError
 
 Labels = NDArray[np.int32]
 
+ENOUGH = 0.5
+"""Share of the wanted number below which superpixels are not what was asked for."""
+
 
 def segment(
     image: NDArray[np.uint8],
@@ -28,7 +31,8 @@ def segment(
         count: Wanted number of superpixels; the answer may differ by a few per cent.
         method: "slic" (Achanta et al. 2012, skimage) or "grid" (the paper's worst case).
         compactness: SLIC's balance of colour and distance.
-        sigma: Gaussian pre-smoothing of SLIC, pixels.
+        sigma: Gaussian pre-smoothing of SLIC, pixels; more where texture shatters superpixels
+            so that less than half of their number are left, and a grid where that does not help.
         min_fraction: Pieces smaller than this fraction of the mean area join a neighbour.
 
     Returns:
@@ -52,16 +56,22 @@ def segment(
         return _grid(height, width, count)
     from skimage.segmentation import slic
 
-    raw = slic(
-        image,
-        n_segments=count,
-        compactness=compactness,
-        sigma=sigma,
-        start_label=0,
-        min_size_factor=min_fraction,
-        max_size_factor=4,
-    )
-    return split_components(raw.astype(np.int32), int(min_fraction * height * width / count))
+    least = int(min_fraction * height * width / count)
+    # texture as fine as pixels shatters SLIC's clusters, and shards join to a few large ones
+    for smoothing in (sigma, *(wider for wider in (1.0, 2.0, 4.0) if wider > sigma)):
+        raw = slic(
+            image,
+            n_segments=count,
+            compactness=compactness,
+            sigma=smoothing,
+            start_label=0,
+            min_size_factor=min_fraction,
+            max_size_factor=4,
+        )
+        labels = split_components(raw.astype(np.int32), least)
+        if labels.max() + 1 >= ENOUGH * count:
+            return labels
+    return _grid(height, width, count)
 
 
 def _grid(height: int, width: int, count: int) -> Labels:
