@@ -26,7 +26,8 @@ from soup_nlp.pipeline import evaluate as evaluate_folder
 from soup_nlp.pipeline import run as run_problem
 from soup_nlp.report.folder import prepare_folder, write_folder, write_text
 from soup_nlp.report.metrics import Scale
-from soup_nlp.solve.ipopt import Progress, interruptible
+from soup_nlp.solve.interrupt import interruptible
+from soup_nlp.solve.ipopt import Progress
 from soup_nlp.verdict import accuracy, missed, protocol, verdict
 
 app = typer.Typer(

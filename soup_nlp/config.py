@@ -21,7 +21,7 @@ from soup_nlp.errors import ConfigError
 from soup_nlp.model.energy import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS
-from soup_nlp.refine.mppbp import RefineOptions
+from soup_nlp.refine.records import RefineOptions
 from soup_nlp.solve.soup import SolverOptions
 from soup_nlp.start.propose import StartOptions
 

@@ -19,7 +19,8 @@ from soup_nlp.model import plain
 from soup_nlp.model.energy import EnergyData, Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
-from soup_nlp.refine.mppbp import Refined, RefineOptions, refine_soup
+from soup_nlp.refine.mppbp import refine_soup
+from soup_nlp.refine.records import Refined, RefineOptions
 from soup_nlp.refine.select import upright
 from soup_nlp.report.baselines import RigidBaseline
 from soup_nlp.report.metrics import DepthMetrics

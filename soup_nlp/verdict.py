@@ -10,7 +10,7 @@ from soup_nlp.report.metrics import DepthMetrics, skill
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline import Run
-    from soup_nlp.refine.mppbp import Refined
+    from soup_nlp.refine.records import Refined
 
 WORDS = {
     "Solve_Succeeded": "converged to the tolerance",

@@ -12,7 +12,7 @@ import pytest
 from soup_nlp import cases, cli
 from soup_nlp.pipeline import StoppedError, run
 from soup_nlp.report import folder as folders
-from soup_nlp.solve.ipopt import interruptible
+from soup_nlp.solve.interrupt import interruptible
 
 ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
 SMALL = [

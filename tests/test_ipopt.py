@@ -14,7 +14,8 @@ from helpers_model import hessian, value
 from soup_nlp.errors import SolverError
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP, assemble
-from soup_nlp.solve.ipopt import Ipopt, Progress, Stage, interruptible
+from soup_nlp.solve.interrupt import interruptible
+from soup_nlp.solve.ipopt import Ipopt, Progress, Stage
 from soup_nlp.solve.kkt import optimality
 
 # --- textbook problems as kernels and tables -----------------------------------------------------

@@ -19,8 +19,9 @@ from soup_nlp.model import plain
 from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
 from soup_nlp.refine.costs import Particles, anchor_depth
 from soup_nlp.refine.local import Local, fit_motion, neighbours
-from soup_nlp.refine.mppbp import RefineOptions, refine_soup
+from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.particles import BORROWED, COMMON, KINDS, WALKS, Proposer
+from soup_nlp.refine.records import RefineOptions
 from soup_nlp.solve.kkt import constraint_residuals
 
 FEW = RefineOptions(rounds=3, particles=16, trws_iterations=15)

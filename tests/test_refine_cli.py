@@ -15,8 +15,8 @@ from soup_nlp.cli import main
 from soup_nlp.config import make_problem
 from soup_nlp.errors import ConfigError
 from soup_nlp.pipeline import run
-from soup_nlp.refine.mppbp import RefineOptions
 from soup_nlp.refine.particles import KINDS
+from soup_nlp.refine.records import RefineOptions
 from soup_nlp.report.check import check_folder
 
 ORBIT = Path(__file__).parent.parent / "problems" / "orbit.yaml"

@@ -16,8 +16,9 @@ from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.refine import mppbp
 from soup_nlp.refine.costs import PairCosts, Particles
 from soup_nlp.refine.local import Local, fit_motion, neighbours
-from soup_nlp.refine.mppbp import SHARES, RefineOptions, refine_soup
+from soup_nlp.refine.mppbp import SHARES, refine_soup
 from soup_nlp.refine.particles import KINDS, Proposer
+from soup_nlp.refine.records import RefineOptions
 from soup_nlp.refine.select import upright
 
 

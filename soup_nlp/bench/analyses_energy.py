@@ -14,7 +14,8 @@ from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model import plain
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline import Run, run
-from soup_nlp.refine.mppbp import RefineOptions, refine_soup
+from soup_nlp.refine.mppbp import refine_soup
+from soup_nlp.refine.records import RefineOptions
 from soup_nlp.report.protocols import preset
 from soup_nlp.solve.soup import SolverOptions, solve_soup
 

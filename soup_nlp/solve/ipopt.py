@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from types import FrameType
 from typing import Any
 
 import casadi as ca
@@ -183,46 +181,6 @@ class _Watch(ca.Callback):
                 self.reason = "Stagnated"
         self.last = f
         return int(bool(self.reason))
-
-
-class interruptible:  # noqa: N801
-    """Context in which Ctrl-C sets an event instead of raising (main thread only).
-
-    The second Ctrl-C raises KeyboardInterrupt, except where `deferred` is set: what is done then
-    must come to its end. Where it is raised in a callback of CasADi it is lost on the way;
-    `aborted` says that there was one.
-
-    Args:
-        say: Told what a Ctrl-C does; it is called in a signal handler.
-    """
-
-    def __init__(self, say: Callable[[str], None] | None = None) -> None:
-        self.event = threading.Event()
-        self.deferred = self.aborted = False
-        self._say = say or (lambda line: None)
-        self._old: Any = None
-
-    def __enter__(self) -> threading.Event:
-        if threading.current_thread() is threading.main_thread():
-            self._old = signal.signal(signal.SIGINT, self._set)
-        return self.event
-
-    def _set(self, number: int, frame: FrameType | None) -> None:
-        if self.deferred:
-            self._say("interrupt received: the files are being written, this ends then")
-        elif self.event.is_set():
-            self.aborted = True
-            raise KeyboardInterrupt
-        else:
-            self._say(
-                "interrupt received: the best iterate will be kept and every file written;"
-                " without a start this ends after the stage; once more aborts"
-            )
-        self.event.set()
-
-    def __exit__(self, *exc: object) -> None:
-        if self._old is not None:
-            signal.signal(signal.SIGINT, self._old)
 
 
 class Ipopt:

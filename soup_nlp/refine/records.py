@@ -1,0 +1,115 @@
+"""What a refinement is told, and what it says of its rounds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from soup_nlp.geometry.soup import Soup
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """Discrete refinement after the NLP.
+
+    Attributes:
+        enabled: Refine at all.
+        from_start: Refine the start: the NLP is skipped.
+        rounds: Most rounds of particles.
+        particles: Labels of every superpixel, the current belief among them.
+        keep: Share of the particles that stays for the next round.
+        depth_reach: A new depth is at most this many times the upper quartile of the neighbours'
+            depths, and at least their lower quartile over this squared.
+        trws_iterations: Most iterations of TRW-S in a round.
+        trws_gap: TRW-S stops at this relative gap.
+        stagnation: End when two rounds in a row lower E by less than this share; 0 never.
+        max_seconds: Time limit of the rounds together.
+        float32: Tables in single precision: half the memory; the bound is exact to that rounding.
+        polish: Solve the NLP again from the refined soup and keep the better.
+    """
+
+    enabled: bool = True
+    from_start: bool = False
+    rounds: int = 10
+    particles: int = 50
+    keep: float = 0.25
+    depth_reach: float = 2.0
+    trws_iterations: int = 15
+    trws_gap: float = 1e-4
+    stagnation: float = 1e-3
+    max_seconds: float = 300.0
+    float32: bool = False
+    polish: bool = False
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round as it went.
+
+    Attributes:
+        energy: Exact E by term afterwards.
+        mrf_energy: Energy of the chosen labels in the MRF.
+        bound: TRW-S's lower bound on every choice among these particles.
+        iterations: Of TRW-S.
+        status: Of TRW-S.
+        ties: Superpixels whose label was a tie when decoded.
+        taken: Whether the choice lowered E; if not, the belief stays.
+        moved: Superpixels that left their current belief.
+        proposed: Feasible particles by kind.
+        accepted: Chosen particles by kind.
+        seconds: Wall time.
+    """
+
+    energy: Mapping[str, float]
+    mrf_energy: float
+    bound: float
+    iterations: int
+    status: str
+    ties: int
+    taken: bool
+    moved: int
+    proposed: Mapping[str, int] = field(repr=False)
+    accepted: Mapping[str, int] = field(repr=False)
+    seconds: float
+
+    def __str__(self) -> str:
+        return (
+            f"E {self.energy['total']:.6g}, bound {self.bound:.6g}, gap {self.gap:.3g},"
+            f" {self.moved} moved, {self.ties} ties, {self.iterations} iterations,"
+            f" {self.seconds:.1f} s"
+        )
+
+    @property
+    def gap(self) -> float:
+        """How far the choice can be from the best one among these particles."""
+        return self.mrf_energy - self.bound
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What the refinement ended with.
+
+    Attributes:
+        soup: Best soup.
+        energy_begin: Exact E by term before.
+        energy: Exact E by term of `soup`.
+        rounds: Every round.
+        status: "rounds" (all of them), "stagnated", "interrupted" or "time limit".
+        seconds: Wall time.
+        polish_gain: By how much an NLP from the last round's soup lowered E; None without one.
+    """
+
+    soup: Soup
+    energy_begin: Mapping[str, float]
+    energy: Mapping[str, float]
+    rounds: tuple[Round, ...]
+    status: str
+    seconds: float
+    polish_gain: float | None = None
+
+    def __str__(self) -> str:
+        gap = f", gap {self.rounds[-1].gap:.3g}" if self.rounds else ""
+        return (
+            f"Refined({self.status}, E {self.energy_begin['total']:.5g} ->"
+            f" {self.energy['total']:.5g} in {len(self.rounds)} rounds{gap}, {self.seconds:.1f} s)"
+        )
