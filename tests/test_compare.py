@@ -16,10 +16,11 @@ from helpers_model import PAPER, Tiny
 
 from soup_nlp.cli import main
 from soup_nlp.compare.isolate import isolated
+from soup_nlp.compare.plugins import PLUGINS
 from soup_nlp.compare.profile import cost_table, draw_curves, draw_profiles, profile
 from soup_nlp.compare.report import page
 from soup_nlp.compare.runner import compare, read_rows
-from soup_nlp.compare.solvers import PLUGINS, available, find_solver
+from soup_nlp.compare.solvers import available, find_solver
 from soup_nlp.compare.task import Answer, Limits, Task, Trace
 from soup_nlp.compare.verify import kkt
 from soup_nlp.errors import DataError, SolverError

@@ -15,7 +15,7 @@ from test_nl import ReadBack, close
 from soup_nlp.artefact import import_sol, parse_formulation
 from soup_nlp.cases import prepare
 from soup_nlp.cli import main
-from soup_nlp.compare.solvers import plugin
+from soup_nlp.compare.plugins import plugin
 from soup_nlp.compare.task import Limits, Task
 from soup_nlp.compare.verify import examine, kkt, violations
 from soup_nlp.config import load_problem

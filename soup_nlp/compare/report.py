@@ -20,7 +20,7 @@ LIMITS = (
     "how quickly a solver proves a point that is almost optimal. From the proposal it is harder.",
     "Local solvers end in local minima: an energy says where this start led, not what is best.",
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
-    "Solvers run with the options in `soup_nlp/compare/solvers.py`, the package's own ones being "
+    "Solvers run with the options in `soup_nlp/compare/plugins.py`, the package's own ones being "
     "tuned on problems of this kind; the others are as they come, but for tolerances and limits.",
     "alpaqa and sleqp differentiate an expanded expression graph, which costs set-up time; "
     "every other plug-in gets this package's own derivatives, and readers of .nl make theirs.",
