@@ -12,9 +12,11 @@ from soup_nlp.bench.truth import true_soup
 from soup_nlp.cases import Case, prepare
 from soup_nlp.cli import main
 from soup_nlp.config import make_problem
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.report.metrics import depth_metrics
 from soup_nlp.solve.soup import solve_soup
+from soup_nlp.start.bending import surfaces
 
 SHEET = Path(__file__).parent.parent / "problems" / "sheet.yaml"
 
@@ -108,3 +110,37 @@ def test_every_claim_of_a_bending_result_holds(tmp_path, capsys):
     main(["solve", str(SHEET), "--out", str(out), *sets])
     assert "bending)" in (out / "log.txt").read_text()
     assert main(["check", str(out)]) == 0, capsys.readouterr().out
+
+
+def strip(count: int) -> Segmentation:
+    """Tiles of 8 pixels in two rows."""
+    v, u = np.mgrid[0:16, 0 : 8 * count]
+    labels = (v // 8 * count + u // 8).astype(np.int32)
+    return build_segmentation(labels, np.zeros((*labels.shape, 3), np.uint8), neighbours=2)
+
+
+def jumps(seg: Segmentation, column: float, size: np.ndarray, noise: float) -> np.ndarray:
+    """(P,) jump of `size` (rows,) between columns before and after `column`, else noise."""
+    i, k = seg.pairs.T
+    x, row = seg.anchors[:, 0] > column, (seg.anchors[:, 1] > 8).astype(int)
+    return np.where(x[i] != x[k], size[row[i]], noise)
+
+
+def test_a_gap_in_a_tear_does_not_join_two_surfaces():
+    seg = strip(10)
+    left = seg.anchors[:, 0] < 40
+    torn = surfaces(jumps(seg, 40, np.array([2.0, 0.6]), 0.01), seg, 1.0)
+    # one of two rows is whole at 1 px: half of the outline tears
+    np.testing.assert_array_equal(torn == torn[0], left)
+    whole = surfaces(jumps(seg, 40, np.array([0.9, 0.6]), 0.01), seg, 1.0)
+    assert (whole == whole[0]).all()
+
+
+def test_noise_does_not_cut_a_surface():
+    seg = strip(10)
+    rng = np.random.default_rng(0)
+    jump = np.where(rng.random(len(seg.pairs)) < 0.3, 0.9, 0.4)
+    assert (surfaces(jump, seg, 1.0) == surfaces(jump, seg, 1.0)[0]).all()
+    # and it does not hide a tear
+    torn = surfaces(np.maximum(jump, jumps(seg, 40, np.array([3.0, 2.0]), 0.0)), seg, 1.0)
+    np.testing.assert_array_equal(torn == torn[0], seg.anchors[:, 0] < 40)

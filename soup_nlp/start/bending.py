@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.start.bodies import joined
 from soup_nlp.start.planes import Views
 
 Float = NDArray[np.float64]
@@ -30,6 +32,42 @@ def bending_share(surface: Int, body: Int) -> float:
     count = np.zeros((int(surface.max()) + 1, int(body.max()) + 1))
     np.add.at(count, (surface, body), 1.0)
     return float(1.0 - count.max(axis=1).sum() / len(surface))
+
+
+ABOVE_NOISE, LEAST_TEAR = 10.0, 0.25
+"""Jumps of the flow that are one are this many times the median jump, which is noise and bending,
+and at least this share of those that tear a surface for certain."""
+
+
+def surfaces(jump: Float, seg: Segmentation, tear_px: float) -> Int:
+    """(N,) surface of every superpixel, each beside others by outlines that mostly tear.
+
+    An outline tears here more, there less, and a single gap in it would join both sides. Where
+    the flow allows it surfaces are cut along smaller jumps, and pieces that were too many join
+    again, those with the longest whole outline first.
+
+    Args:
+        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
+        seg: Superpixels and graphs.
+        tear_px: A jump that tears for certain, pixels.
+    """
+    least = np.clip(ABOVE_NOISE * np.median(jump), LEAST_TEAR * tear_px, tear_px)
+    surface = joined(jump < least, seg)
+    n, (i, k) = len(seg), seg.pairs.T
+    while True:
+        a, b = surface[i], surface[k]
+        outline = np.flatnonzero(a != b)
+        if not len(outline):
+            return surface
+        a, b = np.minimum(a, b)[outline], np.maximum(a, b)[outline]
+        pairs, which = np.unique(a * n + b, return_inverse=True)
+        length = seg.boundary_length[outline].astype(float)
+        whole = np.bincount(which, length * (jump[outline] < tear_px))
+        total = np.bincount(which, length)
+        join = int(np.argmax(np.where(whole > 0.5 * total, total, 0.0)))
+        if not whole[join] > 0.5 * total[join]:
+            return surface
+        surface = np.where(surface == pairs[join] % n, pairs[join] // n, surface)
 
 
 def flow_jump(views: Views, pairs: Int, boundary_ray: Float) -> Float:

@@ -13,7 +13,7 @@ from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy import sample_pixels
-from soup_nlp.start.bending import bending_share, constant_depth, flow_jump
+from soup_nlp.start.bending import bending_share, constant_depth, flow_jump, surfaces
 from soup_nlp.start.bodies import bodies, borrow, contact_scales, joined
 from soup_nlp.start.choice import (
     Choice,
@@ -49,7 +49,8 @@ class Start:
         body: (N,) group that seems to move as one and shares one scale: a dominant motion, or a
             connected piece of superpixels with motions of their own.
         motions: The dominant motions.
-        surface: (N,) group that hangs together: the flow does not tear inside it.
+        surface: (N,) group that hangs together: the flow does not tear inside it; where surfaces
+            bend it mostly tears along the outline.
         bending_share: Share of the superpixels that move otherwise than most of their surface.
         bending: Whether surfaces are taken to bend: all are one body at a constant depth.
     """
@@ -119,7 +120,7 @@ def propose(
     if share > o.bending:
         soup, error = constant_depth(views)
         none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
-        parallax = _parallax(soup, views)
+        parallax, surface = _parallax(soup, views), surfaces(jump, seg, o.tear_px)
         return Start(soup, error, parallax, every, none, none + 1, motions, surface, share, True)
     choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
     own, label, parallax = choice.fit, choice.label, choice.parallax
