@@ -65,6 +65,17 @@ def test_planes_come_back_and_outliers_do_not_pull_them():
         assert np.mean(np.abs(z - fit[labels == i]) / z) <= constant + 1e-12
 
 
+def test_a_few_rows_of_sky_do_not_cost_the_plane():
+    labels, _, depth = labelled_planes()
+    sky = depth.copy()
+    sky[:5] = 1e3
+    fit = plane_depth(fit_planes(labels, sky, K), labels, K)
+    for i in (0, 1):
+        own = labels == i
+        true = np.mean(np.abs(sky - depth)[own] / sky[own])
+        assert np.mean(np.abs(sky - fit)[own] / sky[own]) <= true + 1e-3
+
+
 def test_planes_of_little_truth():
     labels, _, depth = labelled_planes()
     few = np.full(depth.shape, np.nan)
