@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from soup_nlp.bench.accuracy import Job, clean, code_version, measure, settings_hash
+from soup_nlp.bench.accuracy import (
+    Job,
+    clean,
+    code_version,
+    head,
+    input_hash,
+    measure,
+    settings_hash,
+)
 from soup_nlp.bench.accuracy_runner import Where, measure_all, read_rows
 from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.planes import fit_planes, plane_depth, points_as_map
@@ -217,6 +225,22 @@ def test_settings_hash_is_the_same_on_every_pair():
     assert settings_hash(a) != settings_hash(item().problem(["energy.weights.cont=9.0"]))
 
 
+def test_input_hash_is_of_the_frames_not_of_their_place():
+    def sintel_at(root: str, *overrides: str) -> Job:
+        raw = {"kind": "sintel", "root": root, "scene": "alley_1", "frame": 2}
+        return Job(Item("sintel", "alley_1", "alley_1-0002", "dis", raw), overrides)
+
+    here, final = sintel_at("/a"), sintel_at("/a", "input.render=final")
+    assert head(here) == head(sintel_at("/b"))
+    assert head(here)["settings"] == head(final)["settings"]
+    assert head(here)["input"] != head(final)["input"]
+    first, second = (
+        Item("vkitti", "w", "w", "dis", {"kind": k, "root": "r", "scene": s, "frame": 1}).problem()
+        for k, s in (("vkitti1", "0001"), ("vkitti2", "Scene01"))
+    )
+    assert input_hash(first) != input_hash(second)
+
+
 def test_clean_leaves_plain_json():
     given = {"a": np.float64(np.nan), "b": [np.int64(3), float("inf")], "c": (1.5, None, "x")}
     assert clean(given) == {"a": None, "b": [3, None], "c": [1.5, None, "x"]}
@@ -224,8 +248,6 @@ def test_clean_leaves_plain_json():
 
 def fake(job: Job) -> dict:
     """A row without a solve; the process of a pair named "dead" dies."""
-    from soup_nlp.bench.accuracy import head
-
     if job.item.name.startswith("room") and "dies" in job.overrides:
         os._exit(3)
     ok = job.item.sequence != "sheet"
@@ -254,10 +276,13 @@ def test_rows_are_kept_and_what_failed_is_tried_again(tmp_path):
     assert said == [(3, 4), (4, 4)]
     measure_all(fake_jobs(), path, function=counted)
     assert seen[4:] == ["sheet"]
-    # other settings are other rows
+    # other settings are other rows, and so is another input
     measure_all(fake_jobs("seed=1")[:1], path, function=counted)
     assert seen[5:] == ["orbit"]
     assert len(read_rows(path)) == 5
+    measure_all(fake_jobs("input.seed=1")[:1], path, function=counted)
+    assert seen[6:] == ["orbit"]
+    assert len(read_rows(path)) == 6
     with pytest.raises(ConfigError, match="twice"):
         measure_all([*fake_jobs(), *fake_jobs()], path, function=counted)
 

@@ -70,7 +70,15 @@ class Job:
 def settings_hash(problem: Problem) -> str:
     """Hash of everything but the input: the same settings on every pair and in every place."""
     out = ("name", "base", "input", "expected")
-    tree = problem.model_dump(mode="json", exclude=set(out))
+    return _hash(problem.model_dump(mode="json", exclude=set(out)))
+
+
+def input_hash(problem: Problem) -> str:
+    """Hash of the input but its place: the same frames of the same dataset in every folder."""
+    return _hash(problem.input.model_dump(mode="json", exclude={"root", "path"}))
+
+
+def _hash(tree: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -108,9 +116,10 @@ def head(job: Job) -> Row:
     """What names a row."""
     item = job.item
     try:
-        settings = settings_hash(item.problem(job.overrides))
+        problem = item.problem(job.overrides)
+        settings, source = settings_hash(problem), input_hash(problem)
     except Exception:
-        settings = "wrong"
+        settings = source = "wrong"
     return {
         "key": job.key,
         "suite": item.suite,
@@ -121,6 +130,7 @@ def head(job: Job) -> Row:
         "overrides": list(job.overrides),
         "presets": list(item.presets),
         "settings": settings,
+        "input": source,
     }
 
 

@@ -1,8 +1,8 @@
 """Many rows: in this process, in processes of one machine (joblib), or on a cluster (Dask).
 
 Rows are appended to a JSON-lines file by the parent alone, each as soon as it is there, so a run
-that was stopped goes on where it was. A row stands for its key, settings and code version; a row
-that failed is tried again.
+that was stopped goes on where it was. A row stands for its key, settings, input and code version; a
+row that failed is tried again.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from soup_nlp.errors import ConfigError, DataError
 
 Function = Callable[[Job], Row]
 Say = Callable[[int, int, Row], None]
+Name = tuple[str, str, str]
 
 
 @dataclass(frozen=True)
@@ -35,20 +36,26 @@ class Where:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Rows of a JSON-lines file, the last one of every key, settings and code version.
+    """Rows of a JSON-lines file, the last one of every key, settings, input and code version.
 
     A line that was cut off by a crash is left out.
     """
     if not path.is_file():
         return []
-    out: dict[tuple[str, str, str], Row] = {}
+    out: dict[tuple[Name, str], Row] = {}
     for line in path.read_text(encoding="utf-8").splitlines():
         try:
             row = json.loads(line)
-            out[row["key"], row["settings"], row["code"]] = row
+            out[_name(row), row["code"]] = row
         except (ValueError, KeyError, TypeError):
             continue
     return list(out.values())
+
+
+def _name(row: Row) -> Name:
+    """What a row stands for, but its code version."""
+    # rows of old versions do not say which input they had
+    return row["key"], row["settings"], row.get("input", "unknown")
 
 
 def measure_all(
@@ -75,11 +82,11 @@ def measure_all(
         ConfigError: joblib or Dask is needed and not installed, or the cluster does not answer.
     """
     where, code = where or Where(), code_version()
-    known: dict[tuple[str, str], Row] = {}
+    known: dict[Name, Row] = {}
     for row in read_rows(path):
         if row["ok"] and (any_code or row["code"] == code):
-            known[row["key"], row["settings"]] = row
-    names = [(job.key, head(job)["settings"]) for job in jobs]
+            known[_name(row)] = row
+    names = [_name(head(job)) for job in jobs]
     if len(set(names)) < len(names):
         twice = next(n for n in names if names.count(n) > 1)
         raise ConfigError("a row is asked for twice", found=twice[0])
@@ -89,7 +96,7 @@ def measure_all(
         for row in _rows(todo, function, where) if todo else ():
             row["code"] = code
             file.add(row)
-            known[row["key"], row["settings"]] = row
+            known[_name(row)] = row
             done += 1
             if say:
                 say(done, len(jobs), row)
