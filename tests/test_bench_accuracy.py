@@ -6,6 +6,7 @@ import json
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -215,6 +216,21 @@ def test_a_pair_that_fails_is_a_row():
     text = report("T", [{**row, "code": "c"}])
     assert "0 of 1 pairs measured" in text
     assert "K-NN" in text
+
+
+def test_a_pair_without_truth_is_a_row_that_failed(tmp_path):
+    """So it is measured once the truth is there; it is not solved before."""
+    for k in (0, 1):
+        cv2.imwrite(str(tmp_path / f"frame_{k}.png"), np.zeros((48, 64, 3), np.uint8))
+    np.savetxt(tmp_path / "K.txt", K)
+    raw = {"kind": "folder", "path": str(tmp_path)}
+    needs = (tmp_path / "frame_0.png",)
+    pair = Item("kinect_paper", "s", "p", "dis", raw, ("eigen80", "paper"), needs)
+    row = measure(Job(pair, QUICK))
+    assert not row["ok"]
+    assert "pair has no true depth" in row["error"]
+    assert SUITES["kinect_paper"].layout in row["error"]
+    assert SUITES["kinect_paper"].source in row["error"]
 
 
 def test_settings_hash_is_the_same_on_every_pair():

@@ -17,16 +17,17 @@ from numpy.typing import NDArray
 
 import soup_nlp
 from soup_nlp.bench.rivals import depth_maps, true_depth
-from soup_nlp.bench.suites import Item
+from soup_nlp.bench.suites import SUITES, Item
 from soup_nlp.bench.truth import true_soup
 from soup_nlp.config import Problem, dump_problem
-from soup_nlp.data.pair import Pair
+from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
+from soup_nlp.inputs import load_pair
 from soup_nlp.model import plain
 from soup_nlp.pipeline import Run, run
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.metrics import sample_at_points, skill
-from soup_nlp.report.protocols import preset
+from soup_nlp.report.protocols import Preset, preset
 from soup_nlp.report.scene_flow import scene_flow_epe
 
 Float = NDArray[np.float64]
@@ -98,18 +99,38 @@ def measure(job: Job) -> Row:
     begin, cpu = time.perf_counter(), time.process_time()
     try:
         problem = job.item.problem(job.overrides)
+        if job.item.needs:
+            # a dataset without its truth would be solved for nothing, and again every time
+            truth = load_pair(problem).truth
+            if not any(_applies(truth, preset(name)) for name in job.item.presets):
+                raise _no_truth(job.item)
         if job.folder is None:
             result = run(problem)
         else:
             folder = prepare_folder(job.folder)
             result = run(problem, ipopt_log=str(folder / "ipopt.log"))
             write_folder(folder, result, dump_problem(problem), "")
-        row |= {"ok": True, "error": None, **scores(result, job.item.presets)}
+        found = scores(result, job.item.presets)
+        if not found["metrics"]:
+            raise _no_truth(job.item)
+        row |= {"ok": True, "error": None, **found}
     except Exception as error:
         row |= {"ok": False, "error": f"{type(error).__name__}: {error}"}
     row["seconds"] = time.perf_counter() - begin
     row["cpu_seconds"] = time.process_time() - cpu
     return clean(row)
+
+
+def _no_truth(item: Item) -> DataError:
+    """What is missing where no convention gave a number, and where to get it."""
+    suite = SUITES.get(item.suite)
+    return DataError(
+        "pair has no true depth",
+        where=item.key,
+        found=f"no pixel that counts under {', '.join(item.presets)}",
+        expected=suite.layout or None if suite else None,
+        hint=f"get it from {suite.source}" if suite and suite.source else None,
+    )
 
 
 def head(job: Job) -> Row:
@@ -171,12 +192,21 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
     return row
 
 
+def _applies(truth: Truth | None, convention: Preset) -> bool:
+    """Whether a truth has a pixel that counts; a crop needs a depth map."""
+    if truth is None:
+        return False
+    if truth.depth_ref is not None:
+        return convention.counts(truth.depth_ref)
+    if truth.points is None or convention.crop is not None:
+        return False
+    return convention.counts(truth.points[:, 2])
+
+
 def _table(result: Run, maps: Mapping[str, Float], name: str) -> dict[str, dict[str, float]]:
     """Metrics of every method under one convention; {} where it does not apply."""
     truth, convention = result.pair.truth, preset(name)
-    if truth is None or true_depth(result) is None:
-        return {}
-    if truth.depth_ref is None and convention.crop is not None:
+    if truth is None or true_depth(result) is None or not _applies(truth, convention):
         return {}
     out: dict[str, dict[str, float]] = {}
     for method, depth in maps.items():
