@@ -387,6 +387,22 @@ def test_a_suite_takes_what_is_there(tmp_path):
     assert "119 of the list are not in the folder" in str(listing)
 
 
+def test_sintel_needs_its_cameras_but_for_the_scene_whose_camera_is_known(tmp_path):
+    suite = SUITES["sintel"]
+    for i in suite.build(suite, tmp_path, Options()):
+        if i.sequence in ("alley_1", "temple_2"):
+            for path in i.needs:
+                if path.suffix == ".png":
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    path.touch()
+    assert {i.sequence for i in list_suite("sintel", tmp_path).items} == {"alley_1"}
+    camera = tmp_path / "camdata_left" / "temple_2"
+    camera.mkdir(parents=True)
+    for frame in range(1, 51):
+        (camera / f"frame_{frame:04d}.cam").touch()
+    assert len(list_suite("sintel", tmp_path).items) == 48
+
+
 @pytest.mark.parametrize("name", [n for n, s in SUITES.items() if s.layout])
 def test_a_missing_dataset_says_where_to_get_it(name, tmp_path, capsys):
     assert main(["bench", "accuracy", "--suite", name, "--data", str(tmp_path)]) == 2
