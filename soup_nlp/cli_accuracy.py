@@ -146,6 +146,8 @@ def accuracy(
         print(path.read_text(encoding="utf-8"))
         print(f"files       {path.parent}/{path.stem}.*")
         return
+    # a worker of a cluster is at home in another folder
+    folders = folders.expanduser().resolve() if folders else None
     failed = 0
     for name in names:
         listing = list_suite(name, data, options)

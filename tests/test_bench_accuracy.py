@@ -303,6 +303,47 @@ def test_rows_are_kept_and_what_failed_is_tried_again(tmp_path):
         measure_all([*fake_jobs(), *fake_jobs()], path, function=counted)
 
 
+def test_a_stored_row_serves_where_it_has_the_conventions_and_the_folder(tmp_path):
+    path, seen = tmp_path / "rows.jsonl", []
+
+    def scored(job):
+        seen.append(job.item.presets)
+        tables = {name: {"solution": {"mre": 0.1}} for name in job.item.presets}
+        return {**fake(job), "metrics": tables}
+
+    def asked(*presets: str, folder: Path | None = None) -> dict:
+        job = Job(item().scored_by(presets), folder=folder)
+        return measure_all([job], path, function=scored)[0]
+
+    asked("paper", "best")
+    row = asked("best")
+    assert seen == [("paper", "best")]
+    assert row["presets"] == list(row["metrics"]) == ["best"]
+    asked("lsq", "paper", "best")
+    assert seen[1:] == [("lsq", "paper", "best")]
+    assert list(asked("best", "lsq")["metrics"]) == ["best", "lsq"]
+    # a folder that is not there is made, one that is there is not made again
+    kept = tmp_path / "kept"
+    asked("paper", folder=kept)
+    assert len(seen) == 3
+    kept.mkdir()
+    (kept / "summary.json").touch()
+    asked("paper", folder=kept)
+    assert len(seen) == 3
+
+
+def test_scene_flow_keeps_the_scale_of_its_convention(tmp_path):
+    def scored(job):
+        tables = {name: {"solution": {"mre": 0.1}} for name in job.item.presets}
+        seen.append(job)
+        return {**fake(job), "metrics": tables, "scene_flow": {"mean": 0.1}}
+
+    seen: list[Job] = []
+    for presets in (("paper", "best"), ("paper",), ("best",)):
+        measure_all([Job(item().scored_by(presets))], tmp_path / "rows.jsonl", function=scored)
+    assert [job.item.presets for job in seen] == [("paper", "best"), ("best",)]
+
+
 def test_a_line_that_was_cut_off_and_another_code_do_not_count(tmp_path):
     path = tmp_path / "rows.jsonl"
     measure_all(fake_jobs()[:2], path, function=fake)

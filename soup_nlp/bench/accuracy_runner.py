@@ -69,6 +69,9 @@ def measure_all(
 ) -> list[Row]:
     """The row of every job, measured where the file does not have it yet.
 
+    A stored row serves where it has every convention of the job, and where the result folder that
+    the job asks for is there; it is returned with the conventions of the job, in their order.
+
     Args:
         jobs: What to measure; keys are unique.
         path: JSON-lines file, appended to.
@@ -87,6 +90,9 @@ def measure_all(
         if row["ok"] and (any_code or row["code"] == code):
             known[_name(row)] = row
     names = [_name(head(job)) for job in jobs]
+    for job, name in zip(jobs, names, strict=True):
+        if name in known and not _serves(known[name], job):
+            del known[name]
     if len(set(names)) < len(names):
         twice = next(n for n in names if names.count(n) > 1)
         raise ConfigError("a row is asked for twice", found=twice[0])
@@ -100,7 +106,29 @@ def measure_all(
             done += 1
             if say:
                 say(done, len(jobs), row)
-    return [known[name] for name in names]
+    return [_as_asked(known[name], job) for name, job in zip(names, jobs, strict=True)]
+
+
+def _serves(row: Row, job: Job) -> bool:
+    """Whether a stored row has all that a job asks for."""
+    if job.folder is not None and not (job.folder / "summary.json").is_file():
+        return False
+    own, stored = job.item.presets, row["presets"]
+    if not set(own) <= set(stored):
+        return False
+    # scene flow has the scale of the row's main convention, and an analysis may score no other
+    metrics = row.get("metrics")
+    other = not metrics or (own[0] in metrics and not row.get("scene_flow"))
+    return bool(own[0] == stored[0] or other)
+
+
+def _as_asked(row: Row, job: Job) -> Row:
+    """A row with the conventions that a job asks for, in their order."""
+    own, metrics = job.item.presets, row.get("metrics") or {}
+    out = {**row, "presets": list(own)}
+    if "metrics" in row:
+        out["metrics"] = {name: metrics[name] for name in own if name in metrics}
+    return out
 
 
 class _Appender:
