@@ -57,15 +57,20 @@ def numbers(text: str, option: str) -> tuple[int, ...]:
 
 
 class Progress:
-    """Pairs done and time left: one rewritten line on a terminal, a line a pair in a log."""
+    """Pairs done and time left: one rewritten line on a terminal, a line a pair in a log.
+
+    `failed` counts the rows that failed: they are never stored ones.
+    """
 
     def __init__(self, quiet: bool) -> None:
         self.quiet = quiet
         self.live = sys.stderr.isatty()
         self.spent: list[float] = []
+        self.failed = 0
 
     def __call__(self, done: int, total: int, row: Row) -> None:
         """A new row."""
+        self.failed += not row["ok"]
         if self.quiet:
             return
         self.spent.append(float(row["seconds"]))
@@ -145,7 +150,7 @@ def accuracy(
         )
         print(path.read_text(encoding="utf-8"))
         print(f"files       {path.parent}/{path.stem}.*")
-        return
+        raise typer.Exit(1 if progress.failed else 0)
     # a worker of a cluster is at home in another folder
     folders = folders.expanduser().resolve() if folders else None
     failed = 0
@@ -217,6 +222,7 @@ def search(
             f" {len(validation)} validate",
             file=sys.stderr,
         )
+    progress = Progress(quiet)
     found = run_search(
         space,
         train,
@@ -227,7 +233,7 @@ def search(
         seed=seed,
         overrides=tuple(overrides or ()),
         where=Where(workers, dask),
-        say=Progress(quiet),
+        say=progress,
         any_code=any_code,
     )
     words = [f"--suite {s}" for s in suite or ["rendered"]] + (["--data DIR"] if data else [])
@@ -238,3 +244,4 @@ def search(
     write_text(out / "search.md", text_search(found, f"soup-nlp bench search {' '.join(words)}"))
     print((out / "search.md").read_text(encoding="utf-8"))
     print(f"files       {out}/search.md, {out}/search.jsonl")
+    raise typer.Exit(1 if progress.failed else 0)

@@ -299,6 +299,29 @@ def test_errors_of_flow_sources(tmp_path):
     assert (tmp_path / "flows.png").stat().st_size > 1000
 
 
+def broken(job: Job) -> dict:
+    """A row that failed for a file."""
+    error = "DataError: image is missing\n  where: a/0.png\n  found: nothing\n  expected: a file"
+    return {**head(job), "ok": False, "error": error, "seconds": 0.0, "cpu_seconds": 0.0}
+
+
+def test_failed_pairs_of_analyses_and_search_end_with_1(tmp_path, monkeypatch, capsys):
+    def measured_by(function):
+        changed = analyses.replace(ANALYSES["neighbours"], function=function)
+        monkeypatch.setattr(analyses, "ANALYSES", {"neighbours": changed})
+
+    measured_by(fake)
+    words = ["bench", "accuracy", "--analysis", "neighbours", "--values", "4,8", "--only", "orbit"]
+    words += ["--width", "128", "--flow", "truth", "-q", "--out"]
+    assert main([*words, str(tmp_path / "a")]) == 0
+    measured_by(broken)
+    assert main([*words, str(tmp_path / "b")]) == 1
+    kwdefaults = {**search_module.search.__kwdefaults__, "function": broken}
+    monkeypatch.setattr(search_module.search, "__kwdefaults__", kwdefaults)
+    words = ["bench", "search", "--trials", "1", "--width", "128", "-q", "--out", str(tmp_path)]
+    assert main([*words, "--param", "segmentation.neighbours=int:4:19"]) == 1
+
+
 def test_command_line_of_analyses_and_search(tmp_path, capsys, monkeypatch):
     assert main(["bench", "accuracy", "--analysis", "list"]) == 0
     out = capsys.readouterr().out
