@@ -428,6 +428,21 @@ def test_a_suite_takes_what_is_there(tmp_path):
     assert "119 of the list are not in the folder" in str(listing)
 
 
+def test_a_limit_counts_pairs_and_keeps_every_flow(tmp_path):
+    listing = list_suite("rendered", None, Options(limit=2))
+    assert len({i.name for i in listing.items}) == 2
+    assert len(listing.items) == 4
+    assert str(listing) == "suite rendered: 2 pairs (4 rows), 3 left out by the limit"
+    base = tmp_path / "image_0"
+    base.mkdir()
+    for index in range(4):
+        for frame in (10, 11):
+            (base / f"{index:06d}_{frame}.png").touch()
+    listing = list_suite("kitti2012", tmp_path, Options(limit=3, flows=("truth", "dis")))
+    text = "3 pairs (6 rows), 1 left out by the limit, 190 of the list are not in the folder"
+    assert str(listing) == f"suite kitti2012: {text}"
+
+
 def test_sintel_needs_its_cameras_but_for_the_scene_whose_camera_is_known(tmp_path):
     suite = SUITES["sintel"]
     for i in suite.build(suite, tmp_path, Options()):

@@ -63,7 +63,7 @@ class Options:
         flows: Flow sources; None for the suite's own.
         width: Columns of rendered scenes (436 of 1024 rows).
         seeds: Seeds of rendered scenes.
-        limit: At most this many pairs, spread evenly; None for all.
+        limit: At most this many pairs, spread evenly, each with every flow; None for all.
         only: Keep names that contain one of these words; empty for all.
     """
 
