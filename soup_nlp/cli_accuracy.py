@@ -11,7 +11,7 @@ import typer
 
 from soup_nlp.bench.accuracy import Job, Row
 from soup_nlp.bench.accuracy_runner import Where, measure_all
-from soup_nlp.bench.accuracy_table import get, report, show
+from soup_nlp.bench.accuracy_table import get, reason, report, show
 from soup_nlp.bench.suites import SUITES, Options, list_suite
 from soup_nlp.errors import ConfigError
 from soup_nlp.report.folder import write_text
@@ -79,7 +79,7 @@ class Progress:
             main = row["presets"][0]
             result = f"MRE {show(get(row, main, 'solution'))}"
         else:
-            result = f"failed: {str(row['error']).splitlines()[0]}"
+            result = f"failed: {reason(row)}"
         line = f"{done}/{total}  {row['key']}  {result}  {row['seconds']:.0f} s"
         if total > done:
             line += f"  (about {left:.0f} s of work left)"

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from soup_nlp.bench import analyses
 from soup_nlp.bench import search as search_module
 from soup_nlp.bench.accuracy import Job, head
+from soup_nlp.bench.accuracy_table import reason, report
 from soup_nlp.bench.analyses import ANALYSES, run_analysis
 from soup_nlp.bench.analyses_energy import measure_energy
 from soup_nlp.bench.analyses_flow import plot_flow, text_flow
@@ -36,6 +37,7 @@ from soup_nlp.bench.search_report import text_search
 from soup_nlp.bench.suites import Options, list_suite
 from soup_nlp.bench.suites_pairs import Item
 from soup_nlp.cli import main
+from soup_nlp.cli_accuracy import Progress
 from soup_nlp.errors import ConfigError
 
 QUICK = (
@@ -303,6 +305,15 @@ def broken(job: Job) -> dict:
     """A row that failed for a file."""
     error = "DataError: image is missing\n  where: a/0.png\n  found: nothing\n  expected: a file"
     return {**head(job), "ok": False, "error": error, "seconds": 0.0, "cpu_seconds": 0.0}
+
+
+def test_every_list_of_failures_says_which_file(capsys):
+    row = {**broken(Job(items(0)[0])), "code": "c"}
+    for text in (report("T", [row]), text_variants("x", "w", [row]), text_flow("x", "w", [row])):
+        assert "DataError: image is missing, where: a/0.png, found: nothing\n" in text
+    Progress(quiet=False)(1, 1, row)
+    assert "image is missing, where: a/0.png" in capsys.readouterr().err
+    assert reason({"error": ""}) == "no reason"
 
 
 def test_failed_pairs_of_analyses_and_search_end_with_1(tmp_path, monkeypatch, capsys):

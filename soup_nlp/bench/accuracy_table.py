@@ -35,6 +35,13 @@ def show(value: Number, form: str = ".4f") -> str:
     return "-" if value is None else format(value, form)
 
 
+def reason(row: Row) -> str:
+    """Why a row failed, on one line: what was wrong, where it was and what was found there."""
+    first, *more = str(row.get("error")).splitlines() or ["no reason"]
+    told = (line.strip() for line in more)
+    return ", ".join([first, *(t for t in told if t.startswith(("where: ", "found: ")))])
+
+
 def pair_names(rows: Sequence[Row]) -> list[str]:
     """The pair of every row; with its suite where another suite has a pair of that name."""
     suites: dict[str, set[str]] = {}
@@ -75,7 +82,7 @@ def report(title: str, rows: Sequence[Row], note: str = "") -> str:
     bad = [r for r in rows if not r.get("ok")]
     if bad:
         lines += ["## Failed", ""]
-        lines += [f"- {r['key']}: {str(r.get('error')).splitlines()[0]}" for r in bad]
+        lines += [f"- {r['key']}: {reason(r)}" for r in bad]
     return "\n".join(lines).rstrip() + "\n"
 
 
