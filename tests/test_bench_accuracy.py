@@ -467,16 +467,29 @@ def test_a_missing_dataset_says_where_to_get_it(name, tmp_path, capsys):
     assert "expected:" in text
 
 
-def test_published_numbers_are_marked():
-    assert published("kitti2015") == dict(COMPARISON["kitti"])
-    assert published("rendered") == {}
-    row = {
-        **{"key": "k", "ok": True, "good": True, "suite": "kinect_paper", "pair": "p"},
-        **{"sequence": "s", "flow": "dis", "presets": ["paper"], "status": "x", "code": "c"},
-        **{"metrics": {"paper": {"solution": {"mre": 0.03}, "constant": {"mre": 0.04}}}},
+def solved(suite: str, convention: str = "paper") -> dict:
+    """A row of one convention, without a solve."""
+    return {
+        **{"key": "k", "ok": True, "good": True, "suite": suite, "pair": "p"},
+        **{"sequence": "s", "flow": "dis", "presets": [convention], "status": "x", "code": "c"},
+        **{"metrics": {convention: {"solution": {"mre": 0.03}, "constant": {"mre": 0.04}}}},
         **{"flow_error": None, "scene_flow": None, "cpu_seconds": 1.0},
         "energy": {"solution": {"total": 1.0}},
     }
+
+
+def test_every_pair_is_in_the_detail_of_its_own_convention():
+    text = report("T", [solved("shared"), {**solved("shared", "kitti"), "pair": "q"}])
+    detail = text.split("## The solution, ")[1:]
+    assert [part.partition(":")[0] for part in detail] == ["paper", "kitti"]
+    assert "| p | dis |" in detail[0]
+    assert "| q | dis |" in detail[1]
+
+
+def test_published_numbers_are_marked():
+    assert published("kitti2015") == dict(COMPARISON["kitti"])
+    assert published("rendered") == {}
+    row = solved("kinect_paper")
     text = report("T", [row])
     assert "| BMM (published) | 0.0322 |" in text
     assert "(measured) | 0.0300 |" in text

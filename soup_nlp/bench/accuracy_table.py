@@ -75,7 +75,8 @@ def report(title: str, rows: Sequence[Row], note: str = "") -> str:
     for name in sorted(conventions, key=lambda p: p != main):
         lines += _convention(name, good)
     lines += _beaten_by(good)
-    lines += _detail(good, main)
+    for name in dict.fromkeys(_own(r) for r in good):
+        lines += _detail([r for r in good if _own(r) == name], name)
     suites = list(dict.fromkeys(r["suite"] for r in rows))
     for suite in suites:
         lines += _published(suite, [r for r in good if r["suite"] == suite])
