@@ -98,7 +98,7 @@ def accuracy(
         str | None, typer.Option(help="An analysis instead of the table; `list` names them.")
     ] = None,
     values: Annotated[
-        str | None, typer.Option(help="Variants of the analysis, such as 100,250,500.")
+        str | None, typer.Option(help="Variants of the analysis, such as 100, 250, 500.")
     ] = None,
     overrides: Set = None,
     flow: Flow = None,
@@ -116,7 +116,7 @@ def accuracy(
     quiet: Quiet = False,
 ) -> None:
     """Depth against truth on a suite of pairs; stopped runs go on where they were."""
-    from soup_nlp.bench.analyses import ANALYSES, run_analysis
+    from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
 
     if analysis == "list":
         for name, entry in ANALYSES.items():
@@ -138,13 +138,21 @@ def accuracy(
     where, progress = Where(workers, dask), Progress(quiet)
     names: Sequence[str] = suite or ["rendered"]
     if analysis:
+        if folders:
+            raise ConfigError(
+                "result folders are kept of suites, not of analyses",
+                where="--folders",
+                found=f"--analysis {analysis}",
+                hint="give one without the other",
+            )
         path = run_analysis(
             analysis,
             [list_suite(name, data, options) for name in names],
             out,
             tuple(overrides or ()),
             where,
-            values=values.split(",") if values else None,
+            values=None if values is None else split_values(analysis, values),
+            presets=conventions or (),
             say=progress,
             any_code=any_code,
         )

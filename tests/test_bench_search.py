@@ -14,7 +14,7 @@ from soup_nlp.bench import analyses
 from soup_nlp.bench import search as search_module
 from soup_nlp.bench.accuracy import Job, head
 from soup_nlp.bench.accuracy_table import reason, report
-from soup_nlp.bench.analyses import ANALYSES, run_analysis
+from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
 from soup_nlp.bench.analyses_energy import measure_energy
 from soup_nlp.bench.analyses_flow import plot_flow, text_flow
 from soup_nlp.bench.analyses_report import (
@@ -218,6 +218,49 @@ def test_an_analysis_writes_table_and_plot(tmp_path, monkeypatch):
         run_analysis("neighbour", [listing], tmp_path)
     with pytest.raises(ConfigError, match="no pair is left"):
         run_analysis("neighbours", [], tmp_path)
+
+
+def test_values_are_names_with_commas_and_blanks_and_are_checked_first(tmp_path):
+    assert split_values("pattern", "slic,grid") == ["slic", "grid"]
+    both = ["slic, image alone", "grid, image alone"]
+    assert split_values("pattern", "slic, image alone,grid,image alone") == both
+    assert split_values("flows", " dis, reweighted 0.5 , dis") == ["dis, reweighted 0.5", "dis"]
+    assert split_values("neighbours", "4, 8 ,12") == ["4", "8", "12"]
+    for text in ("", "4,,8", "4,"):
+        with pytest.raises(ConfigError, match="value is empty"):
+            split_values("neighbours", text)
+    listing = list_suite("rendered", None, Options(width=128, flows=("dis",), limit=1))
+    out = tmp_path / "out"
+    for name, values in (
+        *(("neighbours", ["8", v]) for v in ("abc", "nan", "4.5")),
+        ("pattern", ["hexagons"]),
+    ):
+        with pytest.raises(ConfigError):
+            run_analysis(name, [listing], out, values=values)
+    with pytest.raises(ConfigError, match="give --flow truth"):
+        run_analysis("flow", [listing], out)
+    assert not out.exists()
+
+
+def test_conventions_and_folders_of_an_analysis_are_not_ignored(tmp_path, monkeypatch, capsys):
+    seen = []
+
+    def scored(job):
+        seen.append(job.item.presets)
+        row = fake(job)
+        return {**row, "metrics": {"lsq": row["metrics"]["paper"]}}
+
+    changed = analyses.replace(ANALYSES["neighbours"], function=scored)
+    monkeypatch.setattr(analyses, "ANALYSES", {**ANALYSES, "neighbours": changed})
+    words = ["bench", "accuracy", "--only", "orbit", "--width", "128", "--flow", "truth", "-q"]
+    words += ["--preset", "lsq", "--out", str(tmp_path / "out"), "--analysis"]
+    assert main([*words, "neighbours", "--values", "8"]) == 0
+    assert seen == [("lsq",)]
+    assert "one lsq scale" in capsys.readouterr().out
+    assert main([*words, "flows"]) == 2
+    assert "no depth to score" in capsys.readouterr().err
+    assert main([*words, "neighbours", "--folders", str(tmp_path / "f")]) == 2
+    assert "--folders" in capsys.readouterr().err
 
 
 def test_tables_bear_failed_rows(tmp_path):
