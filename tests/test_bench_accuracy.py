@@ -494,6 +494,13 @@ def test_published_numbers_are_marked():
     assert "| BMM (published) | 0.0322 |" in text
     assert "(measured) | 0.0300 |" in text
     assert "beats every rival on 1 of 1" in text
+    # of the pairs that have a number, under the name of the convention, on what data
+    bare = {**solved("kitti2015", "kitti"), "metrics": {}}
+    failed = {**bare, "ok": False, "error": "out of luck"}
+    text = report("T", [solved("kitti2015", "kitti"), bare, failed])
+    assert "| this program, flow dis, kitti, 1 pair (measured) | 0.0300 |" in text
+    assert "odometry set 00-09 with LiDAR truth" in text
+    assert "\n\n## Failed\n" in text
     # one rigid motion is met on its own pixels
     metrics = row["metrics"]["paper"]
     metrics |= {"rigid": {"mre": 0.025, "coverage": 0.6}, "solution_rigid": {"mre": 0.02}}

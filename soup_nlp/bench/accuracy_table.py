@@ -9,7 +9,7 @@ from datetime import date
 import numpy as np
 
 from soup_nlp.bench.accuracy import Row
-from soup_nlp.bench.published import PROTOCOL, SOURCE, published
+from soup_nlp.bench.published import PROTOCOL, SOURCE, data_note, published
 from soup_nlp.bench.rivals import METHODS, RIVALS
 from soup_nlp.report.protocols import preset
 
@@ -240,8 +240,16 @@ def _published(suite: str, rows: Sequence[Row]) -> list[str]:
     if not numbers:
         return []
     lines = [[f"{m} (published)", show(v)] for m, v in numbers.items()]
-    for (_, flow), group in _groups(rows, _suite).items():
-        own = mean(get(r, next(iter(r["presets"])), "solution") for r in group)
-        lines.append([f"this program, flow {flow}, {len(group)} pairs (measured)", show(own)])
-    text = f"Published rows are copied, not measured: {SOURCE}. {PROTOCOL}."
-    return [f"## {suite} beside published numbers", "", *table(["method", "MRE"], lines), "", text]
+    measured = _groups([r for r in rows if _own(r)], lambda r: (r["flow"], _own(r)))
+    for (flow, name), group in measured.items():
+        own = mean(get(r, name, "solution") for r in group)
+        who = f"this program, flow {flow}, {name}, {_count(group)} (measured)"
+        lines.append([who, show(own)])
+    text = f"Published rows are copied, not measured: {SOURCE}. {PROTOCOL}. {data_note(suite)}."
+    text += "".join(f" Measured: {preset(name)}." for name in dict.fromkeys(n for _, n in measured))
+    head = f"## {suite} beside published numbers"
+    return [head, "", *table(["method", "MRE"], lines), "", text, ""]
+
+
+def _count(pairs: Sequence[Row]) -> str:
+    return f"{len(pairs)} pair{'' if len(pairs) == 1 else 's'}"
