@@ -486,6 +486,10 @@ def test_every_pair_is_in_the_detail_of_its_own_convention():
     assert "| q | dis |" in detail[1]
 
 
+def test_a_table_says_where_its_convention_is_not_the_usual_one():
+    assert "the scale is the median of z_gt / z" in report("T", [solved("kitti2015", "eigen80")])
+
+
 def test_published_numbers_are_marked():
     assert published("kitti2015") == dict(COMPARISON["kitti"])
     assert published("rendered") == {}

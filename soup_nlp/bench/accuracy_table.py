@@ -166,7 +166,8 @@ def _convention(name: str, rows: Sequence[Row]) -> list[str]:
         cover = mean(get(r, name, "solution", "coverage") for r in group)
         return [*map(show, numbers), show(skill, ".3f"), show(cover, ".1%")]
 
-    lines = [f"## MRE, {preset(name)}", ""]
+    text = preset(name).text
+    lines = [f"## MRE, {preset(name)}", "", f"{text[0].upper()}{text[1:]}.", ""]
     lines += table(head, [[r["pair"], r["flow"], *cells([r])] for r in own])
     for title, group_by in (("sequence", _sequence), ("dataset", _suite)):
         groups = _groups(own, group_by)
