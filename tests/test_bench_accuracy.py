@@ -486,6 +486,13 @@ def test_every_pair_is_in_the_detail_of_its_own_convention():
     assert "| q | dis |" in detail[1]
 
 
+def test_a_table_says_what_its_planes_are_fitted_to():
+    for convention, said in (("paper", False), ("near20", True), ("eigen80", True)):
+        row = solved("shared", convention)
+        row["metrics"][convention]["plane"] = {"mre": 0.05}
+        assert ("`plane`: fitted to all true pixels" in report("T", [row])) is said
+
+
 def test_a_table_says_where_its_convention_is_not_the_usual_one():
     assert "the scale is the median of z_gt / z" in report("T", [solved("kitti2015", "eigen80")])
 

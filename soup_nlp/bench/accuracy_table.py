@@ -177,6 +177,10 @@ def _convention(name: str, rows: Sequence[Row]) -> list[str]:
                 [f"{title} (pairs)", *head[1:]],
                 [[f"{k[0]} ({len(g)})", k[1], *cells(g)] for k, g in groups.items()],
             )
+    fitted = [f"`{m}`" for m in ("plane", "floor") if m in methods]
+    if fitted and (preset(name).cap is not None or preset(name).crop is not None):
+        told = "fitted to all true pixels, not only to those that count here"
+        lines += ["", f"{' and '.join(fitted)}: {told}."]
     held = [r["metrics"][name]["rigid"]["coverage"] for r in own if "rigid" in r["metrics"][name]]
     if held:
         lines += ["", f"`rigid` covers {min(held):.0%} to {max(held):.0%} of the true pixels."]
