@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from soup_nlp import cli_accuracy
 from soup_nlp.bench.accuracy import (
     Job,
     clean,
@@ -521,6 +522,21 @@ def test_published_numbers_are_marked():
     assert "beats every rival on 0 of 1" in text
     assert "| p | dis | paper | rigid | 0.0250 | 0.0260 | 60.0% | -0.0010 |" in text
     assert set(RIVALS) <= set(METHODS)
+
+
+def test_result_folders_are_the_same_for_workers_elsewhere(tmp_path, monkeypatch):
+    asked: list[Path | None] = []
+
+    def stored(jobs, *_, **__):
+        asked.extend(job.folder for job in jobs)
+        return []
+
+    monkeypatch.setattr(cli_accuracy, "measure_all", stored)
+    monkeypatch.chdir(tmp_path)
+    words = ["bench", "accuracy", "--suite", "rendered", "--only", "orbit", "--flow", "truth"]
+    assert main([*words, "-q", "--folders", "runs", "--out", "."]) == 0
+    (folder,) = asked
+    assert folder.is_relative_to(tmp_path / "runs")
 
 
 def test_command_line(tmp_path, capsys):
