@@ -11,7 +11,7 @@ import typer
 
 from soup_nlp.bench.accuracy import Job, Row
 from soup_nlp.bench.accuracy_runner import Where, measure_all
-from soup_nlp.bench.accuracy_table import get, report, show
+from soup_nlp.bench.accuracy_table import get, reason, report, show
 from soup_nlp.bench.suites import SUITES, Options, list_suite
 from soup_nlp.errors import ConfigError
 from soup_nlp.report.folder import write_text
@@ -57,15 +57,20 @@ def numbers(text: str, option: str) -> tuple[int, ...]:
 
 
 class Progress:
-    """Pairs done and time left: one rewritten line on a terminal, a line a pair in a log."""
+    """Pairs done and time left: one rewritten line on a terminal, a line a pair in a log.
+
+    `failed` counts the rows that failed: they are never stored ones.
+    """
 
     def __init__(self, quiet: bool) -> None:
         self.quiet = quiet
         self.live = sys.stderr.isatty()
         self.spent: list[float] = []
+        self.failed = 0
 
     def __call__(self, done: int, total: int, row: Row) -> None:
         """A new row."""
+        self.failed += not row["ok"]
         if self.quiet:
             return
         self.spent.append(float(row["seconds"]))
@@ -74,7 +79,7 @@ class Progress:
             main = row["presets"][0]
             result = f"MRE {show(get(row, main, 'solution'))}"
         else:
-            result = f"failed: {str(row['error']).splitlines()[0]}"
+            result = f"failed: {reason(row)}"
         line = f"{done}/{total}  {row['key']}  {result}  {row['seconds']:.0f} s"
         if total > done:
             line += f"  (about {left:.0f} s of work left)"
@@ -93,7 +98,7 @@ def accuracy(
         str | None, typer.Option(help="An analysis instead of the table; `list` names them.")
     ] = None,
     values: Annotated[
-        str | None, typer.Option(help="Variants of the analysis, such as 100,250,500.")
+        str | None, typer.Option(help="Variants of the analysis, such as 100, 250, 500.")
     ] = None,
     overrides: Set = None,
     flow: Flow = None,
@@ -111,7 +116,7 @@ def accuracy(
     quiet: Quiet = False,
 ) -> None:
     """Depth against truth on a suite of pairs; stopped runs go on where they were."""
-    from soup_nlp.bench.analyses import ANALYSES, run_analysis
+    from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
 
     if analysis == "list":
         for name, entry in ANALYSES.items():
@@ -133,19 +138,29 @@ def accuracy(
     where, progress = Where(workers, dask), Progress(quiet)
     names: Sequence[str] = suite or ["rendered"]
     if analysis:
+        if folders:
+            raise ConfigError(
+                "result folders are kept of suites, not of analyses",
+                where="--folders",
+                found=f"--analysis {analysis}",
+                hint="give one without the other",
+            )
         path = run_analysis(
             analysis,
             [list_suite(name, data, options) for name in names],
             out,
             tuple(overrides or ()),
             where,
-            values=values.split(",") if values else None,
+            values=None if values is None else split_values(analysis, values),
+            presets=conventions or (),
             say=progress,
             any_code=any_code,
         )
         print(path.read_text(encoding="utf-8"))
         print(f"files       {path.parent}/{path.stem}.*")
-        return
+        raise typer.Exit(1 if progress.failed else 0)
+    # a worker of a cluster is at home in another folder
+    folders = folders.expanduser().resolve() if folders else None
     failed = 0
     for name in names:
         listing = list_suite(name, data, options)
@@ -215,6 +230,7 @@ def search(
             f" {len(validation)} validate",
             file=sys.stderr,
         )
+    progress = Progress(quiet)
     found = run_search(
         space,
         train,
@@ -225,7 +241,7 @@ def search(
         seed=seed,
         overrides=tuple(overrides or ()),
         where=Where(workers, dask),
-        say=Progress(quiet),
+        say=progress,
         any_code=any_code,
     )
     words = [f"--suite {s}" for s in suite or ["rendered"]] + (["--data DIR"] if data else [])
@@ -236,3 +252,4 @@ def search(
     write_text(out / "search.md", text_search(found, f"soup-nlp bench search {' '.join(words)}"))
     print((out / "search.md").read_text(encoding="utf-8"))
     print(f"files       {out}/search.md, {out}/search.jsonl")
+    raise typer.Exit(1 if progress.failed else 0)

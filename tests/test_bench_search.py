@@ -13,7 +13,8 @@ from matplotlib.axes import Axes
 from soup_nlp.bench import analyses
 from soup_nlp.bench import search as search_module
 from soup_nlp.bench.accuracy import Job, head
-from soup_nlp.bench.analyses import ANALYSES, run_analysis
+from soup_nlp.bench.accuracy_table import reason, report
+from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
 from soup_nlp.bench.analyses_energy import measure_energy
 from soup_nlp.bench.analyses_flow import plot_flow, text_flow
 from soup_nlp.bench.analyses_report import (
@@ -36,6 +37,7 @@ from soup_nlp.bench.search_report import text_search
 from soup_nlp.bench.suites import Options, list_suite
 from soup_nlp.bench.suites_pairs import Item
 from soup_nlp.cli import main
+from soup_nlp.cli_accuracy import Progress
 from soup_nlp.errors import ConfigError
 
 QUICK = (
@@ -218,6 +220,49 @@ def test_an_analysis_writes_table_and_plot(tmp_path, monkeypatch):
         run_analysis("neighbours", [], tmp_path)
 
 
+def test_values_are_names_with_commas_and_blanks_and_are_checked_first(tmp_path):
+    assert split_values("pattern", "slic,grid") == ["slic", "grid"]
+    both = ["slic, image alone", "grid, image alone"]
+    assert split_values("pattern", "slic, image alone,grid,image alone") == both
+    assert split_values("flows", " dis, reweighted 0.5 , dis") == ["dis, reweighted 0.5", "dis"]
+    assert split_values("neighbours", "4, 8 ,12") == ["4", "8", "12"]
+    for text in ("", "4,,8", "4,"):
+        with pytest.raises(ConfigError, match="value is empty"):
+            split_values("neighbours", text)
+    listing = list_suite("rendered", None, Options(width=128, flows=("dis",), limit=1))
+    out = tmp_path / "out"
+    for name, values in (
+        *(("neighbours", ["8", v]) for v in ("abc", "nan", "4.5")),
+        ("pattern", ["hexagons"]),
+    ):
+        with pytest.raises(ConfigError):
+            run_analysis(name, [listing], out, values=values)
+    with pytest.raises(ConfigError, match="give --flow truth"):
+        run_analysis("flow", [listing], out)
+    assert not out.exists()
+
+
+def test_conventions_and_folders_of_an_analysis_are_not_ignored(tmp_path, monkeypatch, capsys):
+    seen = []
+
+    def scored(job):
+        seen.append(job.item.presets)
+        row = fake(job)
+        return {**row, "metrics": {"lsq": row["metrics"]["paper"]}}
+
+    changed = analyses.replace(ANALYSES["neighbours"], function=scored)
+    monkeypatch.setattr(analyses, "ANALYSES", {**ANALYSES, "neighbours": changed})
+    words = ["bench", "accuracy", "--only", "orbit", "--width", "128", "--flow", "truth", "-q"]
+    words += ["--preset", "lsq", "--out", str(tmp_path / "out"), "--analysis"]
+    assert main([*words, "neighbours", "--values", "8"]) == 0
+    assert seen == [("lsq",)]
+    assert "one lsq scale" in capsys.readouterr().out
+    assert main([*words, "flows"]) == 2
+    assert "no depth to score" in capsys.readouterr().err
+    assert main([*words, "neighbours", "--folders", str(tmp_path / "f")]) == 2
+    assert "--folders" in capsys.readouterr().err
+
+
 def test_tables_bear_failed_rows(tmp_path):
     jobs = [Job(i, (f"segmentation.neighbours={k}",), str(k)) for i in items(0)[:2] for k in (4, 8)]
     rows = [{**fake(j), "code": "c"} for j in jobs]
@@ -297,6 +342,38 @@ def test_errors_of_flow_sources(tmp_path):
     # without the contributed modules the source is a row that failed
     assert "rlof" in text
     assert (tmp_path / "flows.png").stat().st_size > 1000
+
+
+def broken(job: Job) -> dict:
+    """A row that failed for a file."""
+    error = "DataError: image is missing\n  where: a/0.png\n  found: nothing\n  expected: a file"
+    return {**head(job), "ok": False, "error": error, "seconds": 0.0, "cpu_seconds": 0.0}
+
+
+def test_every_list_of_failures_says_which_file(capsys):
+    row = {**broken(Job(items(0)[0])), "code": "c"}
+    for text in (report("T", [row]), text_variants("x", "w", [row]), text_flow("x", "w", [row])):
+        assert "DataError: image is missing, where: a/0.png, found: nothing\n" in text
+    Progress(quiet=False)(1, 1, row)
+    assert "image is missing, where: a/0.png" in capsys.readouterr().err
+    assert reason({"error": ""}) == "no reason"
+
+
+def test_failed_pairs_of_analyses_and_search_end_with_1(tmp_path, monkeypatch, capsys):
+    def measured_by(function):
+        changed = analyses.replace(ANALYSES["neighbours"], function=function)
+        monkeypatch.setattr(analyses, "ANALYSES", {"neighbours": changed})
+
+    measured_by(fake)
+    words = ["bench", "accuracy", "--analysis", "neighbours", "--values", "4,8", "--only", "orbit"]
+    words += ["--width", "128", "--flow", "truth", "-q", "--out"]
+    assert main([*words, str(tmp_path / "a")]) == 0
+    measured_by(broken)
+    assert main([*words, str(tmp_path / "b")]) == 1
+    kwdefaults = {**search_module.search.__kwdefaults__, "function": broken}
+    monkeypatch.setattr(search_module.search, "__kwdefaults__", kwdefaults)
+    words = ["bench", "search", "--trials", "1", "--width", "128", "-q", "--out", str(tmp_path)]
+    assert main([*words, "--param", "segmentation.neighbours=int:4:19"]) == 1
 
 
 def test_command_line_of_analyses_and_search(tmp_path, capsys, monkeypatch):

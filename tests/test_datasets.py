@@ -10,6 +10,7 @@ import pytest
 
 from soup_nlp.data import datasets
 from soup_nlp.data import formats as fmt
+from soup_nlp.data import formats_image as fmt_image
 from soup_nlp.data.datasets_sintel import DEFAULT_CAMERA
 from soup_nlp.errors import DataError
 
@@ -265,8 +266,14 @@ def test_sintel(tmp_path: Path) -> None:
     base = tmp_path / "training"
     for number in (1, 2):
         picture(base / "final" / "cave_2" / f"frame_{number:04d}.png", number)
-    assert datasets.load_sintel(tmp_path, "cave_2", 1, "final").K_ref[0, 0] == DEFAULT_CAMERA[0]
+    with pytest.warns(fmt_image.DataWarning, match=r"cave_2/frame_0001\.cam.*alley_1"):
+        pair = datasets.load_sintel(tmp_path, "cave_2", 1, "final")
+    assert pair.K_ref[0, 0] == DEFAULT_CAMERA[0]
     assert datasets.load_sintel(tmp_path, "cave_2", 1, "final", K=K).K_next[1, 1] == 110
+    for number in (1, 2):
+        picture(base / "final" / "alley_1" / f"frame_{number:04d}.png", number)
+    # the one scene whose camera is known: no warning, which would be an error here
+    assert datasets.load_sintel(tmp_path, "alley_1", 1, "final").K_ref[0, 0] == DEFAULT_CAMERA[0]
     for kind in ("camdata_left", "depth", "flow", "occlusions", "invalid"):
         (base / kind / "cave_2").mkdir(parents=True)
     for number, focal in ((1, 100.0), (2, 120.0)):

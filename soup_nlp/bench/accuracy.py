@@ -17,16 +17,17 @@ from numpy.typing import NDArray
 
 import soup_nlp
 from soup_nlp.bench.rivals import depth_maps, true_depth
-from soup_nlp.bench.suites import Item
+from soup_nlp.bench.suites import SUITES, Item
 from soup_nlp.bench.truth import true_soup
 from soup_nlp.config import Problem, dump_problem
-from soup_nlp.data.pair import Pair
+from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
+from soup_nlp.inputs import load_pair
 from soup_nlp.model import plain
 from soup_nlp.pipeline import Run, run
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.metrics import sample_at_points, skill
-from soup_nlp.report.protocols import preset
+from soup_nlp.report.protocols import Preset, preset
 from soup_nlp.report.scene_flow import scene_flow_epe
 
 Float = NDArray[np.float64]
@@ -70,7 +71,15 @@ class Job:
 def settings_hash(problem: Problem) -> str:
     """Hash of everything but the input: the same settings on every pair and in every place."""
     out = ("name", "base", "input", "expected")
-    tree = problem.model_dump(mode="json", exclude=set(out))
+    return _hash(problem.model_dump(mode="json", exclude=set(out)))
+
+
+def input_hash(problem: Problem) -> str:
+    """Hash of the input but its place: the same frames of the same dataset in every folder."""
+    return _hash(problem.input.model_dump(mode="json", exclude={"root", "path"}))
+
+
+def _hash(tree: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -90,13 +99,21 @@ def measure(job: Job) -> Row:
     begin, cpu = time.perf_counter(), time.process_time()
     try:
         problem = job.item.problem(job.overrides)
+        if job.item.needs:
+            # a dataset without its truth would be solved for nothing, and again every time
+            truth = load_pair(problem).truth
+            if not any(_applies(truth, preset(name)) for name in job.item.presets):
+                raise _no_truth(job.item)
         if job.folder is None:
             result = run(problem)
         else:
             folder = prepare_folder(job.folder)
             result = run(problem, ipopt_log=str(folder / "ipopt.log"))
             write_folder(folder, result, dump_problem(problem), "")
-        row |= {"ok": True, "error": None, **scores(result, job.item.presets)}
+        found = scores(result, job.item.presets)
+        if not found["metrics"]:
+            raise _no_truth(job.item)
+        row |= {"ok": True, "error": None, **found}
     except Exception as error:
         row |= {"ok": False, "error": f"{type(error).__name__}: {error}"}
     row["seconds"] = time.perf_counter() - begin
@@ -104,13 +121,26 @@ def measure(job: Job) -> Row:
     return clean(row)
 
 
+def _no_truth(item: Item) -> DataError:
+    """What is missing where no convention gave a number, and where to get it."""
+    suite = SUITES.get(item.suite)
+    return DataError(
+        "pair has no true depth",
+        where=item.key,
+        found=f"no pixel that counts under {', '.join(item.presets)}",
+        expected=suite.layout or None if suite else None,
+        hint=f"get it from {suite.source}" if suite and suite.source else None,
+    )
+
+
 def head(job: Job) -> Row:
     """What names a row."""
     item = job.item
     try:
-        settings = settings_hash(item.problem(job.overrides))
+        problem = item.problem(job.overrides)
+        settings, source = settings_hash(problem), input_hash(problem)
     except Exception:
-        settings = "wrong"
+        settings = source = "wrong"
     return {
         "key": job.key,
         "suite": item.suite,
@@ -121,6 +151,7 @@ def head(job: Job) -> Row:
         "overrides": list(job.overrides),
         "presets": list(item.presets),
         "settings": settings,
+        "input": source,
     }
 
 
@@ -161,12 +192,21 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
     return row
 
 
+def _applies(truth: Truth | None, convention: Preset) -> bool:
+    """Whether a truth has a pixel that counts; a crop needs a depth map."""
+    if truth is None:
+        return False
+    if truth.depth_ref is not None:
+        return convention.counts(truth.depth_ref)
+    if truth.points is None or convention.crop is not None:
+        return False
+    return convention.counts(truth.points[:, 2])
+
+
 def _table(result: Run, maps: Mapping[str, Float], name: str) -> dict[str, dict[str, float]]:
     """Metrics of every method under one convention; {} where it does not apply."""
     truth, convention = result.pair.truth, preset(name)
-    if truth is None or true_depth(result) is None:
-        return {}
-    if truth.depth_ref is None and convention.crop is not None:
+    if truth is None or true_depth(result) is None or not _applies(truth, convention):
         return {}
     out: dict[str, dict[str, float]] = {}
     for method, depth in maps.items():

@@ -1,8 +1,8 @@
 """Many rows: in this process, in processes of one machine (joblib), or on a cluster (Dask).
 
 Rows are appended to a JSON-lines file by the parent alone, each as soon as it is there, so a run
-that was stopped goes on where it was. A row stands for its key, settings and code version; a row
-that failed is tried again.
+that was stopped goes on where it was. A row stands for its key, settings, input and code version; a
+row that failed is tried again.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from soup_nlp.errors import ConfigError, DataError
 
 Function = Callable[[Job], Row]
 Say = Callable[[int, int, Row], None]
+Name = tuple[str, str, str]
 
 
 @dataclass(frozen=True)
@@ -35,20 +36,26 @@ class Where:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Rows of a JSON-lines file, the last one of every key, settings and code version.
+    """Rows of a JSON-lines file, the last one of every key, settings, input and code version.
 
     A line that was cut off by a crash is left out.
     """
     if not path.is_file():
         return []
-    out: dict[tuple[str, str, str], Row] = {}
+    out: dict[tuple[Name, str], Row] = {}
     for line in path.read_text(encoding="utf-8").splitlines():
         try:
             row = json.loads(line)
-            out[row["key"], row["settings"], row["code"]] = row
+            out[_name(row), row["code"]] = row
         except (ValueError, KeyError, TypeError):
             continue
     return list(out.values())
+
+
+def _name(row: Row) -> Name:
+    """What a row stands for, but its code version."""
+    # rows of old versions do not say which input they had
+    return row["key"], row["settings"], row.get("input", "unknown")
 
 
 def measure_all(
@@ -61,6 +68,9 @@ def measure_all(
     function: Function = measure,
 ) -> list[Row]:
     """The row of every job, measured where the file does not have it yet.
+
+    A stored row serves where it has every convention of the job, and where the result folder that
+    the job asks for is there; it is returned with the conventions of the job, in their order.
 
     Args:
         jobs: What to measure; keys are unique.
@@ -75,11 +85,14 @@ def measure_all(
         ConfigError: joblib or Dask is needed and not installed, or the cluster does not answer.
     """
     where, code = where or Where(), code_version()
-    known: dict[tuple[str, str], Row] = {}
+    known: dict[Name, Row] = {}
     for row in read_rows(path):
         if row["ok"] and (any_code or row["code"] == code):
-            known[row["key"], row["settings"]] = row
-    names = [(job.key, head(job)["settings"]) for job in jobs]
+            known[_name(row)] = row
+    names = [_name(head(job)) for job in jobs]
+    for job, name in zip(jobs, names, strict=True):
+        if name in known and not _serves(known[name], job):
+            del known[name]
     if len(set(names)) < len(names):
         twice = next(n for n in names if names.count(n) > 1)
         raise ConfigError("a row is asked for twice", found=twice[0])
@@ -89,11 +102,33 @@ def measure_all(
         for row in _rows(todo, function, where) if todo else ():
             row["code"] = code
             file.add(row)
-            known[row["key"], row["settings"]] = row
+            known[_name(row)] = row
             done += 1
             if say:
                 say(done, len(jobs), row)
-    return [known[name] for name in names]
+    return [_as_asked(known[name], job) for name, job in zip(names, jobs, strict=True)]
+
+
+def _serves(row: Row, job: Job) -> bool:
+    """Whether a stored row has all that a job asks for."""
+    if job.folder is not None and not (job.folder / "summary.json").is_file():
+        return False
+    own, stored = job.item.presets, row["presets"]
+    if not set(own) <= set(stored):
+        return False
+    # scene flow has the scale of the row's main convention, and an analysis may score no other
+    metrics = row.get("metrics")
+    other = not metrics or (own[0] in metrics and not row.get("scene_flow"))
+    return bool(own[0] == stored[0] or other)
+
+
+def _as_asked(row: Row, job: Job) -> Row:
+    """A row with the conventions that a job asks for, in their order."""
+    own, metrics = job.item.presets, row.get("metrics") or {}
+    out = {**row, "presets": list(own)}
+    if "metrics" in row:
+        out["metrics"] = {name: metrics[name] for name in own if name in metrics}
+    return out
 
 
 class _Appender:

@@ -9,7 +9,7 @@ from datetime import date
 import numpy as np
 
 from soup_nlp.bench.accuracy import Row
-from soup_nlp.bench.published import PROTOCOL, SOURCE, published
+from soup_nlp.bench.published import PROTOCOL, SOURCE, data_note, published
 from soup_nlp.bench.rivals import METHODS, RIVALS
 from soup_nlp.report.protocols import preset
 
@@ -33,6 +33,13 @@ def mean(values: Iterable[Number]) -> Number:
 def show(value: Number, form: str = ".4f") -> str:
     """A number, or a dash."""
     return "-" if value is None else format(value, form)
+
+
+def reason(row: Row) -> str:
+    """Why a row failed, on one line: what was wrong, where it was and what was found there."""
+    first, *more = str(row.get("error")).splitlines() or ["no reason"]
+    told = (line.strip() for line in more)
+    return ", ".join([first, *(t for t in told if t.startswith(("where: ", "found: ")))])
 
 
 def pair_names(rows: Sequence[Row]) -> list[str]:
@@ -68,14 +75,15 @@ def report(title: str, rows: Sequence[Row], note: str = "") -> str:
     for name in sorted(conventions, key=lambda p: p != main):
         lines += _convention(name, good)
     lines += _beaten_by(good)
-    lines += _detail(good, main)
+    for name in dict.fromkeys(_own(r) for r in good):
+        lines += _detail([r for r in good if _own(r) == name], name)
     suites = list(dict.fromkeys(r["suite"] for r in rows))
     for suite in suites:
         lines += _published(suite, [r for r in good if r["suite"] == suite])
     bad = [r for r in rows if not r.get("ok")]
     if bad:
         lines += ["## Failed", ""]
-        lines += [f"- {r['key']}: {str(r.get('error')).splitlines()[0]}" for r in bad]
+        lines += [f"- {r['key']}: {reason(r)}" for r in bad]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -158,7 +166,8 @@ def _convention(name: str, rows: Sequence[Row]) -> list[str]:
         cover = mean(get(r, name, "solution", "coverage") for r in group)
         return [*map(show, numbers), show(skill, ".3f"), show(cover, ".1%")]
 
-    lines = [f"## MRE, {preset(name)}", ""]
+    text = preset(name).text
+    lines = [f"## MRE, {preset(name)}", "", f"{text[0].upper()}{text[1:]}.", ""]
     lines += table(head, [[r["pair"], r["flow"], *cells([r])] for r in own])
     for title, group_by in (("sequence", _sequence), ("dataset", _suite)):
         groups = _groups(own, group_by)
@@ -168,6 +177,10 @@ def _convention(name: str, rows: Sequence[Row]) -> list[str]:
                 [f"{title} (pairs)", *head[1:]],
                 [[f"{k[0]} ({len(g)})", k[1], *cells(g)] for k, g in groups.items()],
             )
+    fitted = [f"`{m}`" for m in ("plane", "floor") if m in methods]
+    if fitted and (preset(name).cap is not None or preset(name).crop is not None):
+        told = "fitted to all true pixels, not only to those that count here"
+        lines += ["", f"{' and '.join(fitted)}: {told}."]
     held = [r["metrics"][name]["rigid"]["coverage"] for r in own if "rigid" in r["metrics"][name]]
     if held:
         lines += ["", f"`rigid` covers {min(held):.0%} to {max(held):.0%} of the true pixels."]
@@ -232,8 +245,16 @@ def _published(suite: str, rows: Sequence[Row]) -> list[str]:
     if not numbers:
         return []
     lines = [[f"{m} (published)", show(v)] for m, v in numbers.items()]
-    for (_, flow), group in _groups(rows, _suite).items():
-        own = mean(get(r, next(iter(r["presets"])), "solution") for r in group)
-        lines.append([f"this program, flow {flow}, {len(group)} pairs (measured)", show(own)])
-    text = f"Published rows are copied, not measured: {SOURCE}. {PROTOCOL}."
-    return [f"## {suite} beside published numbers", "", *table(["method", "MRE"], lines), "", text]
+    measured = _groups([r for r in rows if _own(r)], lambda r: (r["flow"], _own(r)))
+    for (flow, name), group in measured.items():
+        own = mean(get(r, name, "solution") for r in group)
+        who = f"this program, flow {flow}, {name}, {_count(group)} (measured)"
+        lines.append([who, show(own)])
+    text = f"Published rows are copied, not measured: {SOURCE}. {PROTOCOL}. {data_note(suite)}."
+    text += "".join(f" Measured: {preset(name)}." for name in dict.fromkeys(n for _, n in measured))
+    head = f"## {suite} beside published numbers"
+    return [head, "", *table(["method", "MRE"], lines), "", text, ""]
+
+
+def _count(pairs: Sequence[Row]) -> str:
+    return f"{len(pairs)} pair{'' if len(pairs) == 1 else 's'}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -149,6 +150,7 @@ def run_analysis(
     where: Where | None = None,
     *,
     values: Sequence[str] | None = None,
+    presets: Sequence[str] = (),
     say: Say | None = None,
     any_code: bool = False,
 ) -> Path:
@@ -161,6 +163,7 @@ def run_analysis(
         overrides: Of every problem; a variant's own come after them.
         where: Processes or cluster.
         values: Only these variants; of a numeric analysis other values as well.
+        presets: Metric conventions instead of the suites' own, the main one first.
         say: Progress.
         any_code: Also take stored rows of other code versions.
 
@@ -168,16 +171,27 @@ def run_analysis(
         The table's file.
 
     Raises:
-        ConfigError: there is no such analysis or variant, or no pair is left.
+        ConfigError: there is no such analysis or variant, a value is wrong, no pair is left, or
+            conventions are given where no depth is scored.
     """
-    if name not in ANALYSES:
-        raise ConfigError("unknown analysis", found=name, expected=", ".join(ANALYSES))
-    analysis = _chosen(ANALYSES[name], values)
-    items = [i for listing in listings for i in listing.items]
-    if analysis.true_flow_only:
-        items = _with_true_flow(items)
+    analysis = _chosen(_known(name), values)
+    listed = [i for listing in listings for i in listing.items]
+    items = _with_true_flow(listed) if analysis.true_flow_only else listed
     if not items:
-        raise ConfigError("no pair is left for the analysis", where=name)
+        raise ConfigError(
+            "no pair is left for the analysis",
+            where=name,
+            found=f"flow {', '.join(dict.fromkeys(i.flow for i in listed))}" if listed else None,
+            expected="pairs listed with their true flow" if listed else None,
+            hint="give --flow truth" if listed else None,
+        )
+    if presets:
+        if analysis.function is measure_flow:
+            raise ConfigError("analysis has no depth to score", where=name, found=presets[0])
+        items = [i.scored_by(tuple(presets)) for i in items]
+    for own in analysis.variants.values():
+        # a wrong value ends here, not as a failed row a pair
+        items[0].problem((*overrides, *own))
     prepare_folder(out)
     jobs = [
         Job(item, (*overrides, *own), variant)
@@ -205,11 +219,50 @@ def run_analysis(
     return out / f"{name}.md"
 
 
+def split_values(name: str, text: str) -> list[str]:
+    """Variants of a comma-separated list; a name with commas in it is one, the longest first.
+
+    Raises:
+        ConfigError: there is no such analysis, or a value is empty.
+    """
+    names = _known(name).variants
+    words, out = [w.strip() for w in text.split(",")], []
+    while words:
+        ends = range(len(words), 1, -1)
+        take = next((k for k in ends if ", ".join(words[:k]) in names), 1)
+        out.append(", ".join(words[:take]))
+        words = words[take:]
+    if "" in out:
+        raise ConfigError(
+            "a value is empty", where="--values", found=repr(text), expected=", ".join(names)
+        )
+    return out
+
+
+def _known(name: str) -> Analysis:
+    if name not in ANALYSES:
+        raise ConfigError("unknown analysis", found=name, expected=", ".join(ANALYSES))
+    return ANALYSES[name]
+
+
+def _number(text: str) -> bool:
+    """Whether a value has a place on the axis of a plot."""
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
 def _chosen(analysis: Analysis, values: Sequence[str] | None) -> Analysis:
     if not values:
         return analysis
     variants = dict(analysis.variants)
     if analysis.numeric:
+        wrong = [v for v in values if not _number(v)]
+        if wrong:
+            raise ConfigError(
+                "value is no number", where=analysis.name, found=wrong[0], expected="100,250"
+            )
         key = next(iter(variants.values()))[0].partition("=")[0]
         return replace(analysis, variants=_over(key, values))
     if analysis.name == "flow":

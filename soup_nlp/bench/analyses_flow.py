@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from soup_nlp.bench.accuracy import Job, Row, clean, flow_error, head
-from soup_nlp.bench.accuracy_table import mean, pair_names, show, table
+from soup_nlp.bench.accuracy_table import mean, pair_names, reason, show, table
 from soup_nlp.cases import superpixels
 from soup_nlp.data.flow_robust import reweighted
 from soup_nlp.errors import DataError
@@ -77,7 +77,7 @@ def text_flow(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     bad = [r for r in rows if not r.get("ok")]
     if bad:
         lines += ["", "## Failed", ""]
-        lines += [f"- {r['key']}: {str(r['error']).splitlines()[0]}" for r in bad]
+        lines += [f"- {r['key']}: {reason(r)}" for r in bad]
     return "\n".join(lines) + "\n"
 
 

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from soup_nlp.bench.accuracy import Row
-from soup_nlp.bench.accuracy_table import get, mean, pair_names, show, table
+from soup_nlp.bench.accuracy_table import get, mean, pair_names, reason, show, table
 from soup_nlp.bench.analyses_energy import ABOVE, WORSE
 from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC, SOURCE
 from soup_nlp.model.energy import TERMS
@@ -100,7 +100,7 @@ def _beside(name: str) -> list[str]:
 
 def _failures(rows: Sequence[Row]) -> list[str]:
     bad = [r for r in rows if not r.get("ok")]
-    lines = [f"- {r['key']}: {str(r.get('error')).splitlines()[0]}" for r in bad]
+    lines = [f"- {r['key']}: {reason(r)}" for r in bad]
     return ["", "## Failed", "", *lines] if bad else []
 
 

@@ -21,15 +21,16 @@ def fit_planes(
     """Inverse-depth planes m, 1 / z = m . ray, with the least mean relative error per label.
 
     Minimises sum |z - 1 / (m . r)| / z = sum |u - 1| / u with u = z m . r by iteratively
-    re-weighted least squares from the least-squares plane; the best iterate of each label is kept,
-    the best constant depth where no plane is better. The mean relative error is not convex in m,
-    so this is an upper bound of the best, close to it where one plane suits most pixels.
+    re-weighted least squares from two planes, the least squares of 1 / z - m . r and of u - 1; the
+    best iterate of each label is kept, the best constant depth where no plane is better. The mean
+    relative error is not convex in m, so this is an upper bound of the best, close to it where one
+    plane suits most pixels.
 
     Args:
         labels: (H, W) label 0..N-1 of every pixel.
         depth: (H, W) true z; NaN where unknown.
         K: (3, 3) intrinsics.
-        rounds: Re-weighted fits.
+        rounds: Re-weighted fits from either start.
         softening: Relative error below which weights stop growing.
 
     Returns:
@@ -50,14 +51,15 @@ def fit_planes(
     count = np.bincount(which, minlength=n)
     constant = np.column_stack([np.zeros((n, 2)), _best_constant(which, z, count)])
     best, lowest = constant, _errors(constant, which, zr, count)
-    weight = np.ones(len(z))
     rich = count >= LEAST
-    for _ in range(rounds):
-        m = _solve(which, zr, weight, n, constant)
-        cost = _errors(m, which, zr, count)
-        best, lowest = _better(best, lowest, m, cost, rich)
-        u = np.maximum(np.einsum("pc,pc->p", zr, m[which]), 0.05)
-        weight = 1.0 / (u * u * np.maximum(np.abs(1 - 1 / u), softening))
+    # equal weights of u - 1 grow with z^2 in inverse depth: some sky outweighs everything near
+    for weight in (1.0 / (z * z), np.ones(len(z))):
+        for _ in range(rounds):
+            m = _solve(which, zr, weight, n, constant)
+            cost = _errors(m, which, zr, count)
+            best, lowest = _better(best, lowest, m, cost, rich)
+            u = np.maximum(np.einsum("pc,pc->p", zr, m[which]), 0.05)
+            weight = 1.0 / (u * u * np.maximum(np.abs(1 - 1 / u), softening))
     best[count == 0] = np.nan
     return best
 

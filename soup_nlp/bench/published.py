@@ -51,9 +51,26 @@ ABLATION: Mapping[str, tuple[float, float, float, float]] = MappingProxyType(
 GRID_AGAINST_SLIC = MappingProxyType({"slic": 0.0912, "grid": 0.1442})
 """MRE of one frame with 1,000 superpixels of either kind."""
 
+DATA: Mapping[str, str] = MappingProxyType(
+    {
+        "sintel": "The paper names the five sequences and 120 pairs, not which pairs",
+        "vkitti": "The paper names the four worlds and 120 pairs, not which pairs",
+        "kitti": "Published rows are of the odometry set 00-09 with LiDAR truth, measured ones of"
+        " the stereo and flow training set with its own truth",
+        "kinect_paper": "Measured rows are of the pairs in the folder, whichever those are",
+        "kinect_tshirt": "Measured rows are of the pairs in the folder, whichever those are",
+    }
+)
+"""On which pairs the numbers of a dataset are, as far as it is known."""
+
 _DATASET = {"kitti2012": "kitti", "kitti2015": "kitti"}
 
 
 def published(suite: str) -> dict[str, float | None]:
     """Published MRE by method for the dataset of a suite; {} where the paper has none."""
     return dict(COMPARISON.get(_DATASET.get(suite, suite), {}))
+
+
+def data_note(suite: str) -> str:
+    """What is not the same about the data of published and of measured rows; "" where none are."""
+    return DATA.get(_DATASET.get(suite, suite), "")

@@ -27,7 +27,7 @@ METHODS: Mapping[str, str] = MappingProxyType(
         "solution_rigid": "the solution, only where one rigid motion has a depth",
         "rigid": "one rigid motion, triangulated; only where it has a depth",
         "rigid_filled": "the same, holes filled from the nearest pixel",
-        "plane": "the best single plane (fitted to the truth)",
+        "plane": "the best single plane (fitted to the whole truth)",
         "constant": "a constant depth",
         "floor": "superpixel floor: true planes in these superpixels",
     }
@@ -57,7 +57,8 @@ def depth_maps(run: Run) -> dict[str, Float]:
     """(H, W) depths of the reference frame by method, for a run whose pair has a truth of depth.
 
     "nlp" is there where the NLP was refined, the rigid ones where a motion fits, "floor" where the
-    truth is dense enough.
+    truth is dense enough. "plane" and "floor" are fitted to every true pixel, also where a
+    convention leaves some out by a cap or a crop: there another fit may be better.
     """
     pair, seg = run.pair, run.segmentation
     labels = seg.labels

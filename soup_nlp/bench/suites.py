@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -114,18 +114,22 @@ class Listing:
 
     Attributes:
         suite: The suite.
-        items: Pairs to measure.
-        listed: Pairs of the suite's list (with its filters) whether there or not.
+        items: What to measure, an item a pair and flow.
+        left_out: Pairs that are there and were left out by a limit.
+        missing: Pairs of the suite's list (with its filters) that are not there.
     """
 
     suite: Suite
     items: tuple[Item, ...]
-    listed: int
+    left_out: int = 0
+    missing: int = 0
 
     def __str__(self) -> str:
-        missing = self.listed - len(self.items)
-        lack = f", {missing} of the list are not in the folder" if missing else ""
-        return f"suite {self.suite.name}: {len(self.items)} pairs{lack}"
+        pairs = len(_names(self.items))
+        rows = f" ({len(self.items)} rows)" if len(self.items) > pairs else ""
+        limit = f", {self.left_out} left out by the limit" if self.left_out else ""
+        lack = f", {self.missing} of the list are not in the folder" if self.missing else ""
+        return f"suite {self.suite.name}: {pairs} pairs{rows}{limit}{lack}"
 
 
 def list_suite(name: str, data: Path | None = None, options: Options | None = None) -> Listing:
@@ -149,7 +153,9 @@ def list_suite(name: str, data: Path | None = None, options: Options | None = No
         listed = [i for i in suite.build(suite, (root / folder).resolve(), o) if _wanted(i, o)]
         here = [i for i in listed if all(f.is_file() for f in i.needs)]
         if any(i.needs for i in here) or (here and not suite.layout):
-            return Listing(suite, tuple(_thinned(here, o.limit)), len(listed))
+            items = tuple(_thinned(here, o.limit))
+            there = len(_names(here))
+            return Listing(suite, items, there - len(_names(items)), len(_names(listed)) - there)
     if o.only and not listed and (not suite.layout or root.is_dir()):
         raise DataError(
             "no pair of the suite has such a name", where=f"suite {name}", found=", ".join(o.only)
@@ -167,7 +173,15 @@ def _wanted(item: Item, o: Options) -> bool:
     return not o.only or any(word in item.name for word in o.only)
 
 
+def _names(items: Iterable[Item]) -> list[str]:
+    """Pairs, whatever their flow, in order."""
+    return list(dict.fromkeys(i.name for i in items))
+
+
 def _thinned(items: list[Item], limit: int | None) -> list[Item]:
-    if limit is None or limit >= len(items):
+    """Every flow of so many pairs, spread evenly."""
+    names = _names(items)
+    if limit is None or limit >= len(names):
         return items
-    return [items[k] for k in spread(len(items), limit)]
+    kept = {names[k] for k in spread(len(names), limit)}
+    return [i for i in items if i.name in kept]

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 from soup_nlp.config import Problem, make_problem
+from soup_nlp.data.datasets_sintel import DEFAULT_SCENE
 
 RENDERED = ("street", "room", "sheet", "orbit", "still")
 
@@ -62,7 +63,7 @@ class Options:
         flows: Flow sources; None for the suite's own.
         width: Columns of rendered scenes (436 of 1024 rows).
         seeds: Seeds of rendered scenes.
-        limit: At most this many pairs, spread evenly; None for all.
+        limit: At most this many pairs, spread evenly, each with every flow; None for all.
         only: Keep names that contain one of these words; empty for all.
     """
 
@@ -185,7 +186,11 @@ def sintel(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
         # the paper says 120 pairs of these five, not which: 24 each, evenly spaced
         for frame in spread(frames - 1, 24, 1):
             raw = {"kind": "sintel", "root": str(root), "scene": scene, "frame": frame}
-            needs = [base / "clean" / scene / f"frame_{frame + k:04d}.png" for k in (0, 1)]
+            names = [f"{scene}/frame_{frame + k:04d}" for k in (0, 1)]
+            needs = [base / "clean" / f"{name}.png" for name in names]
+            if scene != DEFAULT_SCENE:
+                # the loader knows the camera of one scene only
+                needs += [base / "camdata_left" / f"{name}.cam" for name in names]
             yield from suite.items(scene, f"{scene}-{frame:04d}", raw, o, *needs)
 
 

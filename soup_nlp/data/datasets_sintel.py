@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from soup_nlp.data.flow import leaves
 from soup_nlp.data.formats_camera import intrinsics, read_cam
 from soup_nlp.data.formats_depth import read_dpt
 from soup_nlp.data.formats_flow import read_flo
-from soup_nlp.data.formats_image import PathLike, read_image, read_mask
+from soup_nlp.data.formats_image import DataWarning, PathLike, read_image, read_mask
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 
@@ -23,7 +24,9 @@ LAYOUT = (
 )
 
 DEFAULT_CAMERA = (688.00006, 688.00006, 511.5, 217.5)
-"""fx, fy, cx, cy of scene alley_1, pixels. Other scenes have other focal lengths (several 1120)."""
+"""fx, fy, cx, cy of `DEFAULT_SCENE`, pixels. Other scenes have other focal lengths (some 1120)."""
+
+DEFAULT_SCENE = "alley_1"
 
 
 def load_sintel(
@@ -51,6 +54,9 @@ def load_sintel(
 
     Raises:
         DataError: an image is missing, or a file is wrong for its format or its image.
+
+    Warns:
+        DataWarning: neither `K` nor a camera file is there, and the scene is not alley_1.
     """
     root = need_folder(root, LAYOUT)
     base = root / "training" if (root / "training").is_dir() else root
@@ -58,13 +64,10 @@ def load_sintel(
     image_ref, image_next = (
         read_image(need(base / render / f"{name}.png", LAYOUT)) for name in names
     )
-    cameras = []
-    for name in names:
-        cam = optional(base / "camdata_left" / f"{name}.cam")
-        if K is not None:
-            cameras.append(np.asarray(K, dtype=np.float64))
-        else:
-            cameras.append(read_cam(cam)[0] if cam else intrinsics(*DEFAULT_CAMERA))
+    if K is None:
+        cameras = _cameras([base / "camdata_left" / f"{name}.cam" for name in names], scene)
+    else:
+        cameras = [np.asarray(K, dtype=np.float64)] * 2
     depths = [optional(base / "depth" / f"{name}.dpt") for name in names]
     flow_file = optional(base / "flow" / f"{names[0]}.flo") if step == 1 else None
     mask_file = optional(base / "occlusions" / f"{names[0]}.png") if step == 1 else None
@@ -92,6 +95,20 @@ def load_sintel(
         truth=truth_or_none(truth),
         name=f"sintel_{scene}_{frame:04d}",
     )
+
+
+def _cameras(paths: list[Path], scene: str) -> list[NDArray[np.float64]]:
+    """Intrinsics of the frames; those of alley_1, with a warning elsewhere, where a file is not."""
+    absent = [path for path in paths if not optional(path)]
+    if absent and scene != DEFAULT_SCENE:
+        warnings.warn(
+            f"no camera file {absent[0]}: the focal length of {DEFAULT_SCENE} is taken,"
+            f" {DEFAULT_CAMERA[0]:g} pixels, which may be wrong for {scene}; camdata_left comes"
+            " with Sintel's depth training data",
+            DataWarning,
+            stacklevel=3,
+        )
+    return [intrinsics(*DEFAULT_CAMERA) if p in absent else read_cam(p)[0] for p in paths]
 
 
 def _same_size(mask: NDArray[np.bool_], flow: NDArray[np.float64], path: Path | None) -> None:

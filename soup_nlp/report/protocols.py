@@ -101,7 +101,12 @@ _ALL = (
     Preset("lsq", "lsq", text="least-squares scale, no cap"),
     Preset("metric", "none", text="as it is, no scale"),
     Preset("near20", cap=20.0, text="median scale, depth cap 20"),
-    Preset("sintel70", cap=70.0, text="two-view convention on Sintel: median scale, 0 < z <= 70"),
+    Preset(
+        "sintel70",
+        cap=70.0,
+        text="as two-view work on Sintel, 0 < z <= 70, but the scale is the median of z_gt / z, not"
+        " median z_gt over median z",
+    ),
     Preset("kitti", text="KITTI uncapped: median scale over every true pixel"),
     Preset(
         "eigen80",
@@ -109,7 +114,8 @@ _ALL = (
         low=1e-3,
         crop=GARG_CROP,
         clamp=(1e-3, 80.0),
-        text="KITTI, Eigen's protocol at 80 m: median scale, Garg crop, clamped estimates",
+        text="after Eigen's protocol on KITTI at 80 m, Garg crop, clamped estimates, but the scale"
+        " is the median of z_gt / z, not median z_gt over median z",
     ),
 )
 PRESETS: Mapping[str, Preset] = MappingProxyType({p.name: p for p in _ALL})
