@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
+from soup_nlp.data import flow_options
+
 
 class Strict(BaseModel):
     """Base of every section: unknown keys and conversions between types are errors."""
@@ -27,13 +29,10 @@ RANGES: Mapping[str, tuple[float | None, float | None]] = {
     "presolve_iterations": (1, None),
     "depth_ratio": (1, None),
     "min_facing": (0, 0.5),
-    "finest_scale": (0, 5),
-    "patch_size": (4, 32),
-    "patch_stride": (1, 32),
+    **flow_options.RANGES,
     "tau": (1e-6, None),
     "limit": (1e-6, None),
     "support": (1, None),
-    "planes": (0, 20),
     "particles": (2, None),
     "keep": (0, 0.9),
     "depth_reach": (1, None),

@@ -11,10 +11,10 @@ import pytest
 
 from soup_nlp.cli import main
 from soup_nlp.config import make_problem
+from soup_nlp.data.datasets_layout import MARK
 from soup_nlp.data.formats import write_flo
 from soup_nlp.data.scenes import render_scene
 from soup_nlp.inputs import load_pair
-from soup_nlp.report.folder import MARK
 
 ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
 SMALL = [
@@ -92,8 +92,14 @@ def test_a_result_folder_takes_the_next_result_and_is_no_input(tmp_path, capsys)
     assert main([*args, "--out", str(out)]) in (0, 1)
     for path in (tmp_path / "pair").iterdir():
         (out / path.name).write_bytes(path.read_bytes())
-    assert main(["solve", str(out / "pair.yaml"), "--out", str(tmp_path / "other")]) == 2
-    assert "holds a result" in capsys.readouterr().err
+    marked = tmp_path / "stopped while it was written"
+    marked.mkdir()
+    for path in [*(tmp_path / "pair").iterdir(), out / "depth_ref.png"]:
+        (marked / path.name).write_bytes(path.read_bytes())
+    (marked / MARK).touch()
+    for folder in (out, marked):
+        assert main(["solve", str(folder / "pair.yaml"), "--out", str(tmp_path / "other")]) == 2
+        assert "holds a result" in capsys.readouterr().err
 
 
 def test_images_may_differ_in_size(tmp_path, capsys):

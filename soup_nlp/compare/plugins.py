@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.compare.task import Answer, Limits, Task, Trace
 from soup_nlp.model.nlp import NLP
+from soup_nlp.solve.callback import IterationCallback
 from soup_nlp.solve.ipopt import DEFAULTS
 
 Float = NDArray[np.float64]
@@ -28,27 +29,12 @@ CACHED: Mapping[str, tuple[tuple[str, ...], ...]] = {
 """Outputs of nlp_grad_f, nlp_jac_g and nlp_hess_l that a plug-in asks CasADi for."""
 
 
-class _Watch(ca.Callback):
+class _Watch(IterationCallback):
     """Iterates of a plug-in into the trace; asks it to stop when the time is over."""
 
-    def __init__(self, nlp: NLP, trace: Trace, seconds: float) -> None:
-        ca.Callback.__init__(self)
-        self.sizes = {"f": 1, "x": nlp.nx, "lam_x": nlp.nx, "g": nlp.ng, "lam_g": nlp.ng}
+    def __init__(self, trace: Trace, seconds: float) -> None:
+        super().__init__()
         self.trace, self.seconds, self.late = trace, seconds, False
-        self.construct("watch", {})
-
-    def get_n_in(self) -> int:
-        return int(ca.nlpsol_n_out())
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_name_in(self, i: int) -> str:
-        return str(ca.nlpsol_out(i))
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        size = self.sizes.get(ca.nlpsol_out(i), 0)
-        return ca.Sparsity.dense(size) if size else ca.Sparsity(0, 1)
 
     def eval(self, arg: list[ca.DM]) -> list[int]:
         self.trace.add(np.asarray(arg[0]))
@@ -155,7 +141,7 @@ def plugin(name: str, task: Task) -> Answer:
     library, hessian, calls, options = PLUGINS[name]
     nlp = task.gauss_newton if hessian == "gauss-newton" else task.nlp
     trace = Trace(task.folder / "trace", nlp.nx)
-    watch = _Watch(nlp, trace, task.limits.seconds)
+    watch = _Watch(trace, task.limits.seconds)
     common: dict[str, Any] = {
         "print_time": False,
         "show_eval_warnings": False,
@@ -191,8 +177,8 @@ def plugin(name: str, task: Task) -> Answer:
         problem = {"x": s, "f": f, "g": ca.densify(g)}
         p = np.zeros(0)
     if calls:
+        watch.start("watch", nlp.nx, nlp.ng, len(p))
         common["iteration_callback"] = watch
-        watch.sizes["lam_p"] = len(p)
     solver = ca.nlpsol("solver", library, problem, common | options(task.limits))
     out = solver(x0=nlp.x0, p=p, lbx=nlp.lbx, ubx=nlp.ubx, lbg=nlp.lbg, ubg=nlp.ubg)
     stats = solver.stats()

@@ -23,7 +23,7 @@ from soup_nlp.data.datasets_driving import (
     load_vkitti1,
     load_vkitti2,
 )
-from soup_nlp.data.datasets_layout import is_result, need, need_folder, truth_or_none
+from soup_nlp.data.datasets_layout import MARK, is_result, need, need_folder, truth_or_none
 from soup_nlp.data.datasets_sintel import load_sintel
 from soup_nlp.data.flow import leaves
 from soup_nlp.data.formats_camera import intrinsics, read_intrinsics
@@ -109,7 +109,7 @@ def load_folder(
         raise DataError(
             "input folder holds a result, whose depth and flow would pass for truth",
             where=folder,
-            found="summary.json of a solve",
+            found=f"{MARK} or summary.json of a solve",
             expected="a folder with inputs only",
             hint="move the frames, K.txt and the truth to a folder of their own",
         )

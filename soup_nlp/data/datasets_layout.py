@@ -56,8 +56,14 @@ def need_folder(path: PathLike, layout: str) -> Path:
     return path
 
 
+MARK = ".soup_nlp"
+"""Empty file by which a folder is known as one for results, from before its first file on."""
+
+
 def is_result(folder: Path) -> bool:
-    """Whether a folder holds what a solve has written (its summary names the problem)."""
+    """Whether a folder is for results: it has the mark, or a summary that names its problem."""
+    if (folder / MARK).is_file():
+        return True
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -15,12 +15,19 @@ PRESETS = {
     "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
+RANGES: Mapping[str, tuple[int, int]] = {
+    "finest_scale": (0, 5),
+    "patch_size": (4, 32),
+    "patch_stride": (1, 32),
+    "planes": (0, 20),
+}
+"""Smallest and largest value of whole-number options."""
 _TINY, _HUGE = float(np.nextafter(0, 1)), float(np.finfo(np.float32).max)
 # smallest, largest, whole number, in words; OpenCV's own parameters are int and float32
-_RANGES: Mapping[str, tuple[float, float, bool, str]] = {
-    "finest_scale": (0, 5, True, "a whole number, 0 to 5"),
-    "patch_size": (4, 32, True, "4 to 32 pixels, whole"),
-    "patch_stride": (1, 32, True, "1 to patch_size, whole"),
+_CHECKS: Mapping[str, tuple[float, float, bool, str]] = {
+    "finest_scale": (*RANGES["finest_scale"], True, "a whole number, 0 to 5"),
+    "patch_size": (*RANGES["patch_size"], True, "4 to 32 pixels, whole"),
+    "patch_stride": (*RANGES["patch_stride"], True, "1 to patch_size, whole"),
     "refinement_iterations": (0, 10_000, True, "a whole number, 0 to 10000"),
     "alpha": (0, _HUGE, False, "a finite number, at least 0"),
     "delta": (0, _HUGE, False, "a finite number, at least 0"),
@@ -28,7 +35,7 @@ _RANGES: Mapping[str, tuple[float, float, bool, str]] = {
     "tau": (_TINY, np.inf, False, "a positive number of pixels"),
     "limit": (_TINY, _HUGE, False, "a positive, finite number of pixels"),
     "support": (1, 10_001, True, "an odd number of pixels"),
-    "planes": (0, 20, True, "a whole number, 0 to 20"),
+    "planes": (*RANGES["planes"], True, "a whole number, 0 to 20"),
 }
 
 
@@ -46,7 +53,7 @@ def check_dis_options(options: Mapping[str, object]) -> None:
     )
     if preset not in PRESETS:
         raise _refused("preset", preset, ", ".join(PRESETS))
-    for name, (low, high, whole, expected) in _RANGES.items():
+    for name, (low, high, whole, expected) in _CHECKS.items():
         value = options[name]
         number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
         # NaN is in no range

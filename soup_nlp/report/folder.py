@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from soup_nlp.data.datasets_layout import is_result
+from soup_nlp.data.datasets_layout import MARK, is_result
 from soup_nlp.errors import DataError
 from soup_nlp.report.atomic import atomic_path
 from soup_nlp.report.colour import (
@@ -47,10 +47,6 @@ FILES = (
     "points_next.ply",
 )
 """Files of a result folder; error.png is there with dense truth only."""
-
-
-MARK = ".soup_nlp"
-"""Empty file by which a folder is known as one for results, from before its first file on."""
 
 
 def prepare_folder(folder: str | Path, inputs: Iterable[Path] | None = None) -> Path:
@@ -108,7 +104,7 @@ def _refuse_inputs(folder: Path, inputs: Iterable[Path]) -> None:
 
 def _refuse_foreign(folder: Path) -> None:
     """Raise DataError where files have the names of a result's, but no solve has written them."""
-    if (folder / MARK).exists() or is_result(folder):
+    if is_result(folder):
         return
     found = [name for name in FILES if (folder / name).exists()]
     if found:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
+from soup_nlp.solve.callback import IterationCallback
 from soup_nlp.solve.hessian import LagrangianHessian
 
 Float = NDArray[np.float64]
@@ -99,7 +100,7 @@ class Stage:
         )
 
 
-class _Watch(ca.Callback):
+class _Watch(IterationCallback):
     """CasADi's iteration callback: progress, limits, the best iterate."""
 
     def __init__(
@@ -111,7 +112,7 @@ class _Watch(ca.Callback):
         stagnation: float | None,
         stop: threading.Event,
     ) -> None:
-        ca.Callback.__init__(self)
+        super().__init__()
         self.nlp, self.stage, self.listener = nlp, stage, listener
         self.deadline, self.stagnation, self.stop = deadline, stagnation, stop
         self.begin = time.perf_counter()
@@ -122,31 +123,7 @@ class _Watch(ca.Callback):
         self.best_x = nlp.x0
         self.best_lam: tuple[Float, Float] | None = None
         self.reason = ""
-        self.construct(f"watch_{nlp.name}", {})
-
-    def get_n_in(self) -> int:
-        return int(ca.nlpsol_n_out())
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_name_in(self, i: int) -> str:
-        return str(ca.nlpsol_out(i))
-
-    def get_name_out(self, i: int) -> str:
-        return "ret"
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        name = ca.nlpsol_out(i)
-        size = {
-            "f": 1,
-            "x": self.nlp.nx,
-            "lam_x": self.nlp.nx,
-            "g": self.nlp.ng,
-            "lam_g": self.nlp.ng,
-            "lam_p": len(self.nlp.p),
-        }[name]
-        return ca.Sparsity.dense(size) if size else ca.Sparsity(0, 1)
+        self.start(f"watch_{nlp.name}", nlp.nx, nlp.ng, len(nlp.p))
 
     def eval(self, arg: list[ca.DM]) -> list[int]:
         try:
