@@ -26,22 +26,26 @@ from soup_nlp.solve.soup import SolverOptions
 from soup_nlp.start.propose import StartOptions
 
 # smoothing belongs to the solver's stages, the seed to the problem
-EnergyWeights: Any = mirror(Weights, "EnergyWeights")
+EnergyWeights: Any = mirror(Weights, "EnergyWeights", module=__name__)
 BendingWeights: Any = mirror(
     Weights,
     "BendingWeights",
+    module=__name__,
     defaults={"cont": 0.05, "orient": 4.0, "sigma_arap": 1.0, "leak_arap": 0.05},
 )
-StartConfig: Any = mirror(StartOptions, "StartConfig", leave_out=("seed",))
+StartConfig: Any = mirror(StartOptions, "StartConfig", module=__name__, leave_out=("seed",))
 FormulationConfig: Any = mirror(
     Formulation,
     "FormulationConfig",
+    module=__name__,
     leave_out=("eps", "eps_pixel"),
     choices={"hessian": HESSIANS},
 )
-SolverConfig: Any = mirror(SolverOptions, "SolverConfig")
-RefineConfig: Any = mirror(RefineOptions, "RefineConfig")
-DisConfig: Any = mirror(dis_flow, "DisConfig", choices={"preset": ("ultrafast", "fast", "medium")})
+SolverConfig: Any = mirror(SolverOptions, "SolverConfig", module=__name__)
+RefineConfig: Any = mirror(RefineOptions, "RefineConfig", module=__name__)
+DisConfig: Any = mirror(
+    dis_flow, "DisConfig", module=__name__, choices={"preset": ("ultrafast", "fast", "medium")}
+)
 
 
 class SegmentationConfig(Strict):

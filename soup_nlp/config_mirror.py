@@ -45,6 +45,7 @@ def mirror(
     source: type | Callable[..., Any],
     name: str,
     *,
+    module: str,
     leave_out: tuple[str, ...] = (),
     choices: Mapping[str, tuple[str, ...]] | None = None,
     defaults: Mapping[str, float] | None = None,
@@ -54,6 +55,7 @@ def mirror(
     Args:
         source: Dataclass, or function whose parameters with a default are taken.
         name: Of the model.
+        module: Where the model stands under this name, so that what holds it can be pickled.
         leave_out: Fields that a problem file does not set.
         choices: Allowed words of fields that are plain strings in the source.
         defaults: Other defaults than the source's; a problem file that sets one field of the
@@ -66,7 +68,9 @@ def mirror(
             words = (choices or {}).get(key)
             kind = Literal.__getitem__(words) if words else _kind(key, hints[key], default)
             made[key] = (kind, _plain(default))
-    return create_model(name, __base__=Strict, __doc__=inspect.getdoc(source), **made)
+    return create_model(
+        name, __base__=Strict, __doc__=inspect.getdoc(source), __module__=module, **made
+    )
 
 
 def _defaults(source: type | Callable[..., Any]) -> dict[str, Any]:

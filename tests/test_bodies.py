@@ -115,6 +115,16 @@ def scales(z, own, **options):
     return found.reshape(rows, columns)
 
 
+def test_a_body_in_pieces_is_placed_from_the_ground_up():
+    """A tall piece before a far wall, with the longer outline, on a low one on the ground."""
+    own = thrice([[0, 0, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0], [0, 0, 0]])
+    z = thrice([[8.0, 8, 8], [8, 1, 8], [8, 1, 8], [8, 1, 8], [2, 2, 2]])
+    found = scales(z, own)
+    np.testing.assert_allclose(found, np.where(own > 0, 2.0, 1.0), rtol=1e-12)
+    # which way is down is not known: the wall, which the tall one touches first
+    np.testing.assert_allclose(scales(z, own, upright=False)[own == 2], 8.0, rtol=1e-12)
+
+
 def thrice(cells):
     """Three superpixels of each, both ways: all have some behind them."""
     return np.repeat(np.repeat(cells, 3, axis=0), 3, axis=1)

@@ -185,6 +185,8 @@ def test_another_chart_begins_where_the_first_ended(case):
         first.run(phase)
     problem = TangentProblem(first.soup, case.data, case.weights, FORM, chart=INVERSE)
     second = Descent(problem, after=first)
+    # one pattern, one symbolic analysis
+    assert second._factorise is first._factorise
     for p in (first.problem, problem):
         p.smoothing(LAST.eps)
     assert problem.value(second.x) == pytest.approx(first.problem.value(first.x), rel=1e-9)

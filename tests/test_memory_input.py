@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import h5py
@@ -50,6 +51,13 @@ def test_its_config_is_refused_before_anything_is_written(run, tmp_path, capsys)
     assert main(["solve", str(out / "config.yaml"), "--out", str(tmp_path / "new")]) == 2
     assert run.problem.input.hash in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_a_run_survives_a_pickle(run):
+    again = pickle.loads(pickle.dumps(run))
+    assert again.problem == run.problem
+    assert again.energy == run.energy
+    np.testing.assert_array_equal(again.reconstruction.depth_ref, run.reconstruction.depth_ref)
 
 
 def test_every_array_of_truth_and_history_says_what_it_is(run, tmp_path):

@@ -27,7 +27,7 @@ class Entries(NamedTuple):
     columns: NDArray[np.integer]
     which: Int | None = None
 
-    def of_all(self, values: Int) -> Int:
+    def of_all(self, values: NDArray[np.integer]) -> NDArray[np.integer]:
         """(E k,) values of every element's nonzeros from those of the ones that differ (F k,)."""
         return values if self.which is None else values.reshape(self.rows.shape)[self.which].ravel()
 
@@ -44,16 +44,16 @@ class Pattern(NamedTuple):
     shape: tuple[int, int]
     rows: Int
     columns: Int
-    places: list[Int]
+    places: list[NDArray[np.integer]]
 
     @classmethod
     def of(cls, shape: tuple[int, int], sets: Sequence[Entries]) -> Pattern:
         """Of the nonzeros of each set of elements."""
-        # ten million nonzeros are sorted: half as many bytes take half the time
+        # ten million nonzeros are ranked: half as many bytes take half the time
         kind = np.int32 if shape[0] * shape[1] < 2**31 else np.int64
         keys = [np.multiply(e.columns, shape[0], dtype=kind) + e.rows.astype(kind) for e in sets]
         every = np.concatenate([np.zeros(0, kind), *(key.ravel() for key in keys)])
-        unique, place = np.unique(every, return_inverse=True)
+        unique, place = _ranked(every)
         each = np.split(place, np.cumsum([key.size for key in keys], dtype=int)[:-1])
         columns, rows = np.divmod(unique.astype(np.int64), shape[0])
         return cls(shape, rows, columns, [e.of_all(own) for e, own in zip(sets, each)])
@@ -62,6 +62,17 @@ class Pattern(NamedTuple):
         """For CasADi."""
         start = np.searchsorted(self.columns, np.arange(self.shape[1] + 1))
         return ca.Sparsity(*self.shape, start.tolist(), self.rows.tolist(), True)
+
+
+def _ranked(keys: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.int32]]:
+    """`np.unique(keys, return_inverse=True)`, two to four times as fast on keys nearly in order."""
+    order = np.argsort(keys, kind="stable")
+    ranked = keys[order]
+    new = np.ones(len(keys), bool)
+    np.not_equal(ranked[1:], ranked[:-1], out=new[1:])
+    place = np.empty(len(keys), np.int32)
+    place[order] = np.cumsum(new, dtype=np.int32) - 1
+    return ranked[new], place
 
 
 def jacobian_entries(group: Group) -> Entries:

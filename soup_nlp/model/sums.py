@@ -265,7 +265,7 @@ class _Union(NamedTuple):
     """
 
     entries: Entries
-    parts: dict[str, Int]
+    parts: dict[str, NDArray[np.integer]]
 
 
 def _union(group: Group, kinds: Sequence[str]) -> _Union:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.solve.factor import Back, diagonal_places, factorisation
+from soup_nlp.solve.factor import Back, Factorise, diagonal_places, factorisation, same_pattern
 from soup_nlp.solve.ipopt import Listener, Progress, Stage
 from soup_nlp.solve.phase import Phase, Reached
 from soup_nlp.solve.search import (
@@ -99,7 +99,13 @@ class Descent:
         self.deadline, self.listener = deadline, listener
         self.stop = stop or threading.Event()
         self.log_file = log_file
-        self.library, self._factorise = factorisation(problem.upper)
+        self.library: str
+        self._factorise: Factorise
+        if after and same_pattern(problem.upper, after.problem.upper):
+            # ordering and symbolic analysis of the other chart serve here as well
+            self.library, self._factorise = after.library, after._factorise
+        else:
+            self.library, self._factorise = factorisation(problem.upper)
         self._diagonal = diagonal_places(problem.upper)
         n = problem.layout.count
         self.x: Float = problem.nlp.x0

@@ -43,6 +43,11 @@ def diagonal_places(upper: sparse.csc_matrix) -> Int:
     return places
 
 
+def same_pattern(one: sparse.csc_matrix, other: sparse.csc_matrix) -> bool:
+    """Whether two `numbered` matrices have the same nonzeros, so that one analysis serves both."""
+    return np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices)
+
+
 def cholmod(upper: sparse.csc_matrix) -> Factorise:
     """CHOLMOD as cvxopt brings it (an extra); the symbolic analysis is made once.
 

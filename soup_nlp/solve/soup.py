@@ -23,7 +23,7 @@ from soup_nlp.solve.ipopt import Ipopt, Listener, Stage
 from soup_nlp.solve.kkt import residuals
 from soup_nlp.solve.phase import Phase
 from soup_nlp.solve.tangent import TangentProblem
-from soup_nlp.solve.warm import WARM, warm_start
+from soup_nlp.solve.warm import warm_options, warm_start
 
 Float = NDArray[np.float64]
 
@@ -181,7 +181,7 @@ def solve_soup(
     # the lifted truncation has another solution than the presolve's
     if form.truncation == "smooth" and soup is presolved and o.polish_iterations and near:
         warm = warm_start(nlp, data, soup, rim)
-    solver = Ipopt(nlp, {**(WARM if warm else {}), **o.ipopt})
+    solver = Ipopt(nlp, {**(warm_options(o.tol) if warm else {}), **o.ipopt})
     seconds["build"] = time.perf_counter() - mark
     cpu.append(time.process_time())
     mark = time.perf_counter()

@@ -73,7 +73,7 @@ class TangentProblem:
         own, (r, c) = 9 * np.arange(n)[:, None], self.triangle
         self.sums = make_sums(nlp, list(self._kinds.values()), (own + r, own + c))
         upper = self.sums.upper
-        self.block: Int = upper.places[-1].reshape(n, -1)
+        self.block = upper.places[-1].reshape(n, -1)
         self.upper: sparse.csc_matrix = numbered(upper.rows, upper.columns, nlp.nx)
         tables = {g.kernel.name: g.table for g in nlp.groups}
         self._visible = tables["t_visible"].rows

@@ -31,6 +31,23 @@ WARM: Mapping[str, Any] = {
 }
 """Ipopt options that leave a given start where it is."""
 
+ROUNDING = 10.0
+"""Where rounding of what is far away keeps the dual infeasibility above the tolerance, Newton steps
+of 1e-11 change it at random: three iterations in a row below so many tolerances end the solve."""
+
+
+def warm_options(tol: float) -> dict[str, Any]:
+    """Ipopt options of a solve from a KKT point; "Solved_To_Acceptable_Level" is `ROUNDING`."""
+    enough = ROUNDING * tol
+    return {
+        **WARM,
+        "acceptable_iter": 3,
+        "acceptable_tol": enough,
+        "acceptable_dual_inf_tol": enough,
+        "acceptable_constr_viol_tol": 1e-9,
+        "acceptable_compl_inf_tol": 1e-4,
+    }
+
 
 def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, Float]:
     """Start multipliers of the constrained NLP at the presolve's solution.

@@ -96,6 +96,8 @@ OUTLINE, GROUND, MOST = 0.2, 0.4, 0.6
 the outline that the latter's may reach."""
 BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
+UNSUPPORTED = 1e-6
+"""Added to the share of a body's support that is placed: without any, longer contacts first."""
 
 
 def contact_scales(
@@ -109,7 +111,11 @@ def contact_scales(
     neighbours': the scale is bounded by what most of the outline allows, should the superpixels
     below be wrong ones. Where none are seen (less than a tenth of the outline), or nothing is known
     of the vertical, a body touches what it touches first: a low quantile of the depth ratios all
-    around. Bodies are joined to the placed ones in the order of their contact length.
+    around.
+
+    Bodies are joined to the placed ones in the order of their contact length times the share of
+    what lies below them that is placed: the roof of a car in pieces waits for its wheels, instead
+    of being put where the mountain behind it stands.
 
     Args:
         soup: Planes, every motion in its own scale.
@@ -132,7 +138,11 @@ def contact_scales(
     way = (seg.anchors[k] - seg.anchors[i])[across]
     down = way[:, 1] / np.linalg.norm(way, axis=1)
     below = np.concatenate([down, -down]) > (BELOW if upright else np.inf)
-    height = np.tile(seg.boundary[across, :, 1].mean(axis=1), 2)
+    top = np.full(count, np.inf)
+    np.minimum.at(top, label, seg.anchors[:, 1])
+    low = np.maximum(np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) - top[a], 1.0)
+    weight = contact * low**2
+    support = np.bincount(a[below], weight[below], minlength=count)
     placed = np.zeros(count, bool)
     placed[np.argmax(np.bincount(label, minlength=count))] = True
     while not placed.all():
@@ -140,14 +150,15 @@ def contact_scales(
         if not touch.any():
             break
         length = np.bincount(a[touch], contact[touch], minlength=count)
-        c = int(np.argmax(length))
+        on = touch & below
+        stands = np.bincount(a[on], weight[on], minlength=count) / np.maximum(support, 1.0)
+        c = int(np.argmax(length * (stands + UNSUPPORTED)))
         mine = touch & (a == c)
         ground = mine & below
         value = ratio + log_scale[b]
         if contact[ground].sum() >= 0.1 * contact[mine].sum():
-            low = np.maximum(height - seg.anchors[label == c, 1].min(), 1.0)
             log_scale[c] = min(
-                _quantile(value[ground], (contact * low**2)[ground], GROUND),
+                _quantile(value[ground], weight[ground], GROUND),
                 _quantile(value[mine], contact[mine], MOST),
             )
         else:
