@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -20,9 +20,10 @@ from soup_nlp.bench.rivals import depth_maps, true_depth
 from soup_nlp.bench.suites import SUITES, Item
 from soup_nlp.bench.truth import true_soup
 from soup_nlp.config import Problem, dump_problem
+from soup_nlp.data.flow import is_named
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
-from soup_nlp.inputs import load_pair
+from soup_nlp.inputs import load_flow_of, load_pair
 from soup_nlp.model import plain
 from soup_nlp.pipeline import Run, run
 from soup_nlp.report.folder import prepare_folder, write_folder
@@ -40,7 +41,7 @@ CODE = (
     *(f"{room}/*.py" for room in ("data", "geometry", "model", "mrf", "start", "solve", "refine")),
     *(f"report/{name}.py" for name in ("metrics", "protocols", "scene_flow", "baselines")),
     *(f"bench/{name}.py" for name in ("accuracy", "planes", "rivals", "truth")),
-    *(f"bench/analyses_{name}.py" for name in ("energy", "flow")),
+    *(f"bench/analyses_{name}.py" for name in ("energy", "flow", "views")),
     *("pipeline.py", "cases.py", "inputs.py", "scoring.py"),
 )
 """Sources that decide the numbers of a row: they make its code version."""
@@ -93,13 +94,23 @@ def code_version() -> str:
     return f"{soup_nlp.__version__}-{digest.hexdigest()[:10]}"
 
 
-def measure(job: Job) -> Row:
-    """Solve and score one pair; whatever fails becomes a row with `ok` false and the reason."""
+def measure(job: Job, change: Callable[[Pair], Pair] | None = None) -> Row:
+    """Solve and score one pair; whatever fails becomes a row with `ok` false and the reason.
+
+    Args:
+        job: What to measure.
+        change: Makes another pair of the one that was loaded.
+    """
     row = head(job)
     begin, cpu = time.perf_counter(), time.process_time()
     try:
         problem = job.item.problem(job.overrides)
         pair = load_pair(problem)
+        if change is not None:
+            if not is_named(problem.flow.source):
+                # a file fits the pair as it is
+                pair = pair.with_flow(load_flow_of(problem, pair))
+            pair = change(pair)
         # a dataset without its truth would be solved for nothing, and again every time
         if not any(_applies(pair.truth, preset(name)) for name in job.item.presets):
             raise _no_truth(job.item)

@@ -13,6 +13,7 @@ from soup_nlp.bench.accuracy_runner import Say, Where, measure_all
 from soup_nlp.bench.analyses_energy import measure_energy
 from soup_nlp.bench.analyses_flow import measure_flow, plot_flow, text_flow
 from soup_nlp.bench.analyses_report import plot_energy, plot_variants, text_energy, text_variants
+from soup_nlp.bench.analyses_views import VIEWS, measure_view
 from soup_nlp.bench.suites import Item, Listing
 from soup_nlp.errors import ConfigError
 from soup_nlp.report.atomic import atomic_path
@@ -129,6 +130,13 @@ _ALL = (
         "flow",
         true_flow_only=True,
         function=measure_flow,
+    ),
+    Analysis(
+        "views",
+        "the same pairs mirrored and cropped: how far a figure on one pair is luck",
+        dict.fromkeys(VIEWS, ()),
+        "view",
+        function=measure_view,
     ),
     Analysis(
         "energy",

@@ -1,0 +1,114 @@
+"""A mirrored or cropped pair is the same world: its truth explains its own pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soup_nlp.bench.accuracy import Job
+from soup_nlp.bench.analyses_views import VIEWS, measure_view
+from soup_nlp.bench.suites import Options, list_suite
+from soup_nlp.data.formats_flow import write_flo
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.pair_views import cropped, mirrored
+from soup_nlp.data.scenes import render_scene
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import pixel_grid, project, rays
+
+CHANGED = [v for v in VIEWS.values() if v is not None]
+
+
+@pytest.fixture(scope="module")
+def pair() -> Pair:
+    found = render_scene("street", 1, 128, 96)
+    v, u = np.nonzero(np.isfinite(found.truth.depth_ref))
+    some = slice(None, None, 97)
+    points = np.column_stack([u, v, found.truth.depth_ref[v, u]])[some]
+    uv = np.nan_to_num(found.truth.flow).astype(np.float32)
+    known = np.isfinite(found.truth.flow).all(-1).astype(np.float32)
+    return replace(found, truth=replace(found.truth, points=points), flow=Flow(uv, known, "truth"))
+
+
+@pytest.mark.parametrize("view", CHANGED)
+def test_the_truth_explains_the_flow(view, pair):
+    """Depth, motions and intrinsics give the flow and the scene flow, as in the pair itself."""
+    seen = view(pair)
+    t = seen.truth
+    uv = pixel_grid(*seen.size)
+    X = t.depth_ref[..., None] * rays(seen.K_ref, uv)
+    M = t.motions[t.bodies]
+    moved = np.einsum("hwij,hwj->hwi", M[..., :3, :3], X) + M[..., :3, 3]
+    known = (t.bodies >= 0) & np.isfinite(t.depth_ref)
+    assert known.mean() > 0.5
+    np.testing.assert_allclose((moved - X)[known], t.scene_flow[known], atol=1e-9)
+    np.testing.assert_allclose((project(seen.K_next, moved) - uv)[known], t.flow[known], atol=1e-6)
+    np.testing.assert_allclose(seen.flow.uv[known], t.flow[known], atol=1e-4)
+
+
+@pytest.mark.parametrize("view", CHANGED)
+def test_points_and_pixels_stay_together(view, pair):
+    seen = view(pair)
+    u, v, z = seen.truth.points.T
+    assert 10 < len(z) <= len(pair.truth.points)
+    np.testing.assert_array_equal(seen.truth.depth_ref[v.astype(int), u.astype(int)], z)
+    assert seen.image_ref.shape[:2] == seen.truth.depth_ref.shape == seen.flow.uv.shape[:2]
+    # a crop takes points away with their pixels and no others
+    rows, columns = seen.size
+    share = rows * columns / np.prod(pair.size)
+    assert len(z) == pytest.approx(share * len(pair.truth.points), rel=0.1)
+
+
+def test_twice_in_the_mirror_is_the_pair_itself(pair):
+    K = pair.K_ref.copy()
+    K[0, 1] = 0.3
+    skewed = replace(pair, K_ref=K)
+    once = mirrored(skewed)
+    assert once.K_ref[0, 1] == -0.3
+    assert not np.array_equal(once.image_ref, skewed.image_ref)
+    twice = mirrored(once)
+    for name in ("image_ref", "image_next", "K_ref", "K_next"):
+        np.testing.assert_allclose(getattr(twice, name), getattr(skewed, name), err_msg=name)
+    for name in ("depth_ref", "depth_next", "flow", "occluded", "bodies", "motions", "points"):
+        np.testing.assert_allclose(
+            getattr(twice.truth, name), getattr(skewed.truth, name), atol=1e-12, err_msg=name
+        )
+
+
+def test_frames_of_two_widths_have_two_mirrors():
+    """Column 0 goes to column 3 of the wider image: its mirror image 39 goes to 46."""
+    K = np.array([[50.0, 0, 20], [0, 50, 10], [0, 0, 1]])
+    uv = np.full((20, 40, 2), [3.0, 1.0], np.float32)
+    pair = Pair(
+        image_ref=np.zeros((20, 40, 3), np.uint8),
+        image_next=np.zeros((20, 50, 3), np.uint8),
+        K_ref=K,
+        K_next=K,
+        flow=Flow(uv, np.ones((20, 40), np.float32)),
+    )
+    seen = mirrored(pair)
+    np.testing.assert_array_equal(seen.flow.uv[0, 39], [7.0, 1.0])
+    assert (seen.K_ref[0, 2], seen.K_next[0, 2]) == (19.0, 29.0)
+
+
+def test_nothing_left_is_said(pair):
+    with pytest.raises(DataError, match="margins are wider"):
+        cropped(pair, 100, 0, 28)
+    assert cropped(pair, 100, 0, 27).size == (96, 1)
+
+
+def test_every_view_is_measured_with_its_own_flow(tmp_path):
+    """A view of a pair with true flow scores as the pair does; so does a flow of a file."""
+    listed = list_suite("rendered", options=Options(("truth",), width=160, only=("orbit",)))
+    over = ("segmentation.superpixels=40", "segmentation.neighbours=6", "refine.enabled=false")
+    path = tmp_path / "flow.flo"
+    write_flo(path, render_scene("orbit", 0, 160, 68).truth.flow)
+    for more in ((), (f"flow.source={path}",)):
+        rows = {v: measure_view(Job(listed.items[0], (*over, *more), v)) for v in list(VIEWS)[:3]}
+        assert all(r["ok"] for r in rows.values()), [r["error"] for r in rows.values()]
+        assert len({r["key"] for r in rows.values()}) == 3
+        assert rows["cropped 7x5"]["size"] == [63, 153]
+        for row in rows.values():
+            assert row["flow_error"]["mean"] < 1e-3
+            assert row["metrics"]["paper"]["solution"]["mre"] < 0.02
