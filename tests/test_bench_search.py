@@ -225,6 +225,7 @@ def test_values_are_names_with_commas_and_blanks_and_are_checked_first(tmp_path)
     both = ["slic, image alone", "grid, image alone"]
     assert split_values("pattern", "slic, image alone,grid,image alone") == both
     assert split_values("flows", " dis, reweighted 0.5 , dis") == ["dis, reweighted 0.5", "dis"]
+    assert split_values("views", "mirrored,cropped 7x5") == ["mirrored", "cropped 7x5"]
     assert split_values("neighbours", "4, 8 ,12") == ["4", "8", "12"]
     for text in ("", "4,,8", "4,"):
         with pytest.raises(ConfigError, match="value is empty"):

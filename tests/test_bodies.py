@@ -121,6 +121,15 @@ def test_a_body_in_pieces_is_placed_from_the_ground_up():
     z = thrice([[8.0, 8, 8], [8, 1, 8], [8, 1, 8], [8, 1, 8], [2, 2, 2]])
     found = scales(z, own)
     np.testing.assert_allclose(found, np.where(own > 0, 2.0, 1.0), rtol=1e-12)
+    # what stands on nothing in the image, cut off by its lower edge, waits for nothing
+    own = thrice([[0, 0, 0, 0, 0], [0, 2, 2, 0, 0], *[[0, 0, 1, 0, 0]] * 3])
+    z = thrice([[8.0] * 5, [8, 1, 1, 8, 8], [8, 8, 1, 2, 2], *[[2, 2, 1, 2, 2]] * 2])
+    np.testing.assert_allclose(scales(z, own), np.where(own > 0, 2.0, 1.0), rtol=1e-12)
+
+
+def test_without_a_vertical_the_longest_contact_comes_first():
+    own = thrice([[0, 0, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0], [0, 0, 0]])
+    z = thrice([[8.0, 8, 8], [8, 1, 8], [8, 1, 8], [8, 1, 8], [2, 2, 2]])
     # which way is down is not known: the wall, which the tall one touches first
     np.testing.assert_allclose(scales(z, own, upright=False)[own == 2], 8.0, rtol=1e-12)
 

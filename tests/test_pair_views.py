@@ -10,8 +10,9 @@ import pytest
 from soup_nlp.bench.accuracy import Job
 from soup_nlp.bench.analyses_views import VIEWS, measure_view
 from soup_nlp.bench.suites import Options, list_suite
+from soup_nlp.data.flow_check import leaves
 from soup_nlp.data.formats_flow import write_flo
-from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.data.pair_views import cropped, mirrored
 from soup_nlp.data.scenes import render_scene
 from soup_nlp.errors import DataError
@@ -26,6 +27,8 @@ def pair() -> Pair:
     v, u = np.nonzero(np.isfinite(found.truth.depth_ref))
     some = slice(None, None, 97)
     points = np.column_stack([u, v, found.truth.depth_ref[v, u]])[some]
+    # anywhere in their pixels
+    points[:, :2] += np.random.default_rng(0).uniform(-0.49, 0.49, (len(points), 2))
     uv = np.nan_to_num(found.truth.flow).astype(np.float32)
     known = np.isfinite(found.truth.flow).all(-1).astype(np.float32)
     return replace(found, truth=replace(found.truth, points=points), flow=Flow(uv, known, "truth"))
@@ -48,16 +51,46 @@ def test_the_truth_explains_the_flow(view, pair):
 
 
 @pytest.mark.parametrize("view", CHANGED)
-def test_points_and_pixels_stay_together(view, pair):
-    seen = view(pair)
-    u, v, z = seen.truth.points.T
-    assert 10 < len(z) <= len(pair.truth.points)
-    np.testing.assert_array_equal(seen.truth.depth_ref[v.astype(int), u.astype(int)], z)
-    assert seen.image_ref.shape[:2] == seen.truth.depth_ref.shape == seen.flow.uv.shape[:2]
-    # a crop takes points away with their pixels and no others
-    rows, columns = seen.size
-    share = rows * columns / np.prod(pair.size)
-    assert len(z) == pytest.approx(share * len(pair.truth.points), rel=0.1)
+def test_points_stay_with_their_pixels(view, pair):
+    """A crop takes points away with their pixels and no others."""
+    number = np.arange(96 * 128, dtype=np.int32).reshape(96, 128)
+    points = pair.truth.points
+    seen = view(replace(pair, truth=Truth(bodies=number, points=points))).truth
+
+    def pixels(of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        u, v = np.floor(of[:, :2].T + 0.5).astype(int)
+        assert min(u.min(), v.min()) >= 0
+        return v, u
+
+    before = number[pixels(points)]
+    left = np.isin(before, seen.bodies)
+    assert left.sum() > 10
+    np.testing.assert_array_equal(seen.bodies[pixels(seen.points)], before[left])
+    np.testing.assert_array_equal(seen.points[:, 2], points[left, 2])
+
+
+def test_a_crop_is_a_part_of_every_image(pair):
+    seen, part = cropped(pair, 16, 11, 9, 6), np.s_[11:90, 16:119]
+    for name in ("image_ref", "image_next"):
+        np.testing.assert_array_equal(getattr(seen, name), getattr(pair, name)[part])
+    for name in ("depth_ref", "depth_next", "bodies"):
+        np.testing.assert_array_equal(getattr(seen.truth, name), getattr(pair.truth, name)[part])
+    np.testing.assert_array_equal(seen.flow.confidence, pair.flow.confidence[part])
+    # what the crop hides is hidden: where the flow leads out of what is left
+    gone = leaves(seen.truth.flow, seen.size)
+    hidden = pair.truth.occluded[part] | gone
+    np.testing.assert_array_equal(seen.truth.occluded, hidden)
+    assert (gone & ~pair.truth.occluded[part]).any()
+
+
+def test_what_is_not_known_stays_unknown(pair):
+    depth = Truth(depth_ref=pair.truth.depth_ref)
+    for view in CHANGED:
+        seen = view(replace(pair, flow=None, truth=depth))
+        known = [k for k, v in vars(seen.truth).items() if v is not None]
+        assert known == ["depth_ref", "unit"]
+        assert seen.flow is None
+        assert view(replace(pair, truth=None)).truth is None
 
 
 def test_twice_in_the_mirror_is_the_pair_itself(pair):
@@ -80,15 +113,20 @@ def test_frames_of_two_widths_have_two_mirrors():
     """Column 0 goes to column 3 of the wider image: its mirror image 39 goes to 46."""
     K = np.array([[50.0, 0, 20], [0, 50, 10], [0, 0, 1]])
     uv = np.full((20, 40, 2), [3.0, 1.0], np.float32)
+    confidence = np.ones((20, 40), np.float32)
+    confidence[0, 1] = 0
     pair = Pair(
         image_ref=np.zeros((20, 40, 3), np.uint8),
         image_next=np.zeros((20, 50, 3), np.uint8),
         K_ref=K,
         K_next=K,
-        flow=Flow(uv, np.ones((20, 40), np.float32)),
+        flow=Flow(uv, confidence),
     )
     seen = mirrored(pair)
     np.testing.assert_array_equal(seen.flow.uv[0, 39], [7.0, 1.0])
+    # what is not known is 0 in a flow
+    np.testing.assert_array_equal(seen.flow.uv[0, 38], [0.0, 0.0])
+    assert seen.flow.confidence[0, 38] == 0
     assert (seen.K_ref[0, 2], seen.K_next[0, 2]) == (19.0, 29.0)
 
 

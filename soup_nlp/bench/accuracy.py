@@ -20,7 +20,7 @@ from soup_nlp.bench.rivals import depth_maps, true_depth
 from soup_nlp.bench.suites import SUITES, Item
 from soup_nlp.bench.truth import true_soup
 from soup_nlp.config import Problem, dump_problem
-from soup_nlp.data.flow import is_named
+from soup_nlp.data.flow import is_named, is_network
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.inputs import load_flow_of, load_pair
@@ -107,7 +107,8 @@ def measure(job: Job, change: Callable[[Pair], Pair] | None = None) -> Row:
         problem = job.item.problem(job.overrides)
         pair = load_pair(problem)
         if change is not None:
-            if not is_named(problem.flow.source):
+            source = problem.flow.source
+            if not (is_named(source) or is_network(source)):
                 # a file fits the pair as it is
                 pair = pair.with_flow(load_flow_of(problem, pair))
             pair = change(pair)
@@ -120,7 +121,10 @@ def measure(job: Job, change: Callable[[Pair], Pair] | None = None) -> Row:
             folder = prepare_folder(job.folder)
             result = run(problem, pair=pair, ipopt_log=str(folder / "ipopt.log"))
             write_folder(folder, result, dump_problem(problem), "")
-        row |= {"ok": True, "error": None, **scores(result, job.item.presets)}
+        found = scores(result, job.item.presets)
+        if not found["metrics"]:
+            raise _no_truth(job.item)
+        row |= {"ok": True, "error": None, **found}
     except Exception as error:
         row |= {"ok": False, "error": f"{type(error).__name__}: {error}"}
     row["seconds"] = time.perf_counter() - begin

@@ -15,8 +15,8 @@ VIEWS: Mapping[str, Callable[[Pair], Pair] | None] = MappingProxyType(
         "mirrored": mirrored,
         "cropped 7x5": lambda pair: cropped(pair, 7, 5),
         "cropped 25x17": lambda pair: cropped(pair, 16, 11, 9, 6),
-        "mirrored, cropped 7x5": lambda pair: mirrored(cropped(pair, 7, 5)),
-        "mirrored, cropped 25x17": lambda pair: mirrored(cropped(pair, 16, 11, 9, 6)),
+        "mirrored and cropped 7x5": lambda pair: mirrored(cropped(pair, 7, 5)),
+        "mirrored and cropped 25x17": lambda pair: mirrored(cropped(pair, 16, 11, 9, 6)),
     }
 )
 """What is made of a pair, by the name of a variant; columns x rows that are cut off."""

@@ -10,6 +10,7 @@ from typing import Any
 
 from soup_nlp.bench.speed import Spec
 from soup_nlp.errors import DataError
+from soup_nlp.solve.ipopt import SOLVED
 
 Record = Mapping[str, Any]
 
@@ -60,7 +61,7 @@ def values(record: Record) -> dict[str, float]:
         "nonzeros": float(
             record["sizes"]["hessian_nonzeros"] + record["sizes"]["jacobian_nonzeros"]
         ),
-        "converged": float(record["converged"]),
+        "converged": float(record["status"] == SOLVED),
     }
     yard = record["yardstick"].get("same")
     if yard:

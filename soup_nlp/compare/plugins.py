@@ -131,8 +131,8 @@ PLUGINS: Mapping[str, tuple[str, str, bool, Callable[[Limits], dict[str, Any]]]]
     ),
 }
 """Plug-in, Hessian, whether it calls back at every iteration, options. "ipopt-soup" is how `solve`
-runs Ipopt, "ipopt-tuned" the same with the exact Hessian, "ipopt" Ipopt as it comes; other names
-with "-tuned" have its options for a start near the end. blocksqp is
+runs Ipopt where it starts from no KKT point, "ipopt-tuned" the same with the exact Hessian, "ipopt"
+Ipopt as it comes; other names with "-tuned" have its options for a start near the end. blocksqp is
 left out: it needs a linear solver (ma27) that CasADi's wheel lacks."""
 
 

@@ -34,6 +34,7 @@ __all__ = [
     "flow_from_truth",
     "flow_sources",
     "is_named",
+    "is_network",
     "leaves",
     "load_flow",
     "resolve_flow",
@@ -264,6 +265,11 @@ def is_named(source: str) -> bool:
     return named or source in flow_sources()
 
 
+def is_network(source: str) -> bool:
+    """Whether a flow source is the path of a network."""
+    return Path(source).suffix in (".onnx", ".pth")
+
+
 def resolve_flow(pair: Pair, source: str) -> Flow:
     """The flow of a pair from a named source.
 
@@ -285,7 +291,7 @@ def resolve_flow(pair: Pair, source: str) -> Flow:
         return noisy(flow_from_truth(pair), noise_level(source))
     if source == "rlof":
         return rlof_flow(pair.image_ref, pair.image_next)
-    if source in MODELS or Path(source).suffix in (".onnx", ".pth"):
+    if source in MODELS or is_network(source):
         return learned_flow(source, pair.image_ref, pair.image_next)
     plugins = flow_sources()
     if source in plugins:

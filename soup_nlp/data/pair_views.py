@@ -7,16 +7,16 @@ and their margin, so a figure that holds on all of them is worth more than one o
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.pair import Flow, Pair, Truth
+from soup_nlp.data.flow_check import leaves
+from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
-Array = TypeVar("Array", bound=NDArray[np.generic])
 
 _FLIP = np.diag([-1.0, 1.0, 1.0])
 
@@ -28,11 +28,6 @@ def mirrored(pair: Pair) -> Pair:
     """
     width, there = pair.image_ref.shape[1], pair.image_next.shape[1]
 
-    def flow(uv: Array) -> Array:
-        out = _backwards(uv).copy()
-        out[..., 0] = (there - width) - out[..., 0]
-        return out
-
     truth = pair.truth
     if truth is not None:
         own: dict[str, Any] = {
@@ -41,7 +36,7 @@ def mirrored(pair: Pair) -> Pair:
             if (v := getattr(truth, k)) is not None
         }
         if truth.flow is not None:
-            own["flow"] = flow(truth.flow)
+            own["flow"] = _mirrored_uv(truth.flow, there - width)
         if truth.scene_flow is not None:
             own["scene_flow"] = _backwards(truth.scene_flow) @ _FLIP
         if truth.points is not None:
@@ -56,14 +51,26 @@ def mirrored(pair: Pair) -> Pair:
         image_next=_backwards(pair.image_next),
         K_ref=_mirrored_camera(pair.K_ref, width),
         K_next=_mirrored_camera(pair.K_next, there),
-        flow=pair.flow
-        and Flow(flow(pair.flow.uv), _backwards(pair.flow.confidence), pair.flow.source),
+        flow=pair.flow and _mirrored_flow(pair.flow, there - width),
         truth=truth,
     )
 
 
-def _backwards(array: Array) -> Array:
-    return np.ascontiguousarray(array[:, ::-1])  # type: ignore[return-value]
+def _mirrored_flow(flow: Flow, wider: int) -> Flow:
+    uv, confidence = _mirrored_uv(flow.uv, wider), _backwards(flow.confidence)
+    uv[confidence == 0] = 0.0
+    return Flow(uv, confidence, flow.source)
+
+
+def _mirrored_uv(uv: NDArray[Any], wider: int) -> NDArray[Any]:
+    """Flow in the mirror, where the next image has so many columns more than the reference."""
+    out = _backwards(uv)
+    out[..., 0] = wider - out[..., 0]
+    return out
+
+
+def _backwards(array: NDArray[Any]) -> NDArray[Any]:
+    return array[:, ::-1].copy()
 
 
 def _mirrored_camera(K: Float, width: int) -> Float:
@@ -94,18 +101,26 @@ def cropped(pair: Pair, left: int, top: int, right: int = 0, bottom: int = 0) ->
                 expected=f"less than {image.shape[1]} and {image.shape[0]}",
             )
 
-    def cut(array: Array) -> Array:
+    def cut(array: NDArray[Any]) -> NDArray[Any]:
         rows, columns = array.shape[:2]
-        return np.ascontiguousarray(array[top : rows - bottom, left : columns - right])  # type: ignore[return-value]
+        return array[top : rows - bottom, left : columns - right].copy()
 
     corner = np.array([left, top, 0.0])
     truth = pair.truth
     if truth is not None:
         images = ("depth_ref", "depth_next", "flow", "occluded", "bodies", "scene_flow")
-        own = {k: cut(v) for k in images if (v := getattr(truth, k)) is not None}
-        truth = replace(
-            truth, **own, points=_points_inside(truth, corner, pair.size, right, bottom)
-        )
+        own: dict[str, Any] = {k: cut(v) for k in images if (v := getattr(truth, k)) is not None}
+        if "flow" in own and "occluded" in own:
+            # what moves into the margin is not seen there any more
+            gone = leaves(own["flow"], cut(pair.image_next).shape[:2])
+            own["occluded"] = own["occluded"] | (np.isfinite(own["flow"]).all(axis=2) & gone)
+        if truth.points is not None:
+            # a point belongs to the pixel that it is nearest to
+            pixel = np.floor(truth.points[:, :2] + 0.5)
+            end = np.array([pair.size[1] - right, pair.size[0] - bottom])
+            inside = ((pixel >= corner[:2]) & (pixel < end)).all(axis=1)
+            own["points"] = truth.points[inside] - corner
+        truth = replace(truth, **own)
     return replace(
         pair,
         image_ref=cut(pair.image_ref),
@@ -115,17 +130,6 @@ def cropped(pair: Pair, left: int, top: int, right: int = 0, bottom: int = 0) ->
         flow=pair.flow and Flow(cut(pair.flow.uv), cut(pair.flow.confidence), pair.flow.source),
         truth=truth,
     )
-
-
-def _points_inside(
-    truth: Truth, corner: Float, size: tuple[int, int], right: int, bottom: int
-) -> Float | None:
-    if truth.points is None:
-        return None
-    points = truth.points - corner
-    last = np.array([size[1] - right - 1, size[0] - bottom - 1]) - corner[:2]
-    inside = (points[:, :2] >= 0).all(axis=1) & (points[:, :2] <= last).all(axis=1)
-    return points[inside]
 
 
 def _cropped_camera(K: Float, corner: Float) -> Float:

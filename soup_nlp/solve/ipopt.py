@@ -32,7 +32,8 @@ DEFAULTS: Mapping[str, Any] = {
     "mumps_permuting_scaling": 0,
     "watchdog_shortened_iter_trigger": 0,
 }
-GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+SOLVED, ACCEPTED = "Solve_Succeeded", "Solved_To_Acceptable_Level"
+GOOD = (SOLVED, ACCEPTED)
 
 
 @dataclass(frozen=True)

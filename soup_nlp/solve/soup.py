@@ -50,7 +50,8 @@ class SolverOptions:
         presolve_tol: Dual infeasibility that ends the presolve.
         eps: Smoothing of the constrained NLP.
         max_iter: Iteration limit of the constrained NLP.
-        tol: Tolerance of the constrained NLP.
+        tol: Tolerance of the constrained NLP; from the presolve's KKT point ten times as much is
+            accepted where rounding allows no more, see `warm.ACCEPTABLE`.
         max_seconds: Time limit of all stages together.
         ipopt: Further Ipopt options of the constrained NLP.
     """
@@ -77,7 +78,7 @@ class Solution:
             start where that has the lower exact energy, with rounding-size constraint violations
             retracted.
         status: Ipopt's status of the constrained NLP, or why it was stopped.
-        converged: Its claim.
+        converged: Its claim, "Solved_To_Acceptable_Level" included.
         stages: Phases of the presolve, then Ipopt's of the constrained NLP.
         energy_start: Exact energy by term of the start.
         energy: Exact energy by term of the solution.

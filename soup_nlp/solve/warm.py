@@ -17,6 +17,7 @@ from scipy.sparse.linalg import splu
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy import EnergyData
 from soup_nlp.model.nlp import NLP, to_scipy
+from soup_nlp.solve.ipopt import DEFAULTS
 
 Float = NDArray[np.float64]
 
@@ -31,21 +32,25 @@ WARM: Mapping[str, Any] = {
 }
 """Ipopt options that leave a given start where it is."""
 
-ROUNDING = 10.0
-"""Where rounding of what is far away keeps the dual infeasibility above the tolerance, Newton steps
-of 1e-11 change it at random: three iterations in a row below so many tolerances end the solve."""
+ACCEPTABLE = 10.0
+"""So many tolerances are accepted after three iterates there. Where rounding of what is far
+away holds the dual infeasibility above the tolerance, steps of 1e-11 change it at random."""
 
 
 def warm_options(tol: float) -> dict[str, Any]:
-    """Ipopt options of a solve from a KKT point; "Solved_To_Acceptable_Level" is `ROUNDING`."""
-    enough = ROUNDING * tol
+    """Ipopt options of a solve from a KKT point.
+
+    Args:
+        tol: Tolerance of the solve; it may end at `ACCEPTABLE` times that, with the status
+            "Solved_To_Acceptable_Level".
+    """
     return {
         **WARM,
         "acceptable_iter": 3,
-        "acceptable_tol": enough,
-        "acceptable_dual_inf_tol": enough,
-        "acceptable_constr_viol_tol": 1e-9,
-        "acceptable_compl_inf_tol": 1e-4,
+        "acceptable_tol": ACCEPTABLE * tol,
+        "acceptable_dual_inf_tol": ACCEPTABLE * tol,
+        "acceptable_constr_viol_tol": DEFAULTS["constr_viol_tol"],
+        "acceptable_compl_inf_tol": DEFAULTS["compl_inf_tol"],
     }
 
 

@@ -114,8 +114,8 @@ def contact_scales(
     around.
 
     Bodies are joined to the placed ones in the order of their contact length times the share of
-    what lies below them that is placed: the roof of a car in pieces waits for its wheels, instead
-    of being put where the mountain behind it stands.
+    what lies below them that is placed (1 where nothing does): the roof of a car in pieces waits
+    for its wheels, instead of being put where the mountain behind it stands.
 
     Args:
         soup: Planes, every motion in its own scale.
@@ -152,6 +152,7 @@ def contact_scales(
         length = np.bincount(a[touch], contact[touch], minlength=count)
         on = touch & below
         stands = np.bincount(a[on], weight[on], minlength=count) / np.maximum(support, 1.0)
+        stands[support == 0] = 1.0
         c = int(np.argmax(length * (stands + UNSUPPORTED)))
         mine = touch & (a == c)
         ground = mine & below
