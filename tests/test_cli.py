@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -310,3 +312,14 @@ def test_python_functions_do_the_same():
     assert len(result.soup) == len(result.segmentation)
     again = load_pair(make_problem({"input": {"kind": "motorcycle"}}))
     assert again.K_next[0, 2] > again.K_ref[0, 2]
+
+
+def test_the_package_is_a_command():
+    def command(*words: str) -> subprocess.CompletedProcess[str]:
+        whole = [sys.executable, "-m", "soup_nlp", *words]
+        return subprocess.run(whole, capture_output=True, text=True, check=False)
+
+    shown = command("show", str(PROBLEMS[0]))
+    assert shown.returncode == 0, shown.stderr
+    assert "superpixels: 1000" in shown.stdout
+    assert command("nothing").returncode == 2
