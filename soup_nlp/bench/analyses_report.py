@@ -138,6 +138,10 @@ def _figure(width: float, height: float) -> tuple[Figure, Axes]:
     return figure, figure.add_subplot()
 
 
+LONG = 60
+"""Letters of all variants from which their labels are slanted."""
+
+
 def plot_variants(
     path: Path, axis: str, title: str, rows: Sequence[Row], numeric: bool = False
 ) -> None:
@@ -157,6 +161,8 @@ def plot_variants(
     if numeric and len(x) > 1 and x.max() > 8 * x.min() > 0:
         ax.set_xscale("log")
     ax.set_xticks(x, variants)
+    if not numeric and len("".join(variants)) > LONG:
+        ax.set_xticks(x, variants, rotation=15, ha="right", fontsize=8)
     ax.minorticks_off()
     finite = np.concatenate(curves)
     finite = finite[np.isfinite(finite)]
@@ -164,10 +170,11 @@ def plot_variants(
         ax.set_yscale("log")
     else:
         ax.set_ylim(bottom=0)
-    ax.set(xlabel=axis, ylabel=f"MRE ({rows[0]['presets'][0]})", title=title)
+    ax.set(xlabel=axis, ylabel=f"MRE ({rows[0]['presets'][0]})")
+    figure.suptitle(title, fontsize=10)
     ax.grid(alpha=0.3)
     if len(pairs) <= 14:
-        ax.legend(fontsize=6, ncols=2)
+        figure.legend(loc="outside right center", fontsize=6)
     figure.savefig(path, format="png")
 
 
