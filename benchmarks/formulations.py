@@ -41,9 +41,8 @@ def main() -> None:
     case = prepare(load_problem(ROOT / "problems" / f"{args.scene}.yaml", changes))
     options = replace(case.options, max_iter=args.iterations, max_seconds=args.seconds)
     lines = [
-        f"{args.scene}, true flow, {len(case)} superpixels; constrained NLP to a tolerance"
-        f" of 1e-6 from the same presolve, at most {args.iterations} iterations."
-        f" {date.today()}, {platform.machine()},"
+        f"{args.scene}, true flow, {len(case)} superpixels; constrained NLP to 1e-6 from the same"
+        f" presolve, at most {args.iterations} iterations. {date.today()}, {platform.machine()},"
         " one thread.",
         "",
         HEAD,

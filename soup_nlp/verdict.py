@@ -14,8 +14,7 @@ if TYPE_CHECKING:
 
 WORDS = {
     "Solve_Succeeded": "converged to the tolerance",
-    "Solved_To_Acceptable_Level": "converged to Ipopt's acceptable level (ten times the tolerance,"
-    " unless solver.ipopt says otherwise)",
+    "Solved_To_Acceptable_Level": "converged to Ipopt's acceptable level",
     "Maximum_Iterations_Exceeded": "not converged: iteration limit, best iterate kept",
     "Time_Limit": "not converged: time limit, best iterate kept",
     "Skipped": "refined from the start, no NLP",

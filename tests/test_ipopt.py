@@ -17,7 +17,6 @@ from soup_nlp.model.nlp import NLP, assemble
 from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.solve.ipopt import Ipopt, Progress, Stage
 from soup_nlp.solve.kkt import optimality
-from soup_nlp.solve.warm import warm_options
 
 # --- textbook problems as kernels and tables -----------------------------------------------------
 
@@ -288,27 +287,3 @@ def test_a_nan_in_the_objective_is_a_result_too():
     stage = solve(nlp)
     assert not stage.converged
     assert np.isfinite(stage.x).all()
-
-
-def test_a_solve_that_rounding_holds_above_the_tolerance_ends_soon():
-    """Stiff springs to places whose difference from x is rounded: no x balances them to 1e-6."""
-    x, row, one = symbols(1, 2)
-    spring = Kernel("spring", x, row, one, objective=1.5e7 * ((x[0] + row[0]) - row[1]) ** 2)
-    far = 1000 * np.sqrt([1.0, 2.0, 3.0])
-    places = np.column_stack([far, far + 0.3 + np.array([1e-12, -3e-12, 1.1e-12])])
-    table = Table(np.array([[0], [0], [0], [1]]), places[[0, 1, 2, 0]])
-    nlp = make_nlp([Group(spring, table)], [0.3, 0.3], -np.inf, np.inf, [], [])
-
-    def stage(**options) -> Stage:
-        return Ipopt(nlp, options)(x0=nlp.x0, tol=1e-6, max_iter=30)
-
-    held = stage()
-    assert held.history["inf_du"].min() > 1e-6
-    assert not held.converged
-    soon = stage(**warm_options(1e-6))
-    assert soon.status == "Solved_To_Acceptable_Level"
-    assert soon.iterations < held.iterations
-    assert 1e-6 < soon.history["inf_du"][-1] <= 1e-5
-    # what is accepted goes with the tolerance
-    strict = Ipopt(nlp, warm_options(1e-8))(x0=nlp.x0, tol=1e-8, max_iter=30)
-    assert not strict.converged

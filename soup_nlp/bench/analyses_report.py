@@ -6,6 +6,7 @@ import platform
 from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -160,9 +161,9 @@ def plot_variants(
             ax.plot(x, np.mean(whole, axis=0), "ks-", lw=2, label=f"mean of {len(whole)}")
     if numeric and len(x) > 1 and x.max() > 8 * x.min() > 0:
         ax.set_xscale("log")
-    ax.set_xticks(x, variants)
-    if not numeric and len("".join(variants)) > LONG:
-        ax.set_xticks(x, variants, rotation=15, ha="right", fontsize=8)
+    slanted = not numeric and len("".join(variants)) > LONG
+    style: dict[str, Any] = {"rotation": 15, "ha": "right", "size": 8} if slanted else {}
+    ax.set_xticks(x, variants, **style)
     ax.minorticks_off()
     finite = np.concatenate(curves)
     finite = finite[np.isfinite(finite)]

@@ -10,7 +10,6 @@ from typing import Any
 
 from soup_nlp.bench.speed import Spec
 from soup_nlp.errors import DataError
-from soup_nlp.solve.ipopt import SOLVED
 
 Record = Mapping[str, Any]
 
@@ -61,7 +60,7 @@ def values(record: Record) -> dict[str, float]:
         "nonzeros": float(
             record["sizes"]["hessian_nonzeros"] + record["sizes"]["jacobian_nonzeros"]
         ),
-        "converged": float(record["status"] == SOLVED),
+        "converged": float(record["converged"]),
     }
     yard = record["yardstick"].get("same")
     if yard:

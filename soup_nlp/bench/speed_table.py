@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from soup_nlp.bench.speed_fit import COSTS, growth, outside
-from soup_nlp.solve.ipopt import ACCEPTED, SOLVED
 
 Record = Mapping[str, Any]
 Cell = Callable[[Record], str]
@@ -162,10 +161,8 @@ def conclusion(records: Sequence[Record]) -> str:
     good = [r for r in records if "error" not in r]
     if not good:
         return "No run ended with a result."
-    ends = [r["status"] for r in good]
-    text = [f"{ends.count(SOLVED)} of {len(good)} runs converged to their tolerance."]
-    if ACCEPTED in ends:
-        text.append(f"{ends.count(ACCEPTED)} more to ten times that, where rounding holds them.")
+    converged = sum(bool(r["converged"]) for r in good)
+    text = [f"{converged} of {len(good)} runs converged to their tolerance."]
     by_size: dict[tuple[int, int], list[float]] = defaultdict(list)
     for r in good:
         by_size[r["spec"]["superpixels"], r["spec"]["neighbours"]].append(r["cpu"]["nlp"])

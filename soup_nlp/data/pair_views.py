@@ -6,6 +6,7 @@ and their margin, so a figure that holds on all of them is worth more than one o
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -13,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.data.flow_check import leaves
-from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
 
-_FLIP = np.diag([-1.0, 1.0, 1.0])
+IMAGES = ("depth_ref", "depth_next", "flow", "occluded", "bodies", "scene_flow")
+"""Parts of a truth that have a value for every pixel."""
+_FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
 def mirrored(pair: Pair) -> Pair:
@@ -28,55 +31,48 @@ def mirrored(pair: Pair) -> Pair:
     """
     width, there = pair.image_ref.shape[1], pair.image_next.shape[1]
 
-    truth = pair.truth
+    def turned(uv: NDArray[Any]) -> NDArray[Any]:
+        out = uv.copy()
+        out[..., 0] = (there - width) - out[..., 0]
+        return out
+
+    seen = _each_image(pair, lambda array: array[:, ::-1].copy())
+    flow, truth = seen.flow, seen.truth
+    if flow is not None:
+        known = flow.confidence[..., None] > 0
+        flow = replace(flow, uv=np.where(known, turned(flow.uv), np.float32(0.0)))
     if truth is not None:
-        own: dict[str, Any] = {
-            k: _backwards(v)
-            for k in ("depth_ref", "depth_next", "occluded", "bodies")
-            if (v := getattr(truth, k)) is not None
-        }
+        own: dict[str, Any] = {}
         if truth.flow is not None:
-            own["flow"] = _mirrored_uv(truth.flow, there - width)
+            own["flow"] = turned(truth.flow)
         if truth.scene_flow is not None:
-            own["scene_flow"] = _backwards(truth.scene_flow) @ _FLIP
+            own["scene_flow"] = truth.scene_flow @ _FLIP[:3, :3]
         if truth.points is not None:
             own["points"] = truth.points * [-1, 1, 1] + [width - 1, 0, 0]
         if truth.motions is not None:
-            turn = np.diag([-1.0, 1.0, 1.0, 1.0])
-            own["motions"] = turn @ truth.motions @ turn
+            own["motions"] = _FLIP @ truth.motions @ _FLIP
         truth = replace(truth, **own)
-    return replace(
-        pair,
-        image_ref=_backwards(pair.image_ref),
-        image_next=_backwards(pair.image_next),
-        K_ref=_mirrored_camera(pair.K_ref, width),
-        K_next=_mirrored_camera(pair.K_next, there),
-        flow=pair.flow and _mirrored_flow(pair.flow, there - width),
-        truth=truth,
-    )
-
-
-def _mirrored_flow(flow: Flow, wider: int) -> Flow:
-    uv, confidence = _mirrored_uv(flow.uv, wider), _backwards(flow.confidence)
-    uv[confidence == 0] = 0.0
-    return Flow(uv, confidence, flow.source)
-
-
-def _mirrored_uv(uv: NDArray[Any], wider: int) -> NDArray[Any]:
-    """Flow in the mirror, where the next image has so many columns more than the reference."""
-    out = _backwards(uv)
-    out[..., 0] = wider - out[..., 0]
-    return out
-
-
-def _backwards(array: NDArray[Any]) -> NDArray[Any]:
-    return array[:, ::-1].copy()
+    K_ref, K_next = _mirrored_camera(pair.K_ref, width), _mirrored_camera(pair.K_next, there)
+    return replace(seen, K_ref=K_ref, K_next=K_next, flow=flow, truth=truth)
 
 
 def _mirrored_camera(K: Float, width: int) -> Float:
     out = K.copy()
     out[0, 1], out[0, 2] = -K[0, 1], width - 1 - K[0, 2]
     return out
+
+
+def _each_image(pair: Pair, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Pair:
+    """The pair with all that it has for every pixel changed; cameras and the rest as they were."""
+    flow, truth = pair.flow, pair.truth
+    if flow is not None:
+        flow = replace(flow, uv=change(flow.uv), confidence=change(flow.confidence))
+    if truth is not None:
+        known = ((k, getattr(truth, k)) for k in IMAGES)
+        own: dict[str, Any] = {k: change(v) for k, v in known if v is not None}
+        truth = replace(truth, **own)
+    image_ref, image_next = change(pair.image_ref), change(pair.image_next)
+    return replace(pair, image_ref=image_ref, image_next=image_next, flow=flow, truth=truth)
 
 
 def cropped(pair: Pair, left: int, top: int, right: int = 0, bottom: int = 0) -> Pair:
@@ -106,33 +102,19 @@ def cropped(pair: Pair, left: int, top: int, right: int = 0, bottom: int = 0) ->
         return array[top : rows - bottom, left : columns - right].copy()
 
     corner = np.array([left, top, 0.0])
-    truth = pair.truth
-    if truth is not None:
-        images = ("depth_ref", "depth_next", "flow", "occluded", "bodies", "scene_flow")
-        own: dict[str, Any] = {k: cut(v) for k in images if (v := getattr(truth, k)) is not None}
-        if "flow" in own and "occluded" in own:
-            # what moves into the margin is not seen there any more
-            gone = leaves(own["flow"], cut(pair.image_next).shape[:2])
-            own["occluded"] = own["occluded"] | (np.isfinite(own["flow"]).all(axis=2) & gone)
-        if truth.points is not None:
-            # a point belongs to the pixel that it is nearest to
-            pixel = np.floor(truth.points[:, :2] + 0.5)
-            end = np.array([pair.size[1] - right, pair.size[0] - bottom])
-            inside = ((pixel >= corner[:2]) & (pixel < end)).all(axis=1)
-            own["points"] = truth.points[inside] - corner
-        truth = replace(truth, **own)
-    return replace(
-        pair,
-        image_ref=cut(pair.image_ref),
-        image_next=cut(pair.image_next),
-        K_ref=_cropped_camera(pair.K_ref, corner),
-        K_next=_cropped_camera(pair.K_next, corner),
-        flow=pair.flow and Flow(cut(pair.flow.uv), cut(pair.flow.confidence), pair.flow.source),
-        truth=truth,
-    )
-
-
-def _cropped_camera(K: Float, corner: Float) -> Float:
-    out = K.copy()
-    out[:2, 2] -= corner[:2]
-    return out
+    seen = _each_image(pair, cut)
+    truth = seen.truth
+    if truth is not None and truth.flow is not None and truth.occluded is not None:
+        # what moves into the margin is not seen there any more
+        known = np.isfinite(truth.flow).all(axis=2)
+        gone = known & leaves(truth.flow, seen.image_next.shape[:2])
+        truth = replace(truth, occluded=truth.occluded | gone)
+    if truth is not None and truth.points is not None:
+        # a point belongs to the pixel that it is nearest to
+        pixel = np.floor(truth.points[:, :2] + 0.5) - corner[:2]
+        inside = ((pixel >= 0) & (pixel < seen.size[::-1])).all(axis=1)
+        truth = replace(truth, points=truth.points[inside] - corner)
+    K_ref, K_next = pair.K_ref.copy(), pair.K_next.copy()
+    for K in (K_ref, K_next):
+        K[:2, 2] -= corner[:2]
+    return replace(seen, K_ref=K_ref, K_next=K_next, truth=truth)

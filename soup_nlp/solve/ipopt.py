@@ -32,8 +32,7 @@ DEFAULTS: Mapping[str, Any] = {
     "mumps_permuting_scaling": 0,
     "watchdog_shortened_iter_trigger": 0,
 }
-SOLVED, ACCEPTED = "Solve_Succeeded", "Solved_To_Acceptable_Level"
-GOOD = (SOLVED, ACCEPTED)
+GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from soup_nlp.solve.ipopt import Ipopt, Listener, Stage
 from soup_nlp.solve.kkt import residuals
 from soup_nlp.solve.phase import Phase
 from soup_nlp.solve.tangent import TangentProblem
-from soup_nlp.solve.warm import warm_options, warm_start
+from soup_nlp.solve.warm import WARM, warm_start
 
 Float = NDArray[np.float64]
 
@@ -50,8 +50,7 @@ class SolverOptions:
         presolve_tol: Dual infeasibility that ends the presolve.
         eps: Smoothing of the constrained NLP.
         max_iter: Iteration limit of the constrained NLP.
-        tol: Tolerance of the constrained NLP; from the presolve's KKT point ten times as much is
-            accepted where rounding allows no more, see `warm.ACCEPTABLE`.
+        tol: Tolerance of the constrained NLP.
         max_seconds: Time limit of all stages together.
         ipopt: Further Ipopt options of the constrained NLP.
     """
@@ -78,7 +77,7 @@ class Solution:
             start where that has the lower exact energy, with rounding-size constraint violations
             retracted.
         status: Ipopt's status of the constrained NLP, or why it was stopped.
-        converged: Its claim, "Solved_To_Acceptable_Level" included.
+        converged: Its claim.
         stages: Phases of the presolve, then Ipopt's of the constrained NLP.
         energy_start: Exact energy by term of the start.
         energy: Exact energy by term of the solution.
@@ -182,7 +181,7 @@ def solve_soup(
     # the lifted truncation has another solution than the presolve's
     if form.truncation == "smooth" and soup is presolved and o.polish_iterations and near:
         warm = warm_start(nlp, data, soup, rim)
-    solver = Ipopt(nlp, {**(warm_options(o.tol) if warm else {}), **o.ipopt})
+    solver = Ipopt(nlp, {**(WARM if warm else {}), **o.ipopt})
     seconds["build"] = time.perf_counter() - mark
     cpu.append(time.process_time())
     mark = time.perf_counter()

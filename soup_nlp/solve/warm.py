@@ -17,7 +17,6 @@ from scipy.sparse.linalg import splu
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy import EnergyData
 from soup_nlp.model.nlp import NLP, to_scipy
-from soup_nlp.solve.ipopt import DEFAULTS
 
 Float = NDArray[np.float64]
 
@@ -31,27 +30,6 @@ WARM: Mapping[str, Any] = {
     "warm_start_mult_bound_push": 1e-10,
 }
 """Ipopt options that leave a given start where it is."""
-
-ACCEPTABLE = 10.0
-"""So many tolerances are accepted after three iterates there. Where rounding of what is far
-away holds the dual infeasibility above the tolerance, steps of 1e-11 change it at random."""
-
-
-def warm_options(tol: float) -> dict[str, Any]:
-    """Ipopt options of a solve from a KKT point.
-
-    Args:
-        tol: Tolerance of the solve; it may end at `ACCEPTABLE` times that, with the status
-            "Solved_To_Acceptable_Level".
-    """
-    return {
-        **WARM,
-        "acceptable_iter": 3,
-        "acceptable_tol": ACCEPTABLE * tol,
-        "acceptable_dual_inf_tol": ACCEPTABLE * tol,
-        "acceptable_constr_viol_tol": DEFAULTS["constr_viol_tol"],
-        "acceptable_compl_inf_tol": DEFAULTS["compl_inf_tol"],
-    }
 
 
 def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, Float]:
