@@ -273,6 +273,31 @@ def test_a_step_too_long_for_one_is_shortened_for_all_where_that_one_alone_does_
     np.testing.assert_array_equal(move.length, 0.25)
 
 
+def test_a_bound_that_cuts_one_short_cuts_all_where_norms_hold_them_together():
+    class Bounded(Chain):
+        """One body by its scales; the first superpixel may go a tenth of the step."""
+
+        def slacks(self, x):
+            slack, jacobian = np.ones((self.n, 1)), np.zeros((self.n, 1, 3))
+            slack[0], jacobian[0, 0, 0] = 0.1 - x[0], -1.0
+            return slack, jacobian
+
+        def parts(self, x):
+            return super().parts(np.roll(x, 6))
+
+        def gradient(self, x):
+            return np.roll(super().gradient(x), -6)
+
+    body = Bounded(5)
+    x, h = np.zeros(45), np.zeros(45)
+    h[::9] = 1.0
+    at, gradient = evaluate(body, x, 1e-8), body.gradient(x)
+    move = Search(body, at, h, 1e-8, np.zeros_like).run(gradient, -gradient)
+    assert move.point is not None
+    np.testing.assert_allclose(move.length, 0.099)
+    assert move.point.f < at.f - 0.4
+
+
 def test_a_step_to_the_minimum_is_not_doubled_for_a_fall_by_rounding():
     class Noisy(Chain):
         """A minimum at 1, and rounding by which the value falls beyond it."""

@@ -243,6 +243,21 @@ def test_one_iteration_gives_a_whole_solution(room):
     assert_whole(solution, room)
 
 
+@pytest.mark.parametrize(("few", "spent"), [(2, 2), (60, 4)])
+def test_far_from_a_minimum_ipopt_has_few_iterations(room, few, spent):
+    options = replace(
+        OPTIONS,
+        presolve_iterations=1,
+        polish_iterations=1,
+        far_iterations=few,
+        max_iter=4,
+        tol=1e-12,
+    )
+    stages = room.solve(options).stages
+    assert stages[-2].history["inf_du"][-1] > 1
+    assert stages[-1].iterations == spent
+
+
 def test_a_stop_that_is_set_before_the_start_gives_the_start(room):
     stop = threading.Event()
     stop.set()

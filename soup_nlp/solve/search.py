@@ -25,8 +25,8 @@ LEAST_SLACK = 1e-3
 """A slack keeps at least this share of itself."""
 TRIES = 4
 SHORTER = 0.25
-"""A step that was too long goes on with this share of it: those for which it was too long, then all
-superpixels alike."""
+"""A step that was too long goes on with this share of it for those for which it was too long, then
+for all superpixels alike, with no more than what a bound leaves to any."""
 CORRECTIONS = 6
 """Most steps with one matrix that follow the first."""
 WORTH = 0.05
@@ -175,7 +175,8 @@ class Search:
         # where a step promises next to nothing, energies are equal but for rounding
         promised = -0.5 * float(gradient @ h)
         rounding = (1e-10 if promised < 1e-9 * abs(at.f) else 1e-12) * abs(at.merit)
-        far, whole = np.zeros(len(length), bool), length
+        alike = min(SHORTER, float(length.min()))
+        far = np.zeros(len(length), bool)
         calm = eager = far
         for attempt in range(TRIES):
             trial, length = self._feasible(length)
@@ -203,8 +204,8 @@ class Search:
             if here.any() and attempt < TRIES // 2:
                 length = np.where(here, SHORTER * length, length)
             else:
-                # neighbours whose steps differ pull at the stiff norms between them
-                length, whole = SHORTER * whole, SHORTER * whole
+                # neighbours whose steps differ, also by a bound, pull at stiff norms between them
+                length, alike = np.full_like(length, alike), SHORTER * alike
         return Move(None, length, far, calm, eager)
 
     def _corrected(self, trial: Point) -> Point | None:

@@ -50,6 +50,8 @@ class SolverOptions:
         presolve_tol: Dual infeasibility that ends the presolve.
         eps: Smoothing of the constrained NLP.
         max_iter: Iteration limit of the constrained NLP.
+        far_iterations: The same where the polish ended far from a minimum: from there Ipopt finds
+            none either, and its iterations, of several factorisations each, take seconds.
         tol: Tolerance of the constrained NLP.
         max_seconds: Time limit of all stages together.
         ipopt: Further Ipopt options of the constrained NLP.
@@ -63,6 +65,7 @@ class SolverOptions:
     presolve_tol: float = 1e-6
     eps: float = 0.01
     max_iter: int = 30
+    far_iterations: int = 5
     tol: float = 1e-6
     max_seconds: float = 600.0
     ipopt: Mapping[str, Any] = field(default_factory=dict)
@@ -185,10 +188,11 @@ def solve_soup(
     seconds["build"] = time.perf_counter() - mark
     cpu.append(time.process_time())
     mark = time.perf_counter()
+    far = o.presolve and o.polish_iterations and not near
     stage = solver(
         x0=nlp.x0,
         **warm,
-        max_iter=o.max_iter,
+        max_iter=min(o.max_iter, o.far_iterations) if far else o.max_iter,
         tol=o.tol,
         seconds=max(1.0, o.max_seconds - (mark - begin)),
         stage="constrained NLP",
