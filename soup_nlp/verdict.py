@@ -52,6 +52,10 @@ def verdict(run: Run, folder: Path, files: Sequence[str], limit: float | None = 
     s = run.solution
     words = WORDS.get(s.status, f"not converged: {s.status}, best iterate kept")
     lines = [f"status      {words} ({s.status})"]
+    if s.far and not s.converged:
+        lines.append(
+            f"{PAD}the presolve ended far from a minimum: solver.far_iterations limits Ipopt there"
+        )
     made = DELIVERED[run.delivered]
     if s.stages:
         every = sum(stage.iterations for stage in s.stages)

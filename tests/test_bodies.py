@@ -127,6 +127,13 @@ def test_a_body_in_pieces_is_placed_from_the_ground_up():
     np.testing.assert_allclose(scales(z, own), np.where(own > 0, 2.0, 1.0), rtol=1e-12)
 
 
+def test_a_body_that_stands_on_its_own_filling_is_placed_all_the_same():
+    """All that is below the arch is a body that touches nothing else: neither can wait."""
+    own = thrice([[0, 0, 0, 0, 0], [0, 2, 2, 2, 0], [0, 2, 1, 2, 0]])
+    z = thrice([[4.0] * 5, [4, 1, 1, 1, 4], [4, 1, 1, 1, 4]])
+    np.testing.assert_allclose(scales(z, own), np.where(own > 0, 4.0, 1.0), rtol=1e-12)
+
+
 def test_without_a_vertical_the_longest_contact_comes_first():
     own = thrice([[0, 0, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0], [0, 0, 0]])
     z = thrice([[8.0, 8, 8], [8, 1, 8], [8, 1, 8], [8, 1, 8], [2, 2, 2]])

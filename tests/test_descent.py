@@ -288,6 +288,13 @@ def test_a_bound_that_cuts_one_short_cuts_all_where_norms_hold_them_together():
         def gradient(self, x):
             return np.roll(super().gradient(x), -6)
 
+    class Aside(Bounded):
+        """The first superpixel has nothing to do with the body."""
+
+        def parts(self, x):
+            a, apart, wall = super().parts(x)
+            return a, np.where(np.arange(self.n - 1) == 0, 0.0, apart), wall
+
     body = Bounded(5)
     x, h = np.zeros(45), np.zeros(45)
     h[::9] = 1.0
@@ -296,6 +303,10 @@ def test_a_bound_that_cuts_one_short_cuts_all_where_norms_hold_them_together():
     assert move.point is not None
     np.testing.assert_allclose(move.length, 0.099)
     assert move.point.f < at.f - 0.4
+    aside = Aside(5)
+    at, gradient = evaluate(aside, x, 1e-8), aside.gradient(x)
+    move = Search(aside, at, h, 1e-8, np.zeros_like).run(gradient, -gradient)
+    np.testing.assert_allclose(move.length, [0.25 * 0.099, 0.25, 0.25, 0.25, 0.25])
 
 
 def test_a_step_to_the_minimum_is_not_doubled_for_a_fall_by_rounding():

@@ -103,7 +103,12 @@ def test_twice_in_the_mirror_is_the_pair_itself(pair):
     twice = mirrored(once)
     for name in ("image_ref", "image_next", "K_ref", "K_next"):
         np.testing.assert_allclose(getattr(twice, name), getattr(skewed, name), err_msg=name)
-    for name in ("depth_ref", "depth_next", "flow", "occluded", "bodies", "motions", "points"):
+    np.testing.assert_array_equal(twice.flow.confidence, skewed.flow.confidence)
+    # what is not known is 0 in a flow
+    known = skewed.flow.confidence > 0
+    np.testing.assert_allclose(twice.flow.uv[known], skewed.flow.uv[known], atol=1e-4)
+    names = ("depth_ref", "depth_next", "flow", "occluded", "bodies", "motions", "points")
+    for name in (*names, "scene_flow"):
         np.testing.assert_allclose(
             getattr(twice.truth, name), getattr(skewed.truth, name), atol=1e-12, err_msg=name
         )
@@ -134,16 +139,19 @@ def test_nothing_left_is_said(pair):
     with pytest.raises(DataError, match="margins are wider"):
         cropped(pair, 100, 0, 28)
     assert cropped(pair, 100, 0, 27).size == (96, 1)
+    with pytest.raises(DataError, match=r"negative margin(.|\n)*\(0, 0, -3, 0\)"):
+        cropped(pair, 0, 0, -3)
 
 
-def test_every_view_is_measured_with_its_own_flow(tmp_path):
+def test_views_are_measured_with_their_own_flow(tmp_path):
     """A view of a pair with true flow scores as the pair does; so does a flow of a file."""
     listed = list_suite("rendered", options=Options(("truth",), width=160, only=("orbit",)))
     over = ("segmentation.superpixels=40", "segmentation.neighbours=6", "refine.enabled=false")
     path = tmp_path / "flow.flo"
     write_flo(path, render_scene("orbit", 0, 160, 68).truth.flow)
     for more in ((), (f"flow.source={path}",)):
-        rows = {v: measure_view(Job(listed.items[0], (*over, *more), v)) for v in list(VIEWS)[:3]}
+        some = ("as it is", "cropped 7x5", "mirrored and cropped 7x5")
+        rows = {v: measure_view(Job(listed.items[0], (*over, *more), v)) for v in some}
         assert all(r["ok"] for r in rows.values()), [r["error"] for r in rows.values()]
         assert len({r["key"] for r in rows.values()}) == 3
         assert rows["cropped 7x5"]["size"] == [63, 153]

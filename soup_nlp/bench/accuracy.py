@@ -7,7 +7,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -106,6 +106,7 @@ def measure(job: Job, change: Callable[[Pair], Pair] | None = None) -> Row:
     try:
         problem = job.item.problem(job.overrides)
         pair = load_pair(problem)
+        loaded = time.perf_counter() - begin
         if change is not None:
             source = problem.flow.source
             if not (is_named(source) or is_network(source)):
@@ -116,10 +117,11 @@ def measure(job: Job, change: Callable[[Pair], Pair] | None = None) -> Row:
         if not any(_applies(pair.truth, preset(name)) for name in job.item.presets):
             raise _no_truth(job.item)
         if job.folder is None:
-            result = run(problem, pair=pair)
+            result = _timed(run(problem, pair=pair), loaded)
         else:
             folder = prepare_folder(job.folder)
-            result = run(problem, pair=pair, ipopt_log=str(folder / "ipopt.log"))
+            log = str(folder / "ipopt.log")
+            result = _timed(run(problem, pair=pair, ipopt_log=log), loaded)
             write_folder(folder, result, dump_problem(problem), "")
         found = scores(result, job.item.presets)
         if not found["metrics"]:
@@ -130,6 +132,11 @@ def measure(job: Job, change: Callable[[Pair], Pair] | None = None) -> Row:
     row["seconds"] = time.perf_counter() - begin
     row["cpu_seconds"] = time.process_time() - cpu
     return clean(row)
+
+
+def _timed(result: Run, loaded: float) -> Run:
+    """The run with the seconds that its pair took to load or render."""
+    return replace(result, seconds={**result.seconds, "load": loaded})
 
 
 def _no_truth(item: Item) -> DataError:

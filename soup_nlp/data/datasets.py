@@ -106,12 +106,14 @@ def load_folder(
     """
     folder = need_folder(folder, FOLDER_LAYOUT)
     if is_result(folder):
+        marked = (folder / MARK).is_file()
         raise DataError(
             "input folder holds a result, whose depth and flow would pass for truth",
             where=folder,
-            found=f"{MARK} or summary.json of a solve",
+            found=f"the hidden file {MARK} of a solve" if marked else "summary.json of a solve",
             expected="a folder with inputs only",
-            hint="move the frames, K.txt and the truth to a folder of their own",
+            hint="move the frames, K.txt and the truth to a folder of their own"
+            + (f"; delete {MARK} where no solve has left files" if marked else ""),
         )
     first = _find(folder, ("frame_0", "image_ref"), _IMAGES)
     second = _find(folder, ("frame_1", "image_next"), _IMAGES)

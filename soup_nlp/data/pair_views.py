@@ -86,8 +86,13 @@ def cropped(pair: Pair, left: int, top: int, right: int = 0, bottom: int = 0) ->
         bottom: Rows.
 
     Raises:
-        DataError: nothing would be left.
+        DataError: a margin is negative, or nothing would be left.
     """
+    margins = (left, top, right, bottom)
+    if min(margins) < 0:
+        raise DataError(
+            "negative margin", where=pair.name, found=str(margins), expected="0 or more pixels"
+        )
     for image in (pair.image_ref, pair.image_next):
         if left + right >= image.shape[1] or top + bottom >= image.shape[0]:
             raise DataError(

@@ -10,10 +10,11 @@ each, so eliminating them costs no fill; Ipopt, which keeps them, factorises an 
 of twice the size. H is at first the reweighted Gauss-Newton majorant of the norms, whose full
 steps descend, then the exact Hessian.
 
-Nothing is decided for all superpixels at once: damping mu_i, fraction to the boundary and
-shortened steps are each superpixel's own, so that a few that are on their way to another minimum
-do not hold up the others. Energies cost a tenth of an iteration, so a step is doubled as long
-as that pays: bodies slide along valleys of equal re-projection error in a few iterations.
+Little is decided for all superpixels at once: damping mu_i, fraction to the boundary and, unless
+that is refused, shortened steps are each superpixel's own, so that a few that are on their way to
+another minimum do not hold up the others. Energies cost a tenth of an iteration, so a step is
+doubled as long as that pays: bodies slide along valleys of equal re-projection error in a few
+iterations.
 """
 
 from __future__ import annotations

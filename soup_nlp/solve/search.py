@@ -1,9 +1,10 @@
 """Search along a step of the presolve, superpixel by superpixel.
 
 A step that is too long for a few superpixels is shortened for those alone, and where that does not
-do, for all alike; one that still goes down at its end is doubled, for all and then for those that
-still descend. Energies cost a tenth of an iteration. A step that leaves the floor of a bent valley
-is led back by further ones with the same matrix.
+do, for all alike, at last to what a bound leaves to any of them; one that still goes down at its
+end is doubled, for all and then for those that still descend. Energies cost a tenth of an
+iteration. A step that leaves the floor of a bent valley is led back by further ones with the same
+matrix.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ LEAST_SLACK = 1e-3
 """A slack keeps at least this share of itself."""
 TRIES = 4
 SHORTER = 0.25
-"""A step that was too long goes on with this share of it for those for which it was too long, then
-for all superpixels alike, with no more than what a bound leaves to any."""
+"""A step that was too long goes on with this share of it: those for which it was too long, then all
+superpixels alike."""
 CORRECTIONS = 6
 """Most steps with one matrix that follow the first."""
 WORTH = 0.05
@@ -175,11 +176,12 @@ class Search:
         # where a step promises next to nothing, energies are equal but for rounding
         promised = -0.5 * float(gradient @ h)
         rounding = (1e-10 if promised < 1e-9 * abs(at.f) else 1e-12) * abs(at.merit)
-        alike = min(SHORTER, float(length.min()))
-        far = np.zeros(len(length), bool)
+        far, whole, least = np.zeros(len(length), bool), length, 1.0
         calm = eager = far
-        for attempt in range(TRIES):
+        for attempt in range(TRIES + 1):
             trial, length = self._feasible(length)
+            if not attempt:
+                least = float(length.min())
             slope = self._slope(trial.x)
             bent_back = self._corrected(trial)
             # past its minimum along the step, by more than the quadratic model allows
@@ -203,9 +205,14 @@ class Search:
                 )
             if here.any() and attempt < TRIES // 2:
                 length = np.where(here, SHORTER * length, length)
+            elif attempt < TRIES - 1:
+                # neighbours whose steps differ pull at the stiff norms between them
+                length, whole = SHORTER * whole, SHORTER * whole
+            elif least < 1:
+                # where a bound made them differ, all go as far as it lets any
+                length = np.full_like(length, min(SHORTER, least))
             else:
-                # neighbours whose steps differ, also by a bound, pull at stiff norms between them
-                length, alike = np.full_like(length, alike), SHORTER * alike
+                break
         return Move(None, length, far, calm, eager)
 
     def _corrected(self, trial: Point) -> Point | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -28,6 +28,8 @@ from soup_nlp.solve.warm import WARM, warm_start
 Float = NDArray[np.float64]
 
 
+POLISH = "presolve polish"
+"""Name of the phase with the exact Hessian."""
 STOPPED = ("Interrupted", "Time_Limit")
 """Status of a stage after which no other begins."""
 
@@ -50,8 +52,9 @@ class SolverOptions:
         presolve_tol: Dual infeasibility that ends the presolve.
         eps: Smoothing of the constrained NLP.
         max_iter: Iteration limit of the constrained NLP.
-        far_iterations: The same where the polish ended far from a minimum: from there Ipopt finds
-            none either, and its iterations, of several factorisations each, take seconds.
+        far_iterations: Its limit as well where the polish ended far from a minimum: from there
+            Ipopt finds none either, and its iterations, of several factorisations each, take
+            seconds.
         tol: Tolerance of the constrained NLP.
         max_seconds: Time limit of all stages together.
         ipopt: Further Ipopt options of the constrained NLP.
@@ -93,6 +96,7 @@ class Solution:
             compiler in them.
         cpu_seconds: CPU time of this process in the same.
         delivered: What `soup` is: "constrained NLP", "presolve" or "start".
+        far: Whether the presolve ended far from a minimum, so that Ipopt had few iterations.
     """
 
     soup: Soup
@@ -108,6 +112,7 @@ class Solution:
     seconds: Mapping[str, float]
     cpu_seconds: Mapping[str, float] = field(default_factory=dict)
     delivered: str = "constrained NLP"
+    far: bool = False
 
     def __str__(self) -> str:
         return (
@@ -188,7 +193,9 @@ def solve_soup(
     seconds["build"] = time.perf_counter() - mark
     cpu.append(time.process_time())
     mark = time.perf_counter()
-    far = o.presolve and o.polish_iterations and not near
+    far = _far(stages)
+    if far:
+        say(f"far from a minimum: Ipopt has {o.far_iterations} iterations (solver.far_iterations)")
     stage = solver(
         x0=nlp.x0,
         **warm,
@@ -223,12 +230,20 @@ def solve_soup(
         seconds=seconds,
         cpu_seconds=dict(zip(("presolve", "build", "solve"), np.diff(cpu).tolist())),
         delivered=delivered,
+        far=far,
     )
 
 
 def _near(stage: Stage) -> bool:
     """Whether the presolve has come so near that its multipliers are worth starting from."""
     return stage.converged or bool(stage.history["inf_du"][-1] < 1.0)
+
+
+def _far(stages: Sequence[Stage]) -> bool:
+    """Whether the polish ended, by itself or at its limit, where Ipopt would find no minimum."""
+    last = stages[-1] if stages else None
+    ended = last is not None and last.name == POLISH and last.status not in STOPPED
+    return ended and not _near(stages[-1])
 
 
 def _presolve(
@@ -271,7 +286,7 @@ def _presolve(
         problem = TangentProblem(descent.soup, data, weights, form, chart=chart)
         descent = Descent(problem, after=descent, **watch)
         polish = Phase(
-            name="presolve polish",
+            name=POLISH,
             hessian="exact",
             eps=o.eps,
             barrier=1e-10,
