@@ -99,7 +99,12 @@ def test_a_result_folder_takes_the_next_result_and_is_no_input(tmp_path, capsys)
     (marked / MARK).touch()
     for folder in (out, marked):
         assert main(["solve", str(folder / "pair.yaml"), "--out", str(tmp_path / "other")]) == 2
-        assert "holds a result" in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert "holds a result" in said
+        assert f"delete {MARK} where no solve has left files" in said
+    (out / MARK).unlink()
+    assert main(["solve", str(out / "pair.yaml"), "--out", str(tmp_path / "other")]) == 2
+    assert "found: summary.json of a solve" in capsys.readouterr().err
 
 
 def test_images_may_differ_in_size(tmp_path, capsys):

@@ -135,6 +135,18 @@ def test_factorisations_agree():
             np.testing.assert_allclose(back(2 * b), 2 * expected, atol=1e-10)
 
 
+def test_one_analysis_serves_equal_patterns_alone():
+    plain = factor.numbered(np.array([0, 1, 2]), np.array([0, 1, 2]), 3)
+    upper = factor.numbered(np.array([0, 0, 1, 2]), np.array([0, 1, 1, 2]), 3)
+    # as many nonzeros in every column
+    other = factor.numbered(np.array([0, 0, 1, 1, 2]), np.array([0, 1, 1, 2, 2]), 3)
+    third = factor.numbered(np.array([0, 0, 1, 0, 2]), np.array([0, 1, 1, 2, 2]), 3)
+    matrices = [plain, upper, other, third]
+    for i, one in enumerate(matrices):
+        assert [factor.same_pattern(one, m) for m in matrices] == [i == k for k in range(4)]
+    assert factor.same_pattern(plain, plain.copy())
+
+
 def test_a_matrix_without_its_diagonal_is_refused():
     upper = factor.numbered(np.array([0, 0]), np.array([0, 1]), 2)
     with pytest.raises(ValueError, match="diagonal"):
