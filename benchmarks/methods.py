@@ -12,49 +12,56 @@ from __future__ import annotations
 
 import argparse
 import platform
-from collections.abc import Mapping
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
-from soup_nlp.bench.speed import Spec
+from soup_nlp.bench.accuracy_table import table
+from soup_nlp.bench.speed import plan
 from soup_nlp.cases import Case, prepare
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.report.atomic import atomic_path
 from soup_nlp.solve.soup import solve_soup
-from soup_nlp.solve.yardstick import levenberg_marquardt
+from soup_nlp.solve.yardstick import EPS, levenberg_marquardt
 from soup_nlp.timed import YARDSTICK_ITERATIONS, problem_of
 
 ROOT = Path(__file__).parent.parent
-WIDTHS = {0.1: (0.1, 0.03, 0.01), 0.3: (0.3, 0.1, 0.03, 0.01), 1.0: (1.0, 0.3, 0.1, 0.03, 0.01)}
-"""Smoothing widths by the first, pixels; as shipped the first of these."""
-METHODS = ("NLP 0.1", "NLP 0.3", "NLP 1", "LM 0.1", "LM 1")
+METHODS = {
+    "NLP as shipped": None,
+    "NLP from 0.3": 0.3,
+    "NLP from 1": 1.0,
+    "LM from 0.1": 0.1,
+    "LM from 1": 1.0,
+}
+"""First smoothing width by method, pixels; the next ones are those of EPS below it."""
 
 
-def ends(case: Case) -> Mapping[str, tuple[Soup, float]]:
-    """Soup and exact energy of every method, from the case's start."""
+def solved(case: Case, method: str) -> tuple[Soup, float]:
+    """Soup and exact energy of a method, from the case's start."""
     own = case.soup, case.data, case.weights, case.formulation()
-    out = {}
-    for method in METHODS:
-        name, first = method.split()
-        eps = WIDTHS[float(first)]
-        if name == "NLP":
-            s = solve_soup(*own, replace(case.options, presolve_eps=eps))
-            out[method] = s.soup, s.energy["total"]
-        else:
-            y = levenberg_marquardt(*own, eps=eps, iterations=YARDSTICK_ITERATIONS)
-            out[method] = y.soup, y.energy["total"]
-    return out
+    first = METHODS[method]
+    eps = case.options.presolve_eps if first is None else EPS[EPS.index(first) :]
+    if method.startswith("NLP"):
+        s = solve_soup(*own, replace(case.options, presolve_eps=eps))
+        return s.soup, s.energy["total"]
+    y = levenberg_marquardt(*own, eps=eps, iterations=YARDSTICK_ITERATIONS)
+    return y.soup, y.energy["total"]
 
 
 def refined(case: Case, soup: Soup) -> float:
     """Exact energy after the refinement as shipped."""
-    form, seed = case.formulation(), case.problem.seed
-    options = RefineOptions(**case.problem.refine.model_dump())
-    visible = {"min_facing": form.min_facing, "depth_ratio": form.depth_ratio}
-    r = refine_soup(soup, case.data, case.weights, options, seed=seed, **visible)
+    form = case.formulation()
+    r = refine_soup(
+        soup,
+        case.data,
+        case.weights,
+        RefineOptions(**case.problem.refine.model_dump()),
+        seed=case.problem.seed,
+        min_facing=form.min_facing,
+        depth_ratio=form.depth_ratio,
+    )
     return r.energy["total"]
 
 
@@ -67,37 +74,28 @@ def main() -> None:
     parser.add_argument("--superpixels", type=int, default=1000)
     parser.add_argument("--neighbours", type=int, default=20)
     args = parser.parse_args()
-    head = ["pair", "N", *METHODS, "shipped / least", "refined, of each", "shipped / least"]
-    lines = [
-        "Exact energy E by method and first smoothing width (px), from one start; LM: on-manifold"
-        " Levenberg-Marquardt. Then after the refinement as shipped, of each in the same order."
-        f" DIS flow, K = {args.neighbours}. {date.today()}, {platform.machine()}.",
-        "",
-        "| " + " | ".join(head) + " |",
-        "|" + "---|" * len(head),
-    ]
+    seeds = [int(seed) for seed in args.seeds.split(",")]
+    note = (
+        "Exact energy E by method and first smoothing width (px) from one start, and what the"
+        " refinement as shipped makes of it. LM: on-manifold Levenberg-Marquardt. DIS flow,"
+        f" K = {args.neighbours}. {date.today()}, {platform.machine()}."
+    )
+    head = ["pair, seed", "N", *METHODS, "shipped / least", "both refined"]
+    rows: list[list[str]] = []
     args.out.mkdir(parents=True, exist_ok=True)
-    for scene in args.scenes.split(","):
-        for seed in map(int, args.seeds.split(",")):
-            if scene == "motorcycle" and seed:
-                # a real pair: the seed draws nothing but particles
-                continue
-            case = prepare(problem_of(Spec(scene, args.superpixels, args.neighbours, seed)))
-            found = ends(case)
-            before = [energy for _, energy in found.values()]
-            after = [refined(case, soup) for soup, _ in found.values()]
-            cells = (
-                f"{scene} {seed}",
-                str(len(case)),
-                *(f"{e:.2f}" for e in before),
-                f"{before[0] / min(before):.4f}",
-                " ".join(f"{e:.2f}" for e in after),
-                f"{after[0] / min(after):.4f}",
-            )
-            lines.append("| " + " | ".join(cells) + " |")
-            print(lines[-1], flush=True)
-            with atomic_path(args.out / "methods.md") as path:
-                path.write_text("\n".join(lines) + "\n")
+    for spec in plan(args.scenes.split(","), [args.superpixels], [args.neighbours], seeds):
+        case = prepare(problem_of(spec))
+        found = [solved(case, method) for method in METHODS]
+        before = [energy for _, energy in found]
+        after = [refined(case, soup) for soup, _ in found]
+        rows.append(
+            [f"{spec.scene}, {spec.seed}", str(len(case))]
+            + [f"{b:.2f} -> {a:.2f}" for b, a in zip(before, after)]
+            + [f"{energies[0] / min(energies):.4f}" for energies in (before, after)]
+        )
+        print(*rows[-1], sep="  ", flush=True)
+        with atomic_path(args.out / "methods.md") as path:
+            path.write_text("\n".join([note, "", *table(head, rows)]) + "\n")
 
 
 if __name__ == "__main__":
