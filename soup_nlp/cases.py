@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from soup_nlp.config import Problem
 from soup_nlp.data.flow_borders import follow_flow
 from soup_nlp.data.flow_robust import reweighted
@@ -109,9 +111,7 @@ def prepare(
     lap("start")
     say(str(start))
     data, weights = build_energy(problem, pair, seg, start)
-    solver = problem.solver.model_dump()
-    solver["presolve_eps"] = tuple(solver["presolve_eps"])
-    stages = SolverOptions(**solver)
+    stages = solver_options(problem, start)
     case = Case(problem, pair, seg, start, data, weights, start.soup, stages)
     if not presolve:
         return case
@@ -129,6 +129,20 @@ def superpixels(problem: Problem, pair: Pair) -> Labels:
     return labels if s.follow_flow_px is None else follow_flow(labels, pair.flow, s.follow_flow_px)
 
 
+def _bends(problem: Problem, start: Start) -> bool:
+    """Whether the energy for surfaces that bend is in force."""
+    return start.bending and problem.energy.units == "pixel"
+
+
+def solver_options(problem: Problem, start: Start) -> SolverOptions:
+    """The solver's options of a problem, its smoothing no wider than surfaces allow."""
+    own = problem.solver.model_dump()
+    widest = problem.energy.bending.widest_eps if _bends(problem, start) else np.inf
+    # of several that become the widest one is enough
+    eps = dict.fromkeys(min(float(eps), widest) for eps in own["presolve_eps"])
+    return SolverOptions(**{**own, "presolve_eps": tuple(eps)})
+
+
 def build_energy(
     problem: Problem, pair: Pair, seg: Segmentation, start: Start
 ) -> tuple[EnergyData, Weights]:
@@ -136,7 +150,7 @@ def build_energy(
     assert pair.flow is not None
     e = problem.energy
     pixels = None if e.pixel_samples == "all" else e.pixel_samples
-    bends = start.bending and e.units == "pixel"
+    bends = _bends(problem, start)
     form = e.bending if bends else e
     data = build_energy_data(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, bends or e.arap_at_anchors

@@ -100,6 +100,8 @@ class BendingConfig(Strict):
     nothing. The relief is then held by lengths, continuity and orientation.
 
     Attributes:
+        widest_eps: Widest smoothing of the presolve, pixels: wider ones of solver.presolve_eps
+            become this. What shows relief is a fraction of a pixel, a wide norm flattens it.
         rotation_px: Pixels per radian of rotation difference.
         arap_across: Factor of E_arap where the flow tears; 1 is the paper's, as of the others.
         cont_across: Factor of E_cont there.
@@ -108,6 +110,7 @@ class BendingConfig(Strict):
             grows with their number.
     """
 
+    widest_eps: Positive = 0.1
     rotation_px: Positive = 1e-3
     arap_across: Annotated[float, Field(ge=0, le=1)] = 0.3
     cont_across: Annotated[float, Field(ge=0, le=1)] = 0.01
@@ -129,7 +132,8 @@ class EnergyConfig(Strict):
         rotation_px: Pixels per radian of rotation difference; null for the focal length.
         pixel_samples: Pixels per superpixel in E_proj, or all.
         weights: Factors of the terms and their truncations.
-        bending: What replaces rotation_px, arap_at_anchors and weights where surfaces bend.
+        bending: What replaces rotation_px, arap_at_anchors, weights and the solver's wide smoothing
+            where surfaces bend.
     """
 
     units: Literal["pixel", "paper"] = "pixel"

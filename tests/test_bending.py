@@ -47,6 +47,14 @@ def test_sheet_bends_and_can_be_told_not_to():
     assert not case("sheet", "start.bending=1.0").start.bending
 
 
+def test_where_surfaces_bend_the_presolve_begins_with_narrower_norms():
+    """Also with more widths than that: several that become the widest are one phase."""
+    assert case("sheet").options.presolve_eps == (0.1, 0.03, 0.01)
+    assert case("room").options.presolve_eps == (0.3, 0.03, 0.01)
+    more = "solver.presolve_eps=[1.0, 0.3, 0.02]", "energy.bending.widest_eps=0.2"
+    assert case("sheet", *more).options.presolve_eps == (0.2, 0.02)
+
+
 @pytest.mark.parametrize("count", [100, 300])
 def test_sheet_is_better_than_a_constant_depth(count):
     c = case("sheet", f"segmentation.superpixels={count}")

@@ -10,6 +10,7 @@ import time
 
 from soup_nlp.bench.accuracy import Job, Row, clean, flow_error, head
 from soup_nlp.bench.truth import true_soup
+from soup_nlp.cases import solver_options
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model import plain
 from soup_nlp.model.formulation import Formulation
@@ -17,7 +18,7 @@ from soup_nlp.pipeline import Run, run
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.report.protocols import preset
-from soup_nlp.solve.soup import SolverOptions, solve_soup
+from soup_nlp.solve.soup import solve_soup
 
 WORSE = 0.01
 """Median relative error that solving from the truth may add."""
@@ -76,10 +77,9 @@ def energies(result: Run, convention: str = "paper") -> Row:
 def from_soup(result: Run, soup: Soup) -> dict[str, Soup]:
     """What the NLP, and then the refinement where it is on, make of another start."""
     problem = result.problem
-    solver = problem.solver.model_dump()
-    solver["presolve_eps"] = tuple(solver["presolve_eps"])
     form = Formulation(**problem.formulation.model_dump())
-    solved = solve_soup(soup, result.data, result.weights, form, SolverOptions(**solver))
+    options = solver_options(problem, result.start)
+    solved = solve_soup(soup, result.data, result.weights, form, options)
     out = {"NLP from truth": solved.soup}
     refine = RefineOptions(**problem.refine.model_dump())
     if refine.enabled:

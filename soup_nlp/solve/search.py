@@ -28,6 +28,8 @@ TRIES = 4
 SHORTER = 0.25
 """A step that was too long goes on with this share of it: those for which it was too long, then all
 superpixels alike."""
+BACK = 3
+"""Most changes that bring a superpixel back to bounds that curve."""
 CORRECTIONS = 6
 """Most steps with one matrix that follow the first."""
 WORTH = 0.05
@@ -106,6 +108,31 @@ def inside(problem: TangentProblem, x: Float) -> Float:
         if not out.any():
             break
         x.reshape(-1, 9)[out, 1:3] *= 0.9
+    return x
+
+
+def led_back(problem: TangentProblem, x: Float, aim: Float, floor: Float) -> Float:
+    """x with superpixels that left a curved bound brought back to it.
+
+    A step along a bound that curves leaves it by its square, however small the slack: what the
+    linearised slack promises is restored by the shortest change, bound by bound.
+
+    Args:
+        problem: Slacks.
+        x: (9 N,) end of a step.
+        aim: (N, R) slacks by their derivatives at the begin, positive.
+        floor: (N, R) least slacks.
+    """
+    for _ in range(BACK):
+        slack, jacobian = problem.slacks(x)
+        out = np.flatnonzero((slack <= floor).any(axis=1))
+        if not len(out):
+            break
+        worst = np.argmin(slack[out] - aim[out], axis=1)
+        normal = jacobian[out, worst]
+        lacks = (aim - slack)[out, worst] / np.einsum("nc,nc->n", normal, normal)
+        x = x.copy()
+        x.reshape(-1, 9)[out, :3] += lacks[:, None] * normal
     return x
 
 
@@ -227,7 +254,10 @@ class Search:
             c = self.newton(right)
             length = np.minimum(1.0, TO_BOUNDARY * reach(trial.slack, along(trial.jacobian, c)))
             x = self.problem.normalise(trial.x + (length[:, None] * c.reshape(-1, 9)).ravel())
-            moved = evaluate(self.problem, x, self.barrier, LEAST_SLACK * self.at.slack)
+            floor = LEAST_SLACK * self.at.slack
+            aim = trial.slack + length[:, None] * along(trial.jacobian, c)
+            x = led_back(self.problem, x, np.maximum(aim, 2 * floor), floor)
+            moved = evaluate(self.problem, x, self.barrier, floor)
             if moved is None:
                 return best
             if best is not None:
@@ -240,8 +270,10 @@ class Search:
     def _feasible(self, length: Float) -> tuple[Point, Float]:
         """The point at these lengths, halved where a slack would vanish."""
         length, floor = length.copy(), LEAST_SLACK * self.at.slack
+        change = along(self.at.jacobian, self.h)
         for _ in range(40):
             x = self._at(length)
+            x = led_back(self.problem, x, self.at.slack + length[:, None] * change, floor)
             point = evaluate(self.problem, x, self.barrier, floor)
             if point is not None:
                 return point, length

@@ -61,7 +61,7 @@ class SolverOptions:
     """
 
     presolve: bool = True
-    presolve_eps: tuple[float, ...] = (0.1, 0.03, 0.01)
+    presolve_eps: tuple[float, ...] = (0.3, 0.03, 0.01)
     presolve_iterations: int = 60
     stagnation: float = 1e-3
     polish_iterations: int = 100

@@ -1,0 +1,91 @@
+"""The search along a step of the presolve, at bounds that curve."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soup_nlp.cases import Case, prepare
+from soup_nlp.config import make_problem
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.solve import search as search_module
+from soup_nlp.solve.descent import Descent
+from soup_nlp.solve.search import LEAST_SLACK, Point, Search, along, evaluate, led_back
+from soup_nlp.solve.tangent import TangentProblem
+
+GRAZING = 1e-8
+"""Slack of the bound along which the steps of these tests lead."""
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
+    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+
+
+@pytest.fixture(scope="module", params=["depth", "inverse-depth"])
+def problem(case, request) -> TangentProblem:
+    form = Formulation(compiled=False)
+    out = TangentProblem(case.soup, case.data, case.weights, form, chart=request.param)
+    out.smoothing(0.1)
+    return out
+
+
+def grazing(problem: TangentProblem, k: int) -> tuple[Point, np.ndarray]:
+    """A point where superpixel k almost grazes one rim pixel, and a step of it along that bound."""
+    inner = Descent(problem).x
+    normal = problem.slacks(inner)[1][k, 0]
+
+    def turned(t: float) -> np.ndarray:
+        x = inner.copy()
+        x.reshape(-1, 9)[k, 1:3] -= t * normal[1:]
+        return x
+
+    low, high = 0.0, 20.0
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        inside = problem.slacks(turned(middle))[0][k, : problem.rims].min() > GRAZING
+        low, high = (middle, high) if inside else (low, middle)
+    at = evaluate(problem, turned(low), 1e-10)
+    assert at is not None
+    assert at.slack[k].min() == pytest.approx(GRAZING, rel=1e-3)
+    row = at.jacobian[k, np.argmin(at.slack[k])]
+    side = np.array([0.0, -row[2], row[1]])
+    h = np.zeros_like(at.x)
+    h.reshape(-1, 9)[k, :3] = 0.3 * side / np.linalg.norm(side)
+    return at, h
+
+
+def test_a_step_along_a_curved_bound_is_led_back_to_it(problem):
+    k = 7
+    at, h = grazing(problem, k)
+    assert evaluate(problem, problem.normalise(at.x + h), 1e-10) is None, "it leaves the bound"
+    search = Search(problem, at, h, 1e-10, lambda gradient: np.zeros_like(gradient))
+    point, length = search._feasible(np.ones(len(at.slack)))
+    assert (length == 1).all()
+    assert (point.slack > LEAST_SLACK * at.slack).all()
+    went = (point.x - at.x).reshape(-1, 9)[k, :3]
+    step = h.reshape(-1, 9)[k, :3]
+    assert went @ step > 0.99 * step @ step, "the change is across the step"
+    # what the linearised slack promises, 1e-8 for slopes that changed by 0.3
+    assert point.slack[k, np.argmin(at.slack[k])] == pytest.approx(GRAZING, rel=5e-2)
+
+
+def test_without_it_the_step_would_be_refused_but_for_a_hundredth(problem, monkeypatch):
+    at, h = grazing(problem, 7)
+    monkeypatch.setattr(search_module, "BACK", 0)
+    search = Search(problem, at, h, 1e-10, lambda gradient: np.zeros_like(gradient))
+    _, length = search._feasible(np.ones(len(at.slack)))
+    assert length[7] < 0.01
+
+
+def test_led_back_leaves_alone_what_is_inside(problem):
+    at, h = grazing(problem, 7)
+    x = problem.normalise(at.x + h)
+    floor = LEAST_SLACK * at.slack
+    back = led_back(problem, x, at.slack + along(at.jacobian, h), floor)
+    changed = (back != x).reshape(-1, 9)
+    assert changed[7, :3].any()
+    assert not np.delete(changed, 7, axis=0).any()
+    assert not changed[7, 3:].any(), "a bound is of the plane alone"
+    assert led_back(problem, at.x, at.slack, floor) is at.x
