@@ -179,6 +179,25 @@ def test_growth_is_by_scene_and_neighbours():
     assert speed_fit.outside(records[0]) == 3.0
 
 
+def test_growth_of_all_scenes_has_a_factor_for_each():
+    """One exponent, as by least squares with an indicator of every scene."""
+    rng = np.random.default_rng(2)
+    scene = np.array(["a", "a", "a", "b", "b", "b", "b"])
+    n = np.array([500, 1000, 2000, 500, 700, 1000, 2000])
+    cost = np.where(scene == "a", 1.0, 30.0) * n**1.3 * np.exp(rng.normal(0, 0.1, len(n)))
+    X = np.column_stack([np.log(n), scene == "a", scene == "b"]).astype(float)
+    solution, rest, *_ = np.linalg.lstsq(X, np.log(cost), rcond=None)
+    error = np.sqrt(rest[0] / (len(n) - 3) * np.linalg.inv(X.T @ X)[0, 0])
+    found = speed_fit.fit(n, cost, list(scene))
+    assert found.exponent == pytest.approx(solution[0], rel=1e-10)
+    assert found.error == pytest.approx(error, rel=1e-8)
+    # sizes that differ between scenes alone say nothing
+    assert speed_fit.fit([500, 2000], [1.0, 4.0], ["a", "b"]) is None
+    records = [made(s) for s in speed.plan(["street", "room"], [500, 1000], [10], [0])]
+    assert set(speed_fit.growth(records)) == {("street", 10), ("room", 10), ("all", 10)}
+    assert speed_table.growth_lines(records)[-1].startswith("| all | 10 |")
+
+
 def test_table_and_plots(tmp_path):
     specs = speed.plan(["street", "room"], [250, 500], [10], [0], yardsticks=("same", "wide"))
     records = [made(s) for s in specs]

@@ -22,6 +22,9 @@ COSTS: dict[str, Callable[[Record], float]] = {
 }
 """What growth is fitted of."""
 
+ALL = "all"
+"""Name of all scenes together, with one exponent and a factor for each."""
+
 OUTSIDE = ("flow", "segmentation", "start", "weights", "evaluation", "output")
 """Stages that are not Ipopt's and not the loading or rendering of frames."""
 
@@ -54,29 +57,37 @@ class Growth:
         return f"{self.exponent:.2f}{error}"
 
 
-def fit(sizes: Sequence[float], costs: Sequence[float]) -> Growth | None:
+def fit(
+    sizes: Sequence[float], costs: Sequence[float], scenes: Sequence[str] | None = None
+) -> Growth | None:
     """Least squares of log cost over log N; None with fewer than two different sizes.
 
     Args:
         sizes: N of every run.
         costs: Positive cost of every run.
+        scenes: Scene of every run: one exponent for all, a factor for each. None: all are one.
     """
     n, c = np.asarray(sizes, float), np.asarray(costs, float)
     use = (n > 0) & (c > 0)
     x, y = np.log(n[use]), np.log(c[use])
-    # actual numbers of superpixels differ a little between seeds of one size
-    if len(x) < 2 or np.ptp(x) < 0.2:
+    if len(x) < 2:
         return None
-    dx = x - x.mean()
-    slope = float(dx @ y / (dx @ dx))
-    rest = y - y.mean() - slope * dx
-    free = len(x) - 2
+    names, scene = np.unique(np.asarray(scenes or [""] * len(n))[use], return_inverse=True)
+    count = np.bincount(scene)
+    dx = x - (np.bincount(scene, x) / count)[scene]
+    dy = y - (np.bincount(scene, y) / count)[scene]
+    # actual numbers of superpixels differ a little between seeds of one size
+    if np.ptp(dx) < 0.2:
+        return None
+    slope = float(dx @ dy / (dx @ dx))
+    rest = dy - slope * dx
+    free = len(x) - len(names) - 1
     error = float(np.sqrt(rest @ rest / free / (dx @ dx))) if free else np.nan
     return Growth(slope, error, float(n[use].min()), float(n[use].max()), len(x))
 
 
 def growth(records: Sequence[Record], least: int = 0) -> dict[tuple[str, int], dict[str, Growth]]:
-    """Growth of every cost by scene and K, seeds together.
+    """Growth of every cost by scene and K, seeds together, and of all scenes (ALL) where several.
 
     Args:
         records: Measured runs.
@@ -86,10 +97,16 @@ def growth(records: Sequence[Record], least: int = 0) -> dict[tuple[str, int], d
     for record in records:
         if "error" not in record and record["spec"]["superpixels"] >= least:
             groups[record["spec"]["scene"], record["spec"]["neighbours"]].append(record)
+    for k in sorted({k for _, k in groups}):
+        own = [group for (_, other), group in groups.items() if other == k]
+        if len(own) > 1:
+            groups[ALL, k] = [record for group in own for record in group]
     out = {}
     for key, group in groups.items():
-        sizes = [r["sizes"]["superpixels"] for r in group]
-        fits = {name: fit(sizes, [cost(r) for r in group]) for name, cost in COSTS.items()}
+        runs = [r["sizes"]["superpixels"] for r in group], [r["spec"]["scene"] for r in group]
+        fits = {
+            name: fit(runs[0], [cost(r) for r in group], runs[1]) for name, cost in COSTS.items()
+        }
         found = {name: f for name, f in fits.items() if f is not None}
         if found:
             out[key] = found

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from soup_nlp.bench.speed_fit import COSTS, growth, outside
+from soup_nlp.bench.speed_fit import ALL, COSTS, growth, outside
 
 Record = Mapping[str, Any]
 Cell = Callable[[Record], str]
@@ -123,8 +123,9 @@ def growth_lines(records: Sequence[Record], least: int = 0) -> list[str]:
     found = growth(records, least)
     if not found:
         return []
+    # all pairs: one exponent, a factor for each
     lines = ["| pair | K | N | " + " | ".join(COSTS) + " |", "|---|---|---|" + "---|" * len(COSTS)]
-    for (scene, k), fits in sorted(found.items()):
+    for (scene, k), fits in sorted(found.items(), key=lambda item: (item[0][0] == ALL, item[0])):
         one = next(iter(fits.values()))
         cells = [scene, str(k), f"{one.low:.0f} to {one.high:.0f}"]
         cells += [str(fits.get(name, "-")) for name in COSTS]
