@@ -7,10 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from soup_nlp.cases import prepare
+from soup_nlp.config import make_problem
 from soup_nlp.data.pair import Flow
+from soup_nlp.data.pair_views import cropped
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import build_segmentation
-from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.soup import Soup, reconstruct
+from soup_nlp.inputs import load_pair
 from soup_nlp.model import plain
 from soup_nlp.model.energy import (
     Weights,
@@ -19,6 +23,7 @@ from soup_nlp.model.energy import (
     build_energy_data,
     in_pixels,
 )
+from soup_nlp.start import bodies as bodies_module
 from soup_nlp.start.bodies import contact_scales, depth_from_inside
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
@@ -98,10 +103,11 @@ def test_pairs_of_two_bodies_weigh_less_where_one_hides_the_other(world):
         np.testing.assert_array_equal(one.pair_weight, data.pair_weight, err_msg=why)
 
 
-def scales(z, own, **options):
+def scales(z, own, far=0.01, **options):
     """Scales found for fronto-parallel squares at depths z (r, c), of which `own` are a body.
 
-    Its own unit says 1; everything else is at its true depth.
+    Its own unit says 1, and that it moves by `far` where the scene moves by 1; everything else is
+    at its true depth.
     """
     rows, columns = np.shape(z)
     v, u = np.mgrid[0 : 8 * rows, 0 : 8 * columns]
@@ -110,7 +116,8 @@ def scales(z, own, **options):
     seg = build_segmentation(labels, image, neighbours=4)
     n = rows * columns
     facing, still = np.tile([0, 0, -1.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
-    soup = Soup(np.full(n, 1 / n), facing, n * np.ravel(z), still, np.ones((n, 3)))
+    moved = np.where(np.ravel(own), far, 1.0)[:, None] * [n, 0.0, 0.0]
+    soup = Soup(np.full(n, 1 / n), facing, n * np.ravel(z), still, moved)
     found = contact_scales(soup, np.ravel(own).astype(np.int64), seg, K, **options)
     return found.reshape(rows, columns)
 
@@ -172,6 +179,66 @@ def test_a_body_with_nothing_below_it_touches_its_outline():
     z = thrice([[4.0, 6, 4], [3, 1, 3.5]])
     own = z == 1
     np.testing.assert_allclose(scales(z, own), np.where(own, 3.0, 1.0), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("far", "scale"),
+    # at the outline's 3 it moves 3 far: as far as the scene, less, four times as far, and farther
+    # than what a camera at rest could tell anything about
+    [(1 / 3, 3.0), (0.1, 3.0), (4 / 3, 1.5), (1e3, 3.0)],
+)
+def test_what_the_lower_edge_cuts_off_is_nearer_the_faster_it_moves(far, scale):
+    """Half way, in logarithms, to where it moves as far as the scene."""
+    z = thrice([[4.0, 6, 4], [3, 1, 3.5]])
+    own = z == 1
+    found = scales(z, own, far)
+    np.testing.assert_allclose(found, np.where(own, scale, 1.0), rtol=1e-9)
+    # which way is down is not known, or more of the ground is seen than not
+    assert scales(z, own, far, upright=False)[own] == pytest.approx(3.0)
+    on_ground = thrice([[4.0, 6, 4], [3, 1, 3.5], [3, 3, 3]])
+    own = on_ground == 1
+    assert scales(on_ground, own, far)[own] == pytest.approx(3.0)
+
+
+def test_pieces_of_what_is_cut_off_are_nearer_together():
+    """The upper one, which moves by itself, keeps its contact with the lower."""
+    own = thrice([[0, 0, 0], [0, 2, 0], [0, 1, 0]])
+    z = thrice([[8.0, 8, 8], [4, 1, 4], [4, 1, 4]])
+    found = scales(z, own, np.where(np.ravel(own) == 1, 4.0, 0.5))
+    low, high = found[own == 1], found[own == 2]
+    assert np.ptp(found[own > 0]) == pytest.approx(0.0, abs=1e-12)
+    assert 1.0 < low[0] < 4.0
+    assert high[0] == pytest.approx(low[0])
+
+
+@pytest.mark.parametrize("scene", ["room", "street"])
+def test_bodies_that_the_image_cuts_off_are_placed_nearer_the_truth(scene, monkeypatch):
+    """Rendered pairs whose lower part is cropped: contact alone puts what is cut too far."""
+    errors = {"contact": [], "as shipped": []}
+    for seed in (0, 3, 5):
+        what = {"kind": "scene", "scene": scene, "seed": seed, "width": 512, "height": 218}
+        problem = make_problem({"input": what, "segmentation": {"superpixels": 300}})
+        pair = load_pair(problem)
+        pair = replace(cropped(pair, 0, 0, 0, int(0.3 * pair.image_ref.shape[0])), flow=None)
+        with monkeypatch.context() as context:
+            errors["as shipped"] += cut_errors(pair, problem)
+            context.setattr(
+                bodies_module, "nearer_where_cut_off", lambda soup, label, log_scale, *_: 0.0
+            )
+            errors["contact"] += cut_errors(pair, problem)
+    assert len(errors["contact"]) >= 4
+    assert np.mean(errors["as shipped"]) < 0.9 * np.mean(errors["contact"])
+
+
+def cut_errors(pair, problem):
+    """|log| of the relative depth of every moving true body that touches the lower border."""
+    case = prepare(problem, pair=pair)
+    truth = pair.truth
+    rec = reconstruct(case.soup, case.segmentation.labels, pair.K_ref, pair.K_next)
+    ratio = np.log(rec.depth_ref / truth.depth_ref)
+    still = np.median(ratio[truth.bodies == 0])
+    cut = [b for b in np.unique(truth.bodies[-1]) if b > 0 and (truth.bodies[-1] == b).sum() > 20]
+    return [abs(np.median(ratio[truth.bodies == b]) - still) for b in cut]
 
 
 def test_depths_across_pairs_are_those_of_both_planes(world):

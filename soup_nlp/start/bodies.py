@@ -96,6 +96,8 @@ OUTLINE, GROUND, MOST = 0.2, 0.4, 0.6
 the outline that the latter's may reach."""
 BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
+UNKNOWN = np.log(100.0)
+"""Contact and pace that differ by more, in logarithms, say nothing: the camera is at rest."""
 UNSUPPORTED = 1e-6
 """Added to the share of a body's support that is placed: without any, longer contacts first."""
 
@@ -165,7 +167,63 @@ def contact_scales(
         else:
             log_scale[c] = _quantile(value[mine], contact[mine], OUTLINE)
         placed[c] = True
+    if upright:
+        log_scale -= nearer_where_cut_off(soup, label, log_scale, seg, K_ref)
     return np.exp(log_scale)[label]
+
+
+def nearer_where_cut_off(
+    soup: Soup, label: Int, log_scale: Float, seg: Segmentation, K_ref: Float
+) -> Float:
+    """(C,) by how much bodies that the image's lower border cuts off are nearer, in logarithms.
+
+    What they stand on is not seen, and what they touch is behind them: contact is the farthest
+    that they can be. Where they would move as far, seen from the camera, as the scene does is as
+    near as anything makes likely. Half way between, in logarithms, the error is at most the root
+    of their ratio. Bodies that touch are one here: a person is in pieces.
+
+    Args:
+        soup: Planes, every motion in its own scale.
+        label: (N,) index of the body.
+        log_scale: (C,) scale of every body by contact, in logarithms.
+        seg: Superpixels and graphs.
+        K_ref: (3, 3) intrinsics of the reference frame.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(log_scale)
+    scene = int(np.argmax(np.bincount(label, minlength=count)))
+    i, k = seg.pairs.T
+    hold = (label[i] != scene) & (label[k] != scene)
+    ends = label[i[hold]], label[k[hold]]
+    graph = coo_matrix((np.ones(hold.sum()), ends), shape=(count, count))
+    groups, group_of = connected_components(graph, directed=False)
+    group = group_of[label]
+    top = np.full(groups, np.inf)
+    np.minimum.at(top, group, seg.anchors[:, 1])
+    # what carries a group counts by the square of how low it is in it, as in contact_scales
+    way = seg.anchors[k] - seg.anchors[i]
+    down = way[:, 1] / np.linalg.norm(way, axis=1)
+    seen = np.zeros(groups)
+    for upper, lower, low in ((i, k, down), (k, i, -down)):
+        on = (group[upper] != group[lower]) & (low > BELOW)
+        g, y = group[upper[on]], seg.boundary[on, :, 1].mean(axis=1)
+        seen += np.bincount(g, seg.boundary_length[on] * (y - top[g]) ** 2, minlength=groups)
+    last = group[seg.labels[-1]]
+    hidden = np.bincount(last, (len(seg.labels) - top[last]) ** 2, minlength=groups)
+    # displacements seen from the camera: it turns as the scene does
+    point = soup.points(rays(K_ref, seg.anchors))
+    moved = np.einsum("nij,nj->ni", soup.R, point) + soup.translation
+    moved -= point @ soup.R[label == scene][0].T
+    far = np.linalg.norm(moved, axis=1) * np.exp(log_scale)[label]
+    pace = np.median(far[label == scene])
+    nearer = np.zeros(count)
+    for g in np.flatnonzero((hidden > seen) & (np.arange(groups) != group_of[scene])):
+        own = float(np.median(far[group == g]))
+        if pace < own < pace * np.exp(UNKNOWN):
+            nearer[group_of == g] = 0.5 * np.log(own / pace)
+    return nearer
 
 
 def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -> Float:
