@@ -12,6 +12,12 @@ $(VENV)/.installed: pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	touch $@
 
+# solvers, Dask and networks: where they cannot be had, their tests skip
+$(VENV)/.optional: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,optional]' \
+		|| echo "optional packages could not be installed: their tests skip"
+	touch $@
+
 demo: $(VENV)/.installed
 	$(BIN)/soup-nlp solve problems/motorcycle.yaml --out $(OUT)
 
@@ -20,7 +26,7 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint
+test: lint $(VENV)/.optional
 	$(BIN)/python -m pytest
 
 clean:
