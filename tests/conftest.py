@@ -6,6 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from soup_nlp.cases import Case, prepare
+from soup_nlp.config import make_problem
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.solve.tangent import TangentProblem
+
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 
 
@@ -15,3 +20,17 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"the real pairs are not here: no folder {SHARED_DATA.resolve()}")
     return SHARED_DATA.resolve()
+
+
+@pytest.fixture(scope="session")
+def small_room() -> Case:
+    """Sixty superpixels of a rendered room."""
+    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
+    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+
+
+@pytest.fixture(scope="module", params=["depth", "inverse-depth"])
+def problem(small_room: Case, request: pytest.FixtureRequest) -> TangentProblem:
+    """Its program on the tangent, in both charts."""
+    own = small_room.soup, small_room.data, small_room.weights
+    return TangentProblem(*own, Formulation(compiled=False), chart=request.param)

@@ -7,7 +7,7 @@ import pytest
 
 from soup_nlp.bench.planes import fit_planes, plane_depth, points_as_map
 from soup_nlp.bench.rivals import unorganised
-from soup_nlp.bench.truth import true_soup
+from soup_nlp.bench.truth import rescaled, true_soup
 from soup_nlp.data.flow import flow_from_truth
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.data.scenes import render_scene
@@ -143,3 +143,25 @@ def test_unorganised_superpixels_have_translations_of_length_one(street):
     # the flow of every superpixel stays
     H = soup.homographies(pair.K_ref, pair.K_next)
     np.testing.assert_allclose(alone.homographies(pair.K_ref, pair.K_next), H, atol=1e-9)
+
+
+def test_bodies_are_rescaled_to_where_the_energy_likes_them(street):
+    true = true_soup(*street)
+    size = np.bincount(true.body)
+    order = np.argsort(-size)
+    assert (size[order[:3]] > 0).all()
+    wanted = np.ones(len(size))
+    wanted[order[1]], wanted[order[2]] = 2.0, 0.6
+    target = np.log(wanted)[true.body]
+
+    def energy(soup):
+        """How far log distances are from the wanted ones, with one scale free."""
+        gap = np.log(soup.lam / true.soup.lam) - target
+        return float(np.abs(gap - np.median(gap)).sum())
+
+    gap = np.log(rescaled(true, energy).lam / true.soup.lam)
+    gap -= gap[true.body == order[0]][0]
+    # to half a step of the factors that are tried
+    np.testing.assert_allclose(gap, target, atol=np.log(9) / 40 / 2 + 1e-12)
+    # of what costs nothing the truth is left as it is
+    assert rescaled(true, lambda soup: 0.0) is true.soup

@@ -215,7 +215,7 @@ def test_pieces_of_what_is_cut_off_are_nearer_together():
 def test_bodies_that_the_image_cuts_off_are_placed_nearer_the_truth(scene, monkeypatch):
     """Rendered pairs whose lower part is cropped: contact alone puts what is cut too far."""
     errors = {"contact": [], "as shipped": []}
-    for seed in (0, 3, 5):
+    for seed in range(6):
         what = {"kind": "scene", "scene": scene, "seed": seed, "width": 512, "height": 218}
         problem = make_problem({"input": what, "segmentation": {"superpixels": 300}})
         pair = load_pair(problem)
@@ -226,8 +226,10 @@ def test_bodies_that_the_image_cuts_off_are_placed_nearer_the_truth(scene, monke
                 bodies_module, "nearer_where_cut_off", lambda soup, label, log_scale, *_: 0.0
             )
             errors["contact"] += cut_errors(pair, problem)
-    assert len(errors["contact"]) >= 4
-    assert np.mean(errors["as shipped"]) < 0.9 * np.mean(errors["contact"])
+    contact, shipped = np.array(errors["contact"]), np.array(errors["as shipped"])
+    moved = contact != shipped
+    print(scene, len(moved), moved.sum(), contact[moved], shipped[moved])
+    assert shipped[moved].mean() < 0.7 * contact[moved].mean()
 
 
 def cut_errors(pair, problem):

@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from soup_nlp.cases import Case, prepare
-from soup_nlp.config import make_problem
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.buffered import Buffered
 from soup_nlp.model.formulation import Formulation, build_tangent_nlp
@@ -30,17 +28,6 @@ PHASES = (
     Phase("second", "gauss-newton", 0.1, 1e-5, 60, 1e-5, 1e-6),
 )
 LAST = Phase("last", "exact", 0.1, 1e-8, 60, 0.0, 1e-6)
-
-
-@pytest.fixture(scope="module")
-def case() -> Case:
-    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
-    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
-
-
-@pytest.fixture(scope="module", params=["depth", "inverse-depth"])
-def problem(case, request) -> TangentProblem:
-    return TangentProblem(case.soup, case.data, case.weights, FORM, chart=request.param)
 
 
 @pytest.fixture(scope="module")
@@ -83,10 +70,10 @@ def test_gradient_and_exact_hessian_are_derivatives(problem):
     np.testing.assert_allclose(product, expected, atol=1e-4 * np.abs(expected).max())
 
 
-def test_the_exact_hessian_beside_the_stand_in_is_the_program_of_its_own(problem, case):
+def test_the_exact_hessian_beside_the_stand_in_is_the_program_of_its_own(problem, small_room):
     form = replace(FORM, norm="smooth", hessian="exact", theta=0.0, ridge=0.0)
     chart = problem.layout.chart
-    nlp = build_tangent_nlp(case.soup, case.data, case.weights, form, chart)[0]
+    nlp = build_tangent_nlp(small_room.soup, small_room.data, small_room.weights, form, chart)[0]
     other = problem.nlp.other_hessian("exact")
     rng = np.random.default_rng(6)
     args = (inner_point(problem), nlp.p, 1.0, rng.normal(size=nlp.ng))
@@ -96,7 +83,7 @@ def test_the_exact_hessian_beside_the_stand_in_is_the_program_of_its_own(problem
     assert problem.nlp.hess_lag.sparsity_out(0).nnz() <= one.sparsity().nnz()
 
 
-def test_the_stand_in_lies_above_every_norm(problem, case):
+def test_the_stand_in_lies_above_every_norm(problem, small_room):
     # quadratic model with the stand-in >= f wherever residuals are linear: translations
     problem.smoothing(0.2)
     x = Descent(problem).x
@@ -137,26 +124,28 @@ def test_growth_changes_the_length_unit_alone(problem):
     np.testing.assert_allclose(row.toarray().ravel(), problem.length(x), rtol=1e-12)
 
 
-def test_a_turn_of_a_superpixel_leaves_its_anchor_where_it_is(problem, case):
+def test_a_turn_of_a_superpixel_leaves_its_anchor_where_it_is(problem, small_room):
     x = inner_point(problem).reshape(-1, 9)
     turned = x.copy()
     turned[:, 3:6] += 0.1
 
     def anchors(x):
         soup = problem.layout.unpack(x.ravel())
-        X = soup.depth_at(case.data.anchor_ray)[:, None] * case.data.anchor_ray
+        X = soup.depth_at(small_room.data.anchor_ray)[:, None] * small_room.data.anchor_ray
         return np.einsum("nij,nj->ni", soup.R, X) + soup.translation
 
     np.testing.assert_allclose(anchors(turned), anchors(x), rtol=1e-12)
 
 
-def test_a_plane_moves_in_straight_lines_on_inverse_depths(case):
-    problem = TangentProblem(case.soup, case.data, case.weights, FORM, False, INVERSE)
-    layout, n = problem.layout, len(case.data)
+def test_a_plane_moves_in_straight_lines_on_inverse_depths(small_room):
+    problem = TangentProblem(
+        small_room.soup, small_room.data, small_room.weights, FORM, False, INVERSE
+    )
+    layout, n = problem.layout, len(small_room.data)
 
     def on_plane(m):
         length = np.linalg.norm(m)
-        soup = case.soup
+        soup = small_room.soup
         normal, D = np.tile(-m / length, (n, 1)), np.full(n, 1 / length)
         x = layout.pack(Soup(D, normal, np.ones(n), soup.R, soup.translation / D[:, None]))
         # pack brings to the length unit; undone, rho is linear in m
@@ -179,11 +168,11 @@ def test_a_buffered_function_checks_what_it_is_given(problem):
 # --- where it ends -------------------------------------------------------------------------------
 
 
-def test_another_chart_begins_where_the_first_ended(case):
-    first = Descent(TangentProblem(case.soup, case.data, case.weights, FORM))
+def test_another_chart_begins_where_the_first_ended(small_room):
+    first = Descent(TangentProblem(small_room.soup, small_room.data, small_room.weights, FORM))
     for phase in PHASES:
         first.run(phase)
-    problem = TangentProblem(first.soup, case.data, case.weights, FORM, chart=INVERSE)
+    problem = TangentProblem(first.soup, small_room.data, small_room.weights, FORM, chart=INVERSE)
     second = Descent(problem, after=first)
     # one pattern, one symbolic analysis
     assert second._factorise is first._factorise
@@ -216,11 +205,11 @@ def test_a_second_step_leads_back_into_a_bent_valley(problem):
     assert back.merit - at.merit < max(0.5 * (trial.merit - at.merit), trial.merit - at.merit)
 
 
-def test_rounding_of_what_is_far_away_does_not_reach_the_gradient(case):
+def test_rounding_of_what_is_far_away_does_not_reach_the_gradient(small_room):
     # lengths between near and far, in units of the near: their difference is that of small numbers
-    s, far = case.soup, np.where(np.arange(len(case.soup)) % 2, 1.0, 60.0)
+    s, far = small_room.soup, np.where(np.arange(len(small_room.soup)) % 2, 1.0, 60.0)
     mixed = Soup(s.lam * far, s.n, s.d, s.R, s.t / far[:, None])
-    problem = TangentProblem(mixed, case.data, case.weights, FORM)
+    problem = TangentProblem(mixed, small_room.data, small_room.weights, FORM)
     problem.smoothing(0.01)
     x, rng = problem.nlp.x0, np.random.default_rng(0)
     before = problem.gradient(x)
@@ -331,12 +320,12 @@ def test_a_step_to_the_minimum_is_not_doubled_for_a_fall_by_rounding():
     np.testing.assert_array_equal(move.point.x, h)
 
 
-def test_slopes_are_in_no_edge_but_a_neighbours(problem, case):
+def test_slopes_are_in_no_edge_but_a_neighbours(problem, small_room):
     # E_arap knows anchors alone, whose depth is a variable: 7 of 9 coordinates, a smaller factor
-    U, n = problem.upper.tocoo(), len(case.data)
+    U, n = problem.upper.tocoo(), len(small_room.data)
     i, k = U.row // 9, U.col // 9
-    neighbours = {tuple(p) for p in np.sort(case.data.pairs, axis=1)}
-    edges = {tuple(p) for p in np.sort(case.data.edges, axis=1)} - neighbours
+    neighbours = {tuple(p) for p in np.sort(small_room.data.pairs, axis=1)}
+    edges = {tuple(p) for p in np.sort(small_room.data.edges, axis=1)} - neighbours
     assert edges
     between = np.bincount(i * n + k, minlength=n * n)
     assert {int(between[a * n + b]) for a, b in edges} == {49}
@@ -384,10 +373,12 @@ def test_steps_go_on_beyond_the_tolerance_while_they_pay(problem):
     assert dual == beyond.history["inf_du"][-1]
 
 
-def test_ipopt_stays_where_it_ends(case, problem, solved):
+def test_ipopt_stays_where_it_ends(small_room, problem, solved):
     last = solved[1][-1]
     smooth = replace(FORM, hessian="exact", eps=LAST.eps, eps_pixel=LAST.eps)
-    nlp, _ = build_tangent_nlp(case.soup, case.data, case.weights, smooth, problem.layout.chart)
+    nlp, _ = build_tangent_nlp(
+        small_room.soup, small_room.data, small_room.weights, smooth, problem.layout.chart
+    )
     stage = Ipopt(nlp)(x0=last.x, max_iter=30, tol=1e-6)
     assert stage.converged
     assert stage.objective == pytest.approx(last.objective, rel=1e-6)

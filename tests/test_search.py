@@ -5,9 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.cases import Case, prepare
-from soup_nlp.config import make_problem
-from soup_nlp.model.formulation import Formulation
 from soup_nlp.solve import search as search_module
 from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.search import LEAST_SLACK, Point, Search, along, evaluate, led_back
@@ -17,22 +14,9 @@ GRAZING = 1e-8
 """Slack of the bound along which the steps of these tests lead."""
 
 
-@pytest.fixture(scope="module")
-def case() -> Case:
-    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
-    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
-
-
-@pytest.fixture(scope="module", params=["depth", "inverse-depth"])
-def problem(case, request) -> TangentProblem:
-    form = Formulation(compiled=False)
-    out = TangentProblem(case.soup, case.data, case.weights, form, chart=request.param)
-    out.smoothing(0.1)
-    return out
-
-
 def grazing(problem: TangentProblem, k: int) -> tuple[Point, np.ndarray]:
     """A point where superpixel k almost grazes one rim pixel, and a step of it along that bound."""
+    problem.smoothing(0.1)
     inner = Descent(problem).x
     normal = problem.slacks(inner)[1][k, 0]
 
@@ -83,9 +67,12 @@ def test_led_back_leaves_alone_what_is_inside(problem):
     at, h = grazing(problem, 7)
     x = problem.normalise(at.x + h)
     floor = LEAST_SLACK * at.slack
-    back = led_back(problem, x, at.slack + along(at.jacobian, h), floor)
-    changed = (back != x).reshape(-1, 9)
-    assert changed[7, :3].any()
-    assert not np.delete(changed, 7, axis=0).any()
-    assert not changed[7, 3:].any(), "a bound is of the plane alone"
-    assert led_back(problem, at.x, at.slack, floor) is at.x
+    back, slack, _ = led_back(problem, x, at.slack + along(at.jacobian, h), floor)
+    np.testing.assert_array_equal(slack, problem.slacks(back)[0])
+    # it stays on the simplex, by one factor for all
+    np.testing.assert_allclose(back, problem.normalise(back), rtol=1e-14)
+    ratio = (back / np.where(x == 0, 1.0, x)).reshape(-1, 9)
+    assert np.ptp(np.delete(ratio, 7, axis=0)[:, 0]) < 1e-14
+    np.testing.assert_array_equal(back.reshape(-1, 9)[:, 3:], x.reshape(-1, 9)[:, 3:])
+    assert (ratio[7, :3] != ratio[0, 0]).any()
+    assert led_back(problem, at.x, at.slack, floor)[0] is at.x

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import time
 
+import numpy as np
+
 from soup_nlp.bench.accuracy import Job, Row, clean, flow_error, head
-from soup_nlp.bench.truth import true_soup
+from soup_nlp.bench.truth import rescaled, true_soup
 from soup_nlp.cases import solver_options
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model import plain
@@ -48,12 +50,14 @@ def energies(result: Run, convention: str = "paper") -> Row:
         DataError: the pair has no dense truth of depth and motion.
     """
     true = true_soup(result.pair, result.segmentation)
-    soups = {
-        "start": result.start.soup,
-        "solution": result.soup,
-        "truth": true.soup,
-        **from_soup(result, true.soup),
-    }
+
+    def energy(soup: Soup) -> dict[str, float]:
+        return plain.energy(soup, result.data, result.weights)
+
+    soups = {"start": result.start.soup, "solution": result.soup, "truth": true.soup}
+    if len(np.unique(true.body)) > 1:
+        soups["truth rescaled"] = rescaled(true, lambda soup: energy(soup)["total"])
+    soups |= from_soup(result, true.soup)
     p, truth = result.pair, result.pair.truth
     assert truth is not None
     assert truth.depth_ref is not None
@@ -68,7 +72,7 @@ def energies(result: Run, convention: str = "paper") -> Row:
         "superpixels": len(result.segmentation),
         "size": list(p.size),
         "mixed": float((true.purity < 0.95).mean()),
-        "energy": {k: plain.energy(s, result.data, result.weights) for k, s in soups.items()},
+        "energy": {name: energy(soup) for name, soup in soups.items()},
         "metrics": {convention: metrics},
         "flow_error": flow_error(p),
     }

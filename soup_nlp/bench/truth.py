@@ -6,7 +6,8 @@ solver has missed it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +88,28 @@ def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
     D = 1 / length
     soup = Soup(D, -m[fill] / length[:, None], np.ones(n), R[fill], T[fill] / D[:, None])
     return TrueSoup(soup.normalised(), body, known, purity)
+
+
+SCALES = np.geomspace(1 / 3, 3, 41)
+"""Factors that `rescaled` tries."""
+
+
+def rescaled(true: TrueSoup, energy: Callable[[Soup], float]) -> Soup:
+    """The true soup with every body but the largest at its scale of lowest energy, in turn.
+
+    Flow leaves every body that moves by itself a scale of its own: E(truth) less this is what the
+    model would have instead of true distances.
+
+    Args:
+        true: Soup and bodies.
+        energy: Of a soup.
+    """
+    soup, size = true.soup, np.bincount(true.body)
+    for b in np.argsort(-size, kind="stable")[1 : np.count_nonzero(size)]:
+        own = true.body == b
+        tried = [replace(soup, lam=np.where(own, f, 1.0) * soup.lam).normalised() for f in SCALES]
+        soup = min([soup, *tried], key=energy)
+    return soup
 
 
 def _majority(truth: Truth, seg: Segmentation) -> tuple[NDArray[np.int64], Float]:

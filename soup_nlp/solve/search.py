@@ -111,8 +111,10 @@ def inside(problem: TangentProblem, x: Float) -> Float:
     return x
 
 
-def led_back(problem: TangentProblem, x: Float, aim: Float, floor: Float) -> Float:
-    """x with superpixels that left a curved bound brought back to it.
+def led_back(
+    problem: TangentProblem, x: Float, aim: Float, floor: Float
+) -> tuple[Float, Float, Float]:
+    """x, its slacks and their derivatives, superpixels that left a curved bound brought back to it.
 
     A step along a bound that curves leaves it by its square, however small the slack: what the
     linearised slack promises is restored by the shortest change, bound by bound.
@@ -123,8 +125,8 @@ def led_back(problem: TangentProblem, x: Float, aim: Float, floor: Float) -> Flo
         aim: (N, R) slacks by their derivatives at the begin, positive.
         floor: (N, R) least slacks.
     """
+    slack, jacobian = problem.slacks(x)
     for _ in range(BACK):
-        slack, jacobian = problem.slacks(x)
         out = np.flatnonzero((slack <= floor).any(axis=1))
         if not len(out):
             break
@@ -133,7 +135,9 @@ def led_back(problem: TangentProblem, x: Float, aim: Float, floor: Float) -> Flo
         lacks = (aim - slack)[out, worst] / np.einsum("nc,nc->n", normal, normal)
         x = x.copy()
         x.reshape(-1, 9)[out, :3] += lacks[:, None] * normal
-    return x
+        x = problem.normalise(x)
+        slack, jacobian = problem.slacks(x)
+    return x, slack, jacobian
 
 
 def evaluate(
@@ -141,8 +145,12 @@ def evaluate(
 ) -> Point | None:
     """Energy and slacks at x; None where a slack is not above `floor`."""
     slack, jacobian = problem.slacks(x)
-    if (slack <= floor).any():
-        return None
+    return None if (slack <= floor).any() else _point(problem, x, slack, jacobian, barrier)
+
+
+def _point(
+    problem: TangentProblem, x: Float, slack: Float, jacobian: Float, barrier: float
+) -> Point:
     f = problem.value(x)
     return Point(x, f, merit(f, slack, barrier), slack, jacobian)
 
@@ -256,10 +264,10 @@ class Search:
             x = self.problem.normalise(trial.x + (length[:, None] * c.reshape(-1, 9)).ravel())
             floor = LEAST_SLACK * self.at.slack
             aim = trial.slack + length[:, None] * along(trial.jacobian, c)
-            x = led_back(self.problem, x, np.maximum(aim, 2 * floor), floor)
-            moved = evaluate(self.problem, x, self.barrier, floor)
-            if moved is None:
+            x, slack, jacobian = led_back(self.problem, x, np.maximum(aim, 2 * floor), floor)
+            if (slack <= floor).any():
                 return best
+            moved = _point(self.problem, x, slack, jacobian, self.barrier)
             if best is not None:
                 fell = best.merit - moved.merit
                 if not fell > WORTH * abs(self.at.merit - best.merit):
@@ -272,12 +280,12 @@ class Search:
         length, floor = length.copy(), LEAST_SLACK * self.at.slack
         change = along(self.at.jacobian, self.h)
         for _ in range(40):
-            x = self._at(length)
-            x = led_back(self.problem, x, self.at.slack + length[:, None] * change, floor)
-            point = evaluate(self.problem, x, self.barrier, floor)
-            if point is not None:
-                return point, length
-            length[(self.problem.slacks(x)[0] <= floor).any(axis=1)] *= 0.5
+            aim = self.at.slack + length[:, None] * change
+            x, slack, jacobian = led_back(self.problem, self._at(length), aim, floor)
+            out = (slack <= floor).any(axis=1)
+            if not out.any():
+                return _point(self.problem, x, slack, jacobian, self.barrier), length
+            length[out] *= 0.5
         return self.at, np.zeros_like(length)
 
     def _longer(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,14 +23,16 @@ def components(mask: NDArray[np.bool_], seg: Segmentation) -> Int:
 
 def joined(hold: NDArray[np.bool_], seg: Segmentation) -> Int:
     """(N,) component of every superpixel where only the neighbour pairs (P,) of `hold` count."""
+    return _connected(seg.pairs[hold], len(seg))
+
+
+def _connected(links: Int, count: int) -> Int:
+    """(count,) component of every node of a graph with these links (L, 2)."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    n = len(seg)
-    i, k = seg.pairs[hold].T
-    graph = coo_matrix((np.ones(len(i)), (i, k)), shape=(n, n))
-    _, piece = connected_components(graph, directed=False)
-    return np.asarray(piece, np.int64)
+    graph = coo_matrix((np.ones(len(links)), tuple(links.T)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
 def bodies(label: Int, seg: Segmentation) -> Int:
@@ -102,14 +106,50 @@ UNSUPPORTED = 1e-6
 """Added to the share of a body's support that is placed: without any, longer contacts first."""
 
 
+class Outlines(NamedTuple):
+    """Where bodies touch: every neighbour pair that joins two, in both directions (2 B).
+
+    Attributes:
+        body: The one body.
+        other: The other.
+        contact: Length of their boundary, pixels.
+        below: Whether the other lies below it.
+        weight: Contact times the square of how low it is in the body: a car has room between its
+            wheels.
+        top: (C,) row of the highest anchor of every body.
+    """
+
+    body: Int
+    other: Int
+    contact: Float
+    below: NDArray[np.bool_]
+    weight: Float
+    top: Float
+
+
+def outlines(label: Int, seg: Segmentation) -> Outlines:
+    """Contacts of bodies, of which superpixels have labels (N,)."""
+    ends = label[seg.pairs]
+    across = ends[:, 0] != ends[:, 1]
+    body, other = np.concatenate([ends[across], ends[across, ::-1]]).T
+    contact = np.tile(seg.boundary_length[across], 2).astype(float)
+    way = np.diff(seg.anchors[seg.pairs[across]], axis=1)[:, 0]
+    down = way[:, 1] / np.linalg.norm(way, axis=1)
+    top = np.full(int(label.max()) + 1, np.inf)
+    np.minimum.at(top, label, seg.anchors[:, 1])
+    low = np.maximum(np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) - top[body], 1.0)
+    below = np.concatenate([down, -down]) > BELOW
+    return Outlines(body, other, contact, below, contact * low**2, top)
+
+
 def contact_scales(
     soup: Soup, label: Int, seg: Segmentation, K_ref: Float, upright: bool = True
 ) -> Float:
     """(N,) relative scale of every body, such that bodies touch what is around them.
 
     A body stands on what is below it: in an upright image its scale is the middle of the depth
-    ratios where a neighbour lies below, which count by the square of how low they are in the body
-    (a car has room between its wheels). A body hides what is behind it, so its depth is at most its
+    ratios where a neighbour lies below, which count by the square of how low they are in the body.
+    A body hides what is behind it, so its depth is at most its
     neighbours': the scale is bounded by what most of the outline allows, should the superpixels
     below be wrong ones. Where none are seen (less than a tenth of the outline), or nothing is known
     of the vertical, a body touches what it touches first: a low quantile of the depth ratios all
@@ -130,20 +170,10 @@ def contact_scales(
     log_scale = np.zeros(count)
     if count == 1 or not len(seg.pairs):
         return np.ones(len(soup))
-    i, k = seg.pairs.T
-    across = label[i] != label[k]
     zi, zk = depth_from_inside(soup, label, seg, K_ref)
-    a = np.concatenate([label[i][across], label[k][across]])
-    b = np.concatenate([label[k][across], label[i][across]])
     ratio = np.log(np.concatenate([zk / zi, zi / zk]))
-    contact = np.tile(seg.boundary_length[across], 2).astype(float)
-    way = (seg.anchors[k] - seg.anchors[i])[across]
-    down = way[:, 1] / np.linalg.norm(way, axis=1)
-    below = np.concatenate([down, -down]) > (BELOW if upright else np.inf)
-    top = np.full(count, np.inf)
-    np.minimum.at(top, label, seg.anchors[:, 1])
-    low = np.maximum(np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) - top[a], 1.0)
-    weight = contact * low**2
+    a, b, contact, below, weight, _ = outlines(label, seg)
+    below = below & upright
     support = np.bincount(a[below], weight[below], minlength=count)
     placed = np.zeros(count, bool)
     placed[np.argmax(np.bincount(label, minlength=count))] = True
@@ -189,29 +219,17 @@ def nearer_where_cut_off(
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     count = len(log_scale)
     scene = int(np.argmax(np.bincount(label, minlength=count)))
-    i, k = seg.pairs.T
-    hold = (label[i] != scene) & (label[k] != scene)
-    ends = label[i[hold]], label[k[hold]]
-    graph = coo_matrix((np.ones(hold.sum()), ends), shape=(count, count))
-    groups, group_of = connected_components(graph, directed=False)
-    group = group_of[label]
-    top = np.full(groups, np.inf)
-    np.minimum.at(top, group, seg.anchors[:, 1])
-    # what carries a group counts by the square of how low it is in it, as in contact_scales
-    way = seg.anchors[k] - seg.anchors[i]
-    down = way[:, 1] / np.linalg.norm(way, axis=1)
-    seen = np.zeros(groups)
-    for upper, lower, low in ((i, k, down), (k, i, -down)):
-        on = (group[upper] != group[lower]) & (low > BELOW)
-        g, y = group[upper[on]], seg.boundary[on, :, 1].mean(axis=1)
-        seen += np.bincount(g, seg.boundary_length[on] * (y - top[g]) ** 2, minlength=groups)
+    ends = label[seg.pairs]
+    group_of = _connected(ends[(ends != scene).all(axis=1)], count)
+    group, groups = group_of[label], int(group_of.max()) + 1
+    # what carries a group, seen and beyond the border, by the square of how low it is
+    around = outlines(group, seg)
+    on = around.below
+    seen = np.bincount(around.body[on], around.weight[on], minlength=groups)
     last = group[seg.labels[-1]]
-    hidden = np.bincount(last, (len(seg.labels) - top[last]) ** 2, minlength=groups)
+    hidden = np.bincount(last, (len(seg.labels) - around.top[last]) ** 2, minlength=groups)
     # displacements seen from the camera: it turns as the scene does
     point = soup.points(rays(K_ref, seg.anchors))
     moved = np.einsum("nij,nj->ni", soup.R, point) + soup.translation
