@@ -14,8 +14,8 @@ import time
 import numpy as np
 from scipy.spatial import cKDTree
 
+from soup_nlp.mrf.order import node_levels, node_order
 from soup_nlp.mrf.trws import solve_trws
-from soup_nlp.mrf.trws_order import node_levels, node_order
 
 NODES, LABELS, NEIGHBOURS = 1000, 50, 15
 

@@ -19,14 +19,13 @@ from unittest import mock
 import numpy as np
 
 from soup_nlp.bench.accuracy_table import table
-from soup_nlp.config import make_problem
-from soup_nlp.data.pair_views import cropped
-from soup_nlp.inputs import load_pair
-from soup_nlp.pipeline import run
-from soup_nlp.report.atomic import atomic_path
+from soup_nlp.bench.pair_views import cropped
+from soup_nlp.config.problem import make_problem
+from soup_nlp.pipeline.run import run
+from soup_nlp.storage.atomic import atomic_path
 
 ROOT = Path(__file__).parent.parent
-NEARER = "soup_nlp.start.bodies.nearer_where_cut_off"
+NEARER = "soup_nlp.start.components.nearer_where_cut_off"
 
 
 def errors(scene: str, seed: int, superpixels: int, lower: float) -> tuple[list[float], int]:
@@ -38,7 +37,7 @@ def errors(scene: str, seed: int, superpixels: int, lower: float) -> tuple[list[
             "refine": {"enabled": False},
         }
     )
-    whole = load_pair(problem)
+    whole = problem.load_pair()
     pair = replace(cropped(whole, 0, 0, 0, int(lower * whole.image_ref.shape[0])), flow=None)
     assert pair.truth is not None
     assert pair.truth.bodies is not None

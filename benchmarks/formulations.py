@@ -15,11 +15,11 @@ from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
-from soup_nlp.cases import prepare
-from soup_nlp.config import load_problem
+from soup_nlp.config.problem import load_problem
 from soup_nlp.model.layout import GAUGES
-from soup_nlp.report.atomic import atomic_path
-from soup_nlp.solve.soup import solve_soup
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.solve.stages import solve_soup
+from soup_nlp.storage.atomic import atomic_path
 
 ROOT = Path(__file__).parent.parent
 HEAD = (

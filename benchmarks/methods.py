@@ -19,14 +19,13 @@ from pathlib import Path
 
 from soup_nlp.bench.accuracy_table import table
 from soup_nlp.bench.speed import plan
-from soup_nlp.cases import Case, prepare
+from soup_nlp.bench.timed import YARDSTICK_ITERATIONS, problem_of
+from soup_nlp.bench.yardstick import EPS, levenberg_marquardt
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.refine.mppbp import refine_soup
-from soup_nlp.refine.records import RefineOptions
-from soup_nlp.report.atomic import atomic_path
-from soup_nlp.solve.soup import solve_soup
-from soup_nlp.solve.yardstick import EPS, levenberg_marquardt
-from soup_nlp.timed import YARDSTICK_ITERATIONS, problem_of
+from soup_nlp.solve.stages import solve_soup
+from soup_nlp.storage.atomic import atomic_path
 
 ROOT = Path(__file__).parent.parent
 METHODS = {
@@ -58,7 +57,7 @@ def refined(case: Case, soup: Soup) -> float:
         soup,
         case.data,
         case.weights,
-        RefineOptions(**case.problem.refine.model_dump()),
+        case.problem.refine,
         seed=case.problem.seed,
         min_facing=form.min_facing,
         depth_ratio=form.depth_ratio,

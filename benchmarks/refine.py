@@ -20,10 +20,10 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from soup_nlp.config import dump_problem, load_problem
-from soup_nlp.pipeline import run
-from soup_nlp.report.atomic import atomic_path
+from soup_nlp.config.problem import dump_problem, load_problem
+from soup_nlp.pipeline.run import run
 from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.storage.atomic import atomic_path
 
 ROOT = Path(__file__).parent.parent
 SCENES = ("street", "room", "sheet", "orbit", "still", "motorcycle")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 
-from soup_nlp.cli import main
+from soup_nlp.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main(["bench", "speed", *sys.argv[1:]]))

@@ -2,7 +2,7 @@
 
 import sys
 
-from soup_nlp.cli import main
+from soup_nlp.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

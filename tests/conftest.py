@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from soup_nlp.cases import Case, prepare
-from soup_nlp.config import make_problem
+from soup_nlp.config.problem import make_problem
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.solve.tangent import TangentProblem
+from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.solve.tangent_problem import TangentProblem
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 

@@ -10,8 +10,9 @@ from helpers_model import HEIGHT, WIDTH, Tiny, motion, plane_pose, plane_soup, p
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.model.energy import EnergyData, build_energy_data, in_pixels
+from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.reweighting import in_pixels
 
 UNITS = ("paper", "pixels")
 FORMS = [(n, t) for n in ("smooth", "epigraph") for t in ("smooth", "lifted")]

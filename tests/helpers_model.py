@@ -11,17 +11,20 @@ from hypothesis import settings
 from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.data.raycast import Body, Part, Scene, render
-from soup_nlp.data.shapes import Plane
-from soup_nlp.data.texture import Texture
+from soup_nlp.data.scenes.raycast import Body, Part, Scene, render
+from soup_nlp.data.scenes.shapes import Plane
+from soup_nlp.data.scenes.texture import Texture
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment, split_components
-from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
-from soup_nlp.model.formulation import Formulation, build_matrix_nlp
+from soup_nlp.model.energy_data import EnergyData, build_energy_data
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP, to_scipy
+from soup_nlp.model.reweighting import in_pixels
 
 Float = NDArray[np.float64]
 

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from soup_nlp.data.flow import flow_from_truth
+from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.data.scenes import render_scene
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
+from soup_nlp.evaluate.baselines import FAR, constant_depth, fill_nearest, rigid_depth
+from soup_nlp.evaluate.metrics import constant_depth_metrics, depth_metrics, skill
 from soup_nlp.geometry import rotation
-from soup_nlp.report.baselines import FAR, constant_depth, fill_nearest, rigid_depth
-from soup_nlp.report.metrics import constant_depth_metrics, depth_metrics, skill
 
 
 @pytest.fixture(scope="module")

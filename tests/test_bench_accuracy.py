@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from soup_nlp import cli_accuracy
 from soup_nlp.bench.accuracy import (
     Job,
     clean,
@@ -25,8 +24,9 @@ from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.rivals import METHODS
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.bench.suites_pairs import Item
-from soup_nlp.cli import main
-from soup_nlp.config import make_problem
+from soup_nlp.cli.main import accuracy as cli_accuracy
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import make_problem
 from soup_nlp.errors import ConfigError
 
 QUICK = (

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.axes import Axes
 
 from soup_nlp.bench import analyses
-from soup_nlp.bench import search as search_module
+from soup_nlp.bench import tuning as search_module
 from soup_nlp.bench.accuracy import Job, head
 from soup_nlp.bench.accuracy_table import reason, report
 from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
@@ -23,7 +23,9 @@ from soup_nlp.bench.analyses_report import (
     text_energy,
     text_variants,
 )
-from soup_nlp.bench.search import (
+from soup_nlp.bench.suites import Options, list_suite
+from soup_nlp.bench.suites_pairs import Item
+from soup_nlp.bench.tuning import (
     DEFAULT_SPACE,
     FAILED,
     Parameter,
@@ -33,11 +35,9 @@ from soup_nlp.bench.search import (
     search,
     split,
 )
-from soup_nlp.bench.search_report import text_search
-from soup_nlp.bench.suites import Options, list_suite
-from soup_nlp.bench.suites_pairs import Item
-from soup_nlp.cli import main
-from soup_nlp.cli_accuracy import Progress
+from soup_nlp.bench.tuning_report import text_search
+from soup_nlp.cli.accuracy import Progress
+from soup_nlp.cli.main import main
 from soup_nlp.errors import ConfigError
 
 QUICK = (
@@ -382,7 +382,7 @@ def test_command_line_of_analyses_and_search(tmp_path, capsys, monkeypatch):
     out = capsys.readouterr().out
     assert all(name in out for name in ANALYSES)
     assert main(["bench", "accuracy", "--analysis", "nothing", "--out", str(tmp_path)]) == 2
-    from soup_nlp.bench import search as module
+    from soup_nlp.bench import tuning as module
 
     kwdefaults = {**module.search.__kwdefaults__, "function": fake}
     monkeypatch.setattr(module.search, "__kwdefaults__", kwdefaults)

@@ -13,10 +13,10 @@ from scipy.stats import linregress
 from soup_nlp.bench import speed, speed_fit, speed_gate, speed_plot, speed_table
 from soup_nlp.bench.machine import machine
 from soup_nlp.bench.speed import Spec
-from soup_nlp.cli import main
+from soup_nlp.bench.timed import problem_of, schedule
+from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
-from soup_nlp.solve.soup import SolverOptions
-from soup_nlp.timed import problem_of, schedule
+from soup_nlp.solve.solver_options import SolverOptions
 
 EXPONENT = 1.3
 

@@ -6,7 +6,7 @@ import pytest
 
 from soup_nlp.bench.suites import SUITES, Options, list_suite
 from soup_nlp.bench.suites_pairs import spread
-from soup_nlp.cli import main
+from soup_nlp.cli.main import main
 
 
 def test_suites_list_the_papers_pairs(tmp_path):

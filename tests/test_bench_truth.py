@@ -5,18 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.bench.planes import fit_planes, plane_depth, points_as_map
+from soup_nlp.bench.piecewise_planar import fit_planes, plane_depth, points_as_map
 from soup_nlp.bench.rivals import unorganised
 from soup_nlp.bench.truth import rescaled, true_soup
-from soup_nlp.data.flow import flow_from_truth
+from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Pair, Truth
-from soup_nlp.data.scenes import render_scene
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.model import plain
-from soup_nlp.model.energy import Weights, build_energy_data, in_pixels
+from soup_nlp.model import oracle as plain
+from soup_nlp.model.energy_data import build_energy_data
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.reweighting import in_pixels
 
 K = np.array([[100.0, 0, 32], [0, 100.0, 24], [0, 0, 1]])
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from soup_nlp.bench.truth import true_soup
-from soup_nlp.cases import Case, prepare
-from soup_nlp.cli import main
-from soup_nlp.config import make_problem
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import make_problem
+from soup_nlp.evaluate.metrics import depth_metrics
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.report.metrics import depth_metrics
-from soup_nlp.solve.soup import solve_soup
+from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.bending import surfaces
 
 SHEET = Path(__file__).parent.parent / "problems" / "sheet.yaml"

@@ -7,24 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from soup_nlp.cases import prepare
-from soup_nlp.config import make_problem
+from soup_nlp.bench.pair_views import cropped
+from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow
-from soup_nlp.data.pair_views import cropped
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup, reconstruct
-from soup_nlp.inputs import load_pair
-from soup_nlp.model import plain
-from soup_nlp.model.energy import (
-    Weights,
-    at_occlusions,
-    between_bodies,
-    build_energy_data,
-    in_pixels,
-)
-from soup_nlp.start import bodies as bodies_module
-from soup_nlp.start.bodies import contact_scales, depth_from_inside
+from soup_nlp.model import oracle as plain
+from soup_nlp.model.energy_data import build_energy_data
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.reweighting import at_occlusions, between_bodies, in_pixels
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.start import components as bodies_module
+from soup_nlp.start.components import contact_scales, depth_from_inside
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 
@@ -218,7 +213,7 @@ def test_bodies_that_the_image_cuts_off_are_placed_nearer_the_truth(scene, monke
     for seed in range(6):
         what = {"kind": "scene", "scene": scene, "seed": seed, "width": 512, "height": 218}
         problem = make_problem({"input": what, "segmentation": {"superpixels": 300}})
-        pair = load_pair(problem)
+        pair = problem.load_pair()
         pair = replace(cropped(pair, 0, 0, 0, int(0.3 * pair.image_ref.shape[0])), flow=None)
         with monkeypatch.context() as context:
             errors["as shipped"] += cut_errors(pair, problem)

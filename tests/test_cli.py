@@ -13,12 +13,12 @@ import h5py
 import numpy as np
 import pytest
 
-from soup_nlp.cli import main
-from soup_nlp.config import load_problem, make_problem
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import load_problem, make_problem
 from soup_nlp.data.formats import write_flo
-from soup_nlp.data.scenes import render_scene
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError
-from soup_nlp.pipeline import load_pair, run, solve_pair
+from soup_nlp.pipeline.run import run, solve_pair
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.pointcloud import read_ply
 
@@ -310,7 +310,7 @@ def test_python_functions_do_the_same():
     )
     assert result.metrics["solution"].mre < 0.05
     assert len(result.soup) == len(result.segmentation)
-    again = load_pair(make_problem({"input": {"kind": "motorcycle"}}))
+    again = make_problem({"input": {"kind": "motorcycle"}}).load_pair()
     assert again.K_next[0, 2] > again.K_ref[0, 2]
 
 

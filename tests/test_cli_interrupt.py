@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from soup_nlp import cases, cli
-from soup_nlp.pipeline import StoppedError, run
+from soup_nlp.pipeline.run import StoppedError, run
 from soup_nlp.report import folder as folders
 from soup_nlp.solve.interrupt import interruptible
 

@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from soup_nlp.cli import main
-from soup_nlp.config import make_problem
-from soup_nlp.data.datasets_layout import MARK
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.datasets.layout import MARK
 from soup_nlp.data.formats import write_flo
-from soup_nlp.data.scenes import render_scene
-from soup_nlp.inputs import load_pair
+from soup_nlp.data.scenes.catalogue import render_scene
 
 ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
 SMALL = [
@@ -151,4 +150,4 @@ def test_white_reaches_files_too(tmp_path):
         "intrinsics": [60.0, 60.0, 32.0, 32.0],
     }
     problem = make_problem({"input": {**source, "white": 4095}, "base": str(tmp_path)})
-    assert load_pair(problem).image_ref.min() == 255
+    assert problem.load_pair().image_ref.min() == 255

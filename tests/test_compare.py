@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from helpers_model import PAPER, Tiny
 
-from soup_nlp.cli import main
-from soup_nlp.compare.isolate import isolated
-from soup_nlp.compare.plugins import PLUGINS
-from soup_nlp.compare.profile import cost_table, draw_curves, draw_profiles, profile
-from soup_nlp.compare.report import page
-from soup_nlp.compare.runner import compare, read_rows
-from soup_nlp.compare.solvers import available, find_solver
-from soup_nlp.compare.task import Answer, Limits, Task, Trace
-from soup_nlp.compare.verify import kkt
+from soup_nlp.bench.solvers.isolate import isolated
+from soup_nlp.bench.solvers.page import page
+from soup_nlp.bench.solvers.plugins import PLUGINS
+from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profiles, profile
+from soup_nlp.bench.solvers.registry import available, find_solver
+from soup_nlp.bench.solvers.runner import compare, read_rows
+from soup_nlp.bench.solvers.task import Answer, Task, Trace
+from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError, SolverError
+from soup_nlp.export.verify import Limits, kkt
 from soup_nlp.model.formulation import Formulation
 
 PROBLEMS = Path(__file__).parent.parent / "problems"
@@ -78,7 +78,7 @@ def test_crashes_are_answers(tmp_path):
 
 
 def test_time_and_memory_are_limited(tmp_path, monkeypatch):
-    monkeypatch.setattr("soup_nlp.compare.isolate.GRACE", 0.2)
+    monkeypatch.setattr("soup_nlp.bench.solvers.isolate.GRACE", 0.2)
     assert isolated(lambda: time.sleep(60), tmp_path, 0.1, MANY).how == "killed: time"
     ended = isolated(lambda: np.ones(10**9), tmp_path, 20, MANY)
     assert ended.how == "killed: memory"
@@ -136,7 +136,7 @@ def test_a_false_claim_is_seen(task, tmp_path, monkeypatch):
     def liar(given: Task) -> Answer:
         return Answer(given.nlp.x0 + 1e-3, None, "optimal!", True, 1, 0.5)
 
-    monkeypatch.setattr("soup_nlp.compare.runner.find_solver", lambda name: liar)
+    monkeypatch.setattr("soup_nlp.bench.solvers.runner.find_solver", lambda name: liar)
     rows = compare(
         [(LABEL, lambda folder: replace(task, folder=folder))],
         ["liar"], task.limits, tmp_path / "runs.jsonl", tmp_path, lambda line: None,
@@ -168,7 +168,7 @@ def test_runs_resume_and_a_cut_line_is_run_again(task, tmp_path, monkeypatch):
         calls.append(name)
         return solver
 
-    monkeypatch.setattr("soup_nlp.compare.runner.find_solver", find)
+    monkeypatch.setattr("soup_nlp.bench.solvers.runner.find_solver", find)
     path = tmp_path / "runs.jsonl"
     args = [(LABEL, lambda folder: replace(task, folder=folder))]
 

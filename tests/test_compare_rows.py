@@ -12,20 +12,20 @@ import pytest
 from helpers_model import PAPER, Tiny
 from test_compare import LABEL, MANY, PROBLEMS, ROWS, row
 
-from soup_nlp.cases import Case, prepare
-from soup_nlp.cli import main
-from soup_nlp.compare.isolate import isolated
-from soup_nlp.compare.profile import cost_table, draw_curves, draw_profiles, problem_names
-from soup_nlp.compare.report import by_run, conclusion, page
-from soup_nlp.compare.runner import compare
-from soup_nlp.compare.solvers import executable, find_solver, yardstick
-from soup_nlp.compare.task import Answer, Limits, Task
-from soup_nlp.compare.verify import examine, violations
-from soup_nlp.config import Problem
+from soup_nlp.bench.solvers.isolate import isolated
+from soup_nlp.bench.solvers.page import by_run, conclusion, page
+from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profiles, problem_names
+from soup_nlp.bench.solvers.registry import executable, find_solver, yardstick
+from soup_nlp.bench.solvers.runner import compare
+from soup_nlp.bench.solvers.task import Answer, Task
+from soup_nlp.bench.yardstick import levenberg_marquardt
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError, SolverError
 from soup_nlp.export.sol import write_sol
+from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.solve.yardstick import levenberg_marquardt
+from soup_nlp.pipeline.case import Case, prepare
 
 SMALL = [
     "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",
@@ -98,7 +98,7 @@ def test_a_solver_that_is_asked_for_twice_runs_once(task, tmp_path, monkeypatch)
         calls.append(name)
         return lambda given: Answer(given.nlp.x0, None, "start", False, 0, 0.1)
 
-    monkeypatch.setattr("soup_nlp.compare.runner.find_solver", find)
+    monkeypatch.setattr("soup_nlp.bench.solvers.runner.find_solver", find)
     assert len(run(task, ["a", "a"], tmp_path)) == 1
     assert calls == ["a"]
 
@@ -108,7 +108,9 @@ def test_a_claim_after_the_limit_is_not_within_it(task, tmp_path, monkeypatch):
     rows = []
     for seconds in (19.0, 21.0):
         answer = replace(exact, seconds=seconds)
-        monkeypatch.setattr("soup_nlp.compare.runner.find_solver", lambda n, a=answer: lambda t: a)
+        monkeypatch.setattr(
+            "soup_nlp.bench.solvers.runner.find_solver", lambda n, a=answer: lambda t: a
+        )
         rows += run(task, ["slow"], tmp_path / str(seconds))
     assert [r["verified"] for r in rows] == [True, False]
     assert [r["claimed"] for r in rows] == [True, False]
@@ -191,7 +193,7 @@ def test_an_input_that_cannot_be_used_leaves_the_others_page(tmp_path, monkeypat
             raise DataError("image is gone")
         return prepare(problem, presolve)
 
-    monkeypatch.setattr("soup_nlp.comparing.prepare", second_fails)
+    monkeypatch.setattr("soup_nlp.bench.solvers.compare.prepare", second_fails)
     orbit = str(PROBLEMS / "orbit.yaml")
     words = ["--superpixels", "9", "--solvers", "lm,lm", "--seconds", "5", "--no-presolve"]
     out = tmp_path / "out"

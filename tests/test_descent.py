@@ -10,16 +10,17 @@ import pytest
 
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.buffered import Buffered
-from soup_nlp.model.formulation import Formulation, build_tangent_nlp
+from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Chart
+from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.solve import descent as descent_module
 from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.factor import superlu
 from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.kkt import optimality
+from soup_nlp.solve.line_search import Search, along, evaluate, reach
 from soup_nlp.solve.phase import Phase
-from soup_nlp.solve.search import Search, along, evaluate, reach
-from soup_nlp.solve.tangent import TangentProblem
+from soup_nlp.solve.tangent_problem import TangentProblem
 
 FORM = Formulation(compiled=False)
 INVERSE: Chart = "inverse-depth"

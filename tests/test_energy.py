@@ -26,9 +26,11 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model import plain
-from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels, sample_pixels
-from soup_nlp.model.formulation import build_matrix_nlp
+from soup_nlp.model import oracle as plain
+from soup_nlp.model.energy_data import EnergyData, build_energy_data, sample_pixels
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.model.reweighting import in_pixels
 
 # --- invariances ---------------------------------------------------------------------------------
 

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from test_nl import ReadBack, close
 
-from soup_nlp.artefact import import_sol, parse_formulation
-from soup_nlp.cases import prepare
-from soup_nlp.cli import main
-from soup_nlp.compare.plugins import plugin
-from soup_nlp.compare.task import Limits, Task
-from soup_nlp.compare.verify import examine, kkt, violations
-from soup_nlp.config import load_problem
+from soup_nlp.bench.solvers.plugins import plugin
+from soup_nlp.bench.solvers.task import Task
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ConfigError, ExportError
+from soup_nlp.export.artefact import import_sol, parse_formulation
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.residuals import kind, residual_table, table_text
 from soup_nlp.export.sol import write_sol
-from soup_nlp.model import plain
+from soup_nlp.export.verify import Limits, examine, kkt, violations
+from soup_nlp.model import oracle as plain
+from soup_nlp.pipeline.case import prepare
 
 PROBLEMS = Path(__file__).parent.parent / "problems"
 TINY = [

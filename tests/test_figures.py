@@ -10,6 +10,7 @@ import pytest
 
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.errors import DataError
+from soup_nlp.evaluate.metrics import depth_metrics
 from soup_nlp.report import figures
 from soup_nlp.report.colour import (
     colour_wheel,
@@ -21,7 +22,6 @@ from soup_nlp.report.colour import (
     draw_superpixels,
 )
 from soup_nlp.report.figures import overview, overview_strip, write_clipped_depth_png16, write_png
-from soup_nlp.report.metrics import depth_metrics
 
 
 def turbo(level):

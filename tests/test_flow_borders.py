@@ -7,13 +7,13 @@ import pytest
 from scipy import ndimage
 
 from soup_nlp.bench.truth import true_soup
-from soup_nlp.cases import prepare
-from soup_nlp.config import make_problem
-from soup_nlp.data.flow_borders import follow_flow
-from soup_nlp.data.flow_robust import fit_affine
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.flow.borders import follow_flow
+from soup_nlp.data.flow.robust import fit_affine
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.superpixels import segment
+from soup_nlp.pipeline.case import prepare
 
 HEIGHT, WIDTH, EDGE = 48, 64, 26
 """EDGE is inside a column of cells of 8 pixels."""

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from test_flow import texture
 
-from soup_nlp.data.flow import dis_flow
-from soup_nlp.data.flow_check import confidence_of
-from soup_nlp.data.flow_guided import dominant_homographies, guided_flow
+from soup_nlp.data.flow.consistency import confidence_of
+from soup_nlp.data.flow.guided import dominant_homographies, guided_flow
+from soup_nlp.data.flow.sources import dis_flow
 
 HEIGHT, WIDTH = 200, 360
 # the road of a driving camera: what is far down comes nearer fast

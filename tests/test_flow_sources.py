@@ -6,19 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
-from soup_nlp.cases import prepare
-from soup_nlp.config import make_problem
-from soup_nlp.data.flow import flow_from_truth, is_named, resolve_flow
-from soup_nlp.data.flow_check import checked_flow
-from soup_nlp.data.flow_learned import learned_flow
-from soup_nlp.data.flow_noise import noisy
-from soup_nlp.data.flow_rlof import rlof_available, rlof_flow
-from soup_nlp.data.flow_robust import reweighted
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.flow.consistency import checked_flow
+from soup_nlp.data.flow.learned import learned_flow
+from soup_nlp.data.flow.noise import noisy
+from soup_nlp.data.flow.rlof import rlof_available, rlof_flow
+from soup_nlp.data.flow.robust import reweighted
+from soup_nlp.data.flow.sources import flow_from_truth, is_named, resolve_flow
 from soup_nlp.data.pair import Flow
-from soup_nlp.data.scenes import render_scene
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.inputs import load_flow_of
+from soup_nlp.pipeline.case import prepare
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +62,7 @@ def test_a_problem_can_ask_for_noise(pair):
     raw = {"input": {"kind": "scene", "scene": "street", "width": 160, "height": 96}}
     for level in ("0.5", "1"):
         problem = make_problem({**raw, "flow": {"source": f"truth+noise:{level}"}})
-        assert error(load_flow_of(problem, pair), pair).mean() > 0.5 * float(level)
+        assert error(problem.flow.load(pair, problem.path), pair).mean() > 0.5 * float(level)
     with pytest.raises(DataError, match="number of pixels"):
         resolve_flow(pair, "truth+noise:much")
     assert is_named("rlof")

@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from soup_nlp.errors import ModelError
-from soup_nlp.model.formulation import build_tangent_nlp
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
 # --- layouts -------------------------------------------------------------------------------------
 

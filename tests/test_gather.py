@@ -8,22 +8,23 @@ import numpy as np
 import pytest
 from helpers_model import corner_scene, cut_by_part, motion, with_true_flow
 
-from soup_nlp.data.raycast import render
+from soup_nlp.data.scenes.raycast import render
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.start.bending import flow_jump
-from soup_nlp.start.bodies import borrow
 from soup_nlp.start.choice import Choice, hanging_together, smooth_choice
+from soup_nlp.start.components import borrow
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.gather import gather
-from soup_nlp.start.propose import StartOptions, look, propose
+from soup_nlp.start.merge import gather
+from soup_nlp.start.propose import look, propose
+from soup_nlp.start.start_options import SeededStart
 
 WIDTH, HEIGHT = 192, 144
 K = camera.intrinsics(180.0, 180.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 CAMERA = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
 WEDGE = motion((0, 3, 0), (-0.15, 0.02, 0.1))
-OPTIONS = StartOptions()
+OPTIONS = SeededStart()
 
 
 @pytest.fixture(scope="module")
@@ -203,5 +204,5 @@ def test_a_camera_at_rest_starts_near_its_flow(monkeypatch):
     here = shift()
     assert len(here) > 20
     assert np.median(here) < 0.1
-    monkeypatch.setattr("soup_nlp.start.bodies.SHORTEST", 1.0)
+    monkeypatch.setattr("soup_nlp.start.components.SHORTEST", 1.0)
     assert np.median(shift()) > 1.0

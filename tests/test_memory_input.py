@@ -9,12 +9,12 @@ import h5py
 import numpy as np
 import pytest
 
-from soup_nlp.cli import main
-from soup_nlp.config import dump_problem, load_problem
-from soup_nlp.data.scenes import render_scene
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import dump_problem, load_problem
+from soup_nlp.data.inputs import pair_hash
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError
-from soup_nlp.inputs import load_pair, pair_hash
-from soup_nlp.pipeline import Run, solve_pair
+from soup_nlp.pipeline.run import Run, solve_pair
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 
@@ -47,7 +47,7 @@ def test_its_config_is_refused_before_anything_is_written(run, tmp_path, capsys)
     problem = load_problem(out / "config.yaml")
     assert problem.digest() == run.problem.digest()
     with pytest.raises(ConfigError, match="in memory"):
-        load_pair(problem)
+        problem.load_pair()
     assert main(["solve", str(out / "config.yaml"), "--out", str(tmp_path / "new")]) == 2
     assert run.problem.input.hash in capsys.readouterr().err
     assert not (tmp_path / "new").exists()

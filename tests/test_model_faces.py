@@ -25,12 +25,14 @@ from helpers_model import (
 )
 
 from soup_nlp.model import compile as compiling
-from soup_nlp.model import plain
-from soup_nlp.model.formulation import Formulation, build_matrix_nlp, build_tangent_nlp
+from soup_nlp.model import oracle as plain
+from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS, Kernel
+from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.norms import Norm, smooth_min, solver_form
-from soup_nlp.model.views import tangent_view
+from soup_nlp.model.superpixel import tangent_view
+from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
 UNITS = ("paper", "pixels")
 NORMS = ("smooth", "epigraph")

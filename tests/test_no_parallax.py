@@ -5,17 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.config import make_problem
-from soup_nlp.data.flow_check import confidence_of, round_trip_error
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import build_segmentation
-from soup_nlp.model import plain
-from soup_nlp.model.energy import Weights, build_energy_data
-from soup_nlp.pipeline import run
-from soup_nlp.start.bodies import bodies
+from soup_nlp.model import oracle as plain
+from soup_nlp.model.energy_data import build_energy_data
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.pipeline.run import run
+from soup_nlp.report.verdict import verdict
+from soup_nlp.start.components import bodies
 from soup_nlp.start.propose import propose
-from soup_nlp.verdict import verdict
 
 K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.data.flow import dis_flow
+from soup_nlp.data.flow.sources import dis_flow
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics

@@ -9,12 +9,12 @@ import pytest
 
 from soup_nlp.bench.accuracy import Job
 from soup_nlp.bench.analyses_views import VIEWS, measure_view
+from soup_nlp.bench.pair_views import cropped, mirrored
 from soup_nlp.bench.suites import Options, list_suite
-from soup_nlp.data.flow_check import leaves
-from soup_nlp.data.formats_flow import write_flo
+from soup_nlp.data.flow.consistency import leaves
+from soup_nlp.data.formats.flow_files import write_flo
 from soup_nlp.data.pair import Flow, Pair, Truth
-from soup_nlp.data.pair_views import cropped, mirrored
-from soup_nlp.data.scenes import render_scene
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import pixel_grid, project, rays
 

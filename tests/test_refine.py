@@ -15,10 +15,12 @@ from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.model import plain
-from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
+from soup_nlp.model import oracle as plain
+from soup_nlp.model.energy_data import EnergyData, build_energy_data
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.reweighting import in_pixels
+from soup_nlp.refine.anchored import Local, fit_motion, neighbours
 from soup_nlp.refine.costs import Particles, anchor_depth
-from soup_nlp.refine.local import Local, fit_motion, neighbours
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.particles import BORROWED, COMMON, KINDS, WALKS, Proposer
 from soup_nlp.refine.records import RefineOptions

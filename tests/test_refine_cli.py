@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import yaml
 
-from soup_nlp.cli import main
-from soup_nlp.config import make_problem
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import make_problem
 from soup_nlp.errors import ConfigError
-from soup_nlp.pipeline import run
+from soup_nlp.pipeline.run import run
 from soup_nlp.refine.particles import KINDS
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.report.check import check_folder
@@ -150,7 +150,7 @@ def test_a_polish_keeps_the_better_soup(tmp_path):
 
 def test_the_section_mirrors_its_record_and_is_strict():
     problem = make_problem({"input": {"kind": "motorcycle"}})
-    assert RefineOptions(**problem.refine.model_dump()) == RefineOptions()
+    assert problem.refine == RefineOptions()
     assert problem.refine.particles == 50
     for wrong in ("refine.particles=1", "refine.keep=2", "refine.round=3", "refine.rounds=-1"):
         with pytest.raises(ConfigError):

@@ -10,7 +10,7 @@ from helpers_model import Tiny, random_soup, weights_for
 
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model import plain
+from soup_nlp.model import oracle as plain
 from soup_nlp.refine.costs import PairCosts, Particles, anchor_depth, feasible, unary_costs
 from soup_nlp.refine.mppbp import length_slope
 from soup_nlp.refine.select import conditional_costs, diverse, upright, within_reach

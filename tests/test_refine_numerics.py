@@ -11,11 +11,11 @@ from test_refine import FEW, Planar
 
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model import plain
+from soup_nlp.model import oracle as plain
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.refine import mppbp
+from soup_nlp.refine.anchored import Local, fit_motion, neighbours
 from soup_nlp.refine.costs import PairCosts, Particles
-from soup_nlp.refine.local import Local, fit_motion, neighbours
 from soup_nlp.refine.mppbp import SHARES, refine_soup
 from soup_nlp.refine.particles import KINDS, Proposer
 from soup_nlp.refine.records import RefineOptions

@@ -8,10 +8,10 @@ import pytest
 from scipy import ndimage
 
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.raycast import Body, Part, Scene, inverse, render
-from soup_nlp.data.scenes import SCENES, render_scene
-from soup_nlp.data.shapes import Box, Plane, Sheet, Sphere
-from soup_nlp.data.texture import Panels, Texture, fractal_noise, pulse_coverage, value_noise
+from soup_nlp.data.scenes.catalogue import SCENES, render_scene
+from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
+from soup_nlp.data.scenes.shapes import Box, Plane, Sheet, Sphere
+from soup_nlp.data.scenes.texture import Panels, Texture, fractal_noise, pulse_coverage, value_noise
 from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera, rotation
 

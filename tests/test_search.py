@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.solve import search as search_module
+from soup_nlp.solve import line_search as search_module
 from soup_nlp.solve.descent import Descent
-from soup_nlp.solve.search import LEAST_SLACK, Point, Search, along, evaluate, led_back
-from soup_nlp.solve.tangent import TangentProblem
+from soup_nlp.solve.line_search import LEAST_SLACK, Point, Search, along, evaluate, led_back
+from soup_nlp.solve.tangent_problem import TangentProblem
 
 GRAZING = 1e-8
 """Slack of the bound along which the steps of these tests lead."""

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import ndimage
 
-from soup_nlp.data.scenes import render_scene
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import segment, split_components

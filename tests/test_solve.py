@@ -18,19 +18,23 @@ from helpers_model import (
     with_true_flow,
 )
 
-from soup_nlp.data.scenes import render_scene
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import SolverError
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.model import plain
-from soup_nlp.model.energy import EnergyData, Weights, build_energy_data, in_pixels
-from soup_nlp.model.formulation import Formulation, build_matrix_nlp
+from soup_nlp.model import oracle as plain
+from soup_nlp.model.energy_data import EnergyData, build_energy_data
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS
+from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.solve.ipopt import Ipopt, Progress
 from soup_nlp.solve.kkt import constraint_residuals, optimality
-from soup_nlp.solve.soup import Solution, SolverOptions, solve_soup
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.propose import propose
 
 WEIGHTS = Weights(

@@ -11,8 +11,8 @@ from helpers_formulation import FORMS, TERMS, UNITS, WORLDS, form, tiny, world
 from helpers_model import GAUGES, PAPER, gradient, value, weights_for
 
 from soup_nlp.geometry import rotation
-from soup_nlp.model import plain
-from soup_nlp.model.formulation import build_matrix_nlp
+from soup_nlp.model import oracle as plain
+from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 
 # --- solver forms and the exact energy -----------------------------------------------------------

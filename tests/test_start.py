@@ -16,13 +16,14 @@ from helpers_model import (
 )
 
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.data.raycast import Scene, render
+from soup_nlp.data.scenes.raycast import Scene, render
 from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.solve.kkt import constraint_residuals
-from soup_nlp.start.propose import Start, StartOptions, propose
+from soup_nlp.start.propose import Start, propose
+from soup_nlp.start.start_options import SeededStart
 
 WIDTH, HEIGHT = 192, 144
 K = camera.intrinsics(180.0, 180.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -195,8 +196,8 @@ def test_the_start_is_a_function_of_its_seed():
     pair, seg, _ = cut(corner_scene(CAMERA, motion((0, 3, 0), (-0.15, 0.02, 0.1))))
     noise = np.random.default_rng(99).normal(0, 0.3, pair.flow.uv.shape)
     flow = replace(pair.flow, uv=pair.flow.uv + noise)
-    one, two = (propose(seg, flow, K, K, StartOptions(seed=3)) for _ in range(2))
-    other = propose(seg, flow, K, K, StartOptions(seed=4))
+    one, two = (propose(seg, flow, K, K, SeededStart(seed=3)) for _ in range(2))
+    other = propose(seg, flow, K, K, SeededStart(seed=4))
     for f in fields(one.soup):
         np.testing.assert_array_equal(getattr(one.soup, f.name), getattr(two.soup, f.name))
     np.testing.assert_array_equal(one.motion, two.motion)

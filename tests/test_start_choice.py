@@ -14,15 +14,16 @@ from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.start import choice as choosing
-from soup_nlp.start import gather as gathering
+from soup_nlp.start import merge as gathering
 from soup_nlp.start import propose as proposing
-from soup_nlp.start.bodies import borrow, contact_scales, depth_from_inside
 from soup_nlp.start.choice import Choice, of_neighbourhoods, of_pieces, select
+from soup_nlp.start.components import borrow, contact_scales, depth_from_inside
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.planes import PlaneFit
-from soup_nlp.start.propose import StartOptions, propose
+from soup_nlp.start.plane_fit import PlaneFit
+from soup_nlp.start.propose import propose
+from soup_nlp.start.start_options import SeededStart
 
-OPTIONS = StartOptions()
+OPTIONS = SeededStart()
 PER_RADIAN = 10.0
 """Pixels of error by which a motion misses, per radian of its turn."""
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from soup_nlp.errors import DataError
-from soup_nlp.report.atomic import atomic_path
-from soup_nlp.report.store import (
+from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.storage.store import (
     Array,
     plain,
     read_attrs,
@@ -165,7 +165,7 @@ def test_h5_failure_half_way_leaves_the_old_file(tmp_path, monkeypatch):
     def fail(*args, **kwargs):
         raise OSError("disk is full")
 
-    monkeypatch.setattr("soup_nlp.report.store._write_dataset", fail)
+    monkeypatch.setattr("soup_nlp.storage.store._write_dataset", fail)
     with pytest.raises(DataError, match="disk is full"):
         write_h5(path, tree(), {})
     assert path.read_bytes() == b"old"

@@ -10,19 +10,20 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from soup_nlp.cases import Case, prepare
-from soup_nlp.config import make_problem
+from soup_nlp.config.problem import make_problem
 from soup_nlp.model import compile as compiling
 from soup_nlp.model.assemble import Entries, Pattern
-from soup_nlp.model.formulation import Formulation, build_matrix_nlp
+from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.lanes import LANES, NoLanesError, compile_lanes, in_lanes
 from soup_nlp.model.layout import Chart
+from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP, assemble
 from soup_nlp.model.sums import FunctionSums, LaneSums, make_sums
+from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.solve.hessian import LagrangianHessian
 from soup_nlp.solve.ipopt import Ipopt
-from soup_nlp.solve.tangent import TangentProblem
+from soup_nlp.solve.tangent_problem import TangentProblem
 
 needs_compiler = pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
 

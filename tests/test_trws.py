@@ -19,8 +19,8 @@ from helpers_trws import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from soup_nlp.mrf.order import colour_order, node_levels, plan_levels
 from soup_nlp.mrf.trws import mrf_energy, solve_trws
-from soup_nlp.mrf.trws_order import colour_order, node_levels, plan_levels
 
 # --- the original, node by node ---------------------------------------------------------------
 
@@ -46,7 +46,7 @@ def test_equals_plain_loops(seed, order):
 
 
 def test_equals_plain_loops_on_a_grid_with_many_tables_a_block(monkeypatch):
-    monkeypatch.setattr("soup_nlp.mrf.trws_order._CACHE_BYTES", 3 * 7 * 7 * 8)
+    monkeypatch.setattr("soup_nlp.mrf.order._CACHE_BYTES", 3 * 7 * 7 * 8)
     rng = np.random.default_rng(3)
     index = np.arange(48).reshape(6, 8)
     edges = np.concatenate(

@@ -18,7 +18,7 @@ from soup_nlp.mrf.trws import mrf_energy, solve_trws
 
 def test_functions_lists_and_arrays_agree(monkeypatch):
     monkeypatch.setattr("soup_nlp.mrf.trws.CALL_BYTES", 5 * 4 * 4 * 8)
-    monkeypatch.setattr("soup_nlp.mrf.trws_order.CALL_BYTES", 5 * 4 * 4 * 8)
+    monkeypatch.setattr("soup_nlp.mrf.order.CALL_BYTES", 5 * 4 * 4 * 8)
     rng = np.random.default_rng(7)
     unary, edges, tables = dense(rng, 12, 30, 4)
     asked: list[int] = []

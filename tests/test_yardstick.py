@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from soup_nlp.cases import Case, prepare
-from soup_nlp.config import make_problem
-from soup_nlp.model import plain
-from soup_nlp.model.energy import Weights
+from soup_nlp.bench.yardstick import Yardstick, lbfgs, levenberg_marquardt
+from soup_nlp.config.problem import make_problem
+from soup_nlp.model import oracle as plain
+from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.solve import factor, yardstick
 from soup_nlp.solve.kkt import constraint_residuals
-from soup_nlp.solve.soup import SolverOptions, solve_soup
-from soup_nlp.solve.yardstick import Yardstick, lbfgs, levenberg_marquardt
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.stages import solve_soup
 
 SCHEDULE = (0.1, 0.03)
 # so small a problem is solved before its kernels are compiled

@@ -19,17 +19,16 @@ import soup_nlp
 from soup_nlp.bench.rivals import depth_maps, true_depth
 from soup_nlp.bench.suites import SUITES, Item
 from soup_nlp.bench.truth import true_soup
-from soup_nlp.config import Problem, dump_problem
-from soup_nlp.data.flow import is_named, is_network
+from soup_nlp.config.problem import Problem, dump_problem
+from soup_nlp.data.flow.sources import is_named, is_network
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
-from soup_nlp.inputs import load_flow_of, load_pair
-from soup_nlp.model import plain
-from soup_nlp.pipeline import Run, run
+from soup_nlp.evaluate.metrics import sample_at_points, skill
+from soup_nlp.evaluate.protocols import Preset, preset
+from soup_nlp.evaluate.scene_flow import scene_flow_epe
+from soup_nlp.model import oracle as plain
+from soup_nlp.pipeline.run import Run, run
 from soup_nlp.report.folder import prepare_folder, write_folder
-from soup_nlp.report.metrics import sample_at_points, skill
-from soup_nlp.report.protocols import Preset, preset
-from soup_nlp.report.scene_flow import scene_flow_epe
 
 Float = NDArray[np.float64]
 Row = dict[str, Any]
@@ -105,13 +104,13 @@ def measure(job: Job, change: Callable[[Pair], Pair] | None = None) -> Row:
     begin, cpu = time.perf_counter(), time.process_time()
     try:
         problem = job.item.problem(job.overrides)
-        pair = load_pair(problem)
+        pair = problem.load_pair()
         loaded = time.perf_counter() - begin
         if change is not None:
             source = problem.flow.source
             if not (is_named(source) or is_network(source)):
                 # a file fits the pair as it is
-                pair = pair.with_flow(load_flow_of(problem, pair))
+                pair = pair.with_flow(problem.flow.load(pair, problem.path))
             pair = change(pair)
         # a dataset without its truth would be solved for nothing, and again every time
         if not any(_applies(pair.truth, preset(name)) for name in job.item.presets):

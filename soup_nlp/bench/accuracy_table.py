@@ -11,7 +11,7 @@ import numpy as np
 from soup_nlp.bench.accuracy import Row
 from soup_nlp.bench.published import PROTOCOL, SOURCE, data_note, published
 from soup_nlp.bench.rivals import METHODS, RIVALS
-from soup_nlp.report.protocols import preset
+from soup_nlp.evaluate.protocols import preset
 
 Number = float | None
 

@@ -12,15 +12,14 @@ import numpy as np
 
 from soup_nlp.bench.accuracy import Job, Row, clean, flow_error, head
 from soup_nlp.bench.truth import rescaled, true_soup
-from soup_nlp.cases import solver_options
+from soup_nlp.evaluate.protocols import preset
 from soup_nlp.geometry.soup import Soup, reconstruct
-from soup_nlp.model import plain
+from soup_nlp.model import oracle as plain
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.pipeline import Run, run
+from soup_nlp.pipeline.case import solver_options
+from soup_nlp.pipeline.run import Run, run
 from soup_nlp.refine.mppbp import refine_soup
-from soup_nlp.refine.records import RefineOptions
-from soup_nlp.report.protocols import preset
-from soup_nlp.solve.soup import solve_soup
+from soup_nlp.solve.stages import solve_soup
 
 WORSE = 0.01
 """Median relative error that solving from the truth may add."""
@@ -81,11 +80,11 @@ def energies(result: Run, convention: str = "paper") -> Row:
 def from_soup(result: Run, soup: Soup) -> dict[str, Soup]:
     """What the NLP, and then the refinement where it is on, make of another start."""
     problem = result.problem
-    form = Formulation(**problem.formulation.model_dump())
+    form = Formulation(**dict(problem.formulation))
     options = solver_options(problem, result.start)
     solved = solve_soup(soup, result.data, result.weights, form, options)
     out = {"NLP from truth": solved.soup}
-    refine = RefineOptions(**problem.refine.model_dump())
+    refine = problem.refine
     if refine.enabled:
         refined = refine_soup(
             solved.soup,

@@ -15,10 +15,9 @@ from matplotlib.figure import Figure
 
 from soup_nlp.bench.accuracy import Job, Row, clean, flow_error, head
 from soup_nlp.bench.accuracy_table import mean, pair_names, reason, show, table
-from soup_nlp.cases import superpixels
-from soup_nlp.data.flow_robust import reweighted
+from soup_nlp.data.flow.robust import reweighted
 from soup_nlp.errors import DataError
-from soup_nlp.inputs import load_flow_of, load_pair
+from soup_nlp.pipeline.case import superpixels
 
 COLUMNS = {
     "mean": "mean",
@@ -35,8 +34,8 @@ def measure_flow(job: Job) -> Row:
     begin, cpu = time.perf_counter(), time.process_time()
     try:
         problem = job.item.problem(job.overrides)
-        pair = load_pair(problem)
-        flow = load_flow_of(problem, pair)
+        pair = problem.load_pair()
+        flow = problem.flow.load(pair, problem.path)
         if problem.flow.reweight_px is not None:
             labels = superpixels(problem, pair.with_flow(flow))
             flow = reweighted(flow, labels, problem.flow.reweight_px)

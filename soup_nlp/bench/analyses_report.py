@@ -17,8 +17,8 @@ from soup_nlp.bench.accuracy import Row
 from soup_nlp.bench.accuracy_table import get, mean, pair_names, reason, show, table
 from soup_nlp.bench.analyses_energy import ABOVE, WORSE
 from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC, SOURCE
-from soup_nlp.model.energy import TERMS
-from soup_nlp.report.protocols import preset
+from soup_nlp.evaluate.protocols import preset
+from soup_nlp.model.energy_data import TERMS
 
 COLOURS = {"arap": "#4477aa", "proj": "#66ccee", "cont": "#228833", "orient": "#ccbb44"}
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from soup_nlp.bench.accuracy import Job, Row, measure
+from soup_nlp.bench.pair_views import cropped, mirrored
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.pair_views import cropped, mirrored
 
 VIEWS: Mapping[str, Callable[[Pair], Pair] | None] = MappingProxyType(
     {

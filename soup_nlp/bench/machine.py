@@ -8,7 +8,7 @@ import platform
 from functools import cache
 from pathlib import Path
 
-from soup_nlp.report.store import versions
+from soup_nlp.storage.store import versions
 
 PACKAGE = Path(__file__).resolve().parents[1]
 

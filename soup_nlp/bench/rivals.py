@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.bench.planes import fit_planes, plane_depth, points_as_map
+from soup_nlp.bench.piecewise_planar import fit_planes, plane_depth, points_as_map
+from soup_nlp.evaluate.baselines import constant_depth, fill_nearest
 from soup_nlp.geometry.soup import Soup, reconstruct
-from soup_nlp.report.baselines import constant_depth, fill_nearest
 
 if TYPE_CHECKING:
-    from soup_nlp.pipeline import Run
+    from soup_nlp.pipeline.run import Run
 
 Float = NDArray[np.float64]
 

@@ -113,7 +113,7 @@ def run_alone(spec: Spec, seconds: float = 7200.0) -> Record:
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "spec.json", Path(folder) / "record.json"
         source.write_text(json.dumps(asdict(spec)), encoding="utf-8")
-        command = [sys.executable, "-m", "soup_nlp.timed", str(source), str(target)]
+        command = [sys.executable, "-m", "soup_nlp.bench.timed", str(source), str(target)]
         env = {**os.environ, **dict.fromkeys(THREADS, "1")}
         try:
             done = subprocess.run(

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from soup_nlp.bench.speed_fit import fit, outside
-from soup_nlp.report.atomic import atomic_path
+from soup_nlp.storage.atomic import atomic_path
 
 Record = Mapping[str, Any]
 PARTS = (

@@ -8,8 +8,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from soup_nlp.config import Problem, make_problem
-from soup_nlp.data.datasets_sintel import DEFAULT_SCENE
+from soup_nlp.config.problem import Problem, make_problem
+from soup_nlp.data.datasets.sintel import DEFAULT_SCENE
 
 RENDERED = ("street", "room", "sheet", "orbit", "still")
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.bench.planes import fit_planes
+from soup_nlp.bench.piecewise_planar import fit_planes
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import pixel_grid, rays

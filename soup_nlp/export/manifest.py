@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from soup_nlp.errors import ExportError
-from soup_nlp.export.formats import FUNCTIONS
+from soup_nlp.export.bundles import FUNCTIONS
 from soup_nlp.model.layout import GAUGES
 
 STUB = "soup"

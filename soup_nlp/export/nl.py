@@ -18,18 +18,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.export.checks import (
+from soup_nlp.export.program import Body, orders, take_apart
+from soup_nlp.export.segments import bounds, linear, start
+from soup_nlp.export.validate import (
     plain_problem,
     require_bounds,
     require_finite,
     require_names,
     vector,
 )
-from soup_nlp.export.program import Body, orders, take_apart
-from soup_nlp.export.segments import bounds, linear, start
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP
-from soup_nlp.report.atomic import atomic_path
+from soup_nlp.storage.atomic import atomic_path
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.errors import ExportError
 from soup_nlp.export.opcodes import number
-from soup_nlp.report.atomic import atomic_path
+from soup_nlp.storage.atomic import atomic_path
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.model.elements import Element
+from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP, assemble
 from soup_nlp.model.norms import solver_form
-from soup_nlp.model.options import Formulation
-from soup_nlp.model.views import View
+from soup_nlp.model.superpixel import View
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

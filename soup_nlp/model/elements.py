@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.model import terms
-from soup_nlp.model.energy import EnergyData, Weights
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.norms import Norm
-from soup_nlp.model.views import View
+from soup_nlp.model.superpixel import View
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -1,9 +1,47 @@
-"""The soup's nonlinear programs: the constrained one (the product) and the tangent presolve."""
+"""How the energy is written for a solver: gauge, norm, truncation, Hessian, smoothing."""
 
 from __future__ import annotations
 
-from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.options import Formulation
-from soup_nlp.model.tangent import build_tangent_nlp
+from typing import Annotated, Literal
 
-__all__ = ["Formulation", "build_matrix_nlp", "build_tangent_nlp"]
+from pydantic import Field
+
+from soup_nlp.model.layout import Gauge
+from soup_nlp.model.norms import NormForm, TruncationForm
+from soup_nlp.schema.section import NonNegative, Section, Share
+
+Hessian = Literal["exact", "gauss-newton", "gauss-newton+constraints"]
+
+
+class FormulationOptions(Section):
+    """How the energy is written for a solver."""
+
+    gauge: Gauge = "unit-offset"
+    """unit-offset, unit-translation or free."""
+    norm: NormForm = "smooth"
+    """smooth (sqrt(|v|^2 + eps^2) - eps) or epigraph (slack s in the objective as s - eps,
+    |v|^2 + eps^2 <= s^2): one minimum; with eps = 0 the latter is the exact norm, but has no
+    independent gradients where a norm is 0."""
+    truncation: TruncationForm = "smooth"
+    """smooth or lifted (z in [0, 1], exact)."""
+    hessian: Hessian = "exact"
+    """exact, gauss-newton or gauss-newton+constraints."""
+    theta: Share = 0.9
+    """Share of curvature along a residual that the Gauss-Newton Hessian leaves out."""
+    ridge: NonNegative = 1e-2
+    """Added to the Gauss-Newton Hessian's diagonal."""
+    min_facing: Annotated[float, Field(ge=0, le=0.5)] = 1e-3
+    """Visibility: lower bound c of -n . r."""
+    depth_ratio: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 5.0
+    """Depth at a rim pixel is at most this many times the anchor's."""
+    compiled: bool = True
+    """Compile kernels where a C compiler is found."""
+
+
+class Formulation(FormulationOptions):
+    """A formulation with its smoothing, which belongs to the stage of the solver."""
+
+    eps: NonNegative = 1e-2
+    """Smoothing of lengths and rotations, in the energy's unit (pixels by default)."""
+    eps_pixel: NonNegative = 1e-2
+    """Smoothing of re-projection errors, pixels."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy import EnergyData
+from soup_nlp.model.energy_data import EnergyData
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -11,11 +11,12 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import terms
 from soup_nlp.model.builder import Builder
 from soup_nlp.model.elements import elements
-from soup_nlp.model.energy import EnergyData, Weights
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import GAUGES, MatrixLayout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.options import Formulation
-from soup_nlp.model.views import View, matrix_view
+from soup_nlp.model.superpixel import View, matrix_view
 
 Float = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import casadi as ca
 
 from soup_nlp.model.norms import Norm
-from soup_nlp.model.views import View
+from soup_nlp.model.superpixel import View
 
 Row = Mapping[str, ca.SX]
 

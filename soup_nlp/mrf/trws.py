@@ -14,7 +14,7 @@ author's TRW_S-v1.3 with general tables, so that the bound of every iteration is
   label in a tie.
 
 An edge stores one message, the one that the last pass over it wrote. Nodes that the order does
-not separate run as one batch (:mod:`soup_nlp.mrf.trws_order`), which changes nothing but the
+not separate run as one batch (:mod:`soup_nlp.mrf.order`), which changes nothing but the
 order of floating-point sums.
 """
 
@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from soup_nlp.mrf.trws_order import (
+from soup_nlp.mrf.order import (
     CALL_BYTES,
     Level,
     Side,

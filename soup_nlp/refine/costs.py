@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy import EnergyData, Weights
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -24,11 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model import plain
-from soup_nlp.model.energy import EnergyData, Weights
+from soup_nlp.model import oracle as plain
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
 from soup_nlp.mrf.trws import TRWSResult, solve_trws
+from soup_nlp.refine.anchored import neighbours
 from soup_nlp.refine.costs import PairCosts, Particles, feasible, unary_costs
-from soup_nlp.refine.local import neighbours
 from soup_nlp.refine.particles import COMMON, KINDS, WALKS, Proposals, Proposer
 from soup_nlp.refine.records import Refined, RefineOptions, Round
 from soup_nlp.refine.select import conditional_costs, diverse, upright, within_reach

@@ -4,42 +4,42 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
+
+from pydantic import Field
 
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.schema.section import Count, NonNegative, Section, Tolerance, Whole
 
 
-@dataclass(frozen=True)
-class RefineOptions:
-    """Discrete refinement after the NLP.
-
-    Attributes:
-        enabled: Refine at all.
-        from_start: Refine the start: the NLP is skipped.
-        rounds: Most rounds of particles.
-        particles: Labels of every superpixel, the current belief among them.
-        keep: Share of the particles that stays for the next round.
-        depth_reach: A new depth is at most this many times the upper quartile of the neighbours'
-            depths, and at least their lower quartile over this squared.
-        trws_iterations: Most iterations of TRW-S in a round.
-        trws_gap: TRW-S stops at this relative gap.
-        stagnation: End when two rounds in a row lower E by less than this share; 0 never.
-        max_seconds: Time limit of the rounds together.
-        float32: Tables in single precision: half the memory; the bound is exact to that rounding.
-        polish: Solve the NLP again from the refined soup and keep the better.
-    """
+class RefineOptions(Section):
+    """Discrete refinement after the NLP."""
 
     enabled: bool = True
+    """Refine at all."""
     from_start: bool = False
-    rounds: int = 10
-    particles: int = 50
-    keep: float = 0.25
-    depth_reach: float = 2.0
-    trws_iterations: int = 15
-    trws_gap: float = 1e-4
-    stagnation: float = 1e-3
-    max_seconds: float = 300.0
+    """Refine the start: the NLP is skipped."""
+    rounds: Count = 10
+    """Most rounds of particles."""
+    particles: Annotated[int, Field(ge=2)] = 50
+    """Labels of every superpixel, the current belief among them."""
+    keep: Annotated[float, Field(ge=0, le=0.9)] = 0.25
+    """Share of the particles that stays for the next round."""
+    depth_reach: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 2.0
+    """A new depth is at most this many times the upper quartile of the neighbours' depths, and
+    at least their lower quartile over this squared."""
+    trws_iterations: Whole = 15
+    """Most iterations of TRW-S in a round."""
+    trws_gap: NonNegative = 1e-4
+    """TRW-S stops at this relative gap."""
+    stagnation: NonNegative = 1e-3
+    """End when two rounds in a row lower E by less than this share; 0 never."""
+    max_seconds: Tolerance = 300.0
+    """Time limit of the rounds together."""
     float32: bool = False
+    """Tables in single precision: half the memory; the bound is exact to that rounding."""
     polish: bool = False
+    """Solve the NLP again from the refined soup and keep the better."""
 
 
 @dataclass(frozen=True)

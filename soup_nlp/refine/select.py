@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy import EnergyData
+from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.refine.costs import Particles, anchor_depth
 
 Float = NDArray[np.float64]

@@ -13,7 +13,7 @@ import yaml
 
 from soup_nlp.errors import DataError
 from soup_nlp.report import recompute
-from soup_nlp.report.store import read_attrs, read_h5, require
+from soup_nlp.storage.store import read_attrs, read_h5, require
 
 LIMITS = {
     "so3": 1e-8,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
-from soup_nlp.report.atomic import PathLike, atomic_path
+from soup_nlp.evaluate.metrics import depth_metrics, sample_at_points
 from soup_nlp.report.colour import (
     Image,
     as_map,
@@ -24,7 +24,7 @@ from soup_nlp.report.colour import (
     depth_range,
     draw_superpixels,
 )
-from soup_nlp.report.metrics import depth_metrics, sample_at_points
+from soup_nlp.storage.atomic import PathLike, atomic_path
 
 Float = NDArray[np.floating]
 Bar = tuple[Image, str, str]

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from soup_nlp.data.datasets_layout import MARK, is_result
+from soup_nlp.data.datasets.layout import MARK, is_result
 from soup_nlp.errors import DataError
-from soup_nlp.report.atomic import atomic_path
+from soup_nlp.evaluate.metrics import skill
 from soup_nlp.report.colour import (
     colourise_depth,
     colourise_error,
@@ -20,14 +20,14 @@ from soup_nlp.report.colour import (
     draw_superpixels,
 )
 from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_png
-from soup_nlp.report.metrics import skill
 from soup_nlp.report.pointcloud import write_ply
-from soup_nlp.report.store import versions, write_h5, write_json
 from soup_nlp.report.tree import attributes, result_tree
 from soup_nlp.solve.kkt import constraint_residuals
+from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.storage.store import versions, write_h5, write_json
 
 if TYPE_CHECKING:
-    from soup_nlp.pipeline import Run
+    from soup_nlp.pipeline.run import Run
 
 FILES = (
     "config.yaml",

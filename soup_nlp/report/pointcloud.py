@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from soup_nlp.data.pair import check_intrinsics
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
-from soup_nlp.report.atomic import PathLike, atomic_path
+from soup_nlp.storage.atomic import PathLike, atomic_path
 
 Float32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]

@@ -1,6 +1,6 @@
 """Energy, constraints, depth and scores from stored arrays, written once more from the equations.
 
-Nothing of `soup_nlp.model`, `soup_nlp.solve` or `soup_nlp.report.metrics` is used, so that a
+Nothing of `soup_nlp.model`, `soup_nlp.solve` or `soup_nlp.evaluate.metrics` is used, so that a
 mistake there cannot confirm itself.
 """
 

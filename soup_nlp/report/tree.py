@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.report.store import Array, Tree
 from soup_nlp.solve.ipopt import Stage
+from soup_nlp.storage.store import Array, Tree
 
 if TYPE_CHECKING:
-    from soup_nlp.pipeline import Run
+    from soup_nlp.pipeline.run import Run
 
 # name: unit, shape, sentence
 _ENERGY: Mapping[str, tuple[str, str, str]] = {

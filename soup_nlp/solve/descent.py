@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.solve.factor import Back, Factorise, diagonal_places, factorisation, same_pattern
 from soup_nlp.solve.ipopt import Listener, Progress, Stage
-from soup_nlp.solve.phase import Phase, Reached
-from soup_nlp.solve.search import (
+from soup_nlp.solve.line_search import (
     TO_BOUNDARY,
     Move,
     Point,
@@ -44,7 +43,8 @@ from soup_nlp.solve.search import (
     merit_gradient,
     reach,
 )
-from soup_nlp.solve.tangent import HessianKind, TangentProblem
+from soup_nlp.solve.phase import Phase, Reached
+from soup_nlp.solve.tangent_problem import HessianKind, TangentProblem
 
 Float = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy import EnergyData
+from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.nlp import NLP, to_scipy
 from soup_nlp.solve.ipopt import Stage
 

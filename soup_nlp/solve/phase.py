@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.solve.search import Point
-from soup_nlp.solve.tangent import HessianKind
+from soup_nlp.solve.line_search import Point
+from soup_nlp.solve.tangent_problem import HessianKind
 
 Float = NDArray[np.float64]
 

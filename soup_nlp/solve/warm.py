@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy import EnergyData
+from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.nlp import NLP, to_scipy
 
 Float = NDArray[np.float64]

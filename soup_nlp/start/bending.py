@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bodies import joined
-from soup_nlp.start.planes import Views
+from soup_nlp.start.components import joined
+from soup_nlp.start.plane_fit import Views
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.mrf.trws import solve_trws
-from soup_nlp.start.bodies import components
+from soup_nlp.start.components import components
 from soup_nlp.start.epipolar import Motion, estimate, repeated
-from soup_nlp.start.local import fit_translation, neighbourhood, refine_motion
-from soup_nlp.start.options import StartOptions
-from soup_nlp.start.planes import PlaneFit, Views
+from soup_nlp.start.neighbourhoods import fit_translation, neighbourhood, refine_motion
+from soup_nlp.start.plane_fit import PlaneFit, Views
+from soup_nlp.start.start_options import SeededStart
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -24,12 +24,12 @@ CLIP = 3.0
 """Errors count at most this many pixels where motions are compared."""
 
 
-def least_gain(noise: float, o: StartOptions) -> float:
+def least_gain(noise: float, o: SeededStart) -> float:
     """Pixels of error that another motion has to be better by, given the noise of the flow."""
     return max(2 * noise, o.unexplained_px)
 
 
-def dominant(views: Views, o: StartOptions) -> list[Motion]:
+def dominant(views: Views, o: SeededStart) -> list[Motion]:
     """Motions that many pixels share, the commonest first; at least one.
 
     Args:
@@ -71,7 +71,7 @@ def of_pieces(
     motions: list[Motion],
     cost: Float,
     noise: float,
-    o: StartOptions,
+    o: SeededStart,
 ) -> list[Motion]:
     """Motions of the connected pieces that the motions so far do not explain.
 
@@ -106,7 +106,7 @@ def of_pieces(
     return out
 
 
-def select(cost: Float, noise: float, o: StartOptions) -> list[int]:
+def select(cost: Float, noise: float, o: SeededStart) -> list[int]:
     """Fewest motions that explain the flow: greedy, each must gain on enough superpixels.
 
     Args:
@@ -157,7 +157,7 @@ def smooth_choice(cost: Float, near: Float, seg: Segmentation, price: float) -> 
     return solve_trws(cost, seg.pairs, tables, max_iter=50).labels
 
 
-def hanging_together(jump: Float, o: StartOptions) -> Float:
+def hanging_together(jump: Float, o: SeededStart) -> Float:
     """(P,) how much two neighbours belong together, from 1 where their flow does not jump to 0.
 
     Args:
@@ -219,7 +219,7 @@ class Choice:
 
 
 def of_neighbourhoods(
-    views: Views, seg: Segmentation, choice: Choice, noise: float, o: StartOptions
+    views: Views, seg: Segmentation, choice: Choice, noise: float, o: SeededStart
 ) -> Choice:
     """Motions of every superpixel's own neighbourhood and of its neighbours', where they pay.
 

@@ -12,9 +12,8 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy import sample_pixels
+from soup_nlp.model.energy_data import sample_pixels
 from soup_nlp.start.bending import bending_share, constant_depth, flow_jump, surfaces
-from soup_nlp.start.bodies import bodies, borrow, contact_scales, joined
 from soup_nlp.start.choice import (
     Choice,
     dominant,
@@ -25,12 +24,13 @@ from soup_nlp.start.choice import (
     select,
     smooth_choice,
 )
+from soup_nlp.start.components import bodies, borrow, contact_scales, joined
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.gather import gather
-from soup_nlp.start.options import StartOptions
-from soup_nlp.start.planes import Views
+from soup_nlp.start.merge import gather
+from soup_nlp.start.plane_fit import Views
+from soup_nlp.start.start_options import SeededStart
 
-__all__ = ["Start", "StartOptions", "propose"]
+__all__ = ["SeededStart", "Start", "propose"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -75,7 +75,7 @@ class Start:
 
 
 def propose(
-    seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, options: StartOptions | None = None
+    seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, options: SeededStart | None = None
 ) -> Start:
     """Rotation, translation, plane and scale of every superpixel from its flow.
 
@@ -84,12 +84,12 @@ def propose(
         flow: Flow with confidence.
         K_ref: (3, 3) intrinsics of the reference frame.
         K_next: (3, 3) intrinsics of the next frame.
-        options: See StartOptions.
+        options: See SeededStart.
 
     Raises:
         DataError: fewer than 8 pixels have a usable flow.
     """
-    o = options or StartOptions()
+    o = options or SeededStart()
     views, poor = look(seg, flow, K_ref, K_next, o)
     motions = dominant(views, o)
     fit = views.fit(motions)
@@ -145,7 +145,7 @@ def propose(
 
 
 def look(
-    seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: StartOptions
+    seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: SeededStart
 ) -> tuple[Views, NDArray[np.bool_]]:
     """Rays and targets of sampled pixels, and (N,) which superpixels took a neighbour's.
 

@@ -1,0 +1,125 @@
+"""The same pair seen otherwise, mirrored or cropped, with its truth: what luck has to do with it.
+
+Superpixels, flow and choices come out differently on pixels that are the same but for their order
+and their margin, so a figure that holds on all of them is worth more than one on a single pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.flow.consistency import leaves
+from soup_nlp.data.pair import Pair
+from soup_nlp.errors import DataError
+
+Float = NDArray[np.float64]
+
+IMAGES = ("depth_ref", "depth_next", "flow", "occluded", "bodies", "scene_flow")
+"""Parts of a truth that have a value for every pixel."""
+_FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
+
+
+def mirrored(pair: Pair) -> Pair:
+    """The pair as a mirror beside the camera shows it: columns run backwards, x points left.
+
+    Depths stay; intrinsics, flow, motions, points and scene flow are those of the mirrored world.
+    """
+    width, there = pair.image_ref.shape[1], pair.image_next.shape[1]
+
+    def turned(uv: NDArray[Any]) -> NDArray[Any]:
+        out = uv.copy()
+        out[..., 0] = (there - width) - out[..., 0]
+        return out
+
+    seen = _each_image(pair, lambda array: array[:, ::-1].copy())
+    flow, truth = seen.flow, seen.truth
+    if flow is not None:
+        known = flow.confidence[..., None] > 0
+        flow = replace(flow, uv=np.where(known, turned(flow.uv), np.float32(0.0)))
+    if truth is not None:
+        own: dict[str, Any] = {}
+        if truth.flow is not None:
+            own["flow"] = turned(truth.flow)
+        if truth.scene_flow is not None:
+            own["scene_flow"] = truth.scene_flow @ _FLIP[:3, :3]
+        if truth.points is not None:
+            own["points"] = truth.points * [-1, 1, 1] + [width - 1, 0, 0]
+        if truth.motions is not None:
+            own["motions"] = _FLIP @ truth.motions @ _FLIP
+        truth = replace(truth, **own)
+    K_ref, K_next = _mirrored_camera(pair.K_ref, width), _mirrored_camera(pair.K_next, there)
+    return replace(seen, K_ref=K_ref, K_next=K_next, flow=flow, truth=truth)
+
+
+def _mirrored_camera(K: Float, width: int) -> Float:
+    out = K.copy()
+    out[0, 1], out[0, 2] = -K[0, 1], width - 1 - K[0, 2]
+    return out
+
+
+def _each_image(pair: Pair, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Pair:
+    """The pair with all that it has for every pixel changed; cameras and the rest as they were."""
+    flow, truth = pair.flow, pair.truth
+    if flow is not None:
+        flow = replace(flow, uv=change(flow.uv), confidence=change(flow.confidence))
+    if truth is not None:
+        known = ((k, getattr(truth, k)) for k in IMAGES)
+        own: dict[str, Any] = {k: change(v) for k, v in known if v is not None}
+        truth = replace(truth, **own)
+    image_ref, image_next = change(pair.image_ref), change(pair.image_next)
+    return replace(pair, image_ref=image_ref, image_next=image_next, flow=flow, truth=truth)
+
+
+def cropped(pair: Pair, left: int, top: int, right: int = 0, bottom: int = 0) -> Pair:
+    """The pair without the margins of both images; depths, flow and motions are what they were.
+
+    Args:
+        pair: The pair.
+        left: Columns taken away on the left, and so on.
+        top: Rows.
+        right: Columns.
+        bottom: Rows.
+
+    Raises:
+        DataError: a margin is negative, or nothing would be left.
+    """
+    margins = (left, top, right, bottom)
+    if min(margins) < 0:
+        raise DataError(
+            "negative margin", where=pair.name, found=str(margins), expected="0 or more pixels"
+        )
+    for image in (pair.image_ref, pair.image_next):
+        if left + right >= image.shape[1] or top + bottom >= image.shape[0]:
+            raise DataError(
+                "margins are wider than the image",
+                where=pair.name,
+                found=f"{left} + {right} columns, {top} + {bottom} rows",
+                expected=f"less than {image.shape[1]} and {image.shape[0]}",
+            )
+
+    def cut(array: NDArray[Any]) -> NDArray[Any]:
+        rows, columns = array.shape[:2]
+        return array[top : rows - bottom, left : columns - right].copy()
+
+    corner = np.array([left, top, 0.0])
+    seen = _each_image(pair, cut)
+    truth = seen.truth
+    if truth is not None and truth.flow is not None and truth.occluded is not None:
+        # what moves into the margin is not seen there any more
+        known = np.isfinite(truth.flow).all(axis=2)
+        gone = known & leaves(truth.flow, seen.image_next.shape[:2])
+        truth = replace(truth, occluded=truth.occluded | gone)
+    if truth is not None and truth.points is not None:
+        # a point belongs to the pixel that it is nearest to
+        pixel = np.floor(truth.points[:, :2] + 0.5) - corner[:2]
+        inside = ((pixel >= 0) & (pixel < seen.size[::-1])).all(axis=1)
+        truth = replace(truth, points=truth.points[inside] - corner)
+    K_ref, K_next = pair.K_ref.copy(), pair.K_next.copy()
+    for K in (K_ref, K_next):
+        K[:2, 2] -= corner[:2]
+    return replace(seen, K_ref=K_ref, K_next=K_next, truth=truth)

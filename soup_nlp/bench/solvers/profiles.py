@@ -1,0 +1,171 @@
+"""Performance profiles (Dolan and More, 2002) and pictures of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from soup_nlp.storage.atomic import atomic_path
+
+Float = NDArray[np.float64]
+Row = Mapping[str, Any]
+
+SHORTEST = 0.01
+"""Seconds below which times are not told apart."""
+
+
+class Problem(NamedTuple):
+    """What makes a problem of the profile: NLP, start and limits."""
+
+    problem: str
+    superpixels: int
+    formulation: str
+    start: str
+    tol: float
+    seconds: float
+    iterations: int
+    memory: int
+    problem_hash: str
+
+
+def problem_key(row: Row) -> Problem:
+    """The problem that a row is of."""
+    limits = row["limits"]
+    return Problem(
+        str(row["problem"]),
+        int(row["superpixels"]),
+        str(row["formulation"]),
+        str(row["start"]),
+        float(limits["tol"]),
+        float(limits["seconds"]),
+        int(limits["iterations"]),
+        int(limits["memory"]),
+        str(row["problem_hash"]),
+    )
+
+
+def problem_names(rows: Sequence[Row]) -> dict[Problem, str]:
+    """A name of every problem; start, limits or hash are in it where others differ in them only."""
+    keys = sorted({problem_key(r) for r in rows})
+    out = {}
+    for key in keys:
+        alike = [k for k in keys if k[:3] == key[:3]]
+        words = {
+            "start": f"from the {key.start}",
+            "tol": f"tol {key.tol:g}",
+            "seconds": f"{key.seconds:g} s",
+            "iterations": f"{key.iterations} iterations",
+            "memory": f"{key.memory / 2**30:g} GiB",
+            "problem_hash": key.problem_hash,
+        }
+        told = [text for name, text in words.items() if len({getattr(k, name) for k in alike}) > 1]
+        out[key] = f"{key.problem} ({', '.join(told)})" if told else key.problem
+    return out
+
+
+def cost_table(rows: Sequence[Row], measure: str) -> tuple[list[Problem], list[str], Float]:
+    """Costs (problems, solvers) of the verified runs; infinite where there is none.
+
+    Args:
+        rows: Runs.
+        measure: "time" (seconds), or "energy" (1 + relative gap to the best verified energy).
+    """
+    problems = sorted({problem_key(r) for r in rows})
+    solvers = sorted({str(r["solver"]) for r in rows})
+    cost = np.full((len(problems), len(solvers)), np.inf)
+    for row in rows:
+        if row["verified"]:
+            place = problems.index(problem_key(row)), solvers.index(str(row["solver"]))
+            value = max(row["seconds"], SHORTEST) if measure == "time" else row["energy"]
+            cost[place] = min(cost[place], float(value))
+    return problems, solvers, cost
+
+
+def profile(cost: Float) -> tuple[Float, Float]:
+    """Ratios r >= 1 and the share of problems that each solver solves within r of the best.
+
+    Args:
+        cost: (problems, solvers), infinite for a failure.
+
+    Returns:
+        (k,) ratios in order, starting at 1, and (k, solvers) shares.
+    """
+    best = cost.min(axis=1, initial=np.inf)
+    with np.errstate(invalid="ignore"):
+        ratio = np.where(np.isfinite(cost), cost / best[:, None], np.inf)
+    steps = np.unique(np.append(1.0, ratio[np.isfinite(ratio)]))
+    share = (ratio[None] <= steps[:, None, None]).mean(axis=1) if len(cost) else np.zeros((1, 0))
+    return steps, np.asarray(share, float)
+
+
+def draw_profiles(path: Path, rows: Sequence[Row]) -> None:
+    """Picture of both profiles: time, and final exact energy."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    for k, measure in enumerate(("time", "energy")):
+        axes = figure.add_subplot(1, 2, k + 1)
+        problems, solvers, cost = cost_table(rows, measure)
+        steps, share = profile(cost)
+        x = steps if measure == "time" else steps - 1
+        last = x[-1] * 2 if x[-1] > 0 else 1e-3
+        for j, solver in enumerate(solvers):
+            if np.isfinite(cost[:, j]).any():
+                axes.step([*x, last], [*share[:, j], share[-1, j]], where="post", label=solver)
+        if measure == "time":
+            axes.set_xscale("log")
+            axes.set_xlabel("time / best time")
+        else:
+            axes.set_xscale("symlog", linthresh=1e-6)
+            axes.set_xlabel("relative gap of the exact energy to the best")
+        axes.set_ylim(-0.02, 1.05)
+        axes.set_ylabel(f"share of {len(problems)} problems")
+        axes.grid(alpha=0.3)
+        _legend(axes, fontsize=7, loc="lower right")
+    _save(path, figure)
+
+
+def draw_curves(path: Path, rows: Sequence[Row]) -> None:
+    """Picture of exact energy against time, a panel a problem; a dot where a run ended."""
+    names = problem_names(rows)
+    problems = sorted(names)
+    columns = min(2, len(problems)) or 1
+    lines = -(-len(problems) // columns) or 1
+    figure = Figure(figsize=(5.2 * columns, 3.4 * lines), layout="constrained")
+    for k, problem in enumerate(problems):
+        axes = figure.add_subplot(lines, columns, k + 1)
+        here = [r for r in rows if problem_key(r) == problem]
+        start = min(r["energy_start"] for r in here)
+        for row in sorted(here, key=lambda r: str(r["solver"])):
+            curve = np.array(row["curve"], float).reshape(-1, 2)
+            # off the constraints an iterate's energy may be anything
+            curve = curve[curve[:, 1] < 3 * start]
+            if not len(curve):
+                continue
+            filled = "full" if row["verified"] else "none"
+            line = axes.plot(curve[:, 0], curve[:, 1], lw=1, label=row["solver"])[0]
+            axes.plot(*curve[-1], "o", color=line.get_color(), fillstyle=filled, ms=5)
+        axes.axhline(start, color="0.6", lw=0.8, ls=":")
+        axes.set_xscale("log")
+        title = f"{names[problem]}, N = {problem.superpixels}, {problem.formulation}"
+        axes.set_title(title, fontsize=8)
+        axes.set_xlabel("seconds")
+        axes.set_ylabel("exact energy")
+        _legend(axes, fontsize=6)
+        axes.grid(alpha=0.3)
+    _save(path, figure)
+
+
+def _legend(axes: Axes, **style: Any) -> None:
+    """A legend, where something was drawn that has a name."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(**style)
+
+
+def _save(path: Path, figure: Figure) -> None:
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110, metadata={"Software": ""})

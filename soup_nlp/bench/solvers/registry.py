@@ -1,0 +1,168 @@
+"""Solvers by name: CasADi's plug-ins, executables that read .nl, SCIP, and two yardsticks."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.bench.solvers.plugins import NEAR, PLUGINS, plugin
+from soup_nlp.bench.solvers.task import Answer, Solver, Task, Trace
+from soup_nlp.bench.yardstick import EPS, Yardstick, lbfgs, levenberg_marquardt
+from soup_nlp.errors import SolverError
+from soup_nlp.export.nl import write_nl
+from soup_nlp.export.sol import read_sol
+from soup_nlp.model.matrix import build_matrix_nlp
+
+Float = NDArray[np.float64]
+
+
+def executable(command: str, task: Task, options: tuple[str, ...] = ()) -> Answer:
+    """Solve with a program of the AMPL convention, `solver stub -AMPL key=value ...`."""
+    begin = time.perf_counter()
+    file = write_nl(task.folder / "soup.nl", task.nlp)
+    path = task.folder / "soup.sol"
+    # the folder may hold the answer to another problem
+    path.unlink(missing_ok=True)
+    words = [command, "soup", "-AMPL", *options]
+    with (task.folder / "solver.log").open("w") as log:
+        try:
+            code = subprocess.run(
+                words,
+                cwd=task.folder,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                timeout=max(1.0, task.limits.seconds - (time.perf_counter() - begin)),
+                check=False,
+            ).returncode
+        except subprocess.TimeoutExpired:
+            return Answer(None, None, "Time_Limit", False, -1, time.perf_counter() - begin)
+    if not path.is_file():
+        raise SolverError("solver wrote no .sol", where=Path(command).name, found=f"exit {code}")
+    sol = read_sol(path, file.variables, file.rows)
+    seconds = time.perf_counter() - begin
+    Trace(task.folder / "trace", task.nlp.nx, begin).add(sol.x)
+    status = sol.message.splitlines()[-1] if sol.message else sol.status
+    return Answer(sol.x, sol.lam_g, status, sol.solved, -1, seconds)
+
+
+def _ampl(name: str, task: Task, near: bool = False) -> Answer:
+    """An executable that is found on the path or beside Python."""
+    m = task.limits
+    options: dict[str, tuple[str, ...]] = {
+        "pounce": (
+            f"tol={m.tol}",
+            f"dual_inf_tol={m.tol}",
+            f"compl_inf_tol={m.tol}",
+            f"constr_viol_tol={m.feasibility}",
+            f"max_iter={m.iterations}",
+            "acceptable_iter=0",
+            f"max_wall_time={0.9 * m.seconds}",
+            "print_level=0",
+        ),
+    }
+    words = options.get(name, ())
+    if near:
+        words = (*words, *(f"{k}={v}" for k, v in NEAR.items()))
+    return executable(_find(name) or name, task, words)
+
+
+def _find(name: str) -> str | None:
+    found = shutil.which(name) or shutil.which(str(Path(sys.executable).parent / name))
+    # it runs in another folder than this one
+    return None if found is None else str(Path(found).absolute())
+
+
+def scip(task: Task) -> Answer:
+    """SCIP, a global solver, on the .nl file: for small problems; it has no start of ours."""
+    import pyscipopt
+
+    begin = time.perf_counter()
+    write_nl(task.folder / "soup.nl", task.nlp)
+    names = (task.folder / "soup.col").read_text().split()
+    place = {name: k for k, name in enumerate(task.nlp.x_names())}
+    model = pyscipopt.Model()
+    model.hideOutput()
+    model.readProblem(str(task.folder / "soup.nl"))
+    model.setParam("limits/time", max(1.0, task.limits.seconds - (time.perf_counter() - begin)))
+    model.setParam("numerics/feastol", max(task.limits.feasibility, 1e-9))
+    found = {v.name: v for v in model.getVars()}
+    start = model.createPartialSol()
+    for name in names:
+        model.setSolVal(start, found[name], float(task.nlp.x0[place[name]]))
+    model.addSol(start)
+    model.optimize()
+    best = model.getBestSol()
+    if best is None or not model.getNSols():
+        status = f"{model.getStatus()}, no point"
+        return Answer(None, None, status, False, -1, time.perf_counter() - begin)
+    x = np.empty(task.nlp.nx)
+    for name in names:
+        x[place[name]] = best[found[name]]
+    status = str(model.getStatus())
+    nodes = int(model.getNTotalNodes())
+    return Answer(x, None, status, status == "optimal", nodes, time.perf_counter() - begin)
+
+
+def yardstick(method: Callable[..., Yardstick], task: Task) -> Answer:
+    """On the manifold, without multipliers; it ends where the energy stops falling.
+
+    That is no claim of an optimum: whether the point is one, the residuals say.
+    """
+    last = task.form.eps
+    record = method(
+        task.soup,
+        task.data,
+        task.weights,
+        task.form,
+        eps=[*(e for e in EPS if e > last), last],
+        seconds=0.8 * task.limits.seconds,
+    )
+    # slack variables and switches at their best for this soup
+    x = build_matrix_nlp(record.soup, task.data, task.weights, task.form)[0].x0.copy()
+    x[: task.layout.size] = task.layout.pack(record.soup)
+    history = np.asarray(record.history, float)
+    return Answer(x, None, record.status, False, record.iterations, record.seconds, history)
+
+
+def available() -> dict[str, Solver]:
+    """Every solver that can run here, by name."""
+    out: dict[str, Solver] = {
+        name: partial(plugin, name) for name, row in PLUGINS.items() if ca.has_nlpsol(row[0])
+    }
+    if _find("pounce"):
+        out["pounce"] = partial(_ampl, "pounce")
+        out["pounce-tuned"] = partial(_ampl, "pounce", near=True)
+    out["lm"] = partial(yardstick, levenberg_marquardt)
+    out["lbfgs"] = partial(yardstick, lbfgs)
+    if importlib.util.find_spec("pyscipopt"):
+        out["scip"] = scip
+    return out
+
+
+def find_solver(name: str) -> Solver:
+    """The solver of a name; another name is an executable of the AMPL convention.
+
+    Raises:
+        SolverError: there is none.
+    """
+    known = available()
+    if name in known:
+        return known[name]
+    if name in PLUGINS or name == "scip" or not _find(name):
+        raise SolverError(
+            "solver is not here",
+            where="--solvers",
+            found=name,
+            expected=", ".join(known) + ", or a program that reads .nl",
+        )
+    return partial(_ampl, name)

@@ -1,0 +1,105 @@
+"""What a solver is given and what it gives back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.export.verify import Limits
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.nlp import NLP
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One NLP for one solver.
+
+    Attributes:
+        nlp: With the exact Hessian.
+        gauss_newton: The same NLP with the Gauss-Newton Hessian.
+        layout: Of both.
+        soup: Start.
+        data, weights, form: Of the energy (for yardsticks that take no NLP).
+        limits: Time, iterations, tolerance, memory.
+        folder: Scratch folder of this run.
+    """
+
+    nlp: NLP
+    gauss_newton: NLP
+    layout: MatrixLayout
+    soup: Soup
+    data: EnergyData
+    weights: Weights
+    form: Formulation
+    limits: Limits
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a solver says.
+
+    Attributes:
+        x: (nx,) point, or None where it returned none.
+        lam_g: (ng,) multipliers, or None.
+        status: The solver's words.
+        claimed: It claims an optimum.
+        iterations: Outer iterations, -1 where it does not say.
+        seconds: Wall time of set-up and solve.
+        curve: (k, 2) seconds and exact energy, of solvers that record it themselves.
+    """
+
+    x: Float | None
+    lam_g: Float | None
+    status: str
+    claimed: bool
+    iterations: int
+    seconds: float
+    curve: Float | None = None
+
+
+Solver = Callable[[Task], Answer]
+
+
+@dataclass
+class Trace:
+    """Iterates as they happen, on disk, so that a killed solver leaves them behind.
+
+    Args:
+        path: File of float64 records (seconds, x).
+        nx: Variables.
+    """
+
+    path: Path
+    nx: int
+    begin: float = field(default_factory=time.perf_counter)
+
+    def add(self, x: Float) -> None:
+        """Append an iterate with the time since the trace began."""
+        record = np.concatenate([[time.perf_counter() - self.begin], np.asarray(x, float).ravel()])
+        with self.path.open("ab") as file:
+            file.write(record.tobytes())
+
+    def read(self) -> tuple[Float, Float]:
+        """(k,) seconds and (k, nx) iterates; a record cut short is left out."""
+        try:
+            flat = np.frombuffer(self.path.read_bytes()[: self._whole()], float)
+        except OSError:
+            flat = np.zeros(0)
+        records = flat.reshape(-1, self.nx + 1)
+        return records[:, 0], records[:, 1:]
+
+    def _whole(self) -> int:
+        width = 8 * (self.nx + 1)
+        return self.path.stat().st_size // width * width

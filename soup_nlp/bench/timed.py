@@ -1,0 +1,231 @@
+"""One problem with clocks: seconds, energy and memory of every stage, beside the yardstick.
+
+    python -m soup_nlp.bench.timed SPEC.json RECORD.json
+
+Run so, in a process of its own, the peak memory is the run's and nobody else's.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.bench.speed import Spec
+from soup_nlp.bench.yardstick import EPS, Yardstick, levenberg_marquardt
+from soup_nlp.config.problem import Problem, dump_problem, make_problem
+from soup_nlp.errors import SoupError
+from soup_nlp.evaluate.scoring import score_depths
+from soup_nlp.geometry.soup import reconstruct
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.pipeline import Case, make_run, prepare
+from soup_nlp.report.folder import prepare_folder, write_folder, write_text
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.stages import solve_soup
+
+Float = NDArray[np.float64]
+
+YARDSTICK_ITERATIONS = 100
+"""Limit of Levenberg-Marquardt's steps for every smoothing width."""
+
+
+class Clocks:
+    """Wall and CPU seconds by stage."""
+
+    def __init__(self) -> None:
+        self.wall: dict[str, float] = {}
+        self.cpu: dict[str, float] = {}
+        self.restart()
+
+    def restart(self) -> None:
+        """Start the next lap now."""
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def lap(self, stage: str) -> None:
+        """End a lap."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        self.wall[stage] = self.wall.get(stage, 0.0) + wall - self._wall
+        self.cpu[stage] = self.cpu.get(stage, 0.0) + cpu - self._cpu
+        self._wall, self._cpu = wall, cpu
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """A lap of its own."""
+        self.restart()
+        yield
+        self.lap(name)
+
+
+def problem_of(spec: Spec) -> Problem:
+    """The merged problem of a spec; the NLP alone, without refinement.
+
+    Raises:
+        ConfigError: an override is wrong.
+    """
+    source: dict[str, Any] = {"kind": "motorcycle"}
+    if spec.scene != "motorcycle":
+        source = {"kind": "scene", "scene": spec.scene, "seed": spec.seed}
+        source |= {"width": spec.width, "height": spec.height}
+    raw = {
+        "name": spec.scene,
+        "seed": spec.seed,
+        "input": source,
+        "segmentation": {"superpixels": spec.superpixels, "neighbours": spec.neighbours},
+        "refine": {"enabled": False},
+    }
+    return make_problem(raw, spec.overrides, where="bench speed")
+
+
+def measure(spec: Spec) -> dict[str, Any]:
+    """Solve a problem and say what every stage cost.
+
+    Args:
+        spec: What to solve.
+
+    Returns:
+        Plain numbers: "sizes", "wall" and "cpu" (seconds by stage; build, functions and linear
+        algebra are parts of nlp's wall time, presolve, build and solve of its CPU time),
+        "stages", "iterations" in all, "status", "energy", "mre", "residuals", "peak_bytes"
+        (before the yardstick), and "yardstick" with its own.
+
+    Raises:
+        SoupError: the input cannot be used.
+    """
+    clocks = Clocks()
+    problem = problem_of(spec)
+    case = _prepare(problem, clocks)
+    with clocks.stage("nlp"):
+        solution = solve_soup(case.soup, case.data, case.weights, case.formulation(), case.options)
+    clocks.cpu["compiler"] = solution.seconds["compile"]
+    with clocks.stage("evaluation"):
+        form = case.formulation()
+        answer = MatrixLayout(case.data.share, form.gauge).unpack(solution.stages[-1].x)
+        run = make_run(case, solution, answer, solution.delivered)
+    run = replace(run, seconds=dict(clocks.wall))
+    with clocks.stage("output"), tempfile.TemporaryDirectory() as folder:
+        write_folder(prepare_folder(folder), run, dump_problem(problem), "")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    stages = solution.stages
+    functions = sum(sum(s.calls.values()) for s in stages)
+    ipopt = sum(s.seconds for s in stages)
+    split = {
+        # what the NLP's wall time is made of; all but Ipopt and its functions is building
+        "build": max(0.0, clocks.wall["nlp"] - ipopt),
+        "functions": functions,
+        "linear algebra": max(0.0, ipopt - functions),
+    }
+    return {
+        "sizes": {
+            "superpixels": len(case),
+            "knn_edges": len(case.segmentation.edges),
+            "pairs": len(case.segmentation.pairs),
+            **solution.nlp,
+        },
+        "wall": {**clocks.wall, **split},
+        "cpu": {**clocks.cpu, **solution.cpu_seconds},
+        "iterations": sum(s.iterations for s in stages),
+        "stages": [
+            {
+                "name": s.name,
+                "status": s.status,
+                "iterations": s.iterations,
+                "seconds": s.seconds,
+                **{k: _last(s.history.get(k)) for k in ("inf_du", "inf_pr")},
+            }
+            for s in stages
+        ],
+        "status": solution.status,
+        "converged": solution.converged,
+        "delivered": run.delivered,
+        "energy": dict(solution.energy),
+        "energy_start": dict(solution.energy_start),
+        "mre": {k: m.mre for k, m in run.metrics.items()},
+        "residuals": dict(solution.residuals),
+        "peak_bytes": peak,
+        "yardstick": {kind: _yardstick(case, kind) for kind in spec.yardsticks},
+    }
+
+
+def _last(values: Float | None) -> float | None:
+    """Last finite entry of an array; None where there is none."""
+    if values is None or not len(values) or not np.isfinite(values[-1]):
+        return None
+    return float(values[-1])
+
+
+def _prepare(problem: Problem, clocks: Clocks) -> Case:
+    """`cases.prepare` with a lap a stage."""
+    case = prepare(problem, lap=clocks.lap)
+    clocks.lap("weights")
+    return case
+
+
+def schedule(kind: str, options: SolverOptions) -> tuple[float, ...]:
+    """Smoothing widths of a yardstick: the solver's own ("same") or from a wide start ("wide")."""
+    if kind == "wide":
+        return EPS
+    own = tuple(options.presolve_eps) if options.presolve else ()
+    return own if own and own[-1] <= options.eps else (*own, options.eps)
+
+
+def _yardstick(case: Case, kind: str) -> dict[str, Any]:
+    """Levenberg-Marquardt from the same start on the same energy."""
+    y: Yardstick = levenberg_marquardt(
+        case.soup,
+        case.data,
+        case.weights,
+        case.formulation(),
+        eps=schedule(kind, case.options),
+        iterations=YARDSTICK_ITERATIONS,
+        seconds=case.options.max_seconds,
+    )
+    mre = None
+    if case.pair.truth is not None:
+        pair, size = case.pair, (case.pair.image_next.shape[0], case.pair.image_next.shape[1])
+        dense = reconstruct(y.soup, case.segmentation.labels, pair.K_ref, pair.K_next, size)
+        depth = dense.depth_ref
+        expected = case.problem.expected
+        scores = score_depths(case.pair.truth, {"y": depth}, expected.scale, expected.cap)
+        mre = scores["y"].mre if scores else None
+    return {
+        "name": y.name,
+        "status": y.status,
+        "energy": dict(y.energy),
+        "iterations": y.iterations,
+        "seconds": y.seconds,
+        "cpu_seconds": y.cpu_seconds,
+        "mre": mre,
+        "history": np.round(_thin(y.history), 6).tolist(),
+    }
+
+
+def _thin(history: Float, most: int = 60) -> Float:
+    """At most `most` rows, first and last among them: enough for a plot."""
+    index = np.linspace(0, len(history) - 1, min(most, len(history))).round().astype(int)
+    return history[index]
+
+
+def main(argv: list[str]) -> int:
+    """Read a spec, write its record; 2 where the spec cannot be solved."""
+    source, target = map(Path, argv)
+    try:
+        record = measure(Spec.from_dict(json.loads(source.read_text(encoding="utf-8"))))
+    except SoupError as error:
+        print(error, file=sys.stderr)
+        return 2
+    write_text(target, json.dumps(record))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

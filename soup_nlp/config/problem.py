@@ -1,0 +1,285 @@
+"""Problem files: strict YAML, defaults beside the code that uses them, dotted overrides."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import ValidationError
+
+from soup_nlp.data.flow.sources import FlowOptions
+from soup_nlp.data.inputs import Input
+from soup_nlp.data.pair import Pair
+from soup_nlp.errors import ConfigError
+from soup_nlp.model.energy_options import EnergyOptions
+from soup_nlp.model.formulation import FormulationOptions
+from soup_nlp.refine.records import RefineOptions
+from soup_nlp.schema.explain import Place, explain
+from soup_nlp.schema.section import Count, NonNegative, Positive, Section, Whole
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.start.start_options import StartOptions
+
+
+class SegmentationOptions(Section):
+    """Superpixels and graphs."""
+
+    superpixels: Whole = 1000
+    """Wanted number; the answer may differ by a few per cent."""
+    method: Literal["slic", "grid"] = "slic"
+    """slic, or grid (the paper's worst case)."""
+    compactness: Positive = 10.0
+    """SLIC's balance of colour and distance."""
+    smoothing_px: NonNegative = 0.0
+    """Gaussian pre-smoothing of SLIC, pixels."""
+    follow_flow_px: Positive | None = 1.0
+    """A pixel on a border goes to the neighbour whose affine flow is nearer to its own by more
+    than this, pixels; null leaves the borders to the image alone."""
+    neighbours: Whole = 15
+    """K of the K-NN graph, less than the number of superpixels."""
+    beta: NonNegative = 0.02
+    """Fall-off of w1, w2 with distance, 1/pixel."""
+    beta_colour: NonNegative = 1.0
+    """Fall-off of w4 with colour difference, colours in [0, 1]."""
+    boundary_samples: Whole | Literal["all"] = 3
+    """Points per shared boundary, or all."""
+
+
+class Expected(Section):
+    """What a run should score; solve exits with 1 where it does not."""
+
+    mre_at_most: Positive | None = None
+    """Largest mean relative error of the solution's depth; null for no claim."""
+    scale: Literal["median", "mre", "lsq", "none"] = "median"
+    """Rule of the one global scale that depth metrics are after."""
+    cap: Positive | None = None
+    """Truth beyond this depth is left out, unit of the truth; null for none."""
+
+
+class Problem(Section):
+    """One problem file."""
+
+    name: str = "problem"
+    """For titles."""
+    input: Input
+    """What to solve, by its kind."""
+    seed: Count = 0
+    """Of every random draw."""
+    segmentation: SegmentationOptions = SegmentationOptions()
+    """Superpixels and graphs."""
+    flow: FlowOptions = FlowOptions()
+    """Where the flow comes from."""
+    start: StartOptions = StartOptions()
+    """How the start is made."""
+    energy: EnergyOptions = EnergyOptions()
+    """Terms, weights, units."""
+    formulation: FormulationOptions = FormulationOptions()
+    """How the energy is written for the solver."""
+    solver: SolverOptions = SolverOptions()
+    """Stages and limits; eps are smoothing widths in the energy's unit."""
+    refine: RefineOptions = RefineOptions()
+    """Discrete refinement by particles."""
+    expected: Expected = Expected()
+    """What the run should score."""
+    base: str = "."
+    """Folder that relative paths start from (the file's own)."""
+
+    def path(self, name: str) -> Path:
+        """A path of this problem, relative ones from its file's folder."""
+        return (Path(self.base) / Path(name).expanduser()).resolve()
+
+    def digest(self) -> str:
+        """Hash of everything that decides the result; neither the name nor the place does."""
+        tree = self.model_dump(mode="json", exclude={"name", "base"})
+        return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
+
+    def load_pair(self) -> Pair:
+        """The frame pair, without its flow.
+
+        Raises:
+            ConfigError: the pair was in memory only.
+            DataError: a file is missing, damaged, or does not fit.
+        """
+        return replace(self.input.load(self.path), name=self.name)
+
+    def input_paths(self) -> list[Path]:
+        """Files and folders that are read; what is no file (a flow's name) is harmless here.
+
+        Raises:
+            ConfigError: the pair was in memory only.
+        """
+        return [self.path(name) for name in (*self.input.files(), self.flow.source)]
+
+
+def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
+    """Read a problem file.
+
+    Args:
+        path: YAML file.
+        overrides: `a.b=value` with the value in YAML.
+
+    Raises:
+        ConfigError: the file is missing or not YAML, a key is unknown or given twice, a value is
+            of the wrong type or out of range.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            "problem file cannot be read",
+            where=path,
+            found=getattr(error, "strerror", None) or error,
+            hint="soup-nlp list shows the problems of a folder",
+        ) from error
+    raw, lines = _parse(text, str(path))
+    if not isinstance(raw, dict):
+        raise ConfigError(
+            "problem file must be a mapping",
+            where=path,
+            found=type(raw).__name__,
+            expected="keys such as input: {kind: motorcycle}",
+        )
+    raw.setdefault("name", path.stem)
+    raw.setdefault("base", str(path.resolve().parent))
+    return make_problem(raw, overrides, where=str(path), lines=lines)
+
+
+def make_problem(
+    raw: Mapping[str, Any],
+    overrides: Sequence[str] = (),
+    where: str = "problem",
+    lines: Mapping[Place, str] | None = None,
+) -> Problem:
+    """Check a mapping and its overrides; see `load_problem`.
+
+    Args:
+        raw: Sections by name.
+        overrides: `a.b=value` with the value in YAML.
+        where: Source of the mapping, for messages.
+        lines: Where in the source each key is, for messages.
+
+    Raises:
+        ConfigError: as `load_problem`.
+    """
+    tree = copy.deepcopy(dict(raw))
+    lines = dict(lines or {})
+    for item in overrides:
+        lines[_override(tree, item)] = f"--set {item}"
+    try:
+        return Problem.model_validate(tree)
+    except ValidationError as error:
+        raise explain(error, Problem, tree, where, lines) from error
+
+
+def dump_problem(problem: Problem) -> str:
+    """The complete, merged problem as YAML with a comment on every key; it can be solved again."""
+    return "\n".join(_write(problem, "")) + "\n"
+
+
+def _write(model: Section, pad: str) -> Iterator[str]:
+    docs = model.help()
+    for key in type(model).model_fields:
+        value = getattr(model, key)
+        comment = f"  # {docs[key]}" if key in docs else ""
+        if isinstance(value, Section):
+            yield f"{pad}{key}:{comment}"
+            yield from _write(value, pad + "  ")
+        else:
+            flow = None if isinstance(value, list | dict) else False
+            text = yaml.dump({key: value}, Dumper=_Dumper, default_flow_style=flow, width=10**6)
+            yield f"{pad}{text.rstrip()}{comment}"
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with the numbers and booleans of version 1.2: 1e-3 is a number, `no` is a word."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes whatever either version would not read as a string."""
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, rule) for tag, rule in rules if tag.split(":")[-1] in ("null", "merge")]
+    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+for _tag, _rule, _first in (
+    ("bool", r"true|false|True|False|TRUE|FALSE", "tTfF"),
+    ("int", r"[-+]?\d+", "-+0123456789"),
+    (
+        "float",
+        r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        "-+.0123456789",
+    ),
+):
+    for _class in (_Loader, _Dumper):
+        _class.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_tag}", re.compile(rf"(?:{_rule})\Z"), list(_first)
+        )
+# 010 is ten, not eight
+_Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value))
+_Loader.add_constructor(
+    "tag:yaml.org,2002:float",
+    lambda loader, node: float(node.value.lower().replace(".inf", "inf").replace(".nan", "nan")),
+)
+
+
+def _parse(text: str, source: str) -> tuple[Any, dict[Place, str]]:
+    """The content of a YAML text, and the line of every key."""
+    loader = _Loader(text)
+    lines: dict[Place, str] = {}
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None, lines
+        _locate(node, (), lines, source)
+        return loader.construct_document(node), lines
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        raise ConfigError(
+            "text is not YAML",
+            where=f"{source}, line {mark.line + 1}" if mark else source,
+            found=getattr(error, "problem", None) or error,
+        ) from error
+    finally:
+        loader.dispose()
+
+
+def _locate(node: yaml.Node, place: Place, lines: dict[Place, str], source: str) -> None:
+    """Fill in the line of every key; a key that is given twice is an error."""
+    if not isinstance(node, yaml.MappingNode):
+        return
+    for key, value in node.value:
+        here = (*place, str(key.value))
+        line = f"line {key.start_mark.line + 1}"
+        if here in lines:
+            raise ConfigError("key is given twice", where=f"{source}, {line}", found=".".join(here))
+        lines[here] = line
+        _locate(value, here, lines, source)
+
+
+def _override(tree: dict[str, Any], item: str) -> Place:
+    key, eq, value = item.partition("=")
+    place = tuple(key.strip().split("."))
+    if not eq or not all(place):
+        raise ConfigError(
+            "override is not key=value", where="--set", found=item, expected="solver.max_iter=200"
+        )
+    node: Any = tree
+    for k, part in enumerate(place[:-1]):
+        node = node.setdefault(part, {})
+        if not isinstance(node, dict):
+            raise ConfigError(
+                "override goes below a value",
+                where="--set",
+                found=item,
+                expected=f"{'.'.join(place[: k + 1])} is a section",
+            )
+    node[place[-1]] = _parse(value, f"--set {item}")[0]
+    return place

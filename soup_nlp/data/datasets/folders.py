@@ -1,0 +1,311 @@
+"""Pairs with truth from the layouts that datasets ship in.
+
+Every loader returns a `Pair` whose `flow` is None; the true flow, where known, is `pair.truth.flow`
+and becomes a flow with `flow_from_truth`. Truth is NaN where unknown. A loader
+needs the two images and the camera; truth files that are not there leave that truth None.
+
+This file has the plain folder, TUM RGB-D and the Motorcycle pair; Sintel is in `datasets_sintel`,
+KITTI and Virtual KITTI in `datasets_driving`.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.datasets.driving import (
+    load_kitti2012,
+    load_kitti2015,
+    load_vkitti1,
+    load_vkitti2,
+)
+from soup_nlp.data.datasets.layout import MARK, is_result, need, need_folder, truth_or_none
+from soup_nlp.data.datasets.sintel import load_sintel
+from soup_nlp.data.flow.sources import leaves
+from soup_nlp.data.formats.camera_files import intrinsics, read_intrinsics
+from soup_nlp.data.formats.depth_files import read_depth, read_depth_png16
+from soup_nlp.data.formats.flow_files import read_flow
+from soup_nlp.data.formats.images import PathLike, read_bytes, read_image, read_mask, read_text
+from soup_nlp.data.pair import Pair, Truth
+from soup_nlp.errors import DataError
+
+__all__ = [
+    "load_folder",
+    "load_kitti2012",
+    "load_kitti2015",
+    "load_motorcycle",
+    "load_sintel",
+    "load_tum",
+    "load_vkitti1",
+    "load_vkitti2",
+]
+
+Float = NDArray[np.float64]
+
+FOLDER_LAYOUT = (
+    "frame_0.png and frame_1.png (or image_ref.png and image_next.png), K.txt; optional "
+    "K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, flow.flo|png|npy, occluded.png, points.npz"
+)
+_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp")
+_DEPTHS = (".npy", ".dpt", ".pfm", ".png")
+_FLOWS = (".flo", ".npy", ".png")
+
+TUM_SCALE = 5000.0
+"""Values per metre of a TUM RGB-D depth image."""
+
+TUM_LAYOUT = "rgb.txt, depth.txt, rgb/*.png, depth/*.png (or frame_0.png, depth_0.png, K.txt)"
+_TUM_CAMERAS = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6),
+}
+_TUM_DEFAULT = (525.0, 525.0, 319.5, 239.5)
+_TUM_SLACK = 0.02  # seconds between a colour image and its depth image
+
+
+def _find(folder: Path, stems: tuple[str, ...], suffixes: tuple[str, ...]) -> Path | None:
+    """The first file of the folder with one of the names, in the order given."""
+    for stem in stems:
+        for suffix in suffixes:
+            if (folder / f"{stem}{suffix}").is_file():
+                return folder / f"{stem}{suffix}"
+    return None
+
+
+def load_folder(
+    folder: PathLike, depth_scale: float = 1000.0, unit: str = "m", white: int | None = None
+) -> Pair:
+    """Load a pair from a plain folder.
+
+    Files (the first that exists is taken, in this order; images may also be jpg, tif, ppm, bmp):
+
+    - `frame_0.png` or `image_ref.png`; `frame_1.png` or `image_next.png`
+    - `K.txt`: 3x3 intrinsics, or fx fy cx cy; `K_next.txt` if the next frame's differ
+    - optional truth: `depth`, `depth_0` or `depth_ref` (.npy, .dpt, .pfm, 16-bit .png),
+      `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `occluded.png` (white = occluded)
+    - optional sparse truth `points.npz`: `uv_0` (M, 2) pixels and `xyz_mm_0` (M, 3) millimetres in
+      the reference camera; z is converted to `unit` when that is "m" and kept when it is "mm".
+      (`xyz_mm_1`, the same points in the next frame, has no place in `Truth` and is not read.)
+
+    Args:
+        folder: The folder.
+        depth_scale: Values per `unit` of a 16-bit depth image, e.g. 1000 for mm read as metres.
+        unit: Unit of length of the truth.
+        white: Value of a 16-bit image that is white, see `read_image`.
+
+    Returns:
+        Pair named after the folder.
+
+    Raises:
+        DataError: a required file is missing, a file is wrong for its format or its image, or the
+            folder holds a result of a solve.
+    """
+    folder = need_folder(folder, FOLDER_LAYOUT)
+    if is_result(folder):
+        marked = (folder / MARK).is_file()
+        raise DataError(
+            "input folder holds a result, whose depth and flow would pass for truth",
+            where=folder,
+            found=f"the hidden file {MARK} of a solve" if marked else "summary.json of a solve",
+            expected="a folder with inputs only",
+            hint="move the frames, K.txt and the truth to a folder of their own"
+            + (f"; delete {MARK} where no solve has left files" if marked else ""),
+        )
+    first = _find(folder, ("frame_0", "image_ref"), _IMAGES)
+    second = _find(folder, ("frame_1", "image_next"), _IMAGES)
+    first = need(first or folder / "frame_0.png", FOLDER_LAYOUT)
+    second = need(second or folder / "frame_1.png", FOLDER_LAYOUT)
+    K = read_intrinsics(need(folder / "K.txt", FOLDER_LAYOUT))
+    K_next = folder / "K_next.txt"
+    depth = _find(folder, ("depth", "depth_0", "depth_ref"), _DEPTHS)
+    depth_next = _find(folder, ("depth_next", "depth_1"), _DEPTHS)
+    flow = _find(folder, ("flow",), _FLOWS)
+    occluded = _find(folder, ("occluded",), _IMAGES)
+    points = folder / "points.npz"
+    truth = Truth(
+        depth_ref=read_depth(depth, depth_scale) if depth else None,
+        depth_next=read_depth(depth_next, depth_scale) if depth_next else None,
+        flow=read_flow(flow).astype(np.float64) if flow else None,
+        occluded=read_mask(occluded) if occluded else None,
+        points=_read_points(points, unit) if points.is_file() else None,
+        unit=unit,
+    )
+    return Pair(
+        image_ref=read_image(first, white),
+        image_next=read_image(second, white),
+        K_ref=K,
+        K_next=read_intrinsics(K_next) if K_next.is_file() else K,
+        truth=truth_or_none(truth),
+        name=folder.resolve().name,
+    )
+
+
+def _read_points(path: Path, unit: str) -> Float:
+    """(M, 3) sparse truth (u, v, z) from points.npz."""
+    read_bytes(path, "points file")
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            arrays: dict[str, NDArray[Any]] = {name: content[name] for name in content.files}
+    except Exception as error:  # zipfile, NumPy and zlib each raise their own
+        raise DataError("points file is no .npz", where=path, found=str(error)) from error
+    missing = [name for name in ("uv_0", "xyz_mm_0") if name not in arrays]
+    if missing:
+        raise DataError(
+            f"points file lacks {' and '.join(missing)}",
+            where=path,
+            found=", ".join(arrays) or "no array",
+            expected="uv_0 (M, 2) in pixels and xyz_mm_0 (M, 3) in millimetres",
+        )
+    uv, xyz = arrays["uv_0"], arrays["xyz_mm_0"]
+    if uv.ndim != 2 or uv.shape[1] != 2 or xyz.shape != (len(uv), 3):
+        raise DataError(
+            "points have the wrong shape",
+            where=path,
+            found=f"uv_0 {uv.shape}, xyz_mm_0 {xyz.shape}",
+            expected="(M, 2) and (M, 3)",
+        )
+    scales = {"m": 1000.0, "mm": 1.0}
+    if unit not in scales:
+        raise DataError("points are in millimetres", where=path, found=unit, expected="m or mm")
+    points = np.column_stack([uv, xyz[:, 2] / scales[unit]]).astype(np.float64)
+    return np.asarray(points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)])
+
+
+def load_tum(
+    folder: PathLike, frame: int = 0, step: int = 1, K: NDArray[np.floating] | None = None
+) -> Pair:
+    """Load a pair of a TUM RGB-D sequence, depth in metres.
+
+    Two layouts are known: the original one (`rgb.txt` and `depth.txt` list time stamps and files;
+    a depth image belongs to a colour image within 20 ms), and the plain folder of `load_folder`
+    with 16-bit `depth_0.png`, `depth_1.png` of 5000 values per metre.
+
+    Args:
+        folder: The sequence.
+        frame: Index of the reference image in rgb.txt (original layout only).
+        step: Distance of the next image (original layout only).
+        K: (3, 3) intrinsics of the original layout; by default those that its authors give for
+            the sensor named in the folder (freiburg1, 2 or 3), else 525, 525, 319.5, 239.5.
+            Lens distortion is not removed.
+
+    Returns:
+        Pair with depth truth of both frames where known.
+
+    Raises:
+        DataError: the layout is unknown, a file is missing or the frame does not exist.
+    """
+    folder = need_folder(folder, TUM_LAYOUT)
+    if not (folder / "rgb.txt").is_file():
+        if _find(folder, ("frame_0", "image_ref"), _IMAGES) is None:
+            need(folder / "rgb.txt", TUM_LAYOUT)
+        return load_folder(folder, depth_scale=TUM_SCALE)
+    images = _tum_list(folder / "rgb.txt")
+    depths = _tum_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
+    for index in (frame, frame + step):
+        if not 0 <= index < len(images):
+            raise DataError(
+                "frame is not in the sequence",
+                where=folder / "rgb.txt",
+                found=index,
+                expected=f"0 to {len(images) - 1}",
+            )
+    if K is None:
+        sensor = re.search(r"freiburg[123]", str(folder.resolve()))
+        K = intrinsics(*(_TUM_CAMERAS[sensor.group()] if sensor else _TUM_DEFAULT))
+    camera = np.asarray(K, dtype=np.float64)
+    (t_ref, ref), (t_next, nxt) = images[frame], images[frame + step]
+    truth = Truth(depth_ref=_tum_depth(depths, t_ref), depth_next=_tum_depth(depths, t_next))
+    return Pair(
+        image_ref=read_image(need(ref, TUM_LAYOUT)),
+        image_next=read_image(need(nxt, TUM_LAYOUT)),
+        K_ref=camera,
+        K_next=camera,
+        truth=truth_or_none(truth),
+        name=f"{folder.resolve().name}_{frame}",
+    )
+
+
+def _tum_list(path: Path) -> list[tuple[float, Path]]:
+    """(time stamp in seconds, file) of each line of rgb.txt or depth.txt."""
+    out = []
+    for number, line in enumerate(read_text(path, "file list").splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = line.split()
+        try:
+            out.append((float(words[0]), path.parent / words[1]))
+        except (ValueError, IndexError):
+            raise DataError(
+                "line of a file list is not understood",
+                where=f"{path}, line {number}",
+                found=repr(line[:60]),
+                expected="'timestamp file'",
+            ) from None
+    return out
+
+
+def _tum_depth(depths: list[tuple[float, Path]], time: float) -> Float | None:
+    """Depth of the image nearest in time, or None when that is more than 20 ms away."""
+    if not depths:
+        return None
+    stamp, path = min(depths, key=lambda entry: abs(entry[0] - time))
+    return read_depth_png16(path, TUM_SCALE) if abs(stamp - time) <= _TUM_SLACK else None
+
+
+def load_motorcycle() -> Pair:
+    """The Middlebury 2014 Motorcycle stereo pair of scikit-image, as a pair of frames in metres.
+
+    The rectified cameras differ in their principal points, so a disparity d means
+    Z = f B / (d + doffs) with f 994.978 px, doffs 31.086 px, B 0.193001 m, and the next (right)
+    camera has cx + doffs. The motion is the translation (-B, 0, 0) for every pixel; the true flow
+    is (-d, 0). A pixel counts as occluded where it leaves the right image or where a pixel of the
+    same row and nearer depth lands on it or beyond it.
+
+    Returns:
+        Pair "motorcycle" with depth, flow, scene flow, occlusion and one body of known motion.
+
+    Raises:
+        DataError: the images are not available (scikit-image fetches them once).
+    """
+    from skimage import data
+
+    try:
+        left, right, disparity = data.stereo_motorcycle()
+    except Exception as error:  # pooch, requests and OSError, by version
+        raise DataError(
+            "the Motorcycle pair is not available",
+            where="skimage.data.stereo_motorcycle",
+            found=str(error).strip().splitlines()[0] if str(error) else type(error).__name__,
+            expected="the images in scikit-image's cache, or a connection to fetch them",
+            hint="install pooch and call skimage.data.stereo_motorcycle() once online",
+        ) from error
+    focal, cx, cy, doffs, baseline = 994.978, 311.193, 254.877, 31.086, 0.193001
+    d = np.asarray(disparity, dtype=np.float64)
+    d = np.where(np.isfinite(d) & (d > 0), d, np.nan)
+    known = np.isfinite(d)
+    flow = np.dstack([-d, np.where(known, 0.0, np.nan)])
+    target = np.where(known, np.arange(d.shape[1]) - d, np.inf)
+    right_of = np.full_like(target, np.inf)
+    right_of[:, :-1] = np.minimum.accumulate(target[:, :0:-1], axis=1)[:, ::-1]
+    motion = np.eye(4)
+    motion[0, 3] = -baseline
+    truth = Truth(
+        depth_ref=focal * baseline / (d + doffs),
+        flow=flow,
+        occluded=known & ((target >= right_of) | leaves(flow, right.shape[:2])),
+        bodies=np.where(known, 0, -1).astype(np.int32),
+        motions=motion[None],
+        scene_flow=np.where(known[:, :, None], [-baseline, 0.0, 0.0], np.nan),
+    )
+    return Pair(
+        image_ref=np.ascontiguousarray(left[:, :, :3]),
+        image_next=np.ascontiguousarray(right[:, :, :3]),
+        K_ref=intrinsics(focal, focal, cx, cy),
+        K_next=intrinsics(focal, focal, cx + doffs, cy),
+        truth=truth,
+        name="motorcycle",
+    )

@@ -1,0 +1,77 @@
+"""Robust local optical flow, dense (Geistert et al., 2016; Senst et al.), of opencv-contrib."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.flow.consistency import SUPPORT, checked_flow
+from soup_nlp.data.pair import Flow
+from soup_nlp.errors import DataError
+
+Image = NDArray[np.uint8]
+
+MIN_SIDE = 32
+"""Smallest image side, pixels."""
+
+
+def rlof_available() -> bool:
+    """Whether the installed OpenCV has its contributed module of optical flow."""
+    return hasattr(cv2, "optflow") and hasattr(cv2.optflow, "DenseRLOFOpticalFlow")
+
+
+def rlof_flow(
+    image_ref: Image,
+    image_next: Image,
+    *,
+    grid_step: int = 4,
+    tau: float = 1.0,
+    limit: float = 3.0,
+    support: int = SUPPORT,
+) -> Flow:
+    """Dense RLOF with forward-backward confidence.
+
+    Sparse robust flow on a grid, checked forward and backward, interpolated along edges (EPIC) and
+    refined variationally.
+
+    Args:
+        image_ref: (H, W, 3) uint8 RGB reference image.
+        image_next: (H, W, 3) uint8 RGB next image of the same size.
+        grid_step: Distance of the grid's points, pixels.
+        tau: See `flow_check.checked_flow`.
+        limit: The same.
+        support: The same.
+
+    Raises:
+        DataError: OpenCV has no contributed modules, or the images do not fit.
+    """
+    if not rlof_available():
+        raise DataError(
+            "this OpenCV has no DenseRLOF",
+            where="flow source 'rlof'",
+            found=f"OpenCV {cv2.__version__} without contributed modules",
+            expected="opencv-contrib-python-headless",
+            hint="pip uninstall opencv-python-headless; pip install opencv-contrib-python-headless",
+        )
+    small = min(image_ref.shape[:2]) < MIN_SIDE
+    if image_ref.shape != image_next.shape or image_ref.shape[2:] != (3,) or small:
+        raise DataError(
+            "images do not suit RLOF",
+            found=f"{image_ref.shape} and {image_next.shape}",
+            expected=f"two RGB images of one size, at least {MIN_SIDE} pixels on each side",
+        )
+    method: Any = cv2.optflow.DenseRLOFOpticalFlow.create()
+    method.setGridStep((grid_step, grid_step))
+    method.setInterpolation(cv2.optflow.INTERP_EPIC)
+    method.setForwardBackward(1.0)
+    method.setUsePostProc(True)
+    method.setUseVariationalRefinement(True)
+    a, b = (cv2.cvtColor(image, cv2.COLOR_RGB2BGR) for image in (image_ref, image_next))
+    try:
+        forward, backward = method.calc(a, b, None), method.calc(b, a, None)
+    except cv2.error as error:
+        raise DataError("RLOF failed", found=str(error).strip()) from error
+    return checked_flow(forward, backward, "rlof", tau, limit, support)

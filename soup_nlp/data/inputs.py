@@ -1,0 +1,294 @@
+"""Kinds of input of a problem file; every kind loads its own pair."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from soup_nlp.data.datasets.driving import (
+    load_kitti2012,
+    load_kitti2015,
+    load_vkitti1,
+    load_vkitti2,
+)
+from soup_nlp.data.datasets.folders import load_folder, load_motorcycle, load_tum
+from soup_nlp.data.datasets.sintel import load_sintel
+from soup_nlp.data.formats import read_depth, read_image
+from soup_nlp.data.formats.camera_files import read_intrinsics
+from soup_nlp.data.pair import Pair, Truth
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.errors import ConfigError
+from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.schema.section import Count, Finite, Positive, Section, Whole
+
+Float = NDArray[np.float64]
+Resolve = Callable[[str], Path]
+Camera = Annotated[list[Finite], Field(min_length=4, max_length=4)]
+White = Annotated[int, Field(ge=1, le=65535)]
+
+
+class FilesInput(Section):
+    """Two image files and their cameras; the flow file is named under `flow.source`."""
+
+    kind: Literal["files"]
+    """Kind of input."""
+    ref: str
+    """Reference image."""
+    next: str
+    """Next image."""
+    intrinsics: Camera | str
+    """[fx, fy, cx, cy] of the reference frame in pixels, or a file of 4 or 9 numbers."""
+    intrinsics_next: Camera | str | None = None
+    """The same of the next frame; null for the same camera."""
+    depth: str | None = None
+    """True depth of the reference frame, for measuring only (.dpt .npy .pfm .png)."""
+    depth_next: str | None = None
+    """True depth of the next frame."""
+    depth_scale: Positive = 1000.0
+    """Values per unit of length of a 16-bit .png depth."""
+    unit: str = "m"
+    """Unit of the true depth."""
+    white: White | None = None
+    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for 65535."""
+
+    def load(self, path: Resolve) -> Pair:
+        """The pair of the files."""
+        ref, next_ = (read_image(path(x), self.white) for x in (self.ref, self.next))
+        depths = [
+            None if name is None else read_depth(path(name), self.depth_scale)
+            for name in (self.depth, self.depth_next)
+        ]
+        truth = None
+        if any(depth is not None for depth in depths):
+            truth = Truth(depth_ref=depths[0], depth_next=depths[1], unit=self.unit)
+        K_ref = _camera(self.intrinsics, path)
+        same = self.intrinsics_next is None
+        K_next = K_ref if same else _camera(self.intrinsics_next, path)
+        return Pair(ref, next_, K_ref, K_next, truth=truth)
+
+    def files(self) -> list[str]:
+        """Names of the files that are read."""
+        named = (self.ref, self.next, self.intrinsics, self.intrinsics_next)
+        return [x for x in (*named, self.depth, self.depth_next) if isinstance(x, str)]
+
+
+class FolderInput(Section):
+    """A folder with frame_0, frame_1, K.txt and optional truth."""
+
+    kind: Literal["folder"]
+    """Kind of input."""
+    path: str
+    """The folder."""
+    depth_scale: Positive = 1000.0
+    """Values per unit of length of a 16-bit .png depth."""
+    unit: str = "m"
+    """Unit of the true depth."""
+    white: White | None = None
+    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for 65535."""
+
+    def load(self, path: Resolve) -> Pair:
+        """The pair; `path` resolves the names of files."""
+        return load_folder(path(self.path), self.depth_scale, self.unit, self.white)
+
+    def files(self) -> list[str]:
+        """Names of the files and folders that are read."""
+        return [self.path]
+
+
+class MotorcycleInput(Section):
+    """The Middlebury motorcycle pair that scikit-image ships."""
+
+    kind: Literal["motorcycle"]
+    """Kind of input."""
+
+    def load(self, path: Resolve) -> Pair:
+        """The pair; `path` resolves the names of files."""
+        return load_motorcycle()
+
+    def files(self) -> list[str]:
+        """Names of the files and folders that are read."""
+        return []
+
+
+class SceneInput(Section):
+    """A rendered dynamic scene with exact truth."""
+
+    kind: Literal["scene"]
+    """Kind of input."""
+    scene: Literal["street", "room", "sheet", "orbit", "still"]
+    """Which scene."""
+    seed: Count = 0
+    """Changes layout, textures and motions."""
+    width: Annotated[int, Field(ge=64)] = 1024
+    """Columns, pixels."""
+    height: Annotated[int, Field(ge=48)] = 436
+    """Rows, pixels."""
+
+    def load(self, path: Resolve) -> Pair:
+        """The pair; `path` resolves the names of files."""
+        return render_scene(self.scene, self.seed, self.width, self.height)
+
+    def files(self) -> list[str]:
+        """Names of the files and folders that are read."""
+        return []
+
+
+class SintelInput(Section):
+    """MPI Sintel, official layout."""
+
+    kind: Literal["sintel"]
+    """Kind of input."""
+    root: str
+    """Folder that holds training/."""
+    scene: str
+    """Such as alley_1."""
+    frame: Count
+    """Number of the reference frame."""
+    render: Literal["clean", "final", "albedo"] = "clean"
+    """Rendering pass."""
+    step: Whole = 1
+    """Distance of the next frame."""
+
+    def load(self, path: Resolve) -> Pair:
+        """The pair; `path` resolves the names of files."""
+        return load_sintel(path(self.root), self.scene, self.frame, self.render, self.step)
+
+    def files(self) -> list[str]:
+        """Names of the files and folders that are read."""
+        return [self.root]
+
+
+class KittiInput(Section):
+    """KITTI 2012 or 2015, official layout."""
+
+    kind: Literal["kitti2012", "kitti2015"]
+    """Kind of input."""
+    root: str
+    """Folder that holds training/."""
+    index: str
+    """Six digits in quotes, such as "000138"."""
+    occ: bool = True
+    """Truth with occluded pixels (true) or without."""
+
+    def load(self, path: Resolve) -> Pair:
+        """The pair; `path` resolves the names of files."""
+        load = load_kitti2012 if self.kind == "kitti2012" else load_kitti2015
+        return load(path(self.root), self.index, self.occ)
+
+    def files(self) -> list[str]:
+        """Names of the files and folders that are read."""
+        return [self.root]
+
+
+class VkittiInput(Section):
+    """Virtual KITTI 1 (scene is the world, such as "0001") or 2, official layout."""
+
+    kind: Literal["vkitti1", "vkitti2"]
+    """Kind of input."""
+    root: str
+    """Root folder of the dataset."""
+    scene: str
+    """Such as "0001" (1) or Scene01 (2)."""
+    frame: Count
+    """Number of the reference frame."""
+    variation: str = "clone"
+    """Weather or camera variation."""
+    step: Whole = 1
+    """Distance of the next frame."""
+
+    def load(self, path: Resolve) -> Pair:
+        """The pair; `path` resolves the names of files."""
+        load = load_vkitti1 if self.kind == "vkitti1" else load_vkitti2
+        return load(path(self.root), self.scene, self.frame, self.variation, step=self.step)
+
+    def files(self) -> list[str]:
+        """Names of the files and folders that are read."""
+        return [self.root]
+
+
+class TumInput(Section):
+    """TUM RGB-D, official layout."""
+
+    kind: Literal["tum"]
+    """Kind of input."""
+    path: str
+    """Folder of the sequence."""
+    frame: Count = 0
+    """Index of the reference image in rgb.txt."""
+    step: Whole = 1
+    """Distance of the next image."""
+
+    def load(self, path: Resolve) -> Pair:
+        """The pair; `path` resolves the names of files."""
+        return load_tum(path(self.path), self.frame, self.step)
+
+    def files(self) -> list[str]:
+        """Names of the files and folders that are read."""
+        return [self.path]
+
+
+class MemoryInput(Section):
+    """A pair that was in memory: a problem with it tells runs apart, but cannot be solved again."""
+
+    kind: Literal["memory"]
+    """Kind of input."""
+    hash: str
+    """Of the images, cameras and flow."""
+
+    def load(self, path: Resolve) -> Pair:
+        """Nothing to load: always an error.
+
+        Raises:
+            ConfigError: the pair was in memory only.
+        """
+        raise ConfigError(
+            "pair of this problem was in memory and is not stored",
+            where="input.kind",
+            found=f"memory, hash {self.hash}",
+            expected="an input of files, such as kind: files",
+            hint="solve it from Python with soup_nlp.solve_pair, or write the images to files",
+        )
+
+    def files(self) -> list[str]:
+        """As `load`: always an error."""
+        self.load(Path)
+        return []
+
+
+Input = Annotated[
+    FilesInput
+    | FolderInput
+    | MotorcycleInput
+    | SceneInput
+    | SintelInput
+    | KittiInput
+    | VkittiInput
+    | TumInput
+    | MemoryInput,
+    Field(discriminator="kind"),
+]
+"""What a problem may take as its input, told apart by `kind`."""
+
+
+def pair_hash(pair: Pair) -> str:
+    """Hash of what decides a result: images, cameras and, where there is one, the flow."""
+    digest = hashlib.sha256()
+    arrays: list[NDArray[Any]] = [pair.image_ref, pair.image_next, pair.K_ref, pair.K_next]
+    if pair.flow is not None:
+        arrays += [pair.flow.uv, pair.flow.confidence]
+    for array in arrays:
+        digest.update(f"{array.dtype} {array.shape}\0".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _camera(given: list[float] | str | None, path: Resolve) -> Float:
+    """(3, 3) intrinsics of four numbers or of a file."""
+    assert given is not None
+    return read_intrinsics(path(given)) if isinstance(given, str) else intrinsics(*given)

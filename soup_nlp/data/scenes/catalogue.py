@@ -1,0 +1,378 @@
+"""Named dynamic scenes with exact truth, rendered by `soup_nlp.data.scenes.raycast`.
+
+Scenes are laid out in level coordinates: x right, y down, z forward, the ground is y = 0. The
+truth of the rendered pair is in the usual coordinates, those of the reference camera, in metres.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+
+import numpy as np
+
+from soup_nlp.data.pair import Pair
+from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
+from soup_nlp.data.scenes.shapes import Box, Float, Plane, Shape, Sheet, Sphere
+from soup_nlp.data.scenes.texture import Colour, Panels, Texture
+from soup_nlp.errors import DataError
+from soup_nlp.geometry import camera, rotation
+
+SCENES: dict[str, str] = {
+    "street": "driving camera, two moving cars on a street between houses; depth to 80 m",
+    "room": "camera moving sideways, three independently moving bodies among furniture",
+    "sheet": "a bending, non-rigid sheet at about 1 m before a wall",
+    "orbit": "camera orbiting a still life; one rigid motion",
+    "still": "camera at rest, one moving body",
+}
+"""Names that `render_scene` knows, with one line on each."""
+
+SMALLEST = (48, 64)
+"""Smallest (height, width) that is rendered."""
+
+Random = np.random.Generator
+
+
+def render_scene(name: str, seed: int = 0, width: int = 1024, height: int = 436) -> Pair:
+    """Render a named scene.
+
+    Args:
+        name: One of `SCENES`.
+        seed: Changes layout, textures and motions within sensible ranges; same seed, same bytes.
+        width: Columns of both images, at least 64; the focal length grows with it.
+        height: Rows of both images, at least 48.
+
+    Returns:
+        A `Pair` with full `Truth` in metres and no flow. Body 0 is the static background. Motions
+        are `next_from_ref` with the camera's motion included; NaN for the bending sheet.
+
+    Raises:
+        DataError: unknown name, image too small, negative seed.
+    """
+    if name not in _LAYOUTS:
+        close = difflib.get_close_matches(str(name), _LAYOUTS, n=1)
+        raise DataError(
+            "unknown scene",
+            where="name",
+            found=repr(name),
+            expected=f"one of {', '.join(_LAYOUTS)}",
+            hint=f"did you mean {close[0]!r}?" if close else None,
+        )
+    for what, value, least in (("width", width, SMALLEST[1]), ("height", height, SMALLEST[0])):
+        if not isinstance(value, int | np.integer) or value < least:
+            raise DataError(
+                "image size is not usable",
+                where=what,
+                found=repr(value),
+                expected=f"int >= {least}",
+            )
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise DataError("seed is not usable", where="seed", found=repr(seed), expected="int >= 0")
+    layout, focal = _LAYOUTS[name]
+    # tall images keep the field of view of a 4:3 image, or the ground would pass the camera
+    f = focal * max(width, 4 / 3 * height)
+    K = camera.intrinsics(f, f, (width - 1) / 2, (height - 1) / 2)
+    rng = np.random.default_rng([int(seed), list(_LAYOUTS).index(name)])
+    scene = layout(rng, width / (2 * f), height / (2 * f))
+    return render(scene, K, int(height), int(width), name=f"{name}-{seed}")
+
+
+# --- poses -----------------------------------------------------------------------------------
+
+
+def _pose(x: float, y: float, z: float, yaw: float = 0.0, pitch: float = 0.0) -> Float:
+    """(4, 4) pose at a position (m), turned by `yaw` about y after `pitch` about x (degrees)."""
+    out = np.eye(4)
+    out[:3, :3] = rotation.exp(np.radians([0.0, yaw, 0.0])) @ rotation.exp(
+        np.radians([pitch, 0.0, 0.0])
+    )
+    out[:3, 3] = x, y, z
+    return out
+
+
+def _about(pivot: Float, turn: Float, shift: Float) -> Float:
+    """(4, 4) motion: turn by a rotation vector (degrees) about a pivot (3,), then shift (3,) m."""
+    out = np.eye(4)
+    out[:3, :3] = rotation.exp(np.radians(turn))
+    out[:3, 3] = pivot - out[:3, :3] @ pivot + shift
+    return out
+
+
+def _views(pose: Float, shift: Float, turn: Float) -> tuple[Float, Float]:
+    """(ref_from_scene, next_from_scene) of a camera at `pose` that moves in its own frame."""
+    step = _about(np.zeros(3), turn, shift)
+    return inverse(pose), inverse(pose @ step)
+
+
+def _sign(rng: Random) -> float:
+    return float(rng.choice([-1.0, 1.0]))
+
+
+# --- materials -------------------------------------------------------------------------------
+
+_PAINTS: tuple[tuple[Colour, Colour], ...] = (
+    ((0.72, 0.20, 0.14), (0.50, 0.12, 0.10)),
+    ((0.16, 0.36, 0.68), (0.10, 0.22, 0.46)),
+    ((0.82, 0.66, 0.18), (0.66, 0.46, 0.10)),
+    ((0.18, 0.52, 0.30), (0.34, 0.62, 0.26)),
+    ((0.62, 0.58, 0.56), (0.40, 0.40, 0.44)),
+    ((0.52, 0.26, 0.56), (0.68, 0.40, 0.62)),
+    ((0.20, 0.58, 0.60), (0.12, 0.40, 0.46)),
+    ((0.80, 0.44, 0.20), (0.62, 0.30, 0.14)),
+)
+_WALLS: tuple[tuple[Colour, Colour], ...] = (
+    ((0.70, 0.62, 0.50), (0.58, 0.50, 0.42)),
+    ((0.62, 0.38, 0.30), (0.50, 0.32, 0.27)),
+    ((0.60, 0.62, 0.64), (0.48, 0.50, 0.54)),
+    ((0.74, 0.70, 0.62), (0.62, 0.60, 0.56)),
+)
+_ASPHALT: tuple[Colour, Colour] = ((0.42, 0.42, 0.43), (0.32, 0.32, 0.34))
+_SKY: tuple[Colour, Colour] = ((0.52, 0.68, 0.88), (0.84, 0.88, 0.92))
+_GLASS: Colour = (0.16, 0.20, 0.26)
+
+
+class _Materials:
+    """Textures with a new noise for each surface."""
+
+    def __init__(self, rng: Random) -> None:
+        self.rng = rng
+        self.paints = [_PAINTS[i] for i in rng.permutation(len(_PAINTS))]
+
+    def seed(self) -> int:
+        return int(self.rng.integers(2**31))
+
+    def paint(self, cell: float, panels: Panels | None = None, contrast: float = 0.5) -> Texture:
+        """The next colour of the palette."""
+        self.paints.append(self.paints.pop(0))
+        return Texture(self.paints[-1], cell, contrast, seed=self.seed(), panels=panels)
+
+    def plain(
+        self,
+        colours: tuple[Colour, Colour],
+        cell: float,
+        panels: Panels | None = None,
+        contrast: float = 0.45,
+    ) -> Texture:
+        """A given pair of colours."""
+        return Texture(colours, cell, contrast, seed=self.seed(), panels=panels)
+
+    def wall(self, cell: float, panels: Panels | None = None) -> Texture:
+        """One of the wall colours."""
+        return self.plain(_WALLS[self.rng.integers(len(_WALLS))], cell, panels)
+
+
+def _floor(texture: Texture) -> Part:
+    """The infinite ground y = 0."""
+    return Part(Plane(), _pose(0, 0, 0, pitch=-90), texture)
+
+
+def _backdrop(z: float, texture: Texture, glow: float = 0.45, yaw: float = 0.0) -> Part:
+    """An infinite upright wall at a distance."""
+    return Part(Plane(), _pose(0, 0, z, yaw=yaw), texture, glow)
+
+
+# --- layouts: (rng, half width / f, half height / f) -> Scene ----------------------------------
+
+
+def _car(m: _Materials, x: float, z: float, yaw: float) -> tuple[Part, ...]:
+    """A car of three boxes that stands on the ground, nose along +z at yaw 0."""
+    at = _pose(x, 0, z, yaw=yaw)
+    body = m.paint(0.7)
+    sizes: list[tuple[tuple[float, float, float], tuple[float, float], Texture]] = [
+        # half size, (bottom above ground, offset along the car), texture
+        ((0.86, 0.12, 2.02), (0.0, 0.0), m.plain(((0.12, 0.12, 0.13), (0.2, 0.2, 0.21)), 0.4)),
+        ((0.92, 0.33, 2.15), (0.24, 0.0), body),
+        ((0.78, 0.24, 1.1), (0.9, -0.3), m.plain((_GLASS, (0.3, 0.36, 0.42)), 0.5)),
+        ((0.76, 0.03, 1.0), (1.38, -0.3), body),
+    ]
+    return tuple(
+        Part(Box(half), at @ _pose(0, -(bottom + half[1]), along), texture)
+        for half, (bottom, along), texture in sizes
+    )
+
+
+def _street(rng: Random, half_width: float, half_height: float) -> Scene:
+    m = _Materials(rng)
+    lanes = Panels((3.6, 5.0), (0.035, 0.5), (0.78, 0.78, 0.74), (-0.06, rng.uniform(0, 5)))
+    parts = [
+        _floor(m.plain(_ASPHALT, 2.5, lanes, contrast=0.5)),
+        _backdrop(78, m.plain(_SKY, 9.0, contrast=0.16), glow=1.0),
+    ]
+    for side in (-1.0, 1.0):
+        z = rng.uniform(-4, 0)
+        while z < 74:
+            length, height = rng.uniform(9, 18), rng.uniform(7, 15)
+            front = 7.5 + rng.uniform(0, 1.6)
+            windows = Panels(
+                (rng.uniform(2.2, 3.2), rng.uniform(2.6, 3.4)),
+                (0.45, 0.55),
+                _GLASS,
+                (rng.uniform(0, 3), rng.uniform(0, 3)),
+                variation=0.5,
+            )
+            half = (3.0, height / 2, min(length, 76 - z) / 2)
+            pose = _pose(side * (front + 3.0), -height / 2, z + half[2])
+            parts.append(Part(Box(half), pose, m.wall(3.0, windows)))
+            z += length + rng.choice([0.0, 0.0, 3.0])
+    drive = rng.uniform(0.5, 0.6)
+    lane = 2.0
+    ahead, coming = rng.uniform(11, 13.5), rng.uniform(15, 20)
+    bodies = [Body("street", tuple(parts))]
+    speeds = rng.uniform(0.3, 0.6, 2) * drive
+    if rng.random() < 0.5:
+        same = _car(m, lane, ahead, 0.0)
+        move = _about(
+            np.array([lane, 0, ahead]), np.array([0, _sign(rng), 0]), np.array([0, 0, speeds[0]])
+        )
+    else:
+        yaw = -rng.uniform(50, 75)
+        same = _car(m, lane, ahead, yaw)
+        nose = rotation.exp(np.radians([0, yaw, 0])) @ [0, 0, speeds[0]]
+        move = _about(np.array([lane, 0, ahead]), np.array([0.0, 0, 0]), nose)
+    bodies.append(Body("car ahead", same, move))
+    shift = np.array([0, 0, -speeds[1]])
+    bodies.append(
+        Body("car coming", _car(m, -lane, coming, 180.0), _about(np.zeros(3), np.zeros(3), shift))
+    )
+    turn = np.array([rng.uniform(-0.1, 0.1), _sign(rng) * rng.uniform(0.2, 0.4), 0.1])
+    view = _views(
+        _pose(rng.uniform(-0.4, 0.4), -rng.uniform(2.1, 2.4), 0, yaw=rng.uniform(-2, 2)),
+        np.array([rng.uniform(-0.03, 0.03), 0, drive]),
+        turn,
+    )
+    return Scene(tuple(bodies), *view)
+
+
+_FRONT = ((-0.62, 3.5), (0.0, 3.4), (0.62, 3.6))
+_BACK = ((-0.88, 4.9), (-0.3, 5.0), (0.31, 4.8), (0.88, 5.0))
+"""Spots on the floor: fraction of half the image's width, distance (m). The back row stands in the
+gaps of the front row."""
+
+_WALL = 6.4
+"""Distance of a room's back wall, m."""
+
+
+def _objects(
+    rng: Random, m: _Materials, spots: tuple[tuple[float, float], ...], half_width: float
+) -> list[tuple[Part, Float]]:
+    """Boxes and spheres in turn, one standing on each spot; with its foot (3,)."""
+    out = []
+    for k, (across, distance) in enumerate(spots):
+        z = distance + rng.uniform(-0.1, 0.1)
+        unit = z * half_width
+        size = 0.15 * unit
+        foot = np.array([(across + rng.uniform(-0.03, 0.03)) * unit, 0.0, z])
+        shape: Shape
+        if k % 2:
+            radius = size * rng.uniform(0.85, 1.05)
+            shape, up, yaw = Sphere(radius), radius, rng.uniform(0, 360)
+        else:
+            half = size * rng.uniform([0.75, 0.75, 0.75], [1.0, 1.4, 1.0])
+            shape, up, yaw = Box((half[0], half[1], half[2])), half[1], rng.uniform(20, 70)
+        pose = _pose(foot[0], -up, z, yaw=yaw)
+        out.append((Part(shape, pose, m.paint(0.8 * size)), foot))
+    return out
+
+
+def _interior(rng: Random, m: _Materials, half_width: float) -> list[Part]:
+    """Floor with tiles, papered back wall with a picture, and two side walls."""
+    tiles = Panels((0.6, 0.6), (0.965, 0.965), (0.60, 0.50, 0.40), variation=0.25)
+    paper = Panels((0.5, 9.0), (0.5, 1.0), (0.62, 0.64, 0.56))
+    side = 0.94 * half_width * _WALL
+    picture = _pose(rng.uniform(-0.5, 0.5) * side, -1.65, _WALL - 0.02)
+    return [
+        _floor(m.plain(((0.36, 0.30, 0.25), (0.30, 0.26, 0.22)), 0.7, tiles)),
+        _backdrop(_WALL, m.wall(0.9, paper)),
+        Part(Plane(), _pose(-side, 0, 0, yaw=-90), m.wall(0.9)),
+        Part(Plane(), _pose(side, 0, 0, yaw=90), m.wall(0.9)),
+        Part(Box((0.55, 0.4, 0.02)), picture, m.paint(0.3)),
+    ]
+
+
+def _room(rng: Random, half_width: float, half_height: float) -> Scene:
+    m = _Materials(rng)
+    objects = _objects(rng, m, _FRONT + _BACK, half_width)
+    moving = [rng.integers(3), *(3 + rng.permutation(4)[:2])]
+    rest = [part for k, (part, _) in enumerate(objects) if k not in moving]
+    bodies = [Body("room", (*_interior(rng, m, half_width), *rest))]
+    for rank, k in enumerate(moving):
+        part, foot = objects[k]
+        shift = np.array([_sign(rng), 0, _sign(rng)]) * rng.uniform(
+            [0.03, 0, 0.01], [0.06, 0, 0.06]
+        )
+        if rank == 2:
+            shift[1] = -rng.uniform(0.02, 0.05)  # lifted off the floor
+        turn = np.array([0, _sign(rng) * rng.uniform(2, 4), 0])
+        bodies.append(Body(f"mover {rank}", (part,), _about(foot, turn, shift)))
+    side = _sign(rng)
+    view = _views(
+        _pose(0, -1.35, 0, yaw=side, pitch=-9),
+        np.array([side * rng.uniform(0.06, 0.085), rng.uniform(-0.01, 0.01), 0.04]),
+        np.array([0.1, -side * rng.uniform(0.2, 0.5), _sign(rng) * 0.2]),
+    )
+    return Scene(tuple(bodies), *view)
+
+
+def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
+    m = _Materials(rng)
+    bend, change = _sign(rng) * rng.uniform(0.7, 1.0), _sign(rng) * rng.uniform(0.15, 0.25)
+    axis = rng.uniform(-0.25, 0.25)
+    # sides that bend away from the camera look smaller
+    room = 1.06 if bend > 0 else 0.93
+    shape = Sheet(
+        (room * half_width, room * half_height),
+        (bend, bend + change),
+        (axis, axis + _sign(rng) * rng.uniform(0.02, 0.06)),
+    )
+    dots = Panels((0.16, 0.16), (0.5, 0.5), (0.66, 0.64, 0.56), variation=0.3)
+    cloth = Part(shape, _pose(0, 0, 1.0, yaw=rng.uniform(-8, 8)), m.paint(0.12, dots), glow=0.6)
+    shift = rng.uniform([-0.003, -0.003, -0.01], [0.003, 0.003, 0.01])
+    bodies = (
+        Body("wall", (_backdrop(1.7, m.wall(0.3)),)),
+        Body("sheet", (cloth,), _about(np.array([0, 0, 1.0]), rng.uniform(-0.4, 0.4, 3), shift)),
+    )
+    view = _views(
+        np.eye(4),
+        np.array([_sign(rng) * rng.uniform(0.008, 0.013), rng.uniform(-0.004, 0.004), 0.004]),
+        rng.uniform(-0.15, 0.15, 3),
+    )
+    return Scene(bodies, *view)
+
+
+def _orbit(rng: Random, half_width: float, half_height: float) -> Scene:
+    m = _Materials(rng)
+    objects = _objects(rng, m, _FRONT + _BACK, half_width)
+    bodies = [Body("room", tuple(_interior(rng, m, half_width)))]
+    bodies += [Body(f"object {k}", (part,)) for k, (part, _) in enumerate(objects)]
+    pose = _pose(0, -1.45, 0, pitch=-9)
+    around = _about(
+        np.array([0, 0, 4.2]),
+        np.array([0, _sign(rng) * rng.uniform(1.2, 2.0), 0]),
+        np.array([0, rng.uniform(-0.03, 0.03), rng.uniform(-0.03, 0.06)]),
+    )
+    return Scene(tuple(bodies), inverse(pose), inverse(around @ pose))
+
+
+def _still(rng: Random, half_width: float, half_height: float) -> Scene:
+    m = _Materials(rng)
+    objects = _objects(rng, m, _FRONT + _BACK, half_width)
+    mover = int(rng.integers(3))
+    part, foot = objects.pop(mover)
+    turn = np.array([0, _sign(rng) * rng.uniform(3, 6), 0])
+    shift = np.array([_sign(rng) * rng.uniform(0.05, 0.09), 0, rng.uniform(-0.08, 0.08)])
+    bodies = (
+        Body("room", (*_interior(rng, m, half_width), *(p for p, _ in objects))),
+        Body("mover", (part,), _about(foot, turn, shift)),
+    )
+    pose = inverse(_pose(0, -1.35, 0, pitch=-9))
+    return Scene(bodies, pose, pose)
+
+
+_LAYOUTS: dict[str, tuple[Callable[[Random, float, float], Scene], float]] = {
+    "street": (_street, 0.9),
+    "room": (_room, 0.8),
+    "sheet": (_sheet, 0.9),
+    "orbit": (_orbit, 0.8),
+    "still": (_still, 0.8),
+}
+"""Layout and focal length (in image widths) of each scene."""

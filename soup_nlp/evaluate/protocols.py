@@ -1,0 +1,133 @@
+"""Presets of the metric conventions in use; a preset is named beside every number it made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from soup_nlp.errors import DataError
+from soup_nlp.evaluate.metrics import DepthMetrics, Scale, depth_metrics
+
+Crop = tuple[float, float, float, float]
+
+GARG_CROP: Crop = (0.40810811, 0.99189189, 0.03594771, 0.96405229)
+"""Rows from and to, columns from and to, as shares of the image (Garg et al., ECCV 2016)."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A convention of depth evaluation.
+
+    Attributes:
+        name: As on the command line.
+        scale: Rule of the one global scale.
+        cap: Truth beyond this depth is left out; None for no cap.
+        low: Truth at or below this depth is left out.
+        crop: Part of the image that counts, as shares; None for all of it.
+        clamp: Range that scaled estimates are moved into; None for none.
+        text: What it is, in a few words.
+    """
+
+    name: str
+    scale: Scale = "median"
+    cap: float | None = None
+    low: float = 0.0
+    crop: Crop | None = None
+    clamp: tuple[float, float] | None = None
+    text: str = ""
+
+    def __str__(self) -> str:
+        rule = "no scale" if self.scale == "none" else f"one {self.scale} scale"
+        cap = "no cap" if self.cap is None else f"{self.low:g} < z <= {self.cap:g}"
+        more = ", Garg crop" if self.crop == GARG_CROP else ", cropped" if self.crop else ""
+        if self.clamp:
+            more += f", estimates clamped to [{self.clamp[0]:g}, {self.clamp[1]:g}]"
+        return f"{self.name}: {rule} per image, {cap}{more}"
+
+    def mask(self, truth: ArrayLike) -> NDArray[np.bool_]:
+        """Where a truth (H, W) or (M,) counts; a crop needs the image."""
+        gt = np.asarray(truth, np.float64)
+        keep = gt > self.low
+        if self.cap is not None:
+            keep &= gt <= self.cap
+        if self.crop is not None:
+            if gt.ndim != 2:
+                raise DataError(
+                    "a crop needs a depth map",
+                    where=f"preset {self.name}",
+                    found=gt.shape,
+                    expected="(H, W)",
+                )
+            top, bottom, left, right = (
+                int(share * side)
+                for share, side in zip(self.crop, np.repeat(gt.shape, 2), strict=True)
+            )
+            inside = np.zeros(gt.shape, bool)
+            inside[top:bottom, left:right] = True
+            keep &= inside
+        return keep
+
+    def counts(self, truth: ArrayLike) -> bool:
+        """Whether any true pixel is left."""
+        return bool(self.mask(truth).any())
+
+    def score(self, estimate: ArrayLike, truth: ArrayLike) -> DepthMetrics:
+        """`depth_metrics` under this convention.
+
+        Args:
+            estimate: z in any unit, (H, W) or (M,); NaN where unknown.
+            truth: True z, same shape; NaN where unknown.
+
+        Raises:
+            DataError: shapes differ, a crop meets a vector, or no true pixel is left.
+        """
+        return depth_metrics(
+            estimate,
+            truth,
+            scale=self.scale,
+            cap=self.cap,
+            mask=self.mask(truth),
+            clamp=self.clamp,
+        )
+
+
+_ALL = (
+    Preset("paper", text="the paper's MRE: every true pixel, one global scale"),
+    Preset("best", "mre", text="the scale that minimises the MRE itself, no cap"),
+    Preset("lsq", "lsq", text="least-squares scale, no cap"),
+    Preset("metric", "none", text="as it is, no scale"),
+    Preset("near20", cap=20.0, text="median scale, depth cap 20"),
+    Preset(
+        "sintel70",
+        cap=70.0,
+        text="as two-view work on Sintel, 0 < z <= 70, but the scale is the median of z_gt / z, not"
+        " median z_gt over median z",
+    ),
+    Preset("kitti", text="KITTI uncapped: median scale over every true pixel"),
+    Preset(
+        "eigen80",
+        cap=80.0,
+        low=1e-3,
+        crop=GARG_CROP,
+        clamp=(1e-3, 80.0),
+        text="after Eigen's protocol on KITTI at 80 m, Garg crop, clamped estimates, but the scale"
+        " is the median of z_gt / z, not median z_gt over median z",
+    ),
+)
+PRESETS: Mapping[str, Preset] = MappingProxyType({p.name: p for p in _ALL})
+"""Conventions by name."""
+
+
+def preset(name: str) -> Preset:
+    """The preset of a name.
+
+    Raises:
+        DataError: there is none.
+    """
+    if name not in PRESETS:
+        raise DataError("unknown metric preset", found=repr(name), expected=", ".join(PRESETS))
+    return PRESETS[name]

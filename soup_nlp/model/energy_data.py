@@ -1,0 +1,165 @@
+"""The numbers that the energy is made of: sampled pixels, graphs, weights; no symbols here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.pair import Flow
+from soup_nlp.geometry.camera import rays
+from soup_nlp.geometry.graph import Segmentation
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+TERMS = ("arap", "proj", "cont", "orient")
+
+
+@dataclass(frozen=True)
+class EnergyData:
+    """Everything numeric that E and its constraints need (N superpixels, E edges, P pairs).
+
+    Attributes:
+        K_next: (3, 3) intrinsics of the next frame.
+        anchor_ray: (N, 3).
+        radius: (N,) largest distance of a rim pixel from the anchor, ray units.
+        pixel_ray: (N, S, 3) sampled pixels of every superpixel.
+        pixel_target: (N, S, 2) their flow targets, pixels.
+        pixel_weight: (N, S) confidence / S: E_proj is the confidence-weighted mean of the sample.
+        edges: (E, 2) K-NN edges i < k.
+        edge_weight: (E,) w1 = w2, both directions folded.
+        edge_unit: (E,) length unit of the edge (1: the mean plane distance).
+        rotation_scale: Factor of |R_i - R_k| (1 in the paper's units, focal in pixel units).
+        pairs: (P, 2) neighbours i < k.
+        boundary_ray: (P, B, 3) sampled shared boundary points.
+        pair_weight: (P,) w4, both directions folded.
+        pair_factor: (P,) sqrt(boundary length / B): the sampled Frobenius norm times this stands
+            for the norm over the whole boundary.
+        pair_unit: (P,) length unit of the pair.
+        pair_count: (P,) weight of E_orient: 2, directed pairs folded into one, less where the flow
+            of a bending surface tears.
+        rim_ray: (N, V, 3) rays where visibility is imposed, the anchor first.
+        local_units: edge_unit and pair_unit are shares of the depth of the two anchors, mostly the
+            nearer one (E is then independent of scale, term by term), instead of lengths.
+        share: (N,) weights c of the length unit: lengths are measured with sum_i c_i D_i = 1, D the
+            plane distances; lam_i = c_i D_i is then on the simplex.
+        arap_at_anchors: motion difference taken at the anchors rather than at the camera.
+    """
+
+    K_next: Float
+    anchor_ray: Float
+    radius: Float
+    pixel_ray: Float
+    pixel_target: Float
+    pixel_weight: Float
+    edges: Int
+    edge_weight: Float
+    edge_unit: Float
+    rotation_scale: float
+    pairs: Int
+    boundary_ray: Float
+    pair_weight: Float
+    pair_factor: Float
+    pair_unit: Float
+    pair_count: Float
+    rim_ray: Float
+    share: Float
+    local_units: bool = False
+    arap_at_anchors: bool = False
+
+    def __len__(self) -> int:
+        return len(self.anchor_ray)
+
+    def __str__(self) -> str:
+        return (
+            f"EnergyData({len(self)} superpixels x {self.pixel_ray.shape[1]} pixels,"
+            f" {len(self.edges)} edges, {len(self.pairs)} pairs x {self.boundary_ray.shape[1]})"
+        )
+
+    def visibility_ray(self, depth_ratio: float) -> Float:
+        """(N, V, 3) rays v with `-n . v >= c` for visibility: the anchor, then r_rim - r_a / ratio.
+
+        The latter bounds the depth at a rim pixel by `ratio` times the anchor's and implies
+        `-n . r_rim >= c`.
+        """
+        rim = self.rim_ray[:, 1:] - self.rim_ray[:, :1] / depth_ratio
+        return np.concatenate([self.rim_ray[:, :1], rim], axis=1)
+
+    def arrays(self) -> dict[str, Float]:
+        """Every array by name, for storing."""
+        out = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {k: np.asarray(v) for k, v in out.items()}
+
+
+def sample_pixels(
+    labels: NDArray[np.int32], flow: Flow, samples: int | None, seed: int
+) -> tuple[Int, NDArray[np.bool_]]:
+    """Sampled pixels of every superpixel, confident ones first come.
+
+    Args:
+        labels: (H, W) superpixel labels.
+        flow: Flow with confidence; pixels of confidence 0 are never taken.
+        samples: Pixels per superpixel, None for all.
+        seed: Of the draw.
+
+    Returns:
+        (N, S) flat pixel indices and (N, S) bool, False where a superpixel has fewer pixels.
+    """
+    n = int(labels.max()) + 1
+    rng = np.random.default_rng(seed)
+    flat = labels.ravel()
+    usable = np.flatnonzero(flow.confidence.ravel() > 0)
+    # a random order within each superpixel, then its first S: a sample without replacement
+    order = usable[np.lexsort((rng.random(len(usable)), flat[usable]))]
+    count = np.bincount(flat[order], minlength=n)
+    s = int(count.max(initial=1)) if samples is None else samples
+    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    place = np.arange(s)[None, :]
+    there = place < count[:, None]
+    if not len(order):
+        return np.zeros((n, s), np.int64), there
+    take = np.minimum(start[:, None] + np.where(there, place, 0), len(order) - 1)
+    return order[take], there
+
+
+def build_energy_data(
+    seg: Segmentation,
+    flow: Flow,
+    K_ref: Float,
+    K_next: Float,
+    samples: int | None = 16,
+    seed: int = 0,
+    arap_at_anchors: bool = False,
+) -> EnergyData:
+    """Collect rays, targets and weights of a segmented pair."""
+    width = seg.labels.shape[1]
+    index, there = sample_pixels(seg.labels, flow, samples, seed)
+    uv = np.stack([index % width, index // width], axis=-1).astype(float)
+    confidence = np.where(there, flow.confidence.ravel()[index].astype(float), 0.0)
+    target = uv + np.where(there[..., None], flow.uv.reshape(-1, 2)[index], 0.0)
+    anchor = rays(K_ref, seg.anchors)
+    rim = rays(K_ref, seg.rim)
+    reach = np.linalg.norm((rim - anchor[:, None])[..., :2], axis=-1).max(axis=1)
+    return EnergyData(
+        K_next=np.asarray(K_next, float),
+        anchor_ray=anchor,
+        radius=np.maximum(reach, 1.0 / K_ref[0, 0]),
+        pixel_ray=rays(K_ref, uv),
+        pixel_target=target,
+        pixel_weight=confidence / index.shape[1],
+        edges=seg.edges,
+        edge_weight=seg.edge_weight,
+        edge_unit=np.ones(len(seg.edges)),
+        rotation_scale=1.0,
+        pairs=seg.pairs,
+        boundary_ray=rays(K_ref, seg.boundary),
+        pair_weight=seg.pair_weight,
+        pair_factor=np.sqrt(seg.boundary_length / max(1, seg.boundary.shape[1])),
+        pair_unit=np.ones(len(seg.pairs)),
+        pair_count=np.full(len(seg.pairs), 2.0),
+        rim_ray=np.concatenate([anchor[:, None], rim], axis=1),
+        share=np.full(len(seg), 1.0 / len(seg)),
+        arap_at_anchors=arap_at_anchors,
+    )

@@ -1,0 +1,104 @@
+"""What a problem file says about the energy: weights, truncations, units, departures."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from soup_nlp.schema.section import NonNegative, Positive, Section, Share, Truncation, Whole
+
+
+class Weights(Section):
+    """Constants of E = E_arap + alpha1 E_proj + alpha2 E_cont + alpha3 E_orient.
+
+    The defaults belong to `in_pixels`, where every term is measured in pixels; in the paper's
+    units (lengths with sum_i c_i D_i = 1) other values are needed. beta, w1 to w4 live in the
+    segmentation.
+    """
+
+    arap: NonNegative = 0.15
+    """Factor of E_arap (the paper's is 1; only the ratios of the four factors matter)."""
+    proj: NonNegative = 1.0
+    """alpha1, per pixel of re-projection error."""
+    cont: NonNegative = 3e-4
+    """alpha2."""
+    orient: NonNegative = 5e-3
+    """alpha3."""
+    sigma_cont: Truncation = 1.0
+    """Truncation of E_cont's second-frame gap (rho), length."""
+    sigma_cont_ref: Truncation = np.inf
+    """Truncation of its reference-frame gap; inf is the paper's form."""
+    sigma_orient: Truncation = 0.5
+    """Truncation n of rho_n."""
+    sigma_arap: Truncation = 0.5
+    """Truncation of every ARAP norm; inf is the paper's form."""
+    leak_arap: Share = 0.01
+    """Share of an ARAP norm that is not truncated: it pulls motions that nothing else holds back
+    to their neighbours', where a full truncation leaves them adrift."""
+    sigma_proj: Truncation = np.inf
+    """Truncation of a pixel's re-projection error, pixels; inf is the paper's form."""
+
+
+class BendingWeights(Weights):
+    """Weights where surfaces bend; `orient` is that of 1,000 superpixels, see `BendingOptions`."""
+
+    cont: NonNegative = 0.05
+    """alpha2."""
+    orient: NonNegative = 4.0
+    """alpha3, of 1,000 superpixels; it grows with their number."""
+    sigma_arap: Truncation = 1.0
+    """Truncation of every ARAP norm; inf is the paper's form."""
+    leak_arap: Share = 0.05
+    """Share of an ARAP norm that is not truncated."""
+
+
+class BendingOptions(Section):
+    """The energy where the start finds that surfaces bend, always in pixels.
+
+    Bending is a difference of rotations that keeps lengths: E_arap compares motions at the
+    anchors, where a surface that bends hangs together, and its rotations count for next to
+    nothing. The relief is then held by lengths, continuity and orientation.
+    """
+
+    widest_eps: Positive = 0.1
+    """Widest smoothing of the presolve, pixels: wider ones of solver.presolve_eps become this.
+    What shows relief is a fraction of a pixel, a wide norm flattens it."""
+    rotation_px: Positive = 1e-3
+    """Pixels per radian of rotation difference."""
+    arap_across: Share = 0.3
+    """Factor of E_arap where the flow tears; 1 is the paper's, as of the others."""
+    cont_across: Share = 0.01
+    """Factor of E_cont there."""
+    orient_across: Share = 0.3
+    """Factor of E_orient there."""
+    weights: BendingWeights = BendingWeights()
+    """Factors of the terms and their truncations; orient is that of 1,000 superpixels and grows
+    with their number."""
+
+
+class EnergyOptions(Section):
+    """The energy."""
+
+    units: Literal["pixel", "paper"] = "pixel"
+    """pixel (every term in pixels, free of scale) or paper (one length unit)."""
+    arap_at_anchors: bool = False
+    """Motion difference at the anchors instead of the camera's origin."""
+    arap_across: Share = 0.03
+    """Factor of E_arap between superpixels that the start gives to different bodies; 1 is the
+    paper's."""
+    cont_occluded: Share = 0.03
+    """Factor of E_cont where one of these bodies hides another; 1 is the paper's."""
+    occlusion_gap: Annotated[float, Field(ge=0, lt=1)] = 0.1
+    """It does where the start leaves a larger gap in depth between them, relative to the farther
+    side."""
+    rotation_px: Positive | None = None
+    """Pixels per radian of rotation difference; null for the focal length."""
+    pixel_samples: Whole | Literal["all"] = 16
+    """Pixels per superpixel in E_proj, or all."""
+    weights: Weights = Weights()
+    """Factors of the terms and their truncations."""
+    bending: BendingOptions = BendingOptions()
+    """What replaces rotation_px, arap_at_anchors, weights and the solver's wide smoothing where
+    surfaces bend."""

@@ -1,0 +1,113 @@
+"""Departures from the paper's weights: across components, at occlusions, in pixel units."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy_data import EnergyData
+
+
+def between_bodies(data: EnergyData, body: NDArray[np.int64], factor: float) -> EnergyData:
+    """The same data with E_arap's weights times `factor` on edges from one body to another.
+
+    As-rigid-as-possible holds inside a body. Across bodies it pulls a body that the camera's
+    motion explains at a wrong depth to that depth: with equal motions such an edge costs nothing.
+
+    Args:
+        data: Data of the pair.
+        body: (N,) group of every superpixel, as the start finds them.
+        factor: 1 is the paper's energy.
+    """
+    i, k = data.edges.T
+    return replace(data, edge_weight=np.where(body[i] == body[k], 1.0, factor) * data.edge_weight)
+
+
+def at_occlusions(
+    data: EnergyData, soup: Soup, body: NDArray[np.int64], gap: float, factor: float
+) -> EnergyData:
+    """The same data with E_cont's weights times `factor` where one body hides another.
+
+    A body in front touches what is behind it along a part of its outline alone, where the start
+    has brought both together. The gaps along the rest are real; closing them moves the body away
+    from the camera, and nothing else fixes its scale.
+
+    Args:
+        data: Data of the pair.
+        soup: Start, its bodies scaled to where they touch.
+        body: (N,) group of every superpixel, as the start finds them.
+        gap: Smallest gap in depth that is one, relative to the farther side.
+        factor: 1 is the paper's energy.
+    """
+    i, k = data.pairs.T
+    z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
+    hidden = (body[i] != body[k]) & (z.min(axis=0) < (1 - gap) * z.max(axis=0))
+    return replace(data, pair_weight=np.where(hidden, factor, 1.0) * data.pair_weight)
+
+
+def across_tears(
+    data: EnergyData,
+    surface: NDArray[np.int64],
+    *,
+    arap: float = 1.0,
+    cont: float = 1.0,
+    orient: float = 1.0,
+) -> EnergyData:
+    """The same data with terms times a factor each from one surface to another.
+
+    Where the flow tears, two surfaces pass each other: their gap in depth is nothing to close, they
+    need not move alike, nor face the same way. What ties them flattens the relief of both.
+
+    Args:
+        data: Data of the pair.
+        surface: (N,) surface of every superpixel, as the start finds them.
+        arap: Factor of E_arap; 1 is the paper's energy, as for the others.
+        cont: Factor of E_cont.
+        orient: Factor of E_orient.
+    """
+    torn, apart = (surface[a] != surface[b] for a, b in (data.pairs.T, data.edges.T))
+    return replace(
+        data,
+        edge_weight=np.where(apart, arap, 1.0) * data.edge_weight,
+        pair_weight=np.where(torn, cont, 1.0) * data.pair_weight,
+        pair_count=np.where(torn, orient, 1.0) * data.pair_count,
+    )
+
+
+def in_pixels(
+    data: EnergyData, soup: Soup, seg: Segmentation, rotation_px: float | None = None
+) -> EnergyData:
+    """The same data with every term measured in pixels: the weights mean the same on every scene.
+
+    A rotation by an angle a moves the image by `focal a`; a length l at depth Z by `focal l / Z`;
+    a depth gap g changes the parallax of a baseline T by `focal g / Z * T / Z`. Z is the depth
+    of the two anchors as they are, so that no term gains from shrinking or growing the scene: with
+    one global unit, superpixels without parallax run away to shorten all other lengths. It is
+    their power mean of exponent -4, close to the nearer one: the arithmetic mean rewards whoever
+    recedes. The ratio T / Z is a constant of the energy: its median around the superpixels at the
+    start.
+
+    Args:
+        data: Data in the paper's units.
+        soup: Start, for the ratio of baseline and depth.
+        seg: For the neighbourhoods.
+        rotation_px: Pixels that a radian of rotation difference costs; default the focal length.
+    """
+    ratio = np.linalg.norm(soup.translation, axis=1) / soup.depth_at(data.anchor_ray)
+    if seg.knn.shape[1]:
+        ratio = np.median(ratio[np.column_stack([np.arange(len(soup)), seg.knn])], axis=1)
+    # a camera at rest leaves no parallax: half a pixel of it is the least taken
+    focal = float(data.K_next[0, 0])
+    ratio = np.maximum(ratio, 0.5 / focal)
+    ri, rk = ratio[data.pairs].T
+    return replace(
+        data,
+        local_units=True,
+        edge_unit=np.full(len(data.edges), 1.0 / focal),
+        rotation_scale=rotation_px or focal,
+        pair_unit=1.0 / (focal * np.sqrt(ri * rk)),
+    )

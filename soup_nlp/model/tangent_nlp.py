@@ -1,0 +1,108 @@
+"""The tangent presolve: nine coordinates per superpixel, linear constraints and visibility."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.builder import Builder
+from soup_nlp.model.elements import elements
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import Chart, TangentLayout
+from soup_nlp.model.nlp import NLP
+from soup_nlp.model.superpixel import View, tangent_view
+
+Float = NDArray[np.float64]
+
+
+def build_tangent_nlp(
+    soup: Soup, data: EnergyData, weights: Weights, form: Formulation, chart: Chart = "depth"
+) -> tuple[NLP, TangentLayout]:
+    """The presolve: 9 coordinates per superpixel about the soup, linear constraints only.
+
+    Args:
+        soup: Base and start.
+        data: Pixels, graphs and weights of the pair.
+        weights: Constants of the energy.
+        form: Smoothing and Hessian; gauge is not used.
+        chart: See TangentLayout.
+
+    Returns:
+        The NLP and the layout that turns its vectors into soups.
+    """
+    n = len(data)
+    layout = TangentLayout.about(soup, data, chart)
+    b = Builder(form, 9 * n)
+
+    def view(x: ca.SX, row: dict[str, ca.SX], a: int) -> View:
+        base = {k: row[f"{k}_{a}"] for k in ("anchor", "radius", "depth", "R0", "t0")}
+        return tangent_view(x, **base, chart=chart)
+
+    for name, element in elements(data, weights, layout).items():
+        b.add_norms(f"t_{name}", element.placed(layout), view, 9)
+    # the simplex with the slopes held, linear in chart "depth": every iterate keeps it, and the
+    # constrained NLP, which has it exactly, starts from the normalised answer
+    share = soup.normalised(layout.share).lam
+    lam, part = ca.SX.sym("lam"), ca.SX.sym("share")
+    row = np.tile(b.new_rows("simplex", 1, 1.0, 1.0), (n, 1))
+    b.add_constraint(
+        "t_simplex",
+        lam,
+        part,
+        part * lam if chart == "depth" else part / lam,
+        np.arange(n)[:, None] * 9,
+        share[:, None],
+        row,
+    )
+    # visibility as in the constrained NLP, divided by the anchor's facing 1 / |m| and in chart
+    # "inverse-depth" multiplied by rho: the same set, so that one's solution is the other's
+    count = data.rim_ray.shape[1] - 1
+    off = (data.rim_ray[:, 1:] - data.rim_ray[:, :1])[..., :2] / layout.radius[:, None, None]
+    plane, place = ca.SX.sym("plane", 2 + (chart != "depth")), ca.SX.sym("off", 2 * count)
+    rho, slope = (ca.SX(1), plane) if chart == "depth" else (plane[0], plane[1:])
+    ray, reach = ca.SX.sym("ray", 2), ca.SX.sym("radius")
+    facing = ca.norm_2(ca.vertcat(slope / reach, rho - ca.dot(slope, ray) / reach))
+    rows = b.new_rows("visible", count * n, 0.0, np.inf)
+    b.add_constraint(
+        "t_visible",
+        plane,
+        ca.vertcat(place, ray, reach),
+        ca.vertcat(*[ca.dot(slope, place[2 * j : 2 * j + 2]) for j in range(count)])
+        + (1 - 1 / form.depth_ratio) * rho
+        - form.min_facing * facing,
+        np.arange(n)[:, None] * 9 + np.arange(3 - plane.numel(), 3),
+        np.column_stack([off.reshape(n, -1), layout.anchor[:, :2], layout.radius]),
+        rows.reshape(n, count),
+    )
+    b.add_ridge(np.ones(9 * n))
+    lower, upper = np.full((n, 9), -np.inf), np.full((n, 9), np.inf)
+    lower[:, 0] = 1e-3
+    # wide: visibility bounds the slopes, as in the constrained NLP, which has no such box
+    lower[:, 1:3], upper[:, 1:3] = -20 * form.depth_ratio, 20 * form.depth_ratio
+    extra = b.nx - 9 * n
+    x0 = np.concatenate(
+        [_visible(layout.pack(soup), off, form.depth_ratio, chart), np.zeros(extra)]
+    )
+    nlp = b.finish(
+        "presolve",
+        x0,
+        np.concatenate([lower.ravel(), np.zeros(extra)]),
+        np.concatenate([upper.ravel(), np.zeros(extra)]),
+        9 * n,
+        layout.names,
+    )
+    return nlp, layout
+
+
+def _visible(x: Float, off: Float, depth_ratio: float, chart: Chart) -> Float:
+    """Shrink the slopes of a presolve vector until every rim pixel is visible."""
+    x = x.reshape(-1, 9).copy()
+    rho = np.ones(len(x)) if chart == "depth" else x[:, 0]
+    least = np.einsum("nc,nvc->nv", x[:, 1:3], off).min(axis=1)
+    limit = 0.95 * (1 / depth_ratio - 1) * rho
+    x[:, 1:3] *= np.minimum(1.0, limit / np.minimum(least, limit))[:, None]
+    return x.ravel()

@@ -1,0 +1,165 @@
+"""One problem ready for any solver: pair, start and energy, up to but not into a solve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from soup_nlp.config.problem import Problem
+from soup_nlp.data.flow.borders import follow_flow
+from soup_nlp.data.flow.robust import reweighted
+from soup_nlp.data.pair import Pair
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.superpixels import Labels, segment
+from soup_nlp.model.energy_data import EnergyData, build_energy_data
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.model.nlp import NLP
+from soup_nlp.model.reweighting import across_tears, at_occlusions, between_bodies, in_pixels
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.stages import solve_soup
+from soup_nlp.start.propose import Start, propose
+from soup_nlp.start.start_options import SeededStart
+
+
+@dataclass(frozen=True)
+class Case:
+    """A problem before it is solved.
+
+    Attributes:
+        problem: The merged problem.
+        pair: Images, cameras, flow, truth.
+        segmentation: Superpixels and graphs.
+        start: The unorganised soup.
+        data: Numbers of the energy.
+        weights: Constants of the energy.
+        soup: Where solvers start: the start, or the presolve's answer.
+        options: Stages and limits of the problem.
+    """
+
+    problem: Problem
+    pair: Pair
+    segmentation: Segmentation
+    start: Start
+    data: EnergyData
+    weights: Weights
+    soup: Soup
+    options: SolverOptions
+
+    def __len__(self) -> int:
+        return len(self.segmentation)
+
+    def formulation(self, **changes: object) -> Formulation:
+        """The problem's formulation with its smoothing, changed."""
+        own, eps = dict(self.problem.formulation), self.options.eps
+        return Formulation.make({**own, "eps": eps, "eps_pixel": eps, **changes})
+
+    def nlp(self, form: Formulation) -> tuple[NLP, MatrixLayout]:
+        """The constrained NLP at the case's soup."""
+        return build_matrix_nlp(self.soup, self.data, self.weights, form)
+
+
+def prepare(
+    problem: Problem,
+    presolve: bool = False,
+    say: Callable[[str], None] | None = None,
+    *,
+    pair: Pair | None = None,
+    lap: Callable[[str], None] | None = None,
+) -> Case:
+    """Load, segment, start and weigh a problem: what comes before every solve.
+
+    Args:
+        problem: See `config.load_problem`.
+        presolve: Let solvers start where the tangent presolve ends.
+        say: Called with a line after every stage.
+        pair: Images and cameras, instead of the problem's input; its flow is used when it has one.
+        lap: Called with the name of a stage at its end: "load", "flow", "segmentation", "start".
+
+    Raises:
+        SoupError: the input cannot be used.
+    """
+    say = say or (lambda line: None)
+    lap = lap or (lambda stage: None)
+    pair = pair or problem.load_pair()
+    lap("load")
+    flow = pair.flow or problem.flow.load(pair, problem.path)
+    pair = pair.with_flow(flow)
+    lap("flow")
+    say(str(pair))
+    s = problem.segmentation
+    labels = superpixels(problem, pair)
+    if problem.flow.reweight_px is not None:
+        flow = reweighted(flow, labels, problem.flow.reweight_px)
+        pair = pair.with_flow(flow)
+    samples = None if s.boundary_samples == "all" else s.boundary_samples
+    seg = build_segmentation(labels, pair.image_ref, s.neighbours, s.beta, s.beta_colour, samples)
+    lap("segmentation")
+    say(str(seg))
+    options = SeededStart(**dict(problem.start), seed=problem.seed)
+    start = propose(seg, flow, pair.K_ref, pair.K_next, options)
+    lap("start")
+    say(str(start))
+    data, weights = build_energy(problem, pair, seg, start)
+    stages = solver_options(problem, start)
+    case = Case(problem, pair, seg, start, data, weights, start.soup, stages)
+    if not presolve:
+        return case
+    # one iteration of the constrained NLP is the least that a solve has
+    once = stages.replace(presolve=True, max_iter=1)
+    answer = solve_soup(start.soup, data, weights, case.formulation(), once, say=say)
+    return replace(case, soup=answer.soup)
+
+
+def superpixels(problem: Problem, pair: Pair) -> Labels:
+    """The superpixels that a problem asks for, on a pair that carries its flow."""
+    assert pair.flow is not None
+    s = problem.segmentation
+    labels = segment(pair.image_ref, s.superpixels, s.method, s.compactness, s.smoothing_px)
+    return labels if s.follow_flow_px is None else follow_flow(labels, pair.flow, s.follow_flow_px)
+
+
+def _bends(problem: Problem, start: Start) -> bool:
+    """Whether the energy for surfaces that bend is in force."""
+    return start.bending and problem.energy.units == "pixel"
+
+
+def solver_options(problem: Problem, start: Start) -> SolverOptions:
+    """The solver's options of a problem, its smoothing no wider than surfaces allow."""
+    own = problem.solver
+    widest = problem.energy.bending.widest_eps if _bends(problem, start) else np.inf
+    # of several that become the widest one is enough
+    eps = dict.fromkeys(min(e, widest) for e in own.presolve_eps)
+    return own.replace(presolve_eps=tuple(eps))
+
+
+def build_energy(
+    problem: Problem, pair: Pair, seg: Segmentation, start: Start
+) -> tuple[EnergyData, Weights]:
+    """The energy that a problem asks for, on a pair that carries its flow."""
+    assert pair.flow is not None
+    e = problem.energy
+    pixels = None if e.pixel_samples == "all" else e.pixel_samples
+    bends = _bends(problem, start)
+    form = e.bending if bends else e
+    data = build_energy_data(
+        seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, bends or e.arap_at_anchors
+    )
+    data = between_bodies(data, start.body, e.arap_across)
+    data = at_occlusions(data, start.soup, start.body, e.occlusion_gap, e.cont_occluded)
+    if bends:
+        b = e.bending
+        held = {"arap": b.arap_across, "cont": b.cont_across, "orient": b.orient_across}
+        data = across_tears(data, start.surface, **held)
+    if e.units == "pixel":
+        data = in_pixels(data, start.soup, seg, form.rotation_px)
+    weights: Weights = form.weights
+    if bends:
+        # on the same relief 1 - cos between neighbours falls as 1 / N
+        weights = weights.replace(orient=weights.orient * len(seg) / 1000)
+    return data, weights

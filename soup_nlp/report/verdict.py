@@ -1,0 +1,149 @@
+"""The dozen lines that end a solve: what happened, how good it is, where the files are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from soup_nlp.evaluate.metrics import DepthMetrics, skill
+
+if TYPE_CHECKING:
+    from soup_nlp.pipeline.run import Run
+    from soup_nlp.refine.records import Refined
+
+WORDS = {
+    "Solve_Succeeded": "converged to the tolerance",
+    "Solved_To_Acceptable_Level": "converged to Ipopt's acceptable level",
+    "Maximum_Iterations_Exceeded": "not converged: iteration limit, best iterate kept",
+    "Time_Limit": "not converged: time limit, best iterate kept",
+    "Skipped": "refined from the start, no NLP",
+    "Interrupted": "interrupted, best iterate kept",
+    "Infeasible_Problem_Detected": "not converged: no feasible point nearby, best iterate kept",
+    "Error_In_Step_Computation": "not converged: no further step is found, best iterate kept",
+    "Search_Direction_Becomes_Too_Small": "not converged: steps are of rounding size, best iterate"
+    " kept",
+    "Restoration_Failed": "not converged: feasibility could not be restored, best iterate kept",
+}
+TITLES = {"nlp": "NLP alone", "rigid": "one rigid motion", "constant": "constant depth"}
+DELIVERED = {
+    "constrained NLP": "its answer, retracted to the constraints",
+    "presolve": "the presolve's answer, whose exact energy is lower",
+    "start": "the start",
+}
+OF_ANSWER = ("nlp_infeasibility", "dual_infeasibility", "complementarity")
+"""Residuals of Ipopt's own answer; the others are those of the delivered soup."""
+
+GUESSED = 0.5
+"""Share of superpixels without a depth of their own from which the verdict says so."""
+
+PAD = " " * 12
+
+
+def verdict(run: Run, folder: Path, files: Sequence[str], limit: float | None = None) -> str:
+    """Status, energy, residuals, accuracy, times, files and the next command.
+
+    Args:
+        run: The run.
+        folder: Where its files are.
+        files: Their names.
+        limit: Largest MRE that the problem file allows, if it says so.
+    """
+    s = run.solution
+    words = WORDS.get(s.status, f"not converged: {s.status}, best iterate kept")
+    lines = [f"status      {words} ({s.status})"]
+    if s.far and not s.converged:
+        lines.append(
+            f"{PAD}the presolve ended far from a minimum: solver.far_iterations limits Ipopt there"
+        )
+    made = DELIVERED[run.delivered]
+    if s.stages:
+        every = sum(stage.iterations for stage in s.stages)
+        counted = f"constrained NLP {s.stages[-1].iterations} iterations of {every}"
+        lines.append(f"{PAD}{counted}; {'refined' if run.refined else 'delivered'}: {made}")
+    if run.refined is not None:
+        lines += [PAD + line for line in refinement(run.refined)]
+    names = list(s.energy)
+    lines.append("energy      " + " " * 9 + "".join(f"{k:>11}" for k in names))
+    rows = {"start": s.energy_start, "NLP": s.energy, "solution": run.energy}
+    if run.refined is None or not s.stages:
+        del rows["NLP"]
+    for title, energy in rows.items():
+        lines.append(f"{PAD}{title:<9}" + "".join(f"{energy[k]:>11.5g}" for k in names))
+    own = {k: v for k, v in run.residuals.items() if k not in OF_ANSWER}
+    lines.append("residuals   " + "  ".join(f"{k} {v:.1e}" for k, v in own.items()))
+    answer = "  ".join(f"{k} {s.residuals[k]:.1e}" for k in OF_ANSWER if k in s.residuals)
+    if answer:
+        lines.append(f"{PAD}Ipopt's answer: {answer}")
+    borrowed = float(run.start.borrowed.mean())
+    if borrowed >= GUESSED and not run.start.bending:
+        lines.append(
+            f"depth       {borrowed:.0%} of the superpixels have no parallax: theirs is a guess"
+        )
+    if run.metrics:
+        lines += [f"accuracy    {protocol(run.metrics)}"]
+        lines += [PAD + line for line in accuracy(run.metrics)]
+    if limit is not None and "solution" in run.metrics:
+        lines.append(f"expected    MRE at most {limit:g}: {'missed' if missed(run) else 'met'}")
+    whole = {k: v for k, v in run.seconds.items() if not k.startswith("nlp_")}
+    inner = {k[4:]: v for k, v in run.seconds.items() if k.startswith("nlp_")}
+    lines += [
+        f"seconds     {sum(whole.values()):.1f}: "
+        + "  ".join(f"{k} {v:.1f}" for k, v in whole.items()),
+        *([f"{PAD}of nlp: " + "  ".join(f"{k} {v:.1f}" for k, v in inner.items())] * bool(inner)),
+        f"files       {folder}/: " + ", ".join(files),
+        f"next        soup-nlp check {folder}",
+    ]
+    return "\n".join(lines)
+
+
+def refinement(r: Refined) -> list[str]:
+    """What the refinement did, and how far its choice can be from the best one."""
+    if not r.rounds:
+        return [f"refinement: {r.status} before its first round"]
+    last = r.rounds[-1]
+    fall = 1 - r.energy["total"] / r.energy_begin["total"]
+    lines = [
+        f"refinement {len(r.rounds)} rounds ({r.status}): E {fall:.1%} lower; the last choice is at"
+        f" most {max(last.gap, 0) / last.mrf_energy:.2%} above the best among its particles"
+    ]
+    if r.polish_gain is not None:
+        lines.append(f"polish by the NLP: E {r.polish_gain:.3g} lower")
+    return lines
+
+
+def protocol(metrics: Mapping[str, DepthMetrics]) -> str:
+    """Scale rule and cap that scores are after, in words."""
+    first = next(iter(metrics.values()))
+    cap = "no depth cap" if first.cap is None else f"depth cap {first.cap:g}"
+    rule = "no scale" if first.scale_rule == "none" else f"one global {first.scale_rule} scale each"
+    frame = "reference" if "constant" in metrics else "next"
+    return f"depth of the {frame} frame, {rule}, {cap}"
+
+
+def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
+    """A table of scores: the solution beside the start, one rigid motion and a constant depth."""
+    lines = [f"{'':<17}{'MRE':>8}{'median':>9}{'skill':>8}{'coverage':>10}"]
+    if "constant" not in metrics:
+        # only the next frame has a truth
+        m = metrics["solution_next"]
+        row = f"{'next frame':<17}{m.mre:>8.4f}{m.median_relative:>9.4f}{'':>8}{m.coverage:>10.1%}"
+        return [*lines, row]
+    worst = metrics["constant"].mre
+    for name in ("solution", "nlp", "start", "rigid", "constant"):
+        if name in metrics:
+            m = metrics[name]
+            lines.append(
+                f"{TITLES.get(name, name):<17}{m.mre:>8.4f}{m.median_relative:>9.4f}"
+                f"{skill(m.mre, worst):>8.3f}{m.coverage:>10.1%}"
+            )
+    return lines
+
+
+def missed(run: Run) -> bool:
+    """Whether a known truth is missed by more than the problem file expects."""
+    limit = run.problem.expected.mre_at_most
+    # an MRE that is not a number has not met anything
+    return (
+        limit is not None and "solution" in run.metrics and not run.metrics["solution"].mre <= limit
+    )

@@ -1,0 +1,1 @@
+"""Validated option records: the base class, ranges as types, and errors that name file and key."""

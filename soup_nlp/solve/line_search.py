@@ -1,0 +1,311 @@
+"""Search along a step of the presolve, superpixel by superpixel.
+
+A step that is too long for a few superpixels is shortened for those alone, and where that does not
+do, for all alike, at last to what a bound leaves to any of them; one that still goes down at its
+end is doubled, for all and then for those that still descend. Energies cost a tenth of an
+iteration. A step that leaves the floor of a bent valley is led back by further ones with the same
+matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.solve.tangent_problem import TangentProblem
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+TO_BOUNDARY = 0.99
+"""Share of the way to where a slack vanishes that a step may go."""
+LEAST_SLACK = 1e-3
+"""A slack keeps at least this share of itself."""
+TRIES = 4
+SHORTER = 0.25
+"""A step that was too long goes on with this share of it: those for which it was too long, then all
+superpixels alike."""
+BACK = 3
+"""Most changes that bring a superpixel back to bounds that curve."""
+CORRECTIONS = 6
+"""Most steps with one matrix that follow the first."""
+WORTH = 0.05
+"""Share of the fall so far that another one must bring."""
+
+
+class Point(NamedTuple):
+    """A point with what is known of it.
+
+    Attributes:
+        x: (9 N,) variables.
+        f: Smoothed energy.
+        merit: f - barrier x sum log slack.
+        slack: (N, R) slacks.
+        jacobian: (N, R, 3) their derivatives by scale and slopes.
+    """
+
+    x: Float
+    f: float
+    merit: float
+    slack: Float
+    jacobian: Float
+
+
+class Move(NamedTuple):
+    """What came of a step.
+
+    Attributes:
+        point: Where it led, or None: refused at every length.
+        length: (N,) share of the step that every superpixel went.
+        far: (N,) its superpixels that went past their minimum.
+        calm: (N,) those that ended where the quadratic model says.
+        eager: (N,) those that went down to the end: the step was short for them.
+    """
+
+    point: Point | None
+    length: Float
+    far: Bool
+    calm: Bool
+    eager: Bool
+
+
+def own(h: Float, other: Float) -> Float:
+    """(N,) inner products of every superpixel's share of two vectors (9 N,)."""
+    return np.einsum("nc,nc->n", h.reshape(-1, 9), other.reshape(-1, 9))
+
+
+def reach(value: Float, change: Float) -> Float:
+    """(N,) share of a change (N, R) at which the first positive value (N, R) would vanish."""
+    with np.errstate(divide="ignore"):
+        return np.where(change < 0, -value / change, np.inf).min(axis=1)
+
+
+def along(jacobian: Float, h: Float) -> Float:
+    """(N, R) changes of the slacks along a step (9 N,)."""
+    return np.einsum("nrc,nc->nr", jacobian, h.reshape(-1, 9)[:, :3])
+
+
+def merit_gradient(at: Point, gradient: Float, barrier: float) -> Float:
+    """(9 N,) gradient of `f - barrier sum log slack` at a point, from that of f."""
+    return less_forces(gradient, at.jacobian, barrier / at.slack)
+
+
+def less_forces(gradient: Float, jacobian: Float, force: Float) -> Float:
+    """(9 N,) gradient less the forces (N, R) of the slacks, whose derivatives are (N, R, 3)."""
+    out = gradient.reshape(-1, 9).copy()
+    out[:, :3] -= np.einsum("nrc,nr->nc", jacobian, force)
+    return out.ravel()
+
+
+def inside(problem: TangentProblem, x: Float) -> Float:
+    """x on the simplex, with slopes shrunk until every slack is positive."""
+    x = problem.normalise(x)
+    for _ in range(200):
+        out = (problem.slacks(x)[0] <= 0).any(axis=1)
+        if not out.any():
+            break
+        x.reshape(-1, 9)[out, 1:3] *= 0.9
+    return x
+
+
+def led_back(
+    problem: TangentProblem, x: Float, aim: Float, floor: Float
+) -> tuple[Float, Float, Float]:
+    """x, its slacks and their derivatives, superpixels that left a curved bound brought back to it.
+
+    A step along a bound that curves leaves it by its square, however small the slack: what the
+    linearised slack promises is restored by the shortest change, bound by bound.
+
+    Args:
+        problem: Slacks.
+        x: (9 N,) end of a step.
+        aim: (N, R) slacks by their derivatives at the begin, positive.
+        floor: (N, R) least slacks.
+    """
+    slack, jacobian = problem.slacks(x)
+    for _ in range(BACK):
+        out = np.flatnonzero((slack <= floor).any(axis=1))
+        if not len(out):
+            break
+        worst = np.argmin(slack[out] - aim[out], axis=1)
+        normal = jacobian[out, worst]
+        lacks = (aim - slack)[out, worst] / np.einsum("nc,nc->n", normal, normal)
+        x = x.copy()
+        x.reshape(-1, 9)[out, :3] += lacks[:, None] * normal
+        x = problem.normalise(x)
+        slack, jacobian = problem.slacks(x)
+    return x, slack, jacobian
+
+
+def evaluate(
+    problem: TangentProblem, x: Float, barrier: float, floor: Float | float = 0.0
+) -> Point | None:
+    """Energy and slacks at x; None where a slack is not above `floor`."""
+    slack, jacobian = problem.slacks(x)
+    return None if (slack <= floor).any() else _point(problem, x, slack, jacobian, barrier)
+
+
+def _point(
+    problem: TangentProblem, x: Float, slack: Float, jacobian: Float, barrier: float
+) -> Point:
+    f = problem.value(x)
+    return Point(x, f, merit(f, slack, barrier), slack, jacobian)
+
+
+def merit(f: float, slack: Float, barrier: float) -> float:
+    """`f - barrier sum log slack`, infinite where that is not finite."""
+    value = f - barrier * float(np.log(slack).sum())
+    return value if np.isfinite(value) else np.inf
+
+
+class Search:
+    """The search along one step from one point."""
+
+    def __init__(
+        self,
+        problem: TangentProblem,
+        at: Point,
+        h: Float,
+        barrier: float,
+        newton: Callable[[Float], Float],
+    ) -> None:
+        """Prepare; nothing is evaluated.
+
+        Args:
+            problem: Energy and slacks.
+            at: Where the step begins.
+            h: (9 N,) the step.
+            barrier: b of `f - b sum log c`.
+            newton: Step (9 N,) for a gradient of the merit (9 N,), by the matrix that gave h.
+        """
+        self.problem, self.at, self.h, self.barrier = problem, at, h, barrier
+        self.newton = newton
+        self._known: tuple[Float, Float] | None = None
+
+    def gradient(self, x: Float) -> Float:
+        """Gradient of f at a point of the search (9 N,); that of the last one asked is kept."""
+        if self._known is None or self._known[0] is not x:
+            self._known = x, self.problem.gradient(x)
+        return self._known[1]
+
+    def _at(self, length: Float) -> Float:
+        return self.problem.normalise(self.at.x + (length[:, None] * self.h.reshape(-1, 9)).ravel())
+
+    def _slope(self, x: Float) -> Float:
+        return own(self.h, self.gradient(x))
+
+    def run(self, gradient: Float, bent: Float) -> Move:
+        """Find a lower merit.
+
+        Args:
+            gradient: (9 N,) of f at the point.
+            bent: (9 N,) Hessian times step.
+        """
+        at, h = self.at, self.h
+        length = np.minimum(1.0, TO_BOUNDARY * reach(at.slack, along(at.jacobian, h)))
+        before = own(h, gradient)
+        scale = np.abs(own(h, bent)) + np.abs(before) + 1e-5 * abs(at.f) / len(length)
+        # where a step promises next to nothing, energies are equal but for rounding
+        promised = -0.5 * float(gradient @ h)
+        rounding = (1e-10 if promised < 1e-9 * abs(at.f) else 1e-12) * abs(at.merit)
+        far, whole, least = np.zeros(len(length), bool), length, 1.0
+        calm = eager = far
+        for attempt in range(TRIES + 1):
+            trial, length = self._feasible(length)
+            if not attempt:
+                least = float(length.min())
+            slope = self._slope(trial.x)
+            bent_back = self._corrected(trial)
+            # past its minimum along the step, by more than the quadratic model allows
+            here = ~(slope <= 0.5 * scale)
+            far = far | here
+            calm = (slope <= 0.1 * scale) & ~far
+            # still going down at half the first rate
+            eager = (slope < 0.5 * before) & (slope < -0.02 * scale) & ~far
+            falls = trial.merit < at.merit + rounding
+            if bent_back is not None and bent_back.merit < min(trial.merit, at.merit):
+                if not falls:
+                    # what went too far was the valley's bend, not the step
+                    none = np.zeros_like(far)
+                    return Move(bent_back, length, none, none, none)
+                longer = self._longer(trial, length, eager, before, rounding)
+                moved = min(longer, bent_back, key=lambda point: point.merit)
+                return Move(moved, length, far, calm, eager)
+            if falls:
+                return Move(
+                    self._longer(trial, length, eager, before, rounding), length, far, calm, eager
+                )
+            if here.any() and attempt < TRIES // 2:
+                length = np.where(here, SHORTER * length, length)
+            elif attempt < TRIES - 1:
+                # neighbours whose steps differ pull at the stiff norms between them
+                length, whole = SHORTER * whole, SHORTER * whole
+            elif least < 1:
+                # where a bound made them differ, all go as far as it lets any
+                length = np.full_like(length, min(SHORTER, least))
+            else:
+                break
+        return Move(None, length, far, calm, eager)
+
+    def _corrected(self, trial: Point) -> Point | None:
+        """The trial after further steps with the same matrix: back to the floor of a bent valley.
+
+        Norms that are nearly zero are stiff: a step along a valley of theirs leaves it by its
+        square, and would have to be short without. A step costs a tenth of a factorisation.
+        """
+        best = None
+        for _ in range(CORRECTIONS):
+            right = merit_gradient(trial, self.gradient(trial.x), self.barrier)
+            c = self.newton(right)
+            length = np.minimum(1.0, TO_BOUNDARY * reach(trial.slack, along(trial.jacobian, c)))
+            x = self.problem.normalise(trial.x + (length[:, None] * c.reshape(-1, 9)).ravel())
+            floor = LEAST_SLACK * self.at.slack
+            aim = trial.slack + length[:, None] * along(trial.jacobian, c)
+            x, slack, jacobian = led_back(self.problem, x, np.maximum(aim, 2 * floor), floor)
+            if (slack <= floor).any():
+                return best
+            moved = _point(self.problem, x, slack, jacobian, self.barrier)
+            if best is not None:
+                fell = best.merit - moved.merit
+                if not fell > WORTH * abs(self.at.merit - best.merit):
+                    return moved if fell > 0 else best
+            best = trial = moved
+        return best
+
+    def _feasible(self, length: Float) -> tuple[Point, Float]:
+        """The point at these lengths, halved where a slack would vanish."""
+        length, floor = length.copy(), LEAST_SLACK * self.at.slack
+        change = along(self.at.jacobian, self.h)
+        for _ in range(40):
+            aim = self.at.slack + length[:, None] * change
+            x, slack, jacobian = led_back(self.problem, self._at(length), aim, floor)
+            out = (slack <= floor).any(axis=1)
+            if not out.any():
+                return _point(self.problem, x, slack, jacobian, self.barrier), length
+            length[out] *= 0.5
+        return self.at, np.zeros_like(length)
+
+    def _longer(
+        self, moved: Point, length: Float, eager: Bool, before: Float, rounding: float
+    ) -> Point:
+        """Double the step while the merit falls: of all, then of those still going down.
+
+        A fall by rounding is none: twice a step to the minimum is where it began.
+        """
+        for every in (True, False):
+            some = np.ones_like(eager) if every else eager
+            for _ in range(7):
+                if not some.any():
+                    break
+                longer = np.where(some, 2 * length, length)
+                x = self._at(longer)
+                trial = evaluate(self.problem, x, self.barrier, LEAST_SLACK * self.at.slack)
+                if trial is None or not trial.merit < moved.merit - rounding:
+                    break
+                moved, length = trial, longer
+                if not every:
+                    some = some & (self._slope(x) < 0.5 * before)
+        return moved

@@ -1,0 +1,273 @@
+"""From a start to a solution: tangent presolve with continuation, then the constrained NLP."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model import oracle as plain
+from soup_nlp.model.compile import compiler_seconds
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import Chart, MatrixLayout
+from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.model.nlp import NLP
+from soup_nlp.solve.descent import Descent
+from soup_nlp.solve.ipopt import Ipopt, Listener, Stage
+from soup_nlp.solve.kkt import residuals
+from soup_nlp.solve.phase import Phase
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.tangent_problem import TangentProblem
+from soup_nlp.solve.warm import WARM, warm_start
+
+Float = NDArray[np.float64]
+
+
+POLISH = "presolve polish"
+"""Name of the phase with the exact Hessian."""
+STOPPED = ("Interrupted", "Time_Limit")
+"""Status of a stage after which no other begins."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the constrained NLP ended with.
+
+    Attributes:
+        soup: Solution: Ipopt's answer (best iterate when not converged), or the presolve's or the
+            start where that has the lower exact energy, with rounding-size constraint violations
+            retracted.
+        status: Ipopt's status of the constrained NLP, or why it was stopped.
+        converged: Its claim.
+        stages: Phases of the presolve, then Ipopt's of the constrained NLP.
+        energy_start: Exact energy by term of the start.
+        energy: Exact energy by term of the solution.
+        residuals: Largest violation by kind of constraint, recomputed from the arrays, and the
+            dual infeasibility and complementarity of the NLP at the solution.
+        multipliers: lam_g by constraint name, lam_x.
+        nlp: Sizes of the constrained NLP.
+        description: The NLP as it prints itself.
+        seconds: Wall time of "presolve", "build" and "solve"; "compile" is CPU time of the C
+            compiler in them.
+        cpu_seconds: CPU time of this process in the same.
+        delivered: What `soup` is: "constrained NLP", "presolve" or "start".
+        far: Whether the presolve ended far from a minimum, so that Ipopt had few iterations.
+    """
+
+    soup: Soup
+    status: str
+    converged: bool
+    stages: tuple[Stage, ...]
+    energy_start: Mapping[str, float]
+    energy: Mapping[str, float]
+    residuals: Mapping[str, float]
+    multipliers: Mapping[str, Float] = field(repr=False)
+    nlp: Mapping[str, int]
+    description: str = field(repr=False)
+    seconds: Mapping[str, float]
+    cpu_seconds: Mapping[str, float] = field(default_factory=dict)
+    delivered: str = "constrained NLP"
+    far: bool = False
+
+    def __str__(self) -> str:
+        return (
+            f"Solution({self.status}, E {self.energy_start['total']:.4g} ->"
+            f" {self.energy['total']:.4g}, {sum(s.iterations for s in self.stages)} iterations)"
+        )
+
+
+def solve_soup(
+    start: Soup,
+    data: EnergyData,
+    weights: Weights,
+    form: Formulation | None = None,
+    options: SolverOptions | None = None,
+    *,
+    listener: Listener | None = None,
+    stop: threading.Event | None = None,
+    say: Callable[[str], None] | None = None,
+    log_file: str | None = None,
+) -> Solution:
+    """Minimise E from a start.
+
+    Args:
+        start: Initial soup.
+        data: Pixels, graphs and weights of the pair.
+        weights: Constants of the energy.
+        form: Formulation of the constrained NLP.
+        options: Stages and limits.
+        listener: Called at every iteration.
+        stop: Set it to end at the next iteration with the best iterate.
+        say: Called with a line after every stage.
+        log_file: Ipopt's own log is appended here.
+
+    Returns:
+        The solution; a solve that fails is a Solution with its status, not an exception.
+    """
+    form = form or Formulation()
+    o = options or SolverOptions()
+    stop = stop or threading.Event()
+    say = say or (lambda line: None)
+    begin, cpu, compiling = time.perf_counter(), [time.process_time()], compiler_seconds()
+    seconds = {"presolve": 0.0}
+    soup, presolved = start, None
+    stages: list[Stage] = []
+    if o.presolve:
+        presolved, rim = _presolve(
+            start,
+            data,
+            weights,
+            form,
+            o,
+            stages,
+            say,
+            deadline=begin + 0.7 * o.max_seconds,
+            listener=listener,
+            stop=stop,
+            log_file=log_file,
+        )
+        soup = presolved
+        seconds["presolve"] = time.perf_counter() - begin
+    cpu.append(time.process_time())
+
+    def energy(soup: Soup) -> float:
+        return plain.energy(soup, data, weights)["total"]
+
+    near = bool(stages) and _near(stages[-1])
+    # where the presolve has come near its minimum, smoothing alone may have raised the exact energy
+    if not near and energy(soup) > energy(start):
+        soup = start
+    mark = time.perf_counter()
+    nlp, layout = build_matrix_nlp(soup, data, weights, form.replace(eps=o.eps, eps_pixel=o.eps))
+    say(str(nlp))
+    warm: dict[str, Any] = {}
+    # the lifted truncation has another solution than the presolve's
+    if form.truncation == "smooth" and soup is presolved and o.polish_iterations and near:
+        warm = warm_start(nlp, data, soup, rim)
+    solver = Ipopt(nlp, {**(WARM if warm else {}), **o.ipopt})
+    seconds["build"] = time.perf_counter() - mark
+    cpu.append(time.process_time())
+    mark = time.perf_counter()
+    far = _far(stages)
+    if far:
+        say(f"far from a minimum: Ipopt has {o.far_iterations} iterations (solver.far_iterations)")
+    stage = solver(
+        x0=nlp.x0,
+        **warm,
+        max_iter=min(o.max_iter, o.far_iterations) if far else o.max_iter,
+        tol=o.tol,
+        seconds=max(1.0, o.max_seconds - (mark - begin)),
+        stage="constrained NLP",
+        listener=listener,
+        stop=stop,
+        log_file=log_file,
+    )
+    seconds["solve"] = time.perf_counter() - mark
+    seconds["compile"] = compiler_seconds() - compiling
+    cpu.append(time.process_time())
+    stages.append(stage)
+    say(str(stage))
+    found = {"constrained NLP": layout.unpack(stage.x), "presolve": presolved, "start": start}
+    ends = {k: s.normalised(data.share).retracted() for k, s in found.items() if s is not None}
+    delivered = min(ends, key=lambda k: energy(ends[k]))
+    final = ends[delivered]
+    return Solution(
+        soup=final,
+        status=stage.status,
+        converged=stage.converged,
+        stages=tuple(stages),
+        energy_start=plain.energy(start, data, weights),
+        energy=plain.energy(final, data, weights),
+        residuals=residuals(nlp, final, stage, data, form.min_facing),
+        multipliers=_multipliers(nlp, layout, stage),
+        nlp=nlp.sizes(),
+        description=str(nlp),
+        seconds=seconds,
+        cpu_seconds=dict(zip(("presolve", "build", "solve"), np.diff(cpu).tolist())),
+        delivered=delivered,
+        far=far,
+    )
+
+
+def _near(stage: Stage) -> bool:
+    """Whether the presolve has come so near that its multipliers are worth starting from."""
+    return stage.converged or bool(stage.history["inf_du"][-1] < 1.0)
+
+
+def _far(stages: Sequence[Stage]) -> bool:
+    """Whether the polish ended, by itself or at its limit, where Ipopt would find no minimum."""
+    last = stages[-1] if stages else None
+    ended = last is not None and last.name == POLISH and last.status not in STOPPED
+    return ended and not _near(stages[-1])
+
+
+def _presolve(
+    start: Soup,
+    data: EnergyData,
+    weights: Weights,
+    form: Formulation,
+    o: SolverOptions,
+    stages: list[Stage],
+    say: Callable[[str], None],
+    **watch: Any,
+) -> tuple[Soup, Float]:
+    """The presolve's soup, and its multipliers of rim visibility."""
+    steps = len(o.presolve_eps)
+    # barriers from 1e-3 down to 1e-5 while the norms are reweighted, 1e-10 for the KKT point
+    barriers = np.geomspace(1e-3, 1e-5, steps) if steps > 1 else np.array([1e-5])
+    phases = [
+        Phase(
+            name=f"presolve {eps:g}",
+            hessian="gauss-newton",
+            eps=eps,
+            barrier=float(barrier),
+            iterations=o.presolve_iterations,
+            stagnation=o.stagnation * (0.01 if k == steps - 1 else 1.0),
+            tol=o.presolve_tol,
+        )
+        for k, (eps, barrier) in enumerate(zip(o.presolve_eps, barriers))
+    ]
+    problem = TangentProblem(start, data, weights, form, exact=False)
+    descent = Descent(problem, **watch)
+    for phase in phases:
+        stages.append(descent.run(phase))
+        say(str(stages[-1]))
+        if stages[-1].status in STOPPED:
+            return descent.soup, descent.rim
+    if o.polish_iterations:
+        # on inverse depths the superpixels of a plane move with it in straight lines; reweighting
+        # on depths ends at lower energies. The paper's units need a length unit that is linear.
+        chart: Chart = "inverse-depth" if data.local_units else "depth"
+        problem = TangentProblem(descent.soup, data, weights, form, chart=chart)
+        descent = Descent(problem, after=descent, **watch)
+        polish = Phase(
+            name=POLISH,
+            hessian="exact",
+            eps=o.eps,
+            barrier=1e-10,
+            iterations=o.polish_iterations,
+            stagnation=0.0,
+            tol=o.presolve_tol,
+            beyond=True,
+            highest=1e-5,
+        )
+        stages.append(descent.run(polish))
+        say(str(stages[-1]))
+    return descent.soup, descent.rim
+
+
+def _multipliers(nlp: NLP, layout: MatrixLayout, stage: Stage) -> dict[str, Float]:
+    """lam_g cut into its kinds of constraint (in the order of nlp.g_blocks), and lam_x."""
+    out = {"lam_x": stage.lam_x}
+    for group in nlp.groups:
+        if group.kernel.nc:
+            out[f"lam_g_{group.kernel.name}"] = stage.lam_g[np.unique(group.table.rows)]
+    return out

@@ -1,0 +1,169 @@
+"""The presolve's energy as a descent method wants it: numbers, blocks and slacks per superpixel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import Chart
+from soup_nlp.model.sums import make_sums
+from soup_nlp.model.tangent_nlp import build_tangent_nlp
+from soup_nlp.solve.factor import numbered
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+HessianKind = Literal["gauss-newton", "exact"]
+
+
+class TangentProblem:
+    """min f(x) with slacks c(x) >= 0 of every superpixel by itself, and the simplex.
+
+    Slacks (N, R) are rim visibility (concave, so the set is convex) and the bounds of
+    scale and slopes; they depend on the first three of a superpixel's nine variables.
+
+    Attributes:
+        nlp: The tangent NLP with the reweighted Gauss-Newton Hessian.
+        layout: Turns its vectors into soups.
+        share: (N,) coefficients of the simplex row, `share . scale = 1` (scale = 1 / rho).
+        rims: V, rim pixels of a superpixel.
+        upper: (9 N, 9 N) pattern of Hessians, upper triangle, its values number the nonzeros.
+        sums: Its values and derivatives.
+        block: (N, 45) nonzeros of every superpixel's own triangle, in the order of `triangle`.
+        triangle: (2, 45) rows and columns of that triangle.
+    """
+
+    def __init__(
+        self,
+        start: Soup,
+        data: EnergyData,
+        weights: Weights,
+        form: Formulation,
+        exact: bool = True,
+        chart: Chart = "depth",
+    ) -> None:
+        """Build the program.
+
+        Args:
+            start: Base and start.
+            data: Pixels, graphs and weights of the pair.
+            weights: Constants of the energy.
+            form: Visibility, and whether kernels are compiled.
+            exact: Also make the exact Hessian.
+            chart: Of the coordinates, see TangentLayout.
+        """
+        # theta = 0 and no ridge: reweighted least squares, sum c psi / s J^T J
+        majorant = replace(
+            form,
+            norm="smooth",
+            truncation="smooth",
+            hessian="gauss-newton+constraints",
+            theta=0.0,
+            ridge=0.0,
+        )
+        self.nlp, self.layout = build_tangent_nlp(start, data, weights, majorant, chart)
+        nlp, n = self.nlp, self.layout.count
+        self._kinds = {"gauss-newton": nlp.hessian, **({"exact": "exact"} if exact else {})}
+        self.triangle = np.array(np.triu_indices(9))
+        own, (r, c) = 9 * np.arange(n)[:, None], self.triangle
+        self.sums = make_sums(nlp, list(self._kinds.values()), (own + r, own + c))
+        upper = self.sums.upper
+        self.block = upper.places[-1].reshape(n, -1)
+        self.upper: sparse.csc_matrix = numbered(upper.rows, upper.columns, nlp.nx)
+        tables = {g.kernel.name: g.table for g in nlp.groups}
+        self._visible = tables["t_visible"].rows
+        self.rims = self._visible.shape[1]
+        self._simplex = int(tables["t_simplex"].rows[0, 0])
+        self.share = tables["t_simplex"].data[:, 0]
+        self._low, self._high = nlp.lbx.reshape(-1, 9), nlp.ubx.reshape(-1, 9)
+        self._bound = nlp.lbg[self._visible]
+        # derivatives of a row of visibility, by slopes and in "inverse-depth" by rho: found by row
+        row = self.sums.jacobian.rows
+        order = np.argsort(row, kind="stable")
+        first = np.searchsorted(row[order], self._visible)
+        self._entries = order[first[..., None] + np.arange(2 if chart == "depth" else 3)]
+
+    def smoothing(self, eps: float) -> None:
+        """Set both smoothing widths, pixels."""
+        theta = self.nlp.with_theta(eps=eps, eps_pixel=eps)
+        self.sums.theta = theta[: len(self.nlp.theta)]
+
+    def value(self, x: Float) -> float:
+        """Smoothed energy."""
+        return self.sums.value(x)
+
+    def gradient(self, x: Float) -> Float:
+        """Gradient of the smoothed energy, (9 N,)."""
+        return self.sums.gradient(x)
+
+    def hessian(self, x: Float, z: Float, kind: HessianKind) -> Float:
+        """Nonzeros (in the order of `upper`) of the Hessian of `f - z . c`.
+
+        Args:
+            x: (9 N,) point.
+            z: (N, R) multipliers of the slacks.
+            kind: "exact", or "gauss-newton" for f's reweighted stand-in.
+        """
+        return self.sums.hessian(self._kinds[kind], x, self._lam_g(z))
+
+    def slacks(self, x: Float) -> tuple[Float, Float]:
+        """Slacks (N, R) and their derivatives by scale and slopes (N, R, 3)."""
+        g, jacobian = self.sums.constraints(x)
+        a, n, count = x.reshape(-1, 9), self.layout.count, self.rims
+        J = np.zeros((n, count + 5, 3))
+        own = jacobian[self._entries]
+        J[:, :count, 3 - own.shape[2] :] = own
+        J[:, count:] = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, -1]]
+        low, high = a[:, :3] - self._low[:, :3], self._high[:, 1:3] - a[:, 1:3]
+        return np.column_stack([g[self._visible] - self._bound, low, high]), J
+
+    def normalise(self, x: Float) -> Float:
+        """The same soup with its scales on the simplex."""
+        a = x.reshape(-1, 9).copy()
+        if self.layout.chart == "depth":
+            a[:, 0] /= self.share @ a[:, 0]
+        else:
+            a[:, :3] *= self.share @ (1 / a[:, 0])
+        return a.ravel()
+
+    def growth(self, x: Float) -> Float:
+        """Direction in which all depths grow alike, (9 N,); the length unit grows by 1."""
+        out = np.zeros((len(x) // 9, 9))
+        if self.layout.chart == "depth":
+            out[:, 0] = x[::9]
+        else:
+            out[:, :3] = -x.reshape(-1, 9)[:, :3]
+        return out.ravel()
+
+    def length(self, x: Float) -> Float:
+        """Gradient of the length unit, the simplex row, (9 N,)."""
+        out = np.zeros_like(x)
+        inverse = self.layout.chart != "depth"
+        out[::9] = -self.share / x[::9] ** 2 if inverse else self.share
+        return out
+
+    def calls(self) -> dict[str, float]:
+        """Seconds so far in f, grad_f, jac_g (with g) and hess_lag."""
+        return dict(self.sums.seconds)
+
+    def _lam_g(self, z: Float) -> Float:
+        lam_g = np.zeros(self.nlp.ng)
+        lam_g[self._visible] = -z[:, : self.rims]
+        return lam_g
+
+    def multipliers(self, z: Float, nu: float) -> tuple[Float, Float]:
+        """lam_x (9 N,) and lam_g of the NLP, from those of slacks and simplex."""
+        lam_g = self._lam_g(z)
+        lam_g[self._simplex] = nu
+        lam_x = np.zeros((len(z), 9))
+        bound = z[:, self.rims :]
+        lam_x[:, :3] = -bound[:, :3]
+        lam_x[:, 1:3] += bound[:, 3:]
+        return lam_x.ravel(), lam_g

@@ -1,0 +1,155 @@
+"""One motion for every body: what moves by itself and hangs together is rigid where it can be.
+
+Few pixels leave a motion undetermined, so that several explain the flow of a small body as well,
+the camera's among them, each with depths of its own. Superpixels that choose by themselves tear it.
+The flow says better what belongs together: it jumps along a body's outline.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.start.choice import CLIP, Choice, hanging_together, least_gain, smooth_choice
+from soup_nlp.start.components import joined
+from soup_nlp.start.epipolar import Motion, estimate
+from soup_nlp.start.neighbourhoods import fit_translation, refine_motion
+from soup_nlp.start.plane_fit import Views
+from soup_nlp.start.start_options import SeededStart
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+PIXELS = 1500
+"""A motion is fitted to at most this many pixels of a body."""
+AGREE = 0.7
+"""Share of a body's superpixels that its motion has to explain."""
+TEARS = (1.0, 0.5, 0.25)
+"""Jumps of the flow that part two bodies, relative to the one that ends a surface; the smaller ones
+where no motion explains what hangs together by the larger ones."""
+
+
+def gather(
+    views: Views, seg: Segmentation, jump: Float, choice: Choice, noise: float, o: SeededStart
+) -> Choice:
+    """Bodies take one motion each, and then all superpixels that it explains and that hang on them.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        seg: Superpixels and graphs.
+        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
+        choice: What the superpixels have so far.
+        noise: Flow noise, pixels.
+        o: Least gain and size of a body, price of differing neighbours, where a surface ends.
+
+    Returns:
+        The choice with what was adopted; its indices are no longer those of a list of motions.
+    """
+    if not (choice.label >= 0).any():
+        return choice
+    gain = least_gain(noise, o)
+    for tear in TEARS:
+        choice = _one_motion_each(views, seg, jump < tear * o.tear_px, choice, noise, gain, o)
+    return _spread(views, seg, jump, choice, gain, o)
+
+
+def _main(label: Int) -> int:
+    return int(np.argmax(np.bincount(label[label >= 0])))
+
+
+def _one_motion_each(
+    views: Views,
+    seg: Segmentation,
+    whole: NDArray[np.bool_],
+    choice: Choice,
+    noise: float,
+    gain: float,
+    o: SeededStart,
+) -> Choice:
+    """Pieces beside the main motion, joined where `whole` (P,), take the motion that fits best."""
+    main = _main(choice.label)
+    R_main = choice.R[np.argmax(choice.label == main)]
+    mover = choice.label != main
+    i, k = seg.pairs.T
+    piece = joined(mover[i] & mover[k] & whole, seg)
+    for c in np.unique(piece[mover]):
+        at = np.flatnonzero(mover & (piece == c))
+        held = np.unique(choice.label[at])
+        # one motion already, and what a few pixels would change in it is not to be trusted
+        if len(at) < o.piece_size or (len(held) == 1 and held[0] >= 0):
+            continue
+        R, t = _candidates(views, choice, at, R_main, noise, o)
+        shape = len(at), len(R)
+        fit = views.some(at).fit_own(
+            np.broadcast_to(R, (*shape, 3, 3)), np.broadcast_to(t, (*shape, 3))
+        )
+        cost = fit.penalised()
+        m = int(np.argmin(np.minimum(cost, CLIP).mean(axis=0)))
+        rows = np.flatnonzero(cost[:, m] < choice.error[at] + gain)
+        if len(rows) >= AGREE * len(at):
+            planes = fit.pick((rows, np.full(len(rows), m)))
+            choice = choice.taking(at[rows], R[m], t[m], planes, int(choice.label.max()) + 1)
+    return choice
+
+
+def _candidates(
+    views: Views, choice: Choice, at: Int, R_main: Float, noise: float, o: SeededStart
+) -> tuple[Float, Float]:
+    """(C, 3, 3), (C, 3) motions that superpixels `at` may share, fitted to all their pixels.
+
+    A translation beside the main rotation, as it is and refined; the motions that some of them
+    have, refined; the motion of their own essential matrix.
+    """
+    step = max(1, len(at) * views.ray.shape[1] // PIXELS)
+    r, q = (v[at].reshape(-1, 3)[::step] for v in (views.ray, views.target))
+    w = views.weight[at].ravel()[::step]
+    focal, near = views.focal[0], max(noise, 0.1)
+    t0 = fit_translation(R_main[None], r[None], q[None], w[None], focal, near)
+    start = [Motion(R_main, t0[0])]
+    for c in np.unique(choice.label[at]):
+        mine = at[choice.label[at] == c]
+        some = mine[:1] if c >= 0 else mine[:: max(1, len(mine) // 5)]
+        start += [Motion(choice.R[s], choice.t[s]) for s in some]
+    R, t = (np.stack([getattr(m, name) for m in start]) for name in ("R", "t"))
+    rs, qs, ws = (np.broadcast_to(v, (len(start), *v.shape)) for v in (r, q, w))
+    R, t = refine_motion(R, t, rs, qs, ws, focal, near)
+    found = start[:1]
+    own = estimate(r, q, w, focal, max(3 * noise, 0.3), o.seed)
+    if own is not None:
+        found.append(own)
+    return (
+        np.concatenate([R, np.stack([m.R for m in found])]),
+        np.concatenate([t, np.stack([m.t for m in found])]),
+    )
+
+
+def _spread(
+    views: Views, seg: Segmentation, jump: Float, choice: Choice, gain: float, o: SeededStart
+) -> Choice:
+    """Superpixels choose among the motions of whole bodies, alike where the flow does not jump.
+
+    Those with a motion of their own may keep it. Whole pieces change together, which is why this
+    needs a solver: half of a body may have taken the camera's motion.
+    """
+    label = choice.label
+    count = np.bincount(label[label >= 0])
+    main = _main(label)
+    large = count >= o.piece_size
+    large[main] = False
+    kept = np.array([main, *np.flatnonzero(large)])
+    m = len(kept)
+    if m == 1:
+        return choice
+    first = [np.argmax(label == c) for c in kept]
+    fit = views.fit([Motion(choice.R[a], choice.t[a]) for a in first])
+    cost = np.minimum(fit.penalised(), CLIP)
+    cost[:, 0] -= 0.5 * o.unexplained_px
+    stay = np.where(np.isin(label, kept), np.inf, np.minimum(choice.error, CLIP) + 0.5 * gain)
+    # motions of whole bodies are worth more trust than those of pieces: twice the price
+    near = hanging_together(jump, o)
+    new = smooth_choice(np.column_stack([cost, stay]), near, seg, 2 * o.smoothness)
+    numbers = np.append(kept, -1)[new]
+    at = np.flatnonzero((new < m) & (numbers != label))
+    R, t = choice.R[first], choice.t[first]
+    return choice.taking(at, R[new[at]], t[new[at]], fit.pick((at, new[at])), numbers[at])

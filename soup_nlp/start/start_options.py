@@ -1,0 +1,43 @@
+"""What a problem file says about the initialisation."""
+
+from __future__ import annotations
+
+from soup_nlp.schema.section import Count, NonNegative, Section, Whole
+
+
+class StartOptions(Section):
+    """How the initialisation is made."""
+
+    samples: Whole = 40
+    """Pixels per superpixel."""
+    dominant: Whole = 5
+    """Dominant motions looked for."""
+    threshold_px: NonNegative = 1.0
+    """Inlier distance of a dominant motion."""
+    smoothness: NonNegative = 0.5
+    """Pixels that a border between motions must gain, where the flow does not jump."""
+    min_parallax_px: NonNegative = 0.25
+    """Below this the depth of a superpixel is borrowed from its neighbours."""
+    rounds: Count = 3
+    """Rounds of proposals from unexplained pieces, and from neighbours."""
+    unexplained_px: NonNegative = 0.1
+    """A superpixel whose error is below this has no need of another motion."""
+    pieces: Whole = 6
+    """At most this many unexplained pieces are looked at in a round."""
+    piece_size: Whole = 4
+    """A piece has at least this many superpixels."""
+    bending: NonNegative = 0.25
+    """Surfaces are taken to bend where more than this share of the superpixels moves otherwise
+    than most of its own surface; 1 for never."""
+    tear_px: NonNegative = 1.0
+    """Where the flow of two neighbours differs by more, a surface ends."""
+    upright: bool = True
+    """The image's columns run down: bodies stand on what is below them. Off, a body is scaled to
+    touch whatever it touches first."""
+
+
+class SeededStart(StartOptions):
+    """The same with the seed, which a problem has once for all its stages."""
+
+    seed: Count = 0
+    """Of sampling and RANSAC."""

@@ -1,0 +1,304 @@
+"""Results on disk: HDF5 with units on every array, and JSON that any reader accepts."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, is_dataclass
+from importlib.metadata import PackageNotFoundError, version
+from os import PathLike as _PathLike
+from pathlib import Path
+from typing import Any, TypeAlias, Union
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import soup_nlp
+from soup_nlp.errors import DataError
+from soup_nlp.storage.atomic import PathLike, atomic_path
+
+SCHEMA = 1
+"""Version of the layout of result files; grows when a reader would have to change."""
+
+COMPRESS_ABOVE = 64 * 1024
+"""Arrays of more bytes than this are compressed (gzip level 1 after a byte shuffle)."""
+
+_PACKAGES = {
+    "casadi": "casadi",
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "opencv": "opencv-python-headless",
+    "skimage": "scikit-image",
+    "h5py": "h5py",
+}
+_OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless")
+
+
+@dataclass(frozen=True)
+class Array:
+    """One array of a result file, with what a reader needs to know about it.
+
+    Attributes:
+        value: The numbers (or text, as a string or an array of strings).
+        units: "px", "m", "rad", "1" for none, ...
+        description: One sentence.
+        shape_letters: Names of the axes, such as "N,3,3" or "H,W".
+    """
+
+    value: ArrayLike
+    units: str
+    description: str
+    shape_letters: str = ""
+
+
+Tree: TypeAlias = Mapping[str, Union[Array, "Tree"]]
+ReadTree: TypeAlias = dict[str, Any]
+"""Nested dict of numpy arrays, as `read_h5` returns it."""
+
+
+def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
+    """Write a result file, whole or not at all.
+
+    Each array becomes a dataset with the attributes `units`, `description` and `shape_letters`;
+    each mapping a group. The root gets `attrs` (None is left out; mappings and lists that HDF5
+    cannot hold are stored as JSON text) plus `schema`, `versions` (JSON text) and `machine`.
+
+    Args:
+        path: File to write; its folder must exist.
+        tree: Arrays by name, in nested mappings.
+        attrs: Root attributes; must not use the three names above.
+
+    Raises:
+        DataError: a name or a leaf is not allowed, or the file cannot be written.
+    """
+    leaves = list(_leaves(tree, ""))
+    reserved: dict[str, object] = {
+        "schema": SCHEMA,
+        "versions": json.dumps(versions()),
+        "machine": platform.platform(),
+    }
+    clash = sorted(reserved.keys() & attrs.keys())
+    if clash:
+        raise DataError("root attribute is reserved", where=path, found=clash)
+    root = {key: _attr(value) for key, value in attrs.items() if value is not None} | reserved
+    with atomic_path(path) as temporary:
+        try:
+            with h5py.File(temporary, "w", track_order=True) as file:
+                for key, value in root.items():
+                    file.attrs[key] = value
+                for name, leaf, data in leaves:
+                    if leaf is None:
+                        file.require_group(name)
+                    else:
+                        _write_dataset(file, name, leaf, data)
+        except (OSError, TypeError, ValueError, RuntimeError) as error:
+            raise DataError("cannot write the HDF5 file", where=path, found=error) from error
+
+
+def _leaves(tree: Tree, prefix: str) -> Iterator[tuple[str, Array | None, NDArray[Any]]]:
+    """(name, leaf, data) of every array, and (name, None, empty) of every group."""
+    for key, item in tree.items():
+        name = f"{prefix}{key}"
+        if not isinstance(key, str) or not key or "/" in key or key in (".", ".."):
+            raise DataError(
+                "name is not allowed in a result tree",
+                where=prefix or "/",
+                found=repr(key),
+                expected="a non-empty string without '/'",
+            )
+        if isinstance(item, Array):
+            yield name, item, _data(name, item.value)
+        elif isinstance(item, Mapping):
+            yield name, None, np.empty(0)
+            yield from _leaves(item, f"{name}/")
+        else:
+            raise DataError(
+                "result tree holds something other than arrays",
+                where=name,
+                found=type(item).__name__,
+                expected="Array(value, units, description) or a mapping of them",
+            )
+
+
+def _data(name: str, value: ArrayLike) -> NDArray[Any]:
+    """The array of a leaf in a type that HDF5 holds."""
+    try:
+        data = np.asarray(value)
+    except ValueError as error:  # ragged
+        raise DataError("array of a result tree is ragged", where=name, found=error) from error
+    if data.dtype.kind == "U":
+        return data.astype(h5py.string_dtype())
+    if data.dtype.kind not in "biufcS":
+        raise DataError(
+            "array of a result tree has a type that cannot be stored",
+            where=name,
+            found=data.dtype,
+            expected="bool, integer, float, complex or text",
+        )
+    return data
+
+
+def _write_dataset(file: h5py.File, name: str, leaf: Array, data: NDArray[Any]) -> None:
+    options: dict[str, Any] = {}
+    if data.nbytes > COMPRESS_ABOVE and data.ndim > 0:
+        options = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+    dataset = file.create_dataset(name, data=data, **options)
+    dataset.attrs["units"] = leaf.units
+    dataset.attrs["description"] = leaf.description
+    dataset.attrs["shape_letters"] = leaf.shape_letters
+
+
+def _attr(value: object) -> object:
+    """A root attribute in a type that HDF5 holds: numbers and text as they are, the rest JSON."""
+    if isinstance(value, str | bool | int | float | np.generic):
+        return value
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
+        return value
+    if isinstance(value, list | tuple) and value and all(type(v) in (int, float) for v in value):
+        return np.asarray(value)
+    return json.dumps(plain(value))
+
+
+def read_h5(path: PathLike) -> ReadTree:
+    """All arrays of a result file, as nested dicts of numpy arrays (text as str or object arrays).
+
+    Raises:
+        DataError: the file is missing or is not HDF5.
+    """
+
+    def walk(group: h5py.Group) -> ReadTree:
+        out: ReadTree = {}
+        for key, item in group.items():
+            if isinstance(item, h5py.Group):
+                out[key] = walk(item)
+            elif h5py.check_string_dtype(item.dtype) is not None:
+                out[key] = np.asarray(item.asstr()[()])
+            else:
+                out[key] = np.asarray(item[()])
+        return out
+
+    with _open(path) as file:
+        return walk(file)
+
+
+def read_attrs(path: PathLike, name: str = "/") -> dict[str, Any]:
+    """Attributes of the root of a result file, or of the array or group `name` in it.
+
+    `versions` comes back as a dict; other JSON texts as they were stored.
+
+    Raises:
+        DataError: the file is missing or is not HDF5, or has nothing of that name.
+    """
+    with _open(path) as file:
+        if name not in file:
+            raise DataError(
+                "result file has no such entry", where=path, found=sorted(file), expected=name
+            )
+        out = dict(file[name].attrs)
+    if name == "/" and isinstance(out.get("versions"), str):
+        out["versions"] = json.loads(out["versions"])
+    return {k: v.item() if isinstance(v, np.generic) else v for k, v in out.items()}
+
+
+def _open(path: PathLike) -> h5py.File:
+    if not Path(path).is_file():
+        raise DataError("result file does not exist", where=path)
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise DataError(
+            "file is not a readable HDF5 file",
+            where=path,
+            found=error,
+            expected="a result file written by soup_nlp",
+        ) from error
+
+
+def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:
+    """The array at "a/b" of a tree that was read.
+
+    Raises:
+        DataError: there is no such array; the message lists what is there.
+    """
+    here: Any = tree
+    walked: list[str] = []
+    for key in name.split("/"):
+        if not isinstance(here, Mapping) or key not in here:
+            there = sorted(here) if isinstance(here, Mapping) else "an array, not a group"
+            raise DataError(
+                f"result has no {name!r}",
+                where="/" + "/".join(walked),
+                found=there,
+                expected=repr(key),
+                hint="the file may come from another version, or the run ended early",
+            )
+        here = here[key]
+        walked.append(key)
+    if isinstance(here, Mapping):
+        raise DataError(
+            f"{name!r} is a group, not an array",
+            where="/" + name,
+            found=sorted(here),
+            expected=f"one of its arrays, such as {name}/{next(iter(sorted(here)), '...')}",
+        )
+    return np.asarray(here)
+
+
+def plain(obj: object) -> Any:
+    """An object as JSON holds it: numpy to Python, NaN and infinities to None, paths to text.
+
+    Dataclasses become mappings; tuples, sets and arrays become lists.
+
+    Raises:
+        DataError: a type that has no place in JSON.
+    """
+    if obj is None or isinstance(obj, str | bool | int):
+        return obj
+    if isinstance(obj, float):
+        return float(obj) if math.isfinite(obj) else None
+    if isinstance(obj, np.generic | np.ndarray):
+        return plain(obj.tolist())
+    if is_dataclass(obj) and not isinstance(obj, type):
+        return plain(asdict(obj))
+    if isinstance(obj, Mapping):
+        return {str(plain(key)): plain(value) for key, value in obj.items()}
+    if isinstance(obj, list | tuple):
+        return [plain(value) for value in obj]
+    if isinstance(obj, set | frozenset):
+        return sorted((plain(value) for value in obj), key=str)
+    if isinstance(obj, _PathLike):
+        return str(obj)
+    raise DataError(
+        "value cannot be written as JSON",
+        found=type(obj).__name__,
+        expected="numbers, text, mappings, lists, arrays or dataclasses",
+    )
+
+
+def write_json(path: PathLike, obj: object) -> None:
+    """Write an object as JSON (see `plain`), whole or not at all; two-space indent, UTF-8.
+
+    Raises:
+        DataError: the object holds a type that has no place in JSON, or the file cannot be
+            written.
+    """
+    text = json.dumps(plain(obj), indent=2, ensure_ascii=False, allow_nan=False)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on; "unknown" where a package does not say."""
+    out = {"soup_nlp": soup_nlp.__version__, "python": platform.python_version()}
+    for name, package in _PACKAGES.items():
+        out[name] = "unknown"
+        for candidate in _OPENCV if name == "opencv" else (package,):
+            try:
+                out[name] = version(candidate)
+                break
+            except PackageNotFoundError:
+                continue
+    return out
