@@ -40,7 +40,7 @@ def main() -> None:
     changes = [f"segmentation.superpixels={args.superpixels}", "flow.source=truth"]
     case = prepare(load_problem(ROOT / "problems" / f"{args.scene}.yaml", changes))
     limits = {"max_iter": args.iterations, "far_iterations": args.iterations}
-    options = replace(case.options, **limits, max_seconds=args.seconds)
+    options = case.options.replace(**limits, max_seconds=args.seconds)
     lines = [
         f"{args.scene}, true flow, {len(case)} superpixels; constrained NLP to 1e-6 from the same"
         f" presolve, at most {args.iterations} iterations. {date.today()}, {platform.machine()},"

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import platform
-from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -44,7 +43,7 @@ def solved(case: Case, method: str) -> tuple[Soup, float]:
     first = METHODS[method]
     eps = case.options.presolve_eps if first is None else EPS[EPS.index(first) :]
     if method.startswith("NLP"):
-        s = solve_soup(*own, replace(case.options, presolve_eps=eps))
+        s = solve_soup(*own, case.options.replace(presolve_eps=eps))
         return s.soup, s.energy["total"]
     y = levenberg_marquardt(*own, eps=eps, iterations=YARDSTICK_ITERATIONS)
     return y.soup, y.energy["total"]

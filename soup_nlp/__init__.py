@@ -6,8 +6,7 @@ from soup_nlp.errors import SoupError
 from soup_nlp.evaluate.scoring import evaluate
 from soup_nlp.geometry.soup import Reconstruction, Soup
 from soup_nlp.pipeline import Run, run, solve_pair
-
-__version__ = "0.1.0"
+from soup_nlp.storage.versions import __version__
 
 __all__ = [
     "Flow",

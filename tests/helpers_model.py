@@ -48,7 +48,7 @@ PAPER = Weights(
     sigma_proj=np.inf,
 )
 """Truncated as the paper has it; some elements are on either side of both truncations."""
-TRUNCATED = replace(PAPER, sigma_cont_ref=0.3, sigma_arap=0.25, leak_arap=0.2, sigma_proj=2.0)
+TRUNCATED = PAPER.replace(sigma_cont_ref=0.3, sigma_arap=0.25, leak_arap=0.2, sigma_proj=2.0)
 """Everything truncated."""
 GREY = Texture(((0.5, 0.5, 0.5), (0.3, 0.4, 0.6)), cell=0.2)
 

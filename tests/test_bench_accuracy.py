@@ -13,7 +13,6 @@ import pytest
 from soup_nlp.bench.accuracy import (
     Job,
     clean,
-    code_version,
     head,
     input_hash,
     measure,
@@ -28,6 +27,7 @@ from soup_nlp.cli.main import accuracy as cli_accuracy
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.errors import ConfigError
+from soup_nlp.storage.versions import code_version
 
 QUICK = (
     "segmentation.superpixels=40",

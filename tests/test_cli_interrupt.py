@@ -9,7 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from soup_nlp import cases, cli
+from soup_nlp.cli import main as cli
+from soup_nlp.data.flow.sources import FlowOptions
+from soup_nlp.data.inputs import SceneInput
+from soup_nlp.pipeline import case as cases
 from soup_nlp.pipeline.run import StoppedError, run
 from soup_nlp.report import folder as folders
 from soup_nlp.solve.interrupt import interruptible
@@ -30,15 +33,18 @@ def ctrl_c(times: int = 1) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
 
-@pytest.mark.parametrize("stage", ["load_pair", "load_flow_of", "build_segmentation"])
-def test_before_a_start_it_ends_after_the_stage(stage, tmp_path, monkeypatch, capfd):
-    own = getattr(cases, stage)
+@pytest.mark.parametrize(
+    ("owner", "stage"),
+    [(SceneInput, "load"), (FlowOptions, "load"), (cases, "build_segmentation")],
+)
+def test_before_a_start_it_ends_after_the_stage(owner, stage, tmp_path, monkeypatch, capfd):
+    own = getattr(owner, stage)
 
     def interrupted(*args, **kwargs):
         ctrl_c()
         return own(*args, **kwargs)
 
-    monkeypatch.setattr(cases, stage, interrupted)
+    monkeypatch.setattr(owner, stage, interrupted)
     assert solve(tmp_path / "out") == 130
     error = capfd.readouterr().err
     assert "interrupt received" in error
@@ -48,7 +54,7 @@ def test_before_a_start_it_ends_after_the_stage(stage, tmp_path, monkeypatch, ca
 
 
 def test_a_second_one_aborts_and_says_so(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(cases, "load_flow_of", lambda *args: ctrl_c(2))
+    monkeypatch.setattr(FlowOptions, "load", lambda *args: ctrl_c(2))
     # ignored where the tests run in the background of a shell
     before = signal.getsignal(signal.SIGINT)
     assert solve(tmp_path / "out") == 130

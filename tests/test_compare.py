@@ -44,7 +44,7 @@ def task(tmp_path_factory) -> Task:
     # wide smoothing: with 0.2 the way from a cold start is so long that rounding decides its end
     form = Formulation(hessian="exact", eps=1.0, eps_pixel=1.0, compiled=False)
     nlp, layout = tiny.nlp(PAPER, form)
-    other, _ = tiny.nlp(PAPER, replace(form, hessian="gauss-newton+constraints"))
+    other, _ = tiny.nlp(PAPER, form.replace(hessian="gauss-newton+constraints"))
     limits = Limits(seconds=20, iterations=200, tol=1e-5)
     folder = tmp_path_factory.mktemp("task")
     return Task(nlp, other, layout, tiny.soup, tiny.data, PAPER, form, limits, folder)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.data import formats as fmt
-from soup_nlp.data.datasets.folders import folders as datasets
+from soup_nlp.data.datasets import folders as datasets
 from soup_nlp.data.datasets.sintel import DEFAULT_CAMERA
 from soup_nlp.data.formats import images as fmt_image
 from soup_nlp.errors import DataError

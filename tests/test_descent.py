@@ -72,7 +72,7 @@ def test_gradient_and_exact_hessian_are_derivatives(problem):
 
 
 def test_the_exact_hessian_beside_the_stand_in_is_the_program_of_its_own(problem, small_room):
-    form = replace(FORM, norm="smooth", hessian="exact", theta=0.0, ridge=0.0)
+    form = FORM.replace(norm="smooth", hessian="exact", theta=0.0, ridge=0.0)
     chart = problem.layout.chart
     nlp = build_tangent_nlp(small_room.soup, small_room.data, small_room.weights, form, chart)[0]
     other = problem.nlp.other_hessian("exact")
@@ -376,7 +376,7 @@ def test_steps_go_on_beyond_the_tolerance_while_they_pay(problem):
 
 def test_ipopt_stays_where_it_ends(small_room, problem, solved):
     last = solved[1][-1]
-    smooth = replace(FORM, hessian="exact", eps=LAST.eps, eps_pixel=LAST.eps)
+    smooth = FORM.replace(hessian="exact", eps=LAST.eps, eps_pixel=LAST.eps)
     nlp, _ = build_tangent_nlp(
         small_room.soup, small_room.data, small_room.weights, smooth, problem.layout.chart
     )

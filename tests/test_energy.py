@@ -138,7 +138,7 @@ def test_two_superpixels_by_hand():
     soup = Soup(
         lam, np.tile([0, 0, -1.0], (2, 1)), D / lam, np.tile(np.eye(3), (2, 1, 1)), T / lam[:, None]
     )
-    w = replace(PAPER, arap=1, proj=1, cont=1, orient=1, sigma_cont=0.2, sigma_orient=0.5)
+    w = PAPER.replace(arap=1, proj=1, cont=1, orient=1, sigma_cont=0.2, sigma_orient=0.5)
     e = plain.energy(soup, data, w)
     mean = 2.0  # of the plane distances: the length unit
     anchor = np.array([[-0.2, 0, 1], [0.2, 0, 1]])  # centroids 1.5 and 5.5 of columns about 3.5
@@ -166,7 +166,7 @@ def test_pixel_units_by_hand():
     focal = 90.0
     here = 5
     edge = (data.edges == here).any(axis=1)
-    wide = replace(PAPER, sigma_cont=np.inf)
+    wide = PAPER.replace(sigma_cont=np.inf)
     arap = data.edge_weight * edge
     turned = soup.R.copy()
     angle = 1e-3

@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soup_nlp.data.datasets.folders import folders as datasets
+from soup_nlp.data.datasets import folders as datasets
+from soup_nlp.data.flow import sources as flow_module
 from soup_nlp.data.flow.sources import (
     dis_flow,
     flow_from_truth,
@@ -21,7 +22,6 @@ from soup_nlp.data.flow.sources import (
     resolve_flow,
     round_trip_error,
 )
-from soup_nlp.data.flow.sources import sources as flow_module
 from soup_nlp.data.formats import write_flo, write_kitti_flow
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.errors import DataError

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from soup_nlp.data.flow import guided as flow_guided
 from soup_nlp.data.flow.guided import guided_flow
 from soup_nlp.data.flow.robust import fit_affine
-from soup_nlp.data.flow.sources import guided as flow_guided
 from soup_nlp.data.pair import Flow
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from soup_nlp.errors import DataError
+from soup_nlp.evaluate import recompute
 from soup_nlp.evaluate.metrics import (
     constant_depth_metrics,
     depth_metrics,
@@ -18,7 +19,6 @@ from soup_nlp.evaluate.metrics import (
 )
 from soup_nlp.evaluate.protocols import PRESETS, preset
 from soup_nlp.evaluate.scene_flow import scene_flow_epe
-from soup_nlp.report import recompute
 
 depths = arrays(np.float64, 12, elements=st.floats(0.1, 100.0))
 factors = st.floats(1e-3, 1e3)

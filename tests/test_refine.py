@@ -226,7 +226,7 @@ def test_broken_superpixels_are_repaired_by_their_neighbours():
     truth = plain.energy(scene.truth, scene.data, weights)["total"]
     begin = plain.energy(scene.soup, scene.data, weights)["total"]
     assert begin > 1.5 * truth
-    done = refine_soup(scene.soup, scene.data, weights, replace(FEW, particles=30), seed=0)
+    done = refine_soup(scene.soup, scene.data, weights, FEW.replace(particles=30), seed=0)
     assert done.energy["total"] < truth + 0.05 * (begin - truth)
     ratio = done.soup.depth_at(scene.data.anchor_ray) / scene.truth.depth_at(scene.data.anchor_ray)
     # what remains is the scale between the two bodies, which two views do not determine
@@ -271,7 +271,7 @@ def test_interruption_and_time_limit_keep_the_best():
     assert done.status == "interrupted"
     assert len(done.rounds) == len(lines) == 1
     assert done.energy["total"] < done.energy_begin["total"]
-    late = refine_soup(tiny.soup, tiny.data, weights, replace(FEW, max_seconds=1e-9))
+    late = refine_soup(tiny.soup, tiny.data, weights, FEW.replace(max_seconds=1e-9))
     assert late.status == "time limit"
     assert not late.rounds
 
@@ -307,7 +307,7 @@ def test_an_interrupt_within_a_round_ends_the_refinement():
             raise KeyboardInterrupt
 
     # no round ends by its gap before the second iteration
-    o, stop = replace(FEW, trws_gap=-1.0), threading.Event()
+    o, stop = FEW.replace(trws_gap=-1.0), threading.Event()
     done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, stop=stop, listener=listener)
     assert done.status == "interrupted"
     assert len(heard) == 2
@@ -318,7 +318,7 @@ def test_an_interrupt_within_a_round_ends_the_refinement():
 
 def test_a_time_limit_within_a_round_is_no_interruption():
     tiny = Tiny("pixels", samples=6)
-    o = replace(FEW, trws_gap=-1.0, max_seconds=0.5)
+    o = FEW.replace(trws_gap=-1.0, max_seconds=0.5)
 
     def listener(progress: object) -> None:
         time.sleep(0.55)
@@ -330,7 +330,7 @@ def test_a_time_limit_within_a_round_is_no_interruption():
 
 def test_stagnation_ends_the_rounds():
     tiny = Tiny("pixels", samples=6)
-    o = replace(FEW, rounds=30, stagnation=0.5)
+    o = FEW.replace(rounds=30, stagnation=0.5)
     done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o)
     assert done.status == "stagnated"
     assert len(done.rounds) < 30
@@ -339,7 +339,7 @@ def test_stagnation_ends_the_rounds():
 @pytest.mark.parametrize("particles", [2, 3, 9])
 def test_few_particles_and_a_superpixel_without_edges_are_no_special_case(particles):
     tiny = Tiny("pixels", samples=6)
-    o = replace(FEW, particles=particles)
+    o = FEW.replace(particles=particles)
     done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o)
     assert done.energy["total"] <= done.energy_begin["total"]
     alone = replace(

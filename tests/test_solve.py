@@ -191,8 +191,8 @@ def test_the_claimed_multipliers_balance_the_gradient(room):
 
 def test_without_presolve_the_exact_hessian_converges(room):
     # wide smoothing: with 0.03 px the way from a cold start is so long that rounding decides it
-    options = replace(
-        OPTIONS, eps=0.3, presolve=False, max_iter=300, ipopt={"constr_viol_tol": 1e-9}
+    options = OPTIONS.replace(
+        eps=0.3, presolve=False, max_iter=300, ipopt={"constr_viol_tol": 1e-9}
     )
     solution = room.solve(options, form(hessian="exact"))
     assert [s.name for s in solution.stages] == ["constrained NLP"]
@@ -202,7 +202,7 @@ def test_without_presolve_the_exact_hessian_converges(room):
 
 
 def test_the_lifted_truncation_converges(room):
-    options = replace(OPTIONS, max_iter=200, ipopt={"constr_viol_tol": 1e-9})
+    options = OPTIONS.replace(max_iter=200, ipopt={"constr_viol_tol": 1e-9})
     solution = room.solve(options, form(truncation="lifted"))
     assert solution.converged, solution.status
     assert_constraints(solution, room.data)
@@ -211,7 +211,7 @@ def test_the_lifted_truncation_converges(room):
 
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_the_epigraph_form_starts_at_the_presolves_kkt_point(room, solved, gauge):
-    options = replace(OPTIONS, tol=1e-6)
+    options = OPTIONS.replace(tol=1e-6)
     solution = room.solve(options, form(gauge=gauge, norm="epigraph"))
     assert solution.converged, solution.status
     assert solution.stages[-1].iterations <= 10
@@ -221,7 +221,7 @@ def test_the_epigraph_form_starts_at_the_presolves_kkt_point(room, solved, gauge
 
 
 def test_the_epigraph_form_with_lifted_truncation_stays_feasible(room):
-    solution = room.solve(replace(OPTIONS, max_iter=40), form(norm="epigraph", truncation="lifted"))
+    solution = room.solve(OPTIONS.replace(max_iter=40), form(norm="epigraph", truncation="lifted"))
     assert solution.energy["total"] < solution.energy_start["total"]
     # not converged: the best iterate is feasible to 1e-5 in the solver's own units
     assert_constraints(solution, room.data, 2e-5)
@@ -240,7 +240,7 @@ def assert_whole(solution: Solution, problem: Problem) -> None:
 
 
 def test_one_iteration_gives_a_whole_solution(room):
-    options = replace(OPTIONS, max_iter=1, presolve_iterations=1, polish_iterations=1, tol=1e-12)
+    options = OPTIONS.replace(max_iter=1, presolve_iterations=1, polish_iterations=1, tol=1e-12)
     solution = room.solve(options)
     assert not solution.converged
     assert solution.status == "Maximum_Iterations_Exceeded"
@@ -249,8 +249,7 @@ def test_one_iteration_gives_a_whole_solution(room):
 
 @pytest.mark.parametrize(("few", "spent"), [(2, 2), (60, 4)])
 def test_far_from_a_minimum_ipopt_has_few_iterations(room, few, spent):
-    options = replace(
-        OPTIONS,
+    options = OPTIONS.replace(
         presolve_iterations=1,
         polish_iterations=1,
         far_iterations=few,
@@ -281,7 +280,7 @@ def test_a_stop_in_any_stage_keeps_what_was_reached(room, stage):
         if p.stage == stage:
             stop.set()
 
-    solution = room.solve(replace(OPTIONS, tol=1e-10), listener=listen, stop=stop)
+    solution = room.solve(OPTIONS.replace(tol=1e-10), listener=listen, stop=stop)
     assert solution.status == "Interrupted"
     assert_whole(solution, room)
     assert seen.count(stage) == 1
@@ -289,7 +288,7 @@ def test_a_stop_in_any_stage_keeps_what_was_reached(room, stage):
 
 
 def test_hardly_any_time_still_gives_a_whole_solution(room):
-    solution = room.solve(replace(OPTIONS, max_seconds=1e-3))
+    solution = room.solve(OPTIONS.replace(max_seconds=1e-3))
     assert_whole(solution, room)
 
 
@@ -311,7 +310,7 @@ def test_progress_and_sentences_are_delivered(room, tmp_path):
 
 def test_a_wrong_option_of_the_soup_is_a_solver_error(room):
     with pytest.raises(SolverError, match="no_such_option"):
-        room.solve(replace(OPTIONS, presolve=False, ipopt={"no_such_option": 1}))
+        room.solve(OPTIONS.replace(presolve=False, ipopt={"no_such_option": 1}))
 
 
 def test_same_start_same_answer(room, solved):
@@ -358,8 +357,8 @@ def test_a_rigid_plane_is_recovered_from_a_disturbed_start(slanted, gauge, kind)
     """E >= 0 and E = 0 at the truth: the optimum is known."""
     truth, data = slanted
     start = disturbed(truth, 0.05)
-    weights = replace(PAPER, cont=0.05, sigma_cont=np.inf, sigma_orient=0.5, proj=1.0)
-    options = replace(OPTIONS, tol=1e-6, presolve_tol=1e-5, max_iter=200)
+    weights = PAPER.replace(cont=0.05, sigma_cont=np.inf, sigma_orient=0.5, proj=1.0)
+    options = OPTIONS.replace(tol=1e-6, presolve_tol=1e-5, max_iter=200)
     solution = solve_soup(start, data, weights, form(gauge=gauge, hessian=kind), options)
     before, after = solution.energy_start["total"], solution.energy["total"]
     assert before > 10
@@ -382,7 +381,7 @@ def test_one_superpixel_is_solved():
 
 def test_the_constrained_nlp_starts_at_the_presolves_kkt_point(room):
     # the presolve's multipliers, brought over, leave Ipopt next to nothing to do
-    done = room.solve(options=replace(OPTIONS, tol=1e-6))
+    done = room.solve(options=OPTIONS.replace(tol=1e-6))
     assert done.stages[-2].converged
     assert done.stages[-1].history["inf_du"][0] < 1e-5
     assert done.stages[-1].iterations <= 1
@@ -392,7 +391,7 @@ def test_the_constrained_nlp_starts_at_the_presolves_kkt_point(room):
 def test_it_does_so_where_visibility_binds(room):
     # planes that would slant more than they may: their rows of visibility have forces
     narrow = form(depth_ratio=1.05)
-    done = room.solve(options=replace(OPTIONS, tol=1e-6), f=narrow)
+    done = room.solve(options=OPTIONS.replace(tol=1e-6), f=narrow)
     assert done.stages[-2].converged
     assert done.stages[-1].history["inf_du"][0] < 1e-5
     assert done.stages[-1].iterations <= 1
@@ -402,7 +401,7 @@ def test_it_does_so_where_visibility_binds(room):
 def test_a_start_of_less_exact_energy_keeps_the_nlp_at_the_presolves_kkt_point(room, solved):
     # wide smoothing raises the exact energy above that of a start that was solved with less
     first = solved["unit-offset"].soup
-    options = replace(OPTIONS, presolve_eps=(0.3,), eps=0.3, tol=1e-6)
+    options = OPTIONS.replace(presolve_eps=(0.3,), eps=0.3, tol=1e-6)
     again = solve_soup(first, room.data, WEIGHTS, form(), options)
     assert again.converged, again.status
     assert again.stages[-1].history["inf_du"][0] < 1e-2

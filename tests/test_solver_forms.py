@@ -119,7 +119,7 @@ def test_lifted_alone_at_its_optimum_is_the_exact_energy_as_eps_vanishes(units):
 
 def test_epigraph_alone_at_its_optimum_is_the_exact_energy_without_truncations():
     problem = tiny()
-    weights = replace(PAPER, sigma_cont=np.inf, orient=0.0)
+    weights = PAPER.replace(sigma_cont=np.inf, orient=0.0)
     nlp, _ = problem.nlp(weights, form(norm="epigraph", eps=0.0, eps_pixel=0.0))
     exact = plain.energy(problem.soup, problem.data, weights)["total"]
     assert value(nlp, optimal_extras(nlp))[0] == pytest.approx(exact, rel=1e-10)
@@ -137,7 +137,7 @@ def test_epigraph_at_its_optimum_is_the_smooth_form(units):
 
 
 def test_orientation_can_do_without_truncation():
-    problem, weights = tiny(), replace(PAPER, sigma_orient=np.inf)
+    problem, weights = tiny(), PAPER.replace(sigma_orient=np.inf)
     nlp, _ = problem.nlp(weights, form())
     exact = plain.energy(problem.soup, problem.data, weights)["orient"]
     assert by_term(nlp, nlp.x0, nlp.p)["orient"] == pytest.approx(exact, rel=1e-12)
@@ -147,7 +147,7 @@ def test_orientation_can_do_without_truncation():
 def test_a_weight_scales_its_term_alone(name):
     problem = tiny()
     nlp, _ = problem.nlp(PAPER, form())
-    twice, _ = problem.nlp(replace(PAPER, **{name: 2 * getattr(PAPER, name)}), form())
+    twice, _ = problem.nlp(PAPER.replace(**{name: 2 * getattr(PAPER, name)}), form())
     a, b = by_term(nlp, nlp.x0, nlp.p), by_term(twice, nlp.x0, twice.p)
     for term in TERMS:
         assert b[term] == pytest.approx((2 if term == name else 1) * a[term], rel=1e-12)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -103,7 +103,7 @@ def test_a_motion_that_pays_goes_from_neighbour_to_neighbour(monkeypatch):
     before = taken(Turns(np.zeros(24)), np.where(first, 0.0, 0.3), np.where(first, 0, 1))
     count = []
     for rounds in (0, 1, 3):
-        o = replace(OPTIONS, rounds=rounds)
+        o = OPTIONS.replace(rounds=rounds)
         after = of_neighbourhoods(Turns(np.zeros(24)), seg, before, 0.05, o)
         np.testing.assert_array_equal(after.label == 0, after.error < 1e-9)
         count.append(int((after.label == 0).sum()))

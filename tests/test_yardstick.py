@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import sparse
 
+from soup_nlp.bench import yardstick
 from soup_nlp.bench.yardstick import Yardstick, lbfgs, levenberg_marquardt
 from soup_nlp.config.problem import make_problem
 from soup_nlp.model import oracle as plain
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
-from soup_nlp.solve import factor, yardstick
+from soup_nlp.solve import factor
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
@@ -86,8 +86,8 @@ def test_ipopt_and_levenberg_marquardt_agree(case, lm):
 
 def test_it_is_the_same_energy(case):
     # without truncations the smoothed energy tends to the exact one
-    free = replace(
-        Weights(), sigma_cont=np.inf, sigma_orient=np.inf, sigma_arap=np.inf, sigma_proj=np.inf
+    free = Weights().replace(
+        sigma_cont=np.inf, sigma_orient=np.inf, sigma_arap=np.inf, sigma_proj=np.inf
     )
     problem = yardstick._Tangent(case.soup, case.data, free, FORM)
     x = problem.project(problem.nlp.x0)

@@ -8,14 +8,12 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-import soup_nlp
 from soup_nlp.bench.rivals import depth_maps, true_depth
 from soup_nlp.bench.suites import SUITES, Item
 from soup_nlp.bench.truth import true_soup
@@ -35,15 +33,6 @@ Row = dict[str, Any]
 
 KEPT = ("mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3")
 """Errors that a row keeps, beside scale, coverage and skill."""
-
-CODE = (
-    *(f"{room}/*.py" for room in ("data", "geometry", "model", "mrf", "start", "solve", "refine")),
-    *(f"report/{name}.py" for name in ("metrics", "protocols", "scene_flow", "baselines")),
-    *(f"bench/{name}.py" for name in ("accuracy", "planes", "rivals", "truth")),
-    *(f"bench/analyses_{name}.py" for name in ("energy", "flow", "views")),
-    *("pipeline.py", "cases.py", "inputs.py", "scoring.py"),
-)
-"""Sources that decide the numbers of a row: they make its code version."""
 
 
 @dataclass(frozen=True)
@@ -81,16 +70,6 @@ def input_hash(problem: Problem) -> str:
 
 def _hash(tree: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
-
-
-@cache
-def code_version() -> str:
-    """Version and hash of the sources that decide a result, as they were at the first call."""
-    root = Path(soup_nlp.__file__).parent
-    digest = hashlib.sha256()
-    for file in sorted({f for pattern in CODE for f in root.glob(pattern)}):
-        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
-    return f"{soup_nlp.__version__}-{digest.hexdigest()[:10]}"
 
 
 def measure(job: Job, change: Callable[[Pair], Pair] | None = None) -> Row:

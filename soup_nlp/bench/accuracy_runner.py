@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from soup_nlp.bench.accuracy import Job, Row, clean, code_version, head, measure
+from soup_nlp.bench.accuracy import Job, Row, clean, head, measure
 from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.storage.versions import code_version
 
 Function = Callable[[Job], Row]
 Say = Callable[[int, int, Row], None]

@@ -16,8 +16,8 @@ from soup_nlp.bench.analyses_report import plot_energy, plot_variants, text_ener
 from soup_nlp.bench.analyses_views import VIEWS, measure_view
 from soup_nlp.bench.suites import Item, Listing
 from soup_nlp.errors import ConfigError
-from soup_nlp.report.folder import prepare_folder, write_text
-from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.report.folder import prepare_folder
+from soup_nlp.storage.atomic import atomic_path, write_text
 
 Overrides = tuple[str, ...]
 

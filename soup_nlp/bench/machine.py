@@ -2,21 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import platform
-from functools import cache
 from pathlib import Path
 
-from soup_nlp.storage.store import versions
-
-PACKAGE = Path(__file__).resolve().parents[1]
-
-CODE = (
-    *(f"{room}/*.py" for room in ("data", "geometry", "model", "mrf", "start", "solve")),
-    *("cases.py", "inputs.py"),
-)
-"""Sources that a solve without refinement runs through: they make the code of its seconds."""
+from soup_nlp.storage.versions import code_version, versions
 
 
 def machine() -> dict[str, str]:
@@ -41,13 +31,3 @@ def _processor() -> str:
         return platform.processor() or "unknown"
     lines = [line for line in text.splitlines() if line.startswith("model name")]
     return lines[0].partition(":")[2].strip() if lines else platform.machine()
-
-
-@cache
-def code_version() -> str:
-    """Hash of what a solve runs through; benchmarks, reports and commands are not part of it."""
-    digest = hashlib.sha256()
-    for path in sorted({file for pattern in CODE for file in PACKAGE.glob(pattern)}):
-        digest.update(f"{path.relative_to(PACKAGE).as_posix()}\0".encode())
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]

@@ -29,9 +29,10 @@ from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.pipeline import Case, make_run, prepare
-from soup_nlp.report.folder import prepare_folder, write_folder, write_text
+from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
+from soup_nlp.storage.atomic import write_text
 
 Float = NDArray[np.float64]
 

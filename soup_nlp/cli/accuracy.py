@@ -15,7 +15,7 @@ from soup_nlp.bench.accuracy_table import get, reason, report, show
 from soup_nlp.bench.suites import SUITES, Options, list_suite
 from soup_nlp.errors import ConfigError
 from soup_nlp.evaluate.protocols import preset
-from soup_nlp.report.folder import write_text
+from soup_nlp.storage.atomic import write_text
 
 SuiteName = Annotated[
     list[str] | None, typer.Option("--suite", help=f"{', '.join(SUITES)}; may be repeated.")

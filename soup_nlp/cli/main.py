@@ -24,10 +24,11 @@ from soup_nlp.evaluate.metrics import Scale
 from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.pipeline.run import StoppedError
 from soup_nlp.pipeline.run import run as run_problem
-from soup_nlp.report.folder import prepare_folder, write_folder, write_text
+from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.verdict import accuracy, missed, protocol, verdict
 from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.solve.ipopt import Progress
+from soup_nlp.storage.atomic import write_text
 
 app = typer.Typer(
     add_completion=False,

@@ -18,7 +18,8 @@ from soup_nlp.bench.speed_table import report
 from soup_nlp.bench.timed import problem_of
 from soup_nlp.data.scenes.catalogue import SCENES
 from soup_nlp.errors import ConfigError
-from soup_nlp.report.folder import prepare_folder, write_text
+from soup_nlp.report.folder import prepare_folder
+from soup_nlp.storage.atomic import write_text
 
 QUICK = {"scenes": "street,room", "sizes": "250", "neighbours": "10", "seeds": "0"}
 """What --quick measures, on frames of half the width and height."""

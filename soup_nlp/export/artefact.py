@@ -32,11 +32,12 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import GAUGES, MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline import Case, Run, make_run, prepare
-from soup_nlp.report.folder import write_text
 from soup_nlp.solve.ipopt import Stage
 from soup_nlp.solve.kkt import residuals
 from soup_nlp.solve.stages import Solution
-from soup_nlp.storage.store import versions, write_json
+from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.store import write_json
+from soup_nlp.storage.versions import versions
 
 Float = NDArray[np.float64]
 

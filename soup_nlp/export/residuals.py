@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.report import recompute
+from soup_nlp.evaluate import recompute
 
 Float = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from soup_nlp.errors import DataError
-from soup_nlp.report import recompute
+from soup_nlp.evaluate import recompute
 from soup_nlp.storage.store import read_attrs, read_h5, require
 
 LIMITS = {

@@ -23,8 +23,9 @@ from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_p
 from soup_nlp.report.pointcloud import write_ply
 from soup_nlp.report.tree import attributes, result_tree
 from soup_nlp.solve.kkt import constraint_residuals
-from soup_nlp.storage.atomic import atomic_path
-from soup_nlp.storage.store import versions, write_h5, write_json
+from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.store import write_h5, write_json
+from soup_nlp.storage.versions import versions
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline.run import Run
@@ -115,16 +116,6 @@ def _refuse_foreign(folder: Path) -> None:
             expected="a new or empty folder, or that of an earlier result",
             hint="choose another --out",
         )
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all.
-
-    Raises:
-        DataError: the folder is missing or cannot be written.
-    """
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def write_folder(folder: Path, run: Run, config: str, log: str) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -60,8 +59,7 @@ class TangentProblem:
             chart: Of the coordinates, see TangentLayout.
         """
         # theta = 0 and no ridge: reweighted least squares, sum c psi / s J^T J
-        majorant = replace(
-            form,
+        majorant = form.replace(
             norm="smooth",
             truncation="smooth",
             hessian="gauss-newton+constraints",

@@ -67,6 +67,16 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         raise
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all.
+
+    Raises:
+        DataError: the folder is missing or cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def _mode(target: Path) -> int:
     """Permission bits for the new file: those of the old one, or the default of the process."""
     with suppress(OSError):

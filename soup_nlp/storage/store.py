@@ -7,7 +7,6 @@ import math
 import platform
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
-from importlib.metadata import PackageNotFoundError, version
 from os import PathLike as _PathLike
 from pathlib import Path
 from typing import Any, TypeAlias, Union
@@ -16,25 +15,15 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-import soup_nlp
 from soup_nlp.errors import DataError
 from soup_nlp.storage.atomic import PathLike, atomic_path
+from soup_nlp.storage.versions import versions
 
 SCHEMA = 1
 """Version of the layout of result files; grows when a reader would have to change."""
 
 COMPRESS_ABOVE = 64 * 1024
 """Arrays of more bytes than this are compressed (gzip level 1 after a byte shuffle)."""
-
-_PACKAGES = {
-    "casadi": "casadi",
-    "numpy": "numpy",
-    "scipy": "scipy",
-    "opencv": "opencv-python-headless",
-    "skimage": "scikit-image",
-    "h5py": "h5py",
-}
-_OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless")
 
 
 @dataclass(frozen=True)
@@ -288,17 +277,3 @@ def write_json(path: PathLike, obj: object) -> None:
     text = json.dumps(plain(obj), indent=2, ensure_ascii=False, allow_nan=False)
     with atomic_path(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
-
-
-def versions() -> dict[str, str]:
-    """Versions of what a result depends on; "unknown" where a package does not say."""
-    out = {"soup_nlp": soup_nlp.__version__, "python": platform.python_version()}
-    for name, package in _PACKAGES.items():
-        out[name] = "unknown"
-        for candidate in _OPENCV if name == "opencv" else (package,):
-            try:
-                out[name] = version(candidate)
-                break
-            except PackageNotFoundError:
-                continue
-    return out

@@ -22,7 +22,8 @@ from soup_nlp.export.verify import ENERGY_SLACK, Limits
 from soup_nlp.model import oracle as plain
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
-from soup_nlp.report.folder import prepare_folder, write_text
+from soup_nlp.report.folder import prepare_folder
+from soup_nlp.storage.atomic import write_text
 
 Label = Mapping[str, Any]
 Maker = Callable[[Path], Task]
@@ -65,7 +66,7 @@ class _Maker:
     def __call__(self, folder: Path) -> Task:
         if self._built is None:
             nlp, layout = self.case.nlp(self.form)
-            second, _ = self.case.nlp(replace(self.form, hessian="gauss-newton+constraints"))
+            second, _ = self.case.nlp(self.form.replace(hessian="gauss-newton+constraints"))
             self._built = Task(
                 # a solver's time is its own
                 nlp=nlp.assembled(),

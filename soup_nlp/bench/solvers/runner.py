@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-import soup_nlp
 from soup_nlp.bench.solvers.isolate import isolated
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import Answer, Task, Trace
@@ -24,7 +21,7 @@ from soup_nlp.export.verify import Limits, kkt
 from soup_nlp.model import oracle as plain
 from soup_nlp.storage.atomic import atomic_path
 from soup_nlp.storage.store import plain as jsonable
-from soup_nlp.storage.store import versions
+from soup_nlp.storage.versions import code_version, versions
 
 Float = NDArray[np.float64]
 Row = dict[str, Any]
@@ -33,17 +30,6 @@ CURVE_POINTS = 40
 """Iterates of a trace whose exact energy is taken."""
 KEY = ("problem", "problem_hash", "superpixels", "formulation", "start", "solver", "limits", "code")
 """What makes a row: a run with the same key is not repeated."""
-
-
-@cache
-def code_version() -> str:
-    """Version of the program and a hash of the sources that decide a row."""
-    root = Path(soup_nlp.__file__).parent
-    digest = hashlib.sha256()
-    for room in ("model", "solve", "compare", "export"):
-        for path in sorted((root / room).glob("*.py")):
-            digest.update(path.read_bytes())
-    return f"{soup_nlp.__version__}+{digest.hexdigest()[:8]}"
 
 
 def read_rows(path: Path) -> list[Row]:

@@ -1,0 +1,47 @@
+"""Versions of the program, of its code and of what it runs on."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+__version__ = "0.1.0"
+
+_PACKAGES = {
+    "casadi": "casadi",
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "opencv": "opencv-python-headless",
+    "skimage": "scikit-image",
+    "h5py": "h5py",
+}
+_OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless")
+
+
+@cache
+def code_version() -> str:
+    """Version and hash of the package's sources as they were at the first call.
+
+    Rows of benchmarks carry it: what was measured by other code is measured again.
+    """
+    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return f"{__version__}+{digest.hexdigest()[:10]}"
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on; "unknown" where a package does not say."""
+    out = {"soup_nlp": __version__, "python": platform.python_version()}
+    for name, package in _PACKAGES.items():
+        out[name] = "unknown"
+        for candidate in _OPENCV if name == "opencv" else (package,):
+            try:
+                out[name] = version(candidate)
+                break
+            except PackageNotFoundError:
+                continue
+    return out
