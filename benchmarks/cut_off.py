@@ -1,10 +1,10 @@
-"""Bodies that the lower border cuts off: depth with and without what the start says of them.
+"""Components that the lower border cuts off: depth with and without what the start says of them.
 
     python benchmarks/cut_off.py [--out results/accuracy] [--seeds 0,1,2,3,4,5,6,7]
         [--superpixels 500] [--lower 0.3]
 
 Writes cut_off.md: mean relative errors of start and NLP on rendered streets and rooms without their
-lower part, where what moving bodies stand on is not seen; by contact alone, and as shipped.
+lower part, where what moving components stand on is not seen; by contact alone, and as shipped.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ NEARER = "soup_nlp.start.components.nearer_where_cut_off"
 
 
 def errors(scene: str, seed: int, superpixels: int, lower: float) -> tuple[list[float], int]:
-    """MRE of start and NLP by contact, the same as shipped; how many true bodies are cut off."""
+    """MRE of start and NLP by contact, the same as shipped; how many true components are cut
+    off."""
     problem = make_problem(
         {
             "input": {"kind": "scene", "scene": scene, "seed": seed},
@@ -40,7 +41,7 @@ def errors(scene: str, seed: int, superpixels: int, lower: float) -> tuple[list[
     whole = problem.load_pair()
     pair = replace(cropped(whole, 0, 0, 0, int(lower * whole.image_ref.shape[0])), flow=None)
     assert pair.truth is not None
-    assert pair.truth.bodies is not None
+    assert pair.truth.components is not None
     found: list[float] = []
     for contact in (True, False):
         if contact:
@@ -49,7 +50,7 @@ def errors(scene: str, seed: int, superpixels: int, lower: float) -> tuple[list[
         else:
             metrics = run(problem, pair=pair).metrics
         found += [metrics["start"].mre, metrics["solution"].mre]
-    last = pair.truth.bodies[-1]
+    last = pair.truth.components[-1]
     return found, len(np.unique(last[last > 0]))
 
 
@@ -64,10 +65,10 @@ def main() -> None:
     note = (
         f"MRE (median scale, no cap) of rendered pairs without the lower {args.lower:.0%} of their"
         " rows, by contact alone and as shipped: what the lower border cuts off is nearer than what"
-        f" it touches (`start.bodies`). DIS flow, {args.superpixels} superpixels, NLP without"
+        f" it touches (`start.components`). DIS flow, {args.superpixels} superpixels, NLP without"
         f" refinement. {date.today()}, {platform.machine()}."
     )
-    head = ["pair, seed", "bodies cut off", "start, contact", "NLP, contact", "start", "NLP"]
+    head = ["pair, seed", "components cut off", "start, contact", "NLP, contact", "start", "NLP"]
     rows: list[list[str]] = []
     args.out.mkdir(parents=True, exist_ok=True)
     for scene in ("street", "room"):

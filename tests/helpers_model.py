@@ -230,12 +230,13 @@ def plane_soup(pose: Float, move: Float, count: int) -> Soup:
     )
 
 
-def corner_scene(move: Float, body: Float | None = None, turn: float = 0.0) -> Scene:
-    """Floor and two walls that meet in a corner; with `body`, also a moving wedge of two planes.
+def corner_scene(move: Float, component: Float | None = None, turn: float = 0.0) -> Scene:
+    """Floor and two walls that meet in a corner; with `component`, also a moving wedge of two
+    planes.
 
     Args:
         move: (4, 4) next_from_ref of the room (the camera's motion).
-        body: (4, 4) motion of the wedge in camera coordinates before the camera moves.
+        component: (4, 4) motion of the wedge in camera coordinates before the camera moves.
         turn: Turns the wedge about its edge, degrees.
     """
     room = (
@@ -243,16 +244,16 @@ def corner_scene(move: Float, body: Float | None = None, turn: float = 0.0) -> S
         Part(Plane(), plane_pose(6.0, yaw=-45), GREY),
         Part(Plane(), plane_pose(0.0, pitch=-90) @ shift(0, 0, -1.2), GREY),
     )
-    bodies = [Body("room", room)]
-    if body is not None:
+    components = [Body("room", room)]
+    if component is not None:
         half = Plane((0.7, 0.8))
         wedge = []
         for side in (-1.0, 1.0):
             yaw = turn + side * 40.0
             pose = plane_pose(3.0, yaw=yaw) @ shift(side * 0.7, 0, 0)
             wedge.append(Part(half, pose, GREY))
-        bodies.append(Body("wedge", tuple(wedge), body))
-    return Scene(tuple(bodies), np.eye(4), move)
+        components.append(Body("wedge", tuple(wedge), component))
+    return Scene(tuple(components), np.eye(4), move)
 
 
 def shift(x: float, y: float, z: float) -> Float:

@@ -140,7 +140,7 @@ def test_dynamic_scene_is_not_rigid():
     pair = render_scene("street", width=256, height=109)
     found = rigid_depth(pair, flow_from_truth(pair))
     m = depth_metrics(found.depth, pair.truth.depth_ref)
-    static = depth_metrics(found.depth, pair.truth.depth_ref, mask=pair.truth.bodies == 0)
+    static = depth_metrics(found.depth, pair.truth.depth_ref, mask=pair.truth.components == 0)
     assert static.mre < m.mre < 0.05
     assert found.inlier_fraction < 0.95
 

@@ -59,7 +59,7 @@ def test_a_row_has_every_number(orbit_row):
         assert set(table) == set(METHODS)
         assert table["constant"]["skill"] == 0.0
         assert table["floor"]["mre"] <= table["plane"]["mre"] <= table["constant"]["mre"]
-        # one rigid motion with the true flow is exact on a scene of one body
+        # one rigid motion with the true flow is exact on a scene of one component
         assert table["rigid"]["mre"] < 1e-3
         assert table["floor"]["mre"] <= table["solution"]["mre"]
         if convention == "best":

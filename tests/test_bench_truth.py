@@ -92,9 +92,9 @@ def test_true_soup_is_the_truth_but_for_mixed_superpixels(street):
     gap = np.linalg.norm(rec.flow - pair.truth.flow, axis=2)
     assert np.median(gap[pure]) < 0.1
     assert true.known.all()
-    # its motions come out of the scene flow as well as from the bodies
+    # its motions come out of the scene flow as well as from the components
     other = pair.truth.__class__(
-        depth_ref=gt, bodies=pair.truth.bodies, scene_flow=pair.truth.scene_flow
+        depth_ref=gt, components=pair.truth.components, scene_flow=pair.truth.scene_flow
     )
     again = true_soup(pair.__class__(**{**vars(pair), "truth": other}), seg)
     np.testing.assert_allclose(again.soup.R, true.soup.R, atol=1e-6)
@@ -111,7 +111,7 @@ def test_a_true_plane_seen_from_behind_somewhere_faces_the_camera():
     depth = np.where(labels == 1, 2.0, 1 / inverse)
     black = np.zeros((height, width, 3), np.uint8)
     truth = Truth(
-        depth_ref=depth, bodies=np.zeros((height, width), np.int32), motions=np.eye(4)[None]
+        depth_ref=depth, components=np.zeros((height, width), np.int32), motions=np.eye(4)[None]
     )
     pair = Pair(black, black, K, K, truth=truth)
     true = true_soup(pair, build_segmentation(labels, black, neighbours=1))
@@ -147,14 +147,14 @@ def test_unorganised_superpixels_have_translations_of_length_one(street):
     np.testing.assert_allclose(alone.homographies(pair.K_ref, pair.K_next), H, atol=1e-9)
 
 
-def test_bodies_are_rescaled_to_where_the_energy_likes_them(street):
+def test_components_are_rescaled_to_where_the_energy_likes_them(street):
     true = true_soup(*street)
-    size = np.bincount(true.body)
+    size = np.bincount(true.component)
     order = np.argsort(-size)
     assert (size[order[:3]] > 0).all()
     wanted = np.ones(len(size))
     wanted[order[1]], wanted[order[2]] = 2.0, 0.6
-    target = np.log(wanted)[true.body]
+    target = np.log(wanted)[true.component]
 
     def energy(soup):
         """How far log distances are from the wanted ones, with one scale free."""
@@ -162,7 +162,7 @@ def test_bodies_are_rescaled_to_where_the_energy_likes_them(street):
         return float(np.abs(gap - np.median(gap)).sum())
 
     gap = np.log(rescaled(true, energy).lam / true.soup.lam)
-    gap -= gap[true.body == order[0]][0]
+    gap -= gap[true.component == order[0]][0]
     # to half a step of the factors that are tried
     np.testing.assert_allclose(gap, target, atol=np.log(9) / 40 / 2 + 1e-12)
     # of what costs nothing the truth is left as it is

@@ -1,4 +1,4 @@
-"""Surfaces that bend are told from bodies that move apart, and solved without rigid pieces."""
+"""Surfaces that bend are told from components that move apart, and solved without rigid pieces."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def case(scene: str, *overrides: str) -> Case:
 
 
 @pytest.mark.parametrize("scene", ["street", "room", "orbit"])
-def test_rigid_bodies_do_not_bend(scene):
+def test_rigid_components_do_not_bend(scene):
     start = case(scene).start
     assert not start.bending
     assert start.bending_share < 0.2
@@ -42,7 +42,7 @@ def test_sheet_bends_and_can_be_told_not_to():
     assert c.start.bending
     assert c.start.bending_share > 0.35
     assert c.data.arap_at_anchors
-    assert (c.start.body == 0).all()
+    assert (c.start.component == 0).all()
     np.testing.assert_allclose(c.soup.depth_at(c.data.anchor_ray), 1.0, rtol=1e-9)
     assert not case("sheet", "start.bending=1.0").start.bending
 
@@ -78,7 +78,7 @@ def test_one_weight_that_is_set_leaves_those_of_the_others():
     [
         ("arap", 0.3, "edges", "edge_weight"),
         ("cont", 0.01, "pairs", "pair_weight"),
-        ("orient", 0.3, "pairs", "pair_count"),
+        ("orient", 0.3, "pairs", "orient_weight"),
     ],
 )
 def test_little_holds_surfaces_together_where_the_flow_tears(term, factor, graph, column):
@@ -90,8 +90,8 @@ def test_little_holds_surfaces_together_where_the_flow_tears(term, factor, graph
     expected = np.where(torn, factor, 1.0) * getattr(whole.data, column)
     np.testing.assert_allclose(getattr(c.data, column), expected, rtol=1e-12)
     # the tears are the outline of the sheet
-    body = true_soup(c.pair, c.segmentation).body
-    assert (body[i] != body[k])[torn].mean() > 0.9
+    component = true_soup(c.pair, c.segmentation).component
+    assert (component[i] != component[k])[torn].mean() > 0.9
     rigid = [getattr(case("street", *over).data, column) for over in ((), (option,))]
     np.testing.assert_array_equal(*rigid)
 
@@ -107,7 +107,7 @@ def own_relief(c: Case) -> float:
     answer = solve_soup(c.soup, c.data, c.weights, c.formulation(), c.options)
     z = reconstruct(answer.soup, c.segmentation.labels, c.pair.K_ref, c.pair.K_next).depth_ref
     gt = c.pair.truth.depth_ref
-    return depth_metrics(z, np.where(c.pair.truth.bodies == 1, gt, np.nan)).mre
+    return depth_metrics(z, np.where(c.pair.truth.components == 1, gt, np.nan)).mre
 
 
 def test_every_claim_of_a_bending_result_holds(tmp_path, capsys):

@@ -19,7 +19,7 @@ from soup_nlp.report.folder import prepare_folder, write_folder
 
 @pytest.fixture(scope="module")
 def run() -> Run:
-    """Bodies that move: occlusions, and cracks where the camera comes nearer."""
+    """Components that move: occlusions, and cracks where the camera comes nearer."""
     return solve_pair(
         render_scene("street", 0, 192, 128),
         segmentation={"superpixels": 60, "neighbours": 6},

@@ -113,14 +113,14 @@ def test_check_holds_and_catches_tampering(solved, capsys):
 
 @pytest.mark.parametrize("row", ["edge", "pair"])
 def test_check_makes_the_weights_of_edges_and_pairs_again(row, tmp_path):
-    """On a scene with bodies, where both depend on the start."""
+    """On a scene with components, where both depend on the start."""
     street = str(PROBLEMS[0].parent / "street.yaml")
     assert main(["solve", street, "--out", str(tmp_path), *SMALL, "--no-refine"]) == 0
     assert check_folder(tmp_path).ok
     with h5py.File(tmp_path / "result.h5", "a") as file:
-        body = file["start/body"][:]
+        component = file["start/component"][:]
         i, k = file[f"energy/{row}s"][:].T
-        across = np.flatnonzero(body[i] != body[k])
+        across = np.flatnonzero(component[i] != component[k])
         assert len(across)
         weight = file[f"energy/{row}_weight"][:]
         weight[across[0]] *= 2

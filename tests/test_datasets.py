@@ -206,8 +206,8 @@ def test_kitti2015(tmp_path: Path) -> None:
     before = np.array([(u - 4) / 100, (v - 3) / 100, 1]) * 5.4
     after = np.array([(u + 2 - 4) / 100, (v + 2 - 3) / 100, 1]) * 4.5
     np.testing.assert_allclose(truth.scene_flow[v, u], after - before)
-    assert truth.bodies is not None
-    assert truth.bodies.sum() == H
+    assert truth.components is not None
+    assert truth.components.sum() == H
     with raises(r"image_2[\s\S]*calib_cam_to_cam"):
         datasets.load_kitti2015(tmp_path, 2)
 

@@ -265,7 +265,7 @@ def test_a_step_too_long_for_one_is_shortened_for_all_where_that_one_alone_does_
 
 def test_a_bound_that_cuts_one_short_cuts_all_where_norms_hold_them_together():
     class Bounded(Chain):
-        """One body by its scales; the first superpixel may go a tenth of the step."""
+        """One component by its scales; the first superpixel may go a tenth of the step."""
 
         def slacks(self, x):
             slack, jacobian = np.ones((self.n, 1)), np.zeros((self.n, 1, 3))
@@ -279,17 +279,17 @@ def test_a_bound_that_cuts_one_short_cuts_all_where_norms_hold_them_together():
             return np.roll(super().gradient(x), -6)
 
     class Aside(Bounded):
-        """The first superpixel has nothing to do with the body."""
+        """The first superpixel has nothing to do with the component."""
 
         def parts(self, x):
             a, apart, wall = super().parts(x)
             return a, np.where(np.arange(self.n - 1) == 0, 0.0, apart), wall
 
-    body = Bounded(5)
+    component = Bounded(5)
     x, h = np.zeros(45), np.zeros(45)
     h[::9] = 1.0
-    at, gradient = evaluate(body, x, 1e-8), body.gradient(x)
-    move = Search(body, at, h, 1e-8, np.zeros_like).run(gradient, -gradient)
+    at, gradient = evaluate(component, x, 1e-8), component.gradient(x)
+    move = Search(component, at, h, 1e-8, np.zeros_like).run(gradient, -gradient)
     assert move.point is not None
     np.testing.assert_allclose(move.length, 0.099)
     assert move.point.f < at.f - 0.4

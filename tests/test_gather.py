@@ -1,4 +1,5 @@
-"""Bodies take one motion each: torn ones are gathered, halves of them come back, the rest stays."""
+"""Components take one motion each: torn ones are gathered, halves of them come back, the rest
+stays."""
 
 from __future__ import annotations
 
@@ -29,15 +30,17 @@ OPTIONS = SeededStart()
 
 @pytest.fixture(scope="module")
 def world():
-    """A wedge that moves in a room: views, superpixels, jumps, true body and motions."""
+    """A wedge that moves in a room: views, superpixels, jumps, true component and motions."""
     scene = corner_scene(CAMERA, WEDGE, turn=10)
     pair = with_true_flow(render(scene, K, HEIGHT, WIDTH))
     labels, _ = cut_by_part(scene, pair, 100)
     seg = build_segmentation(labels, pair.image_ref, neighbours=10)
     views, _ = look(seg, pair.flow, K, K, OPTIONS)
     jump = flow_jump(views, seg.pairs, camera.rays(K, seg.boundary))
-    body = np.array([np.bincount(pair.truth.bodies[labels == i]).argmax() for i in range(len(seg))])
-    return views, seg, jump, body, unit(pair.truth.motions)
+    component = np.array(
+        [np.bincount(pair.truth.components[labels == i]).argmax() for i in range(len(seg))]
+    )
+    return views, seg, jump, component, unit(pair.truth.motions)
 
 
 def unit(M: np.ndarray) -> list[Motion]:
@@ -57,46 +60,46 @@ def turned(m: Motion, degrees: float, axis: int) -> Motion:
     return Motion(R @ m.R, t / np.linalg.norm(t))
 
 
-def agreement(choice: Choice, body: np.ndarray) -> tuple[float, float]:
+def agreement(choice: Choice, component: np.ndarray) -> tuple[float, float]:
     """Share of wedge and of room that have the commonest motion of theirs."""
     shares = []
     for b in (1, 0):
-        own = choice.label[body == b]
+        own = choice.label[component == b]
         shares.append(np.unique(own, return_counts=True)[1].max() / len(own))
     return shares[0], shares[1]
 
 
-def off(choice: Choice, body: np.ndarray, m: Motion) -> float:
+def off(choice: Choice, component: np.ndarray, m: Motion) -> float:
     """Median angle in degrees between the wedge's rotation and the true one."""
-    turn = rotation.log(np.swapaxes(choice.R[body == 1], 1, 2) @ m.R)
+    turn = rotation.log(np.swapaxes(choice.R[component == 1], 1, 2) @ m.R)
     return float(np.median(np.degrees(np.linalg.norm(turn, axis=1))))
 
 
-def test_a_torn_body_is_gathered(world):
-    views, seg, jump, body, (room, wedge) = world
+def test_a_torn_component_is_gathered(world):
+    views, seg, jump, component, (room, wedge) = world
     torn = [room, turned(wedge, 0.4, 0), turned(wedge, -0.4, 1), turned(wedge, 0.4, 2)]
     part = 1 + np.arange(len(seg)) % 3
-    before = chosen(views, torn, np.where(body == 1, part, 0))
-    assert agreement(before, body)[0] < 0.5
+    before = chosen(views, torn, np.where(component == 1, part, 0))
+    assert agreement(before, component)[0] < 0.5
     after = gather(views, seg, jump, before, 0.05, OPTIONS)
-    assert min(agreement(after, body)) > 0.85
-    assert off(after, body, wedge) < 0.3
-    assert off(after, body, wedge) < off(before, body, wedge)
-    assert np.median(after.error[body == 1]) < np.median(before.error[body == 1])
+    assert min(agreement(after, component)) > 0.85
+    assert off(after, component, wedge) < 0.3
+    assert off(after, component, wedge) < off(before, component, wedge)
+    assert np.median(after.error[component == 1]) < np.median(before.error[component == 1])
 
 
 def test_superpixels_with_motions_of_their_own_are_gathered(world):
-    views, seg, jump, body, (room, wedge) = world
+    views, seg, jump, component, (room, wedge) = world
     rng = np.random.default_rng(0)
     motions, label = [room], np.zeros(len(seg), int)
-    for i in np.flatnonzero(body == 1):
+    for i in np.flatnonzero(component == 1):
         motions.append(turned(wedge, rng.uniform(-0.5, 0.5), int(rng.integers(3))))
         label[i] = len(motions) - 1
     before = chosen(views, motions, label)
-    before = replace(before, label=np.where(body == 1, -1, 0))
+    before = replace(before, label=np.where(component == 1, -1, 0))
     after = gather(views, seg, jump, before, 0.05, OPTIONS)
-    assert min(agreement(after, body)) > 0.85
-    assert off(after, body, wedge) < 0.3
+    assert min(agreement(after, component)) > 0.85
+    assert off(after, component, wedge) < 0.3
     gathered, motions = after.renumbered()
     assert len(motions) == 2
     assert set(np.unique(gathered.label)) <= {-1, 0, 1}
@@ -107,26 +110,26 @@ def test_superpixels_with_motions_of_their_own_are_gathered(world):
         )
 
 
-def test_half_a_body_with_the_rooms_motion_comes_back(world):
-    views, seg, jump, body, (room, wedge) = world
-    left = seg.anchors[:, 0] < np.median(seg.anchors[body == 1, 0])
-    before = chosen(views, [room, wedge], np.where((body == 1) & left, 1, 0))
-    assert agreement(before, body)[0] < 0.7
+def test_half_a_component_with_the_rooms_motion_comes_back(world):
+    views, seg, jump, component, (room, wedge) = world
+    left = seg.anchors[:, 0] < np.median(seg.anchors[component == 1, 0])
+    before = chosen(views, [room, wedge], np.where((component == 1) & left, 1, 0))
+    assert agreement(before, component)[0] < 0.7
     after = gather(views, seg, jump, before, 0.05, OPTIONS)
-    assert min(agreement(after, body)) > 0.85
+    assert min(agreement(after, component)) > 0.85
 
 
 def test_one_rigid_world_stays_as_it_is(world):
-    views, seg, jump, body, (room, _) = world
-    before = chosen(views, [room], np.zeros(len(body), int))
+    views, seg, jump, component, (room, _) = world
+    before = chosen(views, [room], np.zeros(len(component), int))
     after = gather(views, seg, jump, before, 0.05, OPTIONS)
     np.testing.assert_array_equal(after.R, before.R)
     np.testing.assert_array_equal(after.label, before.label)
 
 
 def test_without_a_shared_motion_there_is_nothing_to_gather(world):
-    views, seg, jump, body, (room, _) = world
-    before = replace(chosen(views, [room], 0 * body), label=np.full(len(body), -1))
+    views, seg, jump, component, (room, _) = world
+    before = replace(chosen(views, [room], 0 * component), label=np.full(len(component), -1))
     assert gather(views, seg, jump, before, 0.05, OPTIONS) is before
     same, motions = before.renumbered()
     assert motions == []
@@ -134,17 +137,17 @@ def test_without_a_shared_motion_there_is_nothing_to_gather(world):
 
 
 def test_neighbours_agree_unless_the_flow_jumps(world):
-    _, seg, jump, body, _ = world
+    _, seg, jump, component, _ = world
     rng = np.random.default_rng(1)
     n = len(seg)
-    # each body prefers its own label by 0.3 pixels, a fifth of the superpixels the wrong one
+    # each component prefers its own label by 0.3 pixels, a fifth of the superpixels the wrong one
     wrong = rng.random(n) < 0.2
-    cost = np.where(np.arange(2) == np.where(wrong, 1 - body, body)[:, None], 0.0, 0.3)
+    cost = np.where(np.arange(2) == np.where(wrong, 1 - component, component)[:, None], 0.0, 0.3)
     near = hanging_together(jump, OPTIONS)
     assert near.max() <= 1
-    assert near[jump > 3 * OPTIONS.tear_px].max() < 0.01
+    assert near[jump > 3 * OPTIONS.discontinuity_px].max() < 0.01
     label = smooth_choice(cost, near, seg, 0.5)
-    assert (label == body).mean() > 0.95
+    assert (label == component).mean() > 0.95
     # without a price each takes its own; a high price leaves one
     np.testing.assert_array_equal(smooth_choice(cost, near, seg, 0.0), np.argmin(cost, axis=1))
     assert len(np.unique(smooth_choice(cost, np.ones_like(near), seg, 1e3))) == 1

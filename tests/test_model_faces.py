@@ -125,7 +125,7 @@ def test_truncations_of_the_tiny_problem_cut_some_and_spare_some():
             free = term(problem.soup, problem.data, wide)
             assert np.mean(cut < free) > 0.05, term.__name__
             assert (cut <= free * (1 + 1e-12)).all()
-        turn = plain.orientation(problem.soup, problem.data, weights) / problem.data.pair_count
+        turn = plain.orientation(problem.soup, problem.data, weights) / problem.data.orient_weight
         assert 0.05 < np.mean(turn < weights.sigma_orient) < 0.95
 
 

@@ -15,7 +15,7 @@ from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.verdict import verdict
-from soup_nlp.start.components import bodies
+from soup_nlp.start.components import rigid_components
 from soup_nlp.start.propose import propose
 
 K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
@@ -51,12 +51,12 @@ def test_a_start_without_parallax_borrows_everything_and_keeps_to_the_flow(tiles
 def test_pieces_are_numbered_after_the_motions_that_are_shared(tiles):
     n = len(tiles)
     own = np.full(n, -1)
-    np.testing.assert_array_equal(bodies(own, tiles), np.zeros(n))
+    np.testing.assert_array_equal(rigid_components(own, tiles), np.zeros(n))
     left = tiles.anchors[:, 0] < 50
     split = np.where(left, -1, 2)
-    np.testing.assert_array_equal(bodies(split, tiles), np.where(left, 3, 2))
+    np.testing.assert_array_equal(rigid_components(split, tiles), np.where(left, 3, 2))
     middle = abs(tiles.anchors[:, 0] - 80) < 15
-    assert set(bodies(np.where(middle, 0, -1), tiles)) == {0, 1, 2}
+    assert set(rigid_components(np.where(middle, 0, -1), tiles)) == {0, 1, 2}
 
 
 def test_one_pixel_without_a_way_back_costs_its_own_neighbourhood_alone():

@@ -41,9 +41,9 @@ def test_the_truth_explains_the_flow(view, pair):
     t = seen.truth
     uv = pixel_grid(*seen.size)
     X = t.depth_ref[..., None] * rays(seen.K_ref, uv)
-    M = t.motions[t.bodies]
+    M = t.motions[t.components]
     moved = np.einsum("hwij,hwj->hwi", M[..., :3, :3], X) + M[..., :3, 3]
-    known = (t.bodies >= 0) & np.isfinite(t.depth_ref)
+    known = (t.components >= 0) & np.isfinite(t.depth_ref)
     assert known.mean() > 0.5
     np.testing.assert_allclose((moved - X)[known], t.scene_flow[known], atol=1e-9)
     np.testing.assert_allclose((project(seen.K_next, moved) - uv)[known], t.flow[known], atol=1e-6)
@@ -55,7 +55,7 @@ def test_points_stay_with_their_pixels(view, pair):
     """A crop takes points away with their pixels and no others."""
     number = np.arange(96 * 128, dtype=np.int32).reshape(96, 128)
     points = pair.truth.points
-    seen = view(replace(pair, truth=Truth(bodies=number, points=points))).truth
+    seen = view(replace(pair, truth=Truth(components=number, points=points))).truth
 
     def pixels(of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         u, v = np.floor(of[:, :2].T + 0.5).astype(int)
@@ -63,9 +63,9 @@ def test_points_stay_with_their_pixels(view, pair):
         return v, u
 
     before = number[pixels(points)]
-    left = np.isin(before, seen.bodies)
+    left = np.isin(before, seen.components)
     assert left.sum() > 10
-    np.testing.assert_array_equal(seen.bodies[pixels(seen.points)], before[left])
+    np.testing.assert_array_equal(seen.components[pixels(seen.points)], before[left])
     np.testing.assert_array_equal(seen.points[:, 2], points[left, 2])
 
 
@@ -73,7 +73,7 @@ def test_a_crop_is_a_part_of_every_image(pair):
     seen, part = cropped(pair, 16, 11, 9, 6), np.s_[11:90, 16:119]
     for name in ("image_ref", "image_next"):
         np.testing.assert_array_equal(getattr(seen, name), getattr(pair, name)[part])
-    for name in ("depth_ref", "depth_next", "bodies"):
+    for name in ("depth_ref", "depth_next", "components"):
         np.testing.assert_array_equal(getattr(seen.truth, name), getattr(pair.truth, name)[part])
     np.testing.assert_array_equal(seen.flow.confidence, pair.flow.confidence[part])
     # what the crop hides is hidden: where the flow leads out of what is left
@@ -107,7 +107,7 @@ def test_twice_in_the_mirror_is_the_pair_itself(pair):
     # what is not known is 0 in a flow
     known = skewed.flow.confidence > 0
     np.testing.assert_allclose(twice.flow.uv[known], skewed.flow.uv[known], atol=1e-4)
-    names = ("depth_ref", "depth_next", "flow", "occluded", "bodies", "motions", "points")
+    names = ("depth_ref", "depth_next", "flow", "occluded", "components", "motions", "points")
     for name in (*names, "scene_flow"):
         np.testing.assert_allclose(
             getattr(twice.truth, name), getattr(skewed.truth, name), atol=1e-12, err_msg=name

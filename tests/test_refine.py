@@ -145,7 +145,7 @@ def test_neighbours_on_one_plane_propose_that_plane():
     same = np.abs(p.n - scene.truth.n[:, None]).max(axis=2) < 1e-9
     same &= np.abs(p.D - scene.truth.distance[:, None]) < 1e-9
     same &= np.abs(p.T - scene.truth.translation[:, None]).max(axis=2) < 1e-12
-    # all but those beside the other body find themselves
+    # all but those beside the other component find themselves
     assert same.any(axis=1).mean() > 0.8
     assert same.mean() > 0.5
 
@@ -229,9 +229,9 @@ def test_broken_superpixels_are_repaired_by_their_neighbours():
     done = refine_soup(scene.soup, scene.data, weights, FEW.replace(particles=30), seed=0)
     assert done.energy["total"] < truth + 0.05 * (begin - truth)
     ratio = done.soup.depth_at(scene.data.anchor_ray) / scene.truth.depth_at(scene.data.anchor_ray)
-    # what remains is the scale between the two bodies, which two views do not determine
-    for body in (scene.left, ~scene.left):
-        assert np.abs(ratio[body] / np.median(ratio[body]) - 1).max() < 1e-3
+    # what remains is the scale between the two components, which two views do not determine
+    for component in (scene.left, ~scene.left):
+        assert np.abs(ratio[component] / np.median(ratio[component]) - 1).max() < 1e-3
 
 
 def test_a_soup_at_its_optimum_is_left_alone():
@@ -353,7 +353,7 @@ def test_few_particles_and_a_superpixel_without_edges_are_no_special_case(partic
                 "pair_weight",
                 "pair_factor",
                 "pair_unit",
-                "pair_count",
+                "orient_weight",
             )
         },
     )

@@ -31,7 +31,7 @@ def test_the_mrf_follows_the_exact_energy_when_the_length_unit_changes():
     now = Particles.of(best)
     h = 1e-4
     # particle 1: plane and translation grow together, and with them the unit
-    p = now.joined(Particles(now.n, (1 + h) * now.D, now.R, (1 + h) * now.T))
+    p = now.connected_labels(Particles(now.n, (1 + h) * now.D, now.R, (1 + h) * now.T))
     unary, pairwise = mppbp._costs(best, p, tiny.data, weights, pair_costs, RefineOptions())
     slope = mppbp.length_slope(best, tiny.data, weights)
     for chosen in ([0], [3, 7], range(6), range(len(best))):

@@ -41,7 +41,7 @@ def sample(image: np.ndarray, uv: np.ndarray, order: int = 1) -> np.ndarray:
 def test_depth_motion_and_flow_agree_exactly(name):
     p = pair(name)
     T = p.truth
-    M = T.motions[T.bodies]
+    M = T.motions[T.components]
     moved = np.einsum("hwij,hwj->hwi", M[..., :3, :3], points(p)) + M[..., :3, 3]
     rigid = np.isfinite(moved).all(axis=-1)
     assert rigid.mean() == 1 if name != "sheet" else 0 < rigid.mean() < 0.5
@@ -52,7 +52,7 @@ def test_depth_motion_and_flow_agree_exactly(name):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_scene_flow_projects_to_the_flow_on_every_body(name):
+def test_scene_flow_projects_to_the_flow_on_every_component(name):
     p = pair(name)
     target = camera.project(p.K_next, points(p) + p.truth.scene_flow)
     uv = camera.pixel_grid(*p.size)
@@ -89,11 +89,11 @@ def test_occluded_points_are_hidden_or_outside(name):
     assert 0.001 < T.occluded.mean() < 0.25
 
 
-def test_labels_name_bodies_that_can_be_seen():
+def test_labels_name_components_that_can_be_seen():
     for name in ALL:
         for seed in range(3):
             p = pair(name, seed, 192, 82)
-            count = np.bincount(p.truth.bodies.ravel(), minlength=len(p.truth.motions))
+            count = np.bincount(p.truth.components.ravel(), minlength=len(p.truth.motions))
             assert len(count) == len(p.truth.motions)
             assert count.min() > 0.003 * count.sum(), (name, seed)
 
@@ -124,9 +124,9 @@ def test_still_background_does_not_move():
     p = pair("still")
     T = p.truth
     np.testing.assert_allclose(T.motions[0], np.eye(4), atol=1e-12)
-    assert abs(T.flow[T.bodies == 0]).max() < 1e-9
-    assert np.linalg.norm(T.flow[T.bodies == 1], axis=-1).mean() > 1
-    same = (T.bodies == 0) & (T.depth_ref == T.depth_next)
+    assert abs(T.flow[T.components == 0]).max() < 1e-9
+    assert np.linalg.norm(T.flow[T.components == 1], axis=-1).mean() > 1
+    same = (T.components == 0) & (T.depth_ref == T.depth_next)
     change = np.abs(p.image_ref.astype(int) - p.image_next).max(axis=-1)
     assert np.mean(change[same] == 0) > 0.95  # the rest are edge pixels of the mover
 
@@ -229,9 +229,9 @@ def test_points_that_pass_the_camera_have_no_flow():
     near = Body("near", (Part(Plane((0.2, 0.2)), _at(0, 0, 1), GREY),), _at(0, 0, -2))
     K = camera.intrinsics(64, 64, 31.5, 23.5)
     T = render(Scene((wall, near), np.eye(4), np.eye(4)), K, 48, 64).truth
-    assert np.isnan(T.flow[T.bodies == 1]).all()
-    assert T.occluded[T.bodies == 1].all()
-    assert np.isfinite(T.flow[T.bodies == 0]).all()
+    assert np.isnan(T.flow[T.components == 1]).all()
+    assert T.occluded[T.components == 1].all()
+    assert np.isfinite(T.flow[T.components == 0]).all()
 
 
 def test_edge_pixels_mix_both_sides_by_their_share():

@@ -58,7 +58,7 @@ def test_the_smooth_truncation_stays_near_the_exact_energy(units):
         "arap": 3 * w.arap * w.sigma_arap * data.edge_weight.sum(),
         "proj": w.proj * w.sigma_proj * data.pixel_weight.sum(),
         "cont": w.cont * (w.sigma_cont + w.sigma_cont_ref) * data.pair_weight.sum(),
-        "orient": w.orient * w.sigma_orient * data.pair_count.sum(),
+        "orient": w.orient * w.sigma_orient * data.orient_weight.sum(),
     }
     for term in TERMS:
         assert abs(made[term] - exact[term]) <= 0.2 * cap[term]

@@ -34,7 +34,7 @@ CAMERA = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
 class Errors:
     """Of every superpixel that lies on one plane: angles in degrees, relative depth ratio."""
 
-    body: np.ndarray
+    component: np.ndarray
     rotation: np.ndarray
     direction: np.ndarray
     normal: np.ndarray
@@ -50,20 +50,20 @@ def compare(start: Start, pair: Pair, seg: Segmentation, pure: np.ndarray) -> Er
     """Errors against the truth that the pixels of each superpixel carry."""
     truth, soup = pair.truth, start.soup
     X = truth.depth_ref[..., None] * camera.rays(pair.K_ref, camera.pixel_grid(*pair.size))
-    body, normal, depth = [], [], []
+    component, normal, depth = [], [], []
     anchor = camera.rays(pair.K_ref, seg.anchors)
     for i in range(len(seg)):
         mine = seg.labels == i
-        body.append(np.bincount(truth.bodies[mine]).argmax())
+        component.append(np.bincount(truth.components[mine]).argmax())
         P = X[mine]
         n = np.linalg.svd(P - P.mean(0), full_matrices=False)[2][2]
         n *= -np.sign(n @ P.mean(0))
         normal.append(n)
         depth.append((n @ P.mean(0)) / (n @ anchor[i]))
-    M = truth.motions[np.array(body)]
+    M = truth.motions[np.array(component)]
     turn = rotation.log(np.swapaxes(M[:, :3, :3], 1, 2) @ soup.R)
     return Errors(
-        body=np.array(body)[pure],
+        component=np.array(component)[pure],
         rotation=np.degrees(np.linalg.norm(turn, axis=1))[pure],
         direction=angle(soup.translation, M[:, :3, 3])[pure],
         normal=angle(np.array(normal), soup.n)[pure],
@@ -119,15 +119,15 @@ def test_one_motion_is_recovered_exactly(shift):
 
 
 def test_two_motions_are_told_apart():
-    body = motion((0, 3, 0), (-0.15, 0.02, 0.1))
-    pair, seg, pure = cut(corner_scene(CAMERA, body, turn=10))
+    component = motion((0, 3, 0), (-0.15, 0.02, 0.1))
+    pair, seg, pure = cut(corner_scene(CAMERA, component, turn=10))
     start = propose(seg, pair.flow, K, K)
     assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
     for b, (turn, direction, normal, depth) in enumerate(
         [(0.05, 1.0, 1.0, 0.01), (1.5, 10.0, 8.0, 0.03)]
     ):
-        mine = e.body == b
+        mine = e.component == b
         assert mine.sum() >= 10
         assert np.median(e.rotation[mine]) < turn
         assert np.median(e.direction[mine]) < direction

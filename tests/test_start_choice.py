@@ -1,4 +1,5 @@
-"""Who takes which motion, by made-up errors: what is asked of a motion, a body, a neighbour."""
+"""Who takes which motion, by made-up errors: what is asked of a motion, a component, a
+neighbour."""
 
 from __future__ import annotations
 
@@ -111,7 +112,8 @@ def test_a_motion_that_pays_goes_from_neighbour_to_neighbour(monkeypatch):
     assert 1 < count[1] < count[2] < 24
 
 
-# --- bodies --------------------------------------------------------------------------------------
+# --- components
+# --------------------------------------------------------------------------------------
 
 
 def torn(seg: Segmentation, own: np.ndarray) -> np.ndarray:
@@ -127,52 +129,52 @@ def offered(monkeypatch, *angles: float) -> None:
 
 
 @pytest.mark.parametrize("enough", [True, False])
-def test_a_motion_that_many_of_a_body_contradict_is_not_the_bodys(monkeypatch, enough):
+def test_a_motion_that_many_of_a_component_contradict_is_not_the_bodys(monkeypatch, enough):
     seg = cells(6, 10)
     column = (seg.anchors[:, 0] // 8).astype(int)
-    body = column >= 6
-    agree = np.flatnonzero(body)
+    component = column >= 6
+    agree = np.flatnonzero(component)
     needed = int(np.ceil(gathering.AGREE * len(agree)))
     agree = agree[: needed + 1 if enough else needed - 1]
-    true = np.where(body, 0.5, 0.0)
+    true = np.where(component, 0.5, 0.0)
     true[agree] = 0.2
     views = Turns(true)
     # everyone explains its own flow, with motions of its own
-    before = taken(views, true, np.where(body, -1, 0))
+    before = taken(views, true, np.where(component, -1, 0))
     offered(monkeypatch, 0.2)
-    jump = np.where(torn(seg, body), 10.0, 0.0)
+    jump = np.where(torn(seg, component), 10.0, 0.0)
     after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
-    assert (after.label[~body] == 0).all()
+    assert (after.label[~component] == 0).all()
     if enough:
         assert (after.label[agree] > 0).all()
         assert len(np.unique(after.label[agree])) == 1
     else:
-        assert (after.label[body] == -1).all()
+        assert (after.label[component] == -1).all()
 
 
-def test_bodies_that_hang_together_by_a_small_tear_are_parted_there(monkeypatch):
+def test_components_that_hang_together_by_a_small_tear_are_parted_there(monkeypatch):
     """No motion explains both: the smaller jump between them is the outline then."""
     seg = cells(6, 10)
     column = (seg.anchors[:, 0] // 8).astype(int)
-    body = np.where(column >= 8, 2, np.where(column >= 6, 1, 0))
-    true = np.array([0.0, 0.3, -0.3])[body]
+    component = np.where(column >= 8, 2, np.where(column >= 6, 1, 0))
+    true = np.array([0.0, 0.3, -0.3])[component]
     views = Turns(true)
-    before = taken(views, true + 0.02, np.where(body > 0, -1, 0))
+    before = taken(views, true + 0.02, np.where(component > 0, -1, 0))
     offered(monkeypatch, 0.3, -0.3)
     least, most = gathering.TEARS[-1], gathering.TEARS[0]
     assert least < most
-    between = 0.5 * (least + most) * OPTIONS.tear_px
-    jump = np.where(torn(seg, body), between, 0.0)
-    jump[torn(seg, body > 0)] = 10.0
+    between = 0.5 * (least + most) * OPTIONS.discontinuity_px
+    jump = np.where(torn(seg, component), between, 0.0)
+    jump[torn(seg, component > 0)] = 10.0
     after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
     for b in (1, 2):
-        assert len(np.unique(after.label[body == b])) == 1
-        assert after.error[body == b].max() < 1e-9
-        assert (after.label[body == b] > 0).all()
+        assert len(np.unique(after.label[component == b])) == 1
+        assert after.error[component == b].max() < 1e-9
+        assert (after.label[component == b] > 0).all()
     assert len(np.unique(after.label)) == 3
 
 
-def test_one_of_a_body_goes_with_its_neighbours():
+def test_one_of_a_component_goes_with_its_neighbours():
     """Alone it would rather have the main motion, by less than its outline costs."""
     seg = cells(4, 9)
     right = seg.anchors[:, 0] > 48
@@ -235,7 +237,7 @@ def test_of_the_planes_behind_an_outline_one_wild_one_does_not_decide():
     seg = cells(3, 3)
     label = (np.arange(9) == 1).astype(int)
     z = np.full(9, 4.0)
-    # the body is in the middle of the top row; behind the cell below it are three others
+    # the component is in the middle of the top row; behind the cell below it are three others
     z[1], z[4], z[5] = 1.0, 2.0, 40.0
     i, k = seg.pairs.T
     across = seg.pairs[label[i] != label[k]]
@@ -245,7 +247,7 @@ def test_of_the_planes_behind_an_outline_one_wild_one_does_not_decide():
     np.testing.assert_allclose(depth[:, below[0]], [1.0, 4.0], rtol=1e-12)
 
 
-def test_what_is_lowest_in_a_body_places_it():
+def test_what_is_lowest_in_a_component_places_it():
     """Two wheels stand on the ground; the wider gap between them shows something nearer."""
     gap = [9.0, 1, 1.2, 1.2, 1.2, 1, 9]
     ground = [2.0, 2, 1.2, 1.2, 1.2, 2, 2]

@@ -166,7 +166,7 @@ def test_lengths_are_checked_before_machine_code_reads():
 @needs_compiler
 def test_every_operation_has_casadis_value():
     a, b = ca.SX.sym("a"), ca.SX.sym("b")
-    body = ca.vertcat(
+    component = ca.vertcat(
         a + b - a * b / (2 + b),
         -a,
         a**2 + 2 * a + 1 / (3 + a),
@@ -178,7 +178,7 @@ def test_every_operation_has_casadis_value():
         ca.logic_not(a < b),
         1.5,
     )
-    f = ca.Function("every", [a, b, ca.SX(0, 1)], [body])
+    f = ca.Function("every", [a, b, ca.SX(0, 1)], [component])
     library = compile_lanes([f])
     rng = np.random.default_rng(2)
     x, data = rng.normal(size=(LANES, 1)), rng.normal(size=(LANES, 1))

@@ -39,7 +39,7 @@ def case() -> Case:
 
 @pytest.fixture(scope="module")
 def far() -> Case:
-    """The same with bodies that start further away: their scale is that of their outline."""
+    """The same with components that start further away: their scale is that of their outline."""
     return small(start={"upright": False}, energy={"cont_occluded": 1.0})
 
 

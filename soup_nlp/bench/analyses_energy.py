@@ -54,7 +54,7 @@ def energies(result: Run, convention: str = "paper") -> Row:
         return plain.energy(soup, result.data, result.weights)
 
     soups = {"start": result.start.soup, "solution": result.soup, "truth": true.soup}
-    if len(np.unique(true.body)) > 1:
+    if len(np.unique(true.component)) > 1:
         soups["truth rescaled"] = rescaled(true, lambda soup: energy(soup)["total"])
     soups |= from_soup(result, true.soup)
     p, truth = result.pair, result.pair.truth

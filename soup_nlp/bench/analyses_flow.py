@@ -59,20 +59,20 @@ def text_flow(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     title = {(r["suite"], r["pair"]): name for name, r in zip(pair_names(good), good, strict=True)}
     pairs = list(title)
     own = {(r["suite"], r["pair"], r["variant"]): r["flow_error"] for r in good}
-    body = []
+    component = []
     complete = [p for p in pairs if all((*p, v) in own for v in variants)]
     for v in variants:
         numbers = [mean(own[(*p, v)][k] for p in complete) for k in COLUMNS]
-        body.append([v, *map(_shown, COLUMNS, numbers)])
+        component.append([v, *map(_shown, COLUMNS, numbers)])
     lines += [f"Mean of {len(complete)} pairs, pixels:", ""]
-    lines += [*table(["source", *COLUMNS.values()], body), "", "By pair:", ""]
-    body = [
+    lines += [*table(["source", *COLUMNS.values()], component), "", "By pair:", ""]
+    component = [
         [title[p], v, *(_shown(k, own[(*p, v)][k]) for k in COLUMNS)]
         for p in pairs
         for v in variants
         if (*p, v) in own
     ]
-    lines += table(["pair", "source", *COLUMNS.values()], body)
+    lines += table(["pair", "source", *COLUMNS.values()], component)
     bad = [r for r in rows if not r.get("ok")]
     if bad:
         lines += ["", "## Failed", ""]

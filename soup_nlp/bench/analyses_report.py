@@ -71,13 +71,13 @@ def text_variants(name: str, text: str, rows: Sequence[Row], note: str = "") -> 
         ("Exact energy of the solution", _energy),
     ):
         form = ".1f" if "seconds" in title or "energy" in title else ".4f"
-        body = [
+        component = [
             [pair, *(show(measure(own[v]), form) for v in variants)] for pair, own in pairs.items()
         ]
         if len(complete) > 1:
             averages = [mean(measure(p[v]) for p in complete.values()) for v in variants]
-            body.append([f"mean of {len(complete)}", *(show(a, form) for a in averages)])
-        lines += [f"## {title}", "", *table(["pair, flow", *variants], body), ""]
+            component.append([f"mean of {len(complete)}", *(show(a, form) for a in averages)])
+        lines += [f"## {title}", "", *table(["pair, flow", *variants], component), ""]
     lines += _beside(name)
     lines += _failures(rows)
     return "\n".join(lines).rstrip() + "\n"
@@ -90,9 +90,17 @@ def _energy(row: Row) -> float | None:
 def _beside(name: str) -> list[str]:
     """What the paper prints for the same question."""
     if name == "ablation":
-        body = [[f"{k} (published)", *(f"{v:.4f}" for v in row)] for k, row in ABLATION.items()]
+        component = [
+            [f"{k} (published)", *(f"{v:.4f}" for v in row)] for k, row in ABLATION.items()
+        ]
         head = ["sequence", "arap", "+ proj", "+ cont", "+ orient"]
-        return ["## Published MRE", "", *table(head, body), "", f"Copied, not measured: {SOURCE}."]
+        return [
+            "## Published MRE",
+            "",
+            *table(head, component),
+            "",
+            f"Copied, not measured: {SOURCE}.",
+        ]
     if name == "pattern":
         both = ", ".join(f"{k} {v:.4f}" for k, v in GRID_AGAINST_SLIC.items())
         return [f"Published for one frame with 1,000 superpixels (copied, not measured): {both}."]
@@ -109,13 +117,13 @@ def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> st
     """Table of energies by term and soup, and the two claims about them."""
     lines = _head(name, text, rows, note)
     good = [r for r in rows if r.get("ok")]
-    body, summary = [], []
+    component, summary = [], []
     for title, row in zip(_titles(good), good, strict=True):
         scores = row["metrics"][row["presets"][0]]
         for soup, e in row["energy"].items():
             terms = [f"{e[t]:.4g}" for t in ("total", *TERMS)]
             own = [show(scores[soup]["mre"]), show(scores[soup]["median_relative"])]
-            body.append([title, soup, *terms, *own])
+            component.append([title, soup, *terms, *own])
         least = row["energy"]["solution"]["total"]
         ratio = row["energy"]["truth"]["total"] / least
         nearest = row["energy"].get("truth rescaled", row["energy"]["truth"])["total"] / least
@@ -127,12 +135,15 @@ def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> st
                 *[f"{worse:+.4f}", "yes" if worse <= WORSE else "no", f"{row['mixed']:.1%}"],
             ]
         )
-    head = ["pair, flow", "E truth / E solution", f"<= {ABOVE:g}", "bodies rescaled"]
+    head = ["pair, flow", "E truth / E solution", f"<= {ABOVE:g}", "components rescaled"]
     head += ["median error from truth", f"<= {WORSE:g}", "mixed superpixels"]
     lines += table(head, summary)
-    lines += ["", "Bodies rescaled: E of the truth, each body at its scale of lowest E, instead."]
+    lines += [
+        "",
+        "Components rescaled: E of the truth, each component at its scale of lowest E, instead.",
+    ]
     lines += ["", "## By term", ""]
-    lines += table(["pair, flow", "soup", "E", *TERMS, "MRE", "median"], body)
+    lines += table(["pair, flow", "soup", "E", *TERMS, "MRE", "median"], component)
     lines += _failures(rows)
     return "\n".join(lines).rstrip() + "\n"
 

@@ -19,7 +19,7 @@ from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
 
-IMAGES = ("depth_ref", "depth_next", "flow", "occluded", "bodies", "scene_flow")
+IMAGES = ("depth_ref", "depth_next", "flow", "occluded", "components", "scene_flow")
 """Parts of a truth that have a value for every pixel."""
 _FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
 

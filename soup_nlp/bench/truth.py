@@ -30,13 +30,13 @@ class TrueSoup:
 
     Attributes:
         soup: The soup, mean plane distance 1.
-        body: (N,) body of every superpixel (that of most of its pixels); 0 where unknown.
+        component: (N,) component of every superpixel (that of most of its pixels); 0 where unknown.
         known: (N,) False where a superpixel has too little truth and borrows its neighbour's.
-        purity: (N,) share of its true pixels that belong to its body.
+        purity: (N,) share of its true pixels that belong to its component.
     """
 
     soup: Soup
-    body: NDArray[np.int64]
+    component: NDArray[np.int64]
     known: Bools
     purity: Float
 
@@ -50,12 +50,12 @@ class TrueSoup:
 def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
     """Plane and rigid motion of every superpixel from the truth.
 
-    The plane is the one of least mean relative error over the pixels of the superpixel's body. The
-    motion is the body's own where it is known; else the rigid motion that fits the true scene flow
-    of the pixels best (least squares).
+    The plane is the one of least mean relative error over the pixels of the superpixel's
+    component. The motion is the component's own where it is known; else the rigid motion that fits
+    the true scene flow of the pixels best (least squares).
 
     Args:
-        pair: A pair with dense true depth, and motions of bodies or scene flow.
+        pair: A pair with dense true depth, and motions of components or scene flow.
         seg: Its superpixels.
 
     Raises:
@@ -64,13 +64,13 @@ def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
     truth = pair.truth
     if truth is None or truth.depth_ref is None:
         raise DataError("true soup needs a dense true depth", where=pair.name, found=truth)
-    if truth.scene_flow is None and (truth.motions is None or truth.bodies is None):
+    if truth.scene_flow is None and (truth.motions is None or truth.components is None):
         raise DataError("true soup needs motions or scene flow", where=pair.name, found=truth)
     n = len(seg)
-    body, purity = _majority(truth, seg)
+    component, purity = _majority(truth, seg)
     mine = np.isfinite(truth.depth_ref) & (truth.depth_ref > 0)
-    if truth.bodies is not None:
-        mine &= truth.bodies == body[seg.labels]
+    if truth.components is not None:
+        mine &= truth.components == component[seg.labels]
     if truth.scene_flow is not None:
         mine &= np.isfinite(truth.scene_flow).all(axis=2)
     known = np.bincount(seg.labels[mine], minlength=n) >= 6
@@ -81,13 +81,13 @@ def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
     depth = np.where(mine, truth.depth_ref, np.nan)
     m = fit_planes(seg.labels, depth, pair.K_ref)
     m = _facing(m, seg, pair.K_ref, depth)
-    R, T, moved = _motions(truth, seg, body, mine, depth, pair.K_ref)
+    R, T, moved = _motions(truth, seg, component, mine, depth, pair.K_ref)
     known &= moved
     fill = _nearest_known(known, seg)
     length = np.linalg.norm(m[fill], axis=1)
     D = 1 / length
     soup = Soup(D, -m[fill] / length[:, None], np.ones(n), R[fill], T[fill] / D[:, None])
-    return TrueSoup(soup.normalised(), body, known, purity)
+    return TrueSoup(soup.normalised(), component, known, purity)
 
 
 SCALES = np.geomspace(1 / 3, 3, 41)
@@ -95,18 +95,18 @@ SCALES = np.geomspace(1 / 3, 3, 41)
 
 
 def rescaled(true: TrueSoup, energy: Callable[[Soup], float]) -> Soup:
-    """The true soup with every body but the largest at its scale of lowest energy, in turn.
+    """The true soup with every component but the largest at its scale of lowest energy, in turn.
 
-    Flow leaves every body that moves by itself a scale of its own: E(truth) less this is what the
-    model would have instead of true distances.
+    Flow leaves every component that moves by itself a scale of its own: E(truth) less this is what
+    the model would have instead of true distances.
 
     Args:
-        true: Soup and bodies.
+        true: Soup and components.
         energy: Of a soup.
     """
-    soup, size = true.soup, np.bincount(true.body)
+    soup, size = true.soup, np.bincount(true.component)
     for b in np.argsort(-size, kind="stable")[1 : np.count_nonzero(size)]:
-        own = true.body == b
+        own = true.component == b
         tried = [replace(soup, lam=np.where(own, f, 1.0) * soup.lam).normalised() for f in SCALES]
         soup = min([soup, *tried], key=energy)
     return soup
@@ -114,10 +114,10 @@ def rescaled(true: TrueSoup, energy: Callable[[Soup], float]) -> Soup:
 
 def _majority(truth: Truth, seg: Segmentation) -> tuple[NDArray[np.int64], Float]:
     n = len(seg)
-    if truth.bodies is None:
+    if truth.components is None:
         return np.zeros(n, np.int64), np.ones(n)
-    top = int(truth.bodies.max()) + 2
-    flat = seg.labels.ravel().astype(np.int64) * top + truth.bodies.ravel() + 1
+    top = int(truth.components.max()) + 2
+    flat = seg.labels.ravel().astype(np.int64) * top + truth.components.ravel() + 1
     votes = np.bincount(flat, minlength=n * top).reshape(n, top)[:, 1:]
     share = votes.max(axis=1) / np.maximum(votes.sum(axis=1), 1)
     return votes.argmax(axis=1).astype(np.int64), share
@@ -133,13 +133,18 @@ def _facing(m: Float, seg: Segmentation, K: Float, depth: Float) -> Float:
 
 
 def _motions(
-    truth: Truth, seg: Segmentation, body: NDArray[np.int64], mine: Bools, depth: Float, K: Float
+    truth: Truth,
+    seg: Segmentation,
+    component: NDArray[np.int64],
+    mine: Bools,
+    depth: Float,
+    K: Float,
 ) -> tuple[Float, Float, Bools]:
     """(N, 3, 3) rotations, (N, 3) translations, (N,) whether they are known."""
     n = len(seg)
     R, T, known = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.zeros(n, bool)
-    if truth.motions is not None and truth.bodies is not None:
-        own = truth.motions[np.minimum(body, len(truth.motions) - 1)]
+    if truth.motions is not None and truth.components is not None:
+        own = truth.motions[np.minimum(component, len(truth.motions) - 1)]
         known = np.asarray(np.isfinite(own).all(axis=(1, 2)))
         R[known], T[known] = own[known, :3, :3], own[known, :3, 3]
     if truth.scene_flow is None or known.all():

@@ -88,7 +88,7 @@ def _varied(found: Found, best: Trial) -> list[str]:
     """Ranges, the best value, and how the score moves with each parameter."""
     tried = found.train[1:]
     chosen = dict(o.split("=", 1) for o in best.overrides)
-    body = [
+    component = [
         [
             f"`{p.key}`",
             p.kind,
@@ -99,7 +99,7 @@ def _varied(found: Found, best: Trial) -> list[str]:
         for k, p in enumerate(found.space)
     ]
     head = ["setting", "scale", "range", "best trial", "rank correlation with the score"]
-    return table(head, body)
+    return table(head, component)
 
 
 def _tendency(p: Parameter, k: int, tried: Sequence[Trial]) -> str:
@@ -114,10 +114,10 @@ def _tendency(p: Parameter, k: int, tried: Sequence[Trial]) -> str:
 
 
 def _trials(trials: Sequence[Trial], default: Trial) -> list[str]:
-    body = []
+    component = []
     for t in trials:
         good = [r for r in t.rows if r.get("ok")]
-        body.append(
+        component.append(
             [
                 t.name if t.name != default.name else f"{t.name} (default)",
                 f"{t.loss:.3f}",
@@ -127,16 +127,18 @@ def _trials(trials: Sequence[Trial], default: Trial) -> list[str]:
                 " ".join(f"`{o}`" for o in t.overrides) or "-",
             ]
         )
-    return table(["trial", "score", "mean MRE", "E truth / solution", "failed", "settings"], body)
+    return table(
+        ["trial", "score", "mean MRE", "E truth / solution", "failed", "settings"], component
+    )
 
 
 def _by_pair(side: str, before: Sequence[Row], after: Sequence[Row]) -> list[str]:
     own = {_name(r): r for r in after}
-    body = []
+    component = []
     for pair, row in zip(pair_names(before), before, strict=True):
         other = own[_name(row)]
         main = row["presets"][0]
-        body.append(
+        component.append(
             [
                 *[f"{pair}, {row['flow']}", side],
                 show(get(row, main, "constant")),
@@ -145,7 +147,7 @@ def _by_pair(side: str, before: Sequence[Row], after: Sequence[Row]) -> list[str
             ]
         )
     head = ["pair, flow", "side", "constant", "MRE default", "MRE best", "score default", "best"]
-    return table(head, body)
+    return table(head, component)
 
 
 def _name(row: Row) -> str:

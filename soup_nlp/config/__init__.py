@@ -1,1 +1,1 @@
-"""TODO."""
+"""Problem files: strict YAML in, the merged problem out."""

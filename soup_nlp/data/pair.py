@@ -77,8 +77,8 @@ class Truth:
         depth_next: (H', W') z of the next frame; NaN where unknown.
         flow: (H, W, 2) exact flow, NaN where unknown.
         occluded: (H, W) bool, True where a reference pixel is not visible in the next frame.
-        bodies: (H, W) int body label of a reference pixel, -1 for none.
-        motions: (B, 4, 4) next_from_ref of each body, in `unit`.
+        components: (H, W) int component label of a reference pixel, -1 for none.
+        motions: (B, 4, 4) next_from_ref of each component, in `unit`.
         points: (M, 3) sparse truth (u, v, z) of the reference frame, sub-pixel.
         scene_flow: (H, W, 3) X' - X in each frame's own camera coordinates, NaN where unknown.
         unit: Name of the length unit ("m", "mm", "scene").
@@ -88,7 +88,7 @@ class Truth:
     depth_next: Float | None = None
     flow: Float | None = None
     occluded: NDArray[np.bool_] | None = None
-    bodies: NDArray[np.int32] | None = None
+    components: NDArray[np.int32] | None = None
     motions: Float | None = None
     points: Float | None = None
     scene_flow: Float | None = None
@@ -152,7 +152,7 @@ class Pair:
             self._check_truth(self.truth)
 
     def _check_truth(self, truth: Truth) -> None:
-        for what in ("depth_ref", "flow", "occluded", "bodies", "scene_flow"):
+        for what in ("depth_ref", "flow", "occluded", "components", "scene_flow"):
             value = getattr(truth, what)
             if value is not None and value.shape[:2] != self.image_ref.shape[:2]:
                 raise DataError(

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Metrics, baselines, scores, and a referee that recomputes stored results."""

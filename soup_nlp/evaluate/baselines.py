@@ -28,7 +28,7 @@ True depths of driving and indoor pairs reach 14 times their median."""
 
 @dataclass(frozen=True)
 class RigidBaseline:
-    """A reconstruction that takes the whole image for one rigid body.
+    """A reconstruction that takes the whole image for one rigid component.
 
     Attributes:
         R: (3, 3) rotation, next_from_ref.
@@ -71,8 +71,8 @@ def rigid_depth(
     The essential matrix comes from a subsample drawn with probability proportional to confidence
     (RANSAC, then a robust refinement of the Sampson distance), with each frame's own camera. It is
     looked for at the inlier distance and at a tenth of it, and the motion with the smaller Cauchy
-    cost is kept: in small images a body that moves can hide within one pixel of a motion that is
-    right for nothing. Each pixel with confidence is then triangulated by itself; nothing is
+    cost is kept: in small images a component that moves can hide within one pixel of a motion that
+    is right for nothing. Each pixel with confidence is then triangulated by itself; nothing is
     smoothed, so far points with little parallax can have wild depths; only those beyond `FAR`
     times the median are dropped. Look at the median relative error beside the mean.
 

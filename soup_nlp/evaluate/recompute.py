@@ -87,7 +87,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
         gap = np.minimum(before, w["sigma_cont_ref"]) + np.minimum(after, w["sigma_cont"])
         cont = float((e["pair_weight"] * gap).sum())
         turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
-        orient = float((e["pair_count"] * np.minimum(turn, w["sigma_orient"])).sum())
+        orient = float((e["orient_weight"] * np.minimum(turn, w["sigma_orient"])).sum())
     terms = {"arap": arap, "proj": proj, "cont": cont, "orient": orient}
     terms = {name: w[name] * value for name, value in terms.items()}
     return {"total": sum(terms.values()), **terms}
@@ -261,9 +261,9 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
     gap = np.sqrt(((centre[i] - centre[k]) ** 2).sum(1))
     own, near = np.repeat(np.arange(n), seg["knn"].shape[1]), seg["knn"].ravel()
     directed = np.unique(np.minimum(own, near) * n + np.maximum(own, near))
-    body = tree["start"]["body"]
+    component = tree["start"]["component"]
     weight = seg["edge_multiplicity"] * np.exp(-float(settings["segmentation"]["beta"]) * gap)
-    weight[body[i] != body[k]] *= float(settings["energy"]["arap_across"])
+    weight[component[i] != component[k]] *= float(settings["energy"]["arap_across"])
     bending = settings["energy"]["bending"]
     weight[_torn(tree, settings["energy"], "edges")] *= float(bending["arap_across"])
     held = np.full(len(e["pairs"]), 2.0)
@@ -277,21 +277,23 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
         "pixel targets": _gap(target, e["pixel_target"][used]),
         "K-NN edges": float(len(np.setxor1d(directed, i * n + k))),
         "edge weights": _gap(weight, e["edge_weight"]),
-        "pair counts": _gap(held, e["pair_count"]),
+        "pair counts": _gap(held, e["orient_weight"]),
         "pair weights": _gap(_pair_weights(tree, settings["energy"]), e["pair_weight"]),
     }
 
 
 def _pair_weights(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Float:
-    """w4 of the image, less where one body of the start hides another and where the flow tears."""
+    """w4 of the image, less where one component of the start hides another and where the flow
+    tears."""
     start, seg = tree["start"], tree["segmentation"]
     weight = seg["pair_weight"].copy()
     middle = tree["energy"]["boundary_ray"].mean(1)
-    i, k = tree["energy"]["pairs"].T
-    facing = [np.maximum(-(start["n"][who] * middle).sum(1), 1e-3) for who in (i, k)]
-    z = np.stack([(start["lam"] * start["d"])[who] / f for who, f in zip((i, k), facing)])
+    i, k = tree["energy"]["pairs"].T facing = [np.maximum(-(start["n"][who]
+    * middle).sum(1), 1e-3) for who in (i, k)] z = np.stack([(start["lam"] * start["d"])[who] / f for who, f in zip((i, k), facing)])
     open_gap = z.min(0) < (1 - float(form["occlusion_gap"])) * z.max(0)
-    weight[open_gap & (start["body"][i] != start["body"][k])] *= float(form["cont_occluded"])
+    weight[open_gap & (start["component"][i] != start["component"][k])] *= float(
+        form["cont_occluded"]
+    )
     weight[_torn(tree, form, "pairs")] *= float(form["bending"]["cont_across"])
     return np.asarray(weight)
 

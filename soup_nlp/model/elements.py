@@ -161,7 +161,7 @@ def elements(
         ),
     )
     fields, columns = base(
-        {"weight": w.orient * data.pair_count, "sigma": full(len(pairs), w.sigma_orient)}, pairs
+        {"weight": w.orient * data.orient_weight, "sigma": full(len(pairs), w.sigma_orient)}, pairs
     )
     out["orient"] = Element(
         2,

@@ -38,8 +38,8 @@ class EnergyData:
         pair_factor: (P,) sqrt(boundary length / B): the sampled Frobenius norm times this stands
             for the norm over the whole boundary.
         pair_unit: (P,) length unit of the pair.
-        pair_count: (P,) weight of E_orient: 2, directed pairs folded into one, less where the flow
-            of a bending surface tears.
+        orient_weight: (P,) weight of E_orient: 2, directed pairs folded into one, less where the
+            flow of a bending surface tears.
         rim_ray: (N, V, 3) rays where visibility is imposed, the anchor first.
         local_units: edge_unit and pair_unit are shares of the depth of the two anchors, mostly the
             nearer one (E is then independent of scale, term by term), instead of lengths.
@@ -63,7 +63,7 @@ class EnergyData:
     pair_weight: Float
     pair_factor: Float
     pair_unit: Float
-    pair_count: Float
+    orient_weight: Float
     rim_ray: Float
     share: Float
     local_units: bool = False
@@ -158,7 +158,7 @@ def build_energy_data(
         pair_weight=seg.pair_weight,
         pair_factor=np.sqrt(seg.boundary_length / max(1, seg.boundary.shape[1])),
         pair_unit=np.ones(len(seg.pairs)),
-        pair_count=np.full(len(seg.pairs), 2.0),
+        orient_weight=np.full(len(seg.pairs), 2.0),
         rim_ray=np.concatenate([anchor[:, None], rim], axis=1),
         share=np.full(len(seg), 1.0 / len(seg)),
         arap_at_anchors=arap_at_anchors,

@@ -86,10 +86,10 @@ class EnergyOptions(Section):
     arap_at_anchors: bool = False
     """Motion difference at the anchors instead of the camera's origin."""
     arap_across: Share = 0.03
-    """Factor of E_arap between superpixels that the start gives to different bodies; 1 is the
+    """Factor of E_arap between superpixels that the start gives to different components; 1 is the
     paper's."""
     cont_occluded: Share = 0.03
-    """Factor of E_cont where one of these bodies hides another; 1 is the paper's."""
+    """Factor of E_cont where one of these components hides another; 1 is the paper's."""
     occlusion_gap: Annotated[float, Field(ge=0, lt=1)] = 0.1
     """It does where the start leaves a larger gap in depth between them, relative to the farther
     side."""

@@ -109,4 +109,4 @@ def orientation(soup: Soup, data: EnergyData, weights: Weights) -> Float:
         return np.zeros(0)
     i, k = data.pairs.T
     turn = np.abs(1.0 - np.einsum("pc,pc->p", soup.n[i], soup.n[k]))
-    return data.pair_count * np.minimum(turn, weights.sigma_orient)
+    return data.orient_weight * np.minimum(turn, weights.sigma_orient)

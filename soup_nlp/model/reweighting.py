@@ -12,44 +12,47 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 
 
-def between_bodies(data: EnergyData, body: NDArray[np.int64], factor: float) -> EnergyData:
-    """The same data with E_arap's weights times `factor` on edges from one body to another.
+def across_components(data: EnergyData, component: NDArray[np.int64], factor: float) -> EnergyData:
+    """The same data with E_arap's weights times `factor` on edges from one component to another.
 
-    As-rigid-as-possible holds inside a body. Across bodies it pulls a body that the camera's
-    motion explains at a wrong depth to that depth: with equal motions such an edge costs nothing.
+    As-rigid-as-possible holds inside a component. Across components it pulls a component that the
+    camera's motion explains at a wrong depth to that depth: with equal motions such an edge costs
+    nothing.
 
     Args:
         data: Data of the pair.
-        body: (N,) group of every superpixel, as the start finds them.
+        component: (N,) group of every superpixel, as the start finds them.
         factor: 1 is the paper's energy.
     """
     i, k = data.edges.T
-    return replace(data, edge_weight=np.where(body[i] == body[k], 1.0, factor) * data.edge_weight)
+    return replace(
+        data, edge_weight=np.where(component[i] == component[k], 1.0, factor) * data.edge_weight
+    )
 
 
 def at_occlusions(
-    data: EnergyData, soup: Soup, body: NDArray[np.int64], gap: float, factor: float
+    data: EnergyData, soup: Soup, component: NDArray[np.int64], gap: float, factor: float
 ) -> EnergyData:
-    """The same data with E_cont's weights times `factor` where one body hides another.
+    """The same data with E_cont's weights times `factor` where one component hides another.
 
-    A body in front touches what is behind it along a part of its outline alone, where the start
-    has brought both together. The gaps along the rest are real; closing them moves the body away
-    from the camera, and nothing else fixes its scale.
+    A component in front touches what is behind it along a part of its outline alone, where the
+    start has brought both together. The gaps along the rest are real; closing them moves the
+    component away from the camera, and nothing else fixes its scale.
 
     Args:
         data: Data of the pair.
-        soup: Start, its bodies scaled to where they touch.
-        body: (N,) group of every superpixel, as the start finds them.
+        soup: Start, its components scaled to where they touch.
+        component: (N,) group of every superpixel, as the start finds them.
         gap: Smallest gap in depth that is one, relative to the farther side.
         factor: 1 is the paper's energy.
     """
     i, k = data.pairs.T
     z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
-    hidden = (body[i] != body[k]) & (z.min(axis=0) < (1 - gap) * z.max(axis=0))
+    hidden = (component[i] != component[k]) & (z.min(axis=0) < (1 - gap) * z.max(axis=0))
     return replace(data, pair_weight=np.where(hidden, factor, 1.0) * data.pair_weight)
 
 
-def across_tears(
+def across_discontinuities(
     data: EnergyData,
     surface: NDArray[np.int64],
     *,
@@ -74,7 +77,7 @@ def across_tears(
         data,
         edge_weight=np.where(apart, arap, 1.0) * data.edge_weight,
         pair_weight=np.where(torn, cont, 1.0) * data.pair_weight,
-        pair_count=np.where(torn, orient, 1.0) * data.pair_count,
+        orient_weight=np.where(torn, orient, 1.0) * data.orient_weight,
     )
 
 

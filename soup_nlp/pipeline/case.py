@@ -20,7 +20,12 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.reweighting import across_tears, at_occlusions, between_bodies, in_pixels
+from soup_nlp.model.reweighting import (
+    across_components,
+    across_discontinuities,
+    at_occlusions,
+    in_pixels,
+)
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.propose import Start, propose
@@ -150,12 +155,12 @@ def build_energy(
     data = build_energy_data(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, bends or e.arap_at_anchors
     )
-    data = between_bodies(data, start.body, e.arap_across)
-    data = at_occlusions(data, start.soup, start.body, e.occlusion_gap, e.cont_occluded)
+    data = across_components(data, start.component, e.arap_across)
+    data = at_occlusions(data, start.soup, start.component, e.occlusion_gap, e.cont_occluded)
     if bends:
         b = e.bending
         held = {"arap": b.arap_across, "cont": b.cont_across, "orient": b.orient_across}
-        data = across_tears(data, start.surface, **held)
+        data = across_discontinuities(data, start.surface, **held)
     if e.units == "pixel":
         data = in_pixels(data, start.soup, seg, form.rotation_px)
     weights: Weights = form.weights

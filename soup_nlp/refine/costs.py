@@ -229,7 +229,7 @@ class PairCosts:
         _distance2(s.n[:, i], s.n[:, k], x, y)
         x *= 0.5
         np.minimum(x, w.sigma_orient, out=x)
-        x *= w.orient * d.pair_count[rows][:, None, None]
+        x *= w.orient * d.orient_weight[rows][:, None, None]
         total += x
         return total
 

@@ -175,8 +175,9 @@ class Proposer:
         g = base.g + dg
         return Local(Z, g, R, T * scale[..., None]), step
 
-    # --- moves that all superpixels are offered alike: a body moves as one ---------------------
-    # no common scale: E of a body by its scale is flat, and lower where its depth is wrong
+    # --- moves that all superpixels are offered alike: a component moves as one
+    # --------------------- no common scale: E of a component by its scale is flat, and lower where
+    # its depth is wrong
 
     def _common_motion(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, Float]:
         """Motions that many share, fitted again to the flow of their superpixels' present planes.

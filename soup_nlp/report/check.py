@@ -127,7 +127,7 @@ def _rows(
     if settings["energy"]["units"] == "pixel" and bool(tree["start"].get("bending", False)):
         own = dict(settings["energy"]["bending"]["weights"])
         # there it is that of 1,000 superpixels
-        own["orient"] *= len(tree["start"]["body"]) / 1000
+        own["orient"] *= len(tree["start"]["component"]) / 1000
     for key in ("arap", "proj", "cont", "orient"):
         yield _same(f"weight {key}", own[key], weights[key])
     for name, gap in recompute.data_errors(tree, settings).items():

@@ -23,15 +23,15 @@ _ENERGY: Mapping[str, tuple[str, str, str]] = {
     "pixel_target": ("px", "N,S,2", "where the flow brings the sampled pixels"),
     "pixel_weight": ("1", "N,S", "confidence x usable share / sample size; 0 drops a pixel"),
     "edges": ("1", "E,2", "K-NN edges i < k"),
-    "edge_weight": ("1", "E", "w1 = w2, both directions folded, less between two bodies"),
+    "edge_weight": ("1", "E", "w1 = w2, both directions folded, less between two components"),
     "edge_unit": ("1", "E", "length unit of an edge, see local_units"),
     "rotation_scale": ("1", "", "factor of |R_i - R_k|"),
     "pairs": ("1", "P,2", "neighbours i < k that share boundary"),
     "boundary_ray": ("1", "P,B,3", "rays of the sampled shared boundary points"),
-    "pair_weight": ("1", "P", "w4, both directions folded, less where one body hides another"),
+    "pair_weight": ("1", "P", "w4, both directions folded, less where one component hides another"),
     "pair_factor": ("1", "P", "sqrt(boundary length / B): stands for the whole boundary"),
     "pair_unit": ("1", "P", "length unit of a pair, see local_units"),
-    "pair_count": ("1", "P", "weight of E_orient: 2 directed pairs, less where the flow tears"),
+    "orient_weight": ("1", "P", "weight of E_orient: 2 directed pairs, less where the flow tears"),
     "rim_ray": ("1", "N,V,3", "rays where visibility is imposed, the anchor first"),
     "share": ("1", "N", "weights c of the length unit sum_i c_i D_i = 1"),
     "local_units": ("1", "", "units are shares of the depths of two anchors, power mean -4"),
@@ -72,12 +72,12 @@ _TRUTH = {
     "depth_next": ("H,W", "true z of the next frame, NaN where unknown"),
     "flow": ("H,W,2", "true flow, NaN where unknown"),
     "occluded": ("H,W", "reference pixel is not visible in the next frame"),
-    "bodies": ("H,W", "body of a reference pixel, -1 for none"),
-    "motions": ("B,4,4", "next_from_ref of each body"),
+    "components": ("H,W", "component of a reference pixel, -1 for none"),
+    "motions": ("B,4,4", "next_from_ref of each component"),
     "scene_flow": ("H,W,3", "true X' - X, each in its own frame's camera, NaN where unknown"),
     "points": ("M,3", "sparse truth: u and v in px, z in the unit of length"),
 }
-_TRUTH_UNITS = {"flow": "px", "occluded": "1", "bodies": "1"}
+_TRUTH_UNITS = {"flow": "px", "occluded": "1", "components": "1"}
 
 
 def result_tree(run: Run) -> Tree:
@@ -117,7 +117,7 @@ def result_tree(run: Run) -> Tree:
             "parallax": Array(run.start.parallax, "px", "by which the translation moves", "N"),
             "borrowed": Array(run.start.borrowed, "1", "plane or motion from neighbours", "N"),
             "motion": Array(run.start.motion, "1", "dominant motion, -1 for its own", "N"),
-            "body": Array(run.start.body, "1", "group that seems to move as one", "N"),
+            "component": Array(run.start.component, "1", "group that seems to move as one", "N"),
             "surface": Array(run.start.surface, "1", "group within which no flow tears", "N"),
             "bending_share": Array(
                 np.float64(run.start.bending_share), "1", "moves otherwise than most of its surface"

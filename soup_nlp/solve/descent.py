@@ -13,7 +13,7 @@ steps descend, then the exact Hessian.
 Little is decided for all superpixels at once: damping mu_i, fraction to the boundary and, unless
 that is refused, shortened steps are each superpixel's own, so that a few that are on their way to
 another minimum do not hold up the others. Energies cost a tenth of an iteration, so a step is
-doubled as long as that pays: bodies slide along valleys of equal re-projection error in a few
+doubled as long as that pays: components slide along valleys of equal re-projection error in a few
 iterations.
 """
 

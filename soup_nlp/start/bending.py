@@ -1,8 +1,9 @@
-"""Surfaces that bend: how to tell them from bodies that move apart, and where to start with them.
+"""Surfaces that bend: how to tell them from components that move apart, and where to start with
+them.
 
-A rigid body that moves by itself tears the flow along its outline. A bending surface does not: its
-flow is continuous, and yet one rigid motion does not explain it. Cut into rigid pieces, each with a
-parallax of its own, it gets depths that have nothing to do with its shape.
+A rigid component that moves by itself tears the flow along its outline. A bending surface does
+not: its flow is continuous, and yet one rigid motion does not explain it. Cut into rigid pieces,
+each with a parallax of its own, it gets depths that have nothing to do with its shape.
 """
 
 from __future__ import annotations
@@ -13,24 +14,24 @@ from numpy.typing import NDArray
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.components import joined
+from soup_nlp.start.components import connected_labels
 from soup_nlp.start.plane_fit import Views
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-def bending_share(surface: Int, body: Int) -> float:
+def bending_share(surface: Int, component: Int) -> float:
     """Share of the superpixels that move otherwise than most of the surface they belong to.
 
-    It is near 0 where every surface is one rigid body, near 1 where surfaces need many.
+    It is near 0 where every surface is one rigid component, near 1 where surfaces need many.
 
     Args:
         surface: (N,) surface of every superpixel.
-        body: (N,) group that moves as one rigid body.
+        component: (N,) group that moves as one rigid component.
     """
-    count = np.zeros((int(surface.max()) + 1, int(body.max()) + 1))
-    np.add.at(count, (surface, body), 1.0)
+    count = np.zeros((int(surface.max()) + 1, int(component.max()) + 1))
+    np.add.at(count, (surface, component), 1.0)
     return float(1.0 - count.max(axis=1).sum() / len(surface))
 
 
@@ -39,7 +40,7 @@ ABOVE_NOISE, LEAST_TEAR = 10.0, 0.25
 and at least this share of those that tear a surface for certain."""
 
 
-def surfaces(jump: Float, seg: Segmentation, tear_px: float) -> Int:
+def surfaces(jump: Float, seg: Segmentation, discontinuity_px: float) -> Int:
     """(N,) surface of every superpixel, each beside others by outlines that mostly tear.
 
     An outline tears here more, there less, and a single gap in it would join both sides. Where
@@ -49,10 +50,10 @@ def surfaces(jump: Float, seg: Segmentation, tear_px: float) -> Int:
     Args:
         jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
         seg: Superpixels and graphs.
-        tear_px: A jump that tears for certain, pixels.
+        discontinuity_px: A jump that tears for certain, pixels.
     """
-    least = np.clip(ABOVE_NOISE * np.median(jump), LEAST_TEAR * tear_px, tear_px)
-    surface = joined(jump < least, seg)
+    least = np.clip(ABOVE_NOISE * np.median(jump), LEAST_TEAR * discontinuity_px, discontinuity_px)
+    surface = connected_labels(jump < least, seg)
     n, (i, k) = len(seg), seg.pairs.T
     while True:
         a, b = surface[i], surface[k]
@@ -62,7 +63,7 @@ def surfaces(jump: Float, seg: Segmentation, tear_px: float) -> Int:
         a, b = np.minimum(a, b)[outline], np.maximum(a, b)[outline]
         pairs, which = np.unique(a * n + b, return_inverse=True)
         length = seg.boundary_length[outline].astype(float)
-        whole = np.bincount(which, length * (jump[outline] < tear_px))
+        whole = np.bincount(which, length * (jump[outline] < discontinuity_px))
         total = np.bincount(which, length)
         join = int(np.argmax(np.where(whole > 0.5 * total, total, 0.0)))
         if not whole[join] > 0.5 * total[join]:

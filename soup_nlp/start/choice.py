@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.mrf.trws import solve_trws
-from soup_nlp.start.components import components
+from soup_nlp.start.components import connected_pieces
 from soup_nlp.start.epipolar import Motion, estimate, repeated
 from soup_nlp.start.neighbourhoods import fit_translation, neighbourhood, refine_motion
 from soup_nlp.start.plane_fit import PlaneFit, Views
@@ -88,7 +88,7 @@ def of_pieces(
     """
     bad = cost.min(axis=1) > max(3 * noise, o.unexplained_px)
     bad &= views.weight.mean(axis=1) > 0.3
-    piece = components(bad, seg)
+    piece = connected_pieces(bad, seg)
     out: list[Motion] = []
     sizes = np.bincount(piece[piece >= 0], minlength=1)
     for c in np.argsort(-sizes)[: o.pieces]:
@@ -164,7 +164,7 @@ def hanging_together(jump: Float, o: SeededStart) -> Float:
         jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
         o: Where a surface ends.
     """
-    return np.exp(-2 * jump / o.tear_px)
+    return np.exp(-2 * jump / o.discontinuity_px)
 
 
 @dataclass(frozen=True)

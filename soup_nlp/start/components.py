@@ -1,4 +1,4 @@
-"""Bodies, groups of superpixels that move as one: pieces, borrowed depths, contact scales."""
+"""Components, groups of superpixels that move as one: pieces, borrowed depths, contact scales."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-def components(mask: NDArray[np.bool_], seg: Segmentation) -> Int:
+def connected_pieces(mask: NDArray[np.bool_], seg: Segmentation) -> Int:
     """(N,) component of every superpixel of a mask over the neighbour pairs, -1 outside."""
     i, k = seg.pairs.T
-    return np.where(mask, joined(mask[i] & mask[k], seg), -1)
+    return np.where(mask, connected_labels(mask[i] & mask[k], seg), -1)
 
 
-def joined(hold: NDArray[np.bool_], seg: Segmentation) -> Int:
+def connected_labels(hold: NDArray[np.bool_], seg: Segmentation) -> Int:
     """(N,) component of every superpixel where only the neighbour pairs (P,) of `hold` count."""
     return _connected(seg.pairs[hold], len(seg))
 
@@ -35,7 +35,7 @@ def _connected(links: Int, count: int) -> Int:
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
-def bodies(label: Int, seg: Segmentation) -> Int:
+def rigid_components(label: Int, seg: Segmentation) -> Int:
     """Groups that share one scale: a dominant motion, or a piece of superpixels of their own.
 
     Args:
@@ -43,13 +43,13 @@ def bodies(label: Int, seg: Segmentation) -> Int:
         seg: Superpixels and graphs.
 
     Returns:
-        (N,) index of the body.
+        (N,) index of the component.
     """
     own = label < 0
-    body = label.copy()
-    piece = components(own, seg)[own]
-    body[own] = label.max(initial=-1) + 1 + np.unique(piece, return_inverse=True)[1].ravel()
-    return body
+    component = label.copy()
+    piece = connected_pieces(own, seg)[own]
+    component[own] = label.max(initial=-1) + 1 + np.unique(piece, return_inverse=True)[1].ravel()
+    return component
 
 
 SHORTEST = 1e-4
@@ -96,30 +96,31 @@ def borrow(
 
 
 OUTLINE, GROUND, MOST = 0.2, 0.4, 0.6
-"""Quantiles of the depth ratios along a body's outline, along what lies below it, and the one of
-the outline that the latter's may reach."""
+"""Quantiles of the depth ratios along a component's outline, along what lies below it, and the one
+of the outline that the latter's may reach."""
 BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 UNKNOWN = np.log(100.0)
 """Contact and pace that differ by more, in logarithms, say nothing: the camera is at rest."""
 UNSUPPORTED = 1e-6
-"""Added to the share of a body's support that is placed: without any, longer contacts first."""
+"""Added to the share of a component's support that is placed: without any, longer contacts
+first."""
 
 
 class Outlines(NamedTuple):
-    """Where bodies touch: every neighbour pair that joins two, in both directions (2 B).
+    """Where components touch: every neighbour pair that joins two, in both directions (2 B).
 
     Attributes:
-        body: The one body.
+        component: The one component.
         other: The other.
         contact: Length of their boundary, pixels.
         below: Whether the other lies below it.
-        weight: Contact times the square of how low it is in the body: a car has room between its
-            wheels.
-        top: (C,) row of the highest anchor of every body.
+        weight: Contact times the square of how low it is in the component: a car has room between
+            its wheels.
+        top: (C,) row of the highest anchor of every component.
     """
 
-    body: Int
+    component: Int
     other: Int
     contact: Float
     below: NDArray[np.bool_]
@@ -128,40 +129,40 @@ class Outlines(NamedTuple):
 
 
 def outlines(label: Int, seg: Segmentation) -> Outlines:
-    """Contacts of bodies, of which superpixels have labels (N,)."""
+    """Contacts of components, of which superpixels have labels (N,)."""
     ends = label[seg.pairs]
     across = ends[:, 0] != ends[:, 1]
-    body, other = np.concatenate([ends[across], ends[across, ::-1]]).T
+    component, other = np.concatenate([ends[across], ends[across, ::-1]]).T
     contact = np.tile(seg.boundary_length[across], 2).astype(float)
     way = np.diff(seg.anchors[seg.pairs[across]], axis=1)[:, 0]
     down = way[:, 1] / np.linalg.norm(way, axis=1)
     top = np.full(int(label.max()) + 1, np.inf)
     np.minimum.at(top, label, seg.anchors[:, 1])
-    low = np.maximum(np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) - top[body], 1.0)
+    low = np.maximum(np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) - top[component], 1.0)
     below = np.concatenate([down, -down]) > BELOW
-    return Outlines(body, other, contact, below, contact * low**2, top)
+    return Outlines(component, other, contact, below, contact * low**2, top)
 
 
 def contact_scales(
     soup: Soup, label: Int, seg: Segmentation, K_ref: Float, upright: bool = True
 ) -> Float:
-    """(N,) relative scale of every body, such that bodies touch what is around them.
+    """(N,) relative scale of every component, such that components touch what is around them.
 
-    A body stands on what is below it: in an upright image its scale is the middle of the depth
-    ratios where a neighbour lies below, which count by the square of how low they are in the body.
-    A body hides what is behind it, so its depth is at most its
+    A component stands on what is below it: in an upright image its scale is the middle of the depth
+    ratios where a neighbour lies below, which count by the square of how low they are in the
+    component. A component hides what is behind it, so its depth is at most its
     neighbours': the scale is bounded by what most of the outline allows, should the superpixels
     below be wrong ones. Where none are seen (less than a tenth of the outline), or nothing is known
-    of the vertical, a body touches what it touches first: a low quantile of the depth ratios all
-    around.
+    of the vertical, a component touches what it touches first: a low quantile of the depth ratios
+    all around.
 
-    Bodies are joined to the placed ones in the order of their contact length times the share of
+    Components are joined to the placed ones in the order of their contact length times the share of
     what lies below them that is placed (1 where nothing does): the roof of a car in pieces waits
     for its wheels, instead of being put where the mountain behind it stands.
 
     Args:
         soup: Planes, every motion in its own scale.
-        label: (N,) index of the body.
+        label: (N,) index of the component.
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
         upright: Whether the image's columns run down.
@@ -205,17 +206,17 @@ def contact_scales(
 def nearer_where_cut_off(
     soup: Soup, label: Int, log_scale: Float, seg: Segmentation, K_ref: Float
 ) -> Float:
-    """(C,) by how much bodies that the image's lower border cuts off are nearer, in logarithms.
+    """(C,) by how much components that the image's lower border cuts off are nearer, in logarithms.
 
     What they stand on is not seen, and what they touch is behind them: contact is the farthest
     that they can be. Where they would move as far, seen from the camera, as the scene does is as
     near as anything makes likely. Half way between, in logarithms, the error is at most the root
-    of their ratio. Bodies that touch are one here: a person is in pieces.
+    of their ratio. Components that touch are one here: a person is in pieces.
 
     Args:
         soup: Planes, every motion in its own scale.
-        label: (N,) index of the body.
-        log_scale: (C,) scale of every body by contact, in logarithms.
+        label: (N,) index of the component.
+        log_scale: (C,) scale of every component by contact, in logarithms.
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
     """
@@ -227,7 +228,7 @@ def nearer_where_cut_off(
     # what carries a group, seen and beyond the border, by the square of how low it is
     around = outlines(group, seg)
     on = around.below
-    seen = np.bincount(around.body[on], around.weight[on], minlength=groups)
+    seen = np.bincount(around.component[on], around.weight[on], minlength=groups)
     last = group[seg.labels[-1]]
     hidden = np.bincount(last, (len(seg.labels) - around.top[last]) ** 2, minlength=groups)
     # displacements seen from the camera: it turns as the scene does
@@ -245,7 +246,8 @@ def nearer_where_cut_off(
 
 
 def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -> Float:
-    """(2, B) depth of both bodies at each of the B pairs that join two, by planes further inside.
+    """(2, B) depth of both components at each of the B pairs that join two, by planes further
+    inside.
 
     Flow is blurred across an outline, and so are the planes of the superpixels along it. Those
     behind them know better: the median of their planes, drawn out to the boundary. Where there are
@@ -253,7 +255,7 @@ def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -
 
     Args:
         soup: Planes.
-        label: (N,) index of the body.
+        label: (N,) index of the component.
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
     """

@@ -122,7 +122,7 @@ def refine(
     def residual(x: Float) -> Float:
         return root * sampson(unpack(x).essential(), r, q, focal)
 
-    # from the inlier distance down to the noise: bodies that move a little otherwise let go
+    # from the inlier distance down to the noise: components that move a little otherwise let go
     scale = max(0.1, 0.5 * threshold)
     x = np.zeros(5)
     for _ in range(REFINEMENTS):

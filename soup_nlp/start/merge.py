@@ -1,8 +1,8 @@
-"""One motion for every body: what moves by itself and hangs together is rigid where it can be.
+"""One motion for every component: what moves by itself and hangs together is rigid where it can be.
 
-Few pixels leave a motion undetermined, so that several explain the flow of a small body as well,
-the camera's among them, each with depths of its own. Superpixels that choose by themselves tear it.
-The flow says better what belongs together: it jumps along a body's outline.
+Few pixels leave a motion undetermined, so that several explain the flow of a small component as
+well, the camera's among them, each with depths of its own. Superpixels that choose by themselves
+tear it. The flow says better what belongs together: it jumps along a component's outline.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.start.choice import CLIP, Choice, hanging_together, least_gain, smooth_choice
-from soup_nlp.start.components import joined
+from soup_nlp.start.components import connected_labels
 from soup_nlp.start.epipolar import Motion, estimate
 from soup_nlp.start.neighbourhoods import fit_translation, refine_motion
 from soup_nlp.start.plane_fit import Views
@@ -22,18 +22,19 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 PIXELS = 1500
-"""A motion is fitted to at most this many pixels of a body."""
+"""A motion is fitted to at most this many pixels of a component."""
 AGREE = 0.7
-"""Share of a body's superpixels that its motion has to explain."""
+"""Share of a component's superpixels that its motion has to explain."""
 TEARS = (1.0, 0.5, 0.25)
-"""Jumps of the flow that part two bodies, relative to the one that ends a surface; the smaller ones
-where no motion explains what hangs together by the larger ones."""
+"""Jumps of the flow that part two components, relative to the one that ends a surface; the smaller
+ones where no motion explains what hangs together by the larger ones."""
 
 
 def gather(
     views: Views, seg: Segmentation, jump: Float, choice: Choice, noise: float, o: SeededStart
 ) -> Choice:
-    """Bodies take one motion each, and then all superpixels that it explains and that hang on them.
+    """Components take one motion each, and then all superpixels that it explains and that hang on
+    them.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
@@ -41,7 +42,7 @@ def gather(
         jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
         choice: What the superpixels have so far.
         noise: Flow noise, pixels.
-        o: Least gain and size of a body, price of differing neighbours, where a surface ends.
+        o: Least gain and size of a component, price of differing neighbours, where a surface ends.
 
     Returns:
         The choice with what was adopted; its indices are no longer those of a list of motions.
@@ -50,7 +51,9 @@ def gather(
         return choice
     gain = least_gain(noise, o)
     for tear in TEARS:
-        choice = _one_motion_each(views, seg, jump < tear * o.tear_px, choice, noise, gain, o)
+        choice = _one_motion_each(
+            views, seg, jump < tear * o.discontinuity_px, choice, noise, gain, o
+        )
     return _spread(views, seg, jump, choice, gain, o)
 
 
@@ -72,7 +75,7 @@ def _one_motion_each(
     R_main = choice.R[np.argmax(choice.label == main)]
     mover = choice.label != main
     i, k = seg.pairs.T
-    piece = joined(mover[i] & mover[k] & whole, seg)
+    piece = connected_labels(mover[i] & mover[k] & whole, seg)
     for c in np.unique(piece[mover]):
         at = np.flatnonzero(mover & (piece == c))
         held = np.unique(choice.label[at])
@@ -127,10 +130,10 @@ def _candidates(
 def _spread(
     views: Views, seg: Segmentation, jump: Float, choice: Choice, gain: float, o: SeededStart
 ) -> Choice:
-    """Superpixels choose among the motions of whole bodies, alike where the flow does not jump.
+    """Superpixels choose among the motions of whole components, alike where the flow does not jump.
 
     Those with a motion of their own may keep it. Whole pieces change together, which is why this
-    needs a solver: half of a body may have taken the camera's motion.
+    needs a solver: half of a component may have taken the camera's motion.
     """
     label = choice.label
     count = np.bincount(label[label >= 0])
@@ -146,7 +149,7 @@ def _spread(
     cost = np.minimum(fit.penalised(), CLIP)
     cost[:, 0] -= 0.5 * o.unexplained_px
     stay = np.where(np.isin(label, kept), np.inf, np.minimum(choice.error, CLIP) + 0.5 * gain)
-    # motions of whole bodies are worth more trust than those of pieces: twice the price
+    # motions of whole components are worth more trust than those of pieces: twice the price
     near = hanging_together(jump, o)
     new = smooth_choice(np.column_stack([cost, stay]), near, seg, 2 * o.smoothness)
     numbers = np.append(kept, -1)[new]

@@ -24,7 +24,7 @@ from soup_nlp.start.choice import (
     select,
     smooth_choice,
 )
-from soup_nlp.start.components import bodies, borrow, contact_scales, joined
+from soup_nlp.start.components import borrow, connected_labels, contact_scales, rigid_components
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.merge import gather
 from soup_nlp.start.plane_fit import Views
@@ -46,13 +46,13 @@ class Start:
         parallax: (N,) pixels that its translation moves the anchor.
         borrowed: (N,) True where plane or motion come from neighbours.
         motion: (N,) index of its motion among `motions`, -1 for one of its own.
-        body: (N,) group that seems to move as one and shares one scale: a dominant motion, or a
-            connected piece of superpixels with motions of their own.
+        component: (N,) group that seems to move as one and shares one scale: a dominant motion, or
+            a connected piece of superpixels with motions of their own.
         motions: The dominant motions.
         surface: (N,) group that hangs together: the flow does not tear inside it; where surfaces
             bend it mostly tears along the outline.
         bending_share: Share of the superpixels that move otherwise than most of their surface.
-        bending: Whether surfaces are taken to bend: all are one body at a constant depth.
+        bending: Whether surfaces are taken to bend: all are one component at a constant depth.
     """
 
     soup: Soup
@@ -60,7 +60,7 @@ class Start:
     parallax: Float
     borrowed: NDArray[np.bool_]
     motion: Int
-    body: Int
+    component: Int
     motions: list[Motion]
     surface: Int
     bending_share: float = 0.0
@@ -115,12 +115,12 @@ def propose(
     R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
     choice = Choice(R, t, fit.pick((np.arange(len(seg)), label)), label)
     choice = of_neighbourhoods(views, seg, choice, noise, o)
-    surface = joined(jump < o.tear_px, seg)
-    share = bending_share(surface, bodies(choice.label, seg))
+    surface = connected_labels(jump < o.discontinuity_px, seg)
+    share = bending_share(surface, rigid_components(choice.label, seg))
     if share > o.bending:
         soup, error = constant_depth(views)
         none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
-        parallax, surface = _parallax(soup, views), surfaces(jump, seg, o.tear_px)
+        parallax, surface = _parallax(soup, views), surfaces(jump, seg, o.discontinuity_px)
         return Start(soup, error, parallax, every, none, none + 1, motions, surface, share, True)
     choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
     own, label, parallax = choice.fit, choice.label, choice.parallax
@@ -138,10 +138,10 @@ def propose(
         mu, slope, length = borrow(mu, slope, label, weak, seg)
     t = choice.t * length[:, None]
     soup = _soup(mu, slope, choice.R, t, views.anchor, views.radius)
-    body = bodies(label, seg)
-    scale = contact_scales(soup, body, seg, K_ref, o.upright)
+    component = rigid_components(label, seg)
+    scale = contact_scales(soup, component, seg, K_ref, o.upright)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t).normalised()
-    return Start(soup, own.cost[:, 0], parallax, weak, label, body, motions, surface, share)
+    return Start(soup, own.cost[:, 0], parallax, weak, label, component, motions, surface, share)
 
 
 def look(

@@ -29,11 +29,11 @@ class StartOptions(Section):
     bending: NonNegative = 0.25
     """Surfaces are taken to bend where more than this share of the superpixels moves otherwise
     than most of its own surface; 1 for never."""
-    tear_px: NonNegative = 1.0
+    discontinuity_px: NonNegative = 1.0
     """Where the flow of two neighbours differs by more, a surface ends."""
     upright: bool = True
-    """The image's columns run down: bodies stand on what is below them. Off, a body is scaled to
-    touch whatever it touches first."""
+    """The image's columns run down: components stand on what is below them. Off, a component is
+    scaled to touch whatever it touches first."""
 
 
 class SeededStart(StartOptions):

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Files that appear whole, HDF5 with units, JSON, versions."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Loaders of datasets in their official layouts."""

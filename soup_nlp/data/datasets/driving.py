@@ -129,7 +129,7 @@ def load_kitti2015(root: PathLike, index: int | str, occ: bool = True) -> Pair:
 
     Returns:
         Pair with the truth whose files exist: depth, flow, occluded (as `load_kitti2012`), scene
-        flow, and the moving objects of obj_map as bodies (0 is the static scene).
+        flow, and the moving objects of obj_map as components (0 is the static scene).
 
     Raises:
         DataError: an image or the calibration is missing, or a file is wrong for its format.
@@ -164,7 +164,7 @@ def load_kitti2015(root: PathLike, index: int | str, occ: bool = True) -> Pair:
         depth_ref=depth,
         flow=flow,
         occluded=occluded,
-        bodies=decode(objects, "object map").astype(np.int32) if objects else None,
+        components=decode(objects, "object map").astype(np.int32) if objects else None,
         scene_flow=scene_flow,
     )
     return Pair(

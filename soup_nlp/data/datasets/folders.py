@@ -266,7 +266,7 @@ def load_motorcycle() -> Pair:
     same row and nearer depth lands on it or beyond it.
 
     Returns:
-        Pair "motorcycle" with depth, flow, scene flow, occlusion and one body of known motion.
+        Pair "motorcycle" with depth, flow, scene flow, occlusion and one component of known motion.
 
     Raises:
         DataError: the images are not available (scikit-image fetches them once).
@@ -297,7 +297,7 @@ def load_motorcycle() -> Pair:
         depth_ref=focal * baseline / (d + doffs),
         flow=flow,
         occluded=known & ((target >= right_of) | leaves(flow, right.shape[:2])),
-        bodies=np.where(known, 0, -1).astype(np.int32),
+        components=np.where(known, 0, -1).astype(np.int32),
         motions=motion[None],
         scene_flow=np.where(known[:, :, None], [-baseline, 0.0, 0.0], np.nan),
     )

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Sources of optical flow, its confidence, and what follows from it."""

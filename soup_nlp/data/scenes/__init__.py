@@ -1,1 +1,1 @@
-"""TODO."""
+"""Rendered dynamic scenes with exact truth."""

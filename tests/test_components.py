@@ -1,4 +1,5 @@
-"""Bodies: who recedes gains little, edges of two bodies weigh less, gaps they leave stay open."""
+"""Components: who recedes gains little, edges of two components weigh less, gaps they leave stay
+open."""
 
 from __future__ import annotations
 
@@ -16,9 +17,9 @@ from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model import oracle as plain
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.reweighting import at_occlusions, between_bodies, in_pixels
+from soup_nlp.model.reweighting import at_occlusions, across_components, in_pixels
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.start import components as bodies_module
+from soup_nlp.start import components as components_module
 from soup_nlp.start.components import contact_scales, depth_from_inside
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
@@ -31,8 +32,8 @@ def world():
     labels = (v // 8 * 4 + u // 8).astype(np.int32)
     seg = build_segmentation(labels, np.zeros((16, 32, 3), np.uint8), neighbours=4)
     flow = Flow(np.zeros((16, 32, 2), np.float32), np.ones((16, 32), np.float32), "zero")
-    body = (seg.anchors[:, 0] > 16).astype(np.int64)
-    T = np.where(body[:, None] == 1, [[0.3, 0, 0]], [[0.1, 0, 0]])
+    component = (seg.anchors[:, 0] > 16).astype(np.int64)
+    T = np.where(component[:, None] == 1, [[0.3, 0, 0]], [[0.1, 0, 0]])
     lam = np.full(8, 1 / 8)
     soup = Soup(
         lam,
@@ -41,30 +42,34 @@ def world():
         np.tile(np.eye(3), (8, 1, 1)),
         T / lam[:, None],
     )
-    return seg, soup, body, build_energy_data(seg, flow, K, K, 4)
+    return seg, soup, component, build_energy_data(seg, flow, K, K, 4)
 
 
-def test_edges_of_two_bodies_weigh_less(world):
-    seg, _, body, data = world
+def test_edges_of_two_components_weigh_less(world):
+    seg, _, component, data = world
     i, k = seg.edges.T
-    across = body[i] != body[k]
+    across = component[i] != component[k]
     assert across.any()
     assert not across.all()
-    less = between_bodies(data, body, 0.1)
+    less = across_components(data, component, 0.1)
     np.testing.assert_allclose(less.edge_weight[across], 0.1 * seg.edge_weight[across], rtol=1e-15)
     np.testing.assert_array_equal(less.edge_weight[~across], seg.edge_weight[~across])
-    np.testing.assert_array_equal(between_bodies(data, body, 1.0).edge_weight, seg.edge_weight)
-    np.testing.assert_array_equal(between_bodies(data, 0 * body, 0.1).edge_weight, seg.edge_weight)
+    np.testing.assert_array_equal(
+        across_components(data, component, 1.0).edge_weight, seg.edge_weight
+    )
+    np.testing.assert_array_equal(
+        across_components(data, 0 * component, 0.1).edge_weight, seg.edge_weight
+    )
 
 
 @pytest.mark.parametrize("factor", [10.0, 1e4])
-def test_a_body_gains_little_by_receding(world, factor):
-    """Its motion kept, the right body goes far away: 2^(1/4) is the most that E_arap falls."""
-    seg, soup, body, data = world
+def test_a_component_gains_little_by_receding(world, factor):
+    """Its motion kept, the right component goes far away: 2^(1/4) is the most that E_arap falls."""
+    seg, soup, component, data = world
     data = in_pixels(data, soup, seg)
     weights = Weights(sigma_arap=np.inf)
-    across = np.abs(np.diff(body[seg.edges], axis=1)[:, 0]) == 1
-    far = np.where(body == 1, factor, 1.0)
+    across = np.abs(np.diff(component[seg.edges], axis=1)[:, 0]) == 1
+    far = np.where(component == 1, factor, 1.0)
     away = replace(soup, d=soup.d * far)
     np.testing.assert_allclose(away.translation, soup.translation, rtol=1e-14)
     gap = data.edge_weight[across] * 50.0 * 0.2 / 2.0  # focal x |T_i - T_k| / depth
@@ -75,31 +80,31 @@ def test_a_body_gains_little_by_receding(world, factor):
     assert (plain.arap(away, data, weights)[across] >= 2**-0.25 * gap * (1 - 1e-12)).all()
 
 
-def test_pairs_of_two_bodies_weigh_less_where_one_hides_the_other(world):
-    """Of the right body's outline the lower half touches the left one; the upper is in front."""
-    seg, soup, body, data = world
-    upper = seg.anchors[:, 1] < 8
-    z = np.where((body == 1) & upper, 0.7, 1.0)
-    soup = replace(soup, d=soup.d * z)
+def test_pairs_of_two_components_weigh_less_where_one_hides_the_other(world):
+    """Of the right component's outline the lower half touches the left one; the upper is in
+    front."""
+    seg, soup, component, data = world
+    upper = seg.anchors[:, 1] < 8 z = np.where((component
+    == 1) & upper, 0.7, 1.0) soup = replace(soup, d=soup.d * z)
     i, k = seg.pairs.T
-    across = body[i] != body[k]
+    across = component[i] != component[k]
     hidden = across & (upper[i] | upper[k])
     assert hidden.sum() == 1
     assert across.sum() == 2
-    less = at_occlusions(data, soup, body, 0.2, 0.1)
+    less = at_occlusions(data, soup, component, 0.2, 0.1)
     np.testing.assert_array_equal(less.pair_weight, np.where(hidden, 0.1, 1.0) * data.pair_weight)
     np.testing.assert_array_equal(less.edge_weight, data.edge_weight)
     same = {
-        "gap is no larger": at_occlusions(data, soup, body, 0.31, 0.1),
-        "one body": at_occlusions(data, soup, 0 * body, 0.2, 0.1),
-        "the paper's": at_occlusions(data, soup, body, 0.2, 1.0),
+        "gap is no larger": at_occlusions(data, soup, component, 0.31, 0.1),
+        "one component": at_occlusions(data, soup, 0 * component, 0.2, 0.1),
+        "the paper's": at_occlusions(data, soup, component, 0.2, 1.0),
     }
     for why, one in same.items():
         np.testing.assert_array_equal(one.pair_weight, data.pair_weight, err_msg=why)
 
 
 def scales(z, own, far=0.01, **options):
-    """Scales found for fronto-parallel squares at depths z (r, c), of which `own` are a body.
+    """Scales found for fronto-parallel squares at depths z (r, c), of which `own` are a component.
 
     Its own unit says 1, and that it moves by `far` where the scene moves by 1; everything else is
     at its true depth.
@@ -117,7 +122,7 @@ def scales(z, own, far=0.01, **options):
     return found.reshape(rows, columns)
 
 
-def test_a_body_in_pieces_is_placed_from_the_ground_up():
+def test_a_component_in_pieces_is_placed_from_the_ground_up():
     """A tall piece before a far wall, with the longer outline, on a low one on the ground."""
     own = thrice([[0, 0, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0], [0, 0, 0]])
     z = thrice([[8.0, 8, 8], [8, 1, 8], [8, 1, 8], [8, 1, 8], [2, 2, 2]])
@@ -129,8 +134,8 @@ def test_a_body_in_pieces_is_placed_from_the_ground_up():
     np.testing.assert_allclose(scales(z, own), np.where(own > 0, 2.0, 1.0), rtol=1e-12)
 
 
-def test_a_body_that_stands_on_its_own_filling_is_placed_all_the_same():
-    """All that is below the arch is a body that touches nothing else: neither can wait."""
+def test_a_component_that_stands_on_its_own_filling_is_placed_all_the_same():
+    """All that is below the arch is a component that touches nothing else: neither can wait."""
     own = thrice([[0, 0, 0, 0, 0], [0, 2, 2, 2, 0], [0, 2, 1, 2, 0]])
     z = thrice([[4.0] * 5, [4, 1, 1, 1, 4], [4, 1, 1, 1, 4]])
     np.testing.assert_allclose(scales(z, own), np.where(own > 0, 4.0, 1.0), rtol=1e-12)
@@ -151,10 +156,10 @@ def thrice(cells):
 @pytest.mark.parametrize(
     ("upright", "ground", "scale"), [(True, 2.0, 2.0), (False, 2.0, 1.0), (True, 40.0, 4.0)]
 )
-def test_a_body_stands_on_what_is_below_it(upright, ground, scale):
+def test_a_component_stands_on_what_is_below_it(upright, ground, scale):
     """Amid a wall, on the ground, half behind a near thing.
 
-    A ground that is beyond most of what the body hides is none.
+    A ground that is beyond most of what the component hides is none.
     """
     own = thrice([[0, 0, 0], [0, 1, 0], [0, 0, 0]]) > 0
     z = thrice([[1.0, 4, 4], [1, 1, 4], [1, ground, ground]])
@@ -169,7 +174,7 @@ def test_a_car_has_room_between_its_wheels():
     np.testing.assert_allclose(scales(z, own), np.where(own, 2.0, 1.0), rtol=1e-12)
 
 
-def test_a_body_with_nothing_below_it_touches_its_outline():
+def test_a_component_with_nothing_below_it_touches_its_outline():
     """The lower edge of the image cuts it off: a low quantile of the depth ratios around it."""
     z = thrice([[4.0, 6, 4], [3, 1, 3.5]])
     own = z == 1
@@ -207,7 +212,7 @@ def test_pieces_of_what_is_cut_off_are_nearer_together():
 
 
 @pytest.mark.parametrize("scene", ["room", "street"])
-def test_bodies_that_the_image_cuts_off_are_placed_nearer_the_truth(scene, monkeypatch):
+def test_components_that_the_image_cuts_off_are_placed_nearer_the_truth(scene, monkeypatch):
     """Rendered pairs whose lower part is cropped: contact alone puts what is cut too far."""
     errors = {"contact": [], "as shipped": []}
     for seed in range(6):
@@ -218,7 +223,7 @@ def test_bodies_that_the_image_cuts_off_are_placed_nearer_the_truth(scene, monke
         with monkeypatch.context() as context:
             errors["as shipped"] += cut_errors(pair, problem)
             context.setattr(
-                bodies_module, "nearer_where_cut_off", lambda soup, label, log_scale, *_: 0.0
+                components_module, "nearer_where_cut_off", lambda soup, label, log_scale, *_: 0.0
             )
             errors["contact"] += cut_errors(pair, problem)
     contact, shipped = np.array(errors["contact"]), np.array(errors["as shipped"])
@@ -228,14 +233,18 @@ def test_bodies_that_the_image_cuts_off_are_placed_nearer_the_truth(scene, monke
 
 
 def cut_errors(pair, problem):
-    """|log| of the relative depth of every moving true body that touches the lower border."""
+    """|log| of the relative depth of every moving true component that touches the lower border."""
     case = prepare(problem, pair=pair)
     truth = pair.truth
     rec = reconstruct(case.soup, case.segmentation.labels, pair.K_ref, pair.K_next)
     ratio = np.log(rec.depth_ref / truth.depth_ref)
-    still = np.median(ratio[truth.bodies == 0])
-    cut = [b for b in np.unique(truth.bodies[-1]) if b > 0 and (truth.bodies[-1] == b).sum() > 20]
-    return [abs(np.median(ratio[truth.bodies == b]) - still) for b in cut]
+    still = np.median(ratio[truth.components == 0])
+    cut = [
+        b
+        for b in np.unique(truth.components[-1])
+        if b > 0 and (truth.components[-1] == b).sum() > 20
+    ]
+    return [abs(np.median(ratio[truth.components == b]) - still) for b in cut]
 
 
 def test_depths_across_pairs_are_those_of_both_planes(world):
@@ -266,19 +275,19 @@ def test_blurred_outlines_are_seen_through(world):
 
 def test_depths_from_inside_follow_slanted_planes(world):
     """On one plane all superpixels agree, own or not; the extrapolation is exact."""
-    seg, soup, body, _ = world
+    seg, soup, component, _ = world
     n = np.tile(np.array([0.1, 0.2, -1.0]) / np.linalg.norm([0.1, 0.2, -1.0]), (len(soup), 1))
     one = replace(soup, n=n)
     i, k = seg.pairs.T
-    across = body[i] != body[k]
+    across = component[i] != component[k]
     ray = camera.rays(K, seg.boundary[across].mean(axis=1))
     exact = one.depth_across(seg.pairs[across], ray)
     assert np.ptp(exact) > 0
-    np.testing.assert_allclose(depth_from_inside(one, body, seg, K), exact, rtol=1e-12)
+    np.testing.assert_allclose(depth_from_inside(one, component, seg, K), exact, rtol=1e-12)
     # one superpixel of an outline off its plane changes nothing: its neighbours inside answer
     off = one.lam.copy()
-    off[np.flatnonzero(body == 1)[0]] *= 3
-    assert np.isin(np.flatnonzero(body == 1)[0], seg.pairs[across])
+    off[np.flatnonzero(component == 1)[0]] *= 3
+    assert np.isin(np.flatnonzero(component == 1)[0], seg.pairs[across])
     np.testing.assert_allclose(
-        depth_from_inside(replace(one, lam=off), body, seg, K), exact, rtol=1e-12
+        depth_from_inside(replace(one, lam=off), component, seg, K), exact, rtol=1e-12
     )
