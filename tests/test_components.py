@@ -17,7 +17,7 @@ from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model import oracle as plain
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.reweighting import at_occlusions, across_components, in_pixels
+from soup_nlp.model.reweighting import across_components, at_occlusions, in_pixels
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.start import components as components_module
 from soup_nlp.start.components import contact_scales, depth_from_inside
@@ -84,8 +84,9 @@ def test_pairs_of_two_components_weigh_less_where_one_hides_the_other(world):
     """Of the right component's outline the lower half touches the left one; the upper is in
     front."""
     seg, soup, component, data = world
-    upper = seg.anchors[:, 1] < 8 z = np.where((component
-    == 1) & upper, 0.7, 1.0) soup = replace(soup, d=soup.d * z)
+    upper = seg.anchors[:, 1] < 8
+    z = np.where((component == 1) & upper, 0.7, 1.0)
+    soup = replace(soup, d=soup.d * z)
     i, k = seg.pairs.T
     across = component[i] != component[k]
     hidden = across & (upper[i] | upper[k])

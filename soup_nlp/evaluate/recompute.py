@@ -288,8 +288,9 @@ def _pair_weights(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Float:
     start, seg = tree["start"], tree["segmentation"]
     weight = seg["pair_weight"].copy()
     middle = tree["energy"]["boundary_ray"].mean(1)
-    i, k = tree["energy"]["pairs"].T facing = [np.maximum(-(start["n"][who]
-    * middle).sum(1), 1e-3) for who in (i, k)] z = np.stack([(start["lam"] * start["d"])[who] / f for who, f in zip((i, k), facing)])
+    i, k = tree["energy"]["pairs"].T
+    facing = [np.maximum(-(start["n"][who] * middle).sum(1), 1e-3) for who in (i, k)]
+    z = np.stack([(start["lam"] * start["d"])[who] / f for who, f in zip((i, k), facing)])
     open_gap = z.min(0) < (1 - float(form["occlusion_gap"])) * z.max(0)
     weight[open_gap & (start["component"][i] != start["component"][k])] *= float(
         form["cont_occluded"]
