@@ -15,7 +15,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
@@ -128,12 +128,12 @@ def test_the_truth_has_less_energy_than_a_shaken_truth(street):
     data = build_energy_data(seg, flow_from_truth(pair), pair.K_ref, pair.K_next)
     soup = true_soup(pair, seg).soup
     data = in_pixels(data, soup, seg)
-    own = plain.energy(soup, data, Weights())["total"]
+    own = oracle.energy(soup, data, Weights())["total"]
     rng = np.random.default_rng(0)
     shaken = soup.__class__(
         soup.lam * np.exp(rng.normal(0, 0.1, len(soup))), soup.n, soup.d, soup.R, soup.t
     )
-    assert plain.energy(shaken, data, Weights())["total"] > 1.5 * own
+    assert oracle.energy(shaken, data, Weights())["total"] > 1.5 * own
 
 
 def test_unorganised_superpixels_have_translations_of_length_one(street):

@@ -14,7 +14,7 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup, reconstruct
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import across_components, at_occlusions, in_pixels
@@ -73,11 +73,11 @@ def test_a_component_gains_little_by_receding(world, factor):
     away = replace(soup, d=soup.d * far)
     np.testing.assert_allclose(away.translation, soup.translation, rtol=1e-14)
     gap = data.edge_weight[across] * 50.0 * 0.2 / 2.0  # focal x |T_i - T_k| / depth
-    near = plain.arap(soup, data, weights)[across]
+    near = oracle.arap(soup, data, weights)[across]
     # the anchors' distance changes by at most |T_i - T_k|: the sum is once or twice the gap
     assert (near >= gap * (1 - 1e-12)).all()
     assert (near <= 2 * gap * (1 + 1e-12)).all()
-    assert (plain.arap(away, data, weights)[across] >= 2**-0.25 * gap * (1 - 1e-12)).all()
+    assert (oracle.arap(away, data, weights)[across] >= 2**-0.25 * gap * (1 - 1e-12)).all()
 
 
 def test_pairs_of_two_components_weigh_less_where_one_hides_the_other(world):

@@ -26,7 +26,7 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData, build_energy_data, sample_pixels
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.matrix import build_matrix_nlp
@@ -36,7 +36,7 @@ from soup_nlp.model.reweighting import in_pixels
 
 
 def energies(soup: Soup, data: EnergyData, weights: Weights) -> np.ndarray:
-    e = plain.energy(soup, data, weights)
+    e = oracle.energy(soup, data, weights)
     return np.array([e[k] for k in TERMS])
 
 
@@ -113,8 +113,8 @@ def test_local_units_make_every_edge_blind_to_its_own_scale():
     lam = problem.soup.lam.copy()
     lam[[i, k]] *= 2
     twice = replace(problem.soup, lam=lam)
-    a = plain.arap(problem.soup, problem.data, weights)
-    b = plain.arap(twice, problem.data, weights)
+    a = oracle.arap(problem.soup, problem.data, weights)
+    b = oracle.arap(twice, problem.data, weights)
     assert b[0] == pytest.approx(a[0], rel=1e-12)
     touched = np.isin(problem.seg.edges, [i, k]).any(axis=1)
     np.testing.assert_allclose(b[~touched], a[~touched], rtol=1e-12)
@@ -139,7 +139,7 @@ def test_two_superpixels_by_hand():
         lam, np.tile([0, 0, -1.0], (2, 1)), D / lam, np.tile(np.eye(3), (2, 1, 1)), T / lam[:, None]
     )
     w = PAPER.replace(arap=1, proj=1, cont=1, orient=1, sigma_cont=0.2, sigma_orient=0.5)
-    e = plain.energy(soup, data, w)
+    e = oracle.energy(soup, data, w)
     mean = 2.0  # of the plane distances: the length unit
     anchor = np.array([[-0.2, 0, 1], [0.2, 0, 1]])  # centroids 1.5 and 5.5 of columns about 3.5
     X = D[:, None] * anchor
@@ -172,20 +172,20 @@ def test_pixel_units_by_hand():
     angle = 1e-3
     turned[here] = turned[here] @ rotation.exp([0, 0, angle])
     # |R_i - R_k|_F = sqrt(8) sin(angle / 2); turning about z leaves the camera's own motion
-    e = plain.arap(replace(soup, R=turned), data, wide)
+    e = oracle.arap(replace(soup, R=turned), data, wide)
     rotating = focal * np.sqrt(8) * np.sin(angle / 2)
     np.testing.assert_array_less(arap * rotating - 1e-9, e)
     assert np.median(e[edge] / (arap[edge] * rotating)) == pytest.approx(1, abs=0.5)
     moved = soup.t.copy()
     moved[here] += [0, 0, g / soup.lam[here]]
-    gap = plain.arap(replace(soup, t=moved), data, wide)
+    gap = oracle.arap(replace(soup, t=moved), data, wide)
     at_least = arap * focal * g / Z
     assert (gap >= at_least - 1e-9).all()
     assert (gap <= 2 * at_least + 1e-9).all()
     assert gap[edge].min() > 0
     # deeper by g, with the motion unchanged: both frames' gaps are g along the rays
     deeper = replace(soup, d=np.where(np.arange(12) == here, soup.d * (1 + g / Z), soup.d))
-    cont = plain.continuity(deeper, data, wide)
+    cont = oracle.continuity(deeper, data, wide)
     pair = (data.pairs == here).any(axis=1)
     length = np.linalg.norm(data.boundary_ray, axis=2)
     whole = np.sqrt(np.sum(length**2, axis=1)) * data.pair_factor
@@ -207,8 +207,8 @@ def test_sampled_boundaries_stand_for_the_whole():
     soup = random_soup(0, 12, spread=0.0)
     lam = soup.lam * np.random.default_rng(0).uniform(0.8, 1.2, 12)
     soup = replace(soup, lam=lam)
-    few = plain.continuity(soup, Tiny(boundary_samples=3).data, PAPER)
-    every = plain.continuity(soup, Tiny(boundary_samples=None).data, PAPER)
+    few = oracle.continuity(soup, Tiny(boundary_samples=3).data, PAPER)
+    every = oracle.continuity(soup, Tiny(boundary_samples=None).data, PAPER)
     np.testing.assert_allclose(few, every, rtol=0.02)
 
 
@@ -245,7 +245,7 @@ def test_superpixels_without_flow_take_no_pixels_and_have_no_projection():
     data = build_energy_data(problem.seg, flow, K_REF, K_NEXT, 6)
     assert (data.pixel_weight[5] == 0).all()
     assert (data.pixel_weight[4] > 0).all()
-    error = plain.reprojection(problem.soup, data, PAPER)
+    error = oracle.reprojection(problem.soup, data, PAPER)
     assert error[5] == 0
     nlp, _ = build_matrix_nlp(problem.soup, data, PAPER, form())
     assert np.isfinite(value(nlp, nlp.x0)[0])
@@ -256,7 +256,7 @@ def test_confidence_zero_everywhere_leaves_a_valid_problem():
     flow = Flow(problem.flow.uv, np.zeros((HEIGHT, WIDTH), np.float32), "nothing")
     data = build_energy_data(problem.seg, flow, K_REF, K_NEXT, 6)
     nlp, _ = build_matrix_nlp(problem.soup, data, PAPER, form())
-    e = plain.energy(problem.soup, data, PAPER)
+    e = oracle.energy(problem.soup, data, PAPER)
     assert e["proj"] == 0
     assert np.isfinite(value(nlp, nlp.x0)[0])
 
@@ -270,7 +270,7 @@ def test_one_superpixel_is_a_valid_problem():
     data = in_pixels(build_energy_data(seg, flow, K, K, 6), soup, seg)
     for gauge in GAUGES:
         nlp, _ = build_matrix_nlp(soup, data, PAPER, form(gauge=gauge))
-        e = plain.energy(soup, data, PAPER)
+        e = oracle.energy(soup, data, PAPER)
         assert e["arap"] == e["cont"] == e["orient"] == 0
         assert value(nlp, nlp.x0)[0] == pytest.approx(e["total"], rel=0.1)
         assert value(nlp, nlp.x0)[1][: 6 + 1] == pytest.approx(0, abs=1e-12)

@@ -22,7 +22,7 @@ from soup_nlp.export.names import readable_names
 from soup_nlp.export.residuals import kind, residual_table, table_text
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, kkt, violations
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 
 PROBLEMS = Path(__file__).parent.parent / "problems"
@@ -78,7 +78,7 @@ def test_a_family_is_exported_and_read_back(scene, tmp_path):
         close(back.values(x[v])[1], np.asarray(g).ravel()[r])
         close(back.values(x[v])[2], np.asarray(nlp.grad_f(x, nlp.p)[1]).ravel()[v])
         assert manifest["objective_at_start"] == float(nlp.oracle(nlp.x0, nlp.p)[0])
-        exact = plain.energy(case.soup, case.data, case.weights)["total"]
+        exact = oracle.energy(case.soup, case.data, case.weights)["total"]
         assert manifest["exact_energy_at_start"]["total"] == pytest.approx(exact, rel=1e-12)
         hashes.add(manifest["nl"]["sha256"])
     assert len(hashes) == 8

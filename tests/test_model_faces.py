@@ -25,7 +25,7 @@ from helpers_model import (
 )
 
 from soup_nlp.model import compile as compiling
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS, Kernel
 from soup_nlp.model.matrix import build_matrix_nlp
@@ -89,7 +89,7 @@ def test_exact_kernels_equal_plain_numpy_term_by_term(gauge, units, at_anchors, 
     nlp, layout = problem.nlp(weights, form(units, gauge=gauge, norm="epigraph"))
     for seed in range(3):
         soup = random_soup(seed, len(problem.seg))
-        expected = plain.energy(soup, problem.data, weights)
+        expected = oracle.energy(soup, problem.data, weights)
         x = np.concatenate([layout.pack(soup), np.zeros(nlp.nx - layout.size)])
         found = kernel_exact(nlp, x)
         assert found.keys() == expected.keys() - {"total"}
@@ -106,7 +106,7 @@ def test_tangent_kernels_equal_plain_numpy_term_by_term(units, chart):
     rng = np.random.default_rng(0)
     for size in (0.0, 0.05):
         x = layout.pack(problem.soup) * (1 + size * rng.normal(size=nlp.nx))
-        expected = plain.energy(layout.unpack(x), problem.data, weights)
+        expected = oracle.energy(layout.unpack(x), problem.data, weights)
         # kernels measure in the base's unit, plain in the soup's own: equal at the base, and
         # everywhere once units are local
         found = kernel_exact(nlp, x)
@@ -120,12 +120,12 @@ def test_truncations_of_the_tiny_problem_cut_some_and_spare_some():
     for units in UNITS:
         problem, weights = tiny(units), weights_for(units)
         wide = weights_for(units, truncated=False)
-        for term in (plain.arap, plain.reprojection, plain.continuity):
+        for term in (oracle.arap, oracle.reprojection, oracle.continuity):
             cut = term(problem.soup, problem.data, weights)
             free = term(problem.soup, problem.data, wide)
             assert np.mean(cut < free) > 0.05, term.__name__
             assert (cut <= free * (1 + 1e-12)).all()
-        turn = plain.orientation(problem.soup, problem.data, weights) / problem.data.orient_weight
+        turn = oracle.orientation(problem.soup, problem.data, weights) / problem.data.orient_weight
         assert 0.05 < np.mean(turn < weights.sigma_orient) < 0.95
 
 

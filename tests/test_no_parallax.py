@@ -10,7 +10,7 @@ from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import build_segmentation
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.pipeline.run import run
@@ -43,7 +43,7 @@ def test_a_start_without_parallax_borrows_everything_and_keeps_to_the_flow(tiles
     start = propose(tiles, flow, K, K)
     assert start.borrowed.all()
     data = build_energy_data(tiles, flow, K, K)
-    error = plain.reprojection(start.soup, data, Weights())
+    error = oracle.reprojection(start.soup, data, Weights())
     assert error.max() < 1e-3
     np.testing.assert_allclose(error, start.error, atol=1e-3)
 

@@ -15,7 +15,7 @@ from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
@@ -195,7 +195,7 @@ def test_no_round_raises_the_exact_energy_and_the_soup_is_feasible(units):
     totals = [done.energy_begin["total"], *(r.energy["total"] for r in done.rounds)]
     assert (np.diff(totals) <= 0).all()
     assert totals[-1] < 0.9 * totals[0]
-    assert done.energy == plain.energy(done.soup, tiny.data, weights)
+    assert done.energy == oracle.energy(done.soup, tiny.data, weights)
     assert done.status == "rounds"
     assert len(done.rounds) == FEW.rounds
     residuals = constraint_residuals(done.soup, tiny.data.rim_ray, 1e-3)
@@ -223,8 +223,8 @@ def test_the_same_seed_gives_the_same_soup_and_another_another():
 def test_broken_superpixels_are_repaired_by_their_neighbours():
     scene = Planar(broken=6)
     weights = Weights()
-    truth = plain.energy(scene.truth, scene.data, weights)["total"]
-    begin = plain.energy(scene.soup, scene.data, weights)["total"]
+    truth = oracle.energy(scene.truth, scene.data, weights)["total"]
+    begin = oracle.energy(scene.soup, scene.data, weights)["total"]
     assert begin > 1.5 * truth
     done = refine_soup(scene.soup, scene.data, weights, FEW.replace(particles=30), seed=0)
     assert done.energy["total"] < truth + 0.05 * (begin - truth)
@@ -258,7 +258,7 @@ def test_interruption_and_time_limit_keep_the_best():
     assert done.status == "interrupted"
     assert not done.rounds
     assert done.energy["total"] == pytest.approx(
-        plain.energy(tiny.soup, tiny.data, weights)["total"], rel=1e-12
+        oracle.energy(tiny.soup, tiny.data, weights)["total"], rel=1e-12
     )
     stop.clear()
     lines: list[str] = []

@@ -10,7 +10,7 @@ from helpers_model import Tiny, random_soup, weights_for
 
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.refine.costs import PairCosts, Particles, anchor_depth, feasible, unary_costs
 from soup_nlp.refine.mppbp import length_slope
 from soup_nlp.refine.select import conditional_costs, diverse, upright, within_reach
@@ -51,10 +51,10 @@ def test_costs_of_chosen_labels_are_the_exact_energy(units, at_anchors, truncate
         labels = rng.integers(0, 6, len(tiny.soup))
         soup = chosen(p, labels)
         unit = float(np.sum(tiny.data.share * soup.distance))
-        exact = plain.energy(soup, tiny.data, weights)["total"]
+        exact = oracle.energy(soup, tiny.data, weights)["total"]
         assert assembled(costs, p, labels, unit) == pytest.approx(exact, rel=1e-12)
         # and the soup that is delivered has the same energy: E does not depend on the scale
-        delivered = plain.energy(p.soup(labels, tiny.data.share), tiny.data, weights)["total"]
+        delivered = oracle.energy(p.soup(labels, tiny.data.share), tiny.data, weights)["total"]
         assert delivered == pytest.approx(exact, rel=1e-12)
 
 
@@ -99,7 +99,7 @@ def test_every_entry_is_the_energy_of_its_pair_however_close_the_particles():
             for b in range(p.shape[1]):
                 labels = np.zeros(n, int)
                 labels[i], labels[k] = a, b
-                exact = plain.energy(chosen(p, labels), data, w)["total"]
+                exact = oracle.energy(chosen(p, labels), data, w)["total"]
                 assert table[e, a, b] == pytest.approx(exact, rel=1e-9, abs=1e-12 * table.max())
 
 
@@ -166,7 +166,7 @@ def test_the_length_slope_is_the_derivative_of_the_energy():
     scaled = [
         replace(tiny.data, share=tiny.data.share * (1 + s * h)) for s in (1, -1)
     ]  # the unit is sum(share D)
-    up, down = (plain.energy(tiny.soup, d, weights)["total"] for d in scaled)
+    up, down = (oracle.energy(tiny.soup, d, weights)["total"] for d in scaled)
     assert length_slope(tiny.soup, tiny.data, weights) == pytest.approx(
         (down - up) / (2 * h), rel=1e-5
     )
@@ -180,12 +180,12 @@ def test_conditional_costs_are_differences_of_the_energy():
     unary, _ = unary_costs(p, tiny.data, weights)
     labels = np.random.default_rng(0).integers(0, 4, len(tiny.soup))
     found = conditional_costs(labels, unary, costs.edges, costs.tables(p))
-    base = plain.energy(chosen(p, labels), tiny.data, weights)["total"]
+    base = oracle.energy(chosen(p, labels), tiny.data, weights)["total"]
     for i in (0, 5, 11):
         for x in range(4):
             other = labels.copy()
             other[i] = x
-            gain = plain.energy(chosen(p, other), tiny.data, weights)["total"] - base
+            gain = oracle.energy(chosen(p, other), tiny.data, weights)["total"] - base
             assert found[i, x] - found[i, labels[i]] == pytest.approx(gain, abs=1e-10)
 
 

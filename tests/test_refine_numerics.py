@@ -11,7 +11,7 @@ from test_refine import FEW, Planar
 
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.refine import mppbp
 from soup_nlp.refine.anchored import Local, fit_motion, neighbours
@@ -42,7 +42,7 @@ def test_the_mrf_follows_the_exact_energy_when_the_length_unit_changes():
             for x in (0 * labels, labels)
         ]
         exact = [
-            plain.energy(p.soup(x, tiny.data.share).retracted(), tiny.data, weights)["total"]
+            oracle.energy(p.soup(x, tiny.data.share).retracted(), tiny.data, weights)["total"]
             for x in (0 * labels, labels)
         ]
         share = float(np.sum((tiny.data.share * best.distance)[list(chosen)]))

@@ -11,7 +11,7 @@ from helpers_formulation import FORMS, TERMS, UNITS, WORLDS, form, tiny, world
 from helpers_model import GAUGES, PAPER, gradient, value, weights_for
 
 from soup_nlp.geometry import rotation
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 
@@ -36,7 +36,7 @@ def test_the_smooth_norm_tends_to_the_exact_energy(units):
     problem = tiny(units)
     weights = replace(weights_for(units, truncated=False), sigma_cont=np.inf)
     nlp, _ = problem.nlp(weights, form(truncation="smooth"))
-    exact = plain.energy(problem.soup, problem.data, weights)
+    exact = oracle.energy(problem.soup, problem.data, weights)
     gap = []
     for eps in (1e-2, 1e-3, 1e-4, 1e-7):
         made = by_term(nlp, nlp.x0, nlp.with_theta(eps=eps, eps_pixel=eps))
@@ -52,7 +52,7 @@ def test_the_smooth_truncation_stays_near_the_exact_energy(units):
     """Its corner is rounded by a share of sigma, whatever eps: within a fifth of sigma a norm."""
     problem, weights, data = tiny(units), weights_for(units), tiny(units).data
     nlp, _ = problem.nlp(weights, form(truncation="smooth", eps=1e-7, eps_pixel=1e-7))
-    exact, made = plain.energy(problem.soup, data, weights), by_term(nlp, nlp.x0, nlp.p)
+    exact, made = oracle.energy(problem.soup, data, weights), by_term(nlp, nlp.x0, nlp.p)
     w = weights
     cap = {
         "arap": 3 * w.arap * w.sigma_arap * data.edge_weight.sum(),
@@ -90,7 +90,7 @@ def test_epigraph_and_lifted_at_their_optimum_are_the_exact_energy(gauge, units,
     problem, weights = tiny(units), weights_for(units, truncated)
     sharp = form(gauge=gauge, norm="epigraph", truncation="lifted", eps=0.0, eps_pixel=0.0)
     nlp, _ = problem.nlp(weights, sharp)
-    exact = plain.energy(problem.soup, problem.data, weights)
+    exact = oracle.energy(problem.soup, problem.data, weights)
     x = optimal_extras(nlp)
     f, g = value(nlp, x)
     assert f == pytest.approx(exact["total"], rel=1e-10)
@@ -113,7 +113,7 @@ def test_epigraph_and_lifted_at_their_optimum_are_the_exact_energy(gauge, units,
 def test_lifted_alone_at_its_optimum_is_the_exact_energy_as_eps_vanishes(units):
     problem, weights = tiny(units), weights_for(units)
     nlp, _ = problem.nlp(weights, form(truncation="lifted", eps=1e-9, eps_pixel=1e-9))
-    exact = plain.energy(problem.soup, problem.data, weights)["total"]
+    exact = oracle.energy(problem.soup, problem.data, weights)["total"]
     assert value(nlp, optimal_extras(nlp))[0] == pytest.approx(exact, rel=1e-7)
 
 
@@ -121,7 +121,7 @@ def test_epigraph_alone_at_its_optimum_is_the_exact_energy_without_truncations()
     problem = tiny()
     weights = PAPER.replace(sigma_cont=np.inf, orient=0.0)
     nlp, _ = problem.nlp(weights, form(norm="epigraph", eps=0.0, eps_pixel=0.0))
-    exact = plain.energy(problem.soup, problem.data, weights)["total"]
+    exact = oracle.energy(problem.soup, problem.data, weights)["total"]
     assert value(nlp, optimal_extras(nlp))[0] == pytest.approx(exact, rel=1e-10)
 
 
@@ -139,7 +139,7 @@ def test_epigraph_at_its_optimum_is_the_smooth_form(units):
 def test_orientation_can_do_without_truncation():
     problem, weights = tiny(), PAPER.replace(sigma_orient=np.inf)
     nlp, _ = problem.nlp(weights, form())
-    exact = plain.energy(problem.soup, problem.data, weights)["orient"]
+    exact = oracle.energy(problem.soup, problem.data, weights)["orient"]
     assert by_term(nlp, nlp.x0, nlp.p)["orient"] == pytest.approx(exact, rel=1e-12)
 
 
@@ -161,7 +161,7 @@ def test_a_weight_scales_its_term_alone(name):
 @pytest.mark.parametrize("name", WORLDS)
 def test_a_rigid_plane_has_no_energy_at_the_truth(name, units, at_anchors):
     soup, data = world(name, units, at_anchors)
-    e = plain.energy(soup, data, PAPER)
+    e = oracle.energy(soup, data, PAPER)
     unit = 1.0 if units == "paper" else 100.0  # one radian is about 100 pixels
     assert e["arap"] <= 1e-12 * unit
     assert e["cont"] <= 1e-12 * unit / 0.005  # half a pixel of parallax at the least
@@ -188,7 +188,7 @@ def test_energy_is_positive_off_the_truth_and_each_term_reacts():
     rng = np.random.default_rng(0)
 
     def terms(**change) -> dict[str, float]:
-        return plain.energy(replace(soup, **change), data, PAPER)
+        return oracle.energy(replace(soup, **change), data, PAPER)
 
     turned = rotation.exp(rng.normal(0, 0.01, (12, 3))) @ soup.R
     e = terms(R=turned)

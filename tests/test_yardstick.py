@@ -12,7 +12,7 @@ from scipy import sparse
 from soup_nlp.bench import yardstick
 from soup_nlp.bench.yardstick import Yardstick, lbfgs, levenberg_marquardt
 from soup_nlp.config.problem import make_problem
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
@@ -50,7 +50,7 @@ def lm(case: Case) -> Yardstick:
 
 def check(case: Case, y: Yardstick) -> None:
     """What holds for every record."""
-    exact = plain.energy(y.soup, case.data, case.weights)
+    exact = oracle.energy(y.soup, case.data, case.weights)
     assert dict(y.energy) == exact
     assert exact["total"] == y.history[:, 1].min()
     assert y.history.shape[1] == 2
@@ -63,7 +63,7 @@ def check(case: Case, y: Yardstick) -> None:
 
 def test_levenberg_marquardt_lowers_the_energy(case, lm):
     check(case, lm)
-    before = plain.energy(case.soup, case.data, case.weights)["total"]
+    before = oracle.energy(case.soup, case.data, case.weights)["total"]
     assert lm.energy["total"] < 0.9 * before
     assert lm.history[0, 1] == pytest.approx(before, rel=0.05)
     assert str(lm).startswith("levenberg-marquardt")
@@ -91,7 +91,7 @@ def test_it_is_the_same_energy(case):
     )
     problem = yardstick._Tangent(case.soup, case.data, free, FORM)
     x = problem.project(problem.nlp.x0)
-    exact = plain.energy(problem.layout.unpack(x), case.data, free)["total"]
+    exact = oracle.energy(problem.layout.unpack(x), case.data, free)["total"]
     problem.smoothing(1e-7)
     assert problem.value(x) == pytest.approx(exact, rel=1e-5)
     problem.smoothing(1.0)
@@ -145,7 +145,7 @@ def test_one_analysis_serves_equal_patterns_alone():
     matrices = [plain, upper, other, third]
     for i, one in enumerate(matrices):
         assert [factor.same_pattern(one, m) for m in matrices] == [i == k for k in range(4)]
-    assert factor.same_pattern(plain, plain.copy())
+    assert factor.same_pattern(plain, oracle.copy())
 
 
 def test_a_matrix_without_its_diagonal_is_refused():

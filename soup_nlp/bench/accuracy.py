@@ -24,7 +24,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import sample_at_points, skill
 from soup_nlp.evaluate.protocols import Preset, preset
 from soup_nlp.evaluate.scene_flow import scene_flow_epe
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.pipeline.run import Run, run
 from soup_nlp.report.folder import prepare_folder, write_folder
 
@@ -177,7 +177,7 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
     }
     try:
         true = true_soup(result.pair, result.segmentation)
-        energy["truth"] = plain.energy(true.soup, result.data, result.weights)
+        energy["truth"] = oracle.energy(true.soup, result.data, result.weights)
     except DataError:
         pass  # most real pairs have no true motions
     row["energy"] = {k: dict(v) for k, v in energy.items()}

@@ -14,7 +14,7 @@ from soup_nlp.bench.accuracy import Job, Row, clean, flow_error, head
 from soup_nlp.bench.truth import rescaled, true_soup
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.geometry.soup import Soup, reconstruct
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import solver_options
 from soup_nlp.pipeline.run import Run, run
@@ -51,7 +51,7 @@ def energies(result: Run, convention: str = "paper") -> Row:
     true = true_soup(result.pair, result.segmentation)
 
     def energy(soup: Soup) -> dict[str, float]:
-        return plain.energy(soup, result.data, result.weights)
+        return oracle.energy(soup, result.data, result.weights)
 
     soups = {"start": result.start.soup, "solution": result.soup, "truth": true.soup}
     if len(np.unique(true.component)) > 1:

@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.optimize import minimize
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
@@ -165,7 +165,7 @@ class _Record:
     def note(self, soup: Soup) -> None:
         """Take the exact energy of an iterate."""
         wall, cpu = time.perf_counter(), time.process_time()
-        energy = plain.energy(soup, self.data, self.weights)
+        energy = oracle.energy(soup, self.data, self.weights)
         self.history.append((wall - self.wall, energy["total"]))
         if self.best is None or energy["total"] < self.best[0]["total"]:
             self.best = energy, soup

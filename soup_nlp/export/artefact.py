@@ -27,7 +27,7 @@ from soup_nlp.export.nl import write_nl
 from soup_nlp.export.residuals import EQUATIONS, Kind, kind, residual_table
 from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine, violations
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import GAUGES, MatrixLayout
 from soup_nlp.model.nlp import NLP
@@ -133,7 +133,7 @@ def export_case(
         },
         "nl": {"file": f"{STUB}.nl", "bytes": file.size, "sha256": file.sha256},
         "objective_at_start": float(nlp.oracle(nlp.x0, nlp.p)[0]),
-        "exact_energy_at_start": plain.energy(case.soup, case.data, case.weights),
+        "exact_energy_at_start": oracle.energy(case.soup, case.data, case.weights),
         "fingerprint": _fingerprint(case, nlp, layout),
         "best_known": best,
         "files": files,
@@ -267,7 +267,7 @@ def foreign_run(
     f = nlp.oracle(answer.x, nlp.p)[0]
     own = layout.unpack(answer.x)
     soup = own.retracted()
-    start, energy = (plain.energy(s, case.data, case.weights) for s in (case.start.soup, soup))
+    start, energy = (oracle.energy(s, case.data, case.weights) for s in (case.start.soup, soup))
     good = (
         answer.solved
         and r.within(LIMITS)

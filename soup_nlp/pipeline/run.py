@@ -17,7 +17,7 @@ from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import rigid_baseline, score
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
@@ -249,8 +249,8 @@ def _skipped(start: Soup, data: EnergyData, weights: Weights, form: FormulationO
         status="Skipped",
         converged=False,
         stages=(),
-        energy_start=plain.energy(start, data, weights),
-        energy=plain.energy(soup, data, weights),
+        energy_start=oracle.energy(start, data, weights),
+        energy=oracle.energy(soup, data, weights),
         residuals=constraint_residuals(soup, data.rim_ray, form.min_facing),
         multipliers={},
         nlp={},

@@ -2,7 +2,7 @@
 
 Every round draws particles around the current soup, lays the exact energy out over them as a
 pairwise MRF, finds a good joint choice with TRW-S, and goes on from there. The current belief is
-always particle 0 and a choice is taken only if `plain.energy` says that it is lower: E never
+always particle 0 and a choice is taken only if `oracle.energy` says that it is lower: E never
 rises. Feasibility holds by construction: rotations by the exponential map, normals on the sphere,
 positive distances, visibility by an infinite cost, the simplex by the free global scale.
 
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.mrf.trws import TRWSResult, solve_trws
@@ -95,7 +95,7 @@ def refine_soup(
     deadline = begin + o.max_seconds
     rays = data.visibility_ray(depth_ratio)
     best = upright(soup, data.anchor_ray, rays, min_facing).normalised(data.share).retracted()
-    energy = energy_begin = plain.energy(best, data, weights)
+    energy = energy_begin = oracle.energy(best, data, weights)
     pair_costs = PairCosts(data, weights)
     proposer = Proposer(data, neighbours(pair_costs.edges, data.anchor_ray), seed)
     shares = dict(SHARES)
@@ -135,7 +135,7 @@ def refine_soup(
         interrupted = result.status == "interrupted" and time.perf_counter() <= deadline
         labels = result.labels
         new = p.soup(labels, data.share).retracted()
-        new_energy = plain.energy(new, data, weights)
+        new_energy = oracle.energy(new, data, weights)
         taken = new_energy["total"] < energy["total"]
         if not taken:
             labels = np.zeros(len(best), np.int64)
@@ -229,7 +229,7 @@ def _costs(
 def length_slope(soup: Soup, data: EnergyData, weights: Weights, h: float = 1e-4) -> float:
     """`-dE / d log u`: by how much E rises when the scene's length unit shrinks, all else fixed."""
     up, down = (
-        plain.energy(
+        oracle.energy(
             soup, replace(data, edge_unit=data.edge_unit * s, pair_unit=data.pair_unit * s), weights
         )["total"]
         for s in (1 + h, 1 - h)
@@ -242,7 +242,7 @@ def _current_cost(unary: Float, best: Soup, data: EnergyData, weights: Weights) 
     own = unary[:, 0]
     if np.isfinite(own).all():
         return own
-    exact = weights.proj * plain.reprojection(best, data, weights)
+    exact = weights.proj * oracle.reprojection(best, data, weights)
     return np.where(np.isfinite(own), own, np.minimum(exact, 1e9))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.compile import compiler_seconds
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
@@ -139,7 +139,7 @@ def solve_soup(
     cpu.append(time.process_time())
 
     def energy(soup: Soup) -> float:
-        return plain.energy(soup, data, weights)["total"]
+        return oracle.energy(soup, data, weights)["total"]
 
     near = bool(stages) and _near(stages[-1])
     # where the presolve has come near its minimum, smoothing alone may have raised the exact energy
@@ -184,8 +184,8 @@ def solve_soup(
         status=stage.status,
         converged=stage.converged,
         stages=tuple(stages),
-        energy_start=plain.energy(start, data, weights),
-        energy=plain.energy(final, data, weights),
+        energy_start=oracle.energy(start, data, weights),
+        energy=oracle.energy(final, data, weights),
         residuals=residuals(nlp, final, stage, data, form.min_facing),
         multipliers=_multipliers(nlp, layout, stage),
         nlp=nlp.sizes(),

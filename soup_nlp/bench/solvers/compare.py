@@ -19,7 +19,7 @@ from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import form_label, parse_formulation
 from soup_nlp.export.verify import ENERGY_SLACK, Limits
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.report.folder import prepare_folder
@@ -41,7 +41,7 @@ def make_tasks(
         presolved: The case starts at the presolve's answer.
     """
     out: list[tuple[Label, Maker]] = []
-    ceiling = plain.energy(case.start.soup, case.data, case.weights)["total"]
+    ceiling = oracle.energy(case.start.soup, case.data, case.weights)["total"]
     for chosen in forms:
         form = case.formulation(**chosen, hessian="exact", compiled=False)
         label = {

@@ -18,7 +18,7 @@ from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import Answer, Task, Trace
 from soup_nlp.errors import DataError
 from soup_nlp.export.verify import Limits, kkt
-from soup_nlp.model import oracle as plain
+from soup_nlp.model import oracle
 from soup_nlp.storage.atomic import atomic_path
 from soup_nlp.storage.store import plain as jsonable
 from soup_nlp.storage.versions import code_version, versions
@@ -84,7 +84,7 @@ def run_row(task: Task, label: Mapping[str, Any], solver: str) -> Row:
         "seconds": ended.seconds,
         "cpu_seconds": ended.cpu_seconds,
         "peak_bytes": ended.peak_bytes,
-        "energy_start": plain.energy(task.soup, task.data, task.weights)["total"],
+        "energy_start": oracle.energy(task.soup, task.data, task.weights)["total"],
         "versions": versions(),
         "machine": f"{platform.system()} {platform.machine()}, {_processor()}",
     }
@@ -115,7 +115,7 @@ def _energy(task: Task, x: Float) -> float:
     with np.errstate(all="ignore"):
         try:
             soup = task.layout.unpack(x).retracted()
-            value = plain.energy(soup, task.data, task.weights)["total"]
+            value = oracle.energy(soup, task.data, task.weights)["total"]
         except np.linalg.LinAlgError:
             return float("inf")
     return float(value) if np.isfinite(value) else float("inf")
