@@ -1,10 +1,11 @@
-# make demo: solve the embedded default;  make test: lint, types, tests.  Needs Python 3.11+ only.
+# make demo: solve the embedded default;  make test: lint, types, tests;  make results: every table and
+# picture of results/ again (hours; DATA=folder of the real pairs).  Needs Python 3.11+ only.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/motorcycle
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint results clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/.installed: pyproject.toml
@@ -27,6 +28,9 @@ lint: $(VENV)/.installed
 
 test: lint $(VENV)/.optional
 	$(BIN)/python -m pytest
+
+results: $(VENV)/.optional
+	$(BIN)/soup-nlp bench all $(if $(DATA),--data $(DATA))
 
 clean:
 	rm -rf $(VENV) out

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from soup_nlp.bench.analyses_views import VIEWS, measure_view
 
 from soup_nlp.bench.accuracy import Job
-from soup_nlp.bench.analyses_views import VIEWS, measure_view
 from soup_nlp.bench.pair_views import cropped, mirrored
 from soup_nlp.bench.suites import Options, list_suite
 from soup_nlp.data.flow.consistency import leaves

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from skimage.measure import label
 
 from soup_nlp.data.datasets.driving import (
     load_kitti2012,
@@ -48,7 +49,8 @@ Float = NDArray[np.float64]
 
 FOLDER_LAYOUT = (
     "frame_0.png and frame_1.png (or image_ref.png and image_next.png), K.txt; optional "
-    "K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, flow.flo|png|npy, occluded.png, points.npz"
+    "K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, flow.flo|png|npy, occluded.png, moving.png, "
+    "points.npz"
 )
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp")
 _DEPTHS = (".npy", ".dpt", ".pfm", ".png")
@@ -86,7 +88,8 @@ def load_folder(
     - `frame_0.png` or `image_ref.png`; `frame_1.png` or `image_next.png`
     - `K.txt`: 3x3 intrinsics, or fx fy cx cy; `K_next.txt` if the next frame's differ
     - optional truth: `depth`, `depth_0` or `depth_ref` (.npy, .dpt, .pfm, 16-bit .png),
-      `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `occluded.png` (white = occluded)
+      `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `occluded.png` (white = occluded),
+      `moving.png` (white = moves by itself; every connected region is one component)
     - optional sparse truth `points.npz`: `uv_0` (M, 2) pixels and `xyz_mm_0` (M, 3) millimetres in
       the reference camera; z is converted to `unit` when that is "m" and kept when it is "mm".
       (`xyz_mm_1`, the same points in the next frame, has no place in `Truth` and is not read.)
@@ -125,12 +128,14 @@ def load_folder(
     depth_next = _find(folder, ("depth_next", "depth_1"), _DEPTHS)
     flow = _find(folder, ("flow",), _FLOWS)
     occluded = _find(folder, ("occluded",), _IMAGES)
+    moving = _find(folder, ("moving",), _IMAGES)
     points = folder / "points.npz"
     truth = Truth(
         depth_ref=read_depth(depth, depth_scale) if depth else None,
         depth_next=read_depth(depth_next, depth_scale) if depth_next else None,
         flow=read_flow(flow).astype(np.float64) if flow else None,
         occluded=read_mask(occluded) if occluded else None,
+        components=_moving_components(moving) if moving else None,
         points=_read_points(points, unit) if points.is_file() else None,
         unit=unit,
     )
@@ -142,6 +147,11 @@ def load_folder(
         truth=truth_or_none(truth),
         name=folder.resolve().name,
     )
+
+
+def _moving_components(path: Path) -> NDArray[np.int32]:
+    """(H, W) labels of the connected regions of a mask of moving pixels; 0 elsewhere."""
+    return np.asarray(label(read_mask(path), connectivity=2), np.int32)
 
 
 def _read_points(path: Path, unit: str) -> Float:
