@@ -251,7 +251,7 @@ def test_result_folders_are_the_same_for_workers_elsewhere(tmp_path, monkeypatch
     asked: list[Path | None] = []
 
     def stored(jobs, *_, **__):
-        asked.extend(job.folder for job in jobs)
+        asked.extend(job.work.args[0].keywords["folder"] for job in jobs)
         return []
 
     monkeypatch.setattr(bench_accuracy, "measure_all", stored)

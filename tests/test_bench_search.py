@@ -206,7 +206,7 @@ def test_every_variant_of_an_analysis_is_a_problem(name):
 
 
 def test_an_analysis_writes_table_and_plot(tmp_path, monkeypatch):
-    changed = analyses.replace(ANALYSES["neighbours"], measure=fake)
+    changed = analyses.replace(ANALYSES["neighbours"], function=fake)
     monkeypatch.setattr(analyses, "ANALYSES", {"neighbours": changed})
     listing = list_suite("rendered", None, Options(width=128, flows=("truth",), limit=2))
     path = run_analysis("neighbours", [listing], tmp_path, values=["4", "12", "30"])

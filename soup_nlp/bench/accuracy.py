@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from soup_nlp.bench.depth_maps import depth_maps, true_depth
 from soup_nlp.bench.rows import Job, Row, attempt
 from soup_nlp.bench.suites import SUITES, Item
-from soup_nlp.bench.truth import true_soup
+from soup_nlp.bench.truth import moves_by_itself, true_soup
 from soup_nlp.config.problem import Problem, dump_problem
 from soup_nlp.data.flow.sources import is_named, is_network
 from soup_nlp.data.pair import Pair, Truth
@@ -240,6 +240,7 @@ def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
     if truth is None or truth.components is None or truth.depth_ref is None:
         return None
     gt, label = truth.depth_ref, truth.components
+    label = np.where((label > 0) & ~moves_by_itself(truth)[label], 0, label)
     counts = convention.mask(gt) & np.isfinite(gt) & (gt > 0)
     own, rest = counts & (label > 0), counts & (label == 0)
     if not own.any() or not rest.any():

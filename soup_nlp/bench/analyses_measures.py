@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -11,7 +12,7 @@ from soup_nlp.bench.accuracy import flow_error, measure_pair
 from soup_nlp.bench.pair_views import cropped, mirrored
 from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suites import Item
-from soup_nlp.bench.truth import rescaled, true_soup
+from soup_nlp.bench.truth import moves_by_itself, rescaled, true_soup
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.robust import reweighted
 from soup_nlp.data.pair import Pair
@@ -82,11 +83,15 @@ def measure_energy(item: Item, overrides: tuple[str, ...] = (), variant: str = "
         return oracle.energy(soup, result.data, result.weights)
 
     soups = {"start": result.start.soup, "solution": result.soup, "truth": true.soup}
-    if len(np.unique(true.component)) > 1:
-        soups["truth rescaled"] = rescaled(true, lambda soup: energy(soup)["total"])
-    soups |= from_soup(result, true.soup)
-    p, truth = result.pair, result.pair.truth
+    truth = result.pair.truth
     assert truth is not None
+    if truth.components is not None:
+        own = moves_by_itself(truth)[true.component]
+        if own.any():
+            apart = replace(true, component=np.where(own, true.component, 0))
+            soups["truth rescaled"] = rescaled(apart, lambda soup: energy(soup)["total"])
+    soups |= from_soup(result, true.soup)
+    p = result.pair
     assert truth.depth_ref is not None
     metrics = {}
     for name, soup in soups.items():

@@ -76,9 +76,9 @@ def baseline(records: Sequence[Row], machine: Mapping[str, str]) -> dict[str, An
     Raises:
         DataError: a run failed, so it cannot be a baseline.
     """
-    failed = [r["key"] for r in records if failed(r)]
-    if failed or not records:
-        raise DataError("no baseline of runs that failed", found=", ".join(failed) or "no run")
+    bad = [r["key"] for r in records if failed(r)]
+    if bad or not records:
+        raise DataError("no baseline of runs that failed", found=", ".join(bad) or "no run")
     return {
         "version": VERSION,
         "machine": dict(machine),
