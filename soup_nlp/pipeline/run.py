@@ -14,7 +14,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.errors import SoupError
 from soup_nlp.evaluate.baselines import RigidBaseline
 from soup_nlp.evaluate.metrics import DepthMetrics
-from soup_nlp.evaluate.scoring import rigid_baseline, score
+from soup_nlp.evaluate.scoring import rigid_baseline, score_depths
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.model import oracle
@@ -219,6 +219,11 @@ def make_run(
     after = middle if refined is None else dense(refined.soup)
     between = middle if refined is not None and solution.stages else None
     rigid = rigid_baseline(pair)
+    depths = {"solution": after.depth_ref, "start": before.depth_ref}
+    if between is not None:
+        depths["nlp"] = between.depth_ref
+    if rigid is not None:
+        depths["rigid"] = rigid.depth
     return Run(
         problem=case.problem,
         pair=pair,
@@ -232,7 +237,7 @@ def make_run(
         start_reconstruction=before,
         reconstruction=after,
         rigid=rigid,
-        metrics=score(pair, before, after, rigid, expected.scale, expected.cap, between),
+        metrics=score_depths(pair.truth, depths, expected.scale, expected.cap, after.depth_next),
         seconds={},
         refined=refined,
         nlp_reconstruction=between,
