@@ -131,12 +131,17 @@ def depth_metrics(
 
 
 def true_pixels(truth: Float, cap: float | None) -> Mask:
-    """Where a true depth is known, positive and within the cap.
+    """Where a true depth is known, positive and within the cap."""
+    check_cap(cap)
+    return np.isfinite(truth) & (truth > 0) & (truth <= (np.inf if cap is None else cap))
+
+
+def check_cap(cap: float | None) -> None:
+    """Check that a depth cap is positive or None.
 
     Raises:
-        DataError: the cap is not positive.
+        DataError: it is not; NaN is not.
     """
-    # false for NaN too
     if cap is not None and not cap > 0:
         raise DataError(
             "depth cap must be positive",
@@ -144,7 +149,6 @@ def true_pixels(truth: Float, cap: float | None) -> Mask:
             found=cap,
             expected="a depth in the unit of the truth, such as 70",
         )
-    return np.isfinite(truth) & (truth > 0) & (truth <= (np.inf if cap is None else cap))
 
 
 def _compared(

@@ -16,6 +16,7 @@ from soup_nlp.evaluate.baselines import RigidBaseline, rigid_depth
 from soup_nlp.evaluate.metrics import (
     DepthMetrics,
     Scale,
+    check_cap,
     depth_metrics,
     sample_at_points,
     true_pixels,
@@ -101,6 +102,7 @@ def evaluate(
         DataError: the cap is not positive, a file is missing, sizes differ, or the truth knows no
             pixel.
     """
+    check_cap(cap)
     tree = read_h5(Path(folder) / "result.h5")
     depths = {k: require(tree, f"depth/{v}") for k, v in DEPTHS.items() if v in tree["depth"]}
     gt = read_depth(Path(depth), depth_scale)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.errors import ExportError
 from soup_nlp.export.opcodes import number
-from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.storage.atomic import write_text
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -250,5 +250,4 @@ def write_sol(
     sizes = (len(rows), len(duals), len(variables), len(variables))
     values = [number(v) for v in np.asarray(x, float)[variables].tolist()]
     lines = [*head, "", OPTIONS, "3", "0", "1", "0", *map(str, sizes), *duals, *values]
-    with atomic_path(path) as temporary:
-        temporary.write_text("\n".join([*lines, f"objno 0 {code}"]) + "\n", encoding="utf-8")
+    write_text(path, "\n".join([*lines, f"objno 0 {code}"]) + "\n")

@@ -1,4 +1,4 @@
-"""What is given to a writer, looked at before anything is written."""
+"""Checks of the input of the .nl writers."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from soup_nlp.report.colour import (
     depth_range,
     draw_superpixels,
 )
-from soup_nlp.storage.atomic import PathLike, atomic_path
+from soup_nlp.storage.atomic import PathLike, atomic_path, write_bytes
 
 Float = NDArray[np.floating]
 Bar = tuple[Image, str, str]
@@ -251,5 +251,4 @@ def _encode(path: PathLike, array: NDArray[np.generic]) -> None:
     good, data = cv2.imencode(".png", array)
     if not good:
         raise DataError("image cannot be encoded as PNG", where=path, found=array.shape)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data.tobytes())
+    write_bytes(path, data.tobytes())

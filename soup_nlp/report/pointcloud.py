@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.atomic import PathLike, atomic_path
+from soup_nlp.storage.atomic import PathLike, write_bytes
 
 
 def write_ply(
@@ -53,8 +53,7 @@ def write_ply(
         *(f"property uchar {name}" for name in ("red", "green", "blue")),
         "end_header",
     ]
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(("\n".join(header) + "\n").encode("ascii") + table.tobytes())
+    write_bytes(path, ("\n".join(header) + "\n").encode("ascii") + table.tobytes())
     return len(table)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.atomic import PathLike, atomic_path
+from soup_nlp.storage.atomic import PathLike, atomic_path, write_text
 from soup_nlp.storage.versions import versions
 
 SCHEMA = 1
@@ -275,5 +275,4 @@ def write_json(path: PathLike, obj: object) -> None:
             written.
     """
     text = json.dumps(plain(obj), indent=2, ensure_ascii=False, allow_nan=False)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_text(path, text + "\n")
