@@ -15,7 +15,7 @@ from test_export import problem_of, write
 
 from soup_nlp.cli.main import main
 from soup_nlp.errors import ExportError
-from soup_nlp.export.artefact import import_sol
+from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.sol import write_sol
 
 

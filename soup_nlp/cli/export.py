@@ -13,15 +13,8 @@ import typer
 from soup_nlp.bench.solvers.compare import compare
 from soup_nlp.config.problem import dump_problem, load_problem
 from soup_nlp.errors import ExportError
-from soup_nlp.export.artefact import (
-    Imported,
-    export_case,
-    form_label,
-    import_sol,
-    parse_formulation,
-    sol_table,
-)
-from soup_nlp.export.bundles import FORMATS
+from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_formulation
+from soup_nlp.export.foreign import Imported, import_sol, sol_table
 from soup_nlp.export.residuals import residual_table, table_text
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.check import LIMITS, check_folder

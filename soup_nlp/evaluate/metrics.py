@@ -105,7 +105,7 @@ def depth_metrics(
     z, gt, coverage = _compared(estimate, truth, cap, mask)
     if z.size == 0:
         nan = float("nan")
-        return DepthMetrics(*[nan] * 8, scale, nan, cap, 0.0, 0)
+        return DepthMetrics(nan, nan, nan, nan, nan, nan, nan, nan, scale, nan, cap, 0.0, 0)
     s = _scale(z, gt, scale)
     z = s * z if clamp is None else np.clip(s * z, *clamp)
     gap = np.abs(gt - z)

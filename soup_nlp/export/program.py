@@ -1,4 +1,4 @@
-"""An NLP of kernels and tables taken apart into what the segments of a .nl file are made of."""
+"""An NLP of kernels and tables, taken apart into the parts of a .nl file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy import sparse
 
 from soup_nlp.errors import ExportError
 from soup_nlp.export.opcodes import PLUS, SUM, number
-from soup_nlp.export.split import Split, split
+from soup_nlp.export.split import split
 from soup_nlp.export.stamp import NOWHERE, Defined, Stamp
 from soup_nlp.export.template import DEFINED, Template, make_template
 from soup_nlp.model.kernel import Group
@@ -66,11 +66,11 @@ def take_apart(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Progr
     curved_rows, row_constant = np.zeros(ng, bool), np.zeros(ng)
     curved_objective, objective_constant = False, 0.0
     stamped = []
-    triplets: list[tuple[Float, Int, Int]] = []
+    linear: list[tuple[Float, Int, Int]] = [(np.zeros(0), np.zeros(0, int), np.zeros(0, int))]
     for group in groups:
+        name, table = group.kernel.name, group.table
         if not group.size:
             continue
-        name, table = group.kernel.name, group.table
         parts = split(group, theta)
         if not parts.nonlinear.numel():
             continue
@@ -82,58 +82,38 @@ def take_apart(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Progr
                     where=name,
                     hint="a kernel divides by a column that is 0 somewhere",
                 )
-        goal = _goal(parts, group)
+        goal = np.full((group.size, int(parts.objective)), OBJECTIVE)
+        if group.kernel.nc:
+            goal = np.concatenate([goal, table.rows], axis=1)
         stamped.append((template, table.index, goal))
-        triplets.append(_triplets(parts, group, goal))
+        row, column = goal[:, parts.row], table.index[:, parts.column]
+        linear.append((parts.coefficient.ravel(), row.ravel(), column.ravel()))
         for k in range(parts.nonlinear.numel()):
-            mine = (parts.row == k) & ~parts.is_linear
-            variables = table.index[:, parts.column[mine]]
-            objective = parts.objective and k == 0
-            (in_objective if objective else in_rows)[variables] = True
+            variables = table.index[:, parts.column[(parts.row == k) & ~parts.is_linear]]
             curved = template.roots[k] is not None
             constant = np.broadcast_to(template.constants[k], group.size)
-            if objective:
+            if parts.objective and k == 0:
+                in_objective[variables] = True
                 curved_objective |= curved
                 objective_constant += float(constant.sum())
             else:
+                in_rows[variables] = True
                 curved_rows[goal[:, k]] |= curved
                 np.add.at(row_constant, goal[:, k], constant)
-    curved_rows |= row_constant != 0
-    value, row, column = (
-        np.concatenate([t[i] for t in triplets]) if triplets else np.zeros(0, (float, int, int)[i])
-        for i in range(3)
-    )
-    inside = row != OBJECTIVE
+    # sums of triplets keep zeros: entries of nonlinear variables belong to the structure
+    value, row, column = (np.concatenate(column) for column in zip(*linear))
+    own = row == OBJECTIVE
     return Program(
         stamped=tuple(stamped),
-        jacobian=_sum(value[inside], row[inside], column[inside], (ng, nx)),
-        gradient=_sum(value[~inside], 0 * row[~inside], column[~inside], (1, nx)),
+        jacobian=sparse.csr_matrix((value[~own], (row[~own], column[~own])), (ng, nx)),
+        gradient=sparse.csr_matrix((value[own], (0 * row[own], column[own])), (1, nx)),
         in_rows=in_rows,
         in_objective=in_objective,
-        curved_rows=curved_rows,
+        curved_rows=curved_rows | (row_constant != 0),
         curved_objective=curved_objective,
         row_constant=row_constant,
         objective_constant=objective_constant,
     )
-
-
-def _goal(parts: Split, group: Group) -> Int:
-    """(E, m) row that each output adds to."""
-    first = np.full((group.size, int(parts.objective)), OBJECTIVE)
-    if not group.kernel.nc:
-        return first
-    return np.concatenate([first, group.table.rows], axis=1)
-
-
-def _triplets(parts: Split, group: Group, goal: Int) -> tuple[Float, Int, Int]:
-    """Values, rows and columns of the Jacobian's entries, element by element."""
-    row, column = goal[:, parts.row], group.table.index[:, parts.column]
-    return parts.coefficient.ravel(), row.ravel(), column.ravel()
-
-
-def _sum(value: Float, row: Int, column: Int, shape: tuple[int, int]) -> sparse.csr_matrix:
-    """Sparse sum of triplets that keeps zeros: the structure is the claim."""
-    return sparse.coo_matrix((value, (row, column)), shape=shape).tocsr()
 
 
 def orders(program: Program) -> tuple[Int, Int]:

@@ -1,4 +1,4 @@
-"""Linear from nonlinear: what of a kernel goes to J and G segments, and what to expressions."""
+"""Linear and nonlinear parts of a kernel: J and G segments, and expressions."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def outputs(kernel: Kernel) -> ca.SX:
 
 
 def require_opcodes(name: str, function: ca.Function) -> None:
-    """Every operation on the function's first input can be written.
+    """Check that every operation on the function's first input has an opcode.
 
-    This is asked of the expressions as they are: a part that is constant in pieces (`sign(a)`) has
-    a Jacobian entry that is a number, 0, and would be taken for a linear one.
+    The expressions are checked before they are split: a piecewise constant part such as `sign(a)`
+    has the number 0 in the Jacobian and would pass for a linear one.
 
     Raises:
         ExportError: an operation has no opcode; it is named.

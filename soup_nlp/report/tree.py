@@ -136,13 +136,14 @@ def result_tree(run: Run) -> Tree:
         "nlp_ref": None if nlp is None else nlp.depth_ref,
     }
     flow = {"flow": pair.flow.uv, "confidence": pair.flow.confidence}
+    start = vars(run.start) | {"bending": np.float64(run.start.bending)}
     truth = pair.truth
     return {
         "input": _arrays(_INPUT, {"K_ref": pair.K_ref, "K_next": pair.K_next, **flow}),
         "segmentation": _arrays(_SEGMENTATION, run.segmentation),
         "energy": _arrays(_ENERGY, run.data.arrays()),
         "weights": _weights(run),
-        "start": _arrays(_SOUP, run.start.soup) | _arrays(_START, run.start),
+        "start": _arrays(_SOUP, run.start.soup) | _arrays(_START, start),
         "solution": _arrays(_SOUP, run.soup),
         "nlp": _arrays(_SOUP, run.solution.soup),
         "refine": _refine(run),
