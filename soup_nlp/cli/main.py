@@ -155,7 +155,7 @@ def solve(
                 chosen,
                 listener=teller.iteration,
                 stop=stop,
-                say=teller.say,
+                log=teller.say,
                 ipopt_log=str(folder / "ipopt.log"),
             )
             if interrupt.aborted:

@@ -192,4 +192,4 @@ def foreign_run(
     )
     chosen = {k: getattr(form, k) for k in CHOICES}
     problem = case.problem.replace(formulation=case.problem.formulation.replace(**chosen))
-    return make_run(replace(case, problem=problem), solution, own, "constrained NLP")
+    return make_run(replace(case, problem=problem), solution)
