@@ -1,6 +1,6 @@
 """Writers of AMPL's .nl text format, for NLPs of kernels and tables and for plain SX NLPs.
 
-Every kernel's expression is traced once and filled in once per element (`template`, `stamp`).
+Every kernel's expression is traced once and filled in once per element (`template`, `body`).
 Variables and constraints are in the order that the format demands (nonlinear in both, in
 constraints, in the objective, linear; nonlinear rows before linear ones): `NLFile` says where each
 went. After D. M. Gay, "Writing .nl files" (2005), and the AMPL/MP reader.
@@ -18,7 +18,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.export.program import Body, orders, take_apart
+from soup_nlp.export.body import Body
+from soup_nlp.export.program import orders, take_apart
 from soup_nlp.export.segments import bounds, header, linear, start
 from soup_nlp.export.validate import (
     plain_problem,
