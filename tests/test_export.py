@@ -13,8 +13,6 @@ import pytest
 from helpers_sol import write_sol
 from test_nl import ReadBack, close
 
-from soup_nlp.bench.solvers.plugins import plugin
-from soup_nlp.bench.solvers.task import Task
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ConfigError, ExportError
@@ -25,6 +23,7 @@ from soup_nlp.export.residuals import kind, residual_table, table_text
 from soup_nlp.export.verify import Limits, examine, kkt, violations
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
+from soup_nlp.solve.stages import solve_soup
 
 PROBLEMS = Path(__file__).parent.parent / "problems"
 TINY = [
@@ -108,16 +107,13 @@ def answer(folder: Path, name: str, move: float = 0.0, code: int = 0) -> Path:
 
 
 @pytest.fixture(scope="module")
-def optimum(exported, tmp_path_factory):
-    """Point and multipliers of a local minimum of the exported problem."""
-    case, nlp, layout, _, _ = problem_of(exported)
-    task = Task(
-        nlp, nlp, layout, case.soup, case.data, case.weights, case.formulation(),
-        Limits(seconds=60, iterations=500, tol=1e-6), tmp_path_factory.mktemp("optimum"),
-    )  # fmt: skip
-    found = plugin("ipopt-tuned", task)
-    assert found.claimed, found.status
-    return found.x, found.lam_g
+def optimum(exported):
+    """Point and multipliers of a local minimum of the exported problem, by presolve and Ipopt."""
+    case, _, _, _, _ = problem_of(exported)
+    form = case.formulation(hessian="exact", compiled=False)
+    found = solve_soup(case.start.soup, case.data, case.weights, form, case.options)
+    assert found.converged, found.status
+    return found.stages[-1].x, found.stages[-1].lam_g
 
 
 def test_a_solution_becomes_depth_maps(exported, optimum, tmp_path, capsys):
