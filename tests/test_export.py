@@ -20,7 +20,7 @@ from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.residuals import kind, residual_table, table_text
-from soup_nlp.export.verify import Limits, examine, kkt, violations
+from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.stages import solve_soup
@@ -159,7 +159,7 @@ def test_verified_means_optimal(exported, optimum, tmp_path, capsys):
 def test_what_is_not_a_number_is_not_verified(exported, optimum):
     _, nlp, _, _, _ = problem_of(exported)
     x, lam = optimum
-    assert kkt(nlp, x, lam).within(Limits())
+    assert examine(nlp, x, lam).residuals.within(Limits())
     bad = x.copy()
     bad[3] = np.nan
     assert violations(nlp, bad)["bounds"].max() == np.inf

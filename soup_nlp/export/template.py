@@ -58,7 +58,7 @@ class _Graph:
         return len(self.op) - 1
 
 
-def _trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
+def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
     """Instructions of the outputs; a number is a scalar, or (E,) where it depends on the data."""
     kernel, table = group.kernel, group.table
     function = ca.Function("f", [kernel.x, kernel.row, kernel.theta], [ca.densify(outputs)])
@@ -150,7 +150,7 @@ def make_template(name: str, outputs: ca.SX, group: Group, theta: Float) -> Temp
     Raises:
         ExportError: an operation has no .nl opcode.
     """
-    graph = _trace(name, outputs, group, theta)
+    graph = trace(name, outputs, group, theta)
     names = _defined(graph, group)
     defined = tuple((n, _emit(graph, n, names)) for n in sorted(names))
     roots: list[Text | None] = []
