@@ -1,10 +1,11 @@
-# make demo: solve the embedded default;  make test: lint, types, tests.  Needs Python 3.11+ only.
+# make demo: solve the embedded default;  make test: lint, types, tests;  make quick: the fast tests.
+# Needs Python 3.11+ only.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/motorcycle
 
-.PHONY: demo test lint clean
+.PHONY: demo test quick lint clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/.installed: pyproject.toml
@@ -27,6 +28,9 @@ lint: $(VENV)/.installed
 
 test: lint $(VENV)/.optional
 	$(BIN)/python -m pytest
+
+quick: $(VENV)/.installed
+	$(BIN)/python -m pytest -m 'not slow'
 
 clean:
 	rm -rf $(VENV) out

@@ -57,9 +57,9 @@ def weights_for(units: str, truncated: bool = True) -> Weights:
     """Weights whose truncations cut some elements and spare others."""
     w = TRUNCATED if truncated else PAPER
     if units == "pixels":
-        w = replace(w, sigma_cont=6.0)
+        w = w.replace(sigma_cont=6.0)
         if truncated:
-            w = replace(w, sigma_cont_ref=5.0, sigma_arap=12.0)
+            w = w.replace(sigma_cont_ref=5.0, sigma_arap=12.0)
     return w
 
 
