@@ -24,7 +24,7 @@ from soup_nlp.data.flow.sources import (
 )
 from soup_nlp.data.formats import write_flo, write_kitti_flow
 from soup_nlp.data.pair import Flow, Pair, Truth
-from soup_nlp.errors import DataError
+from soup_nlp.errors import ConfigError, DataError
 
 K = np.array([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]])
 
@@ -118,7 +118,7 @@ def test_dis_confidence_drops_where_nothing_matches() -> None:
 @pytest.mark.parametrize("preset", ["ultrafast", "fast", "medium"])
 def test_dis_options(finest_scale: int, preset: str) -> None:
     first, second = shifted(64, 80, 1, 0)
-    flow = dis_flow(first, second, finest_scale, preset=preset, support=1)
+    flow = dis_flow(first, second, finest_scale=finest_scale, preset=preset, support=1)
     assert np.isfinite(flow.uv).all()
 
 
@@ -137,7 +137,7 @@ def test_dis_options(finest_scale: int, preset: str) -> None:
 )
 def test_dis_option_errors(option: dict) -> None:
     first, second = shifted(20, 20, 0, 0)
-    with raises(rf"out of range[\s\S]*{next(iter(option))}"):
+    with pytest.raises(ConfigError, match=rf"does not fit[\s\S]*{next(iter(option))}"):
         dis_flow(first, second, **option)
 
 

@@ -192,7 +192,7 @@ def _write(model: Section, pad: str) -> Iterator[str]:
             yield f"{pad}{key}:{comment}"
             yield from _write(value, pad + "  ")
         else:
-            flow = None if isinstance(value, list | dict) else False
+            flow = None if isinstance(value, list | tuple | dict) else False
             text = yaml.dump({key: value}, Dumper=_Dumper, default_flow_style=flow, width=10**6)
             yield f"{pad}{text.rstrip()}{comment}"
 
