@@ -9,10 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers_files import write_flo, write_kitti_flow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soup_nlp.data.datasets import folders as datasets
+from soup_nlp.data.datasets.driving import load_kitti
 from soup_nlp.data.flow import sources as flow_module
 from soup_nlp.data.flow.sources import (
     dis_flow,
@@ -22,7 +23,6 @@ from soup_nlp.data.flow.sources import (
     resolve_flow,
     round_trip_error,
 )
-from soup_nlp.data.formats import write_flo, write_kitti_flow
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.errors import ConfigError, DataError
 
@@ -257,7 +257,7 @@ def test_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_dis_on_kitti(
     shared_data: Path, index: int, median: float, outliers: float, trusted: float
 ) -> None:
-    pair = datasets.load_kitti2012(shared_data / "kitti2012", index)
+    pair = load_kitti("kitti2012", shared_data / "kitti2012", index)
     assert pair.truth is not None
     assert pair.truth.flow is not None
     flow = resolve_flow(pair, "dis")

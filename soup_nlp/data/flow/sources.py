@@ -26,8 +26,8 @@ from soup_nlp.data.flow.guided import guided_flow
 from soup_nlp.data.flow.learned import MODELS, learned_flow
 from soup_nlp.data.flow.noise import PREFIX, noise_level, noisy
 from soup_nlp.data.flow.rlof import rlof_flow
-from soup_nlp.data.formats.flow_files import read_flow
 from soup_nlp.data.formats.images import PathLike
+from soup_nlp.data.formats.map_files import read_flow
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
 from soup_nlp.schema.section import Positive, Section, Share
@@ -169,7 +169,7 @@ def load_flow(path: PathLike, shape: tuple[int, int]) -> Flow:
     """A Flow of a file (.flo, KITTI .png, .npy): confidence 1 where the file knows it, else 0.
 
     Args:
-        path: Flow file, see `soup_nlp.data.formats.read_flow`.
+        path: Flow file, see `soup_nlp.data.formats.map_files.read_flow`.
         shape: (H, W) of the reference image.
 
     Raises:
