@@ -15,13 +15,12 @@ from hypothesis import strategies as st
 
 from soup_nlp.data.datasets.driving import load_kitti
 from soup_nlp.data.flow import sources as flow_module
+from soup_nlp.data.flow.consistency import leaves, round_trip_error
 from soup_nlp.data.flow.sources import (
     dis_flow,
     flow_from_truth,
-    leaves,
     load_flow,
     resolve_flow,
-    round_trip_error,
 )
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.errors import ConfigError, DataError

@@ -107,11 +107,7 @@ def load_folder(
         unit=unit,
     )
     return make_pair(
-        images,
-        [K, K if K_next is None else K_next],
-        truth,
-        folder.resolve().name,
-        white,
+        images, [K, K if K_next is None else K_next], truth, folder.resolve().name, white
     )
 
 

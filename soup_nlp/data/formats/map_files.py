@@ -3,6 +3,9 @@
 In memory a flow is (H, W, 2) float64 of float32 precision, displacement (u right, v down) in
 pixels, NaN in both components where unknown. A depth is (H, W) float64, z along the optical axis,
 NaN where unknown; zero, negative and infinite depths count as unknown.
+
+Every reader raises `DataError` for a file that is missing, empty, of another format, of an
+impossible size, or longer or shorter than its header says.
 """
 
 from __future__ import annotations
@@ -132,10 +135,6 @@ def read_flo(path: PathLike) -> Float:
 
     Returns:
         (H, W, 2) float64, pixels; NaN where a component is NaN or larger than 1e9 in magnitude.
-
-    Raises:
-        DataError: the file is missing, has another magic number or an impossible size, or its
-            length does not fit its header.
     """
     return _known_flow(_read_pieh(path, (2,), "flow file"), path)
 
@@ -153,9 +152,6 @@ def read_kitti_flow(path: PathLike) -> Float:
 
     Returns:
         (H, W, 2) float64, pixels; NaN where not valid.
-
-    Raises:
-        DataError: the file is missing, damaged, or no 16-bit PNG with three channels.
     """
     return (_read_flow_png(path, "KITTI flow") - 2.0**15) / 64.0
 
@@ -168,9 +164,6 @@ def read_vkitti_flow(path: PathLike) -> Float:
 
     Returns:
         (H, W, 2) float64, pixels; NaN where invalid.
-
-    Raises:
-        DataError: the file is missing, damaged, or no 16-bit PNG with three channels.
     """
     unit = 2.0 / 65535.0 * _read_flow_png(path, "Virtual KITTI flow") - 1.0
     height, width = unit.shape[:2]
@@ -216,9 +209,6 @@ def read_dpt(path: PathLike) -> Float:
 
     Returns:
         (H, W) float64 depth in scene units (metres in Sintel); NaN where unknown.
-
-    Raises:
-        DataError: as `read_flo`.
     """
     return _known_depth(_read_pieh(path, (), "depth file"), path)
 
@@ -230,9 +220,6 @@ def read_pfm(path: PathLike) -> Float:
 
     Returns:
         (H, W) float64; NaN where unknown.
-
-    Raises:
-        DataError: the file is missing, in colour, has a damaged header, or its length is wrong.
     """
     content = read_bytes(path, "PFM file")
     if content[:2] == b"PF":
@@ -284,9 +271,6 @@ def read_vkitti_depth(path: PathLike) -> Float:
 
     Returns:
         (H, W) float64 depth, metres; NaN for the sky and unknown pixels.
-
-    Raises:
-        DataError: the file is missing, damaged or not 16-bit grey.
     """
     depth = read_depth_png16(path, 100.0)
     depth[depth >= VKITTI_SKY / 100.0] = np.nan
