@@ -11,6 +11,7 @@ import pytest
 
 from soup_nlp.cli import main as cli
 from soup_nlp.cli import solve as solve_module
+from soup_nlp.config.problem import load_problem
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import SceneInput
 from soup_nlp.pipeline import case as cases
@@ -111,7 +112,7 @@ def test_files_that_are_being_written_are_written(tmp_path, monkeypatch, capfd):
 
 
 def test_a_run_of_python_says_it_too():
-    problem = cli.load_problem(ORBIT, [word for word in SMALL if word != "--set"])
+    problem = load_problem(ORBIT, [word for word in SMALL if word != "--set"])
     with interruptible() as stop:
         ctrl_c()
         with pytest.raises(StoppedError, match="load"):

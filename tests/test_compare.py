@@ -23,7 +23,7 @@ from soup_nlp.bench.solvers.runner import compare
 from soup_nlp.bench.solvers.task import Answer, Task, Trace
 from soup_nlp.cli.main import main
 from soup_nlp.errors import SolverError
-from soup_nlp.export.verify import Limits, kkt
+from soup_nlp.export.verify import Limits, examine
 from soup_nlp.model.formulation import Formulation
 
 PROBLEMS = Path(__file__).parent.parent / "problems"
@@ -150,12 +150,13 @@ def test_a_false_claim_is_seen(task, tmp_path, monkeypatch):
 
 def test_residuals_of_known_points(task):
     nlp = task.nlp
-    start = kkt(nlp, nlp.x0, None)
+    start = examine(nlp, nlp.x0, None).residuals
     assert start.primal < 1e-9
     assert start.dual > 1e-2
     assert not start.within(task.limits)
     # multipliers that are not numbers are not used
-    assert kkt(nlp, nlp.x0, np.full(nlp.ng, np.nan)).multipliers == "least squares"
+    found = examine(nlp, nlp.x0, np.full(nlp.ng, np.nan)).residuals
+    assert found.multipliers == "least squares"
 
 
 def test_runs_resume_and_a_cut_line_is_run_again(task, tmp_path, monkeypatch):

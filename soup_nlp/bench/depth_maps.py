@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.bench.piecewise_planar import fit_planes, plane_depth, points_as_map
-from soup_nlp.evaluate.baselines import constant_depth, fill_nearest
+from soup_nlp.evaluate.baselines import fill_nearest
 from soup_nlp.geometry.soup import Soup, reconstruct
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def depth_maps(run: Run) -> dict[str, Float]:
         return out
     whole = np.zeros(labels.shape, np.int32)
     out["plane"] = plane_depth(fit_planes(whole, truth, pair.K_ref), whole, pair.K_ref)
-    out["constant"] = constant_depth(pair.size)
+    out["constant"] = np.ones(pair.size)
     if np.count_nonzero(np.isfinite(truth)) >= SPARSE * len(seg):
         out["floor"] = plane_depth(fit_planes(labels, truth, pair.K_ref), labels, pair.K_ref)
     return out

@@ -21,7 +21,6 @@ from soup_nlp.bench.rows import Job, Row, Say, alone, measure_all
 from soup_nlp.config.problem import Problem, dump_problem, make_problem
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.pipeline import Case, make_run, prepare
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.solve.solver_options import SolverOptions
@@ -182,15 +181,13 @@ def measure(spec: Spec) -> dict[str, Any]:
     """
     clocks = Clocks()
     problem = problem_of(spec)
-    case = prepare(problem, lap=clocks.lap)
+    case = prepare(problem, on_stage=clocks.lap)
     clocks.lap("weights")
     with clocks.stage("nlp"):
         solution = solve_soup(case.soup, case.data, case.weights, case.formulation(), case.options)
     clocks.cpu["compiler"] = solution.seconds["compile"]
     with clocks.stage("evaluation"):
-        form = case.formulation()
-        answer = MatrixLayout(case.data.share, form.gauge).unpack(solution.stages[-1].x)
-        run = make_run(case, solution, answer, solution.delivered)
+        run = make_run(case, solution)
     run = replace(run, seconds=dict(clocks.wall))
     with clocks.stage("output"), tempfile.TemporaryDirectory() as folder:
         write_folder(prepare_folder(folder), run, dump_problem(problem), "")

@@ -5,13 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from soup_nlp.bench.pair_views import cropped
@@ -19,7 +16,7 @@ from soup_nlp.bench.rows import Row, Say
 from soup_nlp.bench.studies import made_on, run_study, settings_table
 from soup_nlp.bench.tables import table
 from soup_nlp.config.problem import make_problem
-from soup_nlp.mrf.order import node_levels, node_order
+from soup_nlp.mrf.levels import colours
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.pipeline.run import run
 
@@ -35,10 +32,7 @@ CUT_OFF_HEAD = (
 )
 NODES, LABELS, NEIGHBOURS = 1000, 50, 15
 """Sizes of the TRW-S study."""
-TRWS_HEAD = (
-    "order", "precision", "tables", "edges", "levels", "ms an iteration", "least", "MiB",
-    "bound", "energy",
-)  # fmt: skip
+TRWS_HEAD = ("precision", "edges", "levels", "ms an iteration", "least", "MiB", "bound", "energy")
 
 
 def measure_cut_off(scene: str, seed: int, superpixels: int, lower: float) -> Row:
@@ -94,7 +88,7 @@ def study_cut_off(
     return run_study(out / "cut_off.md", settings, measure_cut_off, text, say)
 
 
-def measure_trws(source: str, dtype: str, order: Any, iterations: int) -> Row:
+def measure_trws(dtype: str, iterations: int) -> Row:
     """Levels, milliseconds an iteration, bound and energy of TRW-S on a random graph."""
     points = np.random.default_rng(0).random((NODES, 2))
     near = cKDTree(points).query(points, NEIGHBOURS + 1)[1][:, 1:]
@@ -103,27 +97,22 @@ def measure_trws(source: str, dtype: str, order: Any, iterations: int) -> Row:
     rng = np.random.default_rng(1)
     unary = rng.random((NODES, LABELS))
     seed = rng.random((LABELS, LABELS)).astype(dtype)
-
-    def pairwise(ids: NDArray[Any]) -> NDArray[Any]:
-        return np.asarray(seed * (1.0 + (ids % 7)[:, None, None].astype(dtype)))
-
+    tables = seed * (1.0 + (np.arange(len(edges)) % 7)[:, None, None].astype(dtype))
     stamps: list[float] = []
     result = solve_trws(
         unary,
         edges,
-        pairwise(np.arange(len(edges))) if source == "array" else pairwise,
-        order=order,
+        tables,
         dtype=np.dtype(dtype),
         max_iter=iterations,
         gap=-1.0,
         stagnation=-1.0,
-        keep_tables=source == "array",
         callback=lambda *_: stamps.append(time.perf_counter()),
     )
     each = 1e3 * np.diff(stamps)
     return {
         "edges": len(edges),
-        "levels": int(node_levels(node_order(order, NODES, edges), edges).max()) + 1,
+        "levels": int(colours(NODES, edges).max()) + 1,
         "milliseconds": [float(np.median(each)), float(each.min())],
         "bound": result.lower_bound,
         "energy": result.energy,
@@ -134,9 +123,8 @@ def study_trws(out: Path, iterations: int, say: Say | None = None) -> list[Row]:
     """Write OUT/trws.md."""
 
     def cells(row: Row) -> list[str]:
-        own = row["settings"]
         return [
-            *(own[k] for k in ("order", "dtype", "source")),
+            row["settings"]["dtype"],
             *(str(row[k]) for k in ("edges", "levels")),
             *(f"{ms:.1f}" for ms in row["milliseconds"]),
             f"{row['peak_bytes'] / 2**20:.0f}",
@@ -144,11 +132,6 @@ def study_trws(out: Path, iterations: int, say: Say | None = None) -> list[Row]:
         ]
 
     note = f"TRW-S at {NODES} nodes and {LABELS} labels, {iterations} iterations. {made_on()}"
-    settings = [
-        {"source": source, "dtype": dtype, "order": order, "iterations": iterations}
-        for source, dtype, order in product(
-            ("array", "streamed"), ("float64", "float32"), ("colour", "input")
-        )
-    ]
+    settings = [{"dtype": dtype, "iterations": iterations} for dtype in ("float64", "float32")]
     text = settings_table(note, TRWS_HEAD, cells)
     return run_study(out / "trws.md", settings, measure_trws, text, say)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from soup_nlp.cli.import_ import foreign_verdict
-from soup_nlp.export.artefact import import_sol, sol_table
+from soup_nlp.export.foreign import import_sol, sol_table
 from soup_nlp.export.residuals import residual_table, table_text
 from soup_nlp.report.check import LIMITS, check_folder
 from soup_nlp.storage.store import read_h5

@@ -11,8 +11,7 @@ import typer
 
 from soup_nlp.cli.options import Formulations, Out, Presolve, Problem, Quiet, Set, Superpixels
 from soup_nlp.config.problem import load_problem
-from soup_nlp.export.artefact import export_case, form_label, parse_formulation
-from soup_nlp.export.bundles import FORMATS
+from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_formulation
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.folder import prepare_folder
 

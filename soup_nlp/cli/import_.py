@@ -10,7 +10,7 @@ import typer
 
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import ExportError
-from soup_nlp.export.artefact import Imported, import_sol
+from soup_nlp.export.foreign import Imported, import_sol
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.verdict import accuracy, protocol
 

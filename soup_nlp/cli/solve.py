@@ -14,7 +14,7 @@ from rich.console import Console
 
 from soup_nlp.cli.options import Out, Set
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
-from soup_nlp.data.flow.sources import is_named
+from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError
 from soup_nlp.pipeline.run import run as run_problem
@@ -136,7 +136,7 @@ def solve(
                 chosen,
                 listener=log.iteration,
                 stop=stop,
-                say=log.say,
+                log=log.say,
                 ipopt_log=str(folder / "ipopt.log"),
             )
             if interrupt.aborted:
@@ -176,9 +176,7 @@ def _camera(text: str, option: str) -> list[float] | str:
 
 def _flow_source(text: str) -> str:
     """A flow source with its path, if it is one, from the working directory."""
-    if is_named(text) or not (Path(text).suffix or "/" in text):
-        return text
-    return str(Path(text).expanduser().resolve())
+    return str(Path(text).expanduser().resolve()) if is_path(text) else text
 
 
 def _from_options(

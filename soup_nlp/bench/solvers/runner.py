@@ -17,7 +17,7 @@ from soup_nlp.bench.rows import Job, Row, isolated, measure_all, processor, read
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import Answer, Task, Trace
 from soup_nlp.export.artefact import form_label
-from soup_nlp.export.verify import ENERGY_SLACK, Limits, kkt
+from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case
@@ -155,8 +155,8 @@ def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
     row["energy"] = _energy(task, answer.x)
     if not np.isfinite(answer.x).all():
         return row
-    residuals = kkt(task.nlp, answer.x, answer.lam_g)
-    row |= residuals.as_dict()
+    residuals = examine(task.nlp, answer.x, answer.lam_g).residuals
+    row |= vars(residuals)
     row["objective"] = float(task.nlp.oracle(answer.x, task.nlp.p)[0])
     good = residuals.within(task.limits) and row["energy"] <= energy_limit
     row["verified"] = bool(row["claimed"] and good)
