@@ -1,11 +1,12 @@
-# make demo: solve the embedded default;  make test: lint, types, tests;  make quick: the fast tests.
+# make demo: solve the embedded default;  make test: lint, types, tests;  make quick: the fast tests;
+# make results: every table and picture of results/ again (hours; DATA=folder of the real pairs).
 # Needs Python 3.11+ only.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/motorcycle
 
-.PHONY: demo test quick lint clean
+.PHONY: demo test quick lint results clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/.installed: pyproject.toml
@@ -31,6 +32,9 @@ test: lint $(VENV)/.optional
 
 quick: $(VENV)/.installed
 	$(BIN)/python -m pytest -m 'not slow'
+
+results: $(VENV)/.optional
+	$(BIN)/soup-nlp bench all $(if $(DATA),--data $(DATA))
 
 clean:
 	rm -rf $(VENV) out
