@@ -260,6 +260,7 @@ def no_windows():
     matplotlib.use(backend)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_windows")
 def test_a_pair_becomes_pictures():
     names = runpy.run_path(str(NOTEBOOKS / "pair_to_pictures.py"))
@@ -268,6 +269,7 @@ def test_a_pair_becomes_pictures():
     assert len(plt.get_fignums()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_windows")
 def test_a_file_becomes_depth_by_another_solver(monkeypatch):
     # POUNCE need not be here; CasADi's Ipopt is
