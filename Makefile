@@ -37,4 +37,4 @@ results: $(VENV)/.optional
 	$(BIN)/soup-nlp bench all $(if $(DATA),--data $(DATA))
 
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) out site

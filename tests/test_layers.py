@@ -1,4 +1,4 @@
-"""The house stands as DESIGN says: each room knows only the rooms before it."""
+"""Each room imports only the rooms before it, as docs/architecture.md says."""
 
 from __future__ import annotations
 
