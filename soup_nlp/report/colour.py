@@ -12,6 +12,9 @@ Float = NDArray[np.floating]
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
+ERROR_LIMIT = 0.2
+"""Relative depth error at the upper end of the colours."""
+
 _WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 
 
@@ -55,24 +58,21 @@ def colourise_depth(depth: Float, near: float | None = None, far: float | None =
     return _paint((1 / safe - 1 / far) / (1 / near - 1 / far), known, "turbo")
 
 
-def colourise_error(relative_error: Float, limit: float = 0.2) -> Image:
-    """Relative depth error in colour, from 0 (dark) to `limit` and above (bright).
+def colourise_error(relative_error: Float) -> Image:
+    """Relative depth error in colour, from 0 (dark) to `ERROR_LIMIT` and above (bright).
 
     The lowest tenth of the colour map is left out, so that a small error differs from black, the
     colour of the unknown.
 
     Args:
         relative_error: (H, W) |z_gt - z| / z_gt; black where not finite.
-        limit: Error at the upper end.
 
     Raises:
-        DataError: not a map, or a limit that is not positive.
+        DataError: not a map.
     """
     error = np.abs(as_map(relative_error, "relative_error"))
-    if not 0 < limit < np.inf:
-        raise DataError("error limit must be positive", where="limit", found=limit, expected="> 0")
     known = np.isfinite(error)
-    level = np.minimum(np.where(known, error, 0.0) / limit, 1.0)
+    level = np.minimum(np.where(known, error, 0.0) / ERROR_LIMIT, 1.0)
     return _paint(0.1 + 0.9 * level, known, "inferno")
 
 
@@ -144,10 +144,8 @@ def colourise_normals(n_map: Float) -> Image:
     return np.asarray(out)
 
 
-def draw_superpixels(
-    image: Image, labels: NDArray[np.integer], colour: tuple[int, int, int] = (255, 255, 0)
-) -> Image:
-    """The (H, W, 3) image with the boundaries of the labels (H, W) drawn one pixel wide.
+def draw_superpixels(image: Image, labels: NDArray[np.integer]) -> Image:
+    """The (H, W, 3) image with the boundaries of the labels (H, W) in yellow, one pixel wide.
 
     Raises:
         DataError: the image is not RGB, or the labels do not fit it.
@@ -159,7 +157,7 @@ def draw_superpixels(
     edge[:, :-1] |= labels[:, :-1] != labels[:, 1:]
     edge[:-1] |= labels[:-1] != labels[1:]
     out = image.copy()
-    out[edge] = np.asarray(colour, np.uint8)
+    out[edge] = (255, 255, 0)
     return out
 
 

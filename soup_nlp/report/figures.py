@@ -12,10 +12,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from soup_nlp.data.pair import Pair
+from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import depth_metrics, sample_at_points
 from soup_nlp.report.colour import (
+    ERROR_LIMIT,
     Image,
     as_map,
     check_rgb,
@@ -121,18 +122,16 @@ def _axes(figure: Figure, left: float, bottom: float, width: float, height: floa
 def overview(
     path: PathLike,
     pair: Pair,
-    *,
-    labels: NDArray[np.integer] | None = None,
-    depths: Mapping[str, Float] | None = None,
-    normals: Float | None = None,
-    limit: float = 0.2,
-    title: str | None = None,
+    labels: NDArray[np.integer],
+    depths: Mapping[str, Float],
+    normals: Float,
+    title: str,
 ) -> None:
     """Write the overview of a result: input, superpixels, flow, depths, truth, error, normals.
 
-    What is None is left out. The depths share one colour range, that of the truth (without one, of
-    the last of them), to which each is brought by the median ratio; a caption says the MRE by that
-    rule and the coverage. The error shown is that of the last depth.
+    The depths share one colour range, that of the truth (without one, of the last of them), to
+    which each is scaled by the median ratio; a caption holds the MRE by that rule and the coverage.
+    The error shown is that of the last depth.
 
     Args:
         path: PNG file to write; its folder must exist.
@@ -140,33 +139,33 @@ def overview(
         labels: (H, W) superpixels.
         depths: (H, W) z by stage, in order, such as "start", "solution", "refined".
         normals: (H, W, 3) unit normals.
-        limit: Relative error at the upper end of its colour bar.
-        title: Above the panels; None takes the name of the pair.
+        title: Above the panels.
 
     Raises:
         DataError: an array does not fit the pair, or the folder cannot be written.
     """
     panels: list[Panel] = [("reference frame", pair.image_ref), ("next frame", pair.image_next)]
-    if labels is not None:
-        count = f"{np.unique(labels).size} superpixels"
-        panels.append((count, draw_superpixels(pair.image_ref, labels)))
+    count = f"{np.unique(labels).size} superpixels"
+    panels.append((count, draw_superpixels(pair.image_ref, labels)))
     if pair.flow is not None:
+        panels.append((f"flow ({pair.flow.source})", flow_picture(pair.flow)))
         sure = np.clip(pair.flow.confidence, 0, 1).astype(np.float64)
-        uv = np.where(sure[:, :, None] > 0, pair.flow.uv, np.nan)
-        panels.append((f"flow ({pair.flow.source})", colourise_flow(uv)))
         grey = np.repeat((255 * sure).round().astype(np.uint8)[:, :, None], 3, axis=2)
         panels.append((f"confidence, {np.mean(sure > 0):.0%} above 0 (black)", grey))
-    panels += _depth_panels(pair, depths or {}, limit)
-    if normals is not None:
-        panels.append(("normals", colourise_normals(normals)))
-    overview_strip(path, panels, pair.name if title is None else title)
+    panels += _depth_panels(pair, depths)
+    panels.append(("normals", colourise_normals(normals)))
+    overview_strip(path, panels, title)
 
 
-def _depth_panels(pair: Pair, depths: Mapping[str, Float], limit: float) -> list[Panel]:
+def flow_picture(flow: Flow) -> Image:
+    """A flow in colour, black where it has no confidence."""
+    sure = (flow.confidence > 0)[..., None]
+    return colourise_flow(np.where(sure, flow.uv.astype(np.float64), np.nan))
+
+
+def _depth_panels(pair: Pair, depths: Mapping[str, Float]) -> list[Panel]:
     """Panels of the depths on one scale, of the true depth and of the relative error."""
     truth = pair.truth.depth_ref if pair.truth is not None else None
-    if truth is None and not depths:
-        return []
     common = truth if truth is not None else [*depths.values()][-1]
     maps = {name: _scaled(pair, name, z, common) for name, z in depths.items()}
     near, far = depth_range(common if truth is not None else [*maps.values()][-1][0])
@@ -181,9 +180,9 @@ def _depth_panels(pair: Pair, depths: Mapping[str, Float], limit: float) -> list
             known = (truth > 0) & (z > 0)
             error = np.full(truth.shape, np.nan)
             error[known] = np.abs(truth[known] - z[known]) / truth[known]
-            shown = colourise_error(np.linspace(0, limit, 64)[None], limit)
-            picture = colourise_error(error, limit)
-            out.append((f"relative error, {name}", picture, (shown, "0", f"{limit:g}")))
+            shown = colourise_error(np.linspace(0, ERROR_LIMIT, 64)[None])
+            bar = (shown, "0", f"{ERROR_LIMIT:g}")
+            out.append((f"relative error, {name}", colourise_error(error), bar))
     return out
 
 

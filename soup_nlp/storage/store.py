@@ -171,21 +171,17 @@ def read_h5(path: PathLike) -> ReadTree:
         return walk(file)
 
 
-def read_attrs(path: PathLike, name: str = "/") -> dict[str, Any]:
-    """Attributes of the root of a result file, or of the array or group `name` in it.
+def read_attrs(path: PathLike) -> dict[str, Any]:
+    """Root attributes of a result file.
 
-    `versions` comes back as a dict; other JSON texts as they were stored.
+    `versions` is returned as a dict, other JSON texts as they were stored.
 
     Raises:
-        DataError: the file is missing or is not HDF5, or has nothing of that name.
+        DataError: the file is missing or is not HDF5.
     """
     with _open(path) as file:
-        if name not in file:
-            raise DataError(
-                "result file has no such entry", where=path, found=sorted(file), expected=name
-            )
-        out = dict(file[name].attrs)
-    if name == "/" and isinstance(out.get("versions"), str):
+        out = dict(file.attrs)
+    if isinstance(out.get("versions"), str):
         out["versions"] = json.loads(out["versions"])
     return {k: v.item() if isinstance(v, np.generic) else v for k, v in out.items()}
 
