@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_files import write_flo
 
 from soup_nlp.bench.accuracy import Job
 from soup_nlp.bench.analyses_views import VIEWS, measure_view
 from soup_nlp.bench.pair_views import cropped, mirrored
 from soup_nlp.bench.suites import Options, list_suite
 from soup_nlp.data.flow.consistency import leaves
-from soup_nlp.data.formats.flow_files import write_flo
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError

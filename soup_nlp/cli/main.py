@@ -16,7 +16,7 @@ from rich.console import Console
 from soup_nlp.cli.bench import register as register_bench
 from soup_nlp.cli.export import register as register_export
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
-from soup_nlp.data.flow.sources import is_named
+from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.scenes.catalogue import SCENES
 from soup_nlp.errors import ConfigError, SoupError
@@ -195,9 +195,7 @@ def _camera(text: str, option: str) -> list[float] | str:
 
 def _flow_source(text: str) -> str:
     """A flow source with its path, if it is one, from the working directory."""
-    if is_named(text) or not (Path(text).suffix or "/" in text):
-        return text
-    return str(Path(text).expanduser().resolve())
+    return str(Path(text).expanduser().resolve()) if is_path(text) else text
 
 
 def _from_options(

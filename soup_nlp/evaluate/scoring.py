@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.formats import read_depth
+from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.baselines import RigidBaseline, rigid_depth

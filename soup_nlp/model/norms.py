@@ -38,14 +38,6 @@ class Norm:
     kind: Kind = "norm"
     leak: ca.SX | float = 0.0
 
-    def exact(self) -> ca.SX:
-        """The value in the energy that is reported."""
-        square = ca.dot(self.vector, self.vector)
-        y = square / 2 if self.kind == "half_square" else ca.sqrt(square)
-        if self.sigma is None:
-            return self.weight * y
-        return self.weight * ((1 - self.leak) * ca.fmin(y, self.sigma) + self.leak * y)
-
 
 @dataclass(frozen=True)
 class Form:

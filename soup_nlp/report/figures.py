@@ -219,8 +219,7 @@ def write_png(path: PathLike, rgb: Image) -> None:
 def write_clipped_depth_png16(path: PathLike, depth: Float, scale: float | None = None) -> float:
     """Write a depth map as 16-bit PNG: value = round(depth * scale), 0 where unknown.
 
-    A known depth is at least 1 in the file; what exceeds 65535 is written as 65535. Where a depth
-    that does not fit must be an error, as in a dataset, there is `data.formats.write_depth_png16`.
+    A known depth is at least 1 in the file; what exceeds 65535 is written as 65535.
 
     Args:
         path: File to write; its folder must exist.
