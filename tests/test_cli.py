@@ -12,8 +12,8 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from helpers_ply import read_ply
 from helpers_files import write_flo
+from helpers_ply import read_ply
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem, make_problem
