@@ -167,18 +167,8 @@ def run(
     case = prepare(problem, pair=pair, log=log, on_stage=clock)
 
     def nlp(soup: Soup) -> Solution:
-        form, options = case.formulation(), case.options
-        return solve_soup(
-            soup,
-            case.data,
-            case.weights,
-            form,
-            options,
-            listener=listener,
-            stop=stop,
-            say=log,
-            log_file=ipopt_log,
-        )
+        own = soup, case.data, case.weights, case.formulation(), case.options
+        return solve_soup(*own, listener=listener, stop=stop, say=log, log_file=ipopt_log)
 
     if problem.refine.enabled and problem.refine.from_start:
         solution = _skipped(case)
