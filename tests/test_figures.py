@@ -141,17 +141,6 @@ def test_overview_does_not_touch_global_state(tmp_path):
         assert not sys.modules["matplotlib.pyplot"].get_fignums()
 
 
-def test_overview_bad_input_leaves_the_old_file(tmp_path):
-    path = tmp_path / "a.png"
-    path.write_bytes(b"old")
-    with pytest.raises(DataError, match="at least one"):
-        overview_strip(path, [], "t")
-    with pytest.raises(DataError, match="8-bit RGB"):
-        overview_strip(path, [("grey", np.zeros((3, 3), np.uint8))], "t")
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["a.png"]
-
-
 def small_pair(**known):
     """8 x 6 pair with a flow that half of the pixels trust."""
     image = np.full((6, 8, 3), 90, np.uint8)
@@ -239,8 +228,6 @@ def test_overview_file(tmp_path):
     assert image.shape[1] == pytest.approx(100 * (3 * 4.28 + 0.08), abs=2)
     rows = 3 * (3.15 + 0.36)
     assert image.shape[0] == pytest.approx(100 * (0.42 + rows + 2 * 0.2), abs=2)
-    with pytest.raises(DataError, match="does not fit the pair"):
-        overview(tmp_path / "o.png", small_pair(), depths={"a": np.ones((5, 8))}, **given)
     assert os.listdir(tmp_path) == ["o.png"]
 
 
@@ -263,8 +250,6 @@ def test_png_round_trip(tmp_path):
     np.testing.assert_array_equal(back, rgb)
     with pytest.raises(DataError, match="does not exist"):
         write_png(tmp_path / "no" / "a.png", rgb)
-    with pytest.raises(DataError, match="8-bit RGB"):
-        write_png(tmp_path / "a.png", rgb.astype(float))
 
 
 def test_depth_png(tmp_path):
@@ -285,20 +270,3 @@ def test_depth_png_chooses_a_scale(tmp_path, unit):
     np.testing.assert_allclose(back / scale, z, atol=0.51 / scale, rtol=1e-3)
     assert back.max() > 32767
     assert write_clipped_depth_png16(tmp_path / "d.png", np.full((2, 2), np.nan)) > 0
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda: colourise_depth(np.zeros((2, 2, 1))), "shape"),
-        (lambda: colourise_depth(np.ones((2, 2)), 3.0, 2.0), "depth range"),
-        (lambda: colourise_flow(np.zeros((2, 2, 3))), "shape"),
-        (lambda: colourise_flow(np.zeros((2, 2, 2)), -1.0), "limit"),
-        (lambda: colourise_normals(np.zeros((2, 2))), "shape"),
-        (lambda: draw_superpixels(np.zeros((2, 2, 3), np.uint8), np.zeros((2, 3), int)), "labels"),
-        (lambda: write_clipped_depth_png16("x.png", np.ones((2, 2)), -1.0), "scale"),
-    ],
-)
-def test_bad_input(call, words):
-    with pytest.raises(DataError, match=words):
-        call()

@@ -18,8 +18,6 @@ from soup_nlp.evaluate.metrics import depth_metrics, sample_at_points
 from soup_nlp.report.colour import (
     ERROR_LIMIT,
     Image,
-    as_map,
-    check_rgb,
     colourise_depth,
     colourise_error,
     colourise_flow,
@@ -56,12 +54,8 @@ def overview_strip(
         panel_width: Width of a panel, inches at 100 dpi.
 
     Raises:
-        DataError: no panels, a panel that is not RGB, or a folder that cannot be written.
+        DataError: the folder cannot be written.
     """
-    if not panels:
-        raise DataError("overview needs at least one panel", where=path)
-    for panel in panels:
-        check_rgb(panel[1], f"panel {panel[0]!r}")
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     # layout in inches, from the top
@@ -142,7 +136,7 @@ def overview(
         title: Above the panels.
 
     Raises:
-        DataError: an array does not fit the pair, or the folder cannot be written.
+        DataError: the folder cannot be written.
     """
     panels: list[Panel] = [("reference frame", pair.image_ref), ("next frame", pair.image_next)]
     count = f"{np.unique(labels).size} superpixels"
@@ -167,7 +161,7 @@ def _depth_panels(pair: Pair, depths: Mapping[str, Float]) -> list[Panel]:
     """Panels of the depths on one scale, of the true depth and of the relative error."""
     truth = pair.truth.depth_ref if pair.truth is not None else None
     common = truth if truth is not None else [*depths.values()][-1]
-    maps = {name: _scaled(pair, name, z, common) for name, z in depths.items()}
+    maps = {name: _scaled(pair, z, common) for name, z in depths.items()}
     near, far = depth_range(common if truth is not None else [*maps.values()][-1][0])
     levels = 1 / np.linspace(1 / far, 1 / near, 64)[None]
     bar = (colourise_depth(levels, near, far), f"{far:.3g}", f"{near:.3g}")
@@ -186,14 +180,9 @@ def _depth_panels(pair: Pair, depths: Mapping[str, Float]) -> list[Panel]:
     return out
 
 
-def _scaled(pair: Pair, name: str, depth: Float, common: Float) -> tuple[Float, str]:
+def _scaled(pair: Pair, depth: Float, common: Float) -> tuple[Float, str]:
     """A depth times its median ratio to the truth (to `common` without one), and its score."""
-    z = as_map(depth, name)
-    if z.shape != pair.size:
-        raise DataError(
-            "depth does not fit the pair", where=name, found=z.shape, expected=pair.size
-        )
-    z = np.where(np.isfinite(z) & (z > 0), z, np.nan)
+    z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
     known = pair.truth is not None and pair.truth.depth_ref is not None
     estimate, target = z, common
     if not known and pair.truth is not None and pair.truth.points is not None:
@@ -210,9 +199,8 @@ def write_png(path: PathLike, rgb: Image) -> None:
     """Write an (H, W, 3) uint8 RGB image as PNG, whole or not at all.
 
     Raises:
-        DataError: the image is not RGB, or the folder cannot be written.
+        DataError: the folder cannot be written.
     """
-    check_rgb(rgb, "rgb")
     _encode(path, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 
 
@@ -231,15 +219,13 @@ def write_clipped_depth_png16(path: PathLike, depth: Float, scale: float | None 
         The scale, which a reader needs: depth = value / scale.
 
     Raises:
-        DataError: not a map, a scale that is not positive, or a folder that cannot be written.
+        DataError: the folder cannot be written.
     """
-    z = as_map(depth, "depth")
+    z = np.asarray(depth, np.float64)
     known = np.isfinite(z) & (z > 0)
     if scale is None:
         far = float(np.percentile(z[known], 99.9)) if known.any() else 1.0
         scale = float(2.0 ** np.floor(np.log2(65535.0) - np.log2(far)))
-    if not 0 < scale < np.inf:
-        raise DataError("depth scale must be positive", where="scale", found=scale, expected="> 0")
     value = np.clip(np.round(np.where(known, z, 0.0) * scale), 1, 65535)
     _encode(path, np.where(known, value, 0).astype(np.uint16))
     return float(scale)
