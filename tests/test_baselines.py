@@ -83,7 +83,7 @@ def test_depth_without_parallax_is_unknown():
     assert np.isfinite(found).mean() == pytest.approx(50 / 60)
 
 
-def test_wrong_flow_without_confidence_does_no_harm(orbit):
+def test_flow_without_confidence_is_ignored(orbit):
     rng = np.random.default_rng(0)
     uv, confidence = orbit.flow.uv.copy(), orbit.flow.confidence.copy()
     bad = rng.random(confidence.shape) < 0.6

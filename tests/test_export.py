@@ -1,4 +1,4 @@
-"""export, import and check on the command line: a family of files, and answers made results."""
+"""Commands export, import and check: exported files, and foreign answers as results."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_several_sizes_and_formulations_are_exported_and_read_back(tmp_path):
     assert len(hashes) == 4
 
 
-def test_other_formats_say_the_same(exported):
+def test_casadi_and_hdf5_agree_with_the_nlp(exported):
     _, nlp, _, _, _ = problem_of(exported)
     oracle = ca.Function.load(str(exported / "oracle.casadi"))
     hess = ca.Function.load(str(exported / "hess_lag.casadi"))
@@ -115,7 +115,7 @@ def optimum(exported):
     return found.stages[-1].x, found.stages[-1].lam_g
 
 
-def test_a_solution_becomes_depth_maps(exported, optimum, tmp_path, capsys):
+def test_a_foreign_solution_becomes_a_result_folder(exported, optimum, tmp_path, capsys):
     _, _, _, (v, r), _ = problem_of(exported)
     sol = exported / "good.sol"
     write_sol(sol, *optimum, v, r, "hand made", 0)
@@ -155,7 +155,7 @@ def test_verified_means_optimal(exported, optimum, tmp_path, capsys):
         import_sol(exported, exported / "x.sol", renew=False)
 
 
-def test_what_is_not_a_number_is_not_verified(exported, optimum):
+def test_a_point_with_nan_is_not_verified(exported, optimum):
     _, nlp, _, _, _ = problem_of(exported)
     x, lam = optimum
     assert examine(nlp, x, lam).residuals.within(Limits())
@@ -184,7 +184,7 @@ def test_a_huge_point_is_checked_and_makes_no_result(size, exported, tmp_path, c
     assert (exported / "manifest.json").read_text() == before
 
 
-def test_a_false_claim_is_not_believed(exported, tmp_path, capsys):
+def test_a_false_claim_of_success_is_not_verified(exported, tmp_path, capsys):
     sol = answer(exported, "false.sol", move=1e-3)
     run = import_sol(exported, sol, renew=False).run
     assert not run.solution.converged
@@ -221,7 +221,7 @@ def test_the_worst_superpixel_is_named(exported):
     assert kind("normal", np.array([0.0, np.nan]), 1e-6).largest == np.inf
 
 
-def test_folders_that_do_not_fit(exported, tmp_path):
+def test_a_changed_export_is_refused(exported, tmp_path):
     sol = answer(exported, "good.sol")
     other = tmp_path / "other"
     shutil.copytree(exported, other)
