@@ -168,16 +168,16 @@ def test_load_flow(tmp_path: Path) -> None:
     write_flo(tmp_path / "a.flo", uv)
     write_kitti_flow(tmp_path / "a.png", uv)
     for name in ("a.flo", "a.png"):
-        flow = load_flow(tmp_path / name, (4, 5))
+        flow = load_flow(tmp_path / name)
         assert flow.source == name
         assert flow.confidence.sum() == 19
         assert flow.confidence[1, 2] == 0
         assert flow.uv[1, 2].tolist() == [0, 0]
-    with raises(r"differ in size[\s\S]*flow 5x4[\s\S]*5x5"):
-        load_flow(tmp_path / "a.flo", (5, 5))
+    with raises(r"differ in size[\s\S]*5x4[\s\S]*80x60"):
+        resolve_flow(pair_of(), str(tmp_path / "a.flo"))
     write_flo(tmp_path / "b.flo", np.full((4, 5, 2), np.nan))
     with raises("every pixel as unknown"):
-        load_flow(tmp_path / "b.flo", (4, 5))
+        load_flow(tmp_path / "b.flo")
 
 
 def test_flow_from_truth() -> None:

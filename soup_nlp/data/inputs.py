@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from soup_nlp.data.datasets.driving import load_kitti, load_vkitti1, load_vkitti2
+from soup_nlp.data.datasets.driving import load_kitti, load_vkitti
 from soup_nlp.data.datasets.folders import load_folder, load_motorcycle, load_tum
 from soup_nlp.data.datasets.sintel import load_sintel
 from soup_nlp.data.formats.camera_files import read_intrinsics
@@ -191,8 +191,8 @@ class VkittiInput(PairInput):
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        load = load_vkitti1 if self.kind == "vkitti1" else load_vkitti2
-        return load(path(self.root), self.scene, self.frame, self.variation, self.step)
+        root, scene = path(self.root), self.scene
+        return load_vkitti(self.kind, root, scene, self.frame, self.variation, self.step)
 
 
 class TumInput(PairInput):

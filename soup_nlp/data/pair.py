@@ -1,4 +1,4 @@
-"""The record that enters the house: two images, two cameras, a flow and, where known, the truth."""
+"""The input of every solve: two images, two cameras, a flow and, where known, the truth."""
 
 from __future__ import annotations
 
@@ -13,6 +13,32 @@ Float = NDArray[np.float64]
 
 SHORTEST = 0.05
 """Focal length, in sides of the image, below which it cannot be in pixels (168 degrees of view)."""
+
+
+def check_size(
+    what: str,
+    found: tuple[int, ...],
+    expected: tuple[int, ...],
+    where: object,
+    hint: str | None = None,
+) -> None:
+    """Raise DataError unless two arrays have the same (height, width).
+
+    Args:
+        what: Names of the two, e.g. "flow and reference image".
+        found: Shape of the first.
+        expected: Shape of the second; both may have more axes.
+        where: File or array concerned.
+        hint: What to try.
+    """
+    if found[:2] != expected[:2]:
+        raise DataError(
+            f"{what} differ in size",
+            where=where,
+            found=f"{found[1]}x{found[0]}",
+            expected=f"{expected[1]}x{expected[0]} (width x height)",
+            hint=hint,
+        )
 
 
 @dataclass(frozen=True)
@@ -37,13 +63,7 @@ class Flow:
                 found=self.uv.shape,
                 expected="(H, W, 2)",
             )
-        if self.confidence.shape != self.uv.shape[:2]:
-            raise DataError(
-                "flow confidence does not fit the flow",
-                where=self.source,
-                found=self.confidence.shape,
-                expected=self.uv.shape[:2],
-            )
+        check_size("flow confidence and flow", self.confidence.shape, self.uv.shape, self.source)
         # false for NaN too
         fits = (self.confidence >= 0) & (self.confidence <= 1)
         if not fits.all():
@@ -142,35 +162,18 @@ class Pair:
             K = _matrix(getattr(self, what), what)
             object.__setattr__(self, what, K)
             check_intrinsics(K, what)
-        _check_focal(self.K_ref, self.image_ref, "K_ref")
-        _check_focal(self.K_next, self.image_next, "K_next")
-        if self.flow is not None and self.flow.uv.shape[:2] != self.image_ref.shape[:2]:
-            raise DataError(
-                "flow and reference image differ in size",
-                where=self.flow.source,
-                found=f"flow {self.flow.uv.shape[:2]}",
-                expected=f"image {self.image_ref.shape[:2]} (height, width)",
-            )
-        if self.truth is not None:
-            self._check_truth(self.truth)
-
-    def _check_truth(self, truth: Truth) -> None:
-        for what in ("depth_ref", "flow", "occluded", "components", "scene_flow"):
-            value = getattr(truth, what)
-            if value is not None and value.shape[:2] != self.image_ref.shape[:2]:
-                raise DataError(
-                    "truth and reference image differ in size",
-                    where=f"truth.{what}",
-                    found=value.shape[:2],
-                    expected=self.image_ref.shape[:2],
-                )
-        if truth.depth_next is not None and truth.depth_next.shape != self.image_next.shape[:2]:
-            raise DataError(
-                "truth and next image differ in size",
-                where="truth.depth_next",
-                found=truth.depth_next.shape,
-                expected=self.image_next.shape[:2],
-            )
+            _check_focal(K, getattr(self, what.replace("K", "image")), what)
+        if self.flow is not None:
+            hint = "compute the flow at the size of the image; it is not resized"
+            size, source = self.flow.uv.shape, self.flow.source
+            check_size("flow and reference image", size, self.image_ref.shape, source, hint)
+        for what in self.truth.known() if self.truth else []:
+            name, image = "reference image", self.image_ref
+            if what == "depth_next":
+                name, image = "next image", self.image_next
+            if what not in ("motions", "points"):
+                found = getattr(self.truth, what).shape
+                check_size(f"truth and {name}", found, image.shape, f"truth.{what}")
 
     @property
     def size(self) -> tuple[int, int]:

@@ -7,7 +7,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.pair import Flow
+from soup_nlp.data.pair import Flow, check_size
 from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
@@ -62,10 +62,7 @@ def fit_affine(
     Raises:
         DataError: sizes differ, or the scale is not positive.
     """
-    if labels.shape != flow.confidence.shape:
-        raise DataError(
-            "labels and flow differ in size", found=labels.shape, expected=flow.confidence.shape
-        )
+    check_size("labels and flow", labels.shape, flow.uv.shape, flow.source)
     if not scale_px > 0:
         raise DataError("scale of residuals must be positive", found=scale_px, expected="> 0 px")
     v, u = np.nonzero(flow.confidence > 0)

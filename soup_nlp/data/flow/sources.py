@@ -23,7 +23,7 @@ from soup_nlp.data.flow.noise import PREFIX, noise_level, noisy
 from soup_nlp.data.flow.rlof import rlof_flow
 from soup_nlp.data.formats.images import PathLike
 from soup_nlp.data.formats.map_files import read_flow
-from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.pair import Flow, Pair, check_size
 from soup_nlp.errors import DataError
 from soup_nlp.schema.section import Positive, Section, Share
 
@@ -134,26 +134,13 @@ def flow_from_array(uv: NDArray[np.floating], source: str) -> Flow:
     return Flow(filled, known.astype(np.float32), source)
 
 
-def load_flow(path: PathLike, shape: tuple[int, int]) -> Flow:
+def load_flow(path: PathLike) -> Flow:
     """A Flow of a file (.flo, KITTI .png, .npy): confidence 1 where the file knows it, else 0.
 
-    Args:
-        path: Flow file, see `soup_nlp.data.formats.map_files.read_flow`.
-        shape: (H, W) of the reference image.
-
     Raises:
-        DataError: the file is wrong, of another size than the image, or knows no pixel.
+        DataError: the file is wrong (`read_flow`), or knows no pixel.
     """
-    uv = read_flow(path)
-    if uv.shape[:2] != tuple(shape):
-        raise DataError(
-            "flow and reference image differ in size",
-            where=path,
-            found=f"flow {uv.shape[1]}x{uv.shape[0]}",
-            expected=f"{shape[1]}x{shape[0]} (width x height)",
-            hint="compute the flow at the size of the image; it is not resized here",
-        )
-    flow = flow_from_array(uv, Path(path).name)
+    flow = flow_from_array(read_flow(path), Path(path).name)
     if not flow.confidence.any():
         raise DataError("flow file marks every pixel as unknown", where=path)
     return flow
@@ -272,7 +259,9 @@ def resolve_flow(pair: Pair, source: str) -> Flow:
             found=repr(source),
             expected=f"{', '.join(names)}, or the path of a flow file or network",
         )
-    return load_flow(source, pair.size)
+    flow = load_flow(source)
+    pair.with_flow(flow)  # checks its size
+    return flow
 
 
 def _run_plugin(point: EntryPoint, pair: Pair) -> Flow:
@@ -293,11 +282,5 @@ def _run_plugin(point: EntryPoint, pair: Pair) -> Flow:
             found=type(flow).__name__,
             expected="soup_nlp.data.pair.Flow",
         )
-    if flow.uv.shape[:2] != pair.size:
-        raise DataError(
-            "flow and reference image differ in size",
-            where=where,
-            found=flow.uv.shape[:2],
-            expected=f"{pair.size} (height, width)",
-        )
+    check_size("flow and reference image", flow.uv.shape, pair.size, where)
     return flow
