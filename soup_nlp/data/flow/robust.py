@@ -16,7 +16,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class AffineFlow:
-    """What a small plane that moves rigidly does nearly: an affine flow for every superpixel.
+    """An affine flow for every superpixel: nearly that of a small plane that moves rigidly.
 
     Attributes:
         coefficients: (N, 3, 2) of (1, (u - u0) / size, (v - v0) / size) -> flow, pixels.
@@ -47,12 +47,12 @@ def fit_affine(
     """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
 
     The first weights are by the distance from the superpixel's median flow: least squares would
-    lay a slope across two motions and suspect neither.
+    fit a slope across two motions, with no outlier in either.
 
     Args:
         flow: Flow with confidence, which multiplies the weights.
         labels: (H, W) superpixel labels 0..N-1.
-        scale_px: Residual, pixels, below which nothing is suspected; s is at least this, and at
+        scale_px: Smallest residual, pixels, that an outlier can have; s is at least this, and at
             least the superpixel's own spread (1.48 times the weighted mean absolute residual).
         rounds: Re-weighted fits.
 
@@ -77,23 +77,13 @@ def refit_affine(
     scale_px: float,
     rounds: int = 8,
 ) -> AffineFlow:
-    """The fits of `fit_affine`, some of them made before.
-
-    Args:
-        fit: Right where nothing changed.
-        flow: Flow with confidence.
-        labels: (H, W) superpixel labels 0..N-1.
-        changed: (N,) superpixels to fit.
-        scale_px: Residual, pixels, below which nothing is suspected.
-        rounds: Re-weighted fits.
-    """
+    """The fits of `fit_affine`, computed only for superpixels (N,) that `changed` since `fit`."""
     v, u = np.nonzero((flow.confidence > 0) & changed[labels])
     number = np.cumsum(changed) - 1
     new, _ = _fit(flow, number[labels[v, u]], u, v, int(changed.sum()), scale_px, rounds)
-    merged = []
-    for old, own in zip(astuple(fit), astuple(new)):
-        merged.append(old.copy())
-        merged[-1][changed] = own
+    merged = [np.copy(field) for field in astuple(fit)]
+    for field, own in zip(merged, astuple(new), strict=True):
+        field[changed] = own
     return AffineFlow(*merged)
 
 
@@ -143,7 +133,7 @@ def reweighted(
     Args:
         flow: Flow with confidence.
         labels: (H, W) superpixel labels 0..N-1.
-        scale_px: Residual, pixels, below which nothing is suspected.
+        scale_px: Smallest residual, pixels, that an outlier can have.
         rounds: Re-weighted fits.
 
     Returns:
