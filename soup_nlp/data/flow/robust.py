@@ -21,7 +21,7 @@ class AffineFlow:
     Attributes:
         coefficients: (N, 3, 2) of (1, (u - u0) / size, (v - v0) / size) -> flow, pixels.
         centre: (N, 2) u0, v0.
-        size: (N,) root of the number of sure pixels.
+        size: (N,) root of the number of pixels with positive confidence.
         known: (N,) False where a superpixel has fewer than six of them, and its fit means nothing.
     """
 
@@ -35,8 +35,10 @@ class AffineFlow:
         du, dv = u - self.centre[which, 0], v - self.centre[which, 1]
         return np.stack([np.ones(len(which)), du / self.size[which], dv / self.size[which]], axis=1)
 
-    def miss(self, which: Ints, u: NDArray[np.integer], v: NDArray[np.integer], uv: Float) -> Float:
-        """(P,) pixels between flows (P, 2) at pixels and what superpixels `which` (P,) do there."""
+    def residual(
+        self, which: Ints, u: NDArray[np.integer], v: NDArray[np.integer], uv: Float
+    ) -> Float:
+        """(P,) distance, pixels, of flows (P, 2) from those of superpixels `which` (P,)."""
         own = np.einsum("pa,pac->pc", self.basis(which, u, v), self.coefficients[which])
         return np.where(self.known[which], np.linalg.norm(uv - own, axis=1), np.inf)
 

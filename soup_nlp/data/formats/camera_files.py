@@ -1,4 +1,7 @@
-"""Camera files: Sintel .cam, KITTI calibration, Virtual KITTI intrinsics, plain text."""
+"""Camera files: Sintel .cam, KITTI calibration, Virtual KITTI intrinsics, plain text.
+
+Every reader raises `DataError` for a file that is missing or of another kind, or holds no camera.
+"""
 
 from __future__ import annotations
 
@@ -40,9 +43,6 @@ def read_intrinsics(path: PathLike) -> Float:
 
     Returns:
         (3, 3) intrinsics, pixels.
-
-    Raises:
-        DataError: the file is missing, holds other than 9 or 4 numbers, or no valid camera.
     """
     lines = [x for x in read_text(path, "intrinsics").splitlines() if not x.strip().startswith("#")]
     values = _numbers("\n".join(lines), path, "intrinsics file")
@@ -63,9 +63,6 @@ def read_cam(path: PathLike) -> Float:
 
     Returns:
         (3, 3) intrinsics, pixels.
-
-    Raises:
-        DataError: the file is missing, has another magic number or length, or no valid camera.
     """
     content = read_bytes(path, "camera file")
     check_magic(content, path, "camera file")

@@ -1,4 +1,7 @@
-"""Images, and the checks that readers of every format share."""
+"""Images, and the checks that readers of every format share.
+
+Every reader raises `DataError` for a file that is missing, empty, truncated or of another kind.
+"""
 
 from __future__ import annotations
 
@@ -59,11 +62,7 @@ def _neighbours(path: Path) -> str:
 
 
 def read_text(path: PathLike, what: str) -> str:
-    """The content of a UTF-8 text file.
-
-    Raises:
-        DataError: as `read_bytes`, or the file is not text.
-    """
+    """The content of a UTF-8 text file."""
     try:
         return read_bytes(path, what).decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -86,11 +85,7 @@ def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
 
 
 def decode(path: PathLike, what: str) -> NDArray[Any]:
-    """Decode an image file without changing its depth or channels (OpenCV order: BGR, BGRA).
-
-    Raises:
-        DataError: the file is missing, truncated, or no image.
-    """
+    """Decode an image file without changing its depth or channels (OpenCV order: BGR, BGRA)."""
     content = read_bytes(path, what)
     png = content.startswith(b"\x89PNG\r\n\x1a\n") and b"IEND" not in content
     last_scan, end = content.rfind(b"\xff\xda"), content.rfind(b"\xff\xd9")
@@ -120,11 +115,7 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
 
 
 def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]:
-    """Decode a 16-bit PNG with a fixed number of channels (1: (H, W), 3: (H, W, 3) in BGR order).
-
-    Raises:
-        DataError: the file is missing, damaged, not 16-bit, or has other channels.
-    """
+    """Decode a 16-bit PNG with a fixed number of channels (1: (H, W), 3: (H, W, 3) in BGR order)."""
     image = decode(path, what)
     found = 1 if image.ndim == 2 else image.shape[2]
     if image.dtype != np.uint16 or found != channels:
@@ -155,9 +146,6 @@ def read_image(path: PathLike, white: int | None = None) -> NDArray[np.uint8]:
 
     Warns:
         DataWarning: no `white` is given and a 16-bit image is dark throughout.
-
-    Raises:
-        DataError: the file is missing, not decodable, or neither 8- nor 16-bit.
     """
     image = decode(path, "image")
     if image.ndim == 2:
@@ -195,9 +183,5 @@ def read_image(path: PathLike, white: int | None = None) -> NDArray[np.uint8]:
 
 
 def read_mask(path: PathLike) -> NDArray[np.bool_]:
-    """Read a black-and-white picture as (H, W) bool, True above half of the range.
-
-    Raises:
-        DataError: as `read_image`.
-    """
+    """Read a black-and-white picture as (H, W) bool, True above half of the range."""
     return np.asarray(read_image(path, white=65535)[:, :, 0] > 127)

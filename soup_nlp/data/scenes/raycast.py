@@ -59,7 +59,7 @@ class Part:
     glow: float = 0.45
 
     def colour(self, points: Float, footprint: Float, frame: int) -> NDArray[np.float32]:
-        """Colours (N, 3) of points (N, 3) in part coordinates; shading is fixed in the matter."""
+        """Colours (N, 3) of points (N, 3) in part coordinates; shading moves with the surface."""
         material = self.shape.material(points, frame)
         normals = self.shape.normals(self.shape.place(material, 0), 0)
         light = self.scene_from_part[:3, :3].T @ LIGHT
