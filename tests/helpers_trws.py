@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.sparse import coo_array
 
+from soup_nlp.mrf.levels import colours
 from soup_nlp.mrf.trws import TRWSResult
 
 FOREVER = {"gap": -1.0, "stagnation": -1.0}
@@ -90,6 +91,22 @@ def ragged(rng, n, count, most=5, scale=1.0):
     edges = random_edges(rng, n, count)
     unary = [scale * rng.normal(size=k) for k in counts]
     return unary, edges, [scale * rng.normal(size=(counts[a], counts[b])) for a, b in edges]
+
+
+def padded(unary, edges, tables):
+    """A ragged problem as arrays: labels that a node does not have cost +inf."""
+    size = max(len(u) for u in unary)
+    costs, table = np.full((len(unary), size), np.inf), np.full((len(edges), size, size), -1e3)
+    for i, u in enumerate(unary):
+        costs[i, : len(u)] = u
+    for e, t in enumerate(tables):
+        table[e, : t.shape[0], : t.shape[1]] = t
+    return costs, edges, table
+
+
+def colour_order(n, edges):
+    """The nodes in the order of the forward pass."""
+    return np.argsort(colours(n, np.asarray(edges).reshape(-1, 2)), kind="stable")
 
 
 def dense(rng, n, count, size):

@@ -63,7 +63,7 @@ def test_energy_knows_no_global_scale_and_no_gauge(units, seed, scale):
 @given(seed=st.integers(0, 10_000))
 def test_a_rigid_motion_of_the_next_camera_changes_the_projection_only(units, at_anchors, seed):
     """X'' = Q X' + s: distances of all motions and points of the next frame stay."""
-    problem, weights = tiny(units, at_anchors), replace(weights_for(units), sigma_proj=np.inf)
+    problem, weights = tiny(units, at_anchors), weights_for(units).replace(sigma_proj=np.inf)
     soup = random_soup(seed, 12)
     rng = np.random.default_rng(seed)
     Q, s = rotation.exp(rng.normal(0, 0.3, 3)), rng.normal(0, 0.3, 3)

@@ -12,7 +12,8 @@ from helpers_model import GAUGES, PAPER, random_soup, value, weights_for
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soup_nlp.errors import ModelError
+from soup_nlp.errors import ConfigError, ModelError
+from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
@@ -148,13 +149,14 @@ def test_the_print_shows_sizes_bound_kinds_and_sparsity():
         assert re.search(rf"^  {name} +\d+ x ", text, re.M), name
 
 
-def test_wrong_words_are_model_errors():
-    problem = tiny()
-    with pytest.raises(ModelError, match=r"gauge.*\n.*sideways"):
-        problem.nlp(PAPER, form(gauge="sideways"))
-    with pytest.raises(ModelError, match="Hessian"):
-        problem.nlp(PAPER, form(hessian="guess"))
-    nlp, _ = problem.nlp(PAPER, form())
+@pytest.mark.parametrize("wrong", [{"gauge": "sideways"}, {"hessian": "guess"}])
+def test_unknown_kinds_of_formulation_are_refused(wrong):
+    with pytest.raises(ConfigError, match=next(iter(wrong.values()))):
+        Formulation.make(wrong)
+
+
+def test_unknown_parameters_are_refused():
+    nlp, _ = tiny().nlp(PAPER, form())
     with pytest.raises(ModelError, match="unknown parameter"):
         nlp.with_theta(epsilon=1.0)
 

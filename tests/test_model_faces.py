@@ -86,7 +86,7 @@ def assert_derivatives(nlp: NLP, x: np.ndarray, seed: int, exact_hessian: bool =
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_exact_kernels_equal_plain_numpy_term_by_term(gauge, units, at_anchors, truncated):
     problem, weights = tiny(units, at_anchors), weights_for(units, truncated)
-    nlp, layout = problem.nlp(weights, form(units, gauge=gauge, norm="epigraph"))
+    nlp, layout = problem.nlp(weights, form(units, gauge=gauge, truncation="lifted"))
     for seed in range(3):
         soup = random_soup(seed, len(problem.seg))
         expected = oracle.energy(soup, problem.data, weights)
@@ -102,11 +102,14 @@ def test_exact_kernels_equal_plain_numpy_term_by_term(gauge, units, at_anchors, 
 @pytest.mark.parametrize("units", UNITS)
 def test_tangent_kernels_equal_plain_numpy_term_by_term(units, chart):
     problem, weights = tiny(units), weights_for(units)
-    nlp, layout = build_tangent_nlp(problem.soup, problem.data, weights, form(units), chart)
+    lifted = form(units, truncation="lifted")
+    nlp, layout = build_tangent_nlp(problem.soup, problem.data, weights, lifted, chart)
     rng = np.random.default_rng(0)
     for size in (0.0, 0.05):
-        x = layout.pack(problem.soup) * (1 + size * rng.normal(size=nlp.nx))
-        expected = oracle.energy(layout.unpack(x), problem.data, weights)
+        own = layout.pack(problem.soup)
+        own *= 1 + size * rng.normal(size=own.size)
+        x = np.append(own, np.zeros(nlp.nx - own.size))
+        expected = oracle.energy(layout.unpack(own), problem.data, weights)
         # kernels measure in the base's unit, plain in the soup's own: equal at the base, and
         # everywhere once units are local
         found = kernel_exact(nlp, x)

@@ -34,7 +34,7 @@ def by_term(nlp: NLP, x: np.ndarray, p: np.ndarray) -> dict[str, float]:
 @pytest.mark.parametrize("units", UNITS)
 def test_the_smooth_norm_tends_to_the_exact_energy(units):
     problem = tiny(units)
-    weights = replace(weights_for(units, truncated=False), sigma_cont=np.inf)
+    weights = weights_for(units, truncated=False).replace(sigma_cont=np.inf)
     nlp, _ = problem.nlp(weights, form(truncation="smooth"))
     exact = oracle.energy(problem.soup, problem.data, weights)
     gap = []

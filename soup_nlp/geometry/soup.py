@@ -56,7 +56,7 @@ class Soup:
         return self.lam[:, None] * self.t
 
     def depth_at(self, ray: Float) -> Float:
-        """z (N, ...) of rays (N, ..., 3) on their own superpixel's plane (FORMULATION)."""
+        """z (N, ...) of rays (N, ..., 3) on their own superpixel's plane, docs/formulation.md 3."""
         facing = -np.einsum("nc,n...c->n...", self.n, ray)
         return self.distance.reshape(-1, *[1] * (ray.ndim - 2)) / facing
 
@@ -93,7 +93,7 @@ class Soup:
     def retracted(self) -> Soup:
         """Nearest soup that satisfies SO(3), unit normals and the simplex to rounding."""
         n = self.n / np.linalg.norm(self.n, axis=1, keepdims=True)
-        # the plane stays where it is: d belongs to a normal of unit length
+        # the plane does not move: d belongs to a normal of unit length
         d = self.d / np.linalg.norm(self.n, axis=1)
         total = self.lam.sum()
         return Soup(self.lam / total, n, d, nearest(self.R), self.t)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -24,52 +24,59 @@ THETA = ("eps", "eps_pixel", "theta", "ridge")
 """Names of the numbers that an NLP lets change without a new build."""
 
 
+class Block(NamedTuple):
+    """Consecutive variables or constraint rows of one kind, with their bounds."""
+
+    label: str
+    size: int
+    lower: float
+    upper: float
+
+
+def _bounds(blocks: list[Block]) -> tuple[Float, Float]:
+    """Lower and upper bounds of all blocks, in their order."""
+    count = [b.size for b in blocks]
+    return np.repeat([b.lower for b in blocks], count), np.repeat([b.upper for b in blocks], count)
+
+
+def _names(blocks: list[Block]) -> list[str]:
+    return [f"{b.label}[{i}]" for b in blocks for i in range(b.size)]
+
+
 @dataclass
 class Builder:
     """Collects groups, slack variables and constraint rows.
 
     Attributes:
         form: Norm, truncation, Hessian and smoothing.
-        nx: Variables so far.
-        ng: Constraint rows so far.
+        own: Variables that are no slack variables.
     """
 
     form: Formulation
-    nx: int
-    ng: int = 0
+    own: int
+    groups: list[Group] = field(default_factory=list)
+    slacks: list[Block] = field(default_factory=list)
+    rows: list[Block] = field(default_factory=list)
+    theta: ca.SX = field(default_factory=lambda: ca.SX.sym("theta", len(THETA)))
 
-    def __post_init__(self) -> None:
-        self.groups: list[Group] = []
-        self.x_extra: list[tuple[str, Float, Float]] = []
-        self.lbg: list[Float] = []
-        self.ubg: list[Float] = []
-        self.g_blocks: list[tuple[str, Int]] = []
-        self.x_blocks: list[tuple[str, Int]] = []
-        self.theta = ca.SX.sym("theta", len(THETA))
+    def new_variables(self, label: str, count: int, upper: float) -> Int:
+        """Indices of `count` fresh slack variables, at least 0 and at most `upper`."""
+        first = self.own + sum(b.size for b in self.slacks)
+        self.slacks.append(Block(label, count, 0.0, upper))
+        return first + np.arange(count)
 
-    def new_variables(self, label: str, count: int, lower: float, upper: float) -> Int:
-        """Indices of `count` fresh variables with bounds."""
-        index = self.nx + np.arange(count)
-        self.nx += count
-        self.x_extra.append((label, np.full(count, lower), np.full(count, upper)))
-        self.x_blocks.append((label, np.arange(count)))
-        return index
-
-    def new_rows(self, label: str, count: int, lower: float, upper: float) -> Int:
+    def new_rows(self, label: str, count: int, lower: float, upper: float = np.inf) -> Int:
         """Indices of `count` fresh constraint rows with bounds."""
-        index = self.ng + np.arange(count)
-        self.ng += count
-        self.lbg.append(np.full(count, lower))
-        self.ubg.append(np.full(count, upper))
-        self.g_blocks.append((label, np.arange(count)))
-        return index
+        first = sum(b.size for b in self.rows)
+        self.rows.append(Block(label, count, lower, upper))
+        return first + np.arange(count)
 
     def add_norms(self, name: str, element: Element, view: Callable[..., View], own: int) -> None:
         """Add an energy term: kernel of its norms in solver form, and its table.
 
         Args:
             name: Of the kernel.
-            element: Data columns, superpixel indices and the norms.
+            element: Data columns, indices of variables and the norms.
             view: Makes a View of local variables (own,) and the data row, by position.
             own: Variables per superpixel.
         """
@@ -80,61 +87,74 @@ class Builder:
         row = {k: ca.SX.sym(k, c) for k, c in element.fields.items()}
         views = [view(x[own * a : own * (a + 1)], row, a) for a in range(element.arity)]
         norms = element.norms(views, row, self.theta[0], self.theta[1])
-        slacks: list[ca.SX | None] = []
-        switches: list[ca.SX | None] = []
         local, index = [x], [element.index]
-        for norm in norms:
-            slack = switch = None
-            if self.form.norm == "epigraph" and norm.kind == "norm":
-                slack = ca.SX.sym(f"s_{norm.name}")
-                local.append(slack)
-                index.append(self.new_variables(f"s_{norm.name}", size, 0.0, np.inf)[:, None])
-            if self.form.truncation == "lifted" and norm.sigma is not None:
-                switch = ca.SX.sym(f"z_{norm.name}")
-                local.append(switch)
-                index.append(self.new_variables(f"z_{norm.name}", size, 0.0, 1.0)[:, None])
-            slacks.append(slack)
-            switches.append(switch)
-        everything = ca.vertcat(*local)
-        forms = [
-            solver_form(norm, everything, self.theta[2], s, z)
-            for norm, s, z in zip(norms, slacks, switches)
+
+        def extra(prefix: str, label: str, upper: float) -> ca.SX:
+            symbol = ca.SX.sym(f"{prefix}_{label}")
+            local.append(symbol)
+            index.append(self.new_variables(f"{prefix}_{label}", size, upper)[:, None])
+            return symbol
+
+        epigraph, lifted = self.form.norm == "epigraph", self.form.truncation == "lifted"
+        extras = [
+            (
+                extra("s", n.name, np.inf) if epigraph and n.kind == "norm" else None,
+                extra("z", n.name, 1.0) if lifted and n.sigma is not None else None,
+            )
+            for n in norms
         ]
-        cons = [f.constraint for f in forms if f.constraint is not None]
-        rows = np.zeros((size, 0), np.int64)
-        for norm, f in zip(norms, forms):
-            if f.constraint is not None:
-                fresh = self.new_rows(f"epigraph_{norm.name}", size, 0.0, np.inf)
-                rows = np.concatenate([rows, fresh[:, None]], axis=1)
+        everything = ca.vertcat(*local)
+        forms = [solver_form(n, everything, self.theta[2], *e) for n, e in zip(norms, extras)]
+        cons = {n.name: f.constraint for n, f in zip(norms, forms) if f.constraint is not None}
+        rows = [self.new_rows(f"epigraph_{label}", size, 0.0) for label in cons]
         kernel = Kernel(
             name,
             everything,
             ca.vertcat(*row.values()),
             self.theta,
             objective=sum((f.objective for f in forms), ca.SX(0)),
-            constraints=ca.vertcat(*cons) if cons else None,
+            constraints=ca.vertcat(*cons.values()) if cons else None,
             curvature=sum((f.curvature for f in forms), ca.SX(0)),
-            exact=sum((n.exact() for n in norms), ca.SX(0)),
         )
-        data = np.column_stack([element.columns[k].reshape(size, -1) for k in element.fields])
-        self.groups.append(Group(kernel, Table(np.concatenate(index, axis=1), data, rows)))
+        data = np.column_stack([c.reshape(size, -1) for c in element.columns.values()])
+        table = Table(
+            np.concatenate(index, axis=1), data, np.array(rows, np.int64).reshape(-1, size).T
+        )
+        self.groups.append(Group(kernel, table))
 
     def add_constraint(
-        self, name: str, x: ca.SX, row: ca.SX, body: ca.SX, index: Int, data: Float, rows: Int
+        self,
+        name: str,
+        x: ca.SX,
+        body: ca.SX,
+        index: Int,
+        *,
+        lower: float,
+        upper: float,
+        row: ca.SX | None = None,
+        data: Float | None = None,
+        total: bool = False,
     ) -> None:
-        """Add a constraint kernel with its table.
+        """Add a constraint kernel with its table and rows.
 
         Args:
-            name: Of the kernel.
+            name: Of the kernel; the rows are named without a prefix "t_".
             x: (k,) symbols of the variables.
-            row: (m,) symbols of the data.
             body: (r,) constraints.
             index: (E, k) variables of every element.
+            lower: Bound of every row.
+            upper: Bound of every row.
+            row: (m,) symbols of the data, if there are any.
             data: (E, m) data of every element.
-            rows: (E, r) constraint rows of every element.
+            total: Whether the elements add up to one row (r = 1).
         """
-        kernel = Kernel(name, x, row, self.theta, constraints=body)
-        self.groups.append(Group(kernel, Table(index, data, rows)))
+        size, count = len(index), body.numel()
+        fresh = self.new_rows(name.removeprefix("t_"), 1 if total else size * count, lower, upper)
+        rows = np.broadcast_to(fresh.reshape(-1, count), (size, count))
+        symbols = ca.SX.sym("none", 0) if row is None else row
+        kernel = Kernel(name, x, symbols, self.theta, constraints=body)
+        table = Table(index, np.zeros((size, 0)) if data is None else data, rows)
+        self.groups.append(Group(kernel, table))
 
     def add_ridge(self, metric: Float) -> None:
         """Zero objective whose stand-in Hessian is ridge x metric on the diagonal.
@@ -147,77 +167,58 @@ class Builder:
         self.groups.append(Group(kernel, Table(np.arange(len(metric))[:, None], metric[:, None])))
 
     def finish(
-        self, name: str, x0: Float, lbx: Float, ubx: Float, own: int, names: Callable[[], list[str]]
+        self, name: str, x0: Float, lbx: Float, ubx: Float, names: Callable[[], list[str]]
     ) -> NLP:
         """The NLP of everything that was added, its slack variables at their best values.
 
         Args:
             name: Of the NLP.
-            x0: (nx,) start; what is beyond `own` does not matter.
-            lbx: (nx,) lower bounds; what is beyond `own` does not matter.
-            ubx: (nx,) upper bounds; what is beyond `own` does not matter.
-            own: Number of variables that are no slack variables.
-            names: Makes the names of those.
+            x0: (own,) start.
+            lbx: (own,) lower bounds.
+            ubx: (own,) upper bounds.
+            names: Makes the names of these variables.
         """
-        offset = own
-        for _, lower, upper in self.x_extra:
-            lbx[offset : offset + len(lower)] = lower
-            ubx[offset : offset + len(upper)] = upper
-            offset += len(lower)
+        lower, upper = _bounds(self.slacks)
+        lbx, ubx = np.concatenate([lbx, lower]), np.concatenate([ubx, upper])
+        lbg, ubg = _bounds(self.rows)
         f = self.form
         nlp = assemble(
             name,
             tuple(self.groups),
-            x0=np.clip(x0, lbx, ubx),
+            x0=np.clip(np.concatenate([x0, 0.0 * lower]), lbx, ubx),
             lbx=lbx,
             ubx=ubx,
-            lbg=np.concatenate(self.lbg),
-            ubg=np.concatenate(self.ubg),
+            lbg=lbg,
+            ubg=ubg,
             theta=dict(zip(THETA, (f.eps, f.eps_pixel, f.theta, f.ridge))),
             hessian=f.hessian,
-            x_names=lambda: _names(names(), self.x_blocks),
-            g_names=partial(_names, [], self.g_blocks),
+            x_names=lambda: names() + _names(self.slacks),
+            g_names=lambda: _names(self.rows),
             compiled=f.compiled,
         )
-        return _with_slacks(nlp, own)
+        return _with_slacks(nlp) if self.slacks else nlp
 
 
-def _names(own: list[str], blocks: list[tuple[str, Int]]) -> list[str]:
-    return own + [f"{label}[{i}]" for label, index in blocks for i in index]
-
-
-def _with_slacks(nlp: NLP, own: int) -> NLP:
-    """Start slack variables at the norms' values and switches where they are optimal."""
-    if nlp.nx == own:
-        return nlp
+def _with_slacks(nlp: NLP) -> NLP:
+    """The NLP with slack variables at the norms' values and switches where they are best."""
     x0 = nlp.x0.copy()
     for group in nlp.groups:
         kernel, table = group.kernel, group.table
-        extra = np.flatnonzero(table.index[0] >= own)
-        if not len(extra):
-            continue
-        _fill(kernel, table, extra, x0, nlp.p[: len(nlp.theta)])
+        size, names = len(table), [kernel.x[j].name() for j in range(kernel.nx)]
+        slacks = [j for j, s in enumerate(names) if s.startswith("s_")]
+        switches = [j for j, s in enumerate(names) if s.startswith("z_")]
+        symbols = [kernel.x, kernel.row, kernel.theta]
+        theta = np.repeat(nlp.p[: len(nlp.theta), None], size, axis=1)
+        if slacks:
+            # the constraint is s^2 - |v|^2 - eps^2, so at s = 0 its negative is s^2 at the best s
+            local = x0[table.index].copy()
+            local[:, slacks] = 0.0
+            con = ca.Function("c", symbols, [kernel.constraints]).map(size)
+            value = np.asarray(con(local.T, table.data.T, theta)).reshape(len(slacks), size)
+            x0[table.index[:, slacks]] = np.sqrt(np.maximum(-value, 1e-12)).T
+        if switches:
+            # the objective is linear in a switch: its slope says which end is better
+            slope = ca.Function("s", symbols, [ca.gradient(kernel.objective, kernel.x)]).map(size)
+            value = np.asarray(slope(x0[table.index].T, table.data.T, theta))[switches]
+            x0[table.index[:, switches]] = np.where(value < 0, 0.99, 0.01).T
     return replace(nlp, x0=x0)
-
-
-def _fill(kernel: Kernel, table: Table, extra: Int, x0: Float, theta: Float) -> None:
-    """Best values of a kernel's slack variables and switches, written into x0."""
-    size = len(table)
-    th = np.repeat(theta[:, None], size, axis=1)
-    slacks = [j for j in extra if kernel.x[int(j)].name().startswith("s_")]
-    switches = [j for j in extra if kernel.x[int(j)].name().startswith("z_")]
-    if slacks and kernel.constraints is not None:
-        # constraint is s^2 - |v|^2 - eps^2, so at s = 0 its negative is s^2 at the best s
-        con = ca.Function("c", [kernel.x, kernel.row, kernel.theta], [kernel.constraints])
-        local = x0[table.index].copy()
-        local[:, slacks] = 0.0
-        value = np.asarray(con.map(size)(local.T, table.data.T, th)).reshape(len(slacks), size)
-        for j, v in zip(slacks, value):
-            x0[table.index[:, j]] = np.sqrt(np.maximum(-v, 1e-12))
-    if switches and kernel.objective is not None:
-        # the objective is linear in a switch: its slope says which end is better
-        slope = ca.gradient(kernel.objective, kernel.x)
-        fun = ca.Function("s", [kernel.x, kernel.row, kernel.theta], [slope])
-        value = np.asarray(fun.map(size)(x0[table.index].T, table.data.T, th))
-        for j in switches:
-            x0[table.index[:, j]] = np.where(value[j] < 0, 0.99, 0.01)

@@ -18,6 +18,8 @@ from soup_nlp.model.superpixel import View
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+Layout = TangentLayout | MatrixLayout
+Norms = Callable[[list[View], dict[str, ca.SX], ca.SX, ca.SX], list[Norm]]
 
 
 @dataclass(frozen=True)
@@ -25,28 +27,32 @@ class Element:
     """One kind of element: its local superpixel views and where their variables are.
 
     Attributes:
-        arity: Superpixels of an element, a.
-        fields: Width of every data column, in their order.
-        columns: (E, ...) data by column.
         index: (E, a) superpixels, or once placed (E, a k) variables, of every element.
+        columns: (E, ...) data by column.
         norms: Makes the norms from the a views, a data row, eps and eps_pixel.
+        arity: Superpixels of an element, a.
     """
 
-    arity: int
-    fields: dict[str, int]
-    columns: dict[str, Float]
     index: Int
-    norms: Callable[[list[View], dict[str, ca.SX], ca.SX, ca.SX], list[Norm]]
+    columns: dict[str, Float]
+    norms: Norms
+    arity: int
 
-    def placed(self, layout: TangentLayout | MatrixLayout) -> Element:
-        """The element with variables of a layout in the place of superpixels."""
-        of = [layout.of(c) for c in self.index.T]
-        return replace(self, index=np.concatenate(of, axis=1))
+    @property
+    def fields(self) -> dict[str, int]:
+        """Width of every data column."""
+        return {k: int(np.prod(v.shape[1:], dtype=int)) for k, v in self.columns.items()}
+
+    def placed(self, layout: Layout) -> Element:
+        """The element with a layout's variables in the place of superpixels, and its columns."""
+        columns = dict(self.columns)
+        for a, i in enumerate(self.index.T):
+            columns |= {f"{k}_{a}": v for k, v in layout.columns(i).items()}
+        index = np.concatenate([layout.of(i) for i in self.index.T], axis=1)
+        return replace(self, index=index, columns=columns)
 
 
-def elements(
-    data: EnergyData, w: Weights, layout: TangentLayout | MatrixLayout
-) -> dict[str, Element]:
+def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]:
     """The four terms as element kinds, with the columns that the layout's views need.
 
     Args:
@@ -57,119 +63,85 @@ def elements(
     Returns:
         "arap", "proj", "cont", "orient".
     """
+    kinds = {
+        "arap": _arap(data, w),
+        "proj": _proj(data, w),
+        "cont": _cont(data, w),
+        "orient": _orient(data, w),
+    }
+    return {name: element.placed(layout) for name, element in kinds.items()}
 
-    def base(columns: dict[str, Float], sp: Int) -> tuple[dict[str, int], dict[str, Float]]:
-        extra: dict[str, Float] = {}
-        for a in range(sp.shape[1]):
-            i = sp[:, a]
-            if isinstance(layout, TangentLayout):
-                extra[f"anchor_{a}"] = layout.anchor[i]
-                extra[f"radius_{a}"] = layout.radius[i]
-                extra[f"depth_{a}"] = layout.depth[i]
-                extra[f"R0_{a}"] = layout.R0[i].transpose(0, 2, 1).reshape(-1, 9)
-                extra[f"t0_{a}"] = layout.t0[i]
-            else:
-                extra[f"offset_{a}"] = layout.offset[i]
-        merged = {**columns, **extra}
-        widths = {k: int(np.prod(v.shape[1:], dtype=int)) for k, v in merged.items()}
-        return widths, merged
 
-    def full(n: int, value: float) -> Float:
-        return np.full(n, value if np.isfinite(value) else 0.0)
+def _full(count: int, value: float) -> Float:
+    """A constant column; 0 where a truncation is infinite, which the norms then leave out."""
+    return np.full(count, value if np.isfinite(value) else 0.0)
 
-    out = {}
-    e = data.edges
-    fields, columns = base(
-        {
-            "weight": w.arap * data.edge_weight,
-            "unit": data.edge_unit,
-            "turn": full(len(e), data.rotation_scale),
-            "sigma": full(len(e), w.sigma_arap),
-            "leak": full(len(e), w.leak_arap),
-            "ray_i": data.anchor_ray[e[:, 0]],
-            "ray_k": data.anchor_ray[e[:, 1]],
-        },
-        e,
-    )
-    out["arap"] = Element(
-        2,
-        fields,
-        columns,
-        e,
-        lambda v, row, eps, _: terms.arap(
-            v[0],
-            v[1],
-            row,
-            eps,
-            bool(np.isfinite(w.sigma_arap)),
-            data.arap_at_anchors,
-            data.local_units,
-        ),
-    )
-    n, s = data.pixel_weight.shape
-    superpixel = np.repeat(np.arange(n), s)
-    used = data.pixel_weight.ravel() > 0
-    owner = superpixel[used][:, None]
+
+def _arap(data: EnergyData, w: Weights) -> Element:
+    e, truncated = data.edges, bool(np.isfinite(w.sigma_arap))
+    columns = {
+        "weight": w.arap * data.edge_weight,
+        "unit": data.edge_unit,
+        "turn": _full(len(e), data.rotation_scale),
+        "sigma": _full(len(e), w.sigma_arap),
+        "leak": _full(len(e), w.leak_arap),
+        "ray_i": data.anchor_ray[e[:, 0]],
+        "ray_k": data.anchor_ray[e[:, 1]],
+    }
+
+    def norms(v: list[View], row: dict[str, ca.SX], eps: ca.SX, _: ca.SX) -> list[Norm]:
+        return terms.arap(v[0], v[1], row, eps, truncated, data.arap_at_anchors, data.local_units)
+
+    return Element(e, columns, norms, 2)
+
+
+def _proj(data: EnergyData, w: Weights) -> Element:
+    used = data.pixel_weight > 0
+    owner, count = np.nonzero(used)[0][:, None], int(used.sum())
+    truncated = bool(np.isfinite(w.sigma_proj))
     # intrinsics are data, so that kernels compiled once serve every camera
     K = ca.sparsify(ca.DM(data.K_next[:2]))
-    fields, columns = base(
-        {
-            "weight": w.proj * data.pixel_weight.ravel()[used],
-            "sigma": full(int(used.sum()), w.sigma_proj),
-            "ray": data.pixel_ray.reshape(-1, 3)[used],
-            "target": data.pixel_target.reshape(-1, 2)[used],
-            "K": np.tile(K.nonzeros(), (len(owner), 1)),
-        },
-        owner,
-    )
-    out["proj"] = Element(
-        1,
-        fields,
-        columns,
-        owner,
-        lambda v, row, _, eps: terms.reprojection(
-            v[0], row, eps, K.sparsity(), bool(np.isfinite(w.sigma_proj))
-        ),
-    )
-    pairs, b = data.pairs, data.boundary_ray.shape[1]
-    fields, columns = base(
-        {
-            "weight": w.cont * data.pair_weight,
-            "factor": data.pair_factor / data.pair_unit,
-            "sigma_ref": full(len(pairs), w.sigma_cont_ref),
-            "sigma": full(len(pairs), w.sigma_cont),
-            "ray_i": data.anchor_ray[pairs[:, 0]],
-            "ray_k": data.anchor_ray[pairs[:, 1]],
-            "rays": data.boundary_ray.reshape(len(pairs), 3 * b),
-        },
-        pairs,
-    )
-    out["cont"] = Element(
-        2,
-        fields,
-        columns,
-        pairs,
-        lambda v, row, eps, _: terms.continuity(
-            v[0],
-            v[1],
-            row,
-            eps,
-            b,
-            bool(np.isfinite(w.sigma_cont_ref)),
-            bool(np.isfinite(w.sigma_cont)),
-            data.local_units,
-        ),
-    )
-    fields, columns = base(
-        {"weight": w.orient * data.orient_weight, "sigma": full(len(pairs), w.sigma_orient)}, pairs
-    )
-    out["orient"] = Element(
-        2,
-        fields,
-        columns,
-        pairs,
-        lambda v, row, eps, _: terms.orientation(
-            v[0], v[1], row, eps, bool(np.isfinite(w.sigma_orient))
-        ),
-    )
-    return out
+    columns = {
+        "weight": w.proj * data.pixel_weight[used],
+        "sigma": _full(count, w.sigma_proj),
+        "ray": data.pixel_ray[used],
+        "target": data.pixel_target[used],
+        "K": np.tile(K.nonzeros(), (count, 1)),
+    }
+
+    def norms(v: list[View], row: dict[str, ca.SX], _: ca.SX, eps: ca.SX) -> list[Norm]:
+        return terms.reprojection(v[0], row, eps, K.sparsity(), truncated)
+
+    return Element(owner, columns, norms, 1)
+
+
+def _cont(data: EnergyData, w: Weights) -> Element:
+    pairs, samples = data.pairs, data.boundary_ray.shape[1]
+    truncated = bool(np.isfinite(w.sigma_cont_ref)), bool(np.isfinite(w.sigma_cont))
+    columns = {
+        "weight": w.cont * data.pair_weight,
+        "factor": data.pair_factor / data.pair_unit,
+        "sigma_ref": _full(len(pairs), w.sigma_cont_ref),
+        "sigma": _full(len(pairs), w.sigma_cont),
+        "ray_i": data.anchor_ray[pairs[:, 0]],
+        "ray_k": data.anchor_ray[pairs[:, 1]],
+        "rays": data.boundary_ray.reshape(len(pairs), 3 * samples),
+    }
+
+    def norms(v: list[View], row: dict[str, ca.SX], eps: ca.SX, _: ca.SX) -> list[Norm]:
+        return terms.continuity(v[0], v[1], row, eps, samples, *truncated, data.local_units)
+
+    return Element(pairs, columns, norms, 2)
+
+
+def _orient(data: EnergyData, w: Weights) -> Element:
+    truncated = bool(np.isfinite(w.sigma_orient))
+    columns = {
+        "weight": w.orient * data.orient_weight,
+        "sigma": _full(len(data.pairs), w.sigma_orient),
+    }
+
+    def norms(v: list[View], row: dict[str, ca.SX], eps: ca.SX, _: ca.SX) -> list[Norm]:
+        return terms.orientation(v[0], v[1], row, eps, truncated)
+
+    return Element(data.pairs, columns, norms, 2)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
+from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Gauge
 from soup_nlp.model.norms import NormForm, TruncationForm
 from soup_nlp.schema.section import NonNegative, Section, Share
-
-Hessian = Literal["exact", "gauss-newton", "gauss-newton+constraints"]
 
 
 class FormulationOptions(Section):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 
 from soup_nlp.errors import ModelError
 
-HESSIANS = ("exact", "gauss-newton", "gauss-newton+constraints")
+Hessian = Literal["exact", "gauss-newton", "gauss-newton+constraints"]
+HESSIANS: tuple[Hessian, ...] = get_args(Hessian)
+"""gauss-newton: positive semidefinite part of the objective, without curvature of constraints."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,6 @@ class Kernel:
         constraints: (nc,) added to rows of g, or None.
         curvature: (nx, nx) positive semidefinite stand-in for the objective's Hessian, or None
             for none (then "gauss-newton" uses the exact one).
-        exact: Scalar: the element's exact, nonsmooth energy (for comparing), or None.
     """
 
     name: str
@@ -41,7 +43,6 @@ class Kernel:
     objective: ca.SX | None = None
     constraints: ca.SX | None = None
     curvature: ca.SX | None = None
-    exact: ca.SX | None = None
 
     def __str__(self) -> str:
         return f"Kernel({self.name}, {self.nx} variables, {self.row.numel()} data, {self.nc} rows)"

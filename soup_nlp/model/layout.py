@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.plane import about_anchor, at_anchor, inverse_depth, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Gauge = Literal["unit-offset", "unit-translation", "free"]
-GAUGES: tuple[Gauge, ...] = ("unit-offset", "unit-translation", "free")
+GAUGES: tuple[Gauge, ...] = get_args(Gauge)
 Chart = Literal["depth", "inverse-depth"]
 
 
@@ -65,6 +66,10 @@ class MatrixLayout:
     def of(self, superpixel: Int) -> Int:
         """(E, stride) variable indices of superpixels (E,)."""
         return superpixel[:, None] * self.stride + np.arange(self.stride)
+
+    def columns(self, superpixel: Int) -> dict[str, Float]:
+        """Constants (E, ...) that the views of superpixels (E,) need."""
+        return {"offset": self.offset[superpixel]}
 
     def pack(self, soup: Soup) -> Float:
         """Solver vector (size,) of a soup, brought to this gauge and length unit."""
@@ -153,12 +158,18 @@ class TangentLayout:
         """(E, 9) variable indices of superpixels (E,)."""
         return superpixel[:, None] * 9 + np.arange(9)
 
+    def columns(self, superpixel: Int) -> dict[str, Float]:
+        """Constants (E, ...) that the views of superpixels (E,) need; R0 by columns."""
+        i = superpixel
+        R0 = self.R0[i].transpose(0, 2, 1).reshape(-1, 9)
+        own = {"anchor": self.anchor[i], "radius": self.radius[i], "depth": self.depth[i]}
+        return {**own, "R0": R0, "t0": self.t0[i]}
+
     def pack(self, soup: Soup) -> Float:
         """Vector (9 N,) of a soup in this length unit; slopes are not clipped here."""
         s = soup.normalised(self.share)
-        depth = s.depth_at(self.anchor)
-        m = -s.n / s.distance[:, None]
-        slope = m[:, :2] * depth[:, None] * self.radius[:, None]
+        depth, g = at_anchor(inverse_depth(s.n, s.distance), self.anchor)
+        slope = g * self.radius[:, None]
         turn = np.swapaxes(self.R0, 1, 2) @ s.R
         w = rotation.log(turn)
         angle = np.linalg.norm(w, axis=1, keepdims=True)
@@ -173,15 +184,13 @@ class TangentLayout:
         """Feasible soup (SO(3), unit normals, simplex) of a vector."""
         a = np.asarray(x, float).reshape(-1, 9)
         a = _turned(a) if self.chart == "inverse-depth" else a
-        s = a[:, 1:3] / self.radius[:, None]
-        m = np.column_stack([s, 1 - np.sum(s * self.anchor[:, :2], axis=1)])
-        length = np.linalg.norm(m, axis=1)
         depth = a[:, 0] * self.depth
-        D = depth / length
+        m = about_anchor(depth, a[:, 1:3] / self.radius[:, None], self.anchor)
+        n, D = normal_and_distance(m)
         R = rotation.nearest(self.R0 @ rotation.cayley(a[:, 3:6]))
         t = self.t0 + (a[:, 6:9] - np.einsum("nij,nj->ni", R - self.R0, self.anchor))
         T = depth[:, None] * t
-        raw = Soup(D, -m / length[:, None], np.ones(len(D)), R, T / D[:, None])
+        raw = Soup(D, n, np.ones(len(D)), R, T / D[:, None])
         return raw.normalised(self.share)
 
     def names(self) -> list[str]:

@@ -6,7 +6,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.errors import ModelError
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import terms
 from soup_nlp.model.builder import Builder
@@ -14,7 +13,7 @@ from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import GAUGES, MatrixLayout
+from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.superpixel import View, matrix_view
 
@@ -37,12 +36,7 @@ def build_matrix_nlp(
 
     Returns:
         The NLP and the layout that turns its vectors into soups.
-
-    Raises:
-        ModelError: unknown gauge.
     """
-    if form.gauge not in GAUGES:
-        raise ModelError("unknown gauge", found=form.gauge, expected=", ".join(GAUGES))
     n = len(data)
     layout = MatrixLayout(data.share, form.gauge)
     b = Builder(form, layout.size)
@@ -52,51 +46,54 @@ def build_matrix_nlp(
         return matrix_view(x, form.gauge, row[f"offset_{position}"])
 
     for name, element in elements(data, weights, layout).items():
-        b.add_norms(name, element.placed(layout), view, own)
+        b.add_norms(name, element, view, own)
 
     every = layout.of(np.arange(n))
     x = ca.SX.sym("x", own)
-    none, empty = ca.SX.sym("none", 0), np.zeros((n, 0))
     v = matrix_view(x, form.gauge, ca.SX(1.0))
-    rows = b.new_rows("so3", 6 * n, 0.0, 0.0).reshape(n, 6)
-    b.add_constraint("so3", x, none, terms.so3(v), every, empty, rows)
-    rows = b.new_rows("normal", n, 0.0, 0.0)[:, None]
-    b.add_constraint("normal", x, none, terms.unit_normal(v), every, empty, rows)
+    b.add_constraint("so3", x, terms.so3(v), every, lower=0.0, upper=0.0)
+    b.add_constraint("normal", x, terms.unit_normal(v), every, lower=0.0, upper=0.0)
     count = data.rim_ray.shape[1]
     ray = ca.SX.sym("rays", 3 * count)
-    rows = b.new_rows("visible", count * n, form.min_facing, np.inf).reshape(n, count)
     b.add_constraint(
         "visible",
         x,
-        ray,
         terms.visibility(v, ray, count),
         every,
-        data.visibility_ray(form.depth_ratio).reshape(n, -1),
-        rows,
+        lower=form.min_facing,
+        upper=np.inf,
+        row=ray,
+        data=data.visibility_ray(form.depth_ratio).reshape(n, -1),
     )
-    row = np.tile(b.new_rows("simplex", 1, 1.0, 1.0), (n, 1))
-    b.add_constraint("simplex", x, none, v.lam / n, every, empty, row)
+    b.add_constraint("simplex", x, v.lam / n, every, lower=1.0, upper=1.0, total=True)
     if form.gauge != "unit-offset":
         # the length unit: sum_i c_i D_i = 1 (in gauge unit-offset the simplex says it)
-        row = np.tile(b.new_rows("unit", 1, 1.0, 1.0), (n, 1))
         c = ca.SX.sym("share")
-        b.add_constraint("unit", x, c, c * v.lam * x[4], every, data.share[:, None], row)
+        b.add_constraint(
+            "unit",
+            x,
+            c * v.lam * x[4],
+            every,
+            lower=1.0,
+            upper=1.0,
+            row=c,
+            data=data.share[:, None],
+            total=True,
+        )
     if form.gauge == "unit-translation":
         tau = ca.SX.sym("tau")
-        both = ca.vertcat(x, tau)
         index = np.column_stack([every, np.full(n, layout.tau)])
-        rows = b.new_rows("translation", n, 0.0, 0.0)[:, None]
-        b.add_constraint("translation", both, none, ca.sumsqr(v.t) - tau**2, index, empty, rows)
-    b.add_ridge(_metric(layout, layout.pack(soup), data))
-
-    lbx, ubx = np.full(b.nx, -np.inf), np.full(b.nx, np.inf)
+        body = ca.sumsqr(v.t) - tau**2
+        b.add_constraint("translation", ca.vertcat(x, tau), body, index, lower=0.0, upper=0.0)
+    x0 = layout.pack(soup)
+    b.add_ridge(_metric(layout, x0, data))
+    lbx, ubx = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
     lbx[np.arange(n) * own] = MIN_SCALE
     if form.gauge != "unit-offset":
         lbx[np.arange(n) * own + 4] = MIN_SCALE
     if form.gauge == "unit-translation":
         lbx[layout.tau] = 1e-8
-    x0 = np.concatenate([layout.pack(soup), np.zeros(b.nx - layout.size)])
-    return b.finish("soup", x0, lbx, ubx, layout.size, layout.names), layout
+    return b.finish("soup", x0, lbx, ubx, layout.names), layout
 
 
 def _metric(layout: MatrixLayout, x: Float, data: EnergyData) -> Float:

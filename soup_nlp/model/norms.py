@@ -38,14 +38,6 @@ class Norm:
     kind: Kind = "norm"
     leak: ca.SX | float = 0.0
 
-    def exact(self) -> ca.SX:
-        """The value in the energy that is reported."""
-        square = ca.dot(self.vector, self.vector)
-        y = square / 2 if self.kind == "half_square" else ca.sqrt(square)
-        if self.sigma is None:
-            return self.weight * y
-        return self.weight * ((1 - self.leak) * ca.fmin(y, self.sigma) + self.leak * y)
-
 
 @dataclass(frozen=True)
 class Form:
@@ -91,7 +83,7 @@ def solver_form(
         norm: The robust norm.
         x: All local variables of the kernel (slack and switch among them).
         theta: Share of the curvature along the residual that is removed (0: reweighted least
-            squares, 1: Newton's; SOLVING measured 0.9 best).
+            squares, 1: Newton's; see docs/solving.md).
         slack: Variable s >= 0 of the epigraph form, None for the smooth form.
         switch: Variable z in [0, 1] of the lifted truncation, None for the smooth one.
     """

@@ -43,20 +43,21 @@ def build_tangent_nlp(
         return tangent_view(x, **base, chart=chart)
 
     for name, element in elements(data, weights, layout).items():
-        b.add_norms(f"t_{name}", element.placed(layout), view, 9)
+        b.add_norms(f"t_{name}", element, view, 9)
     # the simplex with the slopes held, linear in chart "depth": every iterate keeps it, and the
     # constrained NLP, which has it exactly, starts from the normalised answer
     share = soup.normalised(layout.share).lam
     lam, part = ca.SX.sym("lam"), ca.SX.sym("share")
-    row = np.tile(b.new_rows("simplex", 1, 1.0, 1.0), (n, 1))
     b.add_constraint(
         "t_simplex",
         lam,
-        part,
         part * lam if chart == "depth" else part / lam,
         np.arange(n)[:, None] * 9,
-        share[:, None],
-        row,
+        lower=1.0,
+        upper=1.0,
+        row=part,
+        data=share[:, None],
+        total=True,
     )
     # visibility as in the constrained NLP, divided by the anchor's facing 1 / |m| and in chart
     # "inverse-depth" multiplied by rho: the same set, so that one's solution is the other's
@@ -66,36 +67,25 @@ def build_tangent_nlp(
     rho, slope = (ca.SX(1), plane) if chart == "depth" else (plane[0], plane[1:])
     ray, reach = ca.SX.sym("ray", 2), ca.SX.sym("radius")
     facing = ca.norm_2(ca.vertcat(slope / reach, rho - ca.dot(slope, ray) / reach))
-    rows = b.new_rows("visible", count * n, 0.0, np.inf)
     b.add_constraint(
         "t_visible",
         plane,
-        ca.vertcat(place, ray, reach),
         ca.vertcat(*[ca.dot(slope, place[2 * j : 2 * j + 2]) for j in range(count)])
         + (1 - 1 / form.depth_ratio) * rho
         - form.min_facing * facing,
         np.arange(n)[:, None] * 9 + np.arange(3 - plane.numel(), 3),
-        np.column_stack([off.reshape(n, -1), layout.anchor[:, :2], layout.radius]),
-        rows.reshape(n, count),
+        lower=0.0,
+        upper=np.inf,
+        row=ca.vertcat(place, ray, reach),
+        data=np.column_stack([off.reshape(n, -1), layout.anchor[:, :2], layout.radius]),
     )
     b.add_ridge(np.ones(9 * n))
     lower, upper = np.full((n, 9), -np.inf), np.full((n, 9), np.inf)
     lower[:, 0] = 1e-3
     # wide: visibility bounds the slopes, as in the constrained NLP, which has no such box
     lower[:, 1:3], upper[:, 1:3] = -20 * form.depth_ratio, 20 * form.depth_ratio
-    extra = b.nx - 9 * n
-    x0 = np.concatenate(
-        [_visible(layout.pack(soup), off, form.depth_ratio, chart), np.zeros(extra)]
-    )
-    nlp = b.finish(
-        "presolve",
-        x0,
-        np.concatenate([lower.ravel(), np.zeros(extra)]),
-        np.concatenate([upper.ravel(), np.zeros(extra)]),
-        9 * n,
-        layout.names,
-    )
-    return nlp, layout
+    x0 = _visible(layout.pack(soup), off, form.depth_ratio, chart)
+    return b.finish("presolve", x0, lower.ravel(), upper.ravel(), layout.names), layout
 
 
 def _visible(x: Float, off: Float, depth_ratio: float, chart: Chart) -> Float:

@@ -13,36 +13,20 @@ author's TRW_S-v1.3 with general tables, so that the bound of every iteration is
 * decoding in order: ``x_i = argmin u_i + sum_(j<i) p_ji(x_j, .) + sum_(j>i) M_ji``, the first
   label in a tie.
 
-An edge stores one message, the one that the last pass over it wrote. Nodes that the order does
-not separate run as one batch (:mod:`soup_nlp.mrf.order`), which changes nothing but the
-order of floating-point sums.
+An edge stores one message, the one that the last pass over it wrote. Nodes of one colour run as one
+batch (:mod:`soup_nlp.mrf.levels`), which changes nothing but the order of floating-point sums.
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from soup_nlp.mrf.order import (
-    CALL_BYTES,
-    Level,
-    Side,
-    TableFunction,
-    Tables,
-    call_tables,
-    check_edges,
-    check_labels,
-    fail,
-    node_order,
-    plan_levels,
-)
+from soup_nlp.mrf.levels import Level, Side, Tables, check_edges, colours, fail, plan_levels
 
-Unary = np.ndarray | Sequence[np.ndarray]
-Pairwise = np.ndarray | Sequence[np.ndarray] | TableFunction
 Callback = Callable[[int, float, float, float], bool | None]
 
 
@@ -61,7 +45,6 @@ class TRWSResult:
         status: ``"gap"``, ``"stagnation"``, ``"iterations"`` or ``"interrupted"``.
         ties: Nodes whose label was a tie, to rounding, when ``labels`` were decoded; 0 if they
             are ``init_labels``.
-        seconds: Wall time.
     """
 
     labels: np.ndarray
@@ -73,37 +56,29 @@ class TRWSResult:
     iterations: int
     status: str
     ties: int
-    seconds: float
 
 
 def solve_trws(
-    unary: Unary,
+    unary: np.ndarray,
     edges: np.ndarray,
-    pairwise: Pairwise,
+    pairwise: np.ndarray,
     *,
-    order: str | np.ndarray = "colour",
     max_iter: int = 100,
     gap: float = 1e-6,
     stagnation: float = 1e-7,
     patience: int = 10,
     dtype: type | np.dtype = np.float64,
     init_labels: np.ndarray | None = None,
-    keep_tables: bool = True,
     polish: bool = False,
     callback: Callback | None = None,
 ) -> TRWSResult:
     """Minimise a pairwise energy by TRW-S; see the module for the equations.
 
     Args:
-        unary: (N, L) costs, or N arrays (L_i,) where nodes have different label counts. A cost
-            of +inf forbids a label; every node needs a finite one.
-        edges: (E, 2) node numbers. Edges that join the same two nodes are merged into one whose
-            table is the sum (transposed where they run in opposite directions).
-        pairwise: (E, L, L) tables, axis 1 for ``edges[e, 0]``; or E arrays (L_a, L_b), padded
-            inside to the largest L; or a function of (n,) edge numbers that returns (n, L, L).
-            Finite; entries beyond a node's labels are not used. A C-contiguous array of the
+        unary: (N, L) costs. A cost of +inf forbids a label; every node needs a finite one.
+        edges: (E, 2) node numbers.
+        pairwise: (E, L, L) finite tables, axis 1 for ``edges[e, 0]``. A C-contiguous array of the
             working type is read in place: it must not change during the call.
-        order: ``"colour"`` (few large batches), ``"input"``, or an (N,) permutation.
         max_iter: Most iterations.
         gap: Stop once best energy - bound <= ``gap * max(1, |best energy|)``; negative: never.
         stagnation: Stop once, over ``patience`` iterations, the best energy did not fall and the
@@ -111,9 +86,6 @@ def solve_trws(
         patience: See ``stagnation``.
         dtype: float64, or float32 for half the memory; the bound is then exact to that rounding.
         init_labels: (N,) labels that the result is never worse than; they do not steer the method.
-        keep_tables: Whether to keep the tables of a pairwise function. If not, it is called in
-            blocks of at most 32 MiB, for every edge three times an iteration, and parallel edges
-            are refused.
         polish: Whether to end with iterated conditional modes, which can only lower the energy.
         callback: Called after every iteration as ``callback(iteration, bound, energy, best
             energy)``; a true answer or a KeyboardInterrupt, there or anywhere in the iterations,
@@ -122,20 +94,15 @@ def solve_trws(
     Raises:
         ModelError: Inputs of the wrong shape, type or range, or not finite.
     """
-    start = time.perf_counter()
     work = _working_type(dtype)
     for name, value in (("max_iter", max_iter), ("patience", patience)):
         if value < 1:
             fail("An option of TRW-S is too small.", name, value, "at least 1")
-    costs, counts = _read_unary(unary)
-    pairs = check_edges(edges, len(counts))
-    begin = None if init_labels is None else check_labels(init_labels, counts, "init_labels")
-    with np.errstate(over="ignore"):  # what a float32 cannot hold is caught as infinite
-        source = _read_pairwise(pairwise, pairs, counts, work, keep_tables)
-    tables = Tables(source, pairs, costs.shape[1], work)
-    pairs = pairs[tables.kept]
-    plan = plan_levels(node_order(order, len(counts), pairs), pairs)
-    solver = _Passes(costs, plan, tables)
+    costs = _checked_unary(unary)
+    pairs = check_edges(edges, len(costs))
+    begin = None if init_labels is None else _checked_labels(init_labels, costs, "init_labels")
+    table = _finite(_checked_tables(pairwise, pairs, costs), work)
+    solver = _Passes(costs, plan_levels(colours(len(costs), pairs), pairs), Tables(table))
     first = math.inf if begin is None else mrf_energy(begin, unary, edges, pairwise)
     best = (first, costs.argmin(axis=1) if begin is None else begin, 0)
     rows: list[tuple[float, float, float]] = []
@@ -166,36 +133,29 @@ def solve_trws(
         energy, labels, ties = first, begin, 0  # float32 took a worse labelling for a better one
     bounds, energies, bests = np.array(rows).reshape(-1, 3).T.copy()
     bound = min(float(bounds.max(initial=-math.inf)), energy)
-    took = time.perf_counter() - start
-    return TRWSResult(labels, energy, bound, bounds, energies, bests, len(rows), status, ties, took)
+    return TRWSResult(labels, energy, bound, bounds, energies, bests, len(rows), status, ties)
 
 
-def mrf_energy(labels: np.ndarray, unary: Unary, edges: np.ndarray, pairwise: Pairwise) -> float:
+def mrf_energy(
+    labels: np.ndarray, unary: np.ndarray, edges: np.ndarray, pairwise: np.ndarray
+) -> float:
     """Energy of a labelling in float64, by plain look-up of the inputs of :func:`solve_trws`.
 
     Args:
         labels: (N,) integers.
-        unary: As there, like the two below; parallel edges count one by one.
+        unary: (N, L) costs.
         edges: (E, 2) node numbers.
-        pairwise: Tables or function.
+        pairwise: (E, L, L) tables.
 
     Raises:
         ModelError: Inputs of the wrong shape, type or range.
     """
-    costs, counts = _read_unary(unary)
-    pairs = check_edges(edges, len(counts))
-    x = check_labels(labels, counts, "labels")
-    at, to = x[pairs[:, 0]], x[pairs[:, 1]]
-    total = float(costs[np.arange(len(x)), x].sum())
-    if not callable(pairwise):
-        _check_tables(pairwise, pairs, counts)
-        return total + math.fsum(float(pairwise[e][a, b]) for e, (a, b) in enumerate(zip(at, to)))
-    step = max(1, CALL_BYTES // (8 * costs.shape[1] ** 2))
-    for k in range(0, len(pairs), step):
-        ids = np.arange(k, min(len(pairs), k + step))
-        block = call_tables(pairwise, ids, costs.shape[1])
-        total += float(block[ids - k, at[ids], to[ids]].sum(dtype=np.float64))
-    return total
+    costs = _checked_unary(unary)
+    pairs = check_edges(edges, len(costs))
+    x = _checked_labels(labels, costs, "labels")
+    table = _checked_tables(pairwise, pairs, costs)
+    paid = table[np.arange(len(pairs)), x[pairs[:, 0]], x[pairs[:, 1]]]
+    return float(costs[np.arange(len(x)), x].sum()) + math.fsum(paid.tolist())
 
 
 def _working_type(dtype: type | np.dtype) -> np.dtype:
@@ -209,23 +169,70 @@ def _working_type(dtype: type | np.dtype) -> np.dtype:
     fail("TRW-S cannot work in this type.", "dtype", found, "float64 or float32")
 
 
+def _checked_unary(unary: np.ndarray) -> np.ndarray:
+    """(N, L) float64 costs."""
+    costs = np.asarray(unary, np.float64)
+    if costs.ndim != 2 or not costs.size:
+        shape = f"shape {costs.shape}"
+        fail("The unary costs are not one row of labels a node.", "unary", shape, "shape (N, L)")
+    wrong = np.flatnonzero(~(costs > -np.inf).all(axis=1) | np.isinf(costs).all(axis=1))
+    if wrong.size:
+        where, expected = f"unary[{wrong[0]}]", "numbers or +inf, at least one finite"
+        fail("A node has costs that cannot be used.", where, costs[wrong[0]], expected)
+    return costs
+
+
+def _checked_labels(labels: object, costs: np.ndarray, name: str) -> np.ndarray:
+    """(N,) int64 copy of labels that fit (N, L) costs."""
+    out, (nodes, count) = np.asarray(labels), costs.shape
+    if out.shape != (nodes,) or not np.issubdtype(out.dtype, np.integer):
+        found = f"shape {out.shape}, {out.dtype}"
+    elif (out < 0).any() or (out >= count).any():
+        found = f"label {out[(out < 0) | (out >= count)][0]}"
+    else:
+        return out.astype(np.int64)
+    expected = f"{nodes} integers from 0 to {count - 1}"
+    fail("The labels do not fit the nodes.", name, found, expected)
+
+
+def _checked_tables(pairwise: np.ndarray, edges: np.ndarray, costs: np.ndarray) -> np.ndarray:
+    """(E, L, L) tables of the edges of nodes with (N, L) costs."""
+    table, shape = np.asarray(pairwise), (len(edges), costs.shape[1], costs.shape[1])
+    if table.shape != shape and (len(edges) or table.size):
+        fail("The tables have the wrong shape.", "pairwise", table.shape, shape)
+    return table.reshape(shape)
+
+
+def _finite(table: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """(E, L, L) tables in the working type, checked to be finite there."""
+    with np.errstate(over="ignore"):  # what a float32 cannot hold becomes infinite
+        table = np.ascontiguousarray(table, dtype)
+    # least and largest entries are not finite where any entry is not, and need no copy
+    bad = ~(np.isfinite(table.min(axis=(1, 2))) & np.isfinite(table.max(axis=(1, 2))))
+    if bad.any():
+        where = f"pairwise[{bad.argmax()}]"
+        hint = "forbid a pair by a large cost, a label by an infinite unary cost"
+        fail("A table is not finite.", where, "nan or infinity", f"finite in {dtype}", hint)
+    return table
+
+
 class _Passes:
     """Messages and passes of one problem.
 
     Args:
-        costs: (N, L) unary costs, +inf where a label does not exist.
-        plan: Levels of the order, first to last.
+        costs: (N, L) unary costs, +inf where a label is forbidden.
+        plan: Levels, first to last.
         tables: Tables of the edges, in the working type.
     """
 
     def __init__(self, costs: np.ndarray, plan: list[Level], tables: Tables) -> None:
-        dtype, absent = tables.buffer.dtype, np.isinf(costs)
+        dtype, absent = tables.table.dtype, np.isinf(costs)
         with np.errstate(over="ignore"):
             self.costs = costs.astype(dtype)
         if not np.array_equal(np.isinf(self.costs), absent):
             fail("A unary cost is too large.", "unary", costs[~absent].max(), f"within {dtype}")
         self.absent, self.plan, self.tables = absent, plan, tables
-        self.messages = np.zeros((len(tables.kept), costs.shape[1]), dtype)
+        self.messages = np.zeros((len(tables.table), costs.shape[1]), dtype)
 
     def sweep(self) -> float:
         """One forward and one backward pass; the lower bound."""
@@ -304,69 +311,3 @@ class _Passes:
             if not moved:
                 break
         return labels
-
-
-def _read_unary(unary: Unary) -> tuple[np.ndarray, np.ndarray]:
-    """(N, L) float64 costs padded with +inf, and (N,) label counts, checked."""
-    rows = [np.asarray(row, np.float64) for row in unary]
-    bad = [i for i, row in enumerate(rows) if row.ndim != 1 or not row.size]
-    if not rows or bad:
-        where = f"unary[{bad[0]}]" if bad else "unary"
-        found = f"shape {rows[bad[0]].shape}" if bad else "no node"
-        fail("The unary costs are not one row of labels a node.", where, found, "shape (N, L)")
-    counts = np.array([row.size for row in rows])
-    out = np.full((len(rows), int(counts.max())), np.inf)
-    for i, row in enumerate(rows):
-        out[i, : row.size] = row
-    wrong = np.flatnonzero(~(out > -np.inf).all(axis=1) | np.isinf(out).all(axis=1))
-    if wrong.size:
-        where, expected = f"unary[{wrong[0]}]", "numbers or +inf, at least one finite"
-        fail("A node has costs that cannot be used.", where, rows[wrong[0]], expected)
-    return out, counts
-
-
-def _check_tables(
-    pairwise: np.ndarray | Sequence[np.ndarray], edges: np.ndarray, counts: np.ndarray
-) -> None:
-    """Fail where tables do not have the shapes that the edges and label counts ask for."""
-    n, size = len(edges), int(counts.max())
-    if isinstance(pairwise, np.ndarray):
-        if pairwise.shape != (n, size, size) and (n or pairwise.size):
-            fail("The tables have the wrong shape.", "pairwise", pairwise.shape, (n, size, size))
-        return
-    if len(pairwise) != n:
-        fail("The tables are not one an edge.", "pairwise", len(pairwise), n)
-    for e, (a, b) in enumerate(edges):
-        found, shape = np.shape(pairwise[e]), (int(counts[a]), int(counts[b]))
-        if found != shape:
-            fail("A table does not fit its edge's nodes.", f"pairwise[{e}]", found, shape)
-
-
-def _read_pairwise(
-    pairwise: Pairwise, edges: np.ndarray, counts: np.ndarray, dtype: np.dtype, keep: bool
-) -> np.ndarray | TableFunction:
-    """(E, L, L) tables padded with zeros and checked, or the function itself if not kept."""
-    n, size = len(edges), int(counts.max())
-    step = max(1, CALL_BYTES // (size * size * dtype.itemsize))
-    chunks = [np.arange(k, min(n, k + step)) for k in range(0, n, step)]
-    if callable(pairwise):
-        if not keep:
-            return pairwise
-        table = np.empty((n, size, size), dtype)
-        for ids in chunks:
-            table[ids[0] : ids[-1] + 1] = call_tables(pairwise, ids, size)
-    elif isinstance(pairwise, np.ndarray):
-        _check_tables(pairwise, edges, counts)
-        table = np.ascontiguousarray(pairwise.reshape(n, size, size), dtype)
-    else:
-        _check_tables(pairwise, edges, counts)
-        table = np.zeros((n, size, size), dtype)
-        for e, (a, b) in enumerate(edges):
-            table[e, : counts[a], : counts[b]] = pairwise[e]
-    for ids in chunks:
-        bad = ~np.isfinite(table[ids[0] : ids[-1] + 1]).all(axis=(1, 2))
-        if bad.any():
-            where = f"pairwise[{ids[bad.argmax()]}]"
-            hint = "forbid a pair by a large cost, a label by an infinite unary cost"
-            fail("A table is not finite.", where, "nan or infinity", f"finite in {dtype}", hint)
-    return table

@@ -11,6 +11,8 @@ import re
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from skimage.measure import label
 
 from soup_nlp.data.datasets.layout import MARK, is_result, make_pair, need, need_folder, read_if
 from soup_nlp.data.flow.consistency import leaves
@@ -23,7 +25,8 @@ from soup_nlp.geometry.camera import intrinsics
 
 LAYOUT = (
     "frame_0.png and frame_1.png (or image_ref.png and image_next.png), K.txt; optional "
-    "K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, flow.flo|png|npy, occluded.png, points.npz"
+    "K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, flow.flo|png|npy, occluded.png, moving.png, "
+    "points.npz"
 )
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp")
 _DEPTHS = (".npy", ".dpt", ".pfm", ".png")
@@ -61,7 +64,8 @@ def load_folder(
     - `frame_0.png` or `image_ref.png`; `frame_1.png` or `image_next.png`
     - `K.txt`: 3x3 intrinsics, or fx fy cx cy; `K_next.txt` if the next frame's differ
     - optional truth: `depth`, `depth_0` or `depth_ref` (.npy, .dpt, .pfm, 16-bit .png),
-      `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `occluded.png` (white = occluded)
+      `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `occluded.png` (white = occluded),
+      `moving.png` (white = moves by itself; every connected region is one component)
     - optional sparse truth `points.npz`: `uv_0` (M, 2) pixels and `xyz_mm_0` (M, 3) millimetres in
       the reference camera; z is converted to `unit` when that is "m" and kept when it is "mm".
       (`xyz_mm_1`, the same points in the next frame, has no place in `Truth` and is not read.)
@@ -98,17 +102,27 @@ def load_folder(
     K_next = read_if(read_intrinsics, folder / "K_next.txt")
     depth = _find(folder, ("depth", "depth_0", "depth_ref"), _DEPTHS)
     depth_next = _find(folder, ("depth_next", "depth_1"), _DEPTHS)
+    flow = _find(folder, ("flow",), _FLOWS)
+    occluded = _find(folder, ("occluded",), _IMAGES)
+    moving = _find(folder, ("moving",), _IMAGES)
+    points = folder / "points.npz"
     truth = Truth(
-        depth_ref=read_if(read_depth, depth, depth_scale),
-        depth_next=read_if(read_depth, depth_next, depth_scale),
-        flow=read_if(read_flow, _find(folder, ("flow",), _FLOWS)),
-        occluded=read_if(read_mask, _find(folder, ("occluded",), _IMAGES)),
-        points=read_if(_read_points, folder / "points.npz", unit),
+        depth_ref=read_depth(depth, depth_scale) if depth else None,
+        depth_next=read_depth(depth_next, depth_scale) if depth_next else None,
+        flow=read_flow(flow).astype(np.float64) if flow else None,
+        occluded=read_mask(occluded) if occluded else None,
+        components=_moving_components(moving) if moving else None,
+        points=_read_points(points, unit) if points.is_file() else None,
         unit=unit,
     )
     return make_pair(
         images, [K, K if K_next is None else K_next], truth, folder.resolve().name, white
     )
+
+
+def _moving_components(path: Path) -> NDArray[np.int32]:
+    """(H, W) labels of the connected regions of a mask of moving pixels; 0 elsewhere."""
+    return np.asarray(label(read_mask(path), connectivity=2), np.int32)
 
 
 def _read_points(path: Path, unit: str) -> Float:

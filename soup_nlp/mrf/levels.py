@@ -1,0 +1,202 @@
+"""The batches of nodes and the pairwise tables that TRW-S works through.
+
+A greedy colouring of the graph orders the nodes: colour by colour, and inside a colour by number.
+Nodes of one colour have no edge between them, so that handling them as one batch, a level, is the
+same computation as handling them one after the other. An edge leads from the level of its lower
+colour up to that of its higher colour.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import NoReturn
+
+import numpy as np
+
+from soup_nlp.errors import ModelError
+
+_CACHE_BYTES = 1 << 19  # tables handled together: half of a usual second-level cache
+
+
+def fail(
+    what: str, where: object, found: object, expected: object, hint: str | None = None
+) -> NoReturn:
+    """Raise a :class:`ModelError` with the given parts."""
+    raise ModelError(what, where=where, found=found, expected=expected, hint=hint)
+
+
+@dataclass(frozen=True)
+class Side:
+    """The edges from the nodes of one level to higher levels (``up``) or to lower ones (``down``).
+
+    Attributes:
+        ids: (n,) edge numbers, sorted by the level's node.
+        node: (n,) position in the level of each edge's node.
+        other: (n,) node at the far end.
+        parts: Positions into ``ids`` by the table axis of the level's node: ``(1, positions)``
+            for a node that comes first in its edge, ``(2, positions)`` for one that comes second.
+        who: (k,) positions in the level that have at least one of these edges.
+        starts: (k,) where each of them starts in ``ids``.
+    """
+
+    ids: np.ndarray
+    node: np.ndarray
+    other: np.ndarray
+    parts: tuple[tuple[int, np.ndarray], ...]
+    who: np.ndarray
+    starts: np.ndarray
+
+    def add(self, out: np.ndarray, values: np.ndarray) -> None:
+        """Add (n, L) values of the edges to the (m, L) rows of the level's nodes, in place."""
+        if self.who.size:
+            out[self.who] += np.add.reduceat(values, self.starts, axis=0)
+
+
+@dataclass(frozen=True)
+class Level:
+    """Nodes without an edge between them, in increasing number, with the edges on both sides.
+
+    Attributes:
+        nodes: (n,) node numbers.
+        gamma: (n, 1) ``1 / max(edges up, edges down)``, the weight of a node in each of the
+            monotonic chains through it (1 where the node has no edge; it is then not used).
+        up: Edges to higher levels.
+        down: Edges to lower levels.
+    """
+
+    nodes: np.ndarray
+    gamma: np.ndarray
+    up: Side
+    down: Side
+
+
+def check_edges(edges: object, n_nodes: int) -> np.ndarray:
+    """Edges as an (E, 2) int64 array, checked.
+
+    Args:
+        edges: (E, 2) integers, each row two different nodes; empty allowed.
+        n_nodes: Number of nodes N.
+
+    Raises:
+        ModelError: Wrong shape or type, a node out of range, or an edge from a node to itself.
+    """
+    out = np.asarray(edges)
+    if out.size == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    if out.ndim != 2 or out.shape[1] != 2 or not np.issubdtype(out.dtype, np.integer):
+        found = f"shape {out.shape}, {out.dtype}"
+        fail("The edges are no pairs of nodes.", "edges", found, "shape (E, 2), integers")
+    bad = ((out < 0) | (out >= n_nodes)).any(axis=1) | (out[:, 0] == out[:, 1])
+    if bad.any():
+        fail(
+            "An edge does not join two different nodes of the MRF.",
+            f"edges[{bad.argmax()}]",
+            out[bad.argmax()].tolist(),
+            f"two different numbers from 0 to {n_nodes - 1}",
+            "the diagonal of the table of a loop belongs to the node's unary cost",
+        )
+    return out.astype(np.int64)
+
+
+def colours(n_nodes: int, edges: np.ndarray) -> np.ndarray:
+    """Greedy colouring, largest degree first (Welsh and Powell 1967).
+
+    No two nodes of a colour have an edge between them, and every node has a neighbour in each
+    lower colour: there are at most as many colours as the largest degree + 1.
+
+    Args:
+        n_nodes: Number of nodes N.
+        edges: (E, 2) checked edges.
+
+    Returns:
+        (N,) colour of every node, counted from 0.
+    """
+    near: list[list[int]] = [[] for _ in range(n_nodes)]
+    for a, b in edges.tolist():
+        near[a].append(b)
+        near[b].append(a)
+    colour = [-1] * n_nodes
+    for v in sorted(range(n_nodes), key=lambda v: -len(near[v])):
+        used = {colour[u] for u in near[v]}
+        colour[v] = next(c for c in range(len(used) + 1) if c not in used)
+    return np.asarray(colour, dtype=np.int64)
+
+
+def plan_levels(colour: np.ndarray, edges: np.ndarray) -> list[Level]:
+    """The levels of a colouring, first to last in the forward pass.
+
+    Args:
+        colour: (N,) from :func:`colours`.
+        edges: (E, 2) checked edges.
+    """
+    n, count = len(colour), int(colour.max()) + 1
+    forwards = colour[edges[:, 0]] < colour[edges[:, 1]]
+    early = np.where(forwards, edges[:, 0], edges[:, 1])
+    late = np.where(forwards, edges[:, 1], edges[:, 0])
+    chains = np.maximum(np.bincount(early, minlength=n), np.bincount(late, minlength=n))
+    gamma = 1.0 / np.maximum(chains, 1)
+    nodes = np.argsort(colour, kind="stable")
+    cuts = np.searchsorted(colour[nodes], np.arange(count + 1))
+    place = np.empty(n, dtype=np.int64)
+    place[nodes] = np.arange(n) - cuts[colour[nodes]]
+    ups = _sides(early, late, forwards, colour, place)
+    downs = _sides(late, early, ~forwards, colour, place)
+    return [
+        Level(nodes[a:b], gamma[nodes[a:b], None], up, down)
+        for a, b, up, down in zip(cuts[:-1], cuts[1:], ups, downs)
+    ]
+
+
+def _sides(
+    near: np.ndarray, far: np.ndarray, head: np.ndarray, level: np.ndarray, place: np.ndarray
+) -> list[Side]:
+    """One :class:`Side` a level, of the edges seen from their ``near`` node.
+
+    Args:
+        near: (E,) node on this side of every edge.
+        far: (E,) node at the other end.
+        head: (E,) whether ``near`` comes first in its edge.
+        level: (N,) level of every node.
+        place: (N,) position of every node in its level.
+    """
+    ids = np.lexsort((place[near], level[near]))
+    cuts = np.searchsorted(level[near[ids]], np.arange(int(level.max()) + 2))
+    out = []
+    for a, b in itertools.pairwise(cuts):
+        mine = ids[a:b]
+        node = place[near[mine]]
+        who, starts = np.unique(node, return_index=True)
+        both = ((1, np.flatnonzero(head[mine])), (2, np.flatnonzero(~head[mine])))
+        parts = tuple(part for part in both if part[1].size)
+        out.append(Side(mine, node, far[mine], parts, who, starts))
+    return out
+
+
+class Tables:
+    """The pairwise tables, read block by block and never copied as a whole.
+
+    Args:
+        table: (E, L, L) costs; axis 1 belongs to ``edges[e, 0]``, axis 2 to ``edges[e, 1]``.
+    """
+
+    def __init__(self, table: np.ndarray) -> None:
+        size = table.shape[1]
+        self.table = table
+        self.step = max(1, _CACHE_BYTES // (size * size * table.itemsize))
+        self._buffer = np.empty((min(self.step, len(table)), size, size), table.dtype)
+
+    def block(self, ids: np.ndarray) -> np.ndarray:
+        """(n, L, L) tables of at most ``step`` edges, in a buffer that the caller may overwrite."""
+        out = self._buffer[: len(ids)]
+        np.take(self.table, ids, axis=0, out=out, mode="clip")
+        return out
+
+    def lines(self, side: Side, labels: np.ndarray) -> np.ndarray:
+        """(n, L) table entries over the labels of the level's node, the far end held fixed."""
+        fixed = labels[side.other]
+        out = np.empty((len(side.ids), self.table.shape[1]), self.table.dtype)
+        for axis, at in side.parts:
+            rows = side.ids[at]
+            out[at] = self.table[rows, :, fixed[at]] if axis == 1 else self.table[rows, fixed[at]]
+        return out
