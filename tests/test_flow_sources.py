@@ -9,7 +9,7 @@ import pytest
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.consistency import checked_flow
 from soup_nlp.data.flow.learned import learned_flow
-from soup_nlp.data.flow.rlof import rlof_available, rlof_flow
+from soup_nlp.data.flow.rlof import rlof_flow
 from soup_nlp.data.flow.robust import reweighted
 from soup_nlp.data.flow.sources import add_noise, flow_from_truth, is_named, resolve_flow
 from soup_nlp.data.pair import Flow
@@ -107,7 +107,9 @@ def test_rlof_needs_the_contributed_modules(pair, monkeypatch):
         resolve_flow(pair, "rlof")
 
 
-@pytest.mark.skipif(not rlof_available(), reason="this OpenCV has no contributed modules (RLOF)")
+@pytest.mark.skipif(
+    not hasattr(cv2, "optflow"), reason="this OpenCV has no contributed modules (RLOF)"
+)
 def test_rlof_on_a_rendered_scene(pair):
     flow = resolve_flow(pair, "rlof")
     sure = flow.confidence > 0.5

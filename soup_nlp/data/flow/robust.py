@@ -30,14 +30,12 @@ class AffineFlow:
     size: Float
     known: NDArray[np.bool_]
 
-    def basis(self, which: Ints, u: NDArray[np.integer], v: NDArray[np.integer]) -> Float:
+    def basis(self, which: Ints, u: Ints, v: Ints) -> Float:
         """(P, 3) the three functions at pixels of superpixels `which` (P,)."""
         du, dv = u - self.centre[which, 0], v - self.centre[which, 1]
         return np.stack([np.ones(len(which)), du / self.size[which], dv / self.size[which]], axis=1)
 
-    def residual(
-        self, which: Ints, u: NDArray[np.integer], v: NDArray[np.integer], uv: Float
-    ) -> Float:
+    def residual(self, which: Ints, u: Ints, v: Ints, uv: Float) -> Float:
         """(P,) distance, pixels, of flows (P, 2) from those of superpixels `which` (P,)."""
         own = np.einsum("pa,pac->pc", self.basis(which, u, v), self.coefficients[which])
         return np.where(self.known[which], np.linalg.norm(uv - own, axis=1), np.inf)

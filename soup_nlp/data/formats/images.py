@@ -5,6 +5,7 @@ Every reader raises `DataError` for a file that is missing, empty, truncated or 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import warnings
 from pathlib import Path
@@ -97,12 +98,9 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
             found=f"a {'PNG' if png else 'JPEG'} without its end marker",
             hint="copy or download the file again",
         )
-    try:
+    image = None
+    with contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise DataError(
-            f"{what} cannot be decoded", where=path, found=str(error).strip()
-        ) from error
     if image is None:
         raise DataError(
             f"{what} cannot be decoded",
@@ -115,7 +113,7 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
 
 
 def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]:
-    """Decode a 16-bit PNG with a fixed number of channels (1: (H, W), 3: (H, W, 3) in BGR order)."""
+    """Decode a 16-bit PNG: (H, W) for one channel, (H, W, 3) in BGR order for three."""
     image = decode(path, what)
     found = 1 if image.ndim == 2 else image.shape[2]
     if image.dtype != np.uint16 or found != channels:
