@@ -29,7 +29,6 @@ from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.check import check_folder
-from soup_nlp.schema.section import Section
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = sorted((ROOT / "docs").glob("*.md"))
