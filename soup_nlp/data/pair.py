@@ -35,8 +35,8 @@ def check_size(
         raise DataError(
             f"{what} differ in size",
             where=where,
-            found=f"{found[1]}x{found[0]}",
-            expected=f"{expected[1]}x{expected[0]} (width x height)",
+            found=found,
+            expected=f"{expected[:2]} (height, width)",
             hint=hint,
         )
 
@@ -56,12 +56,12 @@ class Flow:
     source: str = "unknown"
 
     def __post_init__(self) -> None:
-        if self.uv.ndim != 3 or self.uv.shape[2] != 2:
+        if self.uv.shape[2:] != (2,) or self.confidence.ndim != 2:
             raise DataError(
                 "flow has the wrong shape",
                 where=self.source,
-                found=self.uv.shape,
-                expected="(H, W, 2)",
+                found=f"{self.uv.shape}, confidence {self.confidence.shape}",
+                expected="(H, W, 2), confidence (H, W)",
             )
         check_size("flow confidence and flow", self.confidence.shape, self.uv.shape, self.source)
         # false for NaN too
@@ -159,9 +159,8 @@ class Pair:
                     expected="uint8 (H, W, 3)",
                 )
         for what in ("K_ref", "K_next"):
-            K = _matrix(getattr(self, what), what)
+            K = check_intrinsics(getattr(self, what), what)
             object.__setattr__(self, what, K)
-            check_intrinsics(K, what)
             _check_focal(K, getattr(self, what.replace("K", "image")), what)
         if self.flow is not None:
             hint = "compute the flow at the size of the image; it is not resized"
@@ -189,16 +188,6 @@ class Pair:
         return f"Pair({self.name}, {w}x{h}, {self.flow or 'no flow'}, {self.truth or 'no truth'})"
 
 
-def _matrix(K: object, where: str) -> Float:
-    """Intrinsics as an array, whatever rows of numbers they are given as."""
-    try:
-        return np.asarray(K, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DataError(
-            "intrinsics are no matrix of numbers", where=where, found=repr(K), expected="(3, 3)"
-        ) from error
-
-
 def _check_focal(K: Float, image: NDArray[np.uint8], where: str) -> None:
     """Raise DataError for a focal length that no image of this size has."""
     for focal, side, name in ((K[0, 0], image.shape[1], "fx"), (K[1, 1], image.shape[0], "fy")):
@@ -213,10 +202,20 @@ def _check_focal(K: Float, image: NDArray[np.uint8], where: str) -> None:
             )
 
 
-def check_intrinsics(K: Float, where: str) -> None:
-    """Raise DataError unless K is a finite, upper-triangular 3x3 with positive focal lengths."""
-    if np.shape(K) != (3, 3):
-        raise DataError("intrinsics must be 3x3", where=where, found=np.shape(K), expected="(3, 3)")
+def check_intrinsics(given: object, where: object) -> Float:
+    """Rows of numbers as (3, 3) intrinsics.
+
+    Raises:
+        DataError: it is no finite, upper-triangular 3x3 matrix with positive focal lengths.
+    """
+    try:
+        K = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            "intrinsics are no matrix of numbers", where=where, found=repr(given), expected="(3, 3)"
+        ) from error
+    if K.shape != (3, 3):
+        raise DataError("intrinsics must be 3x3", where=where, found=K.shape, expected="(3, 3)")
     if not np.isfinite(K).all():
         raise DataError("intrinsics are not finite", where=where, found=K.tolist())
     if not (K[0, 0] > 0 and K[1, 1] > 0):
@@ -226,11 +225,11 @@ def check_intrinsics(K: Float, where: str) -> None:
             found=f"fx {K[0, 0]:g}, fy {K[1, 1]:g}",
             expected="fx > 0 and fy > 0, in pixels",
         )
-    lower = [K[1, 0], K[2, 0], K[2, 1]]
-    if np.any(lower) or K[2, 2] != 1:
+    if np.any(np.tril(K, -1)) or K[2, 2] != 1:
         raise DataError(
             "intrinsics must be upper triangular with K[2, 2] = 1",
             where=where,
             found=K.tolist(),
             expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]]",
         )
+    return K

@@ -53,9 +53,8 @@ def read_intrinsics(path: PathLike) -> Float:
             found=len(values),
             expected="9 (the 3x3 matrix by rows) or 4 (fx fy cx cy)",
         )
-    K = np.array(values).reshape(3, 3) if len(values) == 9 else intrinsics(*values)
-    check_intrinsics(K, str(path))
-    return K
+    K = np.reshape(values, (3, 3)) if len(values) == 9 else intrinsics(*values)
+    return check_intrinsics(K, path)
 
 
 def read_cam(path: PathLike) -> Float:
@@ -67,9 +66,7 @@ def read_cam(path: PathLike) -> Float:
     content = read_bytes(path, "camera file")
     check_magic(content, path, "camera file")
     check_body(len(content) - 4, _CAM_BYTES, path, "camera file")
-    K = np.frombuffer(content, "<f8", count=9, offset=4).reshape(3, 3).astype(np.float64)
-    check_intrinsics(K, str(path))
-    return K
+    return check_intrinsics(np.frombuffer(content, "<f8", 9, offset=4).reshape(3, 3), path)
 
 
 def read_kitti_projections(path: PathLike, names: Sequence[str]) -> list[Float]:
@@ -149,6 +146,5 @@ def read_vkitti2_intrinsics(path: PathLike, frames: Sequence[int]) -> list[Float
             )
         row, where = rows[str(frame), "0"], f"{path}, frame {frame}"
         numbers = _numbers(" ".join(row[c] for c in _VKITTI2_COLUMNS[2:]), where, "intrinsics row")
-        out.append(intrinsics(*numbers))
-        check_intrinsics(out[-1], where)
+        out.append(check_intrinsics(intrinsics(*numbers), where))
     return out
