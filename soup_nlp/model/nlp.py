@@ -68,19 +68,14 @@ class NLP:
     def hess_lag(self) -> ca.Function:
         """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian; by itself, since
         assembling it takes seconds at real sizes."""
-        return self.other_hessian(self.hessian)
+        sizes = self.ng, len(self.theta)
+        pattern = self.hessian_pattern
+        return assemble_hessian(self.groups, pattern, *sizes, self.hessian, self.compiled)
 
     def assembled(self) -> NLP:
-        """The same, with all its functions assembled now: what is timed later does not pay."""
+        """The same, with all its functions assembled now, so that later timings exclude it."""
         _ = self.functions, self.hess_lag
         return self
-
-    def other_hessian(self, hessian: str) -> ca.Function:
-        """`hess_lag` of any kind."""
-        own = hessian == self.hessian
-        pattern = self.hessian_pattern if own else hessian_pattern(self.groups, self.nx, hessian)
-        sizes = self.ng, len(self.theta)
-        return assemble_hessian(self.groups, pattern, *sizes, hessian, self.compiled)
 
     @property
     def oracle(self) -> ca.Function:
