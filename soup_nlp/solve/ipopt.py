@@ -19,7 +19,7 @@ from soup_nlp.solve.hessian import LagrangianHessian
 
 Float = NDArray[np.float64]
 
-# what SOLVING measured: few bounds are active, so mu starts near its end
+# few bounds are active, so mu starts near its end
 DEFAULTS: Mapping[str, Any] = {
     "linear_solver": "mumps",
     "mu_strategy": "monotone",
@@ -32,6 +32,11 @@ DEFAULTS: Mapping[str, Any] = {
     "mumps_permuting_scaling": 0,
     "watchdog_shortened_iter_trigger": 0,
 }
+CALLS: Mapping[str, str] = {
+    **{k: f"nlp_{k}" for k in ("f", "grad_f", "g", "jac_g")},
+    "hess_lag": "nlp_hess_l",
+}
+"""What CasADi calls the functions in its statistics."""
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -109,16 +114,13 @@ class _Watch(IterationCallback):
         stage: str,
         listener: Listener | None,
         deadline: float,
-        stagnation: float | None,
         stop: threading.Event,
     ) -> None:
         super().__init__()
         self.nlp, self.stage, self.listener = nlp, stage, listener
-        self.deadline, self.stagnation, self.stop = deadline, stagnation, stop
+        self.deadline, self.stop = deadline, stop
         self.begin = time.perf_counter()
         self.count = 0
-        self.small = 0
-        self.last = np.inf
         self.best = self.best_f = np.inf
         self.best_x = nlp.x0
         self.best_lam: tuple[Float, Float] | None = None
@@ -151,12 +153,6 @@ class _Watch(IterationCallback):
             self.reason = "Interrupted"
         elif now > self.deadline:
             self.reason = "Time_Limit"
-        elif self.stagnation is not None:
-            still = abs(self.last - f) <= self.stagnation * max(abs(f), 1e-9)
-            self.small = self.small + 1 if still else 0
-            if self.small >= 2:
-                self.reason = "Stagnated"
-        self.last = f
         return int(bool(self.reason))
 
 
@@ -216,7 +212,6 @@ class Ipopt:
         max_iter: int = 100,
         tol: float = 1e-4,
         seconds: float = np.inf,
-        stagnation: float | None = None,
         stage: str = "solve",
         listener: Listener | None = None,
         stop: threading.Event | None = None,
@@ -232,7 +227,6 @@ class Ipopt:
             max_iter: Iteration limit.
             tol: Ipopt's tol and dual_inf_tol.
             seconds: Time limit; the best iterate is kept.
-            stagnation: Stop when f changes by less than this share, twice in a row.
             stage: Name for progress.
             listener: Called at every iteration.
             stop: Event that ends the solve at the next iteration.
@@ -241,21 +235,11 @@ class Ipopt:
         nlp = self.nlp
         begin = time.perf_counter()
         stop = stop or threading.Event()
-        watch = _Watch(nlp, stage, listener, begin + seconds, stagnation, stop)
+        watch = _Watch(nlp, stage, listener, begin + seconds, stop)
         solver = self._solver(watch, max_iter, tol, log_file)
-        args: dict[str, Any] = {
-            "x0": x0,
-            "p": nlp.p if p is None else p,
-            "lbx": nlp.lbx,
-            "ubx": nlp.ubx,
-            "lbg": nlp.lbg,
-            "ubg": nlp.ubg,
-        }
-        if lam_x0 is not None:
-            args["lam_x0"] = lam_x0
-        if lam_g0 is not None:
-            args["lam_g0"] = lam_g0
-        out = solver(**args)
+        given = {"p": nlp.p if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
+        bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}
+        out = solver(x0=x0, **bounds, **{k: v for k, v in given.items() if v is not None})
         stats = solver.stats()
         status = watch.reason or str(stats.get("return_status", "Unknown"))
         converged = status in GOOD
@@ -277,14 +261,5 @@ class Ipopt:
             iterations=int(stats.get("iter_count", watch.count)),
             seconds=time.perf_counter() - begin,
             history={k: np.asarray(v, float) for k, v in stats.get("iterations", {}).items()},
-            calls={
-                k: float(stats.get(f"t_wall_{s}", 0.0))
-                for k, s in (
-                    ("f", "nlp_f"),
-                    ("grad_f", "nlp_grad_f"),
-                    ("g", "nlp_g"),
-                    ("jac_g", "nlp_jac_g"),
-                    ("hess_lag", "nlp_hess_l"),
-                )
-            },
+            calls={k: float(stats.get(f"t_wall_{s}", 0.0)) for k, s in CALLS.items()},
         )
