@@ -16,7 +16,7 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.solve import descent as descent_module
 from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.factor import superlu
-from soup_nlp.solve.ipopt import Ipopt
+from soup_nlp.solve.ipopt import Ipopt, Watch
 from soup_nlp.solve.kkt import optimality
 from soup_nlp.solve.line_search import Search, along, evaluate, reach
 from soup_nlp.solve.phase import Phase
@@ -393,7 +393,7 @@ def test_superlu_ends_at_the_same_point(problem, solved, monkeypatch):
 def test_limits_and_interruption_keep_the_iterate(problem, tmp_path):
     log = tmp_path / "solve.log"
     seen = []
-    runner = Descent(problem, listener=seen.append, log_file=str(log))
+    runner = Descent(problem, watch=Watch(seen.append, log_file=str(log)))
     three = runner.run(replace(PHASES[0], iterations=3, stagnation=0.0))
     assert (three.status, three.iterations) == ("Maximum_Iterations_Exceeded", 3)
     assert [p.iteration for p in seen] == [0, 1, 2, 3]
@@ -401,7 +401,7 @@ def test_limits_and_interruption_keep_the_iterate(problem, tmp_path):
     assert "first: gauss-newton Hessian" in log.read_text()
     stop = threading.Event()
     stop.set()
-    assert Descent(problem, stop=stop).run(PHASES[0]).status == "Interrupted"
+    assert Descent(problem, watch=Watch(stop=stop)).run(PHASES[0]).status == "Interrupted"
     late = Descent(problem, deadline=0.0).run(PHASES[0])
     assert (late.status, late.iterations) == ("Time_Limit", 0)
     assert np.isfinite(late.x).all()

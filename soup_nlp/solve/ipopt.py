@@ -69,6 +69,23 @@ Listener = Callable[[Progress], None]
 
 
 @dataclass(frozen=True)
+class Watch:
+    """Who follows a solve, and how it is stopped.
+
+    Attributes:
+        listener: Called at every iteration.
+        stop: Set it to end at the next iteration.
+        say: Called with a line after every stage.
+        log_file: A line of every iteration is appended here.
+    """
+
+    listener: Listener | None = None
+    stop: threading.Event = field(default_factory=threading.Event)
+    say: Callable[[str], None] = lambda line: None
+    log_file: str | None = None
+
+
+@dataclass(frozen=True)
 class Stage:
     """One call of Ipopt and how it ended.
 
@@ -105,7 +122,7 @@ class Stage:
         )
 
 
-class _Watch(IterationCallback):
+class _Iterations(IterationCallback):
     """CasADi's iteration callback: progress, limits, the best iterate."""
 
     def __init__(
@@ -165,7 +182,7 @@ class Ipopt:
         # CasADi does not keep a callback alive
         self.hess_lag = LagrangianHessian(nlp)
 
-    def _solver(self, watch: _Watch, max_iter: int, tol: float, log_file: str | None) -> Any:
+    def _solver(self, watch: _Iterations, max_iter: int, tol: float, log_file: str | None) -> Any:
         nlp = self.nlp
         x, p = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", len(nlp.p))
         f, g = nlp.oracle(x, p)
@@ -235,7 +252,7 @@ class Ipopt:
         nlp = self.nlp
         begin = time.perf_counter()
         stop = stop or threading.Event()
-        watch = _Watch(nlp, stage, listener, begin + seconds, stop)
+        watch = _Iterations(nlp, stage, listener, begin + seconds, stop)
         solver = self._solver(watch, max_iter, tol, log_file)
         given = {"p": nlp.p if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
         bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}
