@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +68,7 @@ def test_one_weight_that_is_set_leaves_those_of_the_others():
     own, set_ = (
         case("sheet", *over).weights for over in ((), ("energy.bending.weights.orient=2.0",))
     )
-    assert set_ == replace(own, orient=0.5 * own.orient)
+    assert set_ == own.replace(orient=0.5 * own.orient)
     assert own.cont == 0.05
 
 

@@ -12,15 +12,15 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from helpers_files import write_flo
+from helpers_ply import read_ply
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem, make_problem
-from soup_nlp.data.formats import write_flo
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError
 from soup_nlp.pipeline.run import run, solve_pair
 from soup_nlp.report.check import check_folder
-from soup_nlp.report.pointcloud import read_ply
 
 SMALL = [
     "--set", "input.width=192", "--set", "input.height=128",

@@ -8,11 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers_files import write_flo
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.datasets.layout import MARK
-from soup_nlp.data.formats import write_flo
 from soup_nlp.data.scenes.catalogue import render_scene
 
 ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")

@@ -9,22 +9,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers_files import write_flo, write_kitti_flow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soup_nlp.data.datasets import folders as datasets
+from soup_nlp.data.datasets.driving import load_kitti
 from soup_nlp.data.flow import sources as flow_module
+from soup_nlp.data.flow.consistency import leaves, round_trip_error
 from soup_nlp.data.flow.sources import (
     dis_flow,
     flow_from_truth,
-    leaves,
     load_flow,
     resolve_flow,
-    round_trip_error,
 )
-from soup_nlp.data.formats import write_flo, write_kitti_flow
 from soup_nlp.data.pair import Flow, Pair, Truth
-from soup_nlp.errors import DataError
+from soup_nlp.errors import ConfigError, DataError
 
 K = np.array([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]])
 
@@ -118,7 +117,7 @@ def test_dis_confidence_drops_where_nothing_matches() -> None:
 @pytest.mark.parametrize("preset", ["ultrafast", "fast", "medium"])
 def test_dis_options(finest_scale: int, preset: str) -> None:
     first, second = shifted(64, 80, 1, 0)
-    flow = dis_flow(first, second, finest_scale, preset=preset, support=1)
+    flow = dis_flow(first, second, finest_scale=finest_scale, preset=preset, support=1)
     assert np.isfinite(flow.uv).all()
 
 
@@ -137,7 +136,7 @@ def test_dis_options(finest_scale: int, preset: str) -> None:
 )
 def test_dis_option_errors(option: dict) -> None:
     first, second = shifted(20, 20, 0, 0)
-    with raises(rf"out of range[\s\S]*{next(iter(option))}"):
+    with pytest.raises(ConfigError, match=rf"does not fit[\s\S]*{next(iter(option))}"):
         dis_flow(first, second, **option)
 
 
@@ -257,7 +256,7 @@ def test_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_dis_on_kitti(
     shared_data: Path, index: int, median: float, outliers: float, trusted: float
 ) -> None:
-    pair = datasets.load_kitti2012(shared_data / "kitti2012", index)
+    pair = load_kitti("kitti2012", shared_data / "kitti2012", index)
     assert pair.truth is not None
     assert pair.truth.flow is not None
     flow = resolve_flow(pair, "dis")

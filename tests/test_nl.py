@@ -6,6 +6,7 @@ import itertools
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,7 +74,7 @@ def test_casadi_reads_back_every_formulation(form, tmp_path):
 def test_parameters_decide_the_numbers_of_the_file(tmp_path):
     nlp, _ = Tiny().nlp(PAPER, FORMS[0])
     p = nlp.with_theta(eps=0.5)
-    back = ReadBack(write_nl(tmp_path / "a.nl", nlp, p=p, x0=nlp.x0 + 0.25).path)
+    back = ReadBack(write_nl(tmp_path / "a.nl", replace(nlp, p=p, x0=nlp.x0 + 0.25)).path)
     file = write_nl(tmp_path / "b.nl", nlp)
     assert np.array_equal(back.x0, (nlp.x0 + 0.25)[file.variables])
     f = float(back.values(nlp.x0[file.variables])[0])

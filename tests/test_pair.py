@@ -7,7 +7,7 @@ import pytest
 
 from soup_nlp.data.flow.sources import dis_flow
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.errors import DataError
+from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.camera import intrinsics
 
 IMAGE = np.zeros((40, 60, 3), np.uint8)
@@ -54,5 +54,5 @@ def test_a_confidence_is_between_0_and_1(bad):
     ],
 )
 def test_dis_options_that_opencv_would_not_survive_are_refused(name, bad):
-    with pytest.raises(DataError, match=name):
+    with pytest.raises(ConfigError, match=name):
         dis_flow(IMAGE, IMAGE, **{name: bad})

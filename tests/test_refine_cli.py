@@ -124,13 +124,13 @@ def test_both_halves_cannot_be_left_out(tmp_path, capsys):
 def test_an_interrupted_refinement_keeps_its_best_and_exits_with_1(tmp_path):
     stop = threading.Event()
 
-    def say(line: str) -> None:
+    def log(line: str) -> None:
         if line.startswith("refine 1"):
             stop.set()
 
     overrides = [s for s in SMALL if s != "--set"] + ["refine.from_start=true"]
     problem = make_problem(yaml.safe_load(ORBIT.read_text()), overrides)
-    done = run(problem, stop=stop, say=say)
+    done = run(problem, stop=stop, log=log)
     assert done.refined is not None
     assert done.refined.status == "interrupted"
     assert len(done.refined.rounds) == 1

@@ -20,7 +20,7 @@ def cloud(tiny: Tiny, labels: int, seed: int = 3, spread: float = 1.0) -> Partic
     """So many random soups as particles; particle 0 is the tiny soup."""
     n = len(tiny.soup)
     others = [Particles.of(random_soup(seed + k, n, spread)) for k in range(labels - 1)]
-    return Particles.of(tiny.soup).connected_labels(*others)
+    return Particles.of(tiny.soup).joined(*others)
 
 
 def chosen(p: Particles, labels: np.ndarray) -> Soup:
@@ -66,7 +66,7 @@ def test_every_entry_is_the_energy_of_its_pair_however_close_the_particles():
     steps = (0.0, 1e-9, 1e-6, 1e-3)
     rng = np.random.default_rng(0)
     turn = rng.normal(size=(n, 1, 3))
-    p = near.connected_labels(
+    p = near.joined(
         *(
             Particles(near.n, near.D * (1 + s), rotation.exp(s * turn) @ near.R, near.T * (1 - s))
             for s in steps
@@ -108,7 +108,7 @@ def test_alike_motions_and_planes_cost_exactly_nothing():
     one = Particles.of(tiny.soup)
     n = len(tiny.soup)
     same = Particles(*(np.repeat(v[:1], n, axis=0) for v in (one.n, one.D, one.R, one.T)))
-    table = PairCosts(tiny.data, weights_for("pixels")).tables(same.connected_labels(one))
+    table = PairCosts(tiny.data, weights_for("pixels")).tables(same.joined(one))
     # rotation, translation, gaps and turn vanish; the distances are kept up to rounding
     assert np.abs(table[:, 0, 0]).max() < 1e-12 * table.max()
 
@@ -193,7 +193,7 @@ def test_kept_particles_are_cheap_feasible_and_different():
     tiny = Tiny("pixels")
     p = cloud(tiny, 6)
     n = len(tiny.soup)
-    p = p.connected_labels(p.take(np.full((n, 1), 2)))  # number 6 repeats number 2
+    p = p.joined(p.take(np.full((n, 1), 2)))  # number 6 repeats number 2
     cost = np.tile(np.array([0.0, 1.0, 2.0, 3.0, np.inf, 5.0, 2.1]), (n, 1))
     labels = np.zeros(n, int)
     kept = diverse(p, labels, cost, 4, tiny.data)
@@ -230,7 +230,7 @@ def test_no_particle_runs_away_but_the_current_one_may_stay():
     now = tiny.soup
     far = Soup(now.lam, now.n, now.d * np.where(np.arange(n) == 3, 1e3, 1.0), now.R, now.t)
     p = Particles.of(far)
-    p = p.connected_labels(*(Particles(p.n, p.D * s, p.R, p.T) for s in (1.3, 100.0, 1e-3)))
+    p = p.joined(*(Particles(p.n, p.D * s, p.R, p.T) for s in (1.3, 100.0, 1e-3)))
     near = np.array([[j for j in range(n) if j != i][:6] for i in range(n)])
     found = within_reach(p, far, near, tiny.data.anchor_ray, 2.0)
     assert found[:, 0].all()

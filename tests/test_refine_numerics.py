@@ -31,7 +31,7 @@ def test_the_mrf_follows_the_exact_energy_when_the_length_unit_changes():
     now = Particles.of(best)
     h = 1e-4
     # particle 1: plane and translation grow together, and with them the unit
-    p = now.connected_labels(Particles(now.n, (1 + h) * now.D, now.R, (1 + h) * now.T))
+    p = now.joined(Particles(now.n, (1 + h) * now.D, now.R, (1 + h) * now.T))
     unary, pairwise = mppbp._costs(best, p, tiny.data, weights, pair_costs, RefineOptions())
     slope = mppbp.length_slope(best, tiny.data, weights)
     for chosen in ([0], [3, 7], range(6), range(len(best))):
@@ -82,7 +82,7 @@ def test_only_slow_rounds_in_a_row_end_the_refinement(monkeypatch):
     tiny = Tiny("pixels", samples=6)
     totals = iter([100.0, 99.99, 50.0, 49.99, 49.98, 10.0, 5.0])
     monkeypatch.setattr(
-        mppbp.plain, "energy", lambda *a: {"total": next(totals), "proj": 0.0, "arap": 0.0}
+        mppbp.oracle, "energy", lambda *a: {"total": next(totals), "proj": 0.0, "arap": 0.0}
     )
     o = FEW.replace(rounds=6, stagnation=1e-2, particles=4, trws_iterations=1)
     done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o)

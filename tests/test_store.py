@@ -157,7 +157,7 @@ def test_h5_failure_half_way_leaves_the_old_file(tmp_path, monkeypatch):
     def fail(*args, **kwargs):
         raise OSError("disk is full")
 
-    monkeypatch.setattr("soup_nlp.storage.store._write_dataset", fail)
+    monkeypatch.setattr("soup_nlp.storage.store._write_leaf", fail)
     with pytest.raises(DataError, match="disk is full"):
         write_h5(path, tree(), {})
     assert path.read_bytes() == b"old"

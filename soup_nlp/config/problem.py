@@ -157,7 +157,7 @@ def make_problem(
     where: str = "problem",
     lines: Mapping[Place, str] | None = None,
 ) -> Problem:
-    """Check a mapping and its overrides; see `load_problem`.
+    """Check a mapping of sections and its overrides; see `load_problem`.
 
     Args:
         raw: Sections by name.
@@ -169,9 +169,8 @@ def make_problem(
         ConfigError: as `load_problem`.
     """
     tree = copy.deepcopy(dict(raw))
-    lines = dict(lines or {})
-    for item in overrides:
-        lines[_override(tree, item)] = f"--set {item}"
+    overridden = {_override(tree, item): f"--set {item}" for item in overrides}
+    lines = {**(lines or {}), **overridden}
     try:
         return Problem.model_validate(tree)
     except ValidationError as error:
@@ -192,7 +191,7 @@ def _write(model: Section, pad: str) -> Iterator[str]:
             yield f"{pad}{key}:{comment}"
             yield from _write(value, pad + "  ")
         else:
-            flow = None if isinstance(value, list | dict) else False
+            flow = None if isinstance(value, list | tuple | dict) else False
             text = yaml.dump({key: value}, Dumper=_Dumper, default_flow_style=flow, width=10**6)
             yield f"{pad}{text.rstrip()}{comment}"
 
@@ -209,14 +208,11 @@ _Loader.yaml_implicit_resolvers = {
     first: [(tag, rule) for tag, rule in rules if tag.split(":")[-1] in ("null", "merge")]
     for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
+_FLOAT = r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
 for _tag, _rule, _first in (
     ("bool", r"true|false|True|False|TRUE|FALSE", "tTfF"),
     ("int", r"[-+]?\d+", "-+0123456789"),
-    (
-        "float",
-        r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-        "-+.0123456789",
-    ),
+    ("float", _FLOAT, "-+.0123456789"),
 ):
     for _class in (_Loader, _Dumper):
         _class.add_implicit_resolver(
@@ -272,14 +268,14 @@ def _override(tree: dict[str, Any], item: str) -> Place:
             "override is not key=value", where="--set", found=item, expected="solver.max_iter=200"
         )
     node: Any = tree
-    for k, part in enumerate(place[:-1]):
+    for part in place[:-1]:
         node = node.setdefault(part, {})
         if not isinstance(node, dict):
             raise ConfigError(
                 "override goes below a value",
                 where="--set",
                 found=item,
-                expected=f"{'.'.join(place[: k + 1])} is a section",
+                expected=f"{part} is a section",
             )
     node[place[-1]] = _parse(value, f"--set {item}")[0]
     return place

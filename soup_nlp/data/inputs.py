@@ -11,29 +11,37 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from soup_nlp.data.datasets.driving import (
-    load_kitti2012,
-    load_kitti2015,
-    load_vkitti1,
-    load_vkitti2,
-)
+from soup_nlp.data.datasets.driving import load_kitti, load_vkitti1, load_vkitti2
 from soup_nlp.data.datasets.folders import load_folder, load_motorcycle, load_tum
 from soup_nlp.data.datasets.sintel import load_sintel
-from soup_nlp.data.formats import read_depth, read_image
 from soup_nlp.data.formats.camera_files import read_intrinsics
-from soup_nlp.data.pair import Pair, Truth
+from soup_nlp.data.formats.images import read_image
+from soup_nlp.data.formats.map_files import read_depth
+from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Count, Finite, Positive, Section, Whole
 
-Float = NDArray[np.float64]
 Resolve = Callable[[str], Path]
+"""Full path of a name in the problem file."""
 Camera = Annotated[list[Finite], Field(min_length=4, max_length=4)]
 White = Annotated[int, Field(ge=1, le=65535)]
 
 
-class FilesInput(Section):
+class PairInput(Section):
+    """Base of every kind of input."""
+
+    def load(self, path: Resolve) -> Pair:
+        """The pair, without its flow; `path` resolves the names of files."""
+        raise NotImplementedError
+
+    def files(self) -> list[str]:
+        """Names of the files and folders that are read."""
+        return [getattr(self, name) for name in ("root", "path") if name in type(self).model_fields]
+
+
+class FilesInput(PairInput):
     """Two image files and their cameras; the flow file is named under `flow.source`."""
 
     kind: Literal["files"]
@@ -58,27 +66,27 @@ class FilesInput(Section):
     """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for 65535."""
 
     def load(self, path: Resolve) -> Pair:
-        """The pair of the files."""
-        ref, next_ = (read_image(path(x), self.white) for x in (self.ref, self.next))
-        depths = [
-            None if name is None else read_depth(path(name), self.depth_scale)
-            for name in (self.depth, self.depth_next)
-        ]
-        truth = None
-        if any(depth is not None for depth in depths):
-            truth = Truth(depth_ref=depths[0], depth_next=depths[1], unit=self.unit)
-        K_ref = _camera(self.intrinsics, path)
-        same = self.intrinsics_next is None
-        K_next = K_ref if same else _camera(self.intrinsics_next, path)
-        return Pair(ref, next_, K_ref, K_next, truth=truth)
+        """See `PairInput`."""
+
+        def camera(given: list[float] | str) -> Float:
+            return read_intrinsics(path(given)) if isinstance(given, str) else intrinsics(*given)
+
+        def depth(name: str | None) -> Float | None:
+            return None if name is None else read_depth(path(name), self.depth_scale)
+
+        ref, following = (read_image(path(x), self.white) for x in (self.ref, self.next))
+        truth = Truth(depth(self.depth), depth(self.depth_next), unit=self.unit)
+        K = camera(self.intrinsics)
+        K_next = K if self.intrinsics_next is None else camera(self.intrinsics_next)
+        return Pair(ref, following, K, K_next, truth=truth if truth.known() else None)
 
     def files(self) -> list[str]:
-        """Names of the files that are read."""
+        """See `PairInput`."""
         named = (self.ref, self.next, self.intrinsics, self.intrinsics_next)
         return [x for x in (*named, self.depth, self.depth_next) if isinstance(x, str)]
 
 
-class FolderInput(Section):
+class FolderInput(PairInput):
     """A folder with frame_0, frame_1, K.txt and optional truth."""
 
     kind: Literal["folder"]
@@ -93,30 +101,22 @@ class FolderInput(Section):
     """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for 65535."""
 
     def load(self, path: Resolve) -> Pair:
-        """The pair; `path` resolves the names of files."""
+        """See `PairInput`."""
         return load_folder(path(self.path), self.depth_scale, self.unit, self.white)
 
-    def files(self) -> list[str]:
-        """Names of the files and folders that are read."""
-        return [self.path]
 
-
-class MotorcycleInput(Section):
+class MotorcycleInput(PairInput):
     """The Middlebury motorcycle pair that scikit-image ships."""
 
     kind: Literal["motorcycle"]
     """Kind of input."""
 
     def load(self, path: Resolve) -> Pair:
-        """The pair; `path` resolves the names of files."""
+        """See `PairInput`."""
         return load_motorcycle()
 
-    def files(self) -> list[str]:
-        """Names of the files and folders that are read."""
-        return []
 
-
-class SceneInput(Section):
+class SceneInput(PairInput):
     """A rendered dynamic scene with exact truth."""
 
     kind: Literal["scene"]
@@ -131,15 +131,11 @@ class SceneInput(Section):
     """Rows, pixels."""
 
     def load(self, path: Resolve) -> Pair:
-        """The pair; `path` resolves the names of files."""
+        """See `PairInput`."""
         return render_scene(self.scene, self.seed, self.width, self.height)
 
-    def files(self) -> list[str]:
-        """Names of the files and folders that are read."""
-        return []
 
-
-class SintelInput(Section):
+class SintelInput(PairInput):
     """MPI Sintel, official layout."""
 
     kind: Literal["sintel"]
@@ -156,15 +152,11 @@ class SintelInput(Section):
     """Distance of the next frame."""
 
     def load(self, path: Resolve) -> Pair:
-        """The pair; `path` resolves the names of files."""
+        """See `PairInput`."""
         return load_sintel(path(self.root), self.scene, self.frame, self.render, self.step)
 
-    def files(self) -> list[str]:
-        """Names of the files and folders that are read."""
-        return [self.root]
 
-
-class KittiInput(Section):
+class KittiInput(PairInput):
     """KITTI 2012 or 2015, official layout."""
 
     kind: Literal["kitti2012", "kitti2015"]
@@ -177,16 +169,11 @@ class KittiInput(Section):
     """Truth with occluded pixels (true) or without."""
 
     def load(self, path: Resolve) -> Pair:
-        """The pair; `path` resolves the names of files."""
-        load = load_kitti2012 if self.kind == "kitti2012" else load_kitti2015
-        return load(path(self.root), self.index, self.occ)
-
-    def files(self) -> list[str]:
-        """Names of the files and folders that are read."""
-        return [self.root]
+        """See `PairInput`."""
+        return load_kitti(self.kind, path(self.root), self.index, self.occ)
 
 
-class VkittiInput(Section):
+class VkittiInput(PairInput):
     """Virtual KITTI 1 (scene is the world, such as "0001") or 2, official layout."""
 
     kind: Literal["vkitti1", "vkitti2"]
@@ -203,16 +190,12 @@ class VkittiInput(Section):
     """Distance of the next frame."""
 
     def load(self, path: Resolve) -> Pair:
-        """The pair; `path` resolves the names of files."""
+        """See `PairInput`."""
         load = load_vkitti1 if self.kind == "vkitti1" else load_vkitti2
-        return load(path(self.root), self.scene, self.frame, self.variation, step=self.step)
-
-    def files(self) -> list[str]:
-        """Names of the files and folders that are read."""
-        return [self.root]
+        return load(path(self.root), self.scene, self.frame, self.variation, self.step)
 
 
-class TumInput(Section):
+class TumInput(PairInput):
     """TUM RGB-D, official layout."""
 
     kind: Literal["tum"]
@@ -225,15 +208,11 @@ class TumInput(Section):
     """Distance of the next image."""
 
     def load(self, path: Resolve) -> Pair:
-        """The pair; `path` resolves the names of files."""
+        """See `PairInput`."""
         return load_tum(path(self.path), self.frame, self.step)
 
-    def files(self) -> list[str]:
-        """Names of the files and folders that are read."""
-        return [self.path]
 
-
-class MemoryInput(Section):
+class MemoryInput(PairInput):
     """A pair that was in memory: a problem with it tells runs apart, but cannot be solved again."""
 
     kind: Literal["memory"]
@@ -286,9 +265,3 @@ def pair_hash(pair: Pair) -> str:
         digest.update(f"{array.dtype} {array.shape}\0".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]
-
-
-def _camera(given: list[float] | str | None, path: Resolve) -> Float:
-    """(3, 3) intrinsics of four numbers or of a file."""
-    assert given is not None
-    return read_intrinsics(path(given)) if isinstance(given, str) else intrinsics(*given)

@@ -94,9 +94,12 @@ class Truth:
     scene_flow: Float | None = None
     unit: str = "m"
 
+    def known(self) -> list[str]:
+        """Names of the parts that are not None."""
+        return [name for name, value in vars(self).items() if value is not None and name != "unit"]
+
     def __str__(self) -> str:
-        known = [k for k, v in self.__dict__.items() if v is not None and k != "unit"]
-        return f"Truth({', '.join(known) or 'nothing'}; {self.unit})"
+        return f"Truth({', '.join(self.known()) or 'nothing'}; {self.unit})"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a method for dynamic scenes has to beat: one rigid motion, and one constant depth."""
+"""A baseline that methods for dynamic scenes have to beat: one rigid motion for all pixels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.start import epipolar
@@ -17,6 +17,12 @@ Float = NDArray[np.float64]
 
 MIN_CORRESPONDENCES = 8
 """Fewest pixels with flow for which a motion is looked for."""
+
+SAMPLES = 8000
+"""Largest number of pixels for the motion."""
+
+INLIER = 1.0
+"""Largest Sampson distance of an inlier, pixels of the geometric mean focal length."""
 
 TIGHT = 0.1
 """The motion is also looked for with this fraction of the inlier distance."""
@@ -47,65 +53,28 @@ class RigidBaseline:
     inlier_fraction: float
     coverage: float
 
-    def filled(self) -> Float:
-        """(H, W) depth with each unknown pixel given the depth of the nearest known one."""
-        return fill_nearest(self.depth)
 
-    def __str__(self) -> str:
-        return (
-            f"RigidBaseline({self.inlier_fraction:.1%} of the flow explained, "
-            f"{self.coverage:.1%} of the pixels have a depth)"
-        )
-
-
-def rigid_depth(
-    pair: Pair,
-    flow: Flow | None = None,
-    *,
-    threshold: float = 1.0,
-    samples: int = 8000,
-    seed: int = 0,
-) -> RigidBaseline:
+def rigid_depth(pair: Pair, seed: int = 0) -> RigidBaseline:
     """Depth under one rigid motion for the whole image, triangulated pixel by pixel.
 
     The essential matrix comes from a subsample drawn with probability proportional to confidence
     (RANSAC, then a robust refinement of the Sampson distance), with each frame's own camera. It is
     looked for at the inlier distance and at a tenth of it, and the motion with the smaller Cauchy
-    cost is kept: in small images a component that moves can hide within one pixel of a motion that
-    is right for nothing. Each pixel with confidence is then triangulated by itself; nothing is
-    smoothed, so far points with little parallax can have wild depths; only those beyond `FAR`
-    times the median are dropped. Look at the median relative error beside the mean.
+    cost is kept: in small images a moving component can lie within one pixel of a wrong motion.
+    Each pixel with confidence is then triangulated by itself without smoothing, so far points with
+    little parallax can have wild depths; only those beyond `FAR` times the median are dropped.
 
     Args:
-        pair: Cameras, and the size of the image.
-        flow: Flow from reference to next; None takes the pair's own.
-        threshold: Inlier distance, pixels of the geometric mean focal length of the frames.
-        samples: At most this many pixels for the motion.
+        pair: Cameras and flow.
         seed: Of the subsample and of RANSAC.
 
     Raises:
-        DataError: there is no flow, it does not fit the pair or has too few usable pixels, an
-            option is out of range, or no motion can be found (no parallax).
+        DataError: there is no flow, it does not fit the image or has too few usable pixels, or no
+            motion can be found (no parallax).
     """
-    flow = pair.flow if flow is None else flow
+    flow = pair.flow
     if flow is None:
-        raise DataError(
-            "rigid baseline needs a flow", where=pair.name, hint="give one, or use pair.with_flow"
-        )
-    if flow.confidence.shape != pair.size:
-        raise DataError(
-            "flow and reference image differ in size",
-            where=flow.source,
-            found=flow.confidence.shape,
-            expected=f"{pair.size} (height, width)",
-        )
-    if not (threshold > 0 and samples >= MIN_CORRESPONDENCES):
-        raise DataError(
-            "option of the rigid baseline is out of range",
-            where="threshold, samples",
-            found=(threshold, samples),
-            expected=f"threshold > 0 pixels, samples >= {MIN_CORRESPONDENCES}",
-        )
+        raise DataError("rigid baseline needs a flow", where=pair.name, hint="use pair.with_flow")
     used = flow.confidence > 0
     count = int(np.count_nonzero(used))
     if count < MIN_CORRESPONDENCES:
@@ -122,14 +91,14 @@ def rigid_depth(
         np.prod([pair.K_ref[0, 0], pair.K_ref[1, 1], pair.K_next[0, 0], pair.K_next[1, 1]]) ** 0.25
     )
     pick = np.arange(count)
-    if count > samples:
+    if count > SAMPLES:
         # weighted sampling without replacement (Efraimidis and Spirakis): the largest of u^(1/w)
         key = np.log1p(-np.random.default_rng(seed).random(count)) / weight
-        pick = np.sort(np.argpartition(-key, samples)[:samples])
-        drawn = np.ones(samples)  # the draw has done the weighting
+        pick = np.sort(np.argpartition(-key, SAMPLES)[:SAMPLES])
+        drawn = np.ones(SAMPLES)  # the draw has done the weighting
     else:
         drawn = weight
-    motion = _best_motion(r[pick], q[pick], drawn, focal, threshold, seed)
+    motion = _best_motion(r[pick], q[pick], drawn, focal, seed)
     if motion is None:
         raise DataError(
             "no rigid motion fits the flow",
@@ -143,7 +112,7 @@ def rigid_depth(
         front &= z <= FAR * np.median(z[front])
     depth = np.full(pair.size, np.nan)
     depth[used] = np.where(front, z, np.nan)
-    near = np.abs(epipolar.sampson(motion.essential(), r, q, focal)) < threshold
+    near = np.abs(epipolar.sampson(motion.essential(), r, q, focal)) < INLIER
     return RigidBaseline(
         R=motion.R,
         t=motion.t,
@@ -154,15 +123,15 @@ def rigid_depth(
 
 
 def _best_motion(
-    r: Float, q: Float, weight: Float, focal: float, threshold: float, seed: int
+    r: Float, q: Float, weight: Float, focal: float, seed: int
 ) -> epipolar.Motion | None:
     """The motion of rays r, q (M, 3) with the smallest Cauchy cost, or None where there is none."""
     best, lowest = None, np.inf
-    for distance in (threshold, TIGHT * threshold):
+    for distance in (INLIER, TIGHT * INLIER):
         motion = epipolar.estimate(r, q, weight, focal, distance, seed)
         if motion is None or not (np.isfinite(motion.R).all() and np.isfinite(motion.t).all()):
             continue
-        off = epipolar.sampson(motion.essential(), r, q, focal) / (TIGHT * threshold)
+        off = epipolar.sampson(motion.essential(), r, q, focal) / (TIGHT * INLIER)
         cost = float(np.sum(weight * np.log1p(off * off)))
         if cost < lowest:
             best, lowest = motion, cost
@@ -190,16 +159,3 @@ def fill_nearest(depth: Float) -> Float:
         return depth.copy()
     index = distance_transform_edt(unknown, return_distances=False, return_indices=True)
     return np.asarray(depth[tuple(index)])
-
-
-def constant_depth(shape: tuple[int, int]) -> Float:
-    """(H, W) of ones: the depth of a method that knows nothing but the global scale.
-
-    Raises:
-        DataError: the shape is not two positive numbers.
-    """
-    if len(shape) != 2 or min(shape) < 1:
-        raise DataError(
-            "constant depth needs the size of an image", found=shape, expected="(height, width)"
-        )
-    return np.ones(shape)

@@ -1,9 +1,9 @@
-"""How far an estimated depth is from the truth, with the protocol beside the number.
+"""Errors of an estimated depth and scene flow, with the evaluation protocol beside the number.
 
 A two-view reconstruction has a free global scale, so a depth error means little without the rule
-that chose the scale, the depth cap and the share of the truth that has an estimate at all. Each
-result here carries all three. Conventions: Eigen et al., NIPS 2014 (AbsRel, SqRel, RMSE, log-RMSE,
-delta); MRE as in "Superpixel Soup" (mean relative error, the same number as AbsRel).
+that chose the scale, the depth cap and the share of the truth that has an estimate. Conventions:
+Eigen et al., NIPS 2014 (AbsRel, SqRel, RMSE, log-RMSE, delta); MRE as in "Superpixel Soup" (mean
+relative error, the same number as AbsRel).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Scale = Literal["median", "mre", "lsq", "none"]
 
 
@@ -60,16 +61,6 @@ class DepthMetrics:
         """All attributes by name, in the order above: plain numbers, strings and None."""
         return asdict(self)
 
-    def __str__(self) -> str:
-        cap = "no cap" if self.cap is None else f"cap {self.cap:g}"
-        return (
-            f"MRE {self.mre:.4f}, median {self.median_relative:.4f}, RMSE {self.rmse:.4g}, "
-            f"log-RMSE {self.log_rmse:.4f}, SqRel {self.sq_rel:.4g}, "
-            f"delta<1.25 {self.delta1:.1%} "
-            f"(scale {self.scale_rule} = {self.scale:.4g}, {cap}, "
-            f"coverage {self.coverage:.1%}, {self.n_pixels} px)"
-        )
-
 
 def depth_metrics(
     estimate: ArrayLike,
@@ -109,7 +100,9 @@ def depth_metrics(
     """
     if clamp is not None and not 0 < clamp[0] < clamp[1]:
         raise DataError("clamp is no range of depths", found=clamp, expected="0 < low < high")
-    z, gt, coverage = _compared(estimate, truth, scale, cap, mask)
+    if scale not in get_args(Scale):
+        raise DataError("unknown scale rule", found=repr(scale), expected=list(get_args(Scale)))
+    z, gt, coverage = _compared(estimate, truth, cap, mask)
     if z.size == 0:
         nan = float("nan")
         return DepthMetrics(nan, nan, nan, nan, nan, nan, nan, nan, scale, nan, cap, 0.0, 0)
@@ -137,45 +130,59 @@ def depth_metrics(
     )
 
 
+def true_pixels(truth: Float, cap: float | None) -> Mask:
+    """Where a true depth is known, positive and within the cap."""
+    check_cap(cap)
+    return np.isfinite(truth) & (truth > 0) & (truth <= (np.inf if cap is None else cap))
+
+
+def check_cap(cap: float | None) -> None:
+    """Check that a depth cap is positive or None.
+
+    Raises:
+        DataError: it is not; NaN is not.
+    """
+    if cap is not None and not cap > 0:
+        raise DataError(
+            "depth cap must be positive",
+            where="cap",
+            found=cap,
+            expected="a depth in the unit of the truth, such as 70",
+        )
+
+
 def _compared(
-    estimate: ArrayLike, truth: ArrayLike, scale: str, cap: float | None, mask: ArrayLike | None
+    estimate: ArrayLike, truth: ArrayLike, cap: float | None, mask: ArrayLike | None
 ) -> tuple[Float, Float, float]:
     """Vectors of estimate and truth where both count, and the share of the truth they cover."""
     z, gt = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
     if z.shape != gt.shape:
         raise DataError(
             "estimated and true depth differ in shape",
-            where="depth_metrics",
             found=f"estimate {z.shape}, truth {gt.shape}",
-            expected="the same shape",
             hint="sample a dense estimate at sparse points with sample_at_points",
         )
-    if scale not in get_args(Scale):
-        raise DataError(
-            "unknown scale rule", where="scale", found=repr(scale), expected=list(get_args(Scale))
-        )
-    if cap is not None and not cap > 0:
-        raise DataError("depth cap must be positive", where="cap", found=cap, expected="> 0")
-    true = np.isfinite(gt) & (gt > 0)
-    if cap is not None:
-        true &= gt <= cap
+    true = _masked(true_pixels(gt, cap), mask, "depth")
+    both = true & np.isfinite(z) & (z > 0)
+    return z[both], gt[both], float(np.count_nonzero(both) / np.count_nonzero(true))
+
+
+def _masked(true: Mask, mask: ArrayLike | None, what: str) -> Mask:
+    """The true pixels that are in the mask.
+
+    Raises:
+        DataError: the mask has another shape, or no pixel is left.
+    """
     if mask is not None:
         keep = np.asarray(mask, bool)
-        if keep.shape != gt.shape:
+        if keep.shape != true.shape:
             raise DataError(
-                "mask and depth differ in shape", where="mask", found=keep.shape, expected=gt.shape
+                f"mask and {what} differ in shape", found=keep.shape, expected=true.shape
             )
-        true &= keep
-    total = int(np.count_nonzero(true))
-    if total == 0:
-        raise DataError(
-            "no pixel has a true depth to compare with",
-            where="depth_metrics",
-            found=f"{int(np.isfinite(gt).sum())} finite true depths, cap {cap}",
-            expected="at least one positive depth within cap and mask",
-        )
-    both = true & np.isfinite(z) & (z > 0)
-    return z[both], gt[both], float(np.count_nonzero(both) / total)
+        true = true & keep
+    if not true.any():
+        raise DataError(f"no pixel has a true {what} to compare with, within cap and mask")
+    return true
 
 
 def _scale(z: Float, gt: Float, rule: Scale) -> float:
@@ -183,62 +190,13 @@ def _scale(z: Float, gt: Float, rule: Scale) -> float:
     if rule == "median":
         return float(np.median(gt / z))
     if rule == "mre":
-        return weighted_median(gt / z, z / gt)
+        order = np.argsort(gt / z, kind="stable")
+        total = np.cumsum((z / gt)[order])
+        return float((gt / z)[order][np.searchsorted(total, 0.5 * total[-1])])
     if rule == "lsq":
         unit = z / z.max()  # so that squares of tiny or huge depths stay in range
         return float(np.dot(unit, gt) / np.dot(unit, unit) / z.max())
     return 1.0
-
-
-def weighted_median(values: ArrayLike, weights: ArrayLike) -> float:
-    """The smallest value x with at least half of the weight at or below it.
-
-    It minimises sum w |v - x|; with an even split every x between two values does, and the lower
-    is returned.
-
-    Args:
-        values: (M,) finite numbers.
-        weights: (M,) finite, not negative, with a positive sum.
-
-    Raises:
-        DataError: empty, of different lengths, not finite, or weights that are negative or all 0.
-    """
-    v, w = np.ravel(np.asarray(values, np.float64)), np.ravel(np.asarray(weights, np.float64))
-    good = v.size > 0 and v.shape == w.shape
-    if not (good and np.isfinite(v).all() and np.isfinite(w).all() and w.min() >= 0 < w.max()):
-        raise DataError(
-            "weighted median needs finite values and weights",
-            where="weighted_median",
-            found=f"{v.size} values, {w.size} weights",
-            expected="equal, positive lengths; weights >= 0 with a positive sum",
-        )
-    order = np.argsort(v, kind="stable")
-    # a power of two keeps sums in range and ties exact
-    total = np.cumsum(np.ldexp(w[order], -int(np.frexp(w.max())[1])))
-    return float(v[order[int(np.searchsorted(total, 0.5 * total[-1]))]])
-
-
-def constant_depth_metrics(
-    truth: ArrayLike,
-    *,
-    scale: Scale = "median",
-    cap: float | None = None,
-    mask: ArrayLike | None = None,
-) -> DepthMetrics:
-    """`depth_metrics` of the same depth at every pixel: what knowing nothing scores.
-
-    With scale "none" the constant is 1 in the unit of the truth.
-
-    Args:
-        truth: True z, any shape; NaN where unknown.
-        scale: Scale rule.
-        cap: Depth cap, unit of the truth.
-        mask: Bool, same shape as the truth.
-
-    Raises:
-        DataError: as `depth_metrics`.
-    """
-    return depth_metrics(np.ones(np.shape(truth)), truth, scale=scale, cap=cap, mask=mask)
 
 
 def skill(mre: float, mre_constant: float) -> float:
@@ -269,7 +227,6 @@ def sample_at_points(depth: ArrayLike, points: ArrayLike) -> tuple[Float, Float]
     if z.ndim != 2 or at.ndim != 2 or at.shape[1] != 3:
         raise DataError(
             "cannot sample a depth at points",
-            where="sample_at_points",
             found=f"depth {z.shape}, points {at.shape}",
             expected="depth (H, W), points (M, 3) of u, v, z",
         )
@@ -279,3 +236,42 @@ def sample_at_points(depth: ArrayLike, points: ArrayLike) -> tuple[Float, Float]
     out = np.full(len(at), np.nan)
     out[inside] = z[v[inside].astype(np.intp), u[inside].astype(np.intp)]
     return out, at[:, 2].copy()
+
+
+def scene_flow_epe(
+    estimate: ArrayLike, truth: ArrayLike, *, scale: float = 1.0, mask: ArrayLike | None = None
+) -> dict[str, float | int]:
+    """End-point error of a scene flow: mean and median length of s * estimate - truth.
+
+    Args:
+        estimate: (..., 3) X' - X; NaN where unknown.
+        truth: (..., 3) true X' - X, same shape; NaN where unknown.
+        scale: The factor s; use `DepthMetrics.scale` so that depth and motion share one scale.
+        mask: (...) bool; False leaves a pixel out.
+
+    Returns:
+        mean, median, mean_truth_length (unit of the truth), coverage, n_pixels. The errors are
+        NaN when nothing can be compared.
+
+    Raises:
+        DataError: shapes do not fit, or no pixel has a true scene flow.
+    """
+    est, gt = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
+    if est.shape != gt.shape or gt.ndim < 1 or gt.shape[-1] != 3:
+        raise DataError(
+            "estimated and true scene flow do not fit",
+            found=f"estimate {est.shape}, truth {gt.shape}",
+            expected="the same shape (..., 3)",
+        )
+    true = _masked(np.asarray(np.isfinite(gt).all(axis=-1)), mask, "scene flow")
+    both = np.asarray(true & np.isfinite(est).all(axis=-1))
+    error = np.linalg.norm(scale * est[both] - gt[both], axis=-1)
+    length = np.linalg.norm(gt[both], axis=-1)
+    n, nan = int(both.sum()), float("nan")
+    return {
+        "mean": float(np.mean(error)) if n else nan,
+        "median": float(np.median(error)) if n else nan,
+        "mean_truth_length": float(np.mean(length)) if n else nan,
+        "coverage": n / int(true.sum()),
+        "n_pixels": n,
+    }

@@ -1,4 +1,4 @@
-"""Presets of the metric conventions in use; a preset is named beside every number it made."""
+"""Presets of the conventions of depth evaluation in use."""
 
 from __future__ import annotations
 
@@ -51,17 +51,10 @@ class Preset:
     def mask(self, truth: ArrayLike) -> NDArray[np.bool_]:
         """Where a truth (H, W) or (M,) counts; a crop needs the image."""
         gt = np.asarray(truth, np.float64)
-        keep = gt > self.low
-        if self.cap is not None:
-            keep &= gt <= self.cap
+        keep = (gt > self.low) & (gt <= (np.inf if self.cap is None else self.cap))
         if self.crop is not None:
             if gt.ndim != 2:
-                raise DataError(
-                    "a crop needs a depth map",
-                    where=f"preset {self.name}",
-                    found=gt.shape,
-                    expected="(H, W)",
-                )
+                raise DataError("a crop needs a depth map (H, W)", where=self.name, found=gt.shape)
             top, bottom, left, right = (
                 int(share * side)
                 for share, side in zip(self.crop, np.repeat(gt.shape, 2), strict=True)
@@ -76,26 +69,18 @@ class Preset:
         return bool(self.mask(truth).any())
 
     def score(self, estimate: ArrayLike, truth: ArrayLike) -> DepthMetrics:
-        """`depth_metrics` under this convention.
-
-        Args:
-            estimate: z in any unit, (H, W) or (M,); NaN where unknown.
-            truth: True z, same shape; NaN where unknown.
+        """`depth_metrics` of z against a true z, (H, W) or (M,), under this convention.
 
         Raises:
             DataError: shapes differ, a crop meets a vector, or no true pixel is left.
         """
+        mask = self.mask(truth)
         return depth_metrics(
-            estimate,
-            truth,
-            scale=self.scale,
-            cap=self.cap,
-            mask=self.mask(truth),
-            clamp=self.clamp,
+            estimate, truth, scale=self.scale, cap=self.cap, mask=mask, clamp=self.clamp
         )
 
 
-_ALL = (
+_PRESETS = (
     Preset("paper", text="the paper's MRE: every true pixel, one global scale"),
     Preset("best", "mre", text="the scale that minimises the MRE itself, no cap"),
     Preset("lsq", "lsq", text="least-squares scale, no cap"),
@@ -118,7 +103,7 @@ _ALL = (
         " is the median of z_gt / z, not median z_gt over median z",
     ),
 )
-PRESETS: Mapping[str, Preset] = MappingProxyType({p.name: p for p in _ALL})
+PRESETS: Mapping[str, Preset] = MappingProxyType({p.name: p for p in _PRESETS})
 """Conventions by name."""
 
 

@@ -38,7 +38,7 @@ def lift(s: State, ray: Float, who: Int) -> tuple[Float, Float]:
 
 
 def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, float]:
-    """Exact E and its weighted terms (paper Eq. 1 to 6, FORMULATION's choices).
+    """Exact E and its weighted terms (paper Eq. 1 to 6 as in docs/formulation.md).
 
     Args:
         s: Soup.

@@ -1,4 +1,4 @@
-"""Depth against truth: what a run scores, and what knowing less would score."""
+"""Scores of the depths of a run and of simpler methods against the truth."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.formats import read_depth
+from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.baselines import RigidBaseline, rigid_depth
 from soup_nlp.evaluate.metrics import (
     DepthMetrics,
     Scale,
-    constant_depth_metrics,
+    check_cap,
     depth_metrics,
     sample_at_points,
+    true_pixels,
 )
-from soup_nlp.geometry.soup import Reconstruction
 from soup_nlp.storage.store import read_h5, require
 
 Float = NDArray[np.float64]
@@ -37,73 +37,45 @@ def rigid_baseline(pair: Pair) -> RigidBaseline | None:
     return None
 
 
-def score(
-    pair: Pair,
-    before: Reconstruction,
-    after: Reconstruction,
-    rigid: RigidBaseline | None = None,
+def score_depths(
+    truth: Truth | None,
+    depths: Mapping[str, Float],
     scale: Scale = "median",
     cap: float | None = None,
-    nlp: Reconstruction | None = None,
+    depth_next: Float | None = None,
 ) -> dict[str, DepthMetrics]:
-    """Metrics of solution, start, a constant depth and one rigid motion; {} without truth.
+    """Metrics of named depth maps, and of a constant depth, against dense or sparse truth.
 
     Args:
-        pair: For its truth.
-        before: Start.
-        after: Solution.
-        rigid: The baseline, if there is one.
+        truth: Dense `depth_ref`, or else sparse `points`; `depth_next` where it is known.
+        depths: (H, W) z of the reference frame by name.
         scale: Rule of the one global scale of each depth map.
         cap: Truth beyond this depth is left out.
-        nlp: The NLP's solution, where it was refined.
-    """
-    if pair.truth is None:
-        return {}
-    depths = {"solution": after.depth_ref, "start": before.depth_ref}
-    if nlp is not None:
-        depths["nlp"] = nlp.depth_ref
-    if rigid is not None:
-        depths["rigid"] = rigid.depth
-    out = score_depths(pair.truth, depths, scale, cap)
-    if pair.truth.depth_next is not None and _any_truth(pair.truth.depth_next, cap):
-        gt = pair.truth.depth_next
-        out["solution_next"] = depth_metrics(after.depth_next, gt, scale=scale, cap=cap)
-    return out
-
-
-def score_depths(
-    truth: Truth, depths: Mapping[str, Float], scale: Scale = "median", cap: float | None = None
-) -> dict[str, DepthMetrics]:
-    """Metrics of named depth maps against dense or sparse truth, constant depth beside them.
-
-    Args:
-        truth: Dense `depth_ref`, or else sparse `points`.
-        depths: (H, W) z of the reference frame by name.
-        scale: Scale rule.
-        cap: Truth beyond this depth is left out.
+        depth_next: (H', W') z of the next frame.
 
     Returns:
-        By the same names, and "constant"; {} where no pixel has a truth.
+        By the same names, "constant", and "solution_next" for the next frame; what has no true
+        pixel is absent.
     """
     out: dict[str, DepthMetrics] = {}
+    if truth is None:
+        return out
     for name, depth in depths.items():
         if truth.depth_ref is not None:
             estimate, gt = depth, truth.depth_ref
         elif truth.points is not None:
             estimate, gt = sample_at_points(depth, truth.points)
         else:
-            return {}
-        if not _any_truth(gt, cap):
-            return {}
+            break
+        if not true_pixels(gt, cap).any():
+            break
         out[name] = depth_metrics(estimate, gt, scale=scale, cap=cap)
         if "constant" not in out:
-            out["constant"] = constant_depth_metrics(gt, scale=scale, cap=cap)
+            out["constant"] = depth_metrics(np.ones(gt.shape), gt, scale=scale, cap=cap)
+    gt_next = truth.depth_next
+    if depth_next is not None and gt_next is not None and true_pixels(gt_next, cap).any():
+        out["solution_next"] = depth_metrics(depth_next, gt_next, scale=scale, cap=cap)
     return out
-
-
-def _any_truth(gt: Float, cap: float | None) -> bool:
-    known = np.isfinite(gt) & (gt > 0)
-    return bool((known if cap is None else known & (gt <= cap)).any())
 
 
 def evaluate(
@@ -130,14 +102,7 @@ def evaluate(
         DataError: the cap is not positive, a file is missing, sizes differ, or the truth knows no
             pixel.
     """
-    # false for NaN too
-    if cap is not None and not cap > 0:
-        raise DataError(
-            "depth cap must be positive",
-            where="cap",
-            found=f"{cap:g}",
-            expected="a depth in the unit of the truth, such as 70",
-        )
+    check_cap(cap)
     tree = read_h5(Path(folder) / "result.h5")
     depths = {k: require(tree, f"depth/{v}") for k, v in DEPTHS.items() if v in tree["depth"]}
     gt = read_depth(Path(depth), depth_scale)
@@ -146,7 +111,7 @@ def evaluate(
         raise DataError(
             "truth and result differ in size", where=depth, found=gt.shape, expected=expected
         )
-    if not _any_truth(gt, cap):
+    if not true_pixels(gt, cap).any():
         raise DataError(
             "truth has no pixel to compare with",
             where=depth,

@@ -3,43 +3,69 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
 
 from soup_nlp.errors import ExportError
-from soup_nlp.export.bundles import FUNCTIONS
 from soup_nlp.model.layout import GAUGES
 
 STUB = "soup"
 MANIFEST = "manifest.json"
 NORMS = ("smooth", "epigraph")
 TRUNCATIONS = ("smooth", "lifted")
-OWN = frozenset(f"{STUB}{s}" for s in (".nl", ".col", ".row", ".h5")) | frozenset(
-    f"{name}.casadi" for name in FUNCTIONS
-)
+FUNCTIONS = ("oracle", "grad_f", "jac_g", "hess_lag")
+"""Functions of the NLP that the format casadi has."""
+OWN = {f"{STUB}{s}" for s in (".nl", ".col", ".row", ".h5")} | {f"{f}.casadi" for f in FUNCTIONS}
 """Every file beside problem.yaml and the manifest that an export may write."""
 
 
-def _number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+class _Part(BaseModel):
+    """A part of the manifest; entries beyond these are for people."""
+
+    model_config = ConfigDict(strict=True)
 
 
-Check = Callable[[object], bool]
-NEEDED: Mapping[str, Mapping[str, Check]] = {
-    "formulation": {
-        "gauge": lambda v: v in GAUGES,
-        "norm": lambda v: v in NORMS,
-        "truncation": lambda v: v in TRUNCATIONS,
-    },
-    "smoothing": {"eps": _number, "eps_pixel": _number},
-    "fingerprint": {"objective": _number, "constraints": _number},
-    "exact_energy_at_start": {"total": _number},
-    "nl": {"sha256": lambda v: isinstance(v, str)},
-    "best_known": {"exact_energy": _number, "found_by": lambda v: isinstance(v, str)},
-}
-"""Entries that an import uses, and what they must be; best_known may be null."""
+class _Formulation(_Part):
+    gauge: Literal[GAUGES]  # type: ignore[valid-type]
+    norm: Literal[NORMS]  # type: ignore[valid-type]
+    truncation: Literal[TRUNCATIONS]  # type: ignore[valid-type]
+
+
+class _Smoothing(_Part):
+    eps: FiniteFloat
+    eps_pixel: FiniteFloat
+
+
+class _Fingerprint(_Part):
+    objective: FiniteFloat
+    constraints: FiniteFloat
+
+
+class _Energy(_Part):
+    total: FiniteFloat
+
+
+class _File(_Part):
+    sha256: str
+
+
+class _Best(_Part):
+    exact_energy: FiniteFloat
+    found_by: str
+
+
+class _Manifest(_Part):
+    """Entries that an import needs."""
+
+    formulation: _Formulation
+    smoothing: _Smoothing
+    fingerprint: _Fingerprint
+    exact_energy_at_start: _Energy
+    nl: _File
+    best_known: _Best | None
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -57,33 +83,21 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             found=error,
             hint="soup-nlp export PROBLEM.yaml -o DIR makes one",
         ) from error
-    if not isinstance(manifest, dict):
-        raise ExportError("manifest.json is not a mapping", where=folder)
-    missing = [key for key in NEEDED if key not in manifest]
-    if missing:
-        raise ExportError("manifest.json lacks entries", where=folder, found=missing)
-    for key, checks in NEEDED.items():
-        part = manifest[key]
-        if key == "best_known" and part is None:
-            continue
-        if not isinstance(part, dict):
-            raise _wrong(folder, key, part)
-        for name, good in checks.items():
-            if name not in part or not good(part[name]):
-                raise _wrong(folder, f"{key}.{name}", part.get(name, "nothing"))
-    # what is beyond these is for people
-    for key in ("formulation", "smoothing"):
-        manifest[key] = {name: manifest[key][name] for name in NEEDED[key]}
-    return manifest
-
-
-def _wrong(folder: Path, key: str, found: object) -> ExportError:
-    return ExportError(
-        "manifest.json has an entry that cannot be used",
-        where=f"{folder / MANIFEST}, {key}",
-        found=str(found)[:60],
-        hint="export again",
-    )
+    try:
+        known = _Manifest.model_validate(manifest)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ExportError(
+            "manifest.json has an entry that cannot be used",
+            where=f"{folder / MANIFEST}, {'.'.join(map(str, first['loc']))}",
+            found=first["msg"],
+            hint="export again",
+        ) from None
+    return {
+        **manifest,
+        "formulation": known.formulation.model_dump(),
+        "smoothing": known.smoothing.model_dump(),
+    }
 
 
 def kept_best(folder: Path, sha256: str) -> dict[str, Any] | None:

@@ -1,6 +1,6 @@
-"""AMPL's .nl text format: exact, fast, from kernels and tables or from any plain SX NLP.
+"""Writers of AMPL's .nl text format, for NLPs of kernels and tables and for plain SX NLPs.
 
-Every kernel's expression is read once and stamped once per element (`template`, `stamp`).
+Every kernel's expression is traced once and filled in once per element (`template`, `body`).
 Variables and constraints are in the order that the format demands (nonlinear in both, in
 constraints, in the objective, linear; nonlinear rows before linear ones): `NLFile` says where each
 went. After D. M. Gay, "Writing .nl files" (2005), and the AMPL/MP reader.
@@ -9,17 +9,18 @@ went. After D. M. Gay, "Writing .nl files" (2005), and the AMPL/MP reader.
 from __future__ import annotations
 
 import hashlib
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.export.program import Body, orders, take_apart
-from soup_nlp.export.segments import bounds, linear, start
+from soup_nlp.export.body import Body
+from soup_nlp.export.program import orders, take_apart
+from soup_nlp.export.segments import bounds, header, linear, start
 from soup_nlp.export.validate import (
     plain_problem,
     require_bounds,
@@ -29,11 +30,10 @@ from soup_nlp.export.validate import (
 )
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP
-from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.storage.atomic import write_bytes, write_text
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,6 @@ class NLFile:
         gradient_nonzeros: Entries of the G segment.
         defined: Defined variables by use: both, constraints, objective (several), one constraint,
             the objective alone.
-        seconds: Wall time to write.
     """
 
     path: Path
@@ -65,49 +64,28 @@ class NLFile:
     jacobian_nonzeros: int
     gradient_nonzeros: int
     defined: tuple[int, int, int, int, int]
-    seconds: float
 
 
-def write_nl(
-    path: str | Path,
-    nlp: NLP,
-    *,
-    p: Float | None = None,
-    x0: Float | None = None,
-    lam_g0: Float | None = None,
-    names: tuple[Sequence[str], Sequence[str]] | None = None,
-) -> NLFile:
+Names = Sequence[str]
+
+
+def write_nl(path: str | Path, nlp: NLP, names: tuple[Names, Names] | None = None) -> NLFile:
     """Write an NLP of kernels and tables; names go to `.col` and `.row` beside the file.
 
     Args:
         path: The .nl file; written whole or not at all.
         nlp: The NLP; the Hessian that it carries does not matter.
-        p: Parameters whose leading entries (theta) count, default nlp.p.
-        x0: Start, default nlp.x0.
-        lam_g0: (ng,) initial multipliers in CasADi's sign (positive at upper bounds); the file
-            has AMPL's, which is the opposite. None writes none.
         names: Of variables and constraints; default the NLP's own, see `names.readable_names`.
 
     Raises:
-        ExportError: an operation has no opcode, a number is not finite, bounds cross, or a vector
-            or names are of a wrong length.
+        ExportError: an operation has no opcode, a number is not finite, bounds cross, or names are
+            not as many as variables and rows.
         DataError: the folder cannot be written.
     """
     x_names, g_names = names or (nlp.x_names(), nlp.g_names())
-    return write_groups(
-        path,
-        nlp.groups,
-        x0=nlp.x0 if x0 is None else x0,
-        lbx=nlp.lbx,
-        ubx=nlp.ubx,
-        lbg=nlp.lbg,
-        ubg=nlp.ubg,
-        theta=(nlp.p if p is None else p)[: len(nlp.theta)],
-        x_names=x_names,
-        g_names=g_names,
-        lam_g0=lam_g0,
-        objective_name="E",
-    )
+    theta = nlp.p[: len(nlp.theta)]
+    x, g = (nlp.x0, nlp.lbx, nlp.ubx), (nlp.lbg, nlp.ubg)
+    return _write(Path(path), nlp.groups, theta, x, g, (x_names, g_names, "E"))
 
 
 def write_sx_nl(
@@ -119,8 +97,8 @@ def write_sx_nl(
     ubx: Float | float | None = None,
     lbg: Float | float | None = None,
     ubg: Float | float | None = None,
-    x_names: Sequence[str] | None = None,
-    g_names: Sequence[str] | None = None,
+    x_names: Names | None = None,
+    g_names: Names | None = None,
     lam_g0: Float | float | None = None,
 ) -> NLFile:
     """Write any plain NLP of CasADi's nlpsol form.
@@ -135,148 +113,103 @@ def write_sx_nl(
         ubg: (ng,) upper bounds of g, default none.
         x_names: For the .col file; None writes none.
         g_names: For the .row file; None writes none.
-        lam_g0: (ng,) initial multipliers, see `write_nl`.
+        lam_g0: (ng,) initial multipliers in CasADi's sign (positive at upper bounds); the file
+            has AMPL's, which is the opposite. None writes none.
 
     Raises:
-        ExportError: as `write_nl`; or the problem is not SX, has a free symbol, or its objective
-            is not a scalar.
+        ExportError: as `write_nl`; or the problem is not SX, has a free symbol, its objective is
+            not a scalar, or a vector has a wrong length.
 
     Example:
         >>> x = ca.SX.sym("x", 2)
         >>> rosenbrock = {"x": x, "f": (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2}
         >>> write_sx_nl("rosenbrock.nl", rosenbrock, x0=[-1.2, 1])  # doctest: +SKIP
     """
+    path = Path(path)
     x, f, g = plain_problem(problem, path)
     nx, ng = x.numel(), g.numel()
     none = ca.SX(0, 1)
     kernel = Kernel("nlp", x, none, none, objective=f, constraints=g if ng else None)
     table = Table(np.arange(nx)[None], np.zeros((1, 0)), np.arange(ng)[None])
-
-    return write_groups(
+    return _write(
         path,
         (Group(kernel, table),),
-        x0=vector("x0", x0, nx, 0.0, path),
-        lbx=vector("lbx", lbx, nx, -np.inf, path),
-        ubx=vector("ubx", ubx, nx, np.inf, path),
-        lbg=vector("lbg", lbg, ng, -np.inf, path),
-        ubg=vector("ubg", ubg, ng, np.inf, path),
-        theta=np.zeros(0),
-        x_names=x_names,
-        g_names=g_names,
-        lam_g0=lam_g0,
+        np.zeros(0),
+        (
+            vector("x0", x0, nx, 0.0, path),
+            vector("lbx", lbx, nx, -np.inf, path),
+            vector("ubx", ubx, nx, np.inf, path),
+        ),
+        (vector("lbg", lbg, ng, -np.inf, path), vector("ubg", ubg, ng, np.inf, path)),
+        (x_names, g_names, "f"),
+        None if lam_g0 is None else vector("lam_g0", lam_g0, ng, 0.0, path),
     )
 
 
-def write_groups(
-    path: str | Path,
+def _write(
+    path: Path,
     groups: Sequence[Group],
-    *,
-    x0: Float,
-    lbx: Float,
-    ubx: Float,
-    lbg: Float,
-    ubg: Float,
     theta: Float,
-    x_names: Sequence[str] | None = None,
-    g_names: Sequence[str] | None = None,
-    lam_g0: Float | float | None = None,
-    objective_name: str = "f",
+    x: tuple[Float, Float, Float],
+    g: tuple[Float, Float],
+    names: tuple[Names | None, Names | None, str],
+    lam_g0: Float | None = None,
 ) -> NLFile:
-    """Write sums of kernels over tables; see `write_nl`.
+    """Check, take apart, order and write.
 
-    Raises:
-        ExportError: as `write_nl`; nothing is written then.
+    Args:
+        path: The .nl file.
+        groups: Kernels and tables.
+        theta: Values of the shared parameters.
+        x: Start, lower and upper bounds of the variables.
+        g: Lower and upper bounds of the rows.
+        names: Of variables, rows and the objective.
+        lam_g0: (ng,) initial multipliers, or None.
     """
-    begin = time.perf_counter()
-    path = Path(path)
-    x0 = vector("x0", x0, len(lbx), 0.0, path)
-    multipliers = None if lam_g0 is None else vector("lam_g0", lam_g0, len(lbg), 0.0, path)
-    if multipliers is not None:
-        require_finite("lam_g0", multipliers, path)
-    require_finite("x0", x0, path)
-    require_bounds("x", lbx, ubx, path)
-    require_bounds("g", lbg, ubg, path)
-    require_names("x_names", x_names, len(lbx), path)
-    require_names("g_names", g_names, len(lbg), path)
-    program = take_apart(groups, len(x0), len(lbg), np.asarray(theta, float))
-    variables, rows = orders(program)
-    place = np.empty(len(variables), np.int64)
-    place[variables] = np.arange(len(variables))
-    row_place = np.empty(len(rows), np.int64)
-    row_place[rows] = np.arange(len(rows))
+    if lam_g0 is not None:
+        require_finite("lam_g0", lam_g0, path)
+    require_finite("x0", x[0], path)
+    require_bounds("x", x[1], x[2], path)
+    require_bounds("g", g[0], g[1], path)
+    require_names("x_names", names[0], len(x[0]), path)
+    require_names("g_names", names[1], len(g[0]), path)
 
-    body = Body(program, place, row_place)
-    nlc = int(program.curved_rows.sum())
-    both = int((program.in_rows & program.in_objective).sum())
-    nlvc = int(program.in_rows.sum())
-    only = int((program.in_objective & ~program.in_rows).sum())
-    # the count for objectives spans the constraints' variables where it has some of its own
-    nlvo = nlvc + only if only else both
+    program = take_apart(groups, len(x[0]), len(g[0]), theta)
+    variables, rows = orders(program)
+    body = Body(program, np.argsort(variables), np.argsort(rows))
     J = program.jacobian[rows][:, variables].tocsr()
     J.sort_indices()
     G = program.gradient[:, variables].tocsr()
     G.sort_indices()
-    lbx, ubx, x0 = lbx[variables], ubx[variables], x0[variables]
-    lbg, ubg = lbg[rows], ubg[rows]
-    duals = None if multipliers is None else multipliers[rows]
-    ranges = np.isfinite(lbg) & np.isfinite(ubg) & (lbg != ubg)
-    widest = [max(map(len, names or ()), default=0) for names in (g_names, x_names)]
-    header = [
-        "g3 1 1 0",
-        f" {len(x0)} {len(lbg)} 1 {int(ranges.sum())} {int((lbg == ubg).sum())}"
-        "\t# vars, constraints, objectives, ranges, eqns",
-        f" {nlc} {int(program.curved_objective)}\t# nonlinear constraints, objectives",
-        " 0 0\t# network constraints: nonlinear, linear",
-        f" {nlvc} {nlvo} {both}\t# nonlinear vars in constraints, objectives, both",
-        " 0 0 0 1\t# linear network variables; functions; arith, flags",
-        " 0 0 0 0 0\t# discrete variables: binary, integer, nonlinear (b,c,o)",
-        f" {J.nnz} {G.nnz}\t# nonzeros in Jacobian, gradients",
-        f" {widest[0]} {widest[1]}\t# max name lengths: constraints, variables",
-        " " + " ".join(map(str, body.classes)) + "\t# common exprs: b,c,o,c1,o1",
-    ]
-    digest = hashlib.sha256()
-    size = 0
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        for lines in (
-            header,
-            body.segments(),
-            start(x0, duals),
-            bounds("r", lbg, ubg),
-            bounds("b", lbx, ubx),
-            linear(J, G),
-        ):
-            for chunk in _chunks(lines):
-                digest.update(chunk)
-                size += len(chunk)
-                file.write(chunk)
-    for suffix, names, order in ((".col", x_names, variables), (".row", g_names, rows)):
-        if names is not None:
-            # the objective's name follows those of the rows
-            last = [objective_name] if suffix == ".row" else []
-            with atomic_path(path.with_suffix(suffix)) as temporary:
-                lines_ = [*(names[k] for k in order), *last]
-                temporary.write_text("\n".join(lines_) + "\n", encoding="utf-8")
+    x0, lbx, ubx = (v[variables] for v in x)
+    lbg, ubg = (v[rows] for v in g)
+    longest = [max(map(len, n or ()), default=0) for n in (names[1], names[0])]
+    lines = chain(
+        header(program, lbg, ubg, J.nnz, G.nnz, longest, body.classes),
+        body.segments(),
+        start(x0, None if lam_g0 is None else lam_g0[rows]),
+        bounds("r", lbg, ubg),
+        bounds("b", lbx, ubx),
+        linear(J, G),
+    )
+    data = ("\n".join(lines) + "\n").encode("ascii")
+    write_bytes(path, data)
+    if names[0] is not None:
+        write_text(path.with_suffix(".col"), "".join(f"{names[0][k]}\n" for k in variables))
+    if names[1] is not None:
+        # the objective's name follows those of the rows
+        text = "".join(f"{names[1][k]}\n" for k in rows) + f"{names[2]}\n"
+        write_text(path.with_suffix(".row"), text)
+    both = program.in_rows & program.in_objective
     return NLFile(
         path=path,
-        sha256=digest.hexdigest(),
-        size=size,
+        sha256=hashlib.sha256(data).hexdigest(),
+        size=len(data),
         variables=variables,
         rows=rows,
-        nonlinear=(nlvc, both + only, both),
-        nonlinear_rows=nlc,
+        nonlinear=(int(program.in_rows.sum()), int(program.in_objective.sum()), int(both.sum())),
+        nonlinear_rows=int(program.curved_rows.sum()),
         jacobian_nonzeros=int(J.nnz),
         gradient_nonzeros=int(G.nnz),
         defined=body.classes,
-        seconds=time.perf_counter() - begin,
     )
-
-
-def _chunks(lines: Iterator[str] | Sequence[str], count: int = 20000) -> Iterator[bytes]:
-    buffer: list[str] = []
-    for line in lines:
-        buffer.append(line)
-        if len(buffer) >= count:
-            yield ("\n".join(buffer) + "\n").encode("ascii")
-            buffer = []
-    if buffer:
-        yield ("\n".join(buffer) + "\n").encode("ascii")

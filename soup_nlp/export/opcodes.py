@@ -1,4 +1,4 @@
-"""CasADi's operations in the words of AMPL's .nl format, and in numpy for folding constants."""
+"""Opcodes of AMPL's .nl format for CasADi's operations, and the same operations in NumPy."""
 
 from __future__ import annotations
 

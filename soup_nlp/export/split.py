@@ -1,4 +1,4 @@
-"""Linear from nonlinear: what of a kernel goes to J and G segments, and what to expressions."""
+"""Linear and nonlinear parts of a kernel: J and G segments, and expressions."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.errors import ExportError
-from soup_nlp.export.opcodes import NAMES, OPS
+from soup_nlp.export.template import trace
 from soup_nlp.model.kernel import Group, Kernel
 
 Float = NDArray[np.float64]
@@ -42,33 +41,6 @@ def outputs(kernel: Kernel) -> ca.SX:
     return ca.densify(ca.vertcat(*parts)) if parts else ca.SX(0, 1)
 
 
-def require_opcodes(name: str, function: ca.Function) -> None:
-    """Every operation on the function's first input can be written.
-
-    This is asked of the expressions as they are: a part that is constant in pieces (`sign(a)`) has
-    a Jacobian entry that is a number, 0, and would be taken for a linear one.
-
-    Raises:
-        ExportError: an operation has no opcode; it is named.
-    """
-    varies: dict[int, bool] = {}
-    for k in range(function.n_instructions()):
-        op = function.instruction_id(k)
-        if op == ca.OP_OUTPUT:
-            continue
-        target = function.instruction_output(k)[0]
-        if op == ca.OP_CONST:
-            varies[target] = False
-        elif op == ca.OP_INPUT:
-            varies[target] = function.instruction_input(k)[0] == 0
-        else:
-            varies[target] = any(varies[a] for a in function.instruction_input(k))
-            if varies[target] and op != ca.OP_ASSIGN and op not in OPS:
-                raise ExportError(
-                    "operation cannot be written to .nl", where=name, found=NAMES.get(op, str(op))
-                )
-
-
 def split(group: Group, theta: Float) -> Split:
     """Split the outputs of a kernel.
 
@@ -83,7 +55,9 @@ def split(group: Group, theta: Float) -> Split:
     """
     kernel, table = group.kernel, group.table
     out = outputs(kernel)
-    require_opcodes(kernel.name, ca.Function("f", [kernel.x, kernel.row, kernel.theta], [out]))
+    # before the split: a piecewise constant part such as sign(a) has the number 0 in the Jacobian
+    # and would pass for a linear one
+    trace(kernel.name, out, group, theta)
     jacobian = ca.jacobian(out, kernel.x)
     r, c = jacobian.sparsity().get_triplet()
     row, column = np.asarray(r, np.int64), np.asarray(c, np.int64)

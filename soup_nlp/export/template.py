@@ -1,8 +1,8 @@
-"""A kernel's expressions as prefix text with holes, to be stamped once per element.
+"""A kernel's expressions as prefix text with holes, to be filled in once per element.
 
 The symbolic instructions are read once. What depends on data alone is folded to numbers, for all
-elements at a time; what an element uses more than once, or what many elements have in common (the
-3-D anchor of a superpixel that fifteen edges meet at), becomes a defined variable.
+elements at a time. An expression that an element uses more than once, or that many elements have in
+common (the 3D anchor of a superpixel at which fifteen edges meet), becomes a defined variable.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class _Graph:
         return len(self.op) - 1
 
 
-def _trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
+def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
     """Instructions of the outputs; a number is a scalar, or (E,) where it depends on the data."""
     kernel, table = group.kernel, group.table
     function = ca.Function("f", [kernel.x, kernel.row, kernel.theta], [ca.densify(outputs)])
@@ -123,17 +123,15 @@ def _apply(
 
 @dataclass(frozen=True)
 class Template:
-    """What is stamped for the elements of a group.
+    """Texts of a kernel, to be filled in for the elements of a group.
 
     Attributes:
-        name: Of the kernel.
         defined: Node and text of every defined variable, dependencies first.
         roots: Text of every output, or None where it is a number.
         constants: (E,) or scalar number of every such output, else 0.
         numbers: Folded columns by node: scalar or (E,).
     """
 
-    name: str
     defined: tuple[tuple[int, Text], ...]
     roots: tuple[Text | None, ...]
     constants: tuple[Float, ...]
@@ -152,7 +150,7 @@ def make_template(name: str, outputs: ca.SX, group: Group, theta: Float) -> Temp
     Raises:
         ExportError: an operation has no .nl opcode.
     """
-    graph = _trace(name, outputs, group, theta)
+    graph = trace(name, outputs, group, theta)
     names = _defined(graph, group)
     defined = tuple((n, _emit(graph, n, names)) for n in sorted(names))
     roots: list[Text | None] = []
@@ -164,7 +162,7 @@ def make_template(name: str, outputs: ca.SX, group: Group, theta: Float) -> Temp
         constants.append(np.asarray(0.0 if value is None else value))
     for node, values in graph.number.items():
         graph.number[node] = np.asarray(values)
-    return Template(name, defined, tuple(roots), tuple(constants), graph.number)
+    return Template(defined, tuple(roots), tuple(constants), graph.number)
 
 
 def _operations(graph: _Graph) -> list[int]:
@@ -208,51 +206,42 @@ def _defined(graph: _Graph, group: Group) -> set[int]:
 
 
 def _common(graph: _Graph, nodes: list[int], group: Group) -> set[int]:
-    """Nodes of which many elements have the same instance: same variables, same numbers."""
-    index = group.table.index
-    columns: dict[int, Int] = {}
-    bit: dict[int, int] = {}
-    support: dict[int, int] = {}
+    """Nodes that have the same instance, of the same variables and numbers, in many elements."""
+    mixed: dict[int, NDArray[np.uint64]] = {}
+    support: dict[int, frozenset[int]] = {}
 
-    def leaf(node: int) -> int:
-        if node not in bit:
-            if node in graph.variable:
-                column = index[:, graph.variable[node]].astype(np.int64)
-            elif np.ndim(graph.number[node]):
-                column = np.ascontiguousarray(graph.number[node]).view(np.int64)
-            else:
-                bit[node] = 0
-                return 0
-            bit[node] = 1 << len(columns)
-            columns[len(columns)] = column
-        return bit[node]
+    def leaf(node: int) -> frozenset[int]:
+        """The node itself, if its value depends on the element."""
+        if node in graph.variable:
+            column = group.table.index[:, graph.variable[node]].astype(np.int64)
+        elif np.ndim(graph.number[node]):
+            column = np.ascontiguousarray(graph.number[node]).view(np.int64)
+        else:
+            return frozenset()
+        mixed[node] = _mix(column, len(mixed))
+        return frozenset({node})
 
-    distinct: dict[int, int] = {}
+    distinct: dict[frozenset[int], int] = {}
     common = set()
     for node in nodes:
-        mask = 0
         for a in graph.args[node]:
-            mask |= support[a] if a in support else leaf(a)
-        support[node] = mask
-        if mask not in distinct:
-            distinct[mask] = len(np.unique(_hash(columns, mask)))
-        if distinct[mask] <= SHARED_BELOW * group.size:
+            if a not in support:
+                support[a] = leaf(a)
+        own = frozenset[int]().union(*(support[a] for a in graph.args[node]))
+        support[node] = own
+        if own not in distinct:
+            distinct[own] = len(np.unique(np.sum([mixed[a] for a in own], axis=0)))
+        if distinct[own] <= SHARED_BELOW * group.size:
             common.add(node)
     return common
 
 
-def _hash(columns: dict[int, Int], mask: int) -> NDArray[np.uint64]:
-    """(E,) hash of the columns whose bits are set."""
-    total = np.zeros(len(columns[0]), np.uint64)
-    place = 0
-    while mask >> place:
-        if mask >> place & 1:
-            h = columns[place].view(np.uint64) + np.uint64(0x9E3779B97F4A7C15 * (place + 1) % 2**64)
-            h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-            h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-            total += h ^ (h >> np.uint64(31))
-        place += 1
-    return total
+def _mix(column: Int, place: int) -> NDArray[np.uint64]:
+    """(E,) SplitMix64 hash of a column; hashes of several columns are added."""
+    h = column.view(np.uint64) + np.uint64(0x9E3779B97F4A7C15 * (place + 1) % 2**64)
+    h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return h ^ (h >> np.uint64(31))
 
 
 def _emit(graph: _Graph, top: int, names: set[int], root: bool = False) -> Text:

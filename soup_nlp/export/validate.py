@@ -1,4 +1,4 @@
-"""What is given to a writer, looked at before anything is written."""
+"""Checks of the input of the .nl writers."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ def plain_problem(problem: Mapping[str, object], where: object) -> tuple[ca.SX, 
         ExportError: an entry is unknown, missing, no SX or of a wrong shape, or there are symbols
             that are not variables.
     """
-    unknown = sorted(set(problem) - {"x", "f", "g", "p"})
-    if unknown or problem.get("x") is None:
+    if set(problem) - {"x", "f", "g", "p"} or problem.get("x") is None:
         raise ExportError(
             "NLP is not of the form x, f, g",
             where=where,
@@ -38,9 +37,7 @@ def plain_problem(problem: Mapping[str, object], where: object) -> tuple[ca.SX, 
     if problem.get("f") is None:
         f = ca.SX(0)
     if f.numel() != 1:
-        raise ExportError(
-            "objective is not a scalar", where=where, found=f.shape, expected="(1, 1)"
-        )
+        raise ExportError("objective is not a scalar", where=where, found=f.shape)
     x, g = ca.vec(x), ca.vec(g)
     free = [s for s in ca.symvar(ca.vertcat(f, g)) if not ca.depends_on(x, s)]
     if p.numel() or free:
@@ -54,32 +51,26 @@ def plain_problem(problem: Mapping[str, object], where: object) -> tuple[ca.SX, 
 
 
 def _expression(name: str, value: object, where: object) -> ca.SX:
-    """An entry as SX; none is empty."""
-    if value is None:
-        return ca.SX(0, 1)
+    """An entry as SX; None is empty, numbers are expressions as well, MX is none."""
     try:
-        # numbers are expressions as well, MX is none
-        return ca.SX(value)
+        return ca.SX(0, 1) if value is None else ca.SX(value)
     except (NotImplementedError, TypeError, RuntimeError):
         raise ExportError(
             f"{name} of the NLP is not SX",
             where=where,
             found=type(value).__name__,
-            expected="casadi.SX",
             hint="Function.expand() makes SX of most MX expressions",
         ) from None
 
 
 def vector(name: str, values: object, size: int, default: float, where: object) -> Float:
-    """(size,) numbers; a scalar stands for all, None for the default.
+    """(size,) numbers; a scalar stands for all entries, None for the default.
 
     Raises:
         ExportError: they are not numbers, or of another length.
     """
-    if values is None:
-        return np.full(size, default)
     try:
-        found = np.asarray(values, float)
+        found = np.asarray(default if values is None else values, float)
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         raise ExportError(
             f"{name} is not a vector of numbers", where=where, found=type(values).__name__
@@ -94,45 +85,35 @@ def vector(name: str, values: object, size: int, default: float, where: object) 
 
 
 def require_finite(name: str, values: Float, where: object) -> None:
-    """Numbers without NaN and infinities.
+    """Check that no entry is NaN or infinite.
 
     Raises:
-        ExportError: an entry is not finite.
+        ExportError: one is.
     """
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        raise ExportError(
-            f"{name} is not finite", where=where, found=f"{values[bad[0]]} at entry {bad[0]}"
-        )
+    if not np.isfinite(values).all():
+        k = int(np.argmin(np.isfinite(values)))
+        raise ExportError(f"{name} is not finite", where=where, found=f"{values[k]} at entry {k}")
 
 
 def require_bounds(name: str, lower: Float, upper: Float, where: object) -> None:
-    """Bounds that some number satisfies.
-
-    Args:
-        name: "x" or "g".
-        lower: (n,) lower bounds.
-        upper: (n,) upper bounds.
-        where: File, for messages.
+    """Check that bounds (n,) of "x" or "g" hold for some number.
 
     Raises:
         ExportError: one is NaN, a lower one is +inf, an upper one -inf, or they cross.
     """
-    # written so that NaN is bad
+    # false for NaN too
     good = (lower <= upper) & (lower < np.inf) & (upper > -np.inf)
-    bad = np.flatnonzero(~good)
-    if len(bad):
-        k = int(bad[0])
+    if not good.all():
+        k = int(np.argmin(good))
         raise ExportError(
             f"bounds of {name} hold for no number",
             where=where,
             found=f"[{lower[k]}, {upper[k]}] at entry {k}",
-            expected=f"lb{name} <= ub{name}",
         )
 
 
 def require_names(name: str, names: Sequence[str] | None, size: int, where: object) -> None:
-    """A name for everything, each a line of its own.
+    """Check that there is a name for everything, each on one line.
 
     Raises:
         ExportError: there are too few or too many, or one is empty or has a line break.
@@ -141,10 +122,7 @@ def require_names(name: str, names: Sequence[str] | None, size: int, where: obje
         return
     if len(names) != size:
         raise ExportError(
-            f"{name} are not as many as there is to name",
-            where=where,
-            found=len(names),
-            expected=size,
+            f"{name} has a wrong length", where=where, found=len(names), expected=size
         )
     for word in names:
         if not isinstance(word, str) or len(word.splitlines()) != 1 or not word.strip():

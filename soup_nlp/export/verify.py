@@ -1,27 +1,30 @@
-"""A claim checked: KKT residuals and exact energy, recomputed from the point."""
+"""KKT residuals of a foreign solver's point, with the multipliers that balance it best."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import lsmr
 
-from soup_nlp.export.duals import bound_multipliers, least_squares_multipliers
-from soup_nlp.model.nlp import NLP
+from soup_nlp.model.nlp import NLP, to_scipy
 from soup_nlp.solve.kkt import optimality
 
 Float = NDArray[np.float64]
 
 SLACK = 10.0
-"""Solvers scale their residuals, each in its way; ours are unscaled and may be this much larger."""
+"""Solvers scale their residuals differently; ours are unscaled and may be this much larger."""
 ENERGY_SLACK = 1e-3
-"""A solution's exact energy may be this share above the proposal's: the smoothing moves it."""
+"""A solution's exact energy may be this share above the proposal's because of the smoothing."""
+ACTIVE = 1e-5
+"""A row this close to a bound (relative to 1 + |bound|) counts as active."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Equal for every solver.
+    """Limits that are equal for every solver.
 
     Attributes:
         seconds: Wall time, set-up included.
@@ -66,10 +69,6 @@ class Residuals:
             and self.complementarity <= SLACK * limits.tol
         )
 
-    def as_dict(self) -> dict[str, float | str]:
-        """For a row."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Optimality:
@@ -87,7 +86,7 @@ class Optimality:
 
 
 def violations(nlp: NLP, x: Float) -> dict[str, Float]:
-    """How far "bounds" (nx,) and "rows" (ng,) are outside; infinite where it is not a number."""
+    """Violation of "bounds" (nx,) and "rows" (ng,); infinite where it is not a number."""
     with np.errstate(all="ignore"):
         g = np.asarray(nlp.oracle(x, nlp.p)[1]).ravel()
         outside = {
@@ -97,49 +96,83 @@ def violations(nlp: NLP, x: Float) -> dict[str, Float]:
     return {k: np.maximum(0.0, np.where(np.isnan(v), np.inf, v)) for k, v in outside.items()}
 
 
-def kkt(nlp: NLP, x: Float, lam_g: Float | None) -> Residuals:
+def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Optimality:
     """Residuals of a point with the solver's multipliers or the least-squares ones.
 
-    Multipliers of the bounds follow from the point: nothing of the solver's is needed.
+    The multipliers that balance the gradient better are taken. Those of the bounds follow from the
+    point. What is not a number counts as infinite.
 
     Args:
         nlp: The problem.
         x: (nx,) point.
         lam_g: (ng,) the solver's multipliers, or None.
     """
-    return examine(nlp, x, lam_g).residuals
-
-
-def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Optimality:
-    """As `kkt`, with the multipliers that balance better; what is not a number is infinite."""
     primal = max(float(v.max(initial=0.0)) for v in violations(nlp, x).values())
     nothing = np.zeros(nlp.ng)
-    if not _has_derivatives(nlp, x):
-        lost = Residuals(primal, np.inf, np.inf, "none")
-        return Optimality(lost, np.zeros(nlp.nx), nothing)
+    values = (*nlp.grad_f(x, nlp.p), *nlp.jac_g(x, nlp.p))
+    if not all(np.isfinite(np.array(v.nonzeros(), float)).all() for v in values):
+        return Optimality(Residuals(primal, np.inf, np.inf, "none"), np.zeros(nlp.nx), nothing)
     candidates = {"least squares": least_squares_multipliers(nlp, x)}
     if lam_g is not None:
         candidates["solver"] = lam_g
     candidates = {k: v for k, v in candidates.items() if np.isfinite(v).all()}
-    best: Optimality | None = None
-    # no multipliers at all are worse than any, and better than none to report
+    found = []
     for name, lam in (candidates or {"none": nothing}).items():
         with np.errstate(all="ignore"):
             lam_x = bound_multipliers(nlp, x, lam)
-            found = optimality(nlp, x, lam_x, lam)
+            off = optimality(nlp, x, lam_x, lam)
         dual, gap = (
-            np.inf if np.isnan(found[key]) else found[key]
+            np.inf if np.isnan(off[key]) else off[key]
             for key in ("dual_infeasibility", "complementarity")
         )
-        if best is None or max(dual, gap) < max(
-            best.residuals.dual, best.residuals.complementarity
-        ):
-            best = Optimality(Residuals(primal, dual, gap, name), lam_x, lam)
-    assert best is not None
-    return best
+        found.append(Optimality(Residuals(primal, dual, gap, name), lam_x, lam))
+    return min(found, key=lambda o: max(o.residuals.dual, o.residuals.complementarity))
 
 
-def _has_derivatives(nlp: NLP, x: Float) -> bool:
-    """Objective, rows and their first derivatives are numbers here."""
-    values = (*nlp.grad_f(x, nlp.p), *nlp.jac_g(x, nlp.p))
-    return all(np.isfinite(np.array(v.nonzeros(), float)).all() for v in values)
+def bound_multipliers(nlp: NLP, x: Float, lam_g: Float) -> Float:
+    """(nx,) multipliers of the bounds that belong to a point and its lam_g.
+
+    What is left of the gradient, r = -(grad f + J' lam_g), is balanced by the bound on the side
+    that it points to; split so that dual infeasibility and complementarity are equal,
+    lam = r / (1 + gap).
+    """
+    r = -(_gradient(nlp, x) + _jacobian(nlp, x).T @ lam_g)
+    with np.errstate(invalid="ignore"):
+        gap = np.where(r > 0, nlp.ubx - x, x - nlp.lbx)
+    # a point outside its bounds has no gap
+    lam = r / (1 + np.maximum(gap, 0.0))
+    fixed = nlp.lbx == nlp.ubx
+    return np.where(fixed, r, np.where(np.isfinite(gap), lam, 0.0))
+
+
+def least_squares_multipliers(nlp: NLP, x: Float) -> Float:
+    """(ng,) multipliers that balance the gradient best; only active rows have one.
+
+    min |grad f + J_A' lam_A| over the active rows A and the variables that are off their bounds;
+    signs that an inequality cannot have are dropped and the rest solved once more.
+    """
+    J, grad = _jacobian(nlp, x), _gradient(nlp, x)
+    g = np.asarray(nlp.oracle(x, nlp.p)[1]).ravel()
+    at_lower = np.isfinite(nlp.lbg) & (g - nlp.lbg <= ACTIVE * (1 + np.abs(nlp.lbg)))
+    at_upper = np.isfinite(nlp.ubg) & (nlp.ubg - g <= ACTIVE * (1 + np.abs(nlp.ubg)))
+    inside = (x - nlp.lbx > ACTIVE) & (nlp.ubx - x > ACTIVE)
+    lam = np.zeros(nlp.ng)
+    rows = np.flatnonzero(at_lower | at_upper)
+    for _ in range(2):
+        if not len(rows):
+            break
+        A = sparse.csr_matrix(J[rows][:, inside].T)
+        lam[:] = 0.0
+        lam[rows] = lsmr(A, -grad[inside], atol=1e-12, btol=1e-12, maxiter=20 * len(rows))[0]
+        wrong = (lam < 0) & ~at_lower | (lam > 0) & ~at_upper
+        lam[wrong] = 0.0
+        rows = rows[~wrong[rows]]
+    return lam
+
+
+def _gradient(nlp: NLP, x: Float) -> Float:
+    return np.asarray(nlp.grad_f(x, nlp.p)[1]).ravel()
+
+
+def _jacobian(nlp: NLP, x: Float) -> sparse.csr_matrix:
+    return sparse.csr_matrix(to_scipy(nlp.jac_g(x, nlp.p)[1]))

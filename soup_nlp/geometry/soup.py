@@ -56,7 +56,7 @@ class Soup:
         return self.lam[:, None] * self.t
 
     def depth_at(self, ray: Float) -> Float:
-        """z (N, ...) of rays (N, ..., 3) on their own superpixel's plane (FORMULATION)."""
+        """z (N, ...) of rays (N, ..., 3) on their own superpixel's plane, docs/formulation.md 3."""
         facing = -np.einsum("nc,n...c->n...", self.n, ray)
         return self.distance.reshape(-1, *[1] * (ray.ndim - 2)) / facing
 

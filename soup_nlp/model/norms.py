@@ -83,7 +83,7 @@ def solver_form(
         norm: The robust norm.
         x: All local variables of the kernel (slack and switch among them).
         theta: Share of the curvature along the residual that is removed (0: reweighted least
-            squares, 1: Newton's; SOLVING measured 0.9 best).
+            squares, 1: Newton's; see docs/solving.md).
         slack: Variable s >= 0 of the epigraph form, None for the smooth form.
         switch: Variable z in [0, 1] of the lifted truncation, None for the smooth one.
     """

@@ -1,4 +1,4 @@
-"""One problem ready for any solver: pair, start and energy, up to but not into a solve."""
+"""A problem ready for any solver: pair, segmentation, start and energy."""
 
 from __future__ import annotations
 
@@ -72,31 +72,36 @@ class Case:
 def prepare(
     problem: Problem,
     presolve: bool = False,
-    say: Callable[[str], None] | None = None,
     *,
     pair: Pair | None = None,
-    lap: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
+    on_stage: Callable[[str], None] | None = None,
 ) -> Case:
-    """Load, segment, start and weigh a problem: what comes before every solve.
+    """Load, segment, start and weight a problem: everything before a solve.
 
     Args:
         problem: See `config.load_problem`.
         presolve: Let solvers start where the tangent presolve ends.
-        say: Called with a line after every stage.
         pair: Images and cameras, instead of the problem's input; its flow is used when it has one.
-        lap: Called with the name of a stage at its end: "load", "flow", "segmentation", "start".
+        log: Called with a line after every stage.
+        on_stage: Called with the name of a stage at its end: "load", "flow", "segmentation",
+            "start".
 
     Raises:
         SoupError: the input cannot be used.
     """
-    say = say or (lambda line: None)
-    lap = lap or (lambda stage: None)
+
+    def done(stage: str, line: object = None) -> None:
+        if on_stage:
+            on_stage(stage)
+        if log and line is not None:
+            log(str(line))
+
     pair = pair or problem.load_pair()
-    lap("load")
+    done("load")
     flow = pair.flow or problem.flow.load(pair, problem.path)
     pair = pair.with_flow(flow)
-    lap("flow")
-    say(str(pair))
+    done("flow", pair)
     s = problem.segmentation
     labels = superpixels(problem, pair)
     if problem.flow.reweight_px is not None:
@@ -104,20 +109,18 @@ def prepare(
         pair = pair.with_flow(flow)
     samples = None if s.boundary_samples == "all" else s.boundary_samples
     seg = build_segmentation(labels, pair.image_ref, s.neighbours, s.beta, s.beta_colour, samples)
-    lap("segmentation")
-    say(str(seg))
+    done("segmentation", seg)
     options = SeededStart(**dict(problem.start), seed=problem.seed)
     start = propose(seg, flow, pair.K_ref, pair.K_next, options)
-    lap("start")
-    say(str(start))
+    done("start", start)
     data, weights = build_energy(problem, pair, seg, start)
     stages = solver_options(problem, start)
     case = Case(problem, pair, seg, start, data, weights, start.soup, stages)
     if not presolve:
         return case
-    # one iteration of the constrained NLP is the least that a solve has
+    # one iteration of the constrained NLP is the smallest number that a solve has
     once = stages.replace(presolve=True, max_iter=1)
-    answer = solve_soup(start.soup, data, weights, case.formulation(), once, say=say)
+    answer = solve_soup(start.soup, data, weights, case.formulation(), once, say=log)
     return replace(case, soup=answer.soup)
 
 

@@ -1,4 +1,4 @@
-"""Claims of a result folder, each recomputed from its arrays with code of its own."""
+"""The claims of a result folder, each recomputed from its arrays by independent code."""
 
 from __future__ import annotations
 
@@ -6,15 +6,19 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate import recompute
+from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.storage.store import read_attrs, read_h5, require
 
+Claims: TypeAlias = Mapping[str, Any]
+TERMS = ("arap", "proj", "cont", "orient")
 LIMITS = {
     "so3": 1e-8,
     "normal": 1e-8,
@@ -27,11 +31,10 @@ LIMITS = {
 """Largest violation that a delivered soup may have."""
 
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-DEPTHS = {"solution": "ref", "nlp": "nlp_ref", "start": "start_ref", "rigid": "rigid_ref"}
 RELATIVE = 1e-9
 ABSOLUTE = 1e-12
 ROUNDINGS = 16
-"""Of machine precision, that a pixel coordinate may be off after its way through both frames."""
+"""Error of a pixel coordinate after projection into both frames, in units of machine precision."""
 NOT_CHECKED = "dual infeasibility and complementarity need the model's derivatives: not rechecked"
 
 
@@ -84,14 +87,16 @@ class CheckReport:
 def check_folder(folder: str | Path) -> CheckReport:
     """Recompute energy, constraints, depth and metrics of a result folder.
 
-    Args:
-        folder: Result folder.
-
     Raises:
         DataError: a file, a claim or an array is missing or not what it should be.
     """
     folder = Path(folder)
-    claims = _claims(folder)
+    try:
+        claims = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(
+            "summary.json cannot be read", where=folder, found=error, hint="run solve first"
+        ) from error
     path = folder / "result.h5"
     tree, attrs = read_h5(path), read_attrs(path)
     try:
@@ -104,39 +109,18 @@ def check_folder(folder: str | Path) -> CheckReport:
         ) from error
 
 
-def _claims(folder: Path) -> dict[str, Any]:
-    try:
-        claims = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(
-            "summary.json cannot be read", where=folder, found=error, hint="run solve first"
-        ) from error
-    if not isinstance(claims, dict):
-        raise DataError("summary.json holds no claims", where=folder, found=type(claims).__name__)
-    return claims
-
-
-def _rows(
-    folder: Path, claims: Mapping[str, Any], tree: Mapping[str, Any], attrs: Mapping[str, Any]
-) -> Iterator[Row]:
-    config = (folder / "config.yaml").read_text(encoding="utf-8")
-    yield from _labels(claims, attrs, config)
+def _rows(folder: Path, claims: Claims, tree: Claims, attrs: Claims) -> Iterator[Row]:
+    yield from _labels(claims, attrs, (folder / "config.yaml").read_text(encoding="utf-8"))
     settings = yaml.safe_load(str(attrs["config"]))
     weights = {k: float(v) for k, v in tree["weights"].items()}
-    own = settings["energy"]["weights"]
-    if settings["energy"]["units"] == "pixel" and bool(tree["start"].get("bending", False)):
-        own = dict(settings["energy"]["bending"]["weights"])
-        # there it is that of 1,000 superpixels
-        own["orient"] *= len(tree["start"]["component"]) / 1000
-    for key in ("arap", "proj", "cont", "orient"):
-        yield _same(f"weight {key}", own[key], weights[key])
+    yield from _weights(tree, settings["energy"], weights)
     for name, gap in recompute.data_errors(tree, settings).items():
         yield Row(f"data {name}", 0.0, gap, RELATIVE, gap <= RELATIVE)
     slack = _rounding(tree, weights)
     for which in ("start", "nlp", "solution"):
         found = recompute.energy(_state(tree, which), tree["energy"], weights)
         for term, value in found.items():
-            # a term that cancels to nothing is rounding of the sum it belongs to
+            # a term may be the rounding error of the sum that it belongs to
             claimed = claims["energy"][which][term]
             yield _same(f"energy {which} {term}", claimed, value, of=found["total"], absolute=slack)
     if claims["converged"]:
@@ -145,25 +129,35 @@ def _rows(
         yield Row("energy falls", before, after, before, ok)
     yield from _rounds(claims, slack)
     yield from _constraints(claims, tree, weights)
-    yield from _depth(tree)
-    yield _next_depth(tree)
+    yield from _depths(tree)
     yield from _metrics(tree, claims["metrics"])
 
 
-def _rounding(tree: Mapping[str, Any], weights: Mapping[str, float]) -> float:
-    """What rounding may leave of an energy that should be zero.
+def _weights(tree: Claims, form: Claims, weights: Mapping[str, float]) -> Iterator[Row]:
+    """The stored weights are those of the problem."""
+    own = form["weights"]
+    if form["units"] == "pixel" and bool(tree["start"].get("bending", False)):
+        own = dict(form["bending"]["weights"])
+        # given for 1,000 superpixels
+        own["orient"] *= len(tree["start"]["component"]) / 1000
+    for key in TERMS:
+        yield _same(f"weight {key}", own[key], weights[key])
 
-    E sums one number per superpixel, each a difference of numbers that grow with pixel coordinates
-    and focal lengths: it is known to machine precision of these, not of itself.
+
+def _rounding(tree: Claims, weights: Mapping[str, float]) -> float:
+    """Rounding error of an energy that should be zero.
+
+    E sums differences of numbers as large as pixel coordinates and focal lengths, so its absolute
+    error is their machine precision times the number of superpixels.
     """
     e = tree["energy"]
     used = np.abs(e["pixel_target"][e["pixel_weight"] > 0])
     size = max(float(used.max(initial=1.0)), float(np.abs(e["K_next"]).max()))
-    factor = max(1.0, *(float(weights[term]) for term in ("arap", "proj", "cont", "orient")))
+    factor = max(1.0, *(float(weights[term]) for term in TERMS))
     return ROUNDINGS * float(np.finfo(float).eps) * len(e["anchor_ray"]) * size * factor
 
 
-def _rounds(claims: Mapping[str, Any], slack: float) -> Iterator[Row]:
+def _rounds(claims: Claims, slack: float) -> Iterator[Row]:
     """E never rises from round to round, and no round claims less than its lower bound."""
     refinement = claims.get("refinement")
     if not refinement or not refinement["rounds"]:
@@ -197,8 +191,8 @@ def _same(
     return Row(name, value, found, RELATIVE, bool(ok))
 
 
-def _labels(claims: Mapping[str, Any], attrs: Mapping[str, Any], config: str) -> Iterator[Row]:
-    """What the three files say in words must agree; 1 is agreement."""
+def _labels(claims: Claims, attrs: Claims, config: str) -> Iterator[Row]:
+    """summary.json, config.yaml and result.h5 agree; 1 is agreement."""
     pairs = {
         "status": claims["status"] == attrs["status"],
         "converged": bool(claims["converged"]) == (attrs["status"] in GOOD),
@@ -211,7 +205,7 @@ def _labels(claims: Mapping[str, Any], attrs: Mapping[str, Any], config: str) ->
         yield Row(f"{name} as in result.h5", 1.0, float(ok), 0.0, ok)
 
 
-def _state(tree: Mapping[str, Any], which: str) -> dict[str, recompute.Float]:
+def _state(tree: Claims, which: str) -> dict[str, recompute.Float]:
     """The arrays of a soup.
 
     Raises:
@@ -232,21 +226,26 @@ def _state(tree: Mapping[str, Any], which: str) -> dict[str, recompute.Float]:
     return out
 
 
-def _constraints(
-    claims: Mapping[str, Any], tree: Mapping[str, Any], weights: Mapping[str, float]
-) -> Iterator[Row]:
+def _constraints(claims: Claims, tree: Claims, weights: Mapping[str, float]) -> Iterator[Row]:
+    rim, facing = require(tree, "energy/rim_ray"), weights["min_facing"]
+
+    def satisfied(which: str, key: str, limits: Mapping[str, float]) -> Iterator[Row]:
+        """Constraints of one soup, and what is claimed of them."""
+        found = recompute.constraints(_state(tree, which), rim, facing)
+        for name, limit in limits.items():
+            value, claimed = float(found[name].max()), _number(claims[key][name])
+            ok = value <= limit and abs(value - claimed) <= 1e-3 * value + ABSOLUTE
+            worst = int(found[name].argmax()) if name != "simplex" and value > 0 else -1
+            yield Row(f"{which} {name}", claimed, value, limit, bool(ok), worst)
+
+    yield from satisfied("solution", "residuals", LIMITS)
     if claims["status"] == "Skipped":
-        yield from _satisfied(claims, tree, weights, "solution", "residuals", LIMITS)
         return
+    yield from satisfied("nlp", "nlp_residuals", LIMITS)
     # Ipopt's answer may violate its constraints by as much as it says, the delivered soup by less
-    own = float(claims["residuals"]["nlp_infeasibility"])
-    within = own * (1 + 1e-6) + ABSOLUTE
-    for which, key, limits in (
-        ("solution", "residuals", LIMITS),
-        ("nlp", "nlp_residuals", LIMITS),
-        ("answer", "answer_residuals", dict.fromkeys(("so3", "normal", "simplex"), within)),
-    ):
-        yield from _satisfied(claims, tree, weights, which, key, limits)
+    within = float(claims["residuals"]["nlp_infeasibility"]) * (1 + 1e-6) + ABSOLUTE
+    own = dict.fromkeys(("so3", "normal", "simplex"), within)
+    yield from satisfied("answer", "answer_residuals", own)
     if claims["delivered"] == "constrained NLP":
         a, b = _state(tree, "answer"), _state(tree, "nlp")
         gap = max(float(np.abs(a[k] - b[k]).max()) for k in ("n", "R"))
@@ -255,70 +254,46 @@ def _constraints(
         yield Row("nlp is Ipopt's answer", 0.0, gap, limit, gap <= limit)
 
 
-def _satisfied(
-    claims: Mapping[str, Any],
-    tree: Mapping[str, Any],
-    weights: Mapping[str, float],
-    which: str,
-    key: str,
-    limits: Mapping[str, float],
-) -> Iterator[Row]:
-    """Constraints of one soup, and what is claimed of them."""
-    rim = require(tree, "energy/rim_ray")
-    found = recompute.constraints(_state(tree, which), rim, weights["min_facing"])
-    for name, limit in limits.items():
-        value, claimed = float(found[name].max()), _number(claims[key][name])
-        ok = value <= limit and abs(value - claimed) <= 1e-3 * value + ABSOLUTE
-        worst = int(found[name].argmax()) if name != "simplex" and value > 0 else -1
-        yield Row(f"{which} {name}", claimed, value, limit, bool(ok), worst)
-
-
-def _depth(tree: Mapping[str, Any]) -> Iterator[Row]:
-    """The stored depth maps are those of the stored planes."""
-    labels, K = require(tree, "segmentation/labels"), require(tree, "input/K_ref")
-    for which, key in (("solution", "ref"), ("nlp", "nlp_ref"), ("start", "start_ref")):
-        if key not in tree["depth"]:
-            continue
-        depth = require(tree, f"depth/{key}")
-        z = recompute.depth_map(_state(tree, which), labels, K)
-        known = np.isfinite(depth) & np.isfinite(z)
-        # a pixel exactly at the horizon may fall on either side
-        lost = float((np.isfinite(depth) != np.isfinite(z)).mean())
-        off = float(np.abs(z[known] / depth[known] - 1).max(initial=0.0))
-        ok = off <= RELATIVE and lost <= 1e-4
-        note = "" if lost <= 1e-4 else f"{lost:.1%} of the pixels are known in one only"
-        yield Row(f"depth map {which}", 0.0, off, RELATIVE, ok, note=note)
-
-
-def _next_depth(tree: Mapping[str, Any]) -> Row:
-    """The stored depth of the next frame is where the stored planes and motions bring the first."""
-    depth = require(tree, "depth/next")
-    K_ref, K_next = require(tree, "input/K_ref"), require(tree, "input/K_next")
+def _depths(tree: Claims) -> Iterator[Row]:
+    """The stored depth maps are those of the stored planes and motions."""
     labels = require(tree, "segmentation/labels")
-    z, doubt = recompute.next_depth_map(
-        _state(tree, "solution"), labels, K_ref, K_next, (depth.shape[0], depth.shape[1])
-    )
-    sure = ~doubt
-    known = sure & np.isfinite(depth) & np.isfinite(z)
-    lost = float((np.isfinite(depth) != np.isfinite(z))[sure].mean()) if sure.any() else 0.0
-    off = float(np.abs(z[known] / depth[known] - 1).max(initial=0.0))
-    notes = {
-        f"{lost:.1%} of the pixels are known in one only": lost > 1e-4,
-        f"{doubt.mean():.1%} of the pixels hang on a rounding, not compared": doubt.mean() > 1e-3,
-    }
-    note = "; ".join(text for text, on in notes.items() if on)
-    return Row("depth map next", 0.0, off, RELATIVE, off <= RELATIVE and lost <= 1e-4, note=note)
+    K_ref, K_next = require(tree, "input/K_ref"), require(tree, "input/K_next")
+    for which in ("solution", "nlp", "start"):
+        if DEPTHS[which] in tree["depth"]:
+            depth = require(tree, f"depth/{DEPTHS[which]}")
+            z = recompute.depth_map(_state(tree, which), labels, K_ref)
+            yield _same_depth(which, depth, z, np.zeros(z.shape, bool))
+    depth = require(tree, "depth/next")
+    state = _state(tree, "solution")
+    z, doubt = recompute.next_depth_map(state, labels, K_ref, K_next, depth.shape)
+    yield _same_depth("next", depth, z, doubt)
 
 
-def _metrics(tree: Mapping[str, Any], claims: Mapping[str, Any]) -> Iterator[Row]:
-    truth = tree.get("truth", {})
+def _same_depth(
+    which: str, depth: recompute.Float, z: recompute.Float, doubt: NDArray[np.bool_]
+) -> Row:
+    """A stored depth map must equal a recomputed one where no rounding decides."""
+    # a pixel exactly at the horizon may fall on either side
+    one = (np.isfinite(depth) != np.isfinite(z)) & ~doubt
+    both = np.isfinite(depth) & np.isfinite(z) & ~doubt
+    lost = float(one.sum() / max((~doubt).sum(), 1))
+    off = float(np.abs(z[both] / depth[both] - 1).max(initial=0.0))
+    notes = []
+    if lost > 1e-4:
+        notes.append(f"{lost:.1%} of the pixels are known in one only")
+    if doubt.mean() > 1e-3:
+        notes.append(f"{doubt.mean():.1%} of the pixels are not compared: rounding decides")
+    ok = off <= RELATIVE and lost <= 1e-4
+    return Row(f"depth map {which}", 0.0, off, RELATIVE, ok, note="; ".join(notes))
+
+
+def _metrics(tree: Claims, claims: Claims) -> Iterator[Row]:
+    """The scores are those of the stored depth maps against the stored truth."""
     constant = float("nan")
-    for name in ("constant", *(k for k in claims if k != "constant")):
-        if name not in claims:
-            continue
+    # the skill of the others needs the score of the constant depth
+    for name in sorted(claims, key=lambda k: k != "constant"):
         claim = claims[name]
-        z, gt = _compared(tree, truth, name)
-        found = recompute.scores(z, gt, claim["scale_rule"], claim["cap"])
+        found = recompute.scores(*_compared(tree, name), claim["scale_rule"], claim["cap"])
         if name == "constant":
             constant = found.get("mre", constant)
         if "skill" in claim and constant > 0:
@@ -331,17 +306,13 @@ def _metrics(tree: Mapping[str, Any], claims: Mapping[str, Any]) -> Iterator[Row
         yield Row(f"other scores {name}", count, count - len(bad), 0.0, not bad, note=note)
 
 
-def _compared(
-    tree: Mapping[str, Any], truth: Mapping[str, Any], name: str
-) -> tuple[recompute.Float, recompute.Float]:
-    """Estimate and truth that a row of metrics is about."""
+def _compared(tree: Claims, name: str) -> tuple[recompute.Float, recompute.Float]:
+    """Estimate and truth of a row of metrics."""
     if name == "solution_next":
         return require(tree, "depth/next"), require(tree, "truth/depth_next")
-    if name == "constant":
-        z = np.ones_like(require(tree, "depth/ref"))
+    z = require(tree, f"depth/{'ref' if name == 'constant' else DEPTHS[name]}")
+    if "depth_ref" in tree["truth"]:
+        gt = require(tree, "truth/depth_ref")
     else:
-        z = require(tree, f"depth/{DEPTHS[name]}")
-    if "depth_ref" in truth:
-        return z, truth["depth_ref"]
-    estimate, gt = recompute.at_points(z, require(tree, "truth/points"))
-    return (np.ones_like(gt), gt) if name == "constant" else (estimate, gt)
+        z, gt = recompute.at_points(z, require(tree, "truth/points"))
+    return (np.ones_like(gt) if name == "constant" else z), gt

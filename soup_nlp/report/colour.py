@@ -1,8 +1,6 @@
-"""Depth, error, flow, normals and superpixels in colour: (H, W, 3) uint8 RGB, the unknown black."""
+"""Depth, error, flow, normals and superpixels in colour: (H, W, 3) uint8 RGB, unknown is black."""
 
 from __future__ import annotations
-
-from typing import Literal
 
 import matplotlib
 import numpy as np
@@ -13,19 +11,15 @@ from soup_nlp.errors import DataError
 Float = NDArray[np.floating]
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-DepthMapping = Literal["inverse", "log"]
 
 _WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 
 
-def depth_range(
-    depth: Float, percentiles: tuple[float, float] = (2.0, 98.0)
-) -> tuple[float, float]:
-    """Robust (near, far) of a depth map, for a colour scale that several maps share.
+def depth_range(depth: Float) -> tuple[float, float]:
+    """(near, far) of a depth map, its 2nd and 98th percentile: a colour scale for several maps.
 
     Args:
         depth: (H, W) z; values that are not finite or not positive are left out.
-        percentiles: Of near and far, in percent.
 
     Returns:
         near < far, in the unit of the depth; (1, 2) where nothing is known.
@@ -34,83 +28,58 @@ def depth_range(
     z = z[np.isfinite(z) & (z > 0)]
     if z.size == 0:
         return 1.0, 2.0
-    near, far = (float(x) for x in np.percentile(z, percentiles))
+    near, far = (float(x) for x in np.percentile(z, (2.0, 98.0)))
     if not far > near * (1 + 1e-9):  # a constant depth still needs a scale
         near, far = near / 1.1, far * 1.1
     return near, far
 
 
-def colourise_depth(
-    depth: Float,
-    vmin: float | None = None,
-    vmax: float | None = None,
-    *,
-    mapping: DepthMapping = "inverse",
-    cmap: str = "turbo",
-) -> Image:
-    """Depth in colour: near is the upper end of the colour map (red), far the lower (blue).
+def colourise_depth(depth: Float, near: float | None = None, far: float | None = None) -> Image:
+    """Depth in colour by even steps of 1/z: near is red, far is blue.
 
     Args:
         depth: (H, W) z; black where not finite or not positive.
-        vmin: Depth of the near end; None takes a robust percentile.
-        vmax: Depth of the far end; None takes a robust percentile.
-        mapping: Even steps of colour in 1/z ("inverse", as a disparity looks) or in ln z ("log").
-        cmap: Name of a matplotlib colour map.
+        near: Depth of the near end; None takes `depth_range`.
+        far: Depth of the far end; None takes `depth_range`.
 
     Raises:
-        DataError: not a map, an unknown mapping or colour map, or not 0 < vmin < vmax.
+        DataError: not a map, or not 0 < near < far.
     """
-    z = as_map(depth, "depth", 2)
-    near, far = depth_range(z)
-    near = near if vmin is None else float(vmin)
-    far = far if vmax is None else float(vmax)
+    z = as_map(depth, "depth")
+    own = depth_range(z)
+    near, far = own[0] if near is None else near, own[1] if far is None else far
     if not 0 < near < far < np.inf:
-        raise DataError(
-            "depth range is wrong", where="vmin, vmax", found=(near, far), expected="0 < near < far"
-        )
-    if mapping not in ("inverse", "log"):
-        raise DataError(
-            "unknown depth mapping", where="mapping", found=mapping, expected="inverse or log"
-        )
+        raise DataError("depth range is wrong", found=(near, far), expected="0 < near < far")
     known = np.isfinite(z) & (z > 0)
     safe = np.clip(np.where(known, z, near), near, far)
-    if mapping == "log":
-        level = np.log(far / safe) / np.log(far / near)
-    else:
-        level = (1 / safe - 1 / far) / (1 / near - 1 / far)
-    return _paint(level, known, cmap)
+    return _paint((1 / safe - 1 / far) / (1 / near - 1 / far), known, "turbo")
 
 
-def colourise_error(relative_error: Float, limit: float = 0.2, cmap: str = "inferno") -> Image:
+def colourise_error(relative_error: Float, limit: float = 0.2) -> Image:
     """Relative depth error in colour, from 0 (dark) to `limit` and above (bright).
 
-    The lowest tenth of the colour map is left out, so that a small error is not taken for black,
-    the colour of the unknown.
+    The lowest tenth of the colour map is left out, so that a small error differs from black, the
+    colour of the unknown.
 
     Args:
         relative_error: (H, W) |z_gt - z| / z_gt; black where not finite.
         limit: Error at the upper end.
-        cmap: Name of a matplotlib colour map.
 
     Raises:
         DataError: not a map, or a limit that is not positive.
     """
-    error = np.abs(as_map(relative_error, "relative_error", 2))
+    error = np.abs(as_map(relative_error, "relative_error"))
     if not 0 < limit < np.inf:
         raise DataError("error limit must be positive", where="limit", found=limit, expected="> 0")
     known = np.isfinite(error)
     level = np.minimum(np.where(known, error, 0.0) / limit, 1.0)
-    return _paint(0.1 + 0.9 * level, known, cmap)
+    return _paint(0.1 + 0.9 * level, known, "inferno")
 
 
-def _paint(level: NDArray[np.float64], known: Mask, cmap: str) -> Image:
-    """(H, W, 3) colours of levels (H, W) in [0, 1], black where not known."""
-    if cmap not in matplotlib.colormaps:
-        raise DataError(
-            "unknown colour map", where="cmap", found=cmap, expected="a matplotlib colour map"
-        )
-    table = (matplotlib.colormaps[cmap](np.linspace(0, 1, 256))[:, :3] * 255).round()
-    out = table.astype(np.uint8)[(level * 255).round().astype(np.intp)]
+def _paint(level: NDArray[np.float64], known: Mask, name: str) -> Image:
+    """(H, W, 3) colours of levels (H, W) in [0, 1] by a matplotlib map, black where not known."""
+    table = (matplotlib.colormaps[name](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
+    out = table[(level * 255).round().astype(np.intp)]
     out[~known] = 0
     return np.asarray(out)
 
@@ -136,7 +105,7 @@ def colourise_flow(uv: Float, limit: float | None = None) -> Image:
     Raises:
         DataError: wrong shape, or a limit that is not positive.
     """
-    flow = as_map(uv, "uv", 3, 2)
+    flow = as_map(uv, "uv", 2)
     known: Mask = np.asarray(np.isfinite(flow).all(axis=2))
     flow = np.where(known[:, :, None], flow, 0.0)
     length = np.hypot(flow[:, :, 0], flow[:, :, 1])
@@ -167,7 +136,7 @@ def colourise_normals(n_map: Float) -> Image:
     Raises:
         DataError: wrong shape.
     """
-    n = as_map(n_map, "n_map", 3, 3)
+    n = as_map(n_map, "n_map", 3)
     known: Mask = np.asarray(np.isfinite(n).all(axis=2))
     signed = np.where(known[:, :, None], n, 0.0) * np.array([1.0, -1.0, -1.0])
     out = ((np.clip(signed, -1, 1) + 1) * 127.5).round().astype(np.uint8)
@@ -178,24 +147,14 @@ def colourise_normals(n_map: Float) -> Image:
 def draw_superpixels(
     image: Image, labels: NDArray[np.integer], colour: tuple[int, int, int] = (255, 255, 0)
 ) -> Image:
-    """The image with the boundaries of a labelling drawn one pixel wide.
-
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        labels: (H, W) integer labels.
-        colour: RGB, 0 to 255.
+    """The (H, W, 3) image with the boundaries of the labels (H, W) drawn one pixel wide.
 
     Raises:
         DataError: the image is not RGB, or the labels do not fit it.
     """
     check_rgb(image, "image")
     if labels.shape != image.shape[:2]:
-        raise DataError(
-            "labels do not fit the image",
-            where="labels",
-            found=labels.shape,
-            expected=image.shape[:2],
-        )
+        raise DataError("labels do not fit the image", found=labels.shape, expected=image.shape[:2])
     edge = np.zeros(labels.shape, bool)
     edge[:, :-1] |= labels[:, :-1] != labels[:, 1:]
     edge[:-1] |= labels[:-1] != labels[1:]
@@ -204,20 +163,15 @@ def draw_superpixels(
     return out
 
 
-def as_map(value: Float, where: str, ndim: int, channels: int = 0) -> NDArray[np.float64]:
-    """The value as doubles.
-
-    Args:
-        value: (H, W) or (H, W, channels).
-        where: Its name, for the message.
-        ndim: Dimensions that it must have.
-        channels: Length that its last axis must have; 0 for any.
+def as_map(value: Float, where: str, channels: int = 0) -> NDArray[np.float64]:
+    """An (H, W) map, or an (H, W, channels) one, as doubles.
 
     Raises:
         DataError: another shape, or empty.
     """
     array = np.asarray(value, np.float64)
-    if array.ndim != ndim or array.size == 0 or (channels and array.shape[-1] != channels):
+    fits = array.ndim == 2 if not channels else array.ndim == 3 and array.shape[2] == channels
+    if not fits or array.size == 0:
         raise DataError(
             "cannot draw an array of this shape",
             where=where,
@@ -228,14 +182,10 @@ def as_map(value: Float, where: str, ndim: int, channels: int = 0) -> NDArray[np
 
 
 def check_rgb(image: Image, where: str) -> None:
-    """Raise unless an image can be drawn.
-
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        where: Its name, for the message.
+    """Check that an image is (H, W, 3) uint8 and not empty.
 
     Raises:
-        DataError: not 8-bit RGB, or empty.
+        DataError: it is not.
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise DataError(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -24,7 +26,7 @@ from soup_nlp.report.colour import (
     depth_range,
     draw_superpixels,
 )
-from soup_nlp.storage.atomic import PathLike, atomic_path
+from soup_nlp.storage.atomic import PathLike, atomic_path, write_bytes
 
 Float = NDArray[np.floating]
 Bar = tuple[Image, str, str]
@@ -34,15 +36,11 @@ Panel = tuple[str, Image] | tuple[str, Image, Bar]
 
 _DPI = 100
 _FRAME = 0.6  # points
-_BAR_HEIGHT = 0.2  # inches, of a row's line of colour bars
+_BAR_HEIGHT, _CAPTION, _GAP = 0.2, 0.28, 0.08  # inches
 
 
 def overview_strip(
-    path: PathLike,
-    panels: Sequence[Panel],
-    title: str,
-    columns: int | None = None,
-    panel_width: float = 4.2,
+    path: PathLike, panels: Sequence[Panel], title: str, columns: int = 3, panel_width: float = 4.2
 ) -> None:
     """Write a PNG of captioned panels in a grid, under a title.
 
@@ -53,79 +51,71 @@ def overview_strip(
         path: PNG file to write; its folder must exist.
         panels: (caption, (H, W, 3) uint8 RGB[, colour bar]) in reading order.
         title: Above the panels; "" for none.
-        columns: Panels in a row; None takes up to three.
+        columns: Largest number of panels in a row.
         panel_width: Width of a panel, inches at 100 dpi.
 
     Raises:
-        DataError: no panels, a panel that is not RGB, a column count below 1, or a folder that
-            cannot be written.
+        DataError: no panels, a panel that is not RGB, or a folder that cannot be written.
     """
-    columns = min(3, len(panels)) if columns is None else columns
-    if not panels or columns < 1:
-        raise DataError(
-            "overview needs at least one panel and one column",
-            where=path,
-            found=f"{len(panels)} panels, {columns} columns",
-        )
+    if not panels:
+        raise DataError("overview needs at least one panel", where=path)
     for panel in panels:
         check_rgb(panel[1], f"panel {panel[0]!r}")
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     # layout in inches, from the top
-    caption_height, gap = 0.28, 0.08
-    head = 0.42 if title else gap
+    head = 0.42 if title else _GAP
     heights = [
         panel_width * max(panel[1].shape[0] / panel[1].shape[1] for panel in row)
         + _BAR_HEIGHT * any(len(panel) == 3 for panel in row)
         for row in rows
     ]
-    width = columns * (panel_width + gap) + gap
-    height = head + sum(h + caption_height + gap for h in heights)
+    width = columns * (panel_width + _GAP) + _GAP
+    height = head + sum(h + _CAPTION + _GAP for h in heights)
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    if title:
-        text = figure.text(
-            gap / width, 1 - 0.5 * head / height, title, va="center", fontsize=13, weight="bold"
-        )
-        text.set_parse_math(False)
-    top = head
+    _write(figure, _GAP, height - 0.5 * head, title, fontsize=13, weight="bold")
+    top = height - head
     for row, row_height in zip(rows, heights, strict=True):
         for k, panel in enumerate(row):
-            caption, image = panel[0], panel[1]
-            left = gap + k * (panel_width + gap)
-            text = figure.text(
-                left / width, 1 - (top + 0.5 * caption_height) / height, caption, va="center"
-            )
-            text.set_parse_math(False)
-            tall = panel_width * image.shape[0] / image.shape[1]
-            bottom = height - top - caption_height - tall
-            axes = figure.add_axes(
-                (left / width, bottom / height, panel_width / width, tall / height)
-            )
-            axes.imshow(image, interpolation="antialiased", aspect="auto")
-            axes.set(xticks=[], yticks=[])
-            # a white panel has an end on white paper
-            for side in axes.spines.values():
-                side.set(linewidth=_FRAME, color="0.6")
-            if len(panel) == 3:
-                _draw_bar(figure, panel[2], left, bottom - _BAR_HEIGHT, panel_width)
-        top += row_height + caption_height + gap
+            _draw_panel(figure, panel, _GAP + k * (panel_width + _GAP), top, panel_width)
+        top -= row_height + _CAPTION + _GAP
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)
 
 
-def _draw_bar(figure: Figure, bar: Bar, left: float, bottom: float, width: float) -> None:
-    """A colour bar between its two texts, below a panel (inches from the lower left corner)."""
-    colours, low, high = bar
+def _draw_panel(figure: Figure, panel: Panel, left: float, top: float, width: float) -> None:
+    """Caption, picture and colour bar of a panel; inches from the lower left corner."""
+    caption, image = panel[0], panel[1]
+    _write(figure, left, top - 0.5 * _CAPTION, caption)
+    tall = width * image.shape[0] / image.shape[1]
+    bottom = top - _CAPTION - tall
+    axes = _axes(figure, left, bottom, width, tall)
+    axes.imshow(image, interpolation="antialiased", aspect="auto")
+    axes.set(xticks=[], yticks=[])
+    # so that a white panel is seen on white paper
+    for side in axes.spines.values():
+        side.set(linewidth=_FRAME, color="0.6")
+    if len(panel) == 3:
+        colours, low, high = panel[2]
+        middle = bottom - 0.5 * _BAR_HEIGHT
+        _write(figure, left, middle, low, fontsize=8)
+        _write(figure, left + width, middle, high, fontsize=8, ha="right")
+        axes = _axes(figure, left + 0.45, bottom - _BAR_HEIGHT + 0.05, width - 0.9, 0.1)
+        axes.imshow(colours, interpolation="nearest", aspect="auto")
+        axes.set_axis_off()
+
+
+def _write(figure: Figure, x: float, y: float, text: str, **style: Any) -> None:
+    """Text as it is, without mathematics, at (x, y) inches."""
     wide, tall = figure.get_size_inches()
-    middle = (bottom + 0.5 * _BAR_HEIGHT) / tall
-    figure.text(left / wide, middle, low, va="center", fontsize=8)
-    figure.text((left + width) / wide, middle, high, va="center", ha="right", fontsize=8)
-    axes = figure.add_axes(
-        ((left + 0.45) / wide, (bottom + 0.05) / tall, (width - 0.9) / wide, 0.1 / tall)
-    )
-    axes.imshow(colours, interpolation="nearest", aspect="auto")
-    axes.set_axis_off()
+    figure.text(x / wide, y / tall, text, va="center", parse_math=False, **style)
+
+
+def _axes(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
+    """Axes at a rectangle in inches."""
+    wide, tall = figure.get_size_inches()
+    return figure.add_axes((left / wide, bottom / tall, width / wide, height / tall))
 
 
 def overview(
@@ -175,19 +165,18 @@ def overview(
 def _depth_panels(pair: Pair, depths: Mapping[str, Float], limit: float) -> list[Panel]:
     """Panels of the depths on one scale, of the true depth and of the relative error."""
     truth = pair.truth.depth_ref if pair.truth is not None else None
-    common = truth if truth is not None else next(reversed([*depths.values()]), None)
-    if common is None:
+    if truth is None and not depths:
         return []
-    out: list[Panel] = []
+    common = truth if truth is not None else [*depths.values()][-1]
     maps = {name: _scaled(pair, name, z, common) for name, z in depths.items()}
     near, far = depth_range(common if truth is not None else [*maps.values()][-1][0])
     levels = 1 / np.linspace(1 / far, 1 / near, 64)[None]
     bar = (colourise_depth(levels, near, far), f"{far:.3g}", f"{near:.3g}")
-    for name, (z, score) in maps.items():
-        out.append((f"{name}{score}", colourise_depth(z, near, far), bar))
-    if truth is not None:
-        unit = pair.truth.unit if pair.truth is not None else ""
-        out.append((f"true depth ({unit})", colourise_depth(truth, near, far), bar))
+    out: list[Panel] = [
+        (f"{name}{score}", colourise_depth(z, near, far), bar) for name, (z, score) in maps.items()
+    ]
+    if pair.truth is not None and truth is not None:
+        out.append((f"true depth ({pair.truth.unit})", colourise_depth(truth, near, far), bar))
         for name, (z, _) in [*maps.items()][-1:]:
             known = (truth > 0) & (z > 0)
             error = np.full(truth.shape, np.nan)
@@ -200,7 +189,7 @@ def _depth_panels(pair: Pair, depths: Mapping[str, Float], limit: float) -> list
 
 def _scaled(pair: Pair, name: str, depth: Float, common: Float) -> tuple[Float, str]:
     """A depth times its median ratio to the truth (to `common` without one), and its score."""
-    z = as_map(depth, name, 2)
+    z = as_map(depth, name)
     if z.shape != pair.size:
         raise DataError(
             "depth does not fit the pair", where=name, found=z.shape, expected=pair.size
@@ -231,8 +220,7 @@ def write_png(path: PathLike, rgb: Image) -> None:
 def write_clipped_depth_png16(path: PathLike, depth: Float, scale: float | None = None) -> float:
     """Write a depth map as 16-bit PNG: value = round(depth * scale), 0 where unknown.
 
-    A known depth is at least 1 in the file; what exceeds 65535 is written as 65535. Where a depth
-    that does not fit must be an error, as in a dataset, there is `data.formats.write_depth_png16`.
+    A known depth is at least 1 in the file; what exceeds 65535 is written as 65535.
 
     Args:
         path: File to write; its folder must exist.
@@ -246,7 +234,7 @@ def write_clipped_depth_png16(path: PathLike, depth: Float, scale: float | None 
     Raises:
         DataError: not a map, a scale that is not positive, or a folder that cannot be written.
     """
-    z = as_map(depth, "depth", 2)
+    z = as_map(depth, "depth")
     known = np.isfinite(z) & (z > 0)
     if scale is None:
         far = float(np.percentile(z[known], 99.9)) if known.any() else 1.0
@@ -262,5 +250,4 @@ def _encode(path: PathLike, array: NDArray[np.generic]) -> None:
     good, data = cv2.imencode(".png", array)
     if not good:
         raise DataError("image cannot be encoded as PNG", where=path, found=array.shape)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data.tobytes())
+    write_bytes(path, data.tobytes())

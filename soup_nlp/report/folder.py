@@ -1,4 +1,4 @@
-"""The result folder: every file whole or not at all, whatever the solve ended with."""
+"""The result folder; every file is written whole or not at all."""
 
 from __future__ import annotations
 
@@ -49,22 +49,37 @@ FILES = (
 )
 """Files of a result folder; error.png is there with dense truth only."""
 
+_ROUND = (
+    "energy",
+    "mrf_energy",
+    "bound",
+    "gap",
+    "taken",
+    "moved",
+    "ties",
+    "iterations",
+    "status",
+    "seconds",
+    "proposed",
+    "accepted",
+)
+"""Entries of a round of the refinement in summary.json."""
+
 
 def prepare_folder(folder: str | Path, inputs: Iterable[Path] | None = None) -> Path:
-    """Make the output folder and prove that it can be written.
+    """Make the output folder and check that it can be written.
 
     Args:
         folder: The folder.
         inputs: Files and folders of the problem that is solved into it, see `input_paths`; neither
-            these nor files that no solve has written are overwritten. None does not look.
+            these nor files that no solve has written are overwritten. None checks neither.
 
     Raises:
         DataError: it cannot be written, or holds what is not to be overwritten.
     """
     folder = Path(folder)
     if inputs is not None:
-        _refuse_inputs(folder.resolve(), inputs)
-        _refuse_foreign(folder)
+        _refuse_overwriting(folder, inputs)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -83,51 +98,45 @@ def prepare_folder(folder: str | Path, inputs: Iterable[Path] | None = None) -> 
     return folder
 
 
-def _refuse_inputs(folder: Path, inputs: Iterable[Path]) -> None:
-    """Raise DataError where a result would overwrite, or lie among, what is solved."""
+def _refuse_overwriting(folder: Path, inputs: Iterable[Path]) -> None:
+    """Raise DataError where a result would overwrite, or lie among, its inputs or foreign files."""
+
+    def refuse(what: str, expected: str, found: str | None = None) -> DataError:
+        return DataError(
+            what, where=folder, found=found, expected=expected, hint="choose another --out"
+        )
+
     for place in inputs:
-        if place == folder:
-            raise DataError(
+        if place == folder.resolve():
+            raise refuse(
                 "output folder is the input's folder",
-                where=folder,
-                expected="a folder of its own: depth and flow of a result would pass for truth",
-                hint="choose another --out",
+                "a folder of its own: depth and flow of a result would pass for truth",
             )
-        if place.parent == folder and place.name in FILES:
-            raise DataError(
+        if place.parent == folder.resolve() and place.name in FILES:
+            raise refuse(
                 "an input would be overwritten by the result",
-                where=folder,
-                found=place.name,
-                expected="a folder that holds none of the inputs under the name of a result's file",
-                hint="choose another --out",
+                "a folder that holds none of the inputs under the name of a result's file",
+                place.name,
             )
-
-
-def _refuse_foreign(folder: Path) -> None:
-    """Raise DataError where files have the names of a result's, but no solve has written them."""
-    if is_result(folder):
-        return
-    found = [name for name in FILES if (folder / name).exists()]
+    found = [] if is_result(folder) else [name for name in FILES if (folder / name).exists()]
     if found:
-        raise DataError(
+        raise refuse(
             "output folder holds files that would be overwritten and are of no earlier result",
-            where=folder,
-            found=", ".join(found),
-            expected="a new or empty folder, or that of an earlier result",
-            hint="choose another --out",
+            "a new or empty folder, or that of an earlier result",
+            ", ".join(found),
         )
 
 
 def write_folder(folder: Path, run: Run, config: str, log: str) -> list[str]:
-    """Write every file of a run; summary.json comes last and says that the rest is there.
+    """Write every file of a run, summary.json last: where it exists, the others are complete.
 
-    That of an earlier result goes first.
+    The summary.json of an earlier result is removed first.
 
     Args:
         folder: Prepared folder.
         run: The run.
         config: Merged problem as YAML.
-        log: Lines said during the run.
+        log: Lines of the log.
 
     Returns:
         Names of the files.
@@ -150,7 +159,7 @@ def write_folder(folder: Path, run: Run, config: str, log: str) -> list[str]:
 
 
 def summary(run: Run) -> dict[str, Any]:
-    """What summary.json holds; the keys are stable."""
+    """Contents of summary.json; the keys are stable."""
     s = run.solution
     constant = run.metrics["constant"].mre if "constant" in run.metrics else np.nan
     facing = run.problem.formulation.min_facing
@@ -160,22 +169,18 @@ def summary(run: Run) -> dict[str, Any]:
         "status": s.status,
         "converged": s.converged,
         "delivered": run.delivered,
-        "energy": {
-            "start": dict(s.energy_start),
-            "nlp": dict(s.energy),
-            "solution": dict(run.energy),
-        },
+        "energy": {"start": s.energy_start, "nlp": s.energy, "solution": run.energy},
         "residuals": run.residuals,
         "nlp_residuals": constraint_residuals(s.soup, run.data.rim_ray, facing),
         "answer_residuals": constraint_residuals(run.answer, run.data.rim_ray, facing),
-        "refinement": refinement(run),
+        "refinement": _refinement(run),
         "metrics": {
             # the next frame has a constant depth of its own
             k: m.as_dict() | ({} if k == "solution_next" else {"skill": skill(m.mre, constant)})
             for k, m in run.metrics.items()
         },
         "expected": run.problem.expected.model_dump(),
-        "seconds": dict(run.seconds),
+        "seconds": run.seconds,
         "iterations": {stage.name: stage.iterations for stage in s.stages},
         "sizes": {
             "superpixels": len(run.segmentation),
@@ -196,8 +201,8 @@ def summary(run: Run) -> dict[str, Any]:
     }
 
 
-def refinement(run: Run) -> dict[str, Any] | None:
-    """How the refinement went, round by round; None where it was off."""
+def _refinement(run: Run) -> dict[str, Any] | None:
+    """Progress of the refinement by round; None where it was off."""
     r = run.refined
     if r is None:
         return None
@@ -205,24 +210,8 @@ def refinement(run: Run) -> dict[str, Any] | None:
         "status": r.status,
         "polish_gain": r.polish_gain,
         "seconds": r.seconds,
-        "begin": dict(r.energy_begin),
-        "rounds": [
-            {
-                "energy": dict(one.energy),
-                "mrf_energy": one.mrf_energy,
-                "bound": one.bound,
-                "gap": one.gap,
-                "taken": one.taken,
-                "moved": one.moved,
-                "ties": one.ties,
-                "iterations": one.iterations,
-                "status": one.status,
-                "seconds": one.seconds,
-                "proposed": dict(one.proposed),
-                "accepted": dict(one.accepted),
-            }
-            for one in r.rounds
-        ],
+        "begin": r.energy_begin,
+        "rounds": [{key: getattr(one, key) for key in _ROUND} for one in r.rounds],
     }
 
 

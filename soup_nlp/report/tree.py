@@ -1,21 +1,40 @@
-"""What result.h5 holds: every array of a run with its unit and a sentence on it."""
+"""Layout of result.h5: every array of a run with its unit, its axes and a description."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from soup_nlp.geometry.soup import Soup
 from soup_nlp.solve.ipopt import Stage
 from soup_nlp.storage.store import Array, Tree
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline.run import Run
 
-# name: unit, shape, sentence
-_ENERGY: Mapping[str, tuple[str, str, str]] = {
+Table: TypeAlias = Mapping[str, tuple[str, str, str]]
+"""Unit, axes and description by name; the unit "truth" stands for that of the truth."""
+
+_INPUT: Table = {
+    "K_ref": ("px", "3,3", "intrinsics of the reference frame"),
+    "K_next": ("px", "3,3", "intrinsics of the next frame"),
+    "flow": ("px", "H,W,2", "flow from reference to next"),
+    "confidence": ("1", "H,W", "of the flow, 0 is unused"),
+}
+_SEGMENTATION: Table = {
+    "labels": ("1", "H,W", "superpixel of every pixel"),
+    "anchors": ("px", "N,2", "centroids (u, v)"),
+    "sizes": ("px", "N", "pixels of every superpixel"),
+    "radius": ("px", "N", "root mean square distance from the anchor"),
+    "knn": ("1", "N,K", "nearest anchors, nearest first"),
+    "edge_multiplicity": ("1", "E", "directions in which an edge of energy/edges occurs"),
+    "boundary": ("px", "P,B,2", "sampled shared boundary points (u, v)"),
+    "boundary_length": ("px", "P", "shared boundary before sampling"),
+    "pair_weight": ("1", "P", "w4 of the pairs, of the image alone"),
+    "rim": ("px", "N,V,2", "extreme pixels (u, v) by direction"),
+}
+_ENERGY: Table = {
     "K_next": ("px", "3,3", "intrinsics of the next frame"),
     "anchor_ray": ("1", "N,3", "ray of every anchor, third component 1"),
     "radius": ("1", "N", "largest distance of a rim pixel from the anchor, in ray units"),
@@ -36,6 +55,30 @@ _ENERGY: Mapping[str, tuple[str, str, str]] = {
     "share": ("1", "N", "weights c of the length unit sum_i c_i D_i = 1"),
     "local_units": ("1", "", "units are shares of the depths of two anchors, power mean -4"),
     "arap_at_anchors": ("1", "", "motion difference at the anchors, not at the camera"),
+}
+_START: Table = {
+    "error": ("px", "N", "mean re-projection error"),
+    "parallax": ("px", "N", "displacement that the translation causes"),
+    "borrowed": ("1", "N", "plane or motion from neighbours"),
+    "motion": ("1", "N", "dominant motion, -1 for its own"),
+    "component": ("1", "N", "rigid component"),
+    "surface": ("1", "N", "region without a flow discontinuity"),
+    "bending_share": ("1", "", "share that moves unlike most of its surface"),
+    "bending": ("1", "", "surfaces are taken to bend"),
+}
+_SOUP: Table = {
+    "lam": ("1", "N", "scales, on the simplex"),
+    "n": ("1", "N,3", "unit normals that face the camera"),
+    "d": ("soup", "N", "plane offsets; lam d is the plane's distance"),
+    "R": ("1", "N,3,3", "rotations, next_from_ref"),
+    "t": ("soup", "N,3", "translations; lam t is next_from_ref"),
+}
+_DEPTH: Table = {
+    "ref": ("soup", "H,W", "z of the reference frame, NaN if none"),
+    "next": ("soup", "H,W", "z of the next frame, NaN if none"),
+    "start_ref": ("soup", "H,W", "the start's z, reference frame"),
+    "rigid_ref": ("translations", "H,W", "z by one rigid motion, reference frame"),
+    "nlp_ref": ("soup", "H,W", "the NLP's z, reference frame"),
 }
 _IPOPT = {
     "obj": "objective of the solver's form",
@@ -67,93 +110,81 @@ _ROUNDS = {
     "taken": "whether the choice lowered the exact E",
     "seconds": "wall time",
 }
-_TRUTH = {
-    "depth_ref": ("H,W", "true z of the reference frame, NaN where unknown"),
-    "depth_next": ("H,W", "true z of the next frame, NaN where unknown"),
-    "flow": ("H,W,2", "true flow, NaN where unknown"),
-    "occluded": ("H,W", "reference pixel is not visible in the next frame"),
-    "components": ("H,W", "component of a reference pixel, -1 for none"),
-    "motions": ("B,4,4", "next_from_ref of each component"),
-    "scene_flow": ("H,W,3", "true X' - X, each in its own frame's camera, NaN where unknown"),
-    "points": ("M,3", "sparse truth: u and v in px, z in the unit of length"),
-}
-_TRUTH_UNITS = {"flow": "px", "occluded": "1", "components": "1"}
+_TRUTH: Table = {
+    "depth_ref": ("truth", "H,W", "true z of the reference frame, NaN where unknown"),
+    "depth_next": ("truth", "H,W", "true z of the next frame, NaN where unknown"),
+    "flow": ("px", "H,W,2", "true flow, NaN where unknown"),
+    "occluded": ("1", "H,W", "reference pixel is not visible in the next frame"),
+    "components": ("1", "H,W", "component of a reference pixel, -1 for none"),
+    "motions": ("truth", "B,4,4", "next_from_ref of each component"),
+    "scene_flow": (
+        "truth", "H,W,3", "true X' - X, each in its own frame's camera, NaN where unknown"
+    ),
+    "points": ("truth", "M,3", "sparse truth: u and v in px, z in the unit of length"),
+}  # fmt: skip
 
 
 def result_tree(run: Run) -> Tree:
     """Every array of a run, as `store.write_h5` takes it."""
-    pair, rec = run.pair, run.reconstruction
+    pair, rec, nlp = run.pair, run.reconstruction, run.nlp_reconstruction
     assert pair.flow is not None
     depth = {
-        "ref": Array(rec.depth_ref, "soup", "z of the reference frame, NaN if none", "H,W"),
-        "next": Array(rec.depth_next, "soup", "z of the next frame, NaN if none", "H,W"),
-        "start_ref": Array(
-            run.start_reconstruction.depth_ref, "soup", "the start's z, reference frame", "H,W"
-        ),
+        "ref": rec.depth_ref,
+        "next": rec.depth_next,
+        "start_ref": run.start_reconstruction.depth_ref,
+        "rigid_ref": None if run.rigid is None else run.rigid.depth,
+        "nlp_ref": None if nlp is None else nlp.depth_ref,
     }
-    if run.rigid is not None:
-        depth["rigid_ref"] = Array(
-            run.rigid.depth, "translations", "z by one rigid motion, reference frame", "H,W"
-        )
-    if run.nlp_reconstruction is not None:
-        nlp = run.nlp_reconstruction.depth_ref
-        depth["nlp_ref"] = Array(nlp, "soup", "the NLP's z, reference frame", "H,W")
+    flow = {"flow": pair.flow.uv, "confidence": pair.flow.confidence}
+    start = vars(run.start) | {"bending": np.float64(run.start.bending)}
+    truth = pair.truth
     return {
-        "input": {
-            "K_ref": Array(pair.K_ref, "px", "intrinsics of the reference frame", "3,3"),
-            "K_next": Array(pair.K_next, "px", "intrinsics of the next frame", "3,3"),
-            "flow": Array(pair.flow.uv, "px", "flow from reference to next", "H,W,2"),
-            "confidence": Array(pair.flow.confidence, "1", "of the flow, 0 is unused", "H,W"),
-        },
-        "segmentation": _segmentation(run),
-        "energy": {
-            key: Array(value, *_described(_ENERGY, key, "EnergyData"))
-            for key, value in run.data.arrays().items()
-        },
+        "input": _arrays(_INPUT, {"K_ref": pair.K_ref, "K_next": pair.K_next, **flow}),
+        "segmentation": _arrays(_SEGMENTATION, run.segmentation),
+        "energy": _arrays(_ENERGY, run.data.arrays()),
         "weights": _weights(run),
-        "start": {
-            **_soup(run.start.soup),
-            "error": Array(run.start.error, "px", "mean re-projection error", "N"),
-            "parallax": Array(run.start.parallax, "px", "by which the translation moves", "N"),
-            "borrowed": Array(run.start.borrowed, "1", "plane or motion from neighbours", "N"),
-            "motion": Array(run.start.motion, "1", "dominant motion, -1 for its own", "N"),
-            "component": Array(run.start.component, "1", "group that seems to move as one", "N"),
-            "surface": Array(run.start.surface, "1", "group within which no flow tears", "N"),
-            "bending_share": Array(
-                np.float64(run.start.bending_share), "1", "moves otherwise than most of its surface"
-            ),
-            "bending": Array(np.float64(run.start.bending), "1", "surfaces are taken to bend"),
-        },
-        "solution": _soup(run.soup),
-        "nlp": _soup(run.solution.soup),
+        "start": _arrays(_SOUP, run.start.soup) | _arrays(_START, start),
+        "solution": _arrays(_SOUP, run.soup),
+        "nlp": _arrays(_SOUP, run.solution.soup),
         "refine": _refine(run),
-        "answer": _soup(run.answer),
+        "answer": _arrays(_SOUP, run.answer),
         "multipliers": {
-            key: Array(
-                value,
-                "1",
-                "of the bounds of the variables, in the order of the NLP"
-                if key == "lam_x"
-                else f"of the constraints {key.removeprefix('lam_g_')}, in the order of the NLP",
-                "X" if key == "lam_x" else "G",
-            )
+            key: Array(value, "1", *_constrained(key))
             for key, value in run.solution.multipliers.items()
         },
         "iterations": {
-            f"{k:02d}_{stage.name.replace(' ', '_').replace('/', '_')}": {
-                key: Array(value, "1", f"{_history(stage).get(key, key)}, by iteration", "I")
-                for key, value in stage.history.items()
-            }
+            f"{k:02d}_{stage.name.replace(' ', '_').replace('/', '_')}": _history(stage)
             for k, stage in enumerate(run.solution.stages)
         },
-        "depth": depth,
-        "truth": _truth(run),
+        "depth": _arrays(_DEPTH, depth),
+        "truth": {} if truth is None else _arrays(_TRUTH, truth, truth.unit),
     }
 
 
-def _history(stage: Stage) -> Mapping[str, str]:
-    """What the history of a stage is about."""
-    return _DESCENT if stage.name.startswith("presolve") else _IPOPT
+def _arrays(table: Table, values: object, unit: str = "") -> dict[str, Array]:
+    """The values of a record or mapping that a table describes, without those that are None."""
+    found = values if isinstance(values, Mapping) else vars(values)
+    return {
+        key: Array(found[key], unit if own == "truth" else own, text, axes)
+        for key, (own, axes, text) in table.items()
+        if found.get(key) is not None
+    }
+
+
+def _constrained(key: str) -> tuple[str, str]:
+    """Description and axes of a vector of multipliers."""
+    if key == "lam_x":
+        return "of the bounds of the variables, in the order of the NLP", "X"
+    return f"of the constraints {key.removeprefix('lam_g_')}, in the order of the NLP", "G"
+
+
+def _history(stage: Stage) -> dict[str, Array]:
+    """Progress of a stage by iteration."""
+    known = _DESCENT if stage.name.startswith("presolve") else _IPOPT
+    return {
+        key: Array(value, "1", f"{known.get(key, key)}, by iteration", "I")
+        for key, value in stage.history.items()
+    }
 
 
 def _refine(run: Run) -> dict[str, Array]:
@@ -177,6 +208,20 @@ def _refine(run: Run) -> dict[str, Array]:
     return out
 
 
+def _weights(run: Run) -> dict[str, Array]:
+    """Constants of the energy and of the visibility constraint."""
+    form = run.problem.formulation
+    out = {
+        key: Array(np.float64(value), "px" if key == "sigma_proj" else "1", f"weight {key}")
+        for key, value in vars(run.weights).items()
+    }
+    out["min_facing"] = Array(np.float64(form.min_facing), "1", "visibility: -n . r >= c")
+    out["depth_ratio"] = Array(
+        np.float64(form.depth_ratio), "1", "depth at a rim pixel is at most this x the anchor's"
+    )
+    return out
+
+
 def attributes(run: Run, config: str) -> dict[str, Any]:
     """Root attributes of result.h5."""
     return {
@@ -188,64 +233,4 @@ def attributes(run: Run, config: str) -> dict[str, Any]:
         "delivered": run.delivered,
         "config": config,
         "nlp": run.solution.description,
-    }
-
-
-def _described(
-    table: Mapping[str, tuple[str, str, str]], key: str, record: str
-) -> tuple[str, str, str]:
-    """(unit, sentence, shape) in the order of `Array`."""
-    unit, shape, sentence = table.get(key, ("1", "", f"{record}.{key}"))
-    return unit, sentence, shape
-
-
-def _soup(soup: Soup) -> dict[str, Array]:
-    return {
-        "lam": Array(soup.lam, "1", "scales, on the simplex", "N"),
-        "n": Array(soup.n, "1", "unit normals that face the camera", "N,3"),
-        "d": Array(soup.d, "soup", "plane offsets; lam d is the plane's distance", "N"),
-        "R": Array(soup.R, "1", "rotations, next_from_ref", "N,3,3"),
-        "t": Array(soup.t, "soup", "translations; lam t is next_from_ref", "N,3"),
-    }
-
-
-def _segmentation(run: Run) -> dict[str, Array]:
-    s = run.segmentation
-    return {
-        "labels": Array(s.labels, "1", "superpixel of every pixel", "H,W"),
-        "anchors": Array(s.anchors, "px", "centroids (u, v)", "N,2"),
-        "sizes": Array(s.sizes, "px", "pixels of every superpixel", "N"),
-        "radius": Array(s.radius, "px", "root mean square distance from the anchor", "N"),
-        "knn": Array(s.knn, "1", "nearest anchors, nearest first", "N,K"),
-        "edge_multiplicity": Array(
-            s.edge_multiplicity, "1", "directions in which an edge of energy/edges occurs", "E"
-        ),
-        "boundary": Array(s.boundary, "px", "sampled shared boundary points (u, v)", "P,B,2"),
-        "boundary_length": Array(s.boundary_length, "px", "shared boundary before sampling", "P"),
-        "pair_weight": Array(s.pair_weight, "1", "w4 of the pairs, of the image alone", "P"),
-        "rim": Array(s.rim, "px", "extreme pixels (u, v) by direction", "N,V,2"),
-    }
-
-
-def _weights(run: Run) -> dict[str, Array]:
-    out = {
-        key: Array(np.float64(value), "px" if key == "sigma_proj" else "1", f"weight {key}")
-        for key, value in vars(run.weights).items()
-    }
-    form = run.problem.formulation
-    out["min_facing"] = Array(np.float64(form.min_facing), "1", "visibility: -n . r >= c")
-    out["depth_ratio"] = Array(
-        np.float64(form.depth_ratio), "1", "depth at a rim pixel is at most this x the anchor's"
-    )
-    return out
-
-
-def _truth(run: Run) -> dict[str, Array]:
-    truth = run.pair.truth
-    if truth is None:
-        return {}
-    known = {k: getattr(truth, k) for k in _TRUTH if getattr(truth, k) is not None}
-    return {
-        k: Array(v, _TRUTH_UNITS.get(k, truth.unit), _TRUTH[k][1], _TRUTH[k][0])
-        for k, v in known.items()
     }

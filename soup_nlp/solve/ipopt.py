@@ -19,7 +19,7 @@ from soup_nlp.solve.hessian import LagrangianHessian
 
 Float = NDArray[np.float64]
 
-# few bounds are active, so mu starts near its end
+# few bounds are active, so mu starts near its end (docs/solving.md)
 DEFAULTS: Mapping[str, Any] = {
     "linear_solver": "mumps",
     "mu_strategy": "monotone",

@@ -67,14 +67,19 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         raise
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all.
+def write_bytes(path: PathLike, data: bytes) -> None:
+    """Write a file whole or not at all.
 
     Raises:
         DataError: the folder is missing or cannot be written.
     """
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_bytes(data)
+
+
+def write_text(path: PathLike, text: str) -> None:
+    """Write a text file in UTF-8, see `write_bytes`."""
+    write_bytes(path, text.encode("utf-8"))
 
 
 def _mode(target: Path) -> int:

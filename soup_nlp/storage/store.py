@@ -6,7 +6,7 @@ import json
 import math
 import platform
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from os import PathLike as _PathLike
 from pathlib import Path
 from typing import Any, TypeAlias, Union
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.atomic import PathLike, atomic_path
+from soup_nlp.storage.atomic import PathLike, atomic_path, write_text
 from soup_nlp.storage.versions import versions
 
 SCHEMA = 1
@@ -28,7 +28,7 @@ COMPRESS_ABOVE = 64 * 1024
 
 @dataclass(frozen=True)
 class Array:
-    """One array of a result file, with what a reader needs to know about it.
+    """One array of a result file with its description.
 
     Attributes:
         value: The numbers (or text, as a string or an array of strings).
@@ -76,19 +76,15 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
     with atomic_path(path) as temporary:
         try:
             with h5py.File(temporary, "w", track_order=True) as file:
-                for key, value in root.items():
-                    file.attrs[key] = value
-                for name, leaf, data in leaves:
-                    if leaf is None:
-                        file.require_group(name)
-                    else:
-                        _write_dataset(file, name, leaf, data)
+                file.attrs.update(root)
+                for name, leaf in leaves:
+                    _write_leaf(file, name, leaf)
         except (OSError, TypeError, ValueError, RuntimeError) as error:
             raise DataError("cannot write the HDF5 file", where=path, found=error) from error
 
 
-def _leaves(tree: Tree, prefix: str) -> Iterator[tuple[str, Array | None, NDArray[Any]]]:
-    """(name, leaf, data) of every array, and (name, None, empty) of every group."""
+def _leaves(tree: Tree, prefix: str) -> Iterator[tuple[str, Array | None]]:
+    """(name, array) of every array, and (name, None) of every group; arrays in HDF5's types."""
     for key, item in tree.items():
         name = f"{prefix}{key}"
         if not isinstance(key, str) or not key or "/" in key or key in (".", ".."):
@@ -99,9 +95,9 @@ def _leaves(tree: Tree, prefix: str) -> Iterator[tuple[str, Array | None, NDArra
                 expected="a non-empty string without '/'",
             )
         if isinstance(item, Array):
-            yield name, item, _data(name, item.value)
+            yield name, replace(item, value=_data(name, item.value))
         elif isinstance(item, Mapping):
-            yield name, None, np.empty(0)
+            yield name, None
             yield from _leaves(item, f"{name}/")
         else:
             raise DataError(
@@ -130,14 +126,16 @@ def _data(name: str, value: ArrayLike) -> NDArray[Any]:
     return data
 
 
-def _write_dataset(file: h5py.File, name: str, leaf: Array, data: NDArray[Any]) -> None:
-    options: dict[str, Any] = {}
+def _write_leaf(file: h5py.File, name: str, leaf: Array | None) -> None:
+    if leaf is None:
+        file.require_group(name)
+        return
+    data, options = np.asarray(leaf.value), {}
     if data.nbytes > COMPRESS_ABOVE and data.ndim > 0:
         options = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     dataset = file.create_dataset(name, data=data, **options)
-    dataset.attrs["units"] = leaf.units
-    dataset.attrs["description"] = leaf.description
-    dataset.attrs["shape_letters"] = leaf.shape_letters
+    for key in ("units", "description", "shape_letters"):
+        dataset.attrs[key] = getattr(leaf, key)
 
 
 def _attr(value: object) -> object:
@@ -213,36 +211,28 @@ def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:
         DataError: there is no such array; the message lists what is there.
     """
     here: Any = tree
-    walked: list[str] = []
     for key in name.split("/"):
         if not isinstance(here, Mapping) or key not in here:
             there = sorted(here) if isinstance(here, Mapping) else "an array, not a group"
             raise DataError(
                 f"result has no {name!r}",
-                where="/" + "/".join(walked),
                 found=there,
                 expected=repr(key),
                 hint="the file may come from another version, or the run ended early",
             )
         here = here[key]
-        walked.append(key)
     if isinstance(here, Mapping):
-        raise DataError(
-            f"{name!r} is a group, not an array",
-            where="/" + name,
-            found=sorted(here),
-            expected=f"one of its arrays, such as {name}/{next(iter(sorted(here)), '...')}",
-        )
+        raise DataError(f"{name!r} is a group, not an array", found=sorted(here))
     return np.asarray(here)
 
 
 def plain(obj: object) -> Any:
-    """An object as JSON holds it: numpy to Python, NaN and infinities to None, paths to text.
+    """An object in JSON's types: NumPy to Python, NaN and infinities to None, paths to text.
 
     Dataclasses become mappings; tuples, sets and arrays become lists.
 
     Raises:
-        DataError: a type that has no place in JSON.
+        DataError: a type that JSON does not have.
     """
     if obj is None or isinstance(obj, str | bool | int):
         return obj
@@ -275,5 +265,4 @@ def write_json(path: PathLike, obj: object) -> None:
             written.
     """
     text = json.dumps(plain(obj), indent=2, ensure_ascii=False, allow_nan=False)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_text(path, text + "\n")

@@ -1,54 +1,32 @@
-"""Pairs with truth from the layouts that datasets ship in.
+"""Pairs with truth from a plain folder, TUM RGB-D and the Motorcycle pair.
 
 Every loader returns a `Pair` whose `flow` is None; the true flow, where known, is `pair.truth.flow`
-and becomes a flow with `flow_from_truth`. Truth is NaN where unknown. A loader
-needs the two images and the camera; truth files that are not there leave that truth None.
-
-This file has the plain folder, TUM RGB-D and the Motorcycle pair; Sintel is in `datasets_sintel`,
-KITTI and Virtual KITTI in `datasets_driving`.
+and becomes a flow with `flow_from_truth`. Truth is NaN where unknown. A loader needs the two
+images and the camera; truth files that are not there leave that truth None.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from skimage.measure import label
 
-from soup_nlp.data.datasets.driving import (
-    load_kitti2012,
-    load_kitti2015,
-    load_vkitti1,
-    load_vkitti2,
-)
-from soup_nlp.data.datasets.layout import MARK, is_result, need, need_folder, truth_or_none
-from soup_nlp.data.datasets.sintel import load_sintel
-from soup_nlp.data.flow.sources import leaves
-from soup_nlp.data.formats.camera_files import intrinsics, read_intrinsics
-from soup_nlp.data.formats.depth_files import read_depth, read_depth_png16
-from soup_nlp.data.formats.flow_files import read_flow
-from soup_nlp.data.formats.images import PathLike, read_bytes, read_image, read_mask, read_text
-from soup_nlp.data.pair import Pair, Truth
+from soup_nlp.data.datasets.layout import MARK, is_result, make_pair, need, need_folder, read_if
+from soup_nlp.data.flow.consistency import leaves
+from soup_nlp.data.formats.camera_files import read_intrinsics
+from soup_nlp.data.formats.images import PathLike, read_bytes, read_mask, read_text
+from soup_nlp.data.formats.map_files import read_depth, read_depth_png16, read_flow
+from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import intrinsics
 
-__all__ = [
-    "load_folder",
-    "load_kitti2012",
-    "load_kitti2015",
-    "load_motorcycle",
-    "load_sintel",
-    "load_tum",
-    "load_vkitti1",
-    "load_vkitti2",
-]
-
-Float = NDArray[np.float64]
-
-FOLDER_LAYOUT = (
+LAYOUT = (
     "frame_0.png and frame_1.png (or image_ref.png and image_next.png), K.txt; optional "
-    "K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, flow.flo|png|npy, occluded.png, points.npz"
+    "K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, flow.flo|png|npy, occluded.png, moving.png, "
+    "points.npz"
 )
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp")
 _DEPTHS = (".npy", ".dpt", ".pfm", ".png")
@@ -62,8 +40,8 @@ _TUM_CAMERAS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
     "freiburg2": (520.9, 521.0, 325.1, 249.7),
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
+    "": (525.0, 525.0, 319.5, 239.5),
 }
-_TUM_DEFAULT = (525.0, 525.0, 319.5, 239.5)
 _TUM_SLACK = 0.02  # seconds between a colour image and its depth image
 
 
@@ -86,7 +64,8 @@ def load_folder(
     - `frame_0.png` or `image_ref.png`; `frame_1.png` or `image_next.png`
     - `K.txt`: 3x3 intrinsics, or fx fy cx cy; `K_next.txt` if the next frame's differ
     - optional truth: `depth`, `depth_0` or `depth_ref` (.npy, .dpt, .pfm, 16-bit .png),
-      `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `occluded.png` (white = occluded)
+      `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `occluded.png` (white = occluded),
+      `moving.png` (white = moves by itself; every connected region is one component)
     - optional sparse truth `points.npz`: `uv_0` (M, 2) pixels and `xyz_mm_0` (M, 3) millimetres in
       the reference camera; z is converted to `unit` when that is "m" and kept when it is "mm".
       (`xyz_mm_1`, the same points in the next frame, has no place in `Truth` and is not read.)
@@ -104,7 +83,7 @@ def load_folder(
         DataError: a required file is missing, a file is wrong for its format or its image, or the
             folder holds a result of a solve.
     """
-    folder = need_folder(folder, FOLDER_LAYOUT)
+    folder = need_folder(folder, LAYOUT)
     if is_result(folder):
         marked = (folder / MARK).is_file()
         raise DataError(
@@ -115,33 +94,35 @@ def load_folder(
             hint="move the frames, K.txt and the truth to a folder of their own"
             + (f"; delete {MARK} where no solve has left files" if marked else ""),
         )
-    first = _find(folder, ("frame_0", "image_ref"), _IMAGES)
-    second = _find(folder, ("frame_1", "image_next"), _IMAGES)
-    first = need(first or folder / "frame_0.png", FOLDER_LAYOUT)
-    second = need(second or folder / "frame_1.png", FOLDER_LAYOUT)
-    K = read_intrinsics(need(folder / "K.txt", FOLDER_LAYOUT))
-    K_next = folder / "K_next.txt"
+    images = [
+        need(_find(folder, (f"frame_{k}", stem), _IMAGES) or folder / f"frame_{k}.png", LAYOUT)
+        for k, stem in enumerate(("image_ref", "image_next"))
+    ]
+    K = read_intrinsics(need(folder / "K.txt", LAYOUT))
+    K_next = read_if(read_intrinsics, folder / "K_next.txt")
     depth = _find(folder, ("depth", "depth_0", "depth_ref"), _DEPTHS)
     depth_next = _find(folder, ("depth_next", "depth_1"), _DEPTHS)
     flow = _find(folder, ("flow",), _FLOWS)
     occluded = _find(folder, ("occluded",), _IMAGES)
+    moving = _find(folder, ("moving",), _IMAGES)
     points = folder / "points.npz"
     truth = Truth(
         depth_ref=read_depth(depth, depth_scale) if depth else None,
         depth_next=read_depth(depth_next, depth_scale) if depth_next else None,
         flow=read_flow(flow).astype(np.float64) if flow else None,
         occluded=read_mask(occluded) if occluded else None,
+        components=_moving_components(moving) if moving else None,
         points=_read_points(points, unit) if points.is_file() else None,
         unit=unit,
     )
-    return Pair(
-        image_ref=read_image(first, white),
-        image_next=read_image(second, white),
-        K_ref=K,
-        K_next=read_intrinsics(K_next) if K_next.is_file() else K,
-        truth=truth_or_none(truth),
-        name=folder.resolve().name,
+    return make_pair(
+        images, [K, K if K_next is None else K_next], truth, folder.resolve().name, white
     )
+
+
+def _moving_components(path: Path) -> NDArray[np.int32]:
+    """(H, W) labels of the connected regions of a mask of moving pixels; 0 elsewhere."""
+    return np.asarray(label(read_mask(path), connectivity=2), np.int32)
 
 
 def _read_points(path: Path, unit: str) -> Float:
@@ -149,24 +130,16 @@ def _read_points(path: Path, unit: str) -> Float:
     read_bytes(path, "points file")
     try:
         with np.load(path, allow_pickle=False) as content:
-            arrays: dict[str, NDArray[Any]] = {name: content[name] for name in content.files}
+            arrays = {name: content[name] for name in content.files}
     except Exception as error:  # zipfile, NumPy and zlib each raise their own
         raise DataError("points file is no .npz", where=path, found=str(error)) from error
-    missing = [name for name in ("uv_0", "xyz_mm_0") if name not in arrays]
-    if missing:
-        raise DataError(
-            f"points file lacks {' and '.join(missing)}",
-            where=path,
-            found=", ".join(arrays) or "no array",
-            expected="uv_0 (M, 2) in pixels and xyz_mm_0 (M, 3) in millimetres",
-        )
-    uv, xyz = arrays["uv_0"], arrays["xyz_mm_0"]
+    uv, xyz = arrays.get("uv_0", np.empty(0)), arrays.get("xyz_mm_0", np.empty(0))
     if uv.ndim != 2 or uv.shape[1] != 2 or xyz.shape != (len(uv), 3):
         raise DataError(
-            "points have the wrong shape",
+            "points file lacks an array or has one of the wrong shape",
             where=path,
-            found=f"uv_0 {uv.shape}, xyz_mm_0 {xyz.shape}",
-            expected="(M, 2) and (M, 3)",
+            found=", ".join(f"{name} {a.shape}" for name, a in arrays.items()) or "no array",
+            expected="uv_0 (M, 2) in pixels and xyz_mm_0 (M, 3) in millimetres",
         )
     scales = {"m": 1000.0, "mm": 1.0}
     if unit not in scales:
@@ -175,9 +148,7 @@ def _read_points(path: Path, unit: str) -> Float:
     return np.asarray(points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)])
 
 
-def load_tum(
-    folder: PathLike, frame: int = 0, step: int = 1, K: NDArray[np.floating] | None = None
-) -> Pair:
+def load_tum(folder: PathLike, frame: int = 0, step: int = 1) -> Pair:
     """Load a pair of a TUM RGB-D sequence, depth in metres.
 
     Two layouts are known: the original one (`rgb.txt` and `depth.txt` list time stamps and files;
@@ -188,23 +159,20 @@ def load_tum(
         folder: The sequence.
         frame: Index of the reference image in rgb.txt (original layout only).
         step: Distance of the next image (original layout only).
-        K: (3, 3) intrinsics of the original layout; by default those that its authors give for
-            the sensor named in the folder (freiburg1, 2 or 3), else 525, 525, 319.5, 239.5.
-            Lens distortion is not removed.
 
     Returns:
-        Pair with depth truth of both frames where known.
+        Pair with depth truth of both frames where known. In the original layout the intrinsics are
+        those that its authors give for the sensor named in the folder (freiburg1, 2 or 3), else
+        525, 525, 319.5, 239.5; lens distortion is not removed.
 
     Raises:
         DataError: the layout is unknown, a file is missing or the frame does not exist.
     """
     folder = need_folder(folder, TUM_LAYOUT)
-    if not (folder / "rgb.txt").is_file():
-        if _find(folder, ("frame_0", "image_ref"), _IMAGES) is None:
-            need(folder / "rgb.txt", TUM_LAYOUT)
+    if _find(folder, ("frame_0", "image_ref"), _IMAGES) and not (folder / "rgb.txt").is_file():
         return load_folder(folder, depth_scale=TUM_SCALE)
-    images = _tum_list(folder / "rgb.txt")
-    depths = _tum_list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
+    images = _tum_list(need(folder / "rgb.txt", TUM_LAYOUT))
+    depths = read_if(_tum_list, folder / "depth.txt") or []
     for index in (frame, frame + step):
         if not 0 <= index < len(images):
             raise DataError(
@@ -213,20 +181,13 @@ def load_tum(
                 found=index,
                 expected=f"0 to {len(images) - 1}",
             )
-    if K is None:
-        sensor = re.search(r"freiburg[123]", str(folder.resolve()))
-        K = intrinsics(*(_TUM_CAMERAS[sensor.group()] if sensor else _TUM_DEFAULT))
-    camera = np.asarray(K, dtype=np.float64)
-    (t_ref, ref), (t_next, nxt) = images[frame], images[frame + step]
-    truth = Truth(depth_ref=_tum_depth(depths, t_ref), depth_next=_tum_depth(depths, t_next))
-    return Pair(
-        image_ref=read_image(need(ref, TUM_LAYOUT)),
-        image_next=read_image(need(nxt, TUM_LAYOUT)),
-        K_ref=camera,
-        K_next=camera,
-        truth=truth_or_none(truth),
-        name=f"{folder.resolve().name}_{frame}",
-    )
+    sensor = re.search(r"freiburg[123]", str(folder.resolve()))
+    K = intrinsics(*_TUM_CAMERAS[sensor.group() if sensor else ""])
+    (time_ref, ref), (time_next, following) = images[frame], images[frame + step]
+    truth = Truth(depth_ref=_tum_depth(depths, time_ref), depth_next=_tum_depth(depths, time_next))
+    name = f"{folder.resolve().name}_{frame}"
+    files = [need(path, TUM_LAYOUT) for path in (ref, following)]
+    return make_pair(files, [K, K], truth, name)
 
 
 def _tum_list(path: Path) -> list[tuple[float, Path]]:

@@ -1,13 +1,17 @@
-"""What dataset loaders share: required files, and truth that may be absent."""
+"""What dataset loaders share: required files, truth that may be absent, folders of results."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
-from soup_nlp.data.formats.images import PathLike
-from soup_nlp.data.pair import Truth
+from soup_nlp.data.formats.images import PathLike, read_image
+from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.errors import DataError
+
+T = TypeVar("T")
 
 
 def need(path: PathLike, layout: str) -> Path:
@@ -26,14 +30,10 @@ def need(path: PathLike, layout: str) -> Path:
     folder = path.parent
     while not folder.is_dir() and folder != folder.parent:
         folder = folder.parent
-    if folder == path.parent:
-        found = f"{folder} has no {path.name}"
-    else:
-        found = f"{folder} has no {path.relative_to(folder).parts[0]}"
     raise DataError(
         "file of the dataset is missing",
         where=path,
-        found=found,
+        found=f"{folder} has no {path.relative_to(folder).parts[0]}",
         expected=layout,
         hint="check the root folder and the frame, or rearrange the files to this layout",
     )
@@ -56,6 +56,45 @@ def need_folder(path: PathLike, layout: str) -> Path:
     return path
 
 
+def training_folder(root: PathLike, layout: str) -> Path:
+    """The folder `training` of a dataset, or the root where that is it already.
+
+    Raises:
+        DataError: the root is not a folder.
+    """
+    root = need_folder(root, layout)
+    return root / "training" if (root / "training").is_dir() else root
+
+
+def read_if(reader: Callable[..., T], path: Path | None, *options: object) -> T | None:
+    """What the reader makes of an optional file; None where there is no such file."""
+    return reader(path, *options) if path is not None and path.is_file() else None
+
+
+def make_pair(
+    images: Sequence[Path],
+    cameras: Sequence[Float],
+    truth: Truth,
+    name: str,
+    white: int | None = None,
+) -> Pair:
+    """The pair of two image files; its truth is None where none of it is known.
+
+    Args:
+        images: Reference and next image.
+        cameras: (3, 3) intrinsics of both frames, pixels.
+        truth: What its files hold.
+        name: Name of the pair.
+        white: Value of a 16-bit image that is white, see `read_image`.
+
+    Raises:
+        DataError: an image is damaged, or the truth does not fit it.
+    """
+    ref, following = (read_image(path, white) for path in images)
+    K_ref, K_next = cameras
+    return Pair(ref, following, K_ref, K_next, truth=truth if truth.known() else None, name=name)
+
+
 MARK = ".soup_nlp"
 """Empty file by which a folder is known as one for results, from before its first file on."""
 
@@ -69,14 +108,3 @@ def is_result(folder: Path) -> bool:
     except (OSError, ValueError):
         return False
     return isinstance(summary, dict) and "problem_hash" in summary
-
-
-def optional(path: Path) -> Path | None:
-    """The path if it is a file, else None."""
-    return path if path.is_file() else None
-
-
-def truth_or_none(truth: Truth) -> Truth | None:
-    """The truth, or None when nothing in it is known."""
-    parts = (value for name, value in vars(truth).items() if name != "unit")
-    return truth if any(value is not None for value in parts) else None

@@ -1,8 +1,8 @@
-"""Superpixels that end where the flow breaks.
+"""Borders of superpixels moved to discontinuities of the flow.
 
 SLIC follows colours, and a superpixel across the border of two motions is a plane that fits
-neither: its pixels of the smaller part cost re-projection error that no soup can avoid, and their
-depth is that of the other side. Where the flow knows better than the colours, pixels change sides.
+neither: the pixels of its smaller part have a re-projection error that no solution can avoid, and
+the depth of the other side. Such pixels go to the neighbouring superpixel that has their flow.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ def follow_flow(
     refit: int = 8,
     min_fraction: float = 0.25,
 ) -> Labels:
-    """Move borders of superpixels, pixel by pixel, to where their affine flows say.
+    """Move borders of superpixels, pixel by pixel, to where their affine flows meet.
 
     In every sweep a pixel on a border goes to the neighbour whose affine flow (fitted robustly,
-    see `flow_robust`) is nearest to its own flow, if it is nearer than its superpixel's by more
+    see `fit_affine`) is nearest to its own flow, if it is nearer than its superpixel's by more
     than the margin. A pixel without confidence stays.
 
     Args:
         labels: (H, W) superpixel labels 0..N-1.
         flow: Flow with confidence.
         margin_px: Pixels of flow that a change of sides must win.
-        scale_px: Residual, pixels, below which a fit suspects nothing.
+        scale_px: Residual, pixels, below which a fit takes every pixel for an inlier.
         sweeps: How far a border may move, pixels.
         refit: Sweeps between fits.
         min_fraction: Pieces smaller than this share of the mean area join a neighbour.

@@ -62,30 +62,16 @@ def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.boo
     return np.asarray(~inside)
 
 
-def checked_flow(
-    forward: FloatMap,
-    backward: FloatMap,
-    source: str,
-    tau: float = 1.0,
-    limit: float = 3.0,
-    support: int = SUPPORT,
-) -> Flow:
-    """A Flow whose confidence is its forward-backward consistency.
-
-    With e the round-trip error in pixels and E the larger of e and the mean of min(e, 5) over a
-    window of `support` pixels, the confidence is `exp(-(E / tau)^2)`, and 0 where E > limit or
-    where the forward flow leaves the next image.
+def checked_flow(forward: FloatMap, backward: FloatMap, source: str) -> Flow:
+    """A Flow whose confidence is its forward-backward consistency (`confidence_of`).
 
     Args:
         forward: (H, W, 2) flow from the reference to the next image, pixels.
         backward: (H', W', 2) flow from the next to the reference image.
         source: Name for reports.
-        tau: Error, pixels, at which confidence is exp(-1).
-        limit: Error, pixels, above which confidence is 0.
-        support: Side of the window for the mean error, odd, pixels; 1 is the pixel itself.
     """
     uv = np.ascontiguousarray(forward, dtype=np.float32)
-    confidence = confidence_of(round_trip_error(uv, backward), tau, limit, support)
+    confidence = confidence_of(round_trip_error(uv, backward))
     uv[~np.isfinite(uv).all(axis=2)] = 0.0
     return Flow(uv, confidence, source)
 
@@ -93,7 +79,17 @@ def checked_flow(
 def confidence_of(
     gap: FloatMap, tau: float = 1.0, limit: float = 3.0, support: int = SUPPORT
 ) -> FloatMap:
-    """(H, W) confidence of a round-trip error `gap`, see `checked_flow`."""
+    """(H, W) confidence in [0, 1] of a round-trip error.
+
+    With e the error and E the larger of e and the mean of min(e, 5) over a window, the confidence
+    is `exp(-(E / tau)^2)`, and 0 where E > limit.
+
+    Args:
+        gap: (H, W) round-trip error, pixels; infinite where the flow leaves the next image.
+        tau: Error, pixels, at which confidence is exp(-1).
+        limit: Error, pixels, above which confidence is 0.
+        support: Side of the window for the mean error, odd, pixels; 1 is the pixel itself.
+    """
     if support > 1:
         mean = cv2.blur(np.minimum(gap, _NOISE_CAP), (support, support))
         gap = np.maximum(gap, mean)

@@ -1,8 +1,8 @@
-"""Flow once more on images that a plane's homography brings together.
+"""Flow computed again on images that a dominant homography aligns.
 
 A coarse-to-fine search loses large displacements with a change of scale, as of the ground near a
-driving camera. The dominant homographies of a first flow take most of such a motion away: the rest
-is small, and where its round trip closes better than the first flow's, it is taken.
+driving camera. The dominant homographies of a first flow explain most of such a motion: what
+remains is small, and where its round trip closes better than the first flow's, it is taken.
 """
 
 from __future__ import annotations
@@ -103,12 +103,9 @@ def guided_flow(
 def _under(H: Float, ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, FloatMap]:
     """Flow and round-trip error that are found after H has brought the next image to the first."""
     height, width = ref.shape
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     near = cv2.warpPerspective(
-        nxt,
-        H,
-        (width, height),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
+        nxt, H, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
     rest, back = match(ref, near)
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)

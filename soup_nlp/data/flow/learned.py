@@ -11,12 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.flow.consistency import SUPPORT, checked_flow
+from soup_nlp.data.flow.consistency import FloatMap, checked_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 
 Image = NDArray[np.uint8]
-FloatMap = NDArray[np.float32]
 Network = Callable[[Image, Image], FloatMap]
 
 MODELS: Mapping[str, str] = MappingProxyType(
@@ -34,24 +33,13 @@ RAFT_SIDE = 128
 """Smallest image side of RAFT, pixels: its correlation pyramid has four levels of 1/8 size."""
 
 
-def learned_flow(
-    source: str,
-    image_ref: Image,
-    image_next: Image,
-    *,
-    tau: float = 1.0,
-    limit: float = 3.0,
-    support: int = SUPPORT,
-) -> Flow:
+def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
     """Flow of a network in both directions, with forward-backward confidence.
 
     Args:
         source: "raft_small", "raft_large", a .pth file with the state of either, or an .onnx file.
         image_ref: (H, W, 3) uint8 RGB reference image.
         image_next: (H, W, 3) uint8 RGB next image of the same size.
-        tau: See `flow_check.checked_flow`.
-        limit: The same.
-        support: The same.
 
     Raises:
         DataError: the library or the file is missing, or the network does not map two images to a
@@ -66,7 +54,7 @@ def learned_flow(
         raise DataError("file of a network is missing", where=source)
     network = onnx_network(Path(source)) if source.endswith(".onnx") else raft_network(source)
     forward, backward = network(image_ref, image_next), network(image_next, image_ref)
-    return checked_flow(forward, backward, Path(source).name, tau, limit, support)
+    return checked_flow(forward, backward, Path(source).name)
 
 
 def onnx_network(path: Path) -> Network:

@@ -1,4 +1,4 @@
-"""The true flow with noise of a known size: how much error in the flow a method bears."""
+"""The true flow with noise of a known size, to measure how results depend on errors of flow."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def noise_level(source: str) -> float:
     try:
         sigma = float(source.removeprefix(PREFIX))
     except ValueError:
-        sigma = -1.0
-    if not (source.startswith(PREFIX) and 0 <= sigma < 1000):
+        sigma = np.nan
+    if not 0 <= sigma < 1000:
         raise DataError(
             "noise of the flow is not a number of pixels", found=source, expected=f"{PREFIX}0.5"
         )
@@ -30,9 +30,9 @@ def noise_level(source: str) -> float:
 
 
 def noisy(flow: Flow, sigma: float, correlation: float = 5.0, seed: int = 0) -> Flow:
-    """A flow with Gaussian noise that is alike over a few pixels, as errors of real flows are.
+    """A flow with Gaussian noise that is correlated over a few pixels, as errors of real flows are.
 
-    White noise averages out within a superpixel and tells little.
+    White noise would average out within a superpixel.
 
     Args:
         flow: Any flow.

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.flow.consistency import SUPPORT, checked_flow
+from soup_nlp.data.flow.consistency import checked_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 
@@ -23,15 +23,7 @@ def rlof_available() -> bool:
     return hasattr(cv2, "optflow") and hasattr(cv2.optflow, "DenseRLOFOpticalFlow")
 
 
-def rlof_flow(
-    image_ref: Image,
-    image_next: Image,
-    *,
-    grid_step: int = 4,
-    tau: float = 1.0,
-    limit: float = 3.0,
-    support: int = SUPPORT,
-) -> Flow:
+def rlof_flow(image_ref: Image, image_next: Image) -> Flow:
     """Dense RLOF with forward-backward confidence.
 
     Sparse robust flow on a grid, checked forward and backward, interpolated along edges (EPIC) and
@@ -40,10 +32,6 @@ def rlof_flow(
     Args:
         image_ref: (H, W, 3) uint8 RGB reference image.
         image_next: (H, W, 3) uint8 RGB next image of the same size.
-        grid_step: Distance of the grid's points, pixels.
-        tau: See `flow_check.checked_flow`.
-        limit: The same.
-        support: The same.
 
     Raises:
         DataError: OpenCV has no contributed modules, or the images do not fit.
@@ -64,7 +52,7 @@ def rlof_flow(
             expected=f"two RGB images of one size, at least {MIN_SIDE} pixels on each side",
         )
     method: Any = cv2.optflow.DenseRLOFOpticalFlow.create()
-    method.setGridStep((grid_step, grid_step))
+    method.setGridStep((4, 4))
     method.setInterpolation(cv2.optflow.INTERP_EPIC)
     method.setForwardBackward(1.0)
     method.setUsePostProc(True)
@@ -74,4 +62,4 @@ def rlof_flow(
         forward, backward = method.calc(a, b, None), method.calc(b, a, None)
     except cv2.error as error:
         raise DataError("RLOF failed", found=str(error).strip()) from error
-    return checked_flow(forward, backward, "rlof", tau, limit, support)
+    return checked_flow(forward, backward, "rlof")

@@ -15,19 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.flow.consistency import (
-    FloatMap,
-    confidence_of,
-    leaves,
-    round_trip_error,
-)
+from soup_nlp.data.flow.consistency import FloatMap, confidence_of
 from soup_nlp.data.flow.dis_options import DisOptions
 from soup_nlp.data.flow.guided import guided_flow
 from soup_nlp.data.flow.learned import MODELS, learned_flow
 from soup_nlp.data.flow.noise import PREFIX, noise_level, noisy
 from soup_nlp.data.flow.rlof import rlof_flow
-from soup_nlp.data.formats.flow_files import read_flow
 from soup_nlp.data.formats.images import PathLike
+from soup_nlp.data.formats.map_files import read_flow
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
 from soup_nlp.schema.section import Positive, Section, Share
@@ -35,27 +30,9 @@ from soup_nlp.schema.section import Positive, Section, Share
 Image = NDArray[np.uint8]
 FlowSource = Callable[[Image, Image], Flow]
 
-__all__ = [
-    "dis_flow",
-    "flow_from_array",
-    "flow_from_truth",
-    "flow_sources",
-    "is_named",
-    "is_network",
-    "leaves",
-    "load_flow",
-    "resolve_flow",
-    "round_trip_error",
-]
-
 ENTRY_POINTS = "soup_nlp.flow"
 """Entry-point group in which other packages announce flow methods."""
 
-PRESETS = {
-    "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
-    "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
-    "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
-}
 MIN_SIDE = 16
 """Smallest image side for DIS, pixels."""
 
@@ -66,20 +43,13 @@ _WORK_SIDE = 64  # DIS gets images of at least this side; smaller ones are padde
 def dis_flow(image_ref: Image, image_next: Image, **options: Any) -> Flow:
     """Dense inverse search flow (Kroeger et al., ECCV 2016) with forward-backward confidence.
 
-    The flow is computed in both directions. With e the distance, in pixels, between a reference
-    pixel and where forward then backward flow bring it, and E the larger of e and the mean of
-    min(e, 5) over a window of `support` pixels, the confidence is `exp(-(E / tau)^2)`, and 0 where
-    E > limit or where the forward flow leaves the next image.
+    The flow is computed in both directions, and once more after each of the dominant homographies
+    (`planes`) has aligned the images; the better one is taken pixel by pixel (`guided_flow`): near
+    a driving camera displacements are too large for the coarse-to-fine search alone.
 
-    The flow is also looked for after each of the dominant homographies (`planes`) has brought the
-    images together, and the better one is taken pixel by pixel (`guided_flow`): near a driving
-    camera displacements are too large for the coarse-to-fine search alone.
-
-    Consistency is not proof: a wrong flow that both directions agree on, as on weak texture, keeps
-    its confidence.
-
-    An image without contrast (standard deviation under one grey level) gives a zero flow with
-    confidence 0 everywhere: consistency means nothing there.
+    Its confidence is that of its round-trip error (`confidence_of`). A wrong flow that both
+    directions agree on, as on weak texture, keeps its confidence. An image without contrast
+    (standard deviation under one grey level) gives a zero flow with confidence 0 everywhere.
 
     Args:
         image_ref: (H, W, 3) or (H, W) uint8 reference image.
@@ -102,7 +72,7 @@ def dis_flow(image_ref: Image, image_next: Image, **options: Any) -> Flow:
     if o.equalize:
         clahe = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8))
         ref, nxt = clahe.apply(ref), clahe.apply(nxt)
-    dis = cv2.DISOpticalFlow.create(PRESETS[o.preset])
+    dis = cv2.DISOpticalFlow.create(getattr(cv2, f"DISOPTICAL_FLOW_PRESET_{o.preset.upper()}"))
     dis.setFinestScale(o.finest_scale)
     dis.setPatchSize(o.patch_size)
     dis.setPatchStride(o.patch_stride)
@@ -113,8 +83,12 @@ def dis_flow(image_ref: Image, image_next: Image, **options: Any) -> Flow:
     side = max(_WORK_SIDE, 2 * o.patch_size << o.finest_scale)
 
     def match(first: Image, second: Image) -> tuple[FloatMap, FloatMap]:
-        rows, cols = (max(*pair, side) for pair in zip(first.shape, second.shape, strict=True))
-        a, b = _pad(first, rows, cols), _pad(second, rows, cols)
+        size = np.maximum(np.maximum(first.shape, second.shape), side)
+        # the last row and column are repeated up to a common size
+        a, b = (
+            np.pad(image, [(0, n - m) for n, m in zip(size, image.shape, strict=True)], mode="edge")
+            for image in (first, second)
+        )
         (h1, w1), (h2, w2) = first.shape, second.shape
         return dis.calc(a, b, None)[:h1, :w1], dis.calc(b, a, None)[:h2, :w2]
 
@@ -148,11 +122,6 @@ def _grey(image: Image, where: str) -> Image:
     return np.ascontiguousarray(image)
 
 
-def _pad(image: Image, rows: int, cols: int) -> Image:
-    """The image with its last row and column repeated up to (rows, cols)."""
-    return np.pad(image, ((0, rows - image.shape[0]), (0, cols - image.shape[1])), mode="edge")
-
-
 def flow_from_array(uv: NDArray[np.floating], source: str) -> Flow:
     """A Flow of an array in which NaN means unknown: confidence 1 where known, 0 elsewhere.
 
@@ -169,7 +138,7 @@ def load_flow(path: PathLike, shape: tuple[int, int]) -> Flow:
     """A Flow of a file (.flo, KITTI .png, .npy): confidence 1 where the file knows it, else 0.
 
     Args:
-        path: Flow file, see `soup_nlp.data.formats.read_flow`.
+        path: Flow file, see `soup_nlp.data.formats.map_files.read_flow`.
         shape: (H, W) of the reference image.
 
     Raises:
@@ -246,9 +215,7 @@ class FlowOptions(Section):
             return dis_flow(pair.image_ref, pair.image_next, **dict(self.dis))
         if self.source == "truth":
             return flow_from_truth(pair, self.occluded_confidence)
-        if is_named(self.source) or not (Path(self.source).suffix or "/" in self.source):
-            return resolve_flow(pair, self.source)
-        return resolve_flow(pair, str(path(self.source)))
+        return resolve_flow(pair, str(path(self.source)) if is_path(self.source) else self.source)
 
 
 def flow_sources() -> dict[str, EntryPoint]:
@@ -262,6 +229,11 @@ def is_named(source: str) -> bool:
     return named or source in flow_sources()
 
 
+def is_path(source: str) -> bool:
+    """Whether a flow source is a path: no known name, and with a suffix or a folder."""
+    return not is_named(source) and bool(Path(source).suffix or "/" in source)
+
+
 def is_network(source: str) -> bool:
     """Whether a flow source is the path of a network."""
     return Path(source).suffix in (".onnx", ".pth")
@@ -273,7 +245,7 @@ def resolve_flow(pair: Pair, source: str) -> Flow:
     Args:
         pair: The pair; its own `flow` is not looked at.
         source: "dis" (`dis_flow` with its defaults), "truth" (`flow_from_truth`),
-            "truth+noise:SIGMA" (`flow_noise.noisy`), "rlof" (needs opencv-contrib), "raft_small" or
+            "truth+noise:SIGMA" (`noisy`), "rlof" (needs opencv-contrib), "raft_small" or
             "raft_large" (need torchvision), the name of an installed plug-in (entry-point group
             `soup_nlp.flow`), the path of a network (.onnx, or .pth for RAFT) or of a flow file.
 
@@ -294,13 +266,11 @@ def resolve_flow(pair: Pair, source: str) -> Flow:
     if source in plugins:
         return _run_plugin(plugins[source], pair)
     if not Path(source).suffix and not Path(source).exists():
+        names = ["dis", "truth", f"{PREFIX}SIGMA", "rlof", *MODELS, *sorted(plugins)]
         raise DataError(
             "unknown flow source",
             found=repr(source),
-            expected=", ".join(
-                ["dis", "truth", f"{PREFIX}SIGMA", "rlof", *MODELS, *sorted(plugins)]
-            )
-            + ", or the path of a flow file or network",
+            expected=f"{', '.join(names)}, or the path of a flow file or network",
         )
     return load_flow(source, pair.size)
 

@@ -1,11 +1,9 @@
-"""Images, and the byte-level helpers that every format shares."""
+"""Images, and the checks that readers of every format share."""
 
 from __future__ import annotations
 
 import os
-import tempfile
 import warnings
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +15,8 @@ from soup_nlp.errors import DataError
 
 PathLike = str | os.PathLike[str]
 
-MAX_SIDE = 100_000
-"""Largest width or height that a header may claim, pixels; more is taken for a damaged file."""
-
 DARK = 65535 // 3
-"""A 16-bit image whose largest value is below this is taken for one that may hold fewer bits."""
+"""A 16-bit image whose largest value is below this may hold fewer bits."""
 
 
 class DataWarning(UserWarning):
@@ -43,7 +38,7 @@ def read_bytes(path: PathLike, what: str) -> bytes:
         content = path.read_bytes()
     except FileNotFoundError:
         raise DataError(
-            f"{what} is missing", where=path, expected="an existing file", hint=_near(path)
+            f"{what} is missing", where=path, expected="an existing file", hint=_neighbours(path)
         ) from None
     except OSError as error:
         raise DataError(
@@ -54,8 +49,8 @@ def read_bytes(path: PathLike, what: str) -> bytes:
     return content
 
 
-def _near(path: Path) -> str:
-    """A hint that names what the folder does hold."""
+def _neighbours(path: Path) -> str:
+    """A hint that names what the folder of a missing file holds."""
     if not path.parent.is_dir():
         return f"the folder {path.parent} does not exist; check the path"
     names = sorted(p.name for p in path.parent.iterdir())
@@ -75,47 +70,6 @@ def read_text(path: PathLike, what: str) -> str:
         raise DataError(
             f"{what} is not text", where=path, found="binary content", expected="UTF-8 text"
         ) from None
-
-
-def write_bytes(path: PathLike, content: bytes) -> None:
-    """Write a file whole or not at all: beside its place first, then renamed onto it.
-
-    Raises:
-        DataError: the folder does not exist or is not writable.
-    """
-    path = Path(path)
-    beside: str | None = None
-    try:
-        handle, beside = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(beside, 0o666 & ~mask)
-        os.replace(beside, path)
-    except OSError as error:
-        if beside is not None:
-            Path(beside).unlink(missing_ok=True)
-        raise DataError(
-            "file cannot be written",
-            where=path,
-            found=error.strerror,
-            expected="an existing, writable folder",
-        ) from error
-
-
-def check_size(width: int, height: int, path: PathLike) -> None:
-    """Raise DataError for a width or height that no image has."""
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-        raise DataError(
-            "file header claims an impossible size",
-            where=path,
-            found=f"{width} x {height} (width x height)",
-            expected=f"1 to {MAX_SIDE} on each side",
-            hint="the file is damaged or of another format",
-        )
 
 
 def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
@@ -138,7 +92,16 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
         DataError: the file is missing, truncated, or no image.
     """
     content = read_bytes(path, what)
-    _check_end(content, path, what)
+    png = content.startswith(b"\x89PNG\r\n\x1a\n") and b"IEND" not in content
+    last_scan, end = content.rfind(b"\xff\xda"), content.rfind(b"\xff\xd9")
+    if png or (content.startswith(b"\xff\xd8") and end < last_scan):
+        # OpenCV would decode the part that is there
+        raise DataError(
+            f"{what} is truncated",
+            where=path,
+            found=f"a {'PNG' if png else 'JPEG'} without its end marker",
+            hint="copy or download the file again",
+        )
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -154,32 +117,6 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
             hint="the file may be damaged; try to open it in an image viewer",
         )
     return np.asarray(image)
-
-
-def _check_end(content: bytes, path: PathLike, what: str) -> None:
-    """Raise DataError for a PNG or JPEG without its end, which OpenCV would half decode."""
-    png = content.startswith(b"\x89PNG\r\n\x1a\n") and b"IEND" not in content
-    jpeg = content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9") < content.rfind(
-        b"\xff\xda"
-    )
-    if png or jpeg:
-        raise DataError(
-            f"{what} is truncated",
-            where=path,
-            found=f"a {'PNG' if png else 'JPEG'} without its end marker",
-            hint="copy or download the file again",
-        )
-
-
-def encode_png(path: PathLike, image: NDArray[Any]) -> None:
-    """Write an array as PNG, whole or not at all (OpenCV channel order)."""
-    try:
-        done, content = cv2.imencode(".png", image)
-    except cv2.error as error:
-        raise DataError("array cannot be written as PNG", where=path, found=str(error)) from error
-    if not done:
-        raise DataError("array cannot be written as PNG", where=path, found=image.shape)
-    write_bytes(path, content.tobytes())
 
 
 def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]:
@@ -199,46 +136,6 @@ def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]
             hint="an 8-bit or colour-coded picture of the data does not hold the values",
         )
     return image
-
-
-def load_npy(path: PathLike, what: str) -> NDArray[Any]:
-    """Load a plain .npy array (no pickles).
-
-    Raises:
-        DataError: the file is missing, truncated, no .npy, or holds no real numbers.
-    """
-    read_bytes(path, what)
-    try:
-        array = np.load(Path(path), allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(
-            f"{what} is not a readable .npy file", where=path, found=str(error)
-        ) from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        raise DataError(
-            f"{what} does not hold numbers",
-            where=path,
-            found=getattr(array, "dtype", type(array).__name__),
-            expected="one array of real numbers",
-        )
-    return array
-
-
-def parse_numbers(text: str, path: PathLike, what: str) -> list[float]:
-    """Numbers of a text, separated by blanks or commas.
-
-    Raises:
-        DataError: a word is not a number.
-    """
-    values = []
-    for word in text.replace(",", " ").split():
-        try:
-            values.append(float(word))
-        except ValueError:
-            raise DataError(
-                f"{what} holds a word that is not a number", where=path, found=repr(word)
-            ) from None
-    return values
 
 
 def read_image(path: PathLike, white: int | None = None) -> NDArray[np.uint8]:
@@ -274,10 +171,17 @@ def read_image(path: PathLike, white: int | None = None) -> NDArray[np.uint8]:
             expected="1 (grey), 3 (RGB) or 4 (RGBA)",
         )
     if image.dtype == np.uint16:
-        if white is None:
-            _warn_dark(int(image.max()), path)
-        scale = 255.0 / (65535 if white is None else white)
-        image = np.minimum(np.rint(image * scale), 255).astype(np.uint8)
+        largest = int(image.max())
+        if white is None and 0 < largest < DARK:
+            # the scene may be dark: nothing is guessed
+            full = 2 ** largest.bit_length() - 1
+            warnings.warn(
+                f"{path}: 16-bit image is dark, its largest value is {largest} of 65535; if its"
+                f" white is {full}, say so by the key white of the input (white: {full})",
+                DataWarning,
+                stacklevel=2,
+            )
+        image = np.minimum(np.rint(image * (255.0 / (white or 65535))), 255).astype(np.uint8)
     elif image.dtype != np.uint8:
         raise DataError(
             "image is neither 8-bit nor 16-bit",
@@ -290,18 +194,6 @@ def read_image(path: PathLike, white: int | None = None) -> NDArray[np.uint8]:
     return np.ascontiguousarray(rgb)
 
 
-def _warn_dark(largest: int, path: PathLike) -> None:
-    """Say that a 16-bit image may hold fewer bits; it may be a dark scene: nothing is guessed."""
-    if 0 < largest < DARK:
-        full = 2 ** largest.bit_length() - 1
-        warnings.warn(
-            f"{path}: 16-bit image is dark, its largest value is {largest} of 65535; if its white"
-            f" is {full}, say so by the key white of the input (white: {full})",
-            DataWarning,
-            stacklevel=3,
-        )
-
-
 def read_mask(path: PathLike) -> NDArray[np.bool_]:
     """Read a black-and-white picture as (H, W) bool, True above half of the range.
 
@@ -309,23 +201,3 @@ def read_mask(path: PathLike) -> NDArray[np.bool_]:
         DataError: as `read_image`.
     """
     return np.asarray(read_image(path, white=65535)[:, :, 0] > 127)
-
-
-Reader = Callable[[PathLike], NDArray[Any]]
-
-
-def dispatch(path: PathLike, readers: Mapping[str, Reader], what: str) -> NDArray[Any]:
-    """Read a file with the reader of its suffix.
-
-    Raises:
-        DataError: no reader has this suffix, or the reader refuses the file.
-    """
-    suffix = Path(path).suffix.lower()
-    if suffix not in readers:
-        raise DataError(
-            f"{what} file has an unknown suffix",
-            where=path,
-            found=suffix or "no suffix",
-            expected=", ".join(readers),
-        )
-    return readers[suffix](path)

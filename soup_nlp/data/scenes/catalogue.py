@@ -6,7 +6,6 @@ truth of the rendered pair is in the usual coordinates, those of the reference c
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 
 import numpy as np
@@ -15,7 +14,6 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
 from soup_nlp.data.scenes.shapes import Box, Float, Plane, Shape, Sheet, Sphere
 from soup_nlp.data.scenes.texture import Colour, Panels, Texture
-from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera, rotation
 
 SCENES: dict[str, str] = {
@@ -26,9 +24,6 @@ SCENES: dict[str, str] = {
     "still": "camera at rest, one moving body",
 }
 """Names that `render_scene` knows, with one line on each."""
-
-SMALLEST = (48, 64)
-"""Smallest (height, width) that is rendered."""
 
 Random = np.random.Generator
 
@@ -43,38 +38,16 @@ def render_scene(name: str, seed: int = 0, width: int = 1024, height: int = 436)
         height: Rows of both images, at least 48.
 
     Returns:
-        A `Pair` with full `Truth` in metres and no flow. Body 0 is the static background. Motions
-        are `next_from_ref` with the camera's motion included; NaN for the bending sheet.
-
-    Raises:
-        DataError: unknown name, image too small, negative seed.
+        A `Pair` with full `Truth` in metres and no flow. Component 0 is the static background.
+        Motions are `next_from_ref` with the camera's motion included; NaN for the bending sheet.
     """
-    if name not in _LAYOUTS:
-        close = difflib.get_close_matches(str(name), _LAYOUTS, n=1)
-        raise DataError(
-            "unknown scene",
-            where="name",
-            found=repr(name),
-            expected=f"one of {', '.join(_LAYOUTS)}",
-            hint=f"did you mean {close[0]!r}?" if close else None,
-        )
-    for what, value, least in (("width", width, SMALLEST[1]), ("height", height, SMALLEST[0])):
-        if not isinstance(value, int | np.integer) or value < least:
-            raise DataError(
-                "image size is not usable",
-                where=what,
-                found=repr(value),
-                expected=f"int >= {least}",
-            )
-    if not isinstance(seed, int | np.integer) or seed < 0:
-        raise DataError("seed is not usable", where="seed", found=repr(seed), expected="int >= 0")
     layout, focal = _LAYOUTS[name]
     # tall images keep the field of view of a 4:3 image, or the ground would pass the camera
     f = focal * max(width, 4 / 3 * height)
     K = camera.intrinsics(f, f, (width - 1) / 2, (height - 1) / 2)
-    rng = np.random.default_rng([int(seed), list(_LAYOUTS).index(name)])
+    rng = np.random.default_rng([seed, list(_LAYOUTS).index(name)])
     scene = layout(rng, width / (2 * f), height / (2 * f))
-    return render(scene, K, int(height), int(width), name=f"{name}-{seed}")
+    return render(scene, K, height, width, name=f"{name}-{seed}")
 
 
 # --- poses -----------------------------------------------------------------------------------
@@ -138,14 +111,6 @@ class _Materials:
         self.rng = rng
         self.paints = [_PAINTS[i] for i in rng.permutation(len(_PAINTS))]
 
-    def seed(self) -> int:
-        return int(self.rng.integers(2**31))
-
-    def paint(self, cell: float, panels: Panels | None = None, contrast: float = 0.5) -> Texture:
-        """The next colour of the palette."""
-        self.paints.append(self.paints.pop(0))
-        return Texture(self.paints[-1], cell, contrast, seed=self.seed(), panels=panels)
-
     def plain(
         self,
         colours: tuple[Colour, Colour],
@@ -154,7 +119,12 @@ class _Materials:
         contrast: float = 0.45,
     ) -> Texture:
         """A given pair of colours."""
-        return Texture(colours, cell, contrast, seed=self.seed(), panels=panels)
+        return Texture(colours, cell, contrast, int(self.rng.integers(2**31)), panels)
+
+    def paint(self, cell: float, panels: Panels | None = None) -> Texture:
+        """The next colour of the palette."""
+        self.paints.append(self.paints.pop(0))
+        return self.plain(self.paints[-1], cell, panels, contrast=0.5)
 
     def wall(self, cell: float, panels: Panels | None = None) -> Texture:
         """One of the wall colours."""
@@ -166,9 +136,9 @@ def _floor(texture: Texture) -> Part:
     return Part(Plane(), _pose(0, 0, 0, pitch=-90), texture)
 
 
-def _backdrop(z: float, texture: Texture, glow: float = 0.45, yaw: float = 0.0) -> Part:
+def _backdrop(z: float, texture: Texture, glow: float = 0.45) -> Part:
     """An infinite upright wall at a distance."""
-    return Part(Plane(), _pose(0, 0, z, yaw=yaw), texture, glow)
+    return Part(Plane(), _pose(0, 0, z), texture, glow)
 
 
 # --- layouts: (rng, half width / f, half height / f) -> Scene ----------------------------------

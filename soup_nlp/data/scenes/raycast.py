@@ -26,7 +26,7 @@ SAME_DEPTH = 1e-6
 """Relative difference of depth up to which two hits are the same point."""
 
 TAPS = 3
-"""Colour samples per pixel along the direction in which a tilted surface is squeezed."""
+"""Colour samples per pixel along the direction in which a surface is foreshortened."""
 
 TILTED = 0.75
 """Cosine between normal and ray below which a surface gets `TAPS` colour samples."""
@@ -112,15 +112,11 @@ class Scene:
 
     def camera_from_part(self, frame: int) -> Float:
         """(P, 4, 4) poses of all parts in the camera of a frame."""
-        if frame == 0:
-            return np.array([self.ref_from_scene @ part.scene_from_part for part in self.parts])
-        return np.array(
-            [
-                self.next_from_scene @ body.motion @ part.scene_from_part
-                for body in self.bodies
-                for part in body.parts
-            ]
-        )
+        poses = []
+        for body in self.bodies:
+            view = self.next_from_scene @ body.motion if frame else self.ref_from_scene
+            poses += [view @ part.scene_from_part for part in body.parts]
+        return np.array(poses)
 
     def motions(self) -> Float:
         """(B, 4, 4) next_from_ref of each body, camera motion included; NaN where not rigid."""
@@ -263,9 +259,7 @@ def _paint(
 def _on_edge(part: Int, normals: Float) -> NDArray[np.bool_]:
     """Pixels (H, W) whose 4-neighbours show another part or another face."""
     edge = np.zeros(part.shape, bool)
-    for axis in (0, 1):
-        first = tuple(slice(None, -1) if a == axis else slice(None) for a in (0, 1))
-        second = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
+    for first, second in (np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:]):
         turned = np.einsum("...i,...i", normals[first], normals[second]) < 0.7
         differ = (part[first] != part[second]) | turned
         edge[first] |= differ
@@ -278,8 +272,8 @@ def _shade(
 ) -> tuple[NDArray[np.float32], Float]:
     """Colours and normals of hits.
 
-    A tilted surface is squeezed in one image direction only. Its texture is limited to the finer
-    resolution as far as TAPS samples along the squeezed direction average the rest away.
+    A tilted surface is foreshortened in one image direction only. Its texture keeps the finer
+    resolution where TAPS samples along that direction average the rest away.
 
     Args:
         scene: The scene.
@@ -288,7 +282,7 @@ def _shade(
         depth: (N,) depth of the surface there.
         part: (N,) part index.
         frame: 0 or 1.
-        taps: Samples along the squeezed direction; 1 where the caller averages by itself.
+        taps: Samples along the foreshortened direction; 1 where the caller averages by itself.
 
     Returns:
         Colours (N, 3) and unit normals (N, 3) in camera coordinates.

@@ -1,7 +1,7 @@
-"""Surfaces that a ray can hit: where, with which normal, and which of their points are one matter.
+"""Surfaces that a ray can hit: intersections, normals and material coordinates.
 
-Every shape knows which of its points are the same matter in both frames (`material` and `place`),
-which is the identity for rigid shapes.
+Material coordinates name a point of a surface in both frames (`material` and `place`); for rigid
+shapes they are the shape's own coordinates.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -66,22 +64,12 @@ def _first_hit(*roots: Float) -> Float:
 
 @dataclass(frozen=True)
 class Plane(Shape):
-    """The plane z = 0, normal -z; seen from both sides. Bounded by `half` in x and y, or infinite.
-
-    Attributes:
-        half: Half sizes along x and y, unit of length; `inf` for no bound.
-    """
-
-    half: tuple[float, float] = (np.inf, np.inf)
+    """The infinite plane z = 0, normal -z; seen from both sides."""
 
     def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
         """See `Shape`."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = -origin[2] / rays[:, 2]
-            inside = (abs(origin[0] + t * rays[:, 0]) <= self.half[0]) & (
-                abs(origin[1] + t * rays[:, 1]) <= self.half[1]
-            )
-        return np.where(inside, _first_hit(t), np.inf)
+            return _first_hit(-origin[2] / rays[:, 2])
 
     def normals(self, points: Float, frame: int) -> Float:
         """See `Shape`."""
@@ -89,7 +77,7 @@ class Plane(Shape):
 
     def corners(self) -> Float | None:
         """See `Shape`."""
-        return _corner_points((*self.half, 0.0)) if np.isfinite(self.half).all() else None
+        return None
 
 
 @dataclass(frozen=True)
@@ -183,16 +171,6 @@ class Sheet(Shape):
     angle: tuple[float, float] = (0.0, 0.0)
 
     rigid = False
-
-    def __post_init__(self) -> None:
-        reach = float(np.hypot(*self.half))
-        if max(abs(k) for k in self.curvature) * reach > 0.9 * np.pi:
-            raise DataError(
-                "sheet is bent so far that it meets itself",
-                where="Sheet.curvature",
-                found=self.curvature,
-                expected=f"|curvature| <= {0.9 * np.pi / reach:.3g}",
-            )
 
     def _turn(self, points: Float, angle: float) -> Float:
         c, s = np.cos(angle), np.sin(angle)

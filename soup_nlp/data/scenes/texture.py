@@ -13,8 +13,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.errors import DataError
-
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Colour = tuple[float, float, float]
@@ -24,6 +22,9 @@ PERIOD = 32
 
 FINEST_CELLS = (1.25, 2.5)
 """An octave fades in while its cells grow from the first to the second many footprints."""
+
+LACUNARITY = 1.93
+"""Ratio of the cell sizes of consecutive octaves."""
 
 GOLDEN = 0.6180339887498949
 
@@ -61,22 +62,15 @@ def value_noise(points: Float, seed: int) -> Float32:
     high = (low + 1) & (PERIOD - 1)
     fx, fy, fz = f.T
     planes = []
-    for z in (low[:, 2] * PERIOD**2, high[:, 2] * PERIOD**2):
+    for z in (low[:, 2], high[:, 2]):
         rows = []
-        for y in (low[:, 1] * PERIOD, high[:, 1] * PERIOD):
-            base = z + y
+        for y in (low[:, 1], high[:, 1]):
+            base = (z * PERIOD + y) * PERIOD
             left, right = table[base + low[:, 0]], table[base + high[:, 0]]
             rows.append(left + fx * (right - left))
         planes.append(rows[0] + fy * (rows[1] - rows[0]))
     out: Float32 = planes[0] + fz * (planes[1] - planes[0])
     return out
-
-
-def band_weight(cell: float, footprint: Float) -> Float32:
-    """How much (N,) of an octave with this cell size a pixel of this footprint may show, 0 to 1."""
-    lo, hi = FINEST_CELLS
-    x = np.clip((cell / footprint - lo) / (hi - lo), 0, 1)
-    return (x * x * (3 - 2 * x)).astype(np.float32)
 
 
 def fractal_noise(
@@ -86,7 +80,6 @@ def fractal_noise(
     cell: float,
     seed: int,
     persistence: float = 0.8,
-    lacunarity: float = 1.93,
     octaves: int = 12,
 ) -> Float32:
     """Sum of octaves of `value_noise`, each octave only where pixels can resolve it.
@@ -97,7 +90,6 @@ def fractal_noise(
         cell: Cell size of the coarsest octave, same unit.
         seed: Which noise.
         persistence: Amplitude of an octave relative to the next coarser one.
-        lacunarity: Ratio of the cell sizes of consecutive octaves.
         octaves: At most this many.
 
     Returns:
@@ -110,7 +102,8 @@ def fractal_noise(
     for k in range(octaves):
         if cell < FINEST_CELLS[0] * finest:
             break
-        weight = band_weight(cell, footprint)
+        x = np.clip((cell / footprint - FINEST_CELLS[0]) / np.ptp(FINEST_CELLS), 0, 1)
+        weight = (x * x * (3 - 2 * x)).astype(np.float32)
         visible = np.flatnonzero(weight)
         if len(visible):
             # a shift per octave, or all octaves would share a lattice node at the origin
@@ -118,7 +111,7 @@ def fractal_noise(
             where = turned[visible] / cell + shift
             total[visible] += np.float32(scale) * weight[visible] * value_noise(where, seed)
         scale *= persistence
-        cell /= lacunarity
+        cell /= LACUNARITY
     return total * np.float32(1.6)
 
 
@@ -152,15 +145,6 @@ class Panels:
     offset: tuple[float, float] = (0.0, 0.0)
     variation: float = 0.0
 
-    def __post_init__(self) -> None:
-        if min(self.period) <= 0 or not all(0 < d <= 1 for d in self.duty):
-            raise DataError(
-                "panel grid is empty",
-                where="Panels",
-                found=f"period {self.period}, duty {self.duty}",
-                expected="period > 0 and 0 < duty <= 1",
-            )
-
     def blend(self, colour: Float32, chart: Float, footprint: Float, seed: int) -> Float32:
         """Paint the panels over `colour` (N, 3) at chart positions (N, 2), anti-aliased."""
         grid = (chart - np.asarray(self.offset)) / np.asarray(self.period)
@@ -182,7 +166,6 @@ class Texture:
         colours: Two RGB colours in [0, 1]; slow noise mixes them.
         cell: Size of the coarsest noise cells, unit of length.
         contrast: Strength of the fine multi-octave noise, 0 for flat colours.
-        persistence: Amplitude of each finer octave relative to the coarser one.
         seed: Which noise.
         panels: Rectangles painted over the two colours, or None.
     """
@@ -190,18 +173,8 @@ class Texture:
     colours: tuple[Colour, Colour]
     cell: float
     contrast: float = 0.6
-    persistence: float = 0.8
     seed: int = 0
     panels: Panels | None = None
-
-    def __post_init__(self) -> None:
-        if not self.cell > 0:
-            raise DataError(
-                "texture cells must have a size",
-                where="Texture.cell",
-                found=self.cell,
-                expected="> 0",
-            )
 
     def colour(self, points: Float, chart: Float, footprint: Float) -> Float32:
         """RGB of surface points.
@@ -222,9 +195,7 @@ class Texture:
         colour = first + mix * (second - first)
         if self.panels is not None:
             colour = self.panels.blend(colour, chart, footprint, self.seed)
-        fine = fractal_noise(
-            points, footprint, cell=self.cell, seed=self.seed, persistence=self.persistence
-        )
+        fine = fractal_noise(points, footprint, cell=self.cell, seed=self.seed)
         # exp keeps dark parts dark and never negative; the shoulder keeps detail in bright parts
         colour = colour * np.exp(np.float32(self.contrast) * fine)[:, None]
         return colour / np.sqrt(np.sqrt(1 + colour**4))

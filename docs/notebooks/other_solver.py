@@ -1,0 +1,130 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: py:percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # From the .nl file to another solver to depth
+#
+# The constrained NLP is a file that any AMPL solver reads. Here it is solved from that file
+# alone: by POUNCE if it is installed, else by CasADi's reader of .nl files and its Ipopt. The
+# answer, a .sol file, becomes a result folder with depth maps.
+
+# %%
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+
+import soup_nlp
+from soup_nlp.cli.main import main
+
+folder = Path(tempfile.mkdtemp())
+
+# %% [markdown]
+# ## Export
+#
+# The same as `soup-nlp export orbit.yaml -o orbit --presolve`. With `--presolve` the file's start
+# is the presolve's answer, as for Ipopt in `soup-nlp solve`.
+
+# %%
+(folder / "orbit.yaml").write_text(
+    """
+input: {kind: scene, scene: orbit, width: 192, height: 96}
+flow: {source: truth}
+segmentation: {superpixels: 24, neighbours: 6}
+energy: {pixel_samples: 8}
+"""
+)
+exported = folder / "orbit"
+code = main(["export", str(folder / "orbit.yaml"), "-o", str(exported), "--presolve"])
+assert code == 0
+print(sorted(path.name for path in exported.iterdir()))
+
+# %% [markdown]
+# ## Solve with another solver
+#
+# Any program of the AMPL convention leaves `soup.sol` beside `soup.nl`. Options say that the
+# start is good.
+
+# %%
+options = {"mu_init": 1e-5, "bound_push": 1e-6, "bound_frac": 1e-6, "nlp_scaling_method": "none"}
+pounce = shutil.which("pounce") or shutil.which(str(Path(sys.executable).parent / "pounce"))
+
+
+def solve_by_program(program: str) -> None:
+    """Run a solver on the .nl file."""
+    words = [program, "soup.nl", *(f"{name}={value}" for name, value in options.items())]
+    subprocess.run(words, cwd=exported, check=True, stdout=subprocess.DEVNULL)
+
+
+def solve_by_casadi() -> None:
+    """Read the .nl file with CasADi, solve it with Ipopt, write the .sol file."""
+    import casadi as ca
+    import numpy as np
+
+    from soup_nlp.export.sol import write_sol
+
+    builder = ca.NlpBuilder()
+    builder.import_nl(str(exported / "soup.nl"), {})
+    x, g = ca.vertcat(*builder.x), ca.densify(ca.vertcat(*builder.g))
+    plain = ca.Function("nl", [x], [builder.f, g]).expand()
+    s = ca.SX.sym("x", x.numel())
+    f, g = plain(s)
+    quiet = {"ipopt": {**options, "print_level": 0, "sb": "yes"}, "print_time": False}
+    solver = ca.nlpsol("solver", "ipopt", {"x": s, "f": f, "g": g}, quiet)
+    answer = solver(
+        x0=builder.x_init, lbx=builder.x_lb, ubx=builder.x_ub, lbg=builder.g_lb, ubg=builder.g_ub
+    )
+    status = solver.stats()["return_status"]
+    write_sol(
+        exported / "soup.sol",
+        np.asarray(answer["x"]).ravel(),
+        np.asarray(answer["lam_g"]).ravel(),
+        # x and g are in the order of the file already
+        np.arange(x.numel()),
+        np.arange(g.numel()),
+        f"Ipopt on the imported file: {status}",
+        0 if status == "Solve_Succeeded" else 400,
+    )
+
+
+if pounce:
+    solve_by_program(pounce)
+else:
+    solve_by_casadi()
+print((exported / "soup.sol").read_text().splitlines()[0])
+
+# %% [markdown]
+# ## Check and import
+#
+# `check` names the residuals by kind and the worst superpixels. `import` recomputes energy and
+# residuals from the point and writes the folder that `soup-nlp solve` writes.
+
+# %%
+assert main(["check", str(exported / "soup.sol")]) == 0
+
+# %%
+assert main(["import", str(exported), str(exported / "soup.sol")]) == 0
+result = exported / "result"
+
+# %% [markdown]
+# ## Depth
+
+# %%
+figure, axis = plt.subplots(figsize=(12, 4))
+axis.imshow(plt.imread(result / "overview.png"))
+axis.axis("off")
+figure.tight_layout()
+plt.show()
+
+# %%
+print(soup_nlp.__version__, sorted(path.name for path in result.iterdir()))

@@ -1,0 +1,299 @@
+"""Flow and depth files: Middlebury .flo, Sintel .dpt, .pfm, 16-bit PNG, NumPy arrays.
+
+In memory a flow is (H, W, 2) float64 of float32 precision, displacement (u right, v down) in
+pixels, NaN in both components where unknown. A depth is (H, W) float64, z along the optical axis,
+NaN where unknown; zero, negative and infinite depths count as unknown.
+
+Every reader raises `DataError` for a file that is missing, empty, of another format, of an
+impossible size, or longer or shorter than its header says.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.formats.images import PathLike, check_body, decode_png16, read_bytes
+from soup_nlp.errors import DataError
+
+Float = NDArray[np.float64]
+Reader = Callable[[PathLike], Float]
+
+MAX_SIDE = 100_000
+"""Largest width or height that a header may claim, pixels; more is taken for a damaged file."""
+
+MAGIC = b"PIEH"
+"""First four bytes of .flo, .dpt and .cam files; as a little-endian float32 they read 202021.25."""
+
+UNKNOWN_FLOW = 1e9
+"""A component larger than this marks an unknown flow."""
+
+VKITTI_SKY = 65535
+"""Virtual KITTI stores depths of 655.35 m and more, the sky, as this value."""
+
+KITTI_DISPARITY = 256.0
+"""Values per pixel of a KITTI disparity image."""
+
+
+def check_magic(content: bytes, path: PathLike, what: str) -> None:
+    """Raise DataError unless a file of Sintel or Middlebury starts with `MAGIC`."""
+    if content[:4] != MAGIC:
+        raise DataError(
+            f"{what} has the wrong magic number",
+            where=path,
+            found=repr(content[:4]),
+            expected=f"{MAGIC!r} (float 202021.25)",
+            hint=f"is it really a {Path(path).suffix} file?",
+        )
+
+
+def _raster(
+    content: bytes, start: int, size: tuple[int, ...], order: str, path: PathLike, what: str
+) -> NDArray[np.float32]:
+    """The float32 numbers of byte order `order` after a header of `start` bytes, as an array.
+
+    Raises:
+        DataError: no image has this size (H, W, ...), or the file is shorter or longer.
+    """
+    if not all(0 < side <= MAX_SIDE for side in size):
+        raise DataError(
+            "file header claims an impossible size",
+            where=path,
+            found=f"{size[1]} x {size[0]} (width x height)",
+            expected=f"1 to {MAX_SIDE} on each side",
+            hint="the file is damaged or of another format",
+        )
+    check_body(len(content) - start, 4 * int(np.prod(size)), path, what)
+    values = np.frombuffer(content, f"{order}f4", offset=start).reshape(size)
+    return values.astype(np.float32)
+
+
+def _read_pieh(path: PathLike, channels: tuple[int, ...], what: str) -> NDArray[np.float32]:
+    """The numbers of a .flo or .dpt file: magic, int32 width and height, float32 by rows."""
+    content = read_bytes(path, what)
+    check_magic(content, path, what)
+    check_body(min(len(content) - 4, 8), 8, path, f"{what} header")
+    width, height = struct.unpack("<ii", content[4:12])
+    return _raster(content, 12, (height, width, *channels), "<", path, what)
+
+
+def _read_npy(path: PathLike, what: str) -> NDArray[Any]:
+    """One array of real numbers from a plain .npy file (no pickles)."""
+    read_bytes(path, what)
+    try:
+        array = np.load(Path(path), allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DataError(
+            f"{what} is not a readable .npy file", where=path, found=str(error)
+        ) from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        raise DataError(
+            f"{what} does not hold numbers",
+            where=path,
+            found=getattr(array, "dtype", type(array).__name__),
+            expected="one array of real numbers",
+        )
+    return array
+
+
+def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> Float:
+    suffix = Path(path).suffix.lower()
+    if suffix not in readers:
+        raise DataError(
+            f"{what} file has an unknown suffix",
+            where=path,
+            found=suffix or "no suffix",
+            expected=", ".join(readers),
+        )
+    return readers[suffix](path)
+
+
+# --- flow -----------------------------------------------------------------------------------------
+
+
+def _known_flow(flow: NDArray[Any], path: PathLike) -> Float:
+    """The flow with NaN in both components where either is unknown."""
+    if flow.ndim != 3 or flow.shape[2] != 2:
+        raise DataError(
+            "flow has the wrong shape", where=path, found=flow.shape, expected="(H, W, 2)"
+        )
+    with np.errstate(over="ignore"):
+        out = np.array(flow, dtype=np.float32)
+    out[~(np.abs(out) <= UNKNOWN_FLOW).all(axis=2)] = np.nan
+    return out.astype(np.float64)
+
+
+def read_flo(path: PathLike) -> Float:
+    """Read a Middlebury .flo file (little endian; also used by Sintel).
+
+    Returns:
+        (H, W, 2) float64, pixels; NaN where a component is NaN or larger than 1e9 in magnitude.
+    """
+    return _known_flow(_read_pieh(path, (2,), "flow file"), path)
+
+
+def _read_flow_png(path: PathLike, what: str) -> Float:
+    """(H, W, 2) values of a 16-bit flow PNG, R and G; NaN where B is 0."""
+    bgr = decode_png16(path, 3, what)
+    code = bgr[:, :, :0:-1].astype(np.float64)
+    code[bgr[:, :, 0] == 0] = np.nan
+    return code
+
+
+def read_kitti_flow(path: PathLike) -> Float:
+    """Read a KITTI flow PNG: 16-bit RGB, u = (R - 2^15) / 64, v = (G - 2^15) / 64, B > 0 valid.
+
+    Returns:
+        (H, W, 2) float64, pixels; NaN where not valid.
+    """
+    return (_read_flow_png(path, "KITTI flow") - 2.0**15) / 64.0
+
+
+def read_vkitti_flow(path: PathLike) -> Float:
+    """Read a Virtual KITTI 1 or 2 flow PNG.
+
+    16-bit RGB: u = (2 R / 65535 - 1) (W - 1), v = (2 G / 65535 - 1) (H - 1), B = 0 invalid
+    (sky and the like).
+
+    Returns:
+        (H, W, 2) float64, pixels; NaN where invalid.
+    """
+    unit = 2.0 / 65535.0 * _read_flow_png(path, "Virtual KITTI flow") - 1.0
+    height, width = unit.shape[:2]
+    return _known_flow(unit * [width - 1, height - 1], path)
+
+
+def read_flow(path: PathLike) -> Float:
+    """Read a flow by the suffix of its file.
+
+    `.flo` is Middlebury, `.png` is KITTI (for Virtual KITTI call `read_vkitti_flow`, the two look
+    alike), `.npy` is a plain (H, W, 2) array in pixels with NaN or values over 1e9 where unknown.
+
+    Returns:
+        (H, W, 2) float64, pixels; NaN where unknown.
+
+    Raises:
+        DataError: the suffix is unknown or the file is wrong for its format.
+    """
+    readers: dict[str, Reader] = {
+        ".flo": read_flo,
+        ".png": read_kitti_flow,
+        ".npy": lambda p: _known_flow(_read_npy(p, "flow file"), p),
+    }
+    return _by_suffix(path, readers, "flow")
+
+
+# --- depth ----------------------------------------------------------------------------------------
+
+
+def _known_depth(depth: NDArray[Any], path: PathLike) -> Float:
+    """The depth as float64 with NaN where it is not positive and finite."""
+    if depth.ndim != 2 or depth.size == 0:
+        raise DataError(
+            "depth has the wrong shape", where=path, found=depth.shape, expected="(H, W)"
+        )
+    out = np.array(depth, dtype=np.float64)
+    out[~(np.isfinite(out) & (out > 0))] = np.nan
+    return out
+
+
+def read_dpt(path: PathLike) -> Float:
+    """Read a Sintel .dpt depth file.
+
+    Returns:
+        (H, W) float64 depth in scene units (metres in Sintel); NaN where unknown.
+    """
+    return _known_depth(_read_pieh(path, (), "depth file"), path)
+
+
+def read_pfm(path: PathLike) -> Float:
+    """Read a depth from a grey .pfm map of either byte order, flipped so that row 0 is the top.
+
+    The size of the scale in the header is ignored, its sign is the byte order.
+
+    Returns:
+        (H, W) float64; NaN where unknown.
+    """
+    content = read_bytes(path, "PFM file")
+    if content[:2] == b"PF":
+        raise DataError(
+            "PFM file is in colour", where=path, found="'PF'", expected="'Pf' (grey, one channel)"
+        )
+    number = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+    pattern = rb"Pf\s+(-?\d+)\s+(-?\d+)\s+(" + number + rb")[ \t]*\r?\n"
+    header = re.match(pattern, content[:256])
+    scale = float(header.group(3)) if header else 0.0
+    if header is None or scale == 0.0:
+        raise DataError(
+            "PFM file has a damaged header",
+            where=path,
+            found=repr(content[:24]),
+            expected="'Pf', width height, scale (negative: little endian)",
+        )
+    size = int(header.group(2)), int(header.group(1))
+    order = "<" if scale < 0 else ">"
+    return _known_depth(_raster(content, header.end(), size, order, path, "PFM file")[::-1], path)
+
+
+def read_depth_png16(path: PathLike, scale: float = 1000.0) -> Float:
+    """Read a 16-bit grey PNG of depth = value / scale, 0 where unknown.
+
+    Args:
+        path: The file.
+        scale: Values per unit of length: 1000 for millimetres, 5000 for TUM RGB-D, 256 for KITTI
+            depth, 100 for Virtual KITTI; `KITTI_DISPARITY` gives disparities in pixels.
+
+    Returns:
+        (H, W) float64 depth; NaN where unknown.
+
+    Raises:
+        DataError: the scale is not positive, or the file is missing, damaged or not 16-bit grey.
+    """
+    if not (np.isfinite(scale) and scale > 0):
+        raise DataError(
+            "depth scale must be positive",
+            where=path,
+            found=scale,
+            expected="values per unit of length, e.g. 1000 for millimetres",
+        )
+    return _known_depth(decode_png16(path, 1, "depth image") / float(scale), path)
+
+
+def read_vkitti_depth(path: PathLike) -> Float:
+    """Read a Virtual KITTI 1 or 2 depth PNG: 16-bit grey, centimetres, 65535 for the sky.
+
+    Returns:
+        (H, W) float64 depth, metres; NaN for the sky and unknown pixels.
+    """
+    depth = read_depth_png16(path, 100.0)
+    depth[depth >= VKITTI_SKY / 100.0] = np.nan
+    return depth
+
+
+def read_depth(path: PathLike, png_scale: float = 1000.0) -> Float:
+    """Read a depth by the suffix of its file: .dpt, .npy, .pfm or 16-bit .png.
+
+    Args:
+        path: The file.
+        png_scale: Values per unit of length of a .png, see `read_depth_png16`.
+
+    Returns:
+        (H, W) float64 depth in the unit of the file; NaN where unknown, not positive or infinite.
+
+    Raises:
+        DataError: the suffix is unknown or the file is wrong for its format.
+    """
+    readers: dict[str, Reader] = {
+        ".dpt": read_dpt,
+        ".npy": lambda p: _known_depth(_read_npy(p, "depth file"), p),
+        ".pfm": read_pfm,
+        ".png": partial(read_depth_png16, scale=png_scale),
+    }
+    return _by_suffix(path, readers, "depth")

@@ -1,0 +1,190 @@
+"""Expressions of a .nl file: templates filled in for every element, `V`, `C` and `O` segments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.export.opcodes import PLUS, SUM, number
+from soup_nlp.export.program import OBJECTIVE, Program
+from soup_nlp.export.template import DEFINED, NUMBER, VARIABLE, Template, Text
+
+Int = NDArray[np.int64]
+
+NOWHERE = np.iinfo(np.int64).max
+
+
+@dataclass
+class _Part:
+    """A template on its table, in the numbering of the file.
+
+    Attributes:
+        template: Texts with holes.
+        index: (E, nx) variable of every local one.
+        goal: (E, m) row of every output, or OBJECTIVE.
+        identity: (E,) identities of the instances of each defined node.
+    """
+
+    template: Template
+    index: Int
+    goal: Int
+    identity: dict[int, Int] = field(default_factory=dict)
+
+    def columns(self, text: Text, elements: Int | slice, final: Int | None = None) -> list[Int]:
+        """Integers that fill the holes of a text: variables, defined variables, bits of numbers."""
+        out = []
+        for kind, place in text.holes:
+            if kind == VARIABLE:
+                column = self.index[elements, place]
+            elif kind == DEFINED:
+                column = self.identity[place][elements]
+                column = column if final is None else final[column]
+            else:
+                values = np.ascontiguousarray(self.template.numbers[place], float)
+                column = values.view(np.int64)[elements]
+            out.append(column)
+        return out
+
+    def write(self, text: Text, elements: Int | slice, final: Int) -> list[str]:
+        """The text of elements, defined variables numbered by `final`."""
+        columns: list[list[object]] = []
+        for (kind, _), column in zip(text.holes, self.columns(text, elements, final)):
+            if kind == NUMBER:
+                columns.append(list(map(repr, column.view(np.float64).tolist())))
+            else:
+                columns.append(column.tolist())
+        if not columns:
+            return [text.pattern] * len(np.arange(len(self.index))[elements])
+        return [text.pattern % values for values in zip(*columns)]
+
+
+class Body:
+    """Expressions of a program.
+
+    Two instances of defined nodes are one defined variable when their text is equal: the same
+    operations on the same variables, numbers and defined variables, in whatever template.
+
+    Attributes:
+        classes: Defined variables by use: both, constraints, objective (several), one constraint,
+            the objective alone.
+    """
+
+    def __init__(self, program: Program, place: Int, row_place: Int) -> None:
+        """Number the defined variables.
+
+        Args:
+            program: The NLP in parts.
+            place: (nx,) place in the file of every variable.
+            row_place: (ng,) place in the file of every row.
+        """
+        self._program, self._row_place, self._first = program, row_place, len(place)
+        self._known: dict[str, dict[bytes, int]] = {}
+        self._count = 0
+        self._nodes: list[tuple[_Part, int, Text, Int]] = []
+        self._parts = []
+        # the entry past the last row is the objective's, whose row is -1
+        goals = np.append(row_place, OBJECTIVE)
+        for template, index, goal in program.stamped:
+            part = _Part(template, place[index], goals[goal])
+            for node, text in template.defined:
+                self._identify(part, node, text)
+            self._parts.append(part)
+        low, high, objective = self._users()
+        used = low != NOWHERE
+        kind = np.select([objective & used, used & (low < high), used], [0, 1, 3], 4)
+        # single-use ones stand before their row, in the order of the rows
+        owner = np.where(kind == 3, low, len(row_place))
+        self._order = np.lexsort((np.arange(len(kind)), owner, kind))
+        self._owner = owner[self._order]
+        self._shared = int((kind < 3).sum())
+        self._final = self._first + np.argsort(self._order)
+        b, c, o, c1, o1 = (int((kind == k).sum()) for k in range(5))
+        self.classes = (b, c, o, c1, o1)
+
+    def _identify(self, part: _Part, node: int, text: Text) -> None:
+        """Give every instance of a defined node its identity, new where its text is new."""
+        known = self._known.setdefault(text.pattern, {})
+        columns = part.columns(text, slice(None))
+        blob, width = np.stack(columns, axis=1).tobytes(), 8 * len(columns)
+        begin, identity = self._count, np.empty(len(part.index), np.int64)
+        for e in range(len(identity)):
+            place = known.setdefault(blob[e * width : (e + 1) * width], self._count)
+            self._count += place == self._count
+            identity[e] = place
+        part.identity[node] = identity
+        # first element of every new identity, in the order of the identities
+        new, first = np.unique(identity, return_index=True)
+        self._nodes.append((part, node, text, first[new >= begin]))
+
+    def _users(self) -> tuple[Int, Int, NDArray[np.bool_]]:
+        """Users of each defined variable, direct or through others.
+
+        Returns:
+            Smallest and largest constraint row (NOWHERE, -1 for none) and use in the objective.
+        """
+        low, high = np.full(self._count, NOWHERE), np.full(self._count, -1)
+        objective = np.zeros(self._count, bool)
+        for part in self._parts:
+            for k, root in enumerate(part.template.roots):
+                row = part.goal[:, k]
+                for kind, node in root.holes if root else ():
+                    if kind == DEFINED and row[0] == OBJECTIVE:
+                        objective[part.identity[node]] = True
+                    elif kind == DEFINED:
+                        np.minimum.at(low, part.identity[node], row)
+                        np.maximum.at(high, part.identity[node], row)
+        # a node is visited after everything that uses it
+        for part, node, text, _ in reversed(self._nodes):
+            parent = part.identity[node]
+            for kind, other in text.holes:
+                if kind == DEFINED:
+                    child = part.identity[other]
+                    np.logical_or.at(objective, child, objective[parent])
+                    np.minimum.at(low, child, low[parent])
+                    np.maximum.at(high, child, high[parent])
+        return low, high, objective
+
+    def segments(self) -> Iterator[str]:
+        """`V`, `C` and `O` segments; a variable with one user stands right before it."""
+        rows: list[list[str]] = [[] for _ in self._row_place]
+        objective: list[str] = []
+        for part in self._parts:
+            for k, root in enumerate(part.template.roots):
+                texts = part.write(root, slice(None), self._final) if root else []
+                if part.goal[0, k] == OBJECTIVE:
+                    objective += texts
+                else:
+                    for r, text in zip(part.goal[:, k].tolist(), texts):
+                        rows[r].append(text)
+        constant = np.zeros(len(rows))
+        constant[self._row_place] = self._program.row_constant
+        written = [
+            text
+            for part, _, pattern, first in self._nodes
+            for text in part.write(pattern, first, self._final)
+        ]
+        order, owner = self._order.tolist(), self._owner.tolist()
+        for k in range(self._shared):
+            yield f"V{self._first + k} 0 0\n{written[order[k]]}"
+        k = self._shared
+        # the objective comes after the rows
+        for r in range(len(rows) + 1):
+            while k < len(owner) and owner[k] == r:
+                yield f"V{self._first + k} 0 {r + 1}\n{written[order[k]]}"
+                k += 1
+            if r < len(rows):
+                yield f"C{r}\n{_total(rows[r], constant[r])}"
+        yield f"O0 0\n{_total(objective, self._program.objective_constant)}"
+
+
+def _total(terms: list[str], constant: float) -> str:
+    """Sum of prefix texts and a number."""
+    if constant or not terms:
+        terms = [*terms, f"n{number(constant)}"]
+    if len(terms) == 1:
+        return terms[0]
+    head = PLUS if len(terms) == 2 else f"{SUM}\n{len(terms)}"
+    return "\n".join([head, *terms])

@@ -1,0 +1,195 @@
+"""A foreign solver's answer to an exported problem, verified and made a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.config.problem import load_problem
+from soup_nlp.errors import ExportError
+from soup_nlp.export.artefact import CHOICES, fingerprint
+from soup_nlp.export.manifest import MANIFEST, STUB, read_manifest
+from soup_nlp.export.names import readable_names
+from soup_nlp.export.residuals import EQUATIONS, Kind, kind, residual_table
+from soup_nlp.export.sol import Sol, read_sol
+from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine, violations
+from soup_nlp.model import oracle
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.nlp import NLP
+from soup_nlp.pipeline import Case, Run, make_run, prepare
+from soup_nlp.solve.ipopt import Stage
+from soup_nlp.solve.kkt import residuals
+from soup_nlp.solve.stages import Solution
+from soup_nlp.storage.store import write_json
+
+Float = NDArray[np.float64]
+
+SAME = 1e-7
+"""Relative difference of the objective at which an export is no longer the problem at hand."""
+KKT_LIMIT = 1e-6
+"""Largest violation of a constraint that a verified answer may have."""
+LIMITS = Limits()
+"""Of the other KKT residuals of a verified answer: the defaults of `compare`."""
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A foreign answer, made a run.
+
+    Attributes:
+        run: As `pipeline.run` returns it; "converged" means claimed and verified.
+        sol: What the solver wrote.
+        manifest: Of the export, best_known renewed.
+        violations: Of bounds (nx,) and rows (ng,) by the point as it is.
+    """
+
+    run: Run
+    sol: Sol
+    manifest: Mapping[str, Any]
+    violations: Mapping[str, Float]
+
+
+def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Imported:
+    """Read a .sol for an exported problem; energy and residuals are recomputed.
+
+    The multipliers are the solver's, or the least-squares ones where these balance better; those
+    of the bounds are what point and multipliers imply.
+
+    Args:
+        folder: Exported folder.
+        sol: The solver's file.
+        renew: Write a better verified answer into the manifest's best_known.
+
+    Raises:
+        ExportError: a file is missing or does not belong to the other.
+        SoupError: the problem's input cannot be used.
+    """
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    case = prepare(load_problem(folder / "problem.yaml"))
+    form = case.formulation(
+        **manifest["formulation"], **manifest["smoothing"], hessian="exact", compiled=False
+    )
+    nlp, layout = case.nlp(form)
+    for key, value in fingerprint(case, nlp, layout).items():
+        then = float(manifest["fingerprint"][key])
+        if abs(value - then) > SAME * max(1.0, abs(then)):
+            raise ExportError(
+                "problem is not the one that was exported",
+                where=folder,
+                found=f"{key} {value!r}",
+                expected=repr(then),
+                hint="its images, its problem.yaml or the program have changed; export again",
+            )
+    answer = read_sol(sol, *_orders(folder, nlp, layout))
+    # a point may be anything: what cannot be computed is infinite or NaN, and never verified
+    with np.errstate(all="ignore"):
+        run = foreign_run(case, form, nlp, layout, answer, source=Path(sol).name)
+    best = manifest["best_known"]
+    energy = run.solution.energy["total"]
+    if renew and run.solution.converged and (best is None or energy < best["exact_energy"]):
+        message = answer.message.splitlines()[0] if answer.message else Path(sol).name
+        manifest["best_known"] = {
+            "objective": run.solution.stages[-1].objective,
+            "exact_energy": energy,
+            "found_by": message,
+        }
+        write_json(folder / MANIFEST, manifest)
+    return Imported(run, answer, manifest, violations(nlp, answer.x))
+
+
+def sol_table(imported: Imported) -> list[Kind]:
+    """Residuals by kind of a foreign answer as it is, before it is retracted."""
+    run = imported.run
+    state = {k: getattr(run.answer, k) for k in ("lam", "n", "d", "R", "t")}
+    limits = dict.fromkeys(EQUATIONS, KKT_LIMIT)
+    facing = run.problem.formulation.min_facing
+    with np.errstate(all="ignore"):
+        rows = residual_table(state, run.data.rim_ray, facing, limits)
+    return rows + [kind(k, v, KKT_LIMIT, False) for k, v in imported.violations.items()]
+
+
+def _orders(folder: Path, nlp: NLP, layout: MatrixLayout) -> tuple[Any, Any]:
+    """Order of the file, from its names."""
+    out = []
+    for suffix, names in zip((".col", ".row"), readable_names(nlp, layout)):
+        path = (folder / STUB).with_suffix(suffix)
+        place = {name: k for k, name in enumerate(names)}
+        try:
+            lines = path.read_text(encoding="utf-8").split()[: len(names)]
+            order = np.array([place[name] for name in lines], np.int64)
+        except (OSError, ValueError, KeyError) as error:
+            raise ExportError("names of the file cannot be used", where=path, found=error) from None
+        if len(np.unique(order)) != len(names):
+            raise ExportError(
+                "names of the file are not complete",
+                where=path,
+                found=len(np.unique(order)),
+                expected=len(names),
+            )
+        out.append(order)
+    return out[0], out[1]
+
+
+def foreign_run(
+    case: Case, form: Formulation, nlp: NLP, layout: MatrixLayout, answer: Sol, source: str
+) -> Run:
+    """A run whose solution is a foreign solver's answer; nothing that it says is believed.
+
+    It converged when success is claimed, the recomputed KKT residuals are within LIMITS and
+    KKT_LIMIT, and the exact energy is not above the proposal's.
+    """
+    found = examine(nlp, answer.x, answer.lam_g)
+    r = found.residuals
+    f = nlp.oracle(answer.x, nlp.p)[0]
+    own = layout.unpack(answer.x)
+    soup = own.retracted()
+    start, energy = (oracle.energy(s, case.data, case.weights) for s in (case.start.soup, soup))
+    good = (
+        answer.solved
+        and r.within(LIMITS)
+        and r.primal <= KKT_LIMIT
+        and energy["total"] <= (1 + ENERGY_SLACK) * start["total"]
+    )
+    off = f"violation {r.primal:.1e}, dual {r.dual:.1e}, compl. {r.complementarity:.1e}"
+    status = "Solve_Succeeded" if good else f"{answer.status}, {off}"
+    stage = Stage(
+        name=source,
+        status=status,
+        converged=good,
+        x=answer.x,
+        lam_x=found.lam_x,
+        lam_g=found.lam_g,
+        objective=float(f),
+        iterations=0,
+        seconds=0.0,
+        history={},
+        calls={},
+    )
+    parts = {
+        f"lam_g_{group.kernel.name}": found.lam_g[np.unique(group.table.rows)]
+        for group in nlp.groups
+        if group.kernel.nc
+    }
+    solution = Solution(
+        soup=soup,
+        status=status,
+        converged=good,
+        stages=(stage,),
+        energy_start=start,
+        energy=energy,
+        residuals=residuals(nlp, soup, stage, case.data, form.min_facing),
+        multipliers={"lam_x": found.lam_x, **parts},
+        nlp=nlp.sizes(),
+        description=str(nlp),
+        seconds={},
+    )
+    chosen = {k: getattr(form, k) for k in CHOICES}
+    problem = case.problem.replace(formulation=case.problem.formulation.replace(**chosen))
+    return make_run(replace(case, problem=problem), solution)

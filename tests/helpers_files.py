@@ -1,0 +1,47 @@
+"""Writers of the files that readers are tested with."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from soup_nlp.data.formats.map_files import MAGIC
+
+
+def write_flo(path: Path, flow: np.ndarray) -> None:
+    """A Middlebury .flo file; what is not finite becomes 1e10, the mark of an unknown flow."""
+    values = np.where(np.isfinite(flow).all(axis=2, keepdims=True), flow, 1e10)
+    path.write_bytes(pieh(values.astype("<f4")))
+
+
+def write_dpt(path: Path, depth: np.ndarray) -> None:
+    """A Sintel .dpt file."""
+    path.write_bytes(pieh(depth.astype("<f4")))
+
+
+def pieh(values: np.ndarray) -> bytes:
+    """Content of a .flo or .dpt file."""
+    return MAGIC + struct.pack("<ii", values.shape[1], values.shape[0]) + values.tobytes()
+
+
+def write_cam(path: Path, K: np.ndarray) -> None:
+    """A Sintel .cam file of a camera at the origin."""
+    path.write_bytes(struct.pack("<f21d", 202021.25, *K.ravel(), *np.eye(3, 4).ravel()))
+
+
+def write_pfm(path: Path, values: np.ndarray, scale: str = "-1.0") -> None:
+    """A grey .pfm map; a negative scale is little endian."""
+    order = "<f4" if scale.startswith("-") else ">f4"
+    header = f"Pf\n{values.shape[1]} {values.shape[0]}\n{scale}\n".encode()
+    path.write_bytes(header + values[::-1].astype(order).tobytes())
+
+
+def write_kitti_flow(path: Path, flow: np.ndarray) -> None:
+    """A KITTI flow PNG; what is not finite is invalid."""
+    valid = np.isfinite(flow).all(axis=2)
+    code = np.rint(np.where(valid[..., None], flow, 0.0) * 64.0 + 2.0**15) * valid[..., None]
+    bgr = np.dstack([valid, code[..., 1], code[..., 0]]).astype(np.uint16)
+    cv2.imwrite(str(path), bgr)

@@ -1,0 +1,281 @@
+"""The documents agree with the code: links, names, keys, rooms; the recipes of docs/adding.md."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import runpy
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from helpers_model import PAPER, Tiny
+from pydantic import BaseModel, Field
+from test_layers import ALLOWED
+
+from soup_nlp.bench.solvers.registry import find_solver
+from soup_nlp.bench.solvers.task import Task
+from soup_nlp.config.problem import Problem
+from soup_nlp.data.flow.sources import flow_sources, resolve_flow
+from soup_nlp.data.inputs import Input, Resolve
+from soup_nlp.data.pair import Pair
+from soup_nlp.export.verify import Limits
+from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.report.check import check_folder
+from soup_nlp.schema.section import Section
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+PAGES = [*DOCS, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+LINK = re.compile(r"!?\[([^\]]*)\]\(([^)\s]+)\)")
+NAME = re.compile(r"`([A-Za-z_][\w.]*)`")
+
+
+def ids(path: Path) -> str:
+    return path.name
+
+
+def headings(text: str) -> set[str]:
+    """Anchors of a page's headings, as Markdown renderers make them."""
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    found = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h).strip().lower().replace(" ", "-") for h in found}
+
+
+def definitions(path: Path) -> set[str]:
+    """Names that a module defines: functions, classes, their members, constants."""
+    out = set()
+
+    def collect(body: list[ast.stmt], prefix: str) -> None:
+        for node in body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                out.add(prefix + node.name)
+                if isinstance(node, ast.ClassDef):
+                    collect(node.body, f"{prefix}{node.name}.")
+            targets = node.targets if isinstance(node, ast.Assign) else []
+            targets = [node.target] if isinstance(node, ast.AnnAssign) else targets
+            out.update(prefix + t.id for t in targets if isinstance(t, ast.Name))
+
+    collect(ast.parse(path.read_text(encoding="utf-8")).body, "")
+    return out
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_links_lead_to_files_headings_and_names(page):
+    text = page.read_text(encoding="utf-8")
+    for label, link in LINK.findall(text):
+        if "://" in link:
+            continue
+        place, _, anchor = link.partition("#")
+        target = (page.parent / place).resolve() if place else page
+        assert target.exists(), link
+        if anchor:
+            assert anchor in headings(target.read_text(encoding="utf-8")), link
+        name = NAME.fullmatch(label)
+        if target.suffix == ".py" and name:
+            assert name[1] in definitions(target), f"{name[1]} is not in {link}"
+
+
+def test_the_check_of_names_can_fail():
+    known = definitions(ROOT / "soup_nlp/geometry/soup.py")
+    assert {"Soup", "Soup.points", "Soup.lam", "reconstruct"} <= known
+    assert "Soup.nothing" not in known
+    assert "1-rays" in headings("# Title\n### 1. Rays\n```text\n# none\n```")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_files_that_are_named_exist(page):
+    text = page.read_text(encoding="utf-8")
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    for name in re.findall(
+        r"`((?:soup_nlp|tests|results|benchmarks|docs|problems)/[\w./]+)`", prose
+    ):
+        assert (ROOT / name).exists(), name
+
+
+def keys(model: type[BaseModel], prefix: str = "") -> set[str]:
+    """Every key of a problem file, and its sections."""
+    out = set()
+    for name, field in model.model_fields.items():
+        out.add(prefix + name)
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            out |= keys(field.annotation, f"{prefix}{name}.")
+    return out
+
+
+SECTIONS = "segmentation|flow|start|energy|formulation|solver|refine|expected"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_keys_that_are_named_exist(page):
+    known = keys(Problem)
+    assert "energy.bending.weights.orient" in known
+    text = page.read_text(encoding="utf-8")
+    for key in re.findall(rf"`((?:{SECTIONS})\.[a-z_.]+)(?=[`:= ])", text):
+        # a picture flow.png is none
+        assert key in known or key.endswith(".png"), key
+    for key in re.findall(rf"--set ((?:{SECTIONS})\.[a-z_.]+)=", text):
+        assert key in known, key
+
+
+def test_the_rooms_are_those_of_the_layering_test():
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    table = text.split("## Rooms")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \|[^|]*\|([^|]*)\|$", table, re.MULTILINE)
+    documented = {room: {x.strip() for x in names.split(",")} - {""} for room, names in rows}
+    assert list(documented) == list(ALLOWED)
+    for room, allowed in ALLOWED.items():
+        assert documented[room] == set(allowed) - {"errors", room}, room
+
+
+def test_every_equation_has_its_function():
+    text = (ROOT / "docs/formulation.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| \[(\d+)\]\(#([\w-]+)\) \|(.*)$", text, re.MULTILINE)
+    assert [int(number) for number, *_ in rows] == list(range(1, len(rows) + 1))
+    for number, anchor, rest in rows:
+        assert anchor.startswith(f"{number}-")
+        assert ".py)" in rest, number
+    # all ten of the paper
+    printed = re.findall(r"^\| \[\d+\]\([^)]*\) \| ([\d, ]+) \|", text, re.MULTILINE)
+    assert {int(x) for cell in printed for x in cell.split(",")} == set(range(1, 11))
+
+
+def test_the_readme_is_short():
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 130
+    assert all(len(line) <= 200 for line in lines)
+
+
+# --- the recipes of docs/adding.md -------------------------------------------------------------
+
+
+class NpzInput(Section):
+    """Two images and a camera in one .npz file."""
+
+    kind: Literal["npz"]
+    """Kind of input."""
+    path: str
+    """The file."""
+
+    def load(self, path: Resolve) -> Pair:
+        """The pair; `path` resolves the names of files."""
+        with np.load(path(self.path)) as arrays:
+            return Pair(arrays["ref"], arrays["next"], arrays["K"], arrays["K"])
+
+    def files(self) -> list[str]:
+        """Names of the files and folders that are read."""
+        return [self.path]
+
+
+class WiderProblem(Problem):
+    """A problem file with one more kind of input."""
+
+    input: Annotated[Input | NpzInput, Field(discriminator="kind")]
+    """What to solve, by its kind."""
+
+
+def test_a_dataset_is_a_section_that_loads_itself(tmp_path):
+    rng = np.random.default_rng(0)
+    wide = rng.integers(0, 255, (48, 68, 3), dtype=np.uint8)
+    np.savez(
+        tmp_path / "pair.npz", ref=wide[:, 4:], next=wide[:, :-4], K=intrinsics(60, 60, 31.5, 23.5)
+    )
+    raw = {
+        "input": {"kind": "npz", "path": "pair.npz"},
+        "base": str(tmp_path),
+        "segmentation": {"superpixels": 12, "neighbours": 4},
+    }
+    problem = WiderProblem.make(raw)
+    assert problem.input_paths()[0] == tmp_path / "pair.npz"
+    case = prepare(problem)
+    assert case.pair.size == (48, 64)
+    assert len(case) > 4
+
+
+def test_a_flow_source_is_an_entry_point(tmp_path, monkeypatch, small_room):
+    (tmp_path / "my_flow_package.py").write_text(
+        "import numpy as np\n"
+        "from soup_nlp import Flow\n"
+        "def my_flow(image_ref, image_next):\n"
+        "    shape = image_ref.shape[:2]\n"
+        "    uv = np.full((*shape, 2), 3.0, np.float32)\n"
+        "    return Flow(uv, np.ones(shape, np.float32), 'mine')\n"
+    )
+    info = tmp_path / "my_flow_package-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-flow-package\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[soup_nlp.flow]\nmine = my_flow_package:my_flow\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert "mine" in flow_sources()
+    flow = resolve_flow(small_room.pair, "mine")
+    assert flow.source == "mine"
+    assert (flow.uv == 3.0).all()
+
+
+def test_a_solver_is_any_program_that_reads_nl(tmp_path, monkeypatch):
+    solver = tmp_path / "my-solver"
+    solver.write_text(
+        f"#!{sys.executable}\n"
+        "import sys\n"
+        "import numpy as np\n"
+        "import casadi as ca\n"
+        "from soup_nlp.export.sol import write_sol\n"
+        "builder = ca.NlpBuilder()\n"
+        "builder.import_nl(sys.argv[1] + '.nl', {})\n"
+        "x = np.array(builder.x_init)\n"
+        "rows = np.arange(len(builder.g_lb))\n"
+        "write_sol(sys.argv[1] + '.sol', x, 0.0 * rows, np.arange(len(x)), rows, 'the start')\n"
+    )
+    solver.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    tiny = Tiny(neighbours=2, samples=3, boundary_samples=1)
+    form = Formulation(hessian="exact", compiled=False)
+    nlp, layout = tiny.nlp(PAPER, form)
+    task = Task(nlp, nlp, layout, tiny.soup, tiny.data, PAPER, form, Limits(seconds=60), tmp_path)
+    answer = find_solver("my-solver")(task)
+    assert answer.x == pytest.approx(nlp.x0)
+    assert answer.status == "the start"
+    assert answer.claimed
+
+
+# --- notebooks -----------------------------------------------------------------------------------
+
+NOTEBOOKS = ROOT / "docs/notebooks"
+
+
+@pytest.fixture
+def no_windows():
+    """Matplotlib draws into memory; figures are closed afterwards."""
+    backend = matplotlib.get_backend()
+    matplotlib.use("Agg")
+    yield
+    plt.close("all")
+    matplotlib.use(backend)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_windows")
+def test_a_pair_becomes_pictures():
+    names = runpy.run_path(str(NOTEBOOKS / "pair_to_pictures.py"))
+    assert names["run"].solution.residuals["so3"] < 1e-8
+    assert names["score"].mre < 0.15
+    assert len(plt.get_fignums()) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_windows")
+def test_a_file_becomes_depth_by_another_solver(monkeypatch):
+    # POUNCE need not be here; CasADi's Ipopt is
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    names = runpy.run_path(str(NOTEBOOKS / "other_solver.py"))
+    result = names["result"]
+    assert check_folder(result).ok
+    assert (result / "depth_ref.png").stat().st_size > 0
+    assert len(plt.get_fignums()) == 1

@@ -1,0 +1,87 @@
+"""Problem files: what they accept, how they are dumped, and what their errors say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from soup_nlp.config.problem import dump_problem, load_problem, make_problem
+from soup_nlp.errors import ConfigError
+
+PROBLEMS = sorted((Path(__file__).resolve().parents[1] / "problems").glob("*.yaml"))
+MOTORCYCLE = "input: {kind: motorcycle}\n"
+
+
+@pytest.mark.parametrize("path", PROBLEMS, ids=lambda path: path.stem)
+def test_a_dumped_problem_is_the_same_problem(path, tmp_path):
+    problem = load_problem(path)
+    text = dump_problem(problem)
+    (tmp_path / "again.yaml").write_text(text)
+    assert load_problem(tmp_path / "again.yaml") == problem
+    # other readers of YAML understand it too, and every key has its comment
+    assert yaml.safe_load(text)["segmentation"]["superpixels"] == problem.segmentation.superpixels
+    assert all("  # " in line for line in text.splitlines())
+
+
+def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path):
+    path = tmp_path / "p.yaml"
+    path.write_text(f"{MOTORCYCLE}seed: 010\nname: no\nsegmentation: {{beta: 1e-3}}\n")
+    problem = load_problem(path)
+    assert (problem.seed, problem.name, problem.segmentation.beta) == (10, "no", 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("name: x\n", ["missing key", "expected: input"]),
+        ("input: {}\n", ["missing key", "expected: input.kind", "try: every input has a kind"]),
+        ("input:\n  kind: scene\n", ["missing key", "line 1", "expected: input.scene"]),
+        ("input: {kind: movie}\n", ["line 1, key input.kind", "'movie'", "one of files, folder"]),
+        ("input: 3\n", ["key input", "found: 3", "a section with keys of its own"]),
+        ("input: {kind: scene, scene: stret}\n", ["input.scene", "did you mean street?"]),
+        (
+            "input: {kind: kitti2012, root: x, index: 138}\n",
+            ["key input.index", "found: 138", 'write it in quotes: "138"'],
+        ),
+        (
+            "input: {kind: files, ref: a, next: b, intrinsics: [1, 2, 3]}\n",
+            ["key input.intrinsics", "a list of 4 or more, or a valid string"],
+        ),
+        (
+            MOTORCYCLE + "segmentation:\n  superpixls: 7\n",
+            ["unknown key", "line 3, key segmentation.superpixls", "did you mean superpixels?"],
+        ),
+        (MOTORCYCLE + "superpixels: 3\n", ["did you mean segmentation.superpixels?"]),
+        (MOTORCYCLE + "sed: 5\nname: 3\n", ["(and 1 more mistake)"]),
+        (MOTORCYCLE + "flow: {dis: {patch_stride: 30}}\n", ["patch_stride at most patch_size"]),
+        (MOTORCYCLE + "seed: 1\nseed: 2\n", ["given twice", "line 3", "found: seed"]),
+        ("- 1\n", ["must be a mapping", "found: list"]),
+        ("a: [\n", ["not YAML", "line 2"]),
+    ],
+)
+def test_an_error_says_where_it_is_and_what_was_expected(text, parts, tmp_path):
+    path = tmp_path / "p.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_problem(path)
+    for part in [str(path), *parts]:
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("solver.eps=[1, -1]", ["--set solver.eps", "key solver.eps"]),
+        ("segmentation.boundary_samples=none", ["a valid integer, or all"]),
+        ("input.kind.x=3", ["goes below a value", "kind is a section"]),
+        ("nonsense", ["override is not key=value"]),
+        ("seed=[1", ["not YAML", "--set seed=[1"]),
+    ],
+)
+def test_an_override_is_checked_like_the_file(override, parts):
+    with pytest.raises(ConfigError) as caught:
+        make_problem({"input": {"kind": "motorcycle"}}, [override])
+    for part in parts:
+        assert part in str(caught.value)
