@@ -235,10 +235,8 @@ def measure(spec: Spec) -> dict[str, Any]:
 
 
 def _last(values: Float | None) -> float | None:
-    """Last finite entry of an array; None where there is none."""
-    if values is None or not len(values) or not np.isfinite(values[-1]):
-        return None
-    return float(values[-1])
+    """Last entry of an array; None where there is none."""
+    return None if values is None or not len(values) else float(values[-1])
 
 
 def schedule(kind: str, options: SolverOptions) -> tuple[float, ...]:
