@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from soup_nlp.bench.analyses_measures import refined
-from soup_nlp.bench.reference_solvers import EPS, levenberg_marquardt
+from soup_nlp.bench.reference_solver import EPS, levenberg_marquardt
 from soup_nlp.bench.rows import Row, Say
 from soup_nlp.bench.speed import REFERENCE_ITERATIONS, Spec, plan, problem_of
 from soup_nlp.bench.studies import made_on, run_study, settings_table

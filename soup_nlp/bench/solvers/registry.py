@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.bench.reference_solvers import EPS, ReferenceSolve, lbfgs, levenberg_marquardt
+from soup_nlp.bench.reference_solver import EPS, ReferenceSolve, levenberg_marquardt
 from soup_nlp.bench.solvers.plugins import NEAR, PLUGINS, plugin
 from soup_nlp.bench.solvers.task import Answer, Solver, Task, Trace
 from soup_nlp.errors import SolverError
@@ -129,7 +129,6 @@ def available() -> dict[str, Solver]:
         out["pounce"] = partial(_ampl, "pounce")
         out["pounce-tuned"] = partial(_ampl, "pounce", near=True)
     out["lm"] = partial(reference, levenberg_marquardt)
-    out["lbfgs"] = partial(reference, lbfgs)
     if importlib.util.find_spec("pyscipopt"):
         out["scip"] = scip
     return out
