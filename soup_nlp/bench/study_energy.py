@@ -50,20 +50,17 @@ def measure_refine(scene: str, superpixels: int) -> Row:
     }
 
 
-def _by_method(name: str, form: str, word: str = "") -> Cells:
+def _by_method(key: str, form: str, heads: tuple[str, ...]) -> Cells:
     """Columns of start, either half and both."""
-    methods = {
-        f"{name} start": "start",
-        f"{word}refinement only": "refinement",
-        f"{word}NLP only": "nlp",
-        f"{word}both": "solution",
-    }
-    key = name.lower() if name == "MRE" else "energy"
-    return {
-        title: lambda row, own=own: format(row[key][own], form) for title, own in methods.items()
-    }
+
+    def cell(name: str) -> Callable[[Row], str]:
+        return lambda row: format(row[key][name], form)
+
+    names = "start", "refinement", "nlp", "solution"
+    return {head: cell(name) for head, name in zip(heads, names, strict=True)}
 
 
+HALVES = ("refinement only", "NLP only", "both")
 REFINE = Study(
     "table",
     "Flow by DIS, {superpixels} superpixels wanted, K = 15, 50 particles, at most 10 rounds; MRE"
@@ -73,11 +70,11 @@ REFINE = Study(
     measure_refine,
     {
         "scene": setting("scene"),
-        **_by_method("E", ".2f"),
+        **_by_method("energy", ".2f", ("E start", *HALVES)),
         "below NLP": lambda r: f"{1 - r['energy']['solution'] / r['energy']['nlp']:.1%}",
         "gap": number("gap", ".2%"),
         "monotone": lambda r: "yes" if r["monotone"] else "NO",
-        **_by_method("MRE", ".5f", "MRE "),
+        **_by_method("mre", ".5f", ("MRE start", *(f"MRE {h}" for h in HALVES))),
         "seconds": number("refine_seconds", ".0f"),
         "GiB": lambda r: " / ".join(f"{gib:.2f}" for gib in r["gib"]),
         "NLP": number("status"),
@@ -118,9 +115,9 @@ def _solved(case: Case, method: str) -> tuple[Soup, float]:
     return r.soup, r.energy["total"]
 
 
-def _method(row: Row, place: int) -> str:
-    energies = [row[k][place] for k in ("before", "after") if k in row]
-    return " -> ".join(f"{energy:.2f}" for energy in energies)
+def _method(place: int) -> Callable[[Row], str]:
+    keys = "before", "after"
+    return lambda row: " -> ".join(f"{row[k][place]:.2f}" for k in keys if k in row)
 
 
 def _to_least(key: str) -> Callable[[Row], str]:
@@ -135,7 +132,7 @@ METHODS_UNREFINED = Study(
     {
         "pair, seed": lambda r: f"{r['settings']['scene']}, {r['settings']['seed']}",
         "N": number("superpixels"),
-        **{name: lambda r, k=k: _method(r, k) for k, name in enumerate(METHODS)},
+        **{name: _method(k) for k, name in enumerate(METHODS)},
         "shipped / least": _to_least("before"),
     },
 )
