@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -12,8 +11,10 @@ from scipy.stats import linregress
 
 from soup_nlp.bench import speed, speed_gate, speed_report
 from soup_nlp.bench.processes import machine
-from soup_nlp.bench.rows import measure_all, read_rows
-from soup_nlp.bench.speed import Spec, problem_of, schedule
+from soup_nlp.bench.rows import read_rows
+from soup_nlp.bench.speed import problem_of, schedule
+from soup_nlp.bench.speed_report import SPEED
+from soup_nlp.bench.studies import run_alone
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.solve.solver_options import SolverOptions
@@ -21,9 +22,13 @@ from soup_nlp.solve.solver_options import SolverOptions
 EXPONENT = 1.3
 
 
-def made(spec: Spec, **changes) -> dict:
+def run_settings(scene: str, superpixels: int, neighbours: int) -> dict:
+    return {"scene": scene, "superpixels": superpixels, "neighbours": neighbours, "seed": 0}
+
+
+def made(settings: dict, **changes) -> dict:
     """A record as `speed.measure` writes it, its costs a power of N."""
-    n = spec.superpixels
+    n = settings["superpixels"]
     cost = 1e-3 * n**EXPONENT
     y = {
         "status": "Converged",
@@ -72,53 +77,24 @@ def made(spec: Spec, **changes) -> dict:
         "reference": y,
     }
     record |= changes
-    return {"key": spec.key, "code": "c0de", "spec": asdict(spec), **record}
+    return {"key": f"table {n}", "code": "c0de", "settings": settings, **record}
 
 
 def test_the_plan_has_every_run_once_small_ones_first():
-    specs = speed.plan(["street", "motorcycle"], [500, 250], [20, 10], [3, 4], width=512)
-    assert len({s.key for s in specs}) == len(specs) == 2 * 2 * (2 + 1)
-    assert [s.superpixels for s in specs] == sorted(s.superpixels for s in specs)
-    assert {s.seed for s in specs if s.scene == "motorcycle"} == {3}
-    assert {s.width for s in specs} == {512}
-    for spec in specs:
-        assert Spec.from_dict(json.loads(json.dumps(asdict(spec)))) == spec
-
-
-def test_measurements_resume(tmp_path, monkeypatch):
-    calls = []
-
-    def measure(spec):
-        calls.append(spec.key)
-        if spec.superpixels == 500:
-            return {"error": "broke"}
-        return {k: v for k, v in made(spec).items() if k not in ("key", "code", "spec")}
-
-    monkeypatch.setattr(speed, "run_alone", measure)
-    specs = speed.plan(["street"], [250, 500], [10], [0])
-
-    def go(*chosen):
-        return measure_all([spec.job() for spec in chosen], tmp_path / "records.jsonl")
-
-    first = go(*specs)
-    assert [r["key"] for r in first] == [s.key for s in specs]
-    assert first[1]["error"] == "broke"
-    calls.clear()
-    again = go(*specs)
-    assert again[0] == json.loads(json.dumps(first[0]))
-    # what failed is tried again, another setting is another run
-    assert calls == [specs[1].key]
-    other = replace(specs[0], overrides=("solver.tol=0.5",))
-    go(other)
-    assert calls[1:] == [other.key]
+    settings = speed.plan(["street", "motorcycle"], [500, 250], [20, 10], [3, 4], width=512)
+    assert len({json.dumps(s) for s in settings}) == len(settings) == 2 * 2 * (2 + 1)
+    sizes = [s["superpixels"] for s in settings]
+    assert sizes == sorted(sizes)
+    assert {s["seed"] for s in settings if s["scene"] == "motorcycle"} == {3}
+    assert {s["width"] for s in settings} == {512}
 
 
 def test_a_run_that_fails_says_why(monkeypatch):
-    record = speed.run_alone(Spec("nowhere", 100, 8))
+    record = run_alone(SPEED, run_settings("nowhere", 100, 8))
     assert "nowhere" in record["error"]
     assert "street" in record["error"]
     monkeypatch.setattr("soup_nlp.bench.processes.GRACE", 0.0)
-    late = speed.run_alone(Spec("street", 60, 8), seconds=0.2)
+    late = run_alone(SPEED, run_settings("street", 60, 8), seconds=0.2)
     assert late["error"] == "no answer after 0.2 s"
 
 
@@ -178,35 +154,30 @@ def test_growth_of_all_scenes_has_a_factor_for_each():
 
 
 def test_table_and_plots(tmp_path):
-    specs = speed.plan(["street", "room"], [250, 500], [10], [0])
-    records = [made(s) for s in specs]
-    bare = made(Spec("room", 500, 20), converged=False, mre={})
-    broken = {"key": "b-key", "spec": asdict(specs[0]), "error": "no answer"}
-    text = speed_report.report([*records, bare, broken], machine(), "2026-01-01")
+    records = [made(s) for s in speed.plan(["street", "room"], [250, 500], [10], [0])]
+    bare = made(run_settings("room", 500, 20), converged=False, mre={})
+    broken = {"key": "b-key", "settings": run_settings("street", 250, 10), "error": "no answer"}
+    SPEED.write(tmp_path, [*records, bare, broken])
+    text = (tmp_path / "table.md").read_text()
     assert "4 of 5 runs converged" in text
     assert "1.0200 to 1.0200 times" in text
     assert "1.50 to 1.50 times" in text
     assert "- b-key: no answer" in text
     assert f"| street | 10 | 250 to 500 | {EXPONENT:.2f} |" in text
-    assert text.count("2026-01-01") == 1
-    assert "No run" in speed_report.report([broken], machine(), "d")
-    for name, plot in (
-        ("growth", speed_report.plot_growth),
-        ("phases", speed_report.plot_phases),
-        ("energy", speed_report.plot_energy),
-    ):
-        plot(tmp_path / f"{name}.png", [*records, bare])
+    for name in ("growth", "phases", "energy"):
         assert (tmp_path / f"{name}.png").stat().st_size > 5000
+    SPEED.write(tmp_path, [broken])
+    assert "No run" in (tmp_path / "table.md").read_text()
 
 
 @pytest.fixture
 def kept(tmp_path):
-    spec = Spec("street", 250, 10)
+    own = run_settings("street", 250, 10)
     path = tmp_path / "baseline.json"
-    path.write_text(json.dumps(speed_gate.baseline([made(spec)], machine())))
-    specs, values = speed_gate.read_baseline(path)
-    assert specs == [spec]
-    return spec, values
+    path.write_text(json.dumps(speed_gate.baseline([made(own)], machine())))
+    runs = speed_gate.read_baseline(path)
+    assert [run.settings for run in runs] == [own]
+    return own, runs
 
 
 def worse(findings) -> set[str]:
@@ -214,40 +185,40 @@ def worse(findings) -> set[str]:
 
 
 def test_the_gate_holds_for_the_same_and_for_better(kept):
-    spec, values = kept
-    findings = list(speed_gate.check([made(spec)], values))
+    own, runs = kept
+    findings = list(speed_gate.check([made(own)], runs))
     assert not worse(findings)
     assert {f.name for f in findings} == {*speed_gate.LIMITS, "converged"}
-    better = made(spec, energy={"total": 40.0}, iterations=10)
-    assert not worse(speed_gate.check([better], values))
+    better = made(own, energy={"total": 40.0}, iterations=10)
+    assert not worse(speed_gate.check([better], runs))
 
 
 def test_the_gate_sees_what_is_worse(kept):
-    spec, values = kept
+    own, runs = kept
     cases = {
         "iterations": {"iterations": 140},
         "converged": {"converged": False},
     }
     for name, change in cases.items():
-        assert worse(speed_gate.check([made(spec, **change)], values)) == {name}
-    more = made(spec, energy={"total": 51.0 * 1.01})
-    assert worse(speed_gate.check([more], values)) == {"energy", "energy_to_reference"}
-    dense = copy.deepcopy(made(spec))
+        assert worse(speed_gate.check([made(own, **change)], runs)) == {name}
+    more = made(own, energy={"total": 51.0 * 1.01})
+    assert worse(speed_gate.check([more], runs)) == {"energy", "energy_to_reference"}
+    dense = copy.deepcopy(made(own))
     dense["sizes"]["hessian_nonzeros"] *= 2
-    assert worse(speed_gate.check([dense], values)) == {"nonzeros"}
-    assert worse(speed_gate.check([], values)) == {"run"}
-    failed = {"key": spec.key, "error": "broke"}
-    assert worse(speed_gate.check([failed], values)) == {"run"}
+    assert worse(speed_gate.check([dense], runs)) == {"nonzeros"}
+    assert worse(speed_gate.check([], runs)) == {"run"}
+    failed = {"key": "x", "settings": own, "error": "broke"}
+    assert worse(speed_gate.check([failed], runs)) == {"run"}
 
 
 def test_the_gate_looks_at_ratios_not_at_seconds(kept):
-    spec, values = kept
-    slow = copy.deepcopy(made(spec))
+    own, runs = kept
+    slow = copy.deepcopy(made(own))
     slow["cpu"]["nlp"] *= 10
-    assert worse(speed_gate.check([slow], values)) == {"time_to_reference"}
+    assert worse(speed_gate.check([slow], runs)) == {"time_to_reference"}
     # a machine that is ten times slower at everything
     slow["reference"]["cpu_seconds"] *= 10
-    assert not worse(speed_gate.check([slow], values))
+    assert not worse(speed_gate.check([slow], runs))
 
 
 def test_files_that_are_no_baseline(tmp_path):
@@ -262,13 +233,13 @@ def test_files_that_are_no_baseline(tmp_path):
         speed_gate.baseline([{"key": "x", "error": "broke"}], {})
 
 
-def test_the_spec_becomes_the_problem():
-    p = problem_of(Spec("room", 300, 12, 5, 512, 218, overrides=("solver.tol=0.5",)))
+def test_settings_become_the_problem():
+    p = problem_of("room", 300, 12, 5, 512, 218, overrides=["solver.tol=0.5"])
     assert (p.input.scene, p.input.seed, p.input.width, p.seed) == ("room", 5, 512, 5)
     assert (p.segmentation.superpixels, p.segmentation.neighbours) == (300, 12)
     assert p.solver.tol == 0.5
     assert not p.refine.enabled
-    assert problem_of(Spec("motorcycle", 300, 12)).input.kind == "motorcycle"
+    assert problem_of("motorcycle", 300, 12).input.kind == "motorcycle"
 
 
 def test_the_reference_solver_ends_at_the_solvers_smoothing():
@@ -302,7 +273,7 @@ def test_a_real_run_its_table_and_its_gate(tmp_path, capsys):
     small += ["--set", "formulation.compiled=false"]
     words = ["bench", "speed", *size, *small, "--quiet", "--out", str(out)]
     assert main([*words, "--write-baseline", str(base)]) == 0
-    (record,) = read_rows(out / "records.jsonl")
+    (record,) = read_rows(out / "table.jsonl")
     assert record["energy"]["total"] < record["energy_start"]["total"]
     assert record["reference"]["energy"]["total"] < record["energy_start"]["total"]
     assert record["peak_bytes"] > 5e7

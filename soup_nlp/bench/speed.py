@@ -5,20 +5,17 @@ from __future__ import annotations
 import resource
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from itertools import product
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.bench.processes import alone
 from soup_nlp.bench.reference_solver import levenberg_marquardt
-from soup_nlp.bench.rows import Job, Row
+from soup_nlp.bench.rows import Row
+from soup_nlp.bench.studies import Settings, grid
 from soup_nlp.config.problem import Problem, dump_problem, make_problem
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
@@ -35,65 +32,20 @@ HISTORY_POINTS = 60
 """Rows of the reference solver's history that are kept, enough for a plot."""
 
 
-@dataclass(frozen=True)
-class Spec:
-    """One run.
-
-    Attributes:
-        scene: A rendered scene, or "motorcycle".
-        superpixels: Wanted number N.
-        neighbours: K of the K-NN graph.
-        seed: Of the scene and of all draws.
-        width: Columns of a rendered scene.
-        height: Rows of a rendered scene.
-        overrides: Of the problem, e.g. "solver.max_iter=200".
-    """
-
-    scene: str
-    superpixels: int
-    neighbours: int
-    seed: int = 0
-    width: int = 1024
-    height: int = 436
-    overrides: tuple[str, ...] = ()
-
-    @property
-    def key(self) -> str:
-        """What identifies the run, whatever the code: street-N250-K10-s0-1024x436."""
-        size = "" if self.scene == "motorcycle" else f"-{self.width}x{self.height}"
-        own = "".join(f"-{text}" for text in self.overrides)
-        return f"{self.scene}-N{self.superpixels}-K{self.neighbours}-s{self.seed}{size}{own}"
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Spec:
-        """The spec that `dataclasses.asdict` took apart."""
-        return cls(**{**values, "overrides": tuple(values["overrides"])})
-
-    def job(self) -> Job:
-        """The run in a process of its own with one thread."""
-        return Job({"key": self.key, "spec": asdict(self)}, partial(run_alone, self))
-
-
 def plan(
     scenes: Sequence[str],
     sizes: Sequence[int],
     neighbours: Sequence[int],
     seeds: Sequence[int],
     **others: Any,
-) -> list[Spec]:
-    """Every combination, small ones first; the motorcycle is one pair, so it has the first seed."""
-    grid = product(sorted(sizes), sorted(neighbours), scenes, seeds)
+) -> list[Settings]:
+    """Settings of every run, small ones first; the motorcycle is one pair: it has one seed."""
+    every = grid(superpixels=sorted(sizes), neighbours=sorted(neighbours), scene=scenes, seed=seeds)
     return [
-        Spec(scene, n, k, seed, **others)
-        for n, k, scene, seed in grid
-        if scene != "motorcycle" or seed == seeds[0]
+        {**own, **others}
+        for own in every
+        if own["scene"] != "motorcycle" or own["seed"] == seeds[0]
     ]
-
-
-def run_alone(spec: Spec, seconds: float = 7200.0) -> Row:
-    """`measure` in a process of its own with one thread; {"error": ...} where it failed."""
-    with tempfile.TemporaryDirectory() as folder:
-        return alone(partial(measure, spec), Path(folder), seconds)
 
 
 class Clocks:
@@ -119,31 +71,47 @@ class Clocks:
         self.lap(name)
 
 
-def problem_of(spec: Spec) -> Problem:
-    """The merged problem of a spec; the NLP alone, without refinement.
+def problem_of(
+    scene: str,
+    superpixels: int,
+    neighbours: int,
+    seed: int = 0,
+    width: int = 1024,
+    height: int = 436,
+    overrides: Sequence[str] = (),
+) -> Problem:
+    """The merged problem of a run; the NLP alone, without refinement.
+
+    Args:
+        scene: A rendered scene, or "motorcycle".
+        superpixels: Wanted number N.
+        neighbours: K of the K-NN graph.
+        seed: Of the scene and of all draws.
+        width: Columns of a rendered scene.
+        height: Rows of a rendered scene.
+        overrides: Of the problem, e.g. "solver.max_iter=200".
 
     Raises:
         ConfigError: an override is wrong.
     """
     source: dict[str, Any] = {"kind": "motorcycle"}
-    if spec.scene != "motorcycle":
-        source = {"kind": "scene", "scene": spec.scene, "seed": spec.seed}
-        source |= {"width": spec.width, "height": spec.height}
+    if scene != "motorcycle":
+        source = {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height}
     raw = {
-        "name": spec.scene,
-        "seed": spec.seed,
+        "name": scene,
+        "seed": seed,
         "input": source,
-        "segmentation": {"superpixels": spec.superpixels, "neighbours": spec.neighbours},
+        "segmentation": {"superpixels": superpixels, "neighbours": neighbours},
         "refine": {"enabled": False},
     }
-    return make_problem(raw, spec.overrides, where="bench speed")
+    return make_problem(raw, overrides, where="bench speed")
 
 
-def measure(spec: Spec) -> dict[str, Any]:
+def measure(**settings: Any) -> Row:
     """Solve a problem and say what every stage cost.
 
     Args:
-        spec: What to solve.
+        settings: Of `problem_of`.
 
     Returns:
         Plain numbers: "sizes", "wall" and "cpu" (seconds by stage; build, functions and linear
@@ -155,7 +123,7 @@ def measure(spec: Spec) -> dict[str, Any]:
         SoupError: the input cannot be used.
     """
     clocks = Clocks()
-    problem = problem_of(spec)
+    problem = problem_of(**settings)
     case = prepare(problem, on_stage=clocks.lap)
     clocks.lap("weights")
     with clocks.stage("nlp"):

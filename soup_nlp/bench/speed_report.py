@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from soup_nlp.bench.processes import machine
 from soup_nlp.bench.rows import failed
+from soup_nlp.bench.speed import measure
+from soup_nlp.bench.studies import Study
 from soup_nlp.bench.tables import columns, failures, figure, joined, save, show, table
+from soup_nlp.storage.atomic import write_text
 
 Row = Mapping[str, Any]
 Cell = Callable[[Row], str]
@@ -68,10 +73,10 @@ def _at(form: str, *path: str) -> Cell:
 
 
 IDENTITY: dict[str, Cell] = {
-    "pair": lambda r: r["spec"]["scene"],
-    "seed": _at("d", "spec", "seed"),
+    "pair": _at("", "settings", "scene"),
+    "seed": _at("d", "settings", "seed"),
     "N": _at("d", "sizes", "superpixels"),
-    "K": _at("d", "spec", "neighbours"),
+    "K": _at("d", "settings", "neighbours"),
 }
 COLUMNS: dict[str, Cell] = {
     **IDENTITY,
@@ -90,6 +95,7 @@ COLUMNS: dict[str, Cell] = {
     "MRE LM": _at(".4f", "reference", "mre"),
     "dual inf.": _at(".1e", "residuals", "dual_infeasibility"),
     "constraints": _at(".1e", "residuals", "nlp_infeasibility"),
+    "nnz H": _at("d", "sizes", "hessian_nonzeros"),
     "GB": lambda r: f"{r['peak_bytes'] / 2**30:.2f}",
     "status": lambda r: r["status"].replace("_", " "),
 }
@@ -99,16 +105,6 @@ STAGES: dict[str, Cell] = {
     **{name: _at(".2f", "wall", name) for name in PHASES},
     "compiler, CPU s": _at(".2f", "cpu", "compiler"),
     "outside, CPU s": lambda r: f"{outside(r):.2f}",
-}
-SIZES: dict[str, Cell] = {
-    **IDENTITY,
-    "K-NN edges": _at("d", "sizes", "knn_edges"),
-    **{name: _at("d", "sizes", name) for name in ("pairs", "variables", "constraints")},
-    "nnz J": _at("d", "sizes", "jacobian_nonzeros"),
-    "nnz H": _at("d", "sizes", "hessian_nonzeros"),
-    "SO(3)": _at(".1e", "residuals", "so3"),
-    "normals": _at(".1e", "residuals", "normal"),
-    **{name: _at(".1e", "residuals", name) for name in ("simplex", "visible", "complementarity")},
 }
 
 
@@ -163,7 +159,7 @@ def growth_lines(records: Sequence[Row]) -> list[str]:
             groups["all", k] = [r for group in own.values() for r in group]
     for (scene, k), group in groups.items():
         n = [r["sizes"]["superpixels"] for r in group]
-        scenes = [r["spec"]["scene"] for r in group]
+        scenes = [r["settings"]["scene"] for r in group]
         fits = [fit(n, [cost(r) for r in group], scenes) for cost in COSTS.values()]
         if any(fits):
             told = ["-" if f is None else str(f) for f in fits]
@@ -176,9 +172,9 @@ def conclusion(records: Sequence[Row]) -> str:
     if not records:
         return "No run ended with a result."
     converged = sum(bool(r["converged"]) for r in records)
-    n, k = max((r["spec"]["superpixels"], r["spec"]["neighbours"]) for r in records)
-    large = [r for r in records if r["spec"]["superpixels"] == n]
-    costs = [r["cpu"]["nlp"] for r in large if r["spec"]["neighbours"] == k]
+    n, k = max((r["settings"]["superpixels"], r["settings"]["neighbours"]) for r in records)
+    large = [r for r in records if r["settings"]["superpixels"] == n]
+    costs = [r["cpu"]["nlp"] for r in large if r["settings"]["neighbours"] == k]
     ratios, times = [_energy_ratio(r) for r in records], [_time_ratio(r) for r in records]
     return (
         f"{converged} of {len(records)} runs converged to their tolerance."
@@ -191,40 +187,45 @@ def conclusion(records: Sequence[Row]) -> str:
     )
 
 
-def report(records: Sequence[Row], machine: Mapping[str, str], day: str) -> str:
-    """results/speed/table.md.
+class SpeedStudy(Study):
+    """`bench speed`: a study whose page has several tables and plots."""
 
-    Args:
-        records: Of `measure_all`, failures included.
-        machine: Of `processes.machine`.
-        day: Date of the measurement.
-    """
-    good = [r for r in records if not failed(r)]
-    note = (
-        "CPU s and wall s: the whole NLP (presolve, build, constrained NLP). its: of the presolve"
-        " and of Ipopt. E: exact energy, LM: on-manifold Levenberg-Marquardt with reweighting from"
-        " the same start on the same smoothing widths, in the same process. MRE after median"
-        " scale, no cap. dual inf., constraints: recomputed at Ipopt's answer. GB: peak of the"
-        " process before the reference solver runs."
-    )
-    sections = {
-        "Growth: cost = factor N^p": growth_lines(good),
-        "Wall seconds by stage": columns(STAGES, good),
-        "Sizes and residuals of the delivered soup": columns(SIZES, good),
-        "Machine": [f"- {name}: {value}" for name, value in {"date": day, **machine}.items()],
-        "Limits": [LIMITS],
-    }
-    lines = ["# Speed and growth", "", conclusion(good), "", *columns(COLUMNS, good), "", note]
-    lines += failures([dict(r) for r in records])
-    for title, body in sections.items():
-        lines += ["", f"## {title}", "", *body] if body else []
-    return joined(lines)
+    def write(self, out: Path, rows: Sequence[dict[str, Any]]) -> None:
+        """Table and plots of the runs that are there."""
+        good = [r for r in rows if not failed(r)]
+        sections = {
+            "Growth: cost = factor N^p": growth_lines(good),
+            "Wall seconds by stage": columns(STAGES, good),
+            "Machine": [f"- {k}: {v}" for k, v in {"date": date.today(), **machine()}.items()],
+            "Limits": [LIMITS],
+        }
+        lines = ["# Speed and growth", "", conclusion(good), ""]
+        lines += [*columns(self.cells, good), "", self.note, *failures(list(rows))]
+        for title, body in sections.items():
+            lines += ["", f"## {title}", "", *body] if body else []
+        write_text(out / f"{self.name}.md", joined(lines))
+        if good:
+            plot_growth(out / "growth.png", good)
+            plot_phases(out / "phases.png", good)
+            plot_energy(out / "energy.png", good)
+
+
+SPEED = SpeedStudy(
+    "table",
+    "CPU s and wall s: the whole NLP (presolve, build, constrained NLP). its: of the presolve"
+    " and of Ipopt. E: exact energy, LM: on-manifold Levenberg-Marquardt with reweighting from"
+    " the same start on the same smoothing widths, in the same process. MRE after median"
+    " scale, no cap. dual inf., constraints: recomputed at Ipopt's answer. GB: peak of the"
+    " process before the reference solver runs.",
+    measure,
+    COLUMNS,
+)
 
 
 def _groups(records: Sequence[Row]) -> dict[tuple[str, int], list[Row]]:
     out: dict[tuple[str, int], list[Row]] = defaultdict(list)
     for r in records:
-        out[r["spec"]["scene"], r["spec"]["neighbours"]].append(r)
+        out[r["settings"]["scene"], r["settings"]["neighbours"]].append(r)
     return dict(sorted(out.items()))
 
 
@@ -246,7 +247,7 @@ def plot_growth(path: Path, records: Sequence[Row]) -> None:
     left.set_title("NLP (o), reference solver (x), all stages outside (.)", fontsize=10)
     left.legend(fontsize=8)
     right.set_title("peak memory", fontsize=10)
-    sizes = sorted({r["spec"]["superpixels"] for r in records})
+    sizes = sorted({r["settings"]["superpixels"] for r in records})
     for axes, unit in ((left, "CPU s"), (right, "GB")):
         axes.set(xlabel="superpixels N", ylabel=unit)
         axes.set_xticks(sizes, [str(n) for n in sizes])
@@ -261,7 +262,7 @@ def plot_phases(path: Path, records: Sequence[Row]) -> None:
     """Stacked wall seconds by stage, a bar a run."""
     picture = figure(9, 0.32 * len(records) + 1.4)
     axes = picture.subplots()
-    keys = [r["key"] for r in records]
+    keys = [r["key"].partition(" ")[2] for r in records]
     begin = np.zeros(len(records))
     for index, part in enumerate(p for p in PHASES if p not in ("load", "weights")):
         width = np.array([r["wall"].get(part, 0.0) for r in records])
@@ -290,7 +291,7 @@ def plot_energy(path: Path, records: Sequence[Row], most: int = 12) -> None:
         panel = picture.add_subplot(rows, width, index + 1)
         panel.plot(*np.transpose(r["reference"]["history"]), label="Levenberg-Marquardt")
         panel.plot(r["wall"]["nlp"], r["energy"]["total"], "k*", label="Ipopt, end")
-        panel.set_title(r["key"], fontsize=7)
+        panel.set_title(r["key"].partition(" ")[2], fontsize=7)
         panel.tick_params(labelsize=7)
         if not index:
             panel.legend(fontsize=7)

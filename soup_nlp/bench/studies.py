@@ -43,13 +43,13 @@ class Study:
     cells: Cells
     summary: Callable[[Sequence[Row]], list[str]] | None = None
 
-    def page(self, rows: Sequence[Row]) -> str:
-        """The page of the rows that are there; those that failed are listed at its end."""
+    def write(self, out: Path, rows: Sequence[Row]) -> None:
+        """Write the page of the rows that are there; those that failed are listed at its end."""
         good = [r for r in rows if not failed(r)]
         note = self.note.format(**rows[0]["settings"])
         lines = [f"{note} {date.today()}, {platform.machine()}.", "", *columns(self.cells, good)]
         lines += self.summary(good) if self.summary else []
-        return joined([*lines, *failures(list(rows))])
+        write_text(out / f"{self.name}.md", joined([*lines, *failures(list(rows))]))
 
 
 def grid(**values: Sequence[Any]) -> list[Settings]:
@@ -68,30 +68,31 @@ def number(name: str, form: str = "") -> Callable[[Row], str]:
 
 
 def run_study(
-    study: Study, out: Path, settings: Sequence[Settings], say: Say | None = None
+    study: Study,
+    out: Path,
+    settings: Sequence[Settings],
+    say: Say | None = None,
+    page: bool = True,
 ) -> list[Row]:
-    """Measure every setting and write OUT/NAME.md after every row; rows go to the .jsonl beside it.
+    """Measure every setting; rows go to OUT/NAME.jsonl.
 
     Args:
         study: What is measured.
         out: Folder.
         settings: Keyword arguments of `study.measure`, plain JSON values.
         say: Called after every new row.
+        page: Write OUT/NAME.md after every row.
     """
-
-    def work(own: Settings) -> Row:
-        with tempfile.TemporaryDirectory() as folder:
-            return alone(partial(study.measure, **own), Path(folder))
-
-    page = out / f"{study.name}.md"
-    page.parent.mkdir(parents=True, exist_ok=True)
     jobs = []
     for own in settings:
-        key = f"{study.name} {' '.join(map(str, own.values()))}"
-        jobs.append(Job({"key": key, "settings": own}, partial(work, own)))
-    return measure_all(
-        jobs,
-        page.with_suffix(".jsonl"),
-        say=say,
-        after=lambda rows: write_text(page, study.page(rows)),
-    )
+        key = f"{study.name} {' '.join(str(v) for v in own.values() if v != [])}"
+        jobs.append(Job({"key": key, "settings": own}, partial(run_alone, study, own)))
+    path = out / f"{study.name}.jsonl"
+    after = partial(study.write, out) if page else None
+    return measure_all(jobs, path, say=say, after=after)
+
+
+def run_alone(study: Study, settings: Settings, seconds: float = 7200.0) -> Row:
+    """The row of one setting, or why it failed."""
+    with tempfile.TemporaryDirectory() as folder:
+        return alone(partial(study.measure, **settings), Path(folder), seconds)

@@ -12,7 +12,7 @@ from soup_nlp.bench.accuracy import scores
 from soup_nlp.bench.analyses_measures import refined
 from soup_nlp.bench.reference_solver import EPS, levenberg_marquardt
 from soup_nlp.bench.rows import Row
-from soup_nlp.bench.speed import REFERENCE_ITERATIONS, Spec, problem_of
+from soup_nlp.bench.speed import REFERENCE_ITERATIONS, problem_of
 from soup_nlp.bench.studies import Cells, Study, number, setting
 from soup_nlp.bench.suite_pairs import RENDERED
 from soup_nlp.config.problem import make_problem
@@ -93,7 +93,7 @@ METHODS = {
 
 def measure_methods(scene: str, superpixels: int, neighbours: int, seed: int, refine: bool) -> Row:
     """Exact energies from one start by every method, and what the refinement makes of them."""
-    case = prepare(problem_of(Spec(scene, superpixels, neighbours, seed)))
+    case = prepare(problem_of(scene, superpixels, neighbours, seed))
     solved = [_solved(case, method) for method in METHODS]
     out: Row = {"superpixels": len(case), "before": [energy for _, energy in solved]}
     if refine:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-from datetime import date
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from soup_nlp.bench.processes import machine
-from soup_nlp.bench.rows import Row, failed, measure_all
+from soup_nlp.bench.rows import Row, failed
 from soup_nlp.bench.speed import plan, problem_of
 from soup_nlp.bench.speed_gate import baseline, check, read_baseline
-from soup_nlp.bench.speed_report import plot_energy, plot_growth, plot_phases, report
+from soup_nlp.bench.speed_report import SPEED
+from soup_nlp.bench.studies import Settings, run_study
 from soup_nlp.cli.options import Out, Progress, Quiet, Set, numbers, words
 from soup_nlp.data.scenes.catalogue import SCENES
 from soup_nlp.report.folder import prepare_folder
@@ -41,39 +42,31 @@ def speed(
     quiet: Quiet = False,
 ) -> None:
     """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
-    kept = None
-    if gate is not None:
-        specs, kept = read_baseline(gate)
-    else:
-        specs = plan(
-            words(scenes, "--scenes", [*SCENES, "motorcycle"]),
-            numbers(sizes, "--sizes", 2),
-            numbers(neighbours, "--neighbours", 1),
-            numbers(seeds, "--seeds"),
-            width=width,
-            height=height,
-            overrides=tuple(overrides or ()),
-        )
-    for spec in specs:
-        # a wrong override stops here, not after an hour
-        problem_of(spec)
-    records = prepare_folder(out) / "records.jsonl"
-    rows = measure_all(
-        [spec.job() for spec in specs],
-        records,
-        say=Progress(quiet, _result_of),
-        after=None if kept else lambda so_far: _write(out, so_far),
+    kept = [] if gate is None else read_baseline(gate)
+    settings: Sequence[Settings] = [run.settings for run in kept] or plan(
+        words(scenes, "--scenes", [*SCENES, "motorcycle"]),
+        numbers(sizes, "--sizes", 2),
+        numbers(neighbours, "--neighbours", 1),
+        numbers(seeds, "--seeds"),
+        width=width,
+        height=height,
+        overrides=overrides or [],
     )
+    for own in settings:
+        # a wrong override stops here, not after an hour
+        problem_of(**own)
+    folder = prepare_folder(out)
+    rows = run_study(SPEED, folder, settings, Progress(quiet, _result_of), page=not kept)
     if write_baseline is not None:
         write_text(write_baseline, json.dumps(baseline(rows, machine()), indent=1) + "\n")
-    if kept is not None:
+    if kept:
         findings = list(check(rows, kept))
         print(*findings, sep="\n")
         bad = sum(not f.ok for f in findings)
         print(f"{bad} of {len(findings)} values are worse" if bad else "the gate holds")
     else:
         bad = sum(map(failed, rows))
-        print(f"{len(rows)} runs, {bad} failed, in {records}")
+        print(f"{len(rows)} runs, {bad} failed, in {folder / SPEED.name}.md")
     raise typer.Exit(1 if bad else 0)
 
 
@@ -85,13 +78,3 @@ def _result_of(record: Row) -> str:
         f" iterations, E {record['energy']['total']:.4g};"
         f" LM {y['cpu_seconds']:.1f} CPU s, E {y['energy']['total']:.4g}"
     )
-
-
-def _write(out: Path, records: list[Row]) -> None:
-    """Table and plots of the runs that are there."""
-    good = [r for r in records if not failed(r)]
-    write_text(out / "table.md", report(records, machine(), date.today().isoformat()))
-    if good:
-        plot_growth(out / "growth.png", good)
-        plot_phases(out / "phases.png", good)
-        plot_energy(out / "energy.png", good)

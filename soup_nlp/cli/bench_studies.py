@@ -49,11 +49,7 @@ def methods(
 ) -> None:
     """How low every method ends on one energy, before and after refinement."""
     chosen = words(scenes, "--scenes", SCENES), numbers(superpixels, "--superpixels", 2)
-    keys = "scene", "superpixels", "neighbours", "seed"
-    settings = [
-        {k: getattr(spec, k) for k in keys} | {"refine": not unrefined}
-        for spec in plan(*chosen, [20], numbers(seeds, "--seeds"))
-    ]
+    settings = plan(*chosen, [20], numbers(seeds, "--seeds"), refine=not unrefined)
     study = study_energy.METHODS_UNREFINED if unrefined else study_energy.METHODS_REFINED
     _run(study, out, settings, quiet)
 
