@@ -229,6 +229,11 @@ def _groups(records: Sequence[Row]) -> dict[tuple[str, int], list[Row]]:
     return dict(sorted(out.items()))
 
 
+def _label(r: Row) -> str:
+    s = r["settings"]
+    return f"{s['scene']}, N {s['superpixels']}, K {s['neighbours']}, seed {s['seed']}"
+
+
 def plot_growth(path: Path, records: Sequence[Row]) -> None:
     """CPU seconds of NLP, reference solver and the rest, and peak memory over N, logarithmic."""
     picture = figure(11, 4)
@@ -262,7 +267,7 @@ def plot_phases(path: Path, records: Sequence[Row]) -> None:
     """Stacked wall seconds by stage, a bar a run."""
     picture = figure(9, 0.32 * len(records) + 1.4)
     axes = picture.subplots()
-    keys = [r["key"].partition(" ")[2] for r in records]
+    keys = [_label(r) for r in records]
     begin = np.zeros(len(records))
     for index, part in enumerate(p for p in PHASES if p not in ("load", "weights")):
         width = np.array([r["wall"].get(part, 0.0) for r in records])
@@ -291,7 +296,7 @@ def plot_energy(path: Path, records: Sequence[Row], most: int = 12) -> None:
         panel = picture.add_subplot(rows, width, index + 1)
         panel.plot(*np.transpose(r["reference"]["history"]), label="Levenberg-Marquardt")
         panel.plot(r["wall"]["nlp"], r["energy"]["total"], "k*", label="Ipopt, end")
-        panel.set_title(r["key"].partition(" ")[2], fontsize=7)
+        panel.set_title(_label(r), fontsize=7)
         panel.tick_params(labelsize=7)
         if not index:
             panel.legend(fontsize=7)

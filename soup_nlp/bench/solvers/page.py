@@ -15,18 +15,14 @@ Row = Mapping[str, Any]
 FEASIBLE = 1e-5
 """Largest violation of a point whose energy counts."""
 LIMITS = (
-    "Times are wall times of one run each, set-up included, on the machine named; where it was "
-    "shared with other work, CPU seconds stand beside them.",
+    "Times are wall times of one run each, set-up included, on the machine named.",
     "The presolve's answer is almost optimal: energies hardly move, and the comparison is of how "
     "quickly a solver proves it. From the proposal it is harder.",
     "Local solvers end in local minima: an energy says where this start led, not what is best.",
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
-    "Solvers run with the options in `soup_nlp/bench/solvers/plugins.py`, the package's own ones "
-    "being tuned on such problems; the others are as they come, but for tolerances and limits.",
-    "alpaqa and sleqp differentiate an expanded expression graph, which costs set-up time; "
-    "every other plug-in gets this package's own derivatives, and readers of .nl make theirs.",
-    "lm, the reference solver on the manifold, ends where the energy stops falling and claims no "
-    "optimum; its rows are for the energy.",
+    "Options are those of `soup_nlp/bench/solvers/plugins.py`, the package's own ones being tuned "
+    "on such problems. alpaqa and sleqp differentiate an expanded graph, which costs set-up time.",
+    "lm, the reference solver on the manifold, claims no optimum; its rows are for the energy.",
     "SCIP is a global solver: here it shows what its time limit allows from the same start.",
 )
 
