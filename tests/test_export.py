@@ -10,7 +10,6 @@ import casadi as ca
 import h5py
 import numpy as np
 import pytest
-from helpers_sol import write_sol
 from test_nl import ReadBack, close
 
 from soup_nlp.cli.main import main
@@ -20,6 +19,7 @@ from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.residuals import kind, residual_table, table_text
+from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
