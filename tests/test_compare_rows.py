@@ -12,8 +12,8 @@ import pytest
 from helpers_model import PAPER, Tiny
 from test_compare import LABEL, MANY, PROBLEMS, ROWS, row
 
+from soup_nlp.bench.processes import isolated
 from soup_nlp.bench.reference_solvers import levenberg_marquardt
-from soup_nlp.bench.rows import isolated
 from soup_nlp.bench.solvers.page import by_run, conclusion, page
 from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profiles, problem_names
 from soup_nlp.bench.solvers.registry import executable, find_solver, reference
