@@ -175,6 +175,7 @@ def test_an_interruption_keeps_the_best_iterate():
     result = run(problem, listener=listener, stop=stop)
     assert result.solution.status == "Interrupted"
     start = result.solution.energy_start["total"]
+    # the start itself may be kept, known to rounding
     assert result.solution.energy["total"] <= start * (1 + 1e-9)
 
 

@@ -23,12 +23,7 @@ from soup_nlp.config.problem import Problem, dump_problem
 from soup_nlp.data.flow.sources import is_named, is_network
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import (
-    depth_metrics,
-    sample_at_points,
-    scene_flow_epe,
-    skill,
-)
+from soup_nlp.evaluate.metrics import depth_metrics, sample_at_points, scene_flow_epe, skill
 from soup_nlp.evaluate.protocols import Preset, preset
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.run import Run, run

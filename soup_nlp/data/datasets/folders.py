@@ -116,7 +116,7 @@ def load_folder(
     )
 
 
-def _moving_components(path: Path) -> NDArray[np.int32]:
+def _moving_components(path: PathLike) -> NDArray[np.int32]:
     """(H, W) labels of the connected regions of a mask of moving pixels; 0 elsewhere."""
     return np.asarray(label(read_mask(path), connectivity=2), np.int32)
 
