@@ -38,7 +38,7 @@ BASELINES = ("unorganised", "rigid", "rigid_filled", "plane", "constant")
 """Those that the solution has to beat."""
 
 SPARSE = 4.0
-"""True pixels per superpixel below which the superpixel floor says nothing."""
+"""True pixels per superpixel below which the superpixel floor is meaningless."""
 
 
 def unorganised(soup: Soup) -> Soup:
@@ -69,11 +69,11 @@ def depth_maps(run: Run) -> dict[str, Float]:
     alone = reconstruct(unorganised(run.start.soup), labels, pair.K_ref, pair.K_next)
     out["unorganised"] = alone.depth_ref
     if run.rigid is not None:
-        there = np.isfinite(run.rigid.depth)
+        there = np.isfinite(run.rigid)
         out["solution_rigid"] = np.where(there, run.reconstruction.depth_ref, np.nan)
-        out["rigid"] = run.rigid.depth
-        if np.isfinite(run.rigid.depth).any():
-            out["rigid_filled"] = fill_nearest(run.rigid.depth)
+        out["rigid"] = run.rigid
+        if np.isfinite(run.rigid).any():
+            out["rigid_filled"] = fill_nearest(run.rigid)
     truth = true_depth(run)
     if truth is None:
         return out

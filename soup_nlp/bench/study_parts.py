@@ -32,10 +32,7 @@ CUT_OFF_HEAD = (
 )
 NODES, LABELS, NEIGHBOURS = 1000, 50, 15
 """Sizes of the TRW-S study."""
-TRWS_HEAD = (
-    "precision", "edges", "levels", "ms an iteration", "least", "MiB",
-    "bound", "energy",
-)  # fmt: skip
+TRWS_HEAD = ("precision", "edges", "levels", "ms an iteration", "least", "MiB", "bound", "energy")
 
 
 def measure_cut_off(scene: str, seed: int, superpixels: int, lower: float) -> Row:
@@ -100,12 +97,12 @@ def measure_trws(dtype: str, iterations: int) -> Row:
     rng = np.random.default_rng(1)
     unary = rng.random((NODES, LABELS))
     seed = rng.random((LABELS, LABELS)).astype(dtype)
-    factor = 1.0 + (np.arange(len(edges)) % 7)[:, None, None].astype(dtype)
+    tables = seed * (1.0 + (np.arange(len(edges)) % 7)[:, None, None].astype(dtype))
     stamps: list[float] = []
     result = solve_trws(
         unary,
         edges,
-        seed * factor,
+        tables,
         dtype=np.dtype(dtype),
         max_iter=iterations,
         gap=-1.0,
@@ -126,9 +123,8 @@ def study_trws(out: Path, iterations: int, say: Say | None = None) -> list[Row]:
     """Write OUT/trws.md."""
 
     def cells(row: Row) -> list[str]:
-        own = row["settings"]
         return [
-            own["dtype"],
+            row["settings"]["dtype"],
             *(str(row[k]) for k in ("edges", "levels")),
             *(f"{ms:.1f}" for ms in row["milliseconds"]),
             f"{row['peak_bytes'] / 2**20:.0f}",

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from soup_nlp.cli.options import Out, Set
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
-from soup_nlp.data.flow.sources import is_named
+from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError
 from soup_nlp.pipeline.run import run as run_problem
@@ -25,7 +25,7 @@ from soup_nlp.solve.ipopt import Progress
 from soup_nlp.storage.atomic import write_text
 
 
-class _Teller:
+class SolveLog:
     """Lines for the terminal and the log; iterations rewrite one line on a terminal."""
 
     def __init__(self, quiet: bool) -> None:
@@ -59,7 +59,7 @@ class _Teller:
         file: TextIO | None = None,
         line: str | None = None,
     ) -> None:
-        """What a reader doubts, as a line; warnings of libraries are for developers."""
+        """Print a warning about the input; warnings of libraries are for developers."""
         if issubclass(category, DataWarning):
             self.say(f"warning: {message}")
 
@@ -114,7 +114,7 @@ def solve(
         }
         if any(pair.values()):
             raise ConfigError(
-                "a problem file says itself what its pair is",
+                "a problem file names its own pair",
                 found=f"{problem} and {', '.join(k for k, v in pair.items() if v)}",
                 expected="a problem file, or the options of a pair",
                 hint="--set input.KEY=VALUE changes the input of a problem file",
@@ -125,34 +125,43 @@ def solve(
         chosen = load_problem(problem, overrides)
     else:
         chosen = _from_options(ref, next_, intrinsics, intrinsics_next, flow, depth, overrides)
+    # a problem file's expectation is of the file without overrides
+    _run(chosen, out, quiet, None if overrides else chosen.expected.mre_at_most)
+
+
+def _run(chosen: Problem, out: Path, quiet: bool, mre_at_most: float | None) -> None:
+    """Solve a problem, write its folder and print the verdict.
+
+    Raises:
+        typer.Exit: always, with code 0 for a good result that meets the expectation, else 1.
+    """
     folder = prepare_folder(out, chosen.input_paths())
-    teller = _Teller(quiet)
-    interrupt = interruptible(teller.interrupted)
+    log = SolveLog(quiet)
+    interrupt = interruptible(log.interrupted)
     with interrupt as stop, warnings.catch_warnings():
         warnings.simplefilter("always", DataWarning)
-        warnings.showwarning = teller.warn
+        warnings.showwarning = log.warn
         try:
             run = run_problem(
                 chosen,
-                listener=teller.iteration,
+                listener=log.iteration,
                 stop=stop,
-                log=teller.say,
+                log=log.say,
                 ipopt_log=str(folder / "ipopt.log"),
             )
             if interrupt.aborted:
                 raise KeyboardInterrupt
         except BaseException as error:
-            teller.lines.append(f"failed: {str(error) or type(error).__name__}")
-            write_text(folder / "log.txt", "\n".join(teller.lines) + "\n")
+            log.lines.append(f"failed: {str(error) or type(error).__name__}")
+            write_text(folder / "log.txt", "\n".join(log.lines) + "\n")
             raise
-        # half a folder is of no use, and writing takes seconds
+        # an interruption must not leave half of the files; writing takes seconds only
         interrupt.deferred = True
-        files = write_folder(folder, run, dump_problem(chosen), "\n".join(teller.lines) + "\n")
-        # what a problem file expects holds for the file as it is
-        text = verdict(run, folder, files, None if overrides else chosen.expected.mre_at_most)
-        write_text(folder / "log.txt", "\n".join([*teller.lines, text]) + "\n")
+        files = write_folder(folder, run, dump_problem(chosen), "\n".join(log.lines) + "\n")
+        text = verdict(run, folder, files, mre_at_most)
+        write_text(folder / "log.txt", "\n".join([*log.lines, text]) + "\n")
     print(text)
-    good = run.good and not (not overrides and missed(run))
+    good = run.good and (mre_at_most is None or not missed(run))
     raise typer.Exit(0 if good else 1)
 
 
@@ -176,9 +185,7 @@ def _camera(text: str, option: str) -> list[float] | str:
 
 def _flow_source(text: str) -> str:
     """A flow source with its path, if it is one, from the working directory."""
-    if is_named(text) or not (Path(text).suffix or "/" in text):
-        return text
-    return str(Path(text).expanduser().resolve())
+    return str(Path(text).expanduser().resolve()) if is_path(text) else text
 
 
 def _from_options(

@@ -102,17 +102,13 @@ def load_folder(
     K_next = read_if(read_intrinsics, folder / "K_next.txt")
     depth = _find(folder, ("depth", "depth_0", "depth_ref"), _DEPTHS)
     depth_next = _find(folder, ("depth_next", "depth_1"), _DEPTHS)
-    flow = _find(folder, ("flow",), _FLOWS)
-    occluded = _find(folder, ("occluded",), _IMAGES)
-    moving = _find(folder, ("moving",), _IMAGES)
-    points = folder / "points.npz"
     truth = Truth(
-        depth_ref=read_depth(depth, depth_scale) if depth else None,
-        depth_next=read_depth(depth_next, depth_scale) if depth_next else None,
-        flow=read_flow(flow).astype(np.float64) if flow else None,
-        occluded=read_mask(occluded) if occluded else None,
-        components=_moving_components(moving) if moving else None,
-        points=_read_points(points, unit) if points.is_file() else None,
+        depth_ref=read_if(read_depth, depth, depth_scale),
+        depth_next=read_if(read_depth, depth_next, depth_scale),
+        flow=read_if(read_flow, _find(folder, ("flow",), _FLOWS)),
+        occluded=read_if(read_mask, _find(folder, ("occluded",), _IMAGES)),
+        components=read_if(_moving_components, _find(folder, ("moving",), _IMAGES)),
+        points=read_if(_read_points, folder / "points.npz", unit),
         unit=unit,
     )
     return make_pair(
@@ -120,7 +116,7 @@ def load_folder(
     )
 
 
-def _moving_components(path: Path) -> NDArray[np.int32]:
+def _moving_components(path: PathLike) -> NDArray[np.int32]:
     """(H, W) labels of the connected regions of a mask of moving pixels; 0 elsewhere."""
     return np.asarray(label(read_mask(path), connectivity=2), np.int32)
 
