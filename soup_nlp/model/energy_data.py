@@ -38,8 +38,8 @@ class EnergyData:
         pair_factor: (P,) sqrt(boundary length / B): the sampled Frobenius norm times this stands
             for the norm over the whole boundary.
         pair_unit: (P,) length unit of the pair.
-        orient_weight: (P,) weight of E_orient: 2, directed pairs folded into one, less where the
-            flow of a bending surface tears.
+        orient_weight: (P,) weight of E_orient: 2, directed pairs folded into one, less at flow
+            discontinuities of bending surfaces.
         rim_ray: (N, V, 3) rays where visibility is imposed, the anchor first.
         local_units: edge_unit and pair_unit are shares of the depth of the two anchors, mostly the
             nearer one (E is then independent of scale, term by term), instead of lengths.
@@ -96,7 +96,7 @@ class EnergyData:
 def sample_pixels(
     labels: NDArray[np.int32], flow: Flow, samples: int | None, seed: int
 ) -> tuple[Int, NDArray[np.bool_]]:
-    """Sampled pixels of every superpixel, confident ones first come.
+    """A random sample of every superpixel's pixels of nonzero confidence.
 
     Args:
         labels: (H, W) superpixel labels.
@@ -133,7 +133,17 @@ def build_energy_data(
     seed: int = 0,
     arap_at_anchors: bool = False,
 ) -> EnergyData:
-    """Collect rays, targets and weights of a segmented pair."""
+    """Collect rays, targets and weights of a segmented pair, in the paper's units.
+
+    Args:
+        seg: Superpixels and graphs.
+        flow: Flow with confidence.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        K_next: (3, 3) intrinsics of the next frame.
+        samples: Pixels per superpixel in E_proj, None for all.
+        seed: Of the sample.
+        arap_at_anchors: Motion difference taken at the anchors.
+    """
     width = seg.labels.shape[1]
     index, there = sample_pixels(seg.labels, flow, samples, seed)
     uv = np.stack([index % width, index // width], axis=-1).astype(float)

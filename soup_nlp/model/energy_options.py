@@ -1,4 +1,4 @@
-"""What a problem file says about the energy: weights, truncations, units, departures."""
+"""Options of the energy: weights, truncations, units and departures from the paper."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Weights(Section):
     sigma_arap: Truncation = 0.5
     """Truncation of every ARAP norm; inf is the paper's form."""
     leak_arap: Share = 0.01
-    """Share of an ARAP norm that is not truncated: it pulls motions that nothing else holds back
-    to their neighbours', where a full truncation leaves them adrift."""
+    """Share of an ARAP norm that is not truncated: it pulls a motion that no other term determines
+    towards its neighbours'."""
     sigma_proj: Truncation = np.inf
     """Truncation of a pixel's re-projection error, pixels; inf is the paper's form."""
 

@@ -1,6 +1,6 @@
-"""The exact energy in plain numpy: text for newcomers, oracle for tests, referee for reports.
+"""The exact energy in plain NumPy, for reports and as reference of the symbolic model.
 
-Shares nothing with the symbolic model. Every function follows its equation of the paper; lengths
+It shares nothing with the symbolic model. Every function follows its equation of the paper; lengths
 are measured in the depth of their anchors or with sum_i c_i D_i = 1: either makes E independent
 of the free global scale.
 """

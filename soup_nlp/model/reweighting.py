@@ -62,8 +62,8 @@ def across_discontinuities(
 ) -> EnergyData:
     """The same data with terms times a factor each from one surface to another.
 
-    Where the flow tears, two surfaces pass each other: their gap in depth is nothing to close, they
-    need not move alike, nor face the same way. What ties them flattens the relief of both.
+    At a flow discontinuity one surface passes in front of another: their gap in depth is real, and
+    they need neither move alike nor face the same way. Ties between them flatten both reliefs.
 
     Args:
         data: Data of the pair.

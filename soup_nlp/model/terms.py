@@ -1,7 +1,7 @@
 """The four energy terms and every constraint, each written once for one element.
 
 A term takes the views of its superpixels and its row of data, and returns its robust norms; see
-`energy.EnergyData` for the columns and `plain` for the same in numpy.
+`elements` for the columns and `oracle` for the same in numpy.
 """
 
 from __future__ import annotations
