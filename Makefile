@@ -1,12 +1,12 @@
 # make demo: solve the embedded default;  make test: lint, types, tests;  make quick: the fast tests;
-# make docs: the documentation.
+# make results: every table and picture of results/ again (hours; DATA=folder of the real pairs).
 # Needs Python 3.11+ only.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/motorcycle
 
-.PHONY: demo test quick lint docs clean
+.PHONY: demo test quick lint results clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/.installed: pyproject.toml
@@ -33,12 +33,8 @@ test: lint $(VENV)/.optional
 quick: $(VENV)/.installed
 	$(BIN)/python -m pytest -m 'not slow'
 
-$(VENV)/.docs: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,docs]' && touch $@
-
-# the documentation in site/; a warning is an error
-docs: $(VENV)/.docs
-	$(BIN)/mkdocs build --strict --quiet
+results: $(VENV)/.optional
+	$(BIN)/soup-nlp bench all $(if $(DATA),--data $(DATA))
 
 clean:
 	rm -rf $(VENV) out site

@@ -24,14 +24,10 @@ class ReadBack:
         s = ca.SX.sym("x", x.numel())
         lam_f, lam_g = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", g.numel())
         f, g = plain(s)
-        self._inputs = [s, lam_f, lam_g]
-        self._lagrangian = lam_f * f + (ca.dot(lam_g, g) if g.numel() else 0)
+        lagrangian = lam_f * f + (ca.dot(lam_g, g) if g.numel() else 0)
+        # the Lagrangian's Hessian at (x, lam_f, lam_g)
+        self.hess = ca.Function("h", [s, lam_f, lam_g], [ca.hessian(lagrangian, s)[0]])
         self.values = ca.Function("v", [s], [f, g, ca.gradient(f, s), ca.jacobian(g, s)])
-
-    def hess(self, *at: object) -> ca.DM:
-        """Lagrangian's Hessian at (x, lam_f, lam_g)."""
-        H = ca.hessian(self._lagrangian, self._inputs[0])[0]
-        return ca.Function("h", self._inputs, [H])(*at)
 
 
 def close(found: object, expected: object) -> None:

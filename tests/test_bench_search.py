@@ -12,19 +12,21 @@ from matplotlib.axes import Axes
 
 from soup_nlp.bench import analyses
 from soup_nlp.bench import tuning as search_module
-from soup_nlp.bench.accuracy import Job, head
-from soup_nlp.bench.accuracy_table import reason, report
+from soup_nlp.bench.accuracy import head, pair_job
+from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
-from soup_nlp.bench.analyses_energy import measure_energy
-from soup_nlp.bench.analyses_flow import plot_flow, text_flow
+from soup_nlp.bench.analyses_measures import measure_energy
 from soup_nlp.bench.analyses_report import (
     plot_energy,
+    plot_flow,
     plot_variants,
     text_energy,
+    text_flow,
     text_variants,
 )
-from soup_nlp.bench.suites import Options, list_suite
-from soup_nlp.bench.suites_pairs import Item
+from soup_nlp.bench.rows import attempt
+from soup_nlp.bench.suites import Item, Options, list_suite
+from soup_nlp.bench.tables import reason
 from soup_nlp.bench.tuning import (
     DEFAULT_SPACE,
     FAILED,
@@ -36,9 +38,9 @@ from soup_nlp.bench.tuning import (
     split,
 )
 from soup_nlp.bench.tuning_report import text_search
-from soup_nlp.cli.accuracy import Progress
 from soup_nlp.cli.main import main
-from soup_nlp.errors import ConfigError
+from soup_nlp.cli.options import Progress
+from soup_nlp.errors import ConfigError, DataError
 
 QUICK = (
     "segmentation.superpixels=40",
@@ -54,14 +56,14 @@ SPACE = (
 )
 
 
-def fake(job: Job) -> dict:
+def fake(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> dict:
     """A row whose MRE is least at cont = 1e-3 and K = 12."""
-    given = dict(o.split("=", 1) for o in job.overrides)
+    given = dict(o.split("=", 1) for o in overrides)
     cont = float(given.get("energy.weights.cont", "0.1"))
     k = float(given.get("segmentation.neighbours", "20"))
     mre = 0.02 * (1 + abs(math.log10(cont) + 3) + 0.1 * abs(k - 12))
     return {
-        **head(job),
+        **head(item, overrides, variant),
         **{"ok": True, "error": None, "seconds": 0.0, "cpu_seconds": 0.0},
         "metrics": {
             "paper": {
@@ -109,12 +111,12 @@ def test_search_finds_the_minimum_and_goes_on_where_it_was(tmp_path):
     path = tmp_path / "rows.jsonl"
     calls = []
 
-    def counted(job):
-        calls.append(job.key)
-        return fake(job)
+    def counted(*job):
+        calls.append(job)
+        return fake(*job)
 
     train, validation = items(0)[:2], items(1)[:2]
-    found = search(SPACE, train, validation, path, trials=30, function=counted)
+    found = search(SPACE, train, validation, path, trials=30, measure=counted)
     assert len(found.train) == 31
     assert found.train[0].overrides == ()
     assert found.train[0].loss == pytest.approx(math.log(0.02 * (1 + 2 + 0.8) / 0.4))
@@ -127,7 +129,7 @@ def test_search_finds_the_minimum_and_goes_on_where_it_was(tmp_path):
     far = [np.linalg.norm(t.unit - found.best.unit) for t in found.train[1:]]
     assert np.median(far[20:]) < np.median(far[:15])
     before = len(calls)
-    again = search(SPACE, train, validation, path, trials=30, function=counted)
+    again = search(SPACE, train, validation, path, trials=30, measure=counted)
     assert len(calls) == before
     assert [t.overrides for t in again.train] == [t.overrides for t in found.train]
     text = text_search(found, "soup-nlp bench search")
@@ -138,7 +140,7 @@ def test_search_finds_the_minimum_and_goes_on_where_it_was(tmp_path):
 
 def test_steps_beyond_the_end_of_a_range_turn_back():
     """A best trial at an end is varied inside the range, not tried at the end again and again."""
-    best = Trial("t001", (), np.array([0.01, 0.99]), (fake(Job(items(0)[0])),))
+    best = Trial("t001", (), np.array([0.01, 0.99]), (fake(items(0)[0]),))
     units = np.array(
         [search_module._next(k, 24, np.zeros((12, 2)), [best], 0) for k in range(13, 25)]
     )
@@ -151,11 +153,11 @@ def test_steps_beyond_the_end_of_a_range_turn_back():
 def test_search_refuses_what_cannot_be_right(tmp_path):
     path = tmp_path / "rows.jsonl"
     with pytest.raises(ConfigError, match="both trains and validates"):
-        search(SPACE, items(0), items(0), path, function=fake)
+        search(SPACE, items(0), items(0), path, measure=fake)
     with pytest.raises(ConfigError, match="no training pair"):
-        search(SPACE, [], items(0), path, function=fake)
+        search(SPACE, [], items(0), path, measure=fake)
     with pytest.raises(ConfigError, match="finalist"):
-        search(SPACE, items(0), items(1), path, finalists=0, function=fake)
+        search(SPACE, items(0), items(1), path, finalists=0, measure=fake)
     with pytest.raises(ConfigError):
         search([Parameter("energy.wieghts", "linear", ("0", "1"))], items(0), [], path)
 
@@ -168,20 +170,20 @@ def of_suites(*suites: str, flows: tuple[str, ...] = ("dis",)) -> list[Item]:
 def test_pairs_of_one_name_in_two_suites_may_train_and_validate(tmp_path):
     train, validation = of_suites("kitti2012"), of_suites("kitti2015")
     path = tmp_path / "rows.jsonl"
-    found = search(SPACE, train, validation, path, trials=2, finalists=1, function=fake)
+    found = search(SPACE, train, validation, path, trials=2, finalists=1, measure=fake)
     assert [t.rows[0]["suite"] for t in found.validation] == ["kitti2015"] * 2
     with pytest.raises(ConfigError, match="both trains and validates") as caught:
-        search(SPACE, train, [*validation, *train], path, function=fake)
+        search(SPACE, train, [*validation, *train], path, measure=fake)
     assert "kitti2012/000027" in str(caught.value)
 
 
 def test_loss_charges_failures_and_a_minimum_far_from_the_truth():
-    row = fake(Job(items(0)[0]))
+    row = fake(items(0)[0])
     plain = loss(row)
     far = {**row, "energy": {"solution": {"total": 10.0}, "truth": {"total": 22.0}}}
     assert loss(far) == pytest.approx(plain + math.log(2.0))
     assert loss({**row, "ok": False}) == FAILED
-    worse = fake(Job(items(0)[0], ("segmentation.neighbours=400",)))
+    worse = fake(items(0)[0], ("segmentation.neighbours=400",))
     assert plain < loss(worse) <= FAILED
     assert Trial("t", (), np.zeros(1)).loss == math.inf
 
@@ -246,9 +248,9 @@ def test_values_are_names_with_commas_and_blanks_and_are_checked_first(tmp_path)
 def test_conventions_and_folders_of_an_analysis_are_not_ignored(tmp_path, monkeypatch, capsys):
     seen = []
 
-    def scored(job):
-        seen.append(job.item.presets)
-        row = fake(job)
+    def scored(item, overrides, variant):
+        seen.append(item.presets)
+        row = fake(item, overrides, variant)
         return {**row, "metrics": {"lsq": row["metrics"]["paper"]}}
 
     changed = analyses.replace(ANALYSES["neighbours"], function=scored)
@@ -265,9 +267,9 @@ def test_conventions_and_folders_of_an_analysis_are_not_ignored(tmp_path, monkey
 
 
 def test_tables_bear_failed_rows(tmp_path):
-    jobs = [Job(i, (f"segmentation.neighbours={k}",), str(k)) for i in items(0)[:2] for k in (4, 8)]
-    rows = [{**fake(j), "code": "c"} for j in jobs]
-    rows[1] = {**head(jobs[1]), "ok": False, "error": "out of luck", "code": "c"}
+    jobs = [(i, (f"segmentation.neighbours={k}",), str(k)) for i in items(0)[:2] for k in (4, 8)]
+    rows = [{**fake(*j), "code": "c"} for j in jobs]
+    rows[1] = {**head(*jobs[1]), "ok": False, "error": "out of luck", "code": "c"}
     text = text_variants("ablation", "what", rows)
     assert "out of luck" in text
     assert "alley_1 (published)" in text
@@ -282,8 +284,8 @@ def cells(text: str, column: int = 0) -> list[str]:
 
 def test_pairs_of_one_name_in_two_suites_are_told_apart(tmp_path, monkeypatch):
     def rows_of(made: list[Item], *variants: str) -> list[dict]:
-        jobs = [Job(i, (f"segmentation.neighbours={v}",), v) for i in made for v in variants]
-        return [{**fake(j), "code": "c"} for j in jobs]
+        jobs = [(i, (f"segmentation.neighbours={v}",), v) for i in made for v in variants]
+        return [{**fake(*j), "code": "c"} for j in jobs]
 
     both = rows_of(of_suites("kitti2012", "kitti2015"), "4", "12")
     text = text_variants("neighbours", "what", both)
@@ -313,7 +315,8 @@ def test_pairs_of_one_name_in_two_suites_are_told_apart(tmp_path, monkeypatch):
 def test_energy_at_the_truth(tmp_path):
     raw = {"kind": "scene", "scene": "orbit", "seed": 0, "width": 128, "height": 64}
     item = Item("rendered", "orbit", "orbit", "truth", raw)
-    row = measure_energy(Job(item, QUICK))
+    job = pair_job(item, QUICK, measure=measure_energy)
+    row = {**job.name, **job.work()}
     assert row["ok"], row["error"]
     json.dumps(row, allow_nan=False)
     energy = {k: v["total"] for k, v in row["energy"].items()}
@@ -328,7 +331,7 @@ def test_energy_at_the_truth(tmp_path):
     assert (tmp_path / "e.png").stat().st_size > 1000
     # a pair without motions says so
     bare = Item("shared", "tum", "t", "dis", {"kind": "tum", "path": str(tmp_path)})
-    assert not measure_energy(Job(bare))["ok"]
+    assert not attempt(lambda: measure_energy(bare))["ok"]
 
 
 def test_errors_of_flow_sources(tmp_path):
@@ -345,14 +348,14 @@ def test_errors_of_flow_sources(tmp_path):
     assert (tmp_path / "flows.png").stat().st_size > 1000
 
 
-def broken(job: Job) -> dict:
-    """A row that failed for a file."""
-    error = "DataError: image is missing\n  where: a/0.png\n  found: nothing\n  expected: a file"
-    return {**head(job), "ok": False, "error": error, "seconds": 0.0, "cpu_seconds": 0.0}
+def broken(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> dict:
+    """No row for want of a file."""
+    raise DataError("image is missing", where="a/0.png", found="nothing", expected="a file")
 
 
 def test_every_list_of_failures_says_which_file(capsys):
-    row = {**broken(Job(items(0)[0])), "code": "c"}
+    job = pair_job(items(0)[0], measure=broken)
+    row = {**job.name, **job.work(), "code": "c"}
     for text in (report("T", [row]), text_variants("x", "w", [row]), text_flow("x", "w", [row])):
         assert "DataError: image is missing, where: a/0.png, found: nothing\n" in text
     Progress(quiet=False)(1, 1, row)
@@ -371,7 +374,7 @@ def test_failed_pairs_of_analyses_and_search_end_with_1(tmp_path, monkeypatch, c
     assert main([*words, str(tmp_path / "a")]) == 0
     measured_by(broken)
     assert main([*words, str(tmp_path / "b")]) == 1
-    kwdefaults = {**search_module.search.__kwdefaults__, "function": broken}
+    kwdefaults = {**search_module.search.__kwdefaults__, "measure": broken}
     monkeypatch.setattr(search_module.search, "__kwdefaults__", kwdefaults)
     words = ["bench", "search", "--trials", "1", "--width", "128", "-q", "--out", str(tmp_path)]
     assert main([*words, "--param", "segmentation.neighbours=int:4:19"]) == 1
@@ -384,7 +387,7 @@ def test_command_line_of_analyses_and_search(tmp_path, capsys, monkeypatch):
     assert main(["bench", "accuracy", "--analysis", "nothing", "--out", str(tmp_path)]) == 2
     from soup_nlp.bench import tuning as module
 
-    kwdefaults = {**module.search.__kwdefaults__, "function": fake}
+    kwdefaults = {**module.search.__kwdefaults__, "measure": fake}
     monkeypatch.setattr(module.search, "__kwdefaults__", kwdefaults)
     words = ["bench", "search", "--trials", "4", "--width", "128", "--out", str(tmp_path)]
     assert main([*words, "--param", "segmentation.neighbours=int:4:19", "-q"]) == 0

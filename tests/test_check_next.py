@@ -1,4 +1,4 @@
-"""The depth of the next frame, made again for the check by other means."""
+"""The check recomputes the depth of the next frame."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def run() -> Run:
     )
 
 
-def test_it_is_that_of_the_reconstruction(run):
+def test_the_recomputed_depth_is_that_of_the_reconstruction(run):
     pair, labels = run.pair, run.segmentation.labels
     for size in ((128, 192), (100, 150)):
         z, doubt = recompute.next_depth_map(vars(run.soup), labels, pair.K_ref, pair.K_next, size)
@@ -40,7 +40,7 @@ def test_it_is_that_of_the_reconstruction(run):
 
 
 @pytest.mark.parametrize("shift", [0.5, 1.0])
-def test_targets_on_a_border_are_left_out(run, shift):
+def test_targets_on_a_pixel_border_are_left_out(run, shift):
     """Half a pixel on, every target may be rounded to either side; a whole one on, none."""
     labels, K = np.zeros((20, 30), np.int32), np.diag([25.0, 25.0, 1.0])
     one = Soup(
@@ -54,7 +54,7 @@ def test_targets_on_a_border_are_left_out(run, shift):
     assert not doubt[:, 2:].any() or shift == 0.5
 
 
-def test_a_depth_that_is_not_that_of_the_planes_fails(run, tmp_path):
+def test_a_changed_depth_map_fails_the_check(run, tmp_path):
     write_folder(prepare_folder(tmp_path), run, dump_problem(run.problem), "")
     assert check_folder(tmp_path).ok
     for change in (1 + 1e-6, np.nan):
@@ -69,7 +69,7 @@ def test_a_depth_that_is_not_that_of_the_planes_fails(run, tmp_path):
     assert check_folder(tmp_path).ok
 
 
-def test_another_motion_is_another_depth(run, tmp_path):
+def test_a_mirrored_depth_map_fails_the_check(run, tmp_path):
     moved = replace(run.reconstruction, depth_next=run.reconstruction.depth_next[:, ::-1])
     write_folder(
         prepare_folder(tmp_path), replace(run, reconstruction=moved), dump_problem(run.problem), ""

@@ -1,4 +1,4 @@
-"""An energy that is rounding alone is checked as such."""
+"""The check tolerates rounding of an energy that should be zero."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run() -> Run:
     return solve_pair(one_plane(), **OPTIONS)
 
 
-def test_an_energy_of_rounding_holds(run, tmp_path):
+def test_an_energy_of_rounding_size_passes_the_check(run, tmp_path):
     write_folder(prepare_folder(tmp_path), run, dump_problem(run.problem), "")
     assert run.energy["total"] < 1e-9
     assert [row.name for row in check_folder(tmp_path).rows if not row.ok] == []

@@ -12,8 +12,8 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from helpers_ply import read_ply
 from helpers_files import write_flo
+from helpers_ply import read_ply
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem, make_problem
@@ -174,7 +174,9 @@ def test_an_interruption_keeps_the_best_iterate():
 
     result = run(problem, listener=listener, stop=stop)
     assert result.solution.status == "Interrupted"
-    assert result.solution.energy["total"] <= result.solution.energy_start["total"]
+    start = result.solution.energy_start["total"]
+    # the start itself may be kept, known to rounding
+    assert result.solution.energy["total"] <= start * (1 + 1e-9)
 
 
 @pytest.mark.parametrize(

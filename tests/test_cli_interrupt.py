@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from soup_nlp.cli import main as cli
+from soup_nlp.cli import solve as solve_module
+from soup_nlp.config.problem import load_problem
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import SceneInput
 from soup_nlp.pipeline import case as cases
@@ -62,7 +64,7 @@ def test_a_second_one_aborts_and_says_so(tmp_path, monkeypatch, capfd):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.parametrize("at", [cli._Teller.iteration, cases.propose])
+@pytest.mark.parametrize("at", [solve_module.SolveLog.iteration, cases.propose])
 def test_once_there_is_a_start_the_best_iterate_is_written(at, tmp_path, monkeypatch, capfd):
     pressed = []
 
@@ -72,7 +74,7 @@ def test_once_there_is_a_start_the_best_iterate_is_written(at, tmp_path, monkeyp
             ctrl_c()
         return at(*args, **kwargs)
 
-    owner = cases if at is cases.propose else cli._Teller
+    owner = cases if at is cases.propose else solve_module.SolveLog
     monkeypatch.setattr(owner, at.__name__, interrupted)
     assert solve(tmp_path) == 1
     assert "interrupt received" in capfd.readouterr().err
@@ -86,7 +88,7 @@ def test_a_second_one_in_the_solver_aborts_too(tmp_path, monkeypatch, capfd):
             ctrl_c()
             ctrl_c()
 
-    monkeypatch.setattr(cli._Teller, "iteration", interrupted)
+    monkeypatch.setattr(solve_module.SolveLog, "iteration", interrupted)
     assert solve(tmp_path / "out") == 130
     assert "no result is written" in capfd.readouterr().err
     assert not (tmp_path / "out" / "summary.json").exists()
@@ -110,7 +112,7 @@ def test_files_that_are_being_written_are_written(tmp_path, monkeypatch, capfd):
 
 
 def test_a_run_of_python_says_it_too():
-    problem = cli.load_problem(ORBIT, [word for word in SMALL if word != "--set"])
+    problem = load_problem(ORBIT, [word for word in SMALL if word != "--set"])
     with interruptible() as stop:
         ctrl_c()
         with pytest.raises(StoppedError, match="load"):

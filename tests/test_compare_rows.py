@@ -13,13 +13,13 @@ from helpers_model import PAPER, Tiny
 from helpers_sol import write_sol
 from test_compare import LABEL, MANY, PROBLEMS, ROWS, row
 
-from soup_nlp.bench.solvers.isolate import isolated
+from soup_nlp.bench.reference_solvers import levenberg_marquardt
+from soup_nlp.bench.rows import isolated
 from soup_nlp.bench.solvers.page import by_run, conclusion, page
 from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profiles, problem_names
-from soup_nlp.bench.solvers.registry import executable, find_solver, yardstick
+from soup_nlp.bench.solvers.registry import executable, find_solver, reference
 from soup_nlp.bench.solvers.runner import compare
 from soup_nlp.bench.solvers.task import Answer, Task
-from soup_nlp.bench.yardstick import levenberg_marquardt
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError, SolverError
@@ -120,10 +120,10 @@ def test_a_claim_after_the_limit_is_not_within_it(task, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "form", [{"norm": "epigraph"}, {"norm": "epigraph", "truncation": "lifted"}]
 )
-def test_a_yardstick_hands_back_a_point_of_the_epigraph_form(form, tmp_path):
+def test_a_reference_solver_hands_back_a_point_of_the_epigraph_form(form, tmp_path):
     task = make_task(tmp_path, **form)
     task = replace(task, limits=replace(task.limits, seconds=2.0))
-    x = yardstick(levenberg_marquardt, task).x
+    x = reference(levenberg_marquardt, task).x
     assert x is not None
     size = task.layout.size
     assert np.abs(x[size:] - task.nlp.x0[size:]).max() > 1e-3
@@ -193,7 +193,7 @@ def test_an_input_that_cannot_be_used_leaves_the_others_page(tmp_path, monkeypat
             raise DataError("image is gone")
         return prepare(problem, presolve)
 
-    monkeypatch.setattr("soup_nlp.bench.solvers.compare.prepare", second_fails)
+    monkeypatch.setattr("soup_nlp.cli.compare.prepare", second_fails)
     orbit = str(PROBLEMS / "orbit.yaml")
     words = ["--superpixels", "9", "--solvers", "lm,lm", "--seconds", "5", "--no-presolve"]
     out = tmp_path / "out"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers_files import write_cam, write_dpt, write_flo, write_kitti_flow
 
-from soup_nlp.data.datasets.driving import load_kitti, load_vkitti1, load_vkitti2
+from soup_nlp.data.datasets.driving import load_kitti, load_vkitti
 from soup_nlp.data.datasets.folders import load_folder, load_motorcycle, load_tum
 from soup_nlp.data.datasets.sintel import DEFAULT_CAMERA, load_sintel
 from soup_nlp.data.formats.images import DataWarning
@@ -229,16 +229,16 @@ def test_vkitti1(tmp_path: Path) -> None:
         picture(tmp_path / "vkitti_1.3.1_rgb" / name, number)
         png16(tmp_path / "vkitti_1.3.1_depthgt" / name, np.full((H, W), 1234))
     vkitti_flow(tmp_path / "vkitti_1.3.1_flowgt" / "0001/clone/00000.png")
-    pair = load_vkitti1(tmp_path, "0001", 0)
+    pair = load_vkitti("vkitti1", tmp_path, "0001", 0)
     assert pair.truth is not None
     np.testing.assert_allclose(pair.truth.depth_next, 12.34)
     assert pair.truth.flow is not None
     assert pair.truth.flow[1, 1].tolist() == [W - 1, H - 1]
     assert pair.K_ref[0, 0] == 725
     with raises(r"00002\.png"):
-        load_vkitti1(tmp_path, "0001", 1)
+        load_vkitti("vkitti1", tmp_path, "0001", 1)
     with raises(r"vkitti_\*_rgb"):
-        load_vkitti1(tmp_path / "vkitti_1.3.1_rgb", "0001", 1)
+        load_vkitti("vkitti1", tmp_path / "vkitti_1.3.1_rgb", "0001", 1)
 
 
 def test_vkitti2(tmp_path: Path) -> None:
@@ -249,16 +249,16 @@ def test_vkitti2(tmp_path: Path) -> None:
     vkitti_flow(base / "frames" / "forwardFlow" / "Camera_0" / "flow_00003.png")
     rows = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]\n3 0 725 725 620.5 187\n"
     (base / "intrinsic.txt").write_text(rows + "4 0 726 726 620.5 187\n")
-    pair = load_vkitti2(tmp_path, "Scene01", 3)
+    pair = load_vkitti("vkitti2", tmp_path, "Scene01", 3)
     assert (pair.K_ref[0, 0], pair.K_next[0, 0]) == (725, 726)
     assert pair.truth is not None
     assert pair.truth.depth_ref is not None
     assert np.isnan(pair.truth.depth_ref).all()
     (base / "intrinsic.txt").write_text(rows)
     with raises(r"intrinsics of the frame are missing[\s\S]*frame 4, camera 0"):
-        load_vkitti2(tmp_path, "Scene01", 3)
+        load_vkitti("vkitti2", tmp_path, "Scene01", 3)
     with raises(r"Scene01/clone has no|Scene01 has no fog"):
-        load_vkitti2(tmp_path, "Scene01", 3, "fog")
+        load_vkitti("vkitti2", tmp_path, "Scene01", 3, "fog")
 
 
 # --- Sintel, TUM, Motorcycle --------------------------------------------------------------------

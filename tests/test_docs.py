@@ -22,14 +22,13 @@ from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import Task
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.sources import flow_sources, resolve_flow
-from soup_nlp.data.inputs import Input, Resolve
+from soup_nlp.data.inputs import Input, PairInput, Resolve
 from soup_nlp.data.pair import Pair
 from soup_nlp.export.verify import Limits
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.check import check_folder
-from soup_nlp.schema.section import Section
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = sorted((ROOT / "docs").glob("*.md"))
@@ -156,7 +155,7 @@ def test_the_readme_is_short():
 # --- the recipes of docs/adding.md -------------------------------------------------------------
 
 
-class NpzInput(Section):
+class NpzInput(PairInput):
     """Two images and a camera in one .npz file."""
 
     kind: Literal["npz"]
@@ -168,10 +167,6 @@ class NpzInput(Section):
         """The pair; `path` resolves the names of files."""
         with np.load(path(self.path)) as arrays:
             return Pair(arrays["ref"], arrays["next"], arrays["K"], arrays["K"])
-
-    def files(self) -> list[str]:
-        """Names of the files and folders that are read."""
-        return [self.path]
 
 
 class WiderProblem(Problem):

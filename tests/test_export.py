@@ -1,4 +1,4 @@
-"""export, import and check on the command line: a family of files, and answers made results."""
+"""Commands export, import and check: exported files, and foreign answers as results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,6 @@ TINY = [
     "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",
     "--set", "segmentation.neighbours=4", "--set", "energy.pixel_samples=4",
 ]  # fmt: skip
-FOUR = ["unit-offset", "unit-translation/smooth/lifted", "free/epigraph", "free/epigraph/lifted"]
 
 
 def write(out: Path, *words: str, scene: str = "orbit") -> int:
@@ -57,13 +56,13 @@ def problem_of(folder: Path):
     return case, nlp, layout, orders, manifest
 
 
-@pytest.mark.parametrize("scene", ["orbit", "street"])
-def test_a_family_is_exported_and_read_back(scene, tmp_path):
-    words = [w for f in FOUR for w in ("--formulation", f)]
+def test_several_sizes_and_formulations_are_exported_and_read_back(tmp_path):
+    forms = ["unit-translation/smooth/lifted", "free/epigraph/lifted"]
+    words = [w for f in forms for w in ("--formulation", f)]
     sizes = ["--superpixels", "9", "--superpixels", "12"]
-    assert write(tmp_path, *words, *sizes, "-q", scene=scene) == 0
+    assert write(tmp_path, *words, *sizes, "-q", scene="street") == 0
     folders = sorted(p.parent for p in tmp_path.rglob("soup.nl"))
-    assert len(folders) == 8
+    assert len(folders) == 4
     hashes = set()
     for folder in folders:
         case, nlp, _, (v, r), manifest = problem_of(folder)
@@ -81,10 +80,10 @@ def test_a_family_is_exported_and_read_back(scene, tmp_path):
         exact = oracle.energy(case.soup, case.data, case.weights)["total"]
         assert manifest["exact_energy_at_start"]["total"] == pytest.approx(exact, rel=1e-12)
         hashes.add(manifest["nl"]["sha256"])
-    assert len(hashes) == 8
+    assert len(hashes) == 4
 
 
-def test_other_formats_say_the_same(exported):
+def test_casadi_and_hdf5_agree_with_the_nlp(exported):
     _, nlp, _, _, _ = problem_of(exported)
     oracle = ca.Function.load(str(exported / "oracle.casadi"))
     hess = ca.Function.load(str(exported / "hess_lag.casadi"))
@@ -116,7 +115,7 @@ def optimum(exported):
     return found.stages[-1].x, found.stages[-1].lam_g
 
 
-def test_a_solution_becomes_depth_maps(exported, optimum, tmp_path, capsys):
+def test_a_foreign_solution_becomes_a_result_folder(exported, optimum, tmp_path, capsys):
     _, _, _, (v, r), _ = problem_of(exported)
     sol = exported / "good.sol"
     write_sol(sol, *optimum, v, r, "hand made", 0)
@@ -146,7 +145,7 @@ def test_verified_means_optimal(exported, optimum, tmp_path, capsys):
     assert "(solved, code 0): not verified" in capsys.readouterr().out
     assert (exported / "manifest.json").read_text() == before
     # the point is what counts: multipliers that are wrong, or none, make it no worse
-    for given in (lam, None, -lam, np.full(nlp.ng, 1e300)):
+    for given in (None, -lam, np.full(nlp.ng, 1e300)):
         write_sol(exported / "x.sol", x, given, v, r, "hand made", 0)
         assert import_sol(exported, exported / "x.sol", renew=False).run.solution.converged
     write_sol(exported / "x.sol", x, lam, v, r, "hand made", 400)
@@ -156,7 +155,7 @@ def test_verified_means_optimal(exported, optimum, tmp_path, capsys):
         import_sol(exported, exported / "x.sol", renew=False)
 
 
-def test_what_is_not_a_number_is_not_verified(exported, optimum):
+def test_a_point_with_nan_is_not_verified(exported, optimum):
     _, nlp, _, _, _ = problem_of(exported)
     x, lam = optimum
     assert examine(nlp, x, lam).residuals.within(Limits())
@@ -168,7 +167,7 @@ def test_what_is_not_a_number_is_not_verified(exported, optimum):
     assert not found.within(Limits())
 
 
-@pytest.mark.parametrize("size", [0.0, 1e20, 1e150, 1e300])
+@pytest.mark.parametrize("size", [1e20, 1e300])
 def test_a_huge_point_is_checked_and_makes_no_result(size, exported, tmp_path, capsys):
     _, nlp, _, (v, r), _ = problem_of(exported)
     before = (exported / "manifest.json").read_text()
@@ -185,7 +184,7 @@ def test_a_huge_point_is_checked_and_makes_no_result(size, exported, tmp_path, c
     assert (exported / "manifest.json").read_text() == before
 
 
-def test_a_false_claim_is_not_believed(exported, tmp_path, capsys):
+def test_a_false_claim_of_success_is_not_verified(exported, tmp_path, capsys):
     sol = answer(exported, "false.sol", move=1e-3)
     run = import_sol(exported, sol, renew=False).run
     assert not run.solution.converged
@@ -222,7 +221,7 @@ def test_the_worst_superpixel_is_named(exported):
     assert kind("normal", np.array([0.0, np.nan]), 1e-6).largest == np.inf
 
 
-def test_folders_that_do_not_fit(exported, tmp_path):
+def test_a_changed_export_is_refused(exported, tmp_path):
     sol = answer(exported, "good.sol")
     other = tmp_path / "other"
     shutil.copytree(exported, other)

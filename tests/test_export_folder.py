@@ -1,4 +1,4 @@
-"""Exported folders: what lies in them after one export and after two, and broken ones."""
+"""Exported folders: their files after one and two exports, and broken manifests."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from soup_nlp.errors import ExportError
 from soup_nlp.export.foreign import import_sol
 
 
-def test_casadi_alone_is_enough(tmp_path):
+def test_the_casadi_format_includes_the_start(tmp_path):
     assert write(tmp_path, "--superpixels", "9", "--format", "casadi") == 0
     listed = json.loads((tmp_path / "manifest.json").read_text())["files"]
     assert all((tmp_path / name).is_file() for name in listed)
@@ -33,7 +33,7 @@ def test_casadi_alone_is_enough(tmp_path):
     close(oracle(given["x0"], given["p"])[0], back.values(given["x0"][v])[0])
 
 
-def test_a_second_export_leaves_nothing_of_the_first(tmp_path):
+def test_a_second_export_removes_the_files_of_the_first(tmp_path):
     assert write(tmp_path, "--superpixels", "9", "--format", "casadi", "-q") == 0
     (tmp_path / "mine.casadi").write_text("not of the export")
     manifest = json.loads((tmp_path / "manifest.json").read_text())
@@ -104,7 +104,7 @@ def small(tmp_path_factory) -> Path:
         ("best_known", {"found_by": "me"}),
     ],
 )
-def test_a_broken_manifest_is_named(key, value, small, tmp_path, capsys):
+def test_a_broken_manifest_is_refused(key, value, small, tmp_path, capsys):
     other = tmp_path / "other"
     shutil.copytree(small, other)
     manifest = json.loads((other / "manifest.json").read_text())

@@ -87,7 +87,7 @@ def test_flow_colour_is_continuous_but_for_the_seam_of_the_wheel():
 
 
 def test_error_colours():
-    out = colourise_error(np.array([[0.0, 0.2, 7.0, np.nan]]), 0.2).astype(int)[0]
+    out = colourise_error(np.array([[0.0, 0.2, 7.0, np.nan]])).astype(int)[0]
     assert out[0].any()  # a small error is not the black of the unknown
     np.testing.assert_array_equal(out[1], out[2])
     assert out[1].sum() > out[0].sum()
@@ -105,8 +105,8 @@ def test_superpixel_boundaries():
     image = np.full((4, 6, 3), 9, np.uint8)
     labels = np.repeat([[0, 0, 0, 1, 1, 1]], 4, axis=0)
     labels[3] = 2
-    out = draw_superpixels(image, labels, (1, 2, 3))
-    edge = (out == [1, 2, 3]).all(axis=2)
+    out = draw_superpixels(image, labels)
+    edge = (out == [255, 255, 0]).all(axis=2)
     want = np.zeros((4, 6), bool)
     want[:3, 2] = want[2] = True
     np.testing.assert_array_equal(edge, want)
@@ -141,17 +141,6 @@ def test_overview_does_not_touch_global_state(tmp_path):
         assert not sys.modules["matplotlib.pyplot"].get_fignums()
 
 
-def test_overview_bad_input_leaves_the_old_file(tmp_path):
-    path = tmp_path / "a.png"
-    path.write_bytes(b"old")
-    with pytest.raises(DataError, match="at least one"):
-        overview_strip(path, [], "t")
-    with pytest.raises(DataError, match="8-bit RGB"):
-        overview_strip(path, [("grey", np.zeros((3, 3), np.uint8))], "t")
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["a.png"]
-
-
 def small_pair(**known):
     """8 x 6 pair with a flow that half of the pixels trust."""
     image = np.full((6, 8, 3), 90, np.uint8)
@@ -162,15 +151,18 @@ def small_pair(**known):
     return Pair(image, image[:5], K, K, flow, truth, "small")
 
 
-def drawn(monkeypatch, *args, **kwargs):
-    """What `overview` hands to `overview_strip`: panels by caption, and the title."""
+ONE, FLAT = np.zeros((6, 8), int), np.tile([0.0, 0.0, -1.0], (6, 8, 1))
+
+
+def drawn(monkeypatch, pair, depths, labels=ONE):
+    """Arguments of `overview_strip` in `overview`: panels by caption, and the title."""
     seen = {}
 
     def catch(path, panels, title):
         seen.update(panels={p[0]: p[1:] for p in panels}, title=title)
 
     monkeypatch.setattr(figures, "overview_strip", catch)
-    overview("unused.png", *args, **kwargs)
+    overview("unused.png", pair, labels, depths, FLAT, "a title")
     return seen["panels"], seen["title"]
 
 
@@ -183,11 +175,10 @@ def test_overview_of_everything(monkeypatch):
     panels, title = drawn(
         monkeypatch,
         small_pair(depth_ref=truth),
-        labels=np.arange(48).reshape(6, 8) // 24,
-        depths={"start": start, "solution": solution},
-        normals=np.tile([0.0, 0.0, -1.0], (6, 8, 1)),
+        {"start": start, "solution": solution},
+        np.arange(48).reshape(6, 8) // 24,
     )
-    assert title == "small"
+    assert title == "a title"
     # 47 true pixels, 23 with an estimate, one of them 50 % too deep: 0.5 / 23
     mre = depth_metrics(start, truth).mre
     assert list(panels) == [
@@ -217,30 +208,26 @@ def test_overview_of_everything(monkeypatch):
 
 
 def test_overview_leaves_out_what_is_unknown(monkeypatch):
-    panels, title = drawn(monkeypatch, small_pair(), title="")
-    assert len(panels) == 4
-    assert title == ""
     bare = dataclasses.replace(small_pair(), flow=None)
-    panels, _ = drawn(monkeypatch, bare, depths={"a": np.full((6, 8), 2.0)})
-    assert list(panels) == ["reference frame", "next frame", "a"]
-    panels, _ = drawn(monkeypatch, bare, depths={"nothing": np.full((6, 8), np.nan)})
+    panels, _ = drawn(monkeypatch, bare, {"a": np.full((6, 8), 2.0)})
+    assert list(panels) == ["reference frame", "next frame", "1 superpixels", "a", "normals"]
+    panels, _ = drawn(monkeypatch, bare, {"nothing": np.full((6, 8), np.nan)})
     assert not panels["nothing"][0].any()
     points = np.array([[0.0, 0, 3.0], [1.2, 2, 3.0], [7, 5, 6.0]])
-    panels, _ = drawn(monkeypatch, small_pair(points=points), depths={"a": np.full((6, 8), 2.0)})
+    panels, _ = drawn(monkeypatch, small_pair(points=points), {"a": np.full((6, 8), 2.0)})
     # scale 3/2 at the median; |6 - 3| / 6 at one point of three
-    assert list(panels)[-1] == "a, MRE 0.167 (median), coverage 100%"
+    assert list(panels)[-2] == "a, MRE 0.167 (median), coverage 100%"
 
 
 def test_overview_file(tmp_path):
     truth = np.linspace(2, 4, 48).reshape(6, 8)
-    overview(tmp_path / "o.png", small_pair(depth_ref=truth), depths={"solution": truth})
+    given = {"labels": ONE, "normals": FLAT, "title": "t"}
+    overview(tmp_path / "o.png", small_pair(depth_ref=truth), depths={"solution": truth}, **given)
     image = cv2.imread(str(tmp_path / "o.png"))
-    # two rows with bars, below one without: panels 4.2 in wide, 4.2 * 6 / 8 in high
+    # three rows, the second and third with bars: panels 4.2 in wide, 4.2 * 6 / 8 in high
     assert image.shape[1] == pytest.approx(100 * (3 * 4.28 + 0.08), abs=2)
     rows = 3 * (3.15 + 0.36)
     assert image.shape[0] == pytest.approx(100 * (0.42 + rows + 2 * 0.2), abs=2)
-    with pytest.raises(DataError, match="does not fit the pair"):
-        overview(tmp_path / "o.png", small_pair(), depths={"a": np.ones((5, 8))})
     assert os.listdir(tmp_path) == ["o.png"]
 
 
@@ -263,8 +250,6 @@ def test_png_round_trip(tmp_path):
     np.testing.assert_array_equal(back, rgb)
     with pytest.raises(DataError, match="does not exist"):
         write_png(tmp_path / "no" / "a.png", rgb)
-    with pytest.raises(DataError, match="8-bit RGB"):
-        write_png(tmp_path / "a.png", rgb.astype(float))
 
 
 def test_depth_png(tmp_path):
@@ -285,21 +270,3 @@ def test_depth_png_chooses_a_scale(tmp_path, unit):
     np.testing.assert_allclose(back / scale, z, atol=0.51 / scale, rtol=1e-3)
     assert back.max() > 32767
     assert write_clipped_depth_png16(tmp_path / "d.png", np.full((2, 2), np.nan)) > 0
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda: colourise_depth(np.zeros((2, 2, 1))), "shape"),
-        (lambda: colourise_depth(np.ones((2, 2)), 3.0, 2.0), "depth range"),
-        (lambda: colourise_flow(np.zeros((2, 2, 3))), "shape"),
-        (lambda: colourise_flow(np.zeros((2, 2, 2)), -1.0), "limit"),
-        (lambda: colourise_error(np.zeros((2, 2)), 0.0), "limit"),
-        (lambda: colourise_normals(np.zeros((2, 2))), "shape"),
-        (lambda: draw_superpixels(np.zeros((2, 2, 3), np.uint8), np.zeros((2, 3), int)), "labels"),
-        (lambda: write_clipped_depth_png16("x.png", np.ones((2, 2)), -1.0), "scale"),
-    ],
-)
-def test_bad_input(call, words):
-    with pytest.raises(DataError, match=words):
-        call()

@@ -92,16 +92,19 @@ def test_kitti_projections(tmp_path: Path) -> None:
 def test_vkitti_intrinsics(tmp_path: Path) -> None:
     path = tmp_path / "intrinsic.txt"
     head = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"
-    path.write_text(f"{head}\n0 0 725.0087 725.0087 620.5 187\n0 1 725 726 620.5 187\n\n")
-    table = fmt.read_vkitti2_intrinsics(path)
-    assert sorted(table) == [(0, 0), (0, 1)]
-    np.testing.assert_array_equal(table[0, 1], [[725, 0, 620.5], [0, 726, 187], [0, 0, 1]])
+    path.write_text(f"{head}\n0 0 725 726 620.5 187\n0 1 7 7 6 1\n1 0 730 730 6 1\n\n2 0 725\n")
+    first, second = fmt.read_vkitti2_intrinsics(path, (0, 1))
+    np.testing.assert_array_equal(first, [[725, 0, 620.5], [0, 726, 187], [0, 0, 1]])
+    assert second[0, 0] == 730
+    for missing in (2, 3):
+        with raises(f"3 complete rows[\\s\\S]*a row of frame {missing}"):
+            fmt.read_vkitti2_intrinsics(path, (0, missing))
     path.write_text("frame K[0,0]\n0 1\n")
     with raises("lacks columns"):
-        fmt.read_vkitti2_intrinsics(path)
-    path.write_text(f"{head}\n0 0 725\n")
-    with raises(r"row is too short[\s\S]*"):
-        fmt.read_vkitti2_intrinsics(path)
+        fmt.read_vkitti2_intrinsics(path, (0,))
+    path.write_text(f"{head}\n0 0 725 x 620.5 187\n")
+    with raises("not a number"):
+        fmt.read_vkitti2_intrinsics(path, (0,))
 
 
 # --- images -------------------------------------------------------------------------------------

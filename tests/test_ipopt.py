@@ -252,15 +252,6 @@ def test_an_event_stops_and_keeps_the_best_iterate():
     assert value(nlp, stage.x)[0] == pytest.approx(stage.objective)
 
 
-def test_stagnation_stops_early():
-    nlp = rosenbrock(10)
-    assert solve(nlp, stagnation=0.9).status in ("Stagnated", "Solve_Succeeded")
-    # twice in a row below a share that everything is below
-    stage = solve(nlp, stagnation=1e9)
-    assert stage.status == "Stagnated"
-    assert stage.iterations <= 3
-
-
 def test_a_listener_that_fails_ends_the_solve_with_its_message():
     def listen(p: Progress) -> None:
         raise ValueError("no more paper")

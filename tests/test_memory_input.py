@@ -1,4 +1,4 @@
-"""A pair in memory: its problem tells runs apart, and cannot be mistaken for another input."""
+"""Pairs in memory: the problem of a run holds a hash of the pair and cannot be solved again."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_hash_is_that_of_the_pair(run):
     assert pair_hash(replace(pair, name="other", truth=None)) == pair_hash(pair)
 
 
-def test_its_config_is_refused_before_anything_is_written(run, tmp_path, capsys):
+def test_its_config_cannot_be_solved_again(run, tmp_path, capsys):
     out = tmp_path / "out"
     write_folder(prepare_folder(out), run, dump_problem(run.problem), "")
     assert check_folder(out).ok
@@ -60,7 +60,7 @@ def test_a_run_survives_a_pickle(run):
     np.testing.assert_array_equal(again.reconstruction.depth_ref, run.reconstruction.depth_ref)
 
 
-def test_every_array_of_truth_and_history_says_what_it_is(run, tmp_path):
+def test_arrays_of_truth_and_history_are_described(run, tmp_path):
     write_folder(prepare_folder(tmp_path), run, dump_problem(run.problem), "")
     with h5py.File(tmp_path / "result.h5") as file:
         stored = file["truth/scene_flow"]

@@ -89,7 +89,7 @@ def test_a_preset_finds_no_error_in_a_scaled_truth():
         assert m.scale == pytest.approx(scale)
 
 
-def test_a_ratio_at_a_threshold_is_counted_as_the_result_folder_counts_it():
+def test_metrics_and_check_agree_at_the_delta_thresholds():
     """The check of a result folder recounts the shares: both must say the same at the edge."""
     truth = np.arange(1.0, 200.0)
     for k in (1, 2, 3):
@@ -115,7 +115,7 @@ def test_scale_of_the_estimate_changes_nothing(z, gt, factor, rule):
 
 @quick
 @given(depths, depths, st.floats(1e-2, 1e2))
-def test_each_rule_minimises_what_it_says(z, gt, factor):
+def test_each_scale_rule_minimises_its_error(z, gt, factor):
     best = depth_metrics(z, gt, scale="mre").mre
     rmse = depth_metrics(z, gt, scale="lsq").rmse
     for rule in ("median", "lsq"):
@@ -194,7 +194,7 @@ def test_bad_input(kwargs, words):
         depth_metrics([1.0], arguments.pop("truth"), **arguments)
 
 
-def test_a_clamp_moves_scaled_estimates_only():
+def test_a_clamp_moves_scaled_estimates():
     free = depth_metrics([1.0, 200.0], [1.0, 100.0], scale="none")
     held = depth_metrics([1.0, 200.0], [1.0, 100.0], scale="none", clamp=(1e-3, 80.0))
     assert free.mre == pytest.approx(0.5)
@@ -221,11 +221,11 @@ def test_eigens_clamp_comes_after_the_scale():
     assert m.log_rmse == pytest.approx(np.log(40.0 / 1e-3) / 2)
 
 
-def test_the_cap_itself_counts():
+def test_a_depth_equal_to_the_cap_counts():
     assert PRESETS["sintel70"].mask([70.0, np.nextafter(70.0, 71.0), 0.0]).tolist() == [1, 0, 0]
 
 
-def test_presets_leave_out_what_they_say():
+def test_presets_apply_cap_and_crop():
     truth = np.full((100, 200), 10.0)
     truth[:, 100:] = 75.0
     estimate = np.where(truth == 75.0, 300.0, 20.0)

@@ -1,4 +1,4 @@
-"""The .nl file says exactly what the NLP says: read back by CasADi, ASL, POUNCE and SCIP."""
+"""The .nl file equals the NLP: read back by CasADi, ASL, POUNCE and SCIP."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_casadi_reads_back_every_formulation(form, tmp_path):
     assert file.size == file.path.stat().st_size
 
 
-def test_parameters_decide_the_numbers_of_the_file(tmp_path):
+def test_parameters_and_start_are_written(tmp_path):
     nlp, _ = Tiny().nlp(PAPER, FORMS[0])
     p = nlp.with_theta(eps=0.5)
     back = ReadBack(write_nl(tmp_path / "a.nl", replace(nlp, p=p, x0=nlp.x0 + 0.25)).path)
@@ -82,7 +82,7 @@ def test_parameters_decide_the_numbers_of_the_file(tmp_path):
     assert abs(f - value(nlp, nlp.x0)[0]) > 1e-3
 
 
-def test_what_superpixels_share_is_written_once(tmp_path):
+def test_shared_expressions_are_written_once(tmp_path):
     nlp, layout = Tiny().nlp(PAPER, FORMS[0])
     file = write_nl(tmp_path / "soup.nl", nlp)
     # smooth norms live in the objective alone; lam / (m . r) of an anchor is one of them
@@ -103,7 +103,7 @@ def test_what_superpixels_share_is_written_once(tmp_path):
     assert objective > 0
 
 
-def test_classes_are_those_of_the_format(tmp_path):
+def test_variables_and_rows_are_ordered_by_class(tmp_path):
     nlp, layout = Tiny().nlp(PAPER, FORMS[0])
     file = write_nl(tmp_path / "soup.nl", nlp, names=readable_names(nlp, layout))
     in_rows, in_objective, both = file.nonlinear

@@ -38,7 +38,7 @@ def turned(angle: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.02])
-def test_a_start_without_parallax_borrows_everything_and_keeps_to_the_flow(tiles, angle):
+def test_a_start_without_parallax_borrows_every_depth_and_reproduces_the_flow(tiles, angle):
     flow = Flow(turned(angle).astype(np.float32), np.ones((120, 160), np.float32), "turn")
     start = propose(tiles, flow, K, K)
     assert start.borrowed.all()
@@ -48,7 +48,7 @@ def test_a_start_without_parallax_borrows_everything_and_keeps_to_the_flow(tiles
     np.testing.assert_allclose(error, start.error, atol=1e-3)
 
 
-def test_pieces_are_numbered_after_the_motions_that_are_shared(tiles):
+def test_components_without_a_shared_motion_are_numbered_last(tiles):
     n = len(tiles)
     own = np.full(n, -1)
     np.testing.assert_array_equal(rigid_components(own, tiles), np.zeros(n))
@@ -59,7 +59,7 @@ def test_pieces_are_numbered_after_the_motions_that_are_shared(tiles):
     assert set(rigid_components(np.where(middle, 0, -1), tiles)) == {0, 1, 2}
 
 
-def test_one_pixel_without_a_way_back_costs_its_own_neighbourhood_alone():
+def test_a_pixel_without_backward_flow_affects_its_neighbourhood_alone():
     forward, backward = np.zeros((2, 40, 60, 2), np.float32)
     backward[20, 30] = np.nan
     gap = round_trip_error(forward, backward)
@@ -69,7 +69,7 @@ def test_one_pixel_without_a_way_back_costs_its_own_neighbourhood_alone():
 
 
 @pytest.mark.parametrize(("scene", "said"), [("still", True), ("orbit", False), ("sheet", False)])
-def test_the_verdict_says_where_depth_is_a_guess(scene, said, tmp_path):
+def test_the_verdict_warns_where_depth_is_a_guess(scene, said, tmp_path):
     raw = {
         "input": {"kind": "scene", "scene": scene, "seed": 0, "width": 256, "height": 109},
         "flow": {"source": "truth"},

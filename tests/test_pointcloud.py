@@ -1,12 +1,9 @@
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 from helpers_ply import read_ply
 
-from soup_nlp.errors import DataError
 from soup_nlp.report.pointcloud import write_ply
 
 
@@ -63,23 +60,3 @@ def test_unknown_points_of_a_map_are_dropped(tmp_path):
 def test_empty(tmp_path):
     assert write_ply(tmp_path / "a.ply", np.zeros((0, 3)), np.zeros((0, 3), np.uint8)) == 0
     assert read_ply(tmp_path / "a.ply")[0].shape == (0, 3)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"rgb": np.zeros((50, 3))}, "8-bit"),
-        ({"rgb": np.zeros((49, 3), np.uint8)}, "differ in length"),
-        ({"normals": np.zeros((3, 3))}, "differ in length"),
-        ({"xyz": np.zeros(3)}, "wrong shape"),
-        ({"xyz": np.zeros((50, 2))}, "wrong shape"),
-    ],
-)
-def test_bad_arrays_leave_the_old_file(tmp_path, change, words):
-    xyz, rgb, _ = cloud()
-    path = tmp_path / "a.ply"
-    path.write_bytes(b"old")
-    with pytest.raises(DataError, match=words):
-        write_ply(path, **{"xyz": xyz, "rgb": rgb, **change})
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["a.ply"]

@@ -1,4 +1,4 @@
-"""AMPL's .sol: read, written, and everything that can be wrong with one."""
+"""The reader of AMPL's .sol format, and multipliers of a foreign optimum."""
 
 from __future__ import annotations
 
@@ -95,14 +95,14 @@ def test_written_files_read_back(tmp_path):
         ("\n30\n", "\nnan\n", "not finite"),
     ],
 )
-def test_wrong_files_are_named(tmp_path, old, new, said):
+def test_wrong_files_are_refused(tmp_path, old, new, said):
     assert old in TEXT
     (tmp_path / "a.sol").write_text(TEXT.replace(old, new))
     with pytest.raises(ExportError, match=said):
         read_sol(tmp_path / "a.sol", ORDER, ROWS)
 
 
-def test_a_missing_and_a_cut_file(tmp_path):
+def test_missing_and_truncated_files_are_refused(tmp_path):
     with pytest.raises(ExportError, match="cannot be read"):
         read_sol(tmp_path / "none.sol", ORDER, ROWS)
     (tmp_path / "a.sol").write_text(TEXT[: TEXT.index("20")])
@@ -146,13 +146,13 @@ def test_multipliers_of_a_foreign_optimum(tmp_path):
         ("-1.5\n", "inf\n"),
     ],
 )
-def test_malformed_files_are_errors_of_the_file(tmp_path, old, new):
+def test_malformed_files_are_refused(tmp_path, old, new):
     assert old in TEXT
     (tmp_path / "a.sol").write_text(TEXT.replace(old, new))
     with pytest.raises(ExportError, match=r"a\.sol"):
         read_sol(tmp_path / "a.sol", ORDER, ROWS)
 
 
-def test_a_message_that_says_options_is_read_back(tmp_path):
+def test_a_message_with_the_word_options_is_read_back(tmp_path):
     write_sol(tmp_path / "a.sol", np.ones(3), None, ORDER, ROWS, "one\n Options\ntwo", 0)
     assert read_sol(tmp_path / "a.sol", ORDER, ROWS).message == 'one\n"Options"\ntwo'

@@ -19,7 +19,7 @@ from soup_nlp.model.lanes import LANES, NoLanesError, compile_lanes, in_lanes
 from soup_nlp.model.layout import Chart
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP, assemble
-from soup_nlp.model.sums import FunctionSums, LaneSums, make_sums
+from soup_nlp.model.sums import Sums
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.solve.hessian import LagrangianHessian
 from soup_nlp.solve.ipopt import Ipopt
@@ -86,8 +86,8 @@ def test_vectors_and_functions_give_the_same_presolve(case, chart: Chart):
     args = case.soup, case.data, case.weights
     fast = TangentProblem(*args, Formulation(compiled=True), chart=chart)
     slow = TangentProblem(*args, Formulation(compiled=False), chart=chart)
-    assert isinstance(fast.sums, LaneSums)
-    assert isinstance(slow.sums, FunctionSums)
+    assert fast.sums.vectorised
+    assert not slow.sums.vectorised
     np.testing.assert_array_equal(fast.block, slow.block)
     np.testing.assert_array_equal(fast.upper.indices, slow.upper.indices)
     rng = np.random.default_rng(1)
@@ -108,7 +108,7 @@ def test_vectors_and_functions_give_the_same_presolve(case, chart: Chart):
 @pytest.mark.parametrize("elements", [1, LANES - 1, LANES, LANES + 1, 3 * LANES + 2])
 def test_tables_of_every_size(elements):
     nlp, other = squares(elements), squares(elements, compiled=False)
-    fast, slow = LaneSums(nlp, ["exact"]), FunctionSums(other, ["exact"])
+    fast, slow = Sums(nlp, ["exact"]), Sums(other, ["exact"])
     x, lam = nlp.x0, np.linspace(-1, 1, elements)
     assert fast.value(x) == pytest.approx(slow.value(x), rel=1e-14)
     close(fast.gradient(x), slow.gradient(x), 1e-14)
@@ -122,7 +122,7 @@ def test_tables_of_every_size(elements):
 def test_what_the_caller_wants_besides_stands_in_the_pattern():
     nlp = squares(5)
     corner = np.array([2]), np.array([4])
-    sums = LaneSums(nlp, ["exact"], corner)
+    sums = Sums(nlp, ["exact"], corner)
     (place,) = sums.upper.places[-1]
     assert (sums.upper.rows[place], sums.upper.columns[place]) == (2, 4)
     assert sums.hessian("exact", nlp.x0, np.ones(5))[place] == 0
@@ -148,7 +148,7 @@ def test_a_pattern_is_the_union_of_its_sets(size):
 @needs_compiler
 def test_other_parameters_are_used():
     nlp = squares(5)
-    sums = LaneSums(nlp, ["exact"])
+    sums = Sums(nlp, ["exact"])
     before = sums.value(nlp.x0)
     sums.theta = np.array([6.0])
     assert sums.value(nlp.x0) == pytest.approx(2 * before, rel=1e-14)
@@ -156,7 +156,7 @@ def test_other_parameters_are_used():
 
 @needs_compiler
 def test_lengths_are_checked_before_machine_code_reads():
-    sums = LaneSums(squares(5), ["exact"])
+    sums = Sums(squares(5), ["exact"])
     with pytest.raises(ValueError, match="x has 2 entries, expected 6"):
         sums.value(np.zeros(2))
     with pytest.raises(ValueError, match="lam_g has 1 entries, expected 5"):
@@ -232,7 +232,7 @@ def test_kernels_serve_another_camera(case, own_cache):
     other = TangentProblem(
         case.soup, replace(case.data, K_next=K), case.weights, Formulation(), exact=True
     )
-    assert isinstance(other.sums, LaneSums)
+    assert other.sums.vectorised
     assert sorted(p.name for p in own_cache.glob("*")) == before
 
 
@@ -247,8 +247,8 @@ def test_without_a_compiler_functions_do_it(own_cache, monkeypatch, caplog):
     monkeypatch.setenv("CC", "/bin/false")
     nlp = squares(5)
     with caplog.at_level(logging.INFO):
-        sums = make_sums(nlp, ["exact"])
-    assert isinstance(sums, FunctionSums)
+        sums = Sums(nlp, ["exact"])
+    assert not sums.vectorised
     assert "no machine code on vectors" in caplog.text
     assert sums.value(nlp.x0) == pytest.approx(float(nlp.oracle(nlp.x0, nlp.p)[0]), rel=1e-14)
 
@@ -258,4 +258,4 @@ def test_a_library_that_does_not_load_is_no_way(monkeypatch, tmp_path):
     broken = tmp_path / "broken.so"
     broken.write_text("not a library")
     monkeypatch.setattr("soup_nlp.model.lanes.shared_library", lambda key, source: broken)
-    assert isinstance(make_sums(squares(5), ["exact"]), FunctionSums)
+    assert not Sums(squares(5), ["exact"]).vectorised

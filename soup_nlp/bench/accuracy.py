@@ -1,4 +1,4 @@
-"""One pair measured: solution and rivals under every convention, as one row of plain numbers."""
+"""One pair measured: solution and baselines under every convention, as one row of numbers."""
 
 from __future__ import annotations
 
@@ -7,53 +7,57 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.bench.rivals import depth_maps, true_depth
+from soup_nlp.bench.depth_maps import depth_maps, true_depth
+from soup_nlp.bench.rows import Job, Row, attempt
 from soup_nlp.bench.suites import SUITES, Item
-from soup_nlp.bench.truth import true_soup
+from soup_nlp.bench.truth import moves_by_itself, true_soup
 from soup_nlp.config.problem import Problem, dump_problem
 from soup_nlp.data.flow.sources import is_named, is_network
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import sample_at_points, scene_flow_epe, skill
+from soup_nlp.evaluate.metrics import depth_metrics, sample_at_points, scene_flow_epe, skill
 from soup_nlp.evaluate.protocols import Preset, preset
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.run import Run, run
 from soup_nlp.report.folder import prepare_folder, write_folder
 
 Float = NDArray[np.float64]
-Row = dict[str, Any]
+Measure = Callable[[Item, tuple[str, ...], str], Row]
 
 KEPT = ("mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3")
 """Errors that a row keeps, beside scale, coverage and skill."""
+LEAST_PIXELS = 50
+"""Fewest true pixels of a moving component whose scale is told."""
 
 
-@dataclass(frozen=True)
-class Job:
-    """One row to be measured; it can be sent to another process.
+def pair_job(
+    item: Item,
+    overrides: Sequence[str] = (),
+    variant: str = "",
+    folder: Path | None = None,
+    measure: Measure | None = None,
+) -> Job:
+    """The job of one pair and flow; it can be sent to another process.
 
-    Attributes:
+    Args:
         item: Pair and flow.
         overrides: Of its problem.
         variant: Name of the overrides in an analysis; empty for the defaults.
-        folder: Where to write the result folder; None to keep the row only.
+        folder: Where to write the result folder; a row whose folder is not there is stale.
+        measure: Makes the row of (item, overrides, variant); default `measure_pair`.
     """
-
-    item: Item
-    overrides: tuple[str, ...] = ()
-    variant: str = ""
-    folder: Path | None = None
-
-    @property
-    def key(self) -> str:
-        """Unique in a table."""
-        return f"{self.item.key} {self.variant}".strip()
+    own = item, tuple(overrides), variant
+    work = partial(measure, *own) if measure else partial(measure_pair, *own, folder=folder)
+    stale = folder is not None and not (folder / "summary.json").is_file()
+    return Job(head(*own), partial(attempt, work), stale)
 
 
 def settings_hash(problem: Problem) -> str:
@@ -64,56 +68,77 @@ def settings_hash(problem: Problem) -> str:
 
 def input_hash(problem: Problem) -> str:
     """Hash of the input but its place: the same frames of the same dataset in every folder."""
-    return _hash(problem.input.model_dump(mode="json", exclude={"root", "path"}))
+    places = {"root", "path", "ref", "next", "depth", "depth_next", "intrinsics"}
+    return _hash(problem.input.model_dump(mode="json", exclude=places))
 
 
 def _hash(tree: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def measure(job: Job, change: Callable[[Pair], Pair] | None = None) -> Row:
-    """Solve and score one pair; whatever fails becomes a row with `ok` false and the reason.
+def head(item: Item, overrides: Sequence[str] = (), variant: str = "") -> Row:
+    """What identifies a row."""
+    try:
+        problem = item.problem(overrides)
+        settings, source = settings_hash(problem), input_hash(problem)
+    except Exception:
+        settings = source = "wrong"
+    return {
+        "key": f"{item.key} {variant}".strip(),
+        "suite": item.suite,
+        "sequence": item.sequence,
+        "pair": item.name,
+        "flow": item.flow,
+        "variant": variant,
+        "overrides": list(overrides),
+        "presets": list(item.presets),
+        "settings": settings,
+        "input": source,
+    }
+
+
+def measure_pair(
+    item: Item,
+    overrides: tuple[str, ...] = (),
+    variant: str = "",
+    *,
+    folder: Path | None = None,
+    change: Callable[[Pair], Pair] | None = None,
+) -> Row:
+    """Solve and score one pair.
 
     Args:
-        job: What to measure.
+        item: Pair and flow.
+        overrides: Of its problem.
+        variant: Not used here.
+        folder: Where to write the result folder; None for nowhere.
         change: Makes another pair of the one that was loaded.
+
+    Raises:
+        SoupError: the pair cannot be solved, or no convention has a true pixel.
     """
-    row = head(job)
-    begin, cpu = time.perf_counter(), time.process_time()
-    try:
-        problem = job.item.problem(job.overrides)
-        pair = problem.load_pair()
-        loaded = time.perf_counter() - begin
-        if change is not None:
-            source = problem.flow.source
-            if not (is_named(source) or is_network(source)):
-                # a file fits the pair as it is
-                pair = pair.with_flow(problem.flow.load(pair, problem.path))
-            pair = change(pair)
-        # a dataset without its truth would be solved for nothing, and again every time
-        if not any(_applies(pair.truth, preset(name)) for name in job.item.presets):
-            raise _no_truth(job.item)
-        if job.folder is None:
-            result = _timed(run(problem, pair=pair), loaded)
-        else:
-            folder = prepare_folder(job.folder)
-            log = str(folder / "ipopt.log")
-            result = _timed(run(problem, pair=pair, ipopt_log=log), loaded)
-            write_folder(folder, result, dump_problem(problem), "")
-        found = scores(result, job.item.presets)
-        if not found["metrics"]:
-            raise _no_truth(job.item)
-        row |= {"ok": True, "error": None, **found}
-    except Exception as error:
-        row |= {"ok": False, "error": f"{type(error).__name__}: {error}"}
-    row["seconds"] = time.perf_counter() - begin
-    row["cpu_seconds"] = time.process_time() - cpu
-    return clean(row)
-
-
-def _timed(result: Run, loaded: float) -> Run:
-    """The run with the seconds that its pair took to load or render."""
-    return replace(result, seconds={**result.seconds, "load": loaded})
+    begin = time.perf_counter()
+    problem = item.problem(overrides)
+    pair = problem.load_pair()
+    loaded = time.perf_counter() - begin
+    if change is not None:
+        source = problem.flow.source
+        if not (is_named(source) or is_network(source)):
+            # a flow file fits the pair before the change
+            pair = pair.with_flow(problem.flow.load(pair, problem.path))
+        pair = change(pair)
+    # do not solve a pair that cannot be scored
+    if not any(_applies(pair.truth, preset(name)) for name in item.presets):
+        raise _no_truth(item)
+    log = None if folder is None else str(prepare_folder(folder) / "ipopt.log")
+    result = run(problem, pair=pair, ipopt_log=log)
+    result = replace(result, seconds={**result.seconds, "load": loaded})
+    if folder is not None:
+        write_folder(folder, result, dump_problem(problem), "")
+    found = scores(result, item.presets)
+    if not found["metrics"]:
+        raise _no_truth(item)
+    return found
 
 
 def _no_truth(item: Item) -> DataError:
@@ -128,28 +153,6 @@ def _no_truth(item: Item) -> DataError:
     )
 
 
-def head(job: Job) -> Row:
-    """What names a row."""
-    item = job.item
-    try:
-        problem = item.problem(job.overrides)
-        settings, source = settings_hash(problem), input_hash(problem)
-    except Exception:
-        settings = source = "wrong"
-    return {
-        "key": job.key,
-        "suite": item.suite,
-        "sequence": item.sequence,
-        "pair": item.name,
-        "flow": item.flow,
-        "variant": job.variant,
-        "overrides": list(job.overrides),
-        "presets": list(item.presets),
-        "settings": settings,
-        "input": source,
-    }
-
-
 def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
     """Metrics by convention and method, energies, flow error and scene flow of a run.
 
@@ -162,7 +165,15 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
     if result.refined is not None:
         energy["nlp"] = s.energy
     energy["solution"] = result.energy
-    row: Row = {
+    try:
+        true = true_soup(result.pair, result.segmentation)
+        energy["truth"] = oracle.energy(true.soup, result.data, result.weights)
+    except DataError:
+        pass  # most real pairs have no true motions
+    tables = {name: _table(result, maps, preset(name)) for name in presets}
+    metrics = {name: table for name, table in tables.items() if table}
+    main = next(iter(metrics), "")
+    return {
         "status": s.status,
         "good": result.good,
         "superpixels": len(result.segmentation),
@@ -172,19 +183,11 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
         "parallax_px": float(np.median(result.start.parallax)),
         "bending_share": float(result.start.bending_share),
         "flow_error": flow_error(result.pair),
-        "metrics": {},
+        "metrics": metrics,
+        "energy": {k: dict(v) for k, v in energy.items()},
+        "scene_flow": _scene_flow(result, metrics[main]) if main else None,
+        "moving": moving(result.pair, maps["solution"], preset(main)) if main else None,
     }
-    try:
-        true = true_soup(result.pair, result.segmentation)
-        energy["truth"] = oracle.energy(true.soup, result.data, result.weights)
-    except DataError:
-        pass  # most real pairs have no true motions
-    row["energy"] = {k: dict(v) for k, v in energy.items()}
-    for name in presets:
-        if table := _table(result, maps, name):
-            row["metrics"][name] = table
-    row["scene_flow"] = _scene_flow(result, row["metrics"])
-    return row
 
 
 def _applies(truth: Truth | None, convention: Preset) -> bool:
@@ -198,9 +201,11 @@ def _applies(truth: Truth | None, convention: Preset) -> bool:
     return convention.counts(truth.points[:, 2])
 
 
-def _table(result: Run, maps: Mapping[str, Float], name: str) -> dict[str, dict[str, float]]:
+def _table(
+    result: Run, maps: Mapping[str, Float], convention: Preset
+) -> dict[str, dict[str, float]]:
     """Metrics of every method under one convention; {} where it does not apply."""
-    truth, convention = result.pair.truth, preset(name)
+    truth = result.pair.truth
     if truth is None or true_depth(result) is None or not _applies(truth, convention):
         return {}
     out: dict[str, dict[str, float]] = {}
@@ -210,8 +215,6 @@ def _table(result: Run, maps: Mapping[str, Float], name: str) -> dict[str, dict[
         else:
             assert truth.points is not None
             estimate, gt = sample_at_points(depth, truth.points)
-        if not convention.counts(gt):
-            return {}
         m = convention.score(estimate, gt).as_dict()
         out[method] = {k: m[k] for k in (*KEPT, "scale", "coverage", "n_pixels")}
     for m in out.values():
@@ -219,15 +222,46 @@ def _table(result: Run, maps: Mapping[str, Float], name: str) -> dict[str, dict[
     return out
 
 
-def _scene_flow(result: Run, metrics: Mapping[str, Any]) -> dict[str, float | int] | None:
+def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
+    """Errors of the pixels that move by themselves and of the rest, under one scale for both.
+
+    Args:
+        pair: Its truth must have components (0 is the static scene) and dense depth.
+        depth: (H, W) z.
+        convention: Rule of the one scale of the whole image, and the pixels that count.
+
+    Returns:
+        "mre" and "rest" (MRE of moving pixels and of the others), "share" of moving ones among the
+        true pixels, and "components": pixels and "scale" (median of z / z_true after the scale) of
+        every moving component; None without such a truth or without moving pixels.
+    """
+    truth = pair.truth
+    if truth is None or truth.components is None or truth.depth_ref is None:
+        return None
+    gt, label = truth.depth_ref, truth.components
+    label = np.where((label > 0) & ~moves_by_itself(truth)[label], 0, label)
+    counts = convention.mask(gt) & np.isfinite(gt) & (gt > 0)
+    own, rest = counts & (label > 0), counts & (label == 0)
+    if not own.any() or not rest.any():
+        return None
+    z = depth * convention.score(depth, gt).scale
+    mre = [depth_metrics(z, gt, scale="none", mask=mask).mre for mask in (own, rest)]
+    components = []
+    for k in np.unique(label[own]):
+        ratio = (z / np.where(own, gt, np.nan))[own & (label == k)]
+        ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
+        if len(ratio) >= LEAST_PIXELS:
+            components.append({"pixels": len(ratio), "scale": float(np.median(ratio))})
+    share = float(own.sum() / counts.sum())
+    return {"mre": mre[0], "rest": mre[1], "share": share, "components": components}
+
+
+def _scene_flow(result: Run, table: Mapping[str, Any]) -> dict[str, float | int] | None:
     """3D end-point error with the depth's own scale; None without truth."""
-    truth = result.pair.truth
-    if truth is None or truth.scene_flow is None or not metrics:
+    truth, scale = result.pair.truth, table["solution"]["scale"]
+    if truth is None or truth.scene_flow is None or not math.isfinite(scale):
         return None
     rec = result.reconstruction
-    scale = next(iter(metrics.values()))["solution"]["scale"]
-    if not math.isfinite(scale):
-        return None
     return scene_flow_epe(rec.points_next - rec.points_ref, truth.scene_flow, scale=scale)
 
 
@@ -248,16 +282,3 @@ def flow_error(pair: Pair) -> dict[str, float] | None:
         "over_3px": float(np.mean(gap > 3)),
         "used": float(used.sum() / known.sum()),
     }
-
-
-def clean(value: Any) -> Any:
-    """Plain JSON: numbers of numpy made plain, what is not finite made None."""
-    if isinstance(value, Mapping):
-        return {str(k): clean(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [clean(v) for v in value]
-    if isinstance(value, np.generic):
-        return clean(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

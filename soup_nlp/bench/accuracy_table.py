@@ -2,59 +2,24 @@
 
 from __future__ import annotations
 
-import platform
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from datetime import date
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from soup_nlp.bench.accuracy import Row
+from soup_nlp.bench.depth_maps import BASELINES, METHODS
 from soup_nlp.bench.published import PROTOCOL, SOURCE, data_note, published
-from soup_nlp.bench.rivals import METHODS, RIVALS
+from soup_nlp.bench.rows import Row
+from soup_nlp.bench.tables import (
+    energy_ratio,
+    failures,
+    get,
+    joined,
+    made,
+    mean,
+    show,
+    table,
+)
 from soup_nlp.evaluate.protocols import preset
-
-Number = float | None
-
-
-def get(row: Row, convention: str, method: str, name: str = "mre") -> Number:
-    """A number of a row; None where it is not known."""
-    if not row.get("ok"):
-        return None
-    value = row["metrics"].get(convention, {}).get(method, {}).get(name)
-    return None if value is None else float(value)
-
-
-def mean(values: Iterable[Number]) -> Number:
-    """Mean of what is known; None where nothing is."""
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if known else None
-
-
-def show(value: Number, form: str = ".4f") -> str:
-    """A number, or a dash."""
-    return "-" if value is None else format(value, form)
-
-
-def reason(row: Row) -> str:
-    """Why a row failed, on one line: what was wrong, where it was and what was found there."""
-    first, *more = str(row.get("error")).splitlines() or ["no reason"]
-    told = (line.strip() for line in more)
-    return ", ".join([first, *(t for t in told if t.startswith(("where: ", "found: ")))])
-
-
-def pair_names(rows: Sequence[Row]) -> list[str]:
-    """The pair of every row; with its suite where another suite has a pair of that name."""
-    suites: dict[str, set[str]] = {}
-    for row in rows:
-        suites.setdefault(row["pair"], set()).add(row["suite"])
-    alone = {name for name, own in suites.items() if len(own) == 1}
-    return [r["pair"] if r["pair"] in alone else f"{r['suite']} {r['pair']}" for r in rows]
-
-
-def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> list[str]:
-    """A Markdown table."""
-    rule = ["---"] + ["---:"] * (len(head) - 1)
-    return ["| " + " | ".join(cells) + " |" for cells in [head, rule, *lines]]
 
 
 def report(title: str, rows: Sequence[Row], note: str = "") -> str:
@@ -74,25 +39,22 @@ def report(title: str, rows: Sequence[Row], note: str = "") -> str:
     conventions = list(dict.fromkeys(p for r in good for p in r["metrics"]))
     for name in sorted(conventions, key=lambda p: p != main):
         lines += _convention(name, good)
+    lines += families(good)
     lines += _beaten_by(good)
     for name in dict.fromkeys(_own(r) for r in good):
         lines += _detail([r for r in good if _own(r) == name], name)
     suites = list(dict.fromkeys(r["suite"] for r in rows))
     for suite in suites:
         lines += _published(suite, [r for r in good if r["suite"] == suite])
-    bad = [r for r in rows if not r.get("ok")]
-    if bad:
-        lines += ["## Failed", ""]
-        lines += [f"- {r['key']}: {reason(r)}" for r in bad]
-    return "\n".join(lines).rstrip() + "\n"
+    return joined([*lines[:-1], *failures(rows)])
 
 
 def _verdict(good: Sequence[Row], total: int) -> str:
     with_truth = [r for r in good if _own(r)]
-    ahead = sum(not better_rivals(r) for r in with_truth)
+    ahead = sum(not better_baselines(r) for r in with_truth)
     return (
         f"{len(good)} of {total} pairs measured, {sum(bool(r['good']) for r in good)} converged."
-        f" The solution beats every rival on {ahead} of {len(with_truth)}"
+        f" The solution beats every baseline on {ahead} of {len(with_truth)}"
         " (MRE, each pair's own convention)."
     )
 
@@ -102,29 +64,67 @@ def _own(row: Row) -> str:
     return next((p for p in row["presets"] if get(row, p, "solution") is not None), "")
 
 
-def better_rivals(row: Row) -> dict[str, tuple[float, float]]:
-    """Rivals that are as good as the solution or better: their MRE and the solution's.
+def better_baselines(row: Row) -> dict[str, tuple[float, float]]:
+    """Baselines that are as good as the solution or better: their MRE and the solution's.
 
     `rigid` is met on the pixels where it has a depth.
     """
     name, out = _own(row), {}
     own, there = get(row, name, "solution"), get(row, name, "solution_rigid")
-    for rival in RIVALS:
-        theirs = get(row, name, rival)
-        mine = there if rival == "rigid" and there is not None else own
+    for baseline in BASELINES:
+        theirs = get(row, name, baseline)
+        mine = there if baseline == "rigid" and there is not None else own
         if theirs is not None and mine is not None and not mine < theirs:
-            out[rival] = theirs, mine
+            out[baseline] = theirs, mine
     return out
 
 
+def families(rows: Sequence[Row]) -> list[str]:
+    """The solution by family (sequence) and flow and in all: means, moving pixels, worst pair."""
+    own = [r for r in rows if _own(r)]
+    groups = _groups(own, lambda r: (r["sequence"], r["flow"]))
+    if len(groups) < 2:
+        return []
+    flows = dict.fromkeys(r["flow"] for r in own)
+    groups |= {("all", flow): [r for r in own if r["flow"] == flow] for flow in flows}
+    lines = [[f"{k} ({len(g)})", flow, *_family(g)] for (k, flow), g in groups.items()]
+    head = ["family (pairs)", "flow", "MRE", "median", "d<1.25", "skill", "MRE moving"]
+    head += ["MRE of the rest there", "scale of moving components", "skill < 0", "worst pair"]
+    text = (
+        "Means over the pairs, each under its own convention. Moving: pixels that move by"
+        " themselves, where a mask or the true motion is known; scale: median of z / z_true of"
+        " every moving component after the scale of the whole image (least, median, largest)."
+    )
+    return ["## By family", "", text, "", *table(head, lines), ""]
+
+
+def _family(rows: Sequence[Row]) -> list[str]:
+    def average(name: str) -> str:
+        return show(mean(get(r, _own(r), "solution", name) for r in rows))
+
+    there = [m for r in rows if (m := r.get("moving"))]
+    scales = [c["scale"] for m in there for c in m["components"]]
+    spread = " ".join(f"{np.quantile(scales, q):.2f}" for q in (0, 0.5, 1)) if scales else "-"
+    errors = {r["pair"]: get(r, _own(r), "solution") or 0.0 for r in rows}
+    worst = max(errors, key=lambda name: errors[name])
+    below = np.mean([(get(r, _own(r), "solution", "skill") or 0.0) < 0 for r in rows])
+    return [
+        *map(average, ("mre", "median_relative", "delta1", "skill")),
+        *(show(mean(m[k] for m in there)) for k in ("mre", "rest")),
+        f"{spread} ({len(scales)})" if scales else "-",
+        f"{below:.0%}",
+        f"{worst} {errors[worst]:.4f}",
+    ]
+
+
 def _beaten_by(rows: Sequence[Row]) -> list[str]:
-    """Where a rival is better."""
+    """Where a baseline is better."""
     lines = []
     for r in rows:
-        for rival, (theirs, mine) in better_rivals(r).items():
-            cover = get(r, _own(r), rival, "coverage")
+        for baseline, (theirs, mine) in better_baselines(r).items():
+            cover = get(r, _own(r), baseline, "coverage")
             cells = [
-                rival,
+                baseline,
                 show(theirs),
                 show(mine),
                 show(cover, ".1%"),
@@ -133,19 +133,14 @@ def _beaten_by(rows: Sequence[Row]) -> list[str]:
             lines.append([r["pair"], r["flow"], _own(r), *cells])
     if not lines:
         return []
-    head = ["pair", "flow", "convention", "rival", "its MRE", "the solution's", "its pixels"]
-    text = "The solution's MRE is on the pixels that the rival has a depth for."
-    return ["## Rivals that are better", "", text, "", *table([*head, "difference"], lines), ""]
+    head = ["pair", "flow", "convention", "baseline", "its MRE", "the solution's", "its pixels"]
+    text = "The solution's MRE is on the pixels that the baseline has a depth for."
+    return ["## Baselines that are better", "", text, "", *table([*head, "difference"], lines), ""]
 
 
 def _made(rows: Sequence[Row]) -> str:
-    codes = ", ".join(sorted({str(r.get("code")) for r in rows}))
     settings = ", ".join(sorted({str(r.get("settings")) for r in rows}))
-    cpu = sum(float(r.get("cpu_seconds") or 0) for r in rows)
-    return (
-        f"{date.today()}, {platform.machine()}, {cpu:.0f} CPU seconds in all;"
-        f" code {codes}; settings {settings} (one a flow source)."
-    )
+    return f"{made(rows)}; settings {settings} (one a flow source)."
 
 
 def _present(rows: Sequence[Row], convention: str) -> list[str]:
@@ -230,14 +225,6 @@ def _detail(rows: Sequence[Row], convention: str) -> list[str]:
         )
     text = f"## The solution, {preset(convention)}"
     return [text, "", *table(head, lines), ""]
-
-
-def energy_ratio(row: Row) -> Number:
-    """E(truth) / E(solution); None where the truth has no soup."""
-    energy: Mapping[str, Mapping[str, float]] = row["energy"]
-    if "truth" not in energy or not energy["solution"]["total"]:
-        return None
-    return energy["truth"]["total"] / energy["solution"]["total"]
 
 
 def _published(suite: str, rows: Sequence[Row]) -> list[str]:

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
-from soup_nlp.bench.accuracy import Job, Row, measure
-from soup_nlp.bench.accuracy_runner import Say, Where, measure_all
-from soup_nlp.bench.analyses_energy import measure_energy
-from soup_nlp.bench.analyses_flow import measure_flow, plot_flow, text_flow
-from soup_nlp.bench.analyses_report import plot_energy, plot_variants, text_energy, text_variants
-from soup_nlp.bench.analyses_views import VIEWS, measure_view
-from soup_nlp.bench.suites import Item, Listing
+from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
+from soup_nlp.bench.analyses_measures import VIEWS, measure_energy, measure_flow, measure_view
+from soup_nlp.bench.analyses_report import (
+    plot_energy,
+    plot_flow,
+    plot_variants,
+    text_energy,
+    text_flow,
+    text_variants,
+)
+from soup_nlp.bench.rows import Say, Where, measure_all
+from soup_nlp.bench.suites import Listing
 from soup_nlp.errors import ConfigError
 from soup_nlp.report.folder import prepare_folder
-from soup_nlp.storage.atomic import atomic_path, write_text
+from soup_nlp.storage.atomic import write_text
 
 Overrides = tuple[str, ...]
 
@@ -42,7 +47,7 @@ class Analysis:
     axis: str
     numeric: bool = False
     true_flow_only: bool = False
-    function: Callable[[Job], Row] = measure
+    function: Measure = measure_pair
 
 
 def _over(key: str, values: Sequence[object]) -> dict[str, Overrides]:
@@ -95,14 +100,7 @@ _ALL = (
         "flow source: true, DIS, and the truth with noise of 0.1 to 2 pixels",
         _over(
             "flow.source",
-            (
-                "truth",
-                "truth+noise:0.1",
-                "truth+noise:0.5",
-                "truth+noise:1",
-                "truth+noise:2",
-                "dis",
-            ),
+            ("truth", *(f"truth+noise:{px}" for px in ("0.1", "0.5", "1", "2")), "dis"),
         ),
         "flow",
         true_flow_only=True,
@@ -133,7 +131,7 @@ _ALL = (
     ),
     Analysis(
         "views",
-        "the same pairs mirrored and cropped: how far a figure on one pair is luck",
+        "the same pairs mirrored and cropped: how much a figure on one pair depends on chance",
         dict.fromkeys(VIEWS, ()),
         "view",
         function=measure_view,
@@ -184,7 +182,7 @@ def run_analysis(
     """
     analysis = _chosen(_known(name), values)
     listed = [i for listing in listings for i in listing.items]
-    items = _with_true_flow(listed) if analysis.true_flow_only else listed
+    items = [i for i in listed if i.flow == "truth" or not analysis.true_flow_only]
     if not items:
         raise ConfigError(
             "no pair is left for the analysis",
@@ -202,28 +200,21 @@ def run_analysis(
         items[0].problem((*overrides, *own))
     prepare_folder(out)
     jobs = [
-        Job(item, (*overrides, *own), variant)
+        pair_job(item, (*overrides, *own), variant, measure=analysis.function)
         for item in items
         for variant, own in analysis.variants.items()
     ]
-    rows = measure_all(
-        jobs,
-        out / f"{name}.jsonl",
-        where,
-        say=say,
-        any_code=any_code,
-        function=analysis.function,
-    )
+    rows = measure_all(jobs, out / f"{name}.jsonl", where, say=say, any_code=any_code)
     note = f"Overrides of every pair: {', '.join(f'`{o}`' for o in overrides) or 'none'}."
     text = {"energy": text_energy, "flows": text_flow}.get(name, text_variants)
     write_text(out / f"{name}.md", text(analysis.name, analysis.text, rows, note))
-    with atomic_path(out / f"{name}.png") as temporary:
-        if name == "energy":
-            plot_energy(temporary, rows)
-        elif name == "flows":
-            plot_flow(temporary, rows)
-        else:
-            plot_variants(temporary, analysis.axis, analysis.text, rows, analysis.numeric)
+    picture = out / f"{name}.png"
+    if name == "energy":
+        plot_energy(picture, rows)
+    elif name == "flows":
+        plot_flow(picture, rows)
+    else:
+        plot_variants(picture, analysis.axis, analysis.text, rows, analysis.numeric)
     return out / f"{name}.md"
 
 
@@ -279,8 +270,3 @@ def _chosen(analysis: Analysis, values: Sequence[str] | None) -> Analysis:
     if wrong:
         raise ConfigError("unknown variant", found=wrong[0], expected=", ".join(variants))
     return replace(analysis, variants={v: variants[v] for v in values})
-
-
-def _with_true_flow(items: Sequence[Item]) -> list[Item]:
-    """One item a pair, of those that are listed with their true flow."""
-    return [i for i in items if i.flow == "truth"]

@@ -2,58 +2,68 @@
 
 from __future__ import annotations
 
-import platform
-from collections.abc import Sequence
-from datetime import date
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from soup_nlp.bench.accuracy import Row
-from soup_nlp.bench.accuracy_table import get, mean, pair_names, reason, show, table
-from soup_nlp.bench.analyses_energy import ABOVE, WORSE
 from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC, SOURCE
+from soup_nlp.bench.rows import Row
+from soup_nlp.bench.tables import (
+    codes,
+    failures,
+    figure,
+    joined,
+    made,
+    main_metric,
+    mean,
+    pair_names,
+    save,
+    show,
+    table,
+    titles,
+)
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.model.energy_data import TERMS
 
+WORSE = 0.01
+"""Median relative error that solving from the truth may add."""
+
+ABOVE = 1.10
+"""E(truth) / E(solution) beyond which the model prefers something else."""
+
+FLOW_ERRORS = {
+    "mean": "mean",
+    "weighted_mean": "weighted mean",
+    "median": "median",
+    "over_3px": "over 3 px",
+    "used": "used",
+}
+
 COLOURS = {"arap": "#4477aa", "proj": "#66ccee", "cont": "#228833", "orient": "#ccbb44"}
-
-
-def _titles(rows: Sequence[Row]) -> list[str]:
-    return [f"{name}, {row['flow']}" for name, row in zip(pair_names(rows), rows, strict=True)]
 
 
 def _variants(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(r["variant"] for r in rows))
 
 
-def _pairs(rows: Sequence[Row]) -> dict[str, dict[str, Row]]:
-    """Rows by pair and variant."""
+def _pairs(rows: Sequence[Row], names: Sequence[str]) -> dict[str, dict[str, Row]]:
+    """Rows by name of the pair and variant."""
     out: dict[str, dict[str, Row]] = {}
-    for title, row in zip(_titles(rows), rows, strict=True):
-        out.setdefault(title, {})[row["variant"]] = row
+    for name, row in zip(names, rows, strict=True):
+        out.setdefault(name, {})[row["variant"]] = row
     return out
 
 
-def _main(row: Row, name: str = "mre") -> float | None:
-    return get(row, row["presets"][0], "solution", name)
-
-
 def _head(name: str, text: str, rows: Sequence[Row], note: str) -> list[str]:
-    codes = ", ".join(sorted({str(r.get("code")) for r in rows}))
-    cpu = sum(float(r.get("cpu_seconds") or 0) for r in rows)
     used = dict.fromkeys(r["presets"][0] for r in rows)
     return [
         f"# Analysis: {name}",
         "",
         f"{text[0].upper()}{text[1:]}. {note}",
         "",
-        f"{date.today()}, {platform.machine()}, {cpu:.0f} CPU seconds in all; code {codes}."
-        f" Depth of the reference frame; {'; '.join(str(preset(p)) for p in used)}.",
+        f"{made(rows)}. Depth of the reference frame; {'; '.join(str(preset(p)) for p in used)}.",
         "",
     ]
 
@@ -61,26 +71,28 @@ def _head(name: str, text: str, rows: Sequence[Row], note: str) -> list[str]:
 def text_variants(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     """Table of an analysis: a pair a line, a variant a column."""
     lines = _head(name, text, rows, note)
-    variants, pairs = _variants(rows), _pairs(rows)
-    complete = {t: p for t, p in pairs.items() if all(_main(p[v]) is not None for v in variants)}
+    variants, pairs = _variants(rows), _pairs(rows, titles(rows))
+    complete = {
+        t: p for t, p in pairs.items() if all(main_metric(p[v]) is not None for v in variants)
+    }
     for title, measure in (
-        ("MRE", lambda r: _main(r)),
-        ("Median relative error", lambda r: _main(r, "median_relative")),
-        ("Skill over constant depth", lambda r: _main(r, "skill")),
+        ("MRE", lambda r: main_metric(r)),
+        ("Median relative error", lambda r: main_metric(r, "median_relative")),
+        ("Skill over constant depth", lambda r: main_metric(r, "skill")),
         ("CPU seconds (shared machines count too)", lambda r: r.get("cpu_seconds")),
         ("Exact energy of the solution", _energy),
     ):
         form = ".1f" if "seconds" in title or "energy" in title else ".4f"
-        component = [
+        entries = [
             [pair, *(show(measure(own[v]), form) for v in variants)] for pair, own in pairs.items()
         ]
         if len(complete) > 1:
             averages = [mean(measure(p[v]) for p in complete.values()) for v in variants]
-            component.append([f"mean of {len(complete)}", *(show(a, form) for a in averages)])
-        lines += [f"## {title}", "", *table(["pair, flow", *variants], component), ""]
+            entries.append([f"mean of {len(complete)}", *(show(a, form) for a in averages)])
+        lines += [f"## {title}", "", *table(["pair, flow", *variants], entries), ""]
     lines += _beside(name)
-    lines += _failures(rows)
-    return "\n".join(lines).rstrip() + "\n"
+    lines += failures(rows)
+    return joined(lines)
 
 
 def _energy(row: Row) -> float | None:
@@ -90,14 +102,12 @@ def _energy(row: Row) -> float | None:
 def _beside(name: str) -> list[str]:
     """What the paper prints for the same question."""
     if name == "ablation":
-        component = [
-            [f"{k} (published)", *(f"{v:.4f}" for v in row)] for k, row in ABLATION.items()
-        ]
+        entries = [[f"{k} (published)", *(f"{v:.4f}" for v in row)] for k, row in ABLATION.items()]
         head = ["sequence", "arap", "+ proj", "+ cont", "+ orient"]
         return [
             "## Published MRE",
             "",
-            *table(head, component),
+            *table(head, entries),
             "",
             f"Copied, not measured: {SOURCE}.",
         ]
@@ -107,23 +117,17 @@ def _beside(name: str) -> list[str]:
     return []
 
 
-def _failures(rows: Sequence[Row]) -> list[str]:
-    bad = [r for r in rows if not r.get("ok")]
-    lines = [f"- {r['key']}: {reason(r)}" for r in bad]
-    return ["", "## Failed", "", *lines] if bad else []
-
-
 def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     """Table of energies by term and soup, and the two claims about them."""
     lines = _head(name, text, rows, note)
     good = [r for r in rows if r.get("ok")]
-    component, summary = [], []
-    for title, row in zip(_titles(good), good, strict=True):
+    entries, summary = [], []
+    for title, row in zip(titles(good), good, strict=True):
         scores = row["metrics"][row["presets"][0]]
         for soup, e in row["energy"].items():
             terms = [f"{e[t]:.4g}" for t in ("total", *TERMS)]
             own = [show(scores[soup]["mre"]), show(scores[soup]["median_relative"])]
-            component.append([title, soup, *terms, *own])
+            entries.append([title, soup, *terms, *own])
         least = row["energy"]["solution"]["total"]
         ratio = row["energy"]["truth"]["total"] / least
         nearest = row["energy"].get("truth rescaled", row["energy"]["truth"])["total"] / least
@@ -143,15 +147,9 @@ def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> st
         "Components rescaled: E of the truth, each component at its scale of lowest E, instead.",
     ]
     lines += ["", "## By term", ""]
-    lines += table(["pair, flow", "soup", "E", *TERMS, "MRE", "median"], component)
-    lines += _failures(rows)
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def _figure(width: float, height: float) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.add_subplot()
+    lines += table(["pair, flow", "soup", "E", *TERMS, "MRE", "median"], entries)
+    lines += failures(rows)
+    return joined(lines)
 
 
 LONG = 60
@@ -162,12 +160,13 @@ def plot_variants(
     path: Path, axis: str, title: str, rows: Sequence[Row], numeric: bool = False
 ) -> None:
     """MRE over the variants, a line a pair, their mean in black."""
-    variants, pairs = _variants(rows), _pairs(rows)
+    variants, pairs = _variants(rows), _pairs(rows, titles(rows))
     x = np.array([float(v) for v in variants]) if numeric else np.arange(float(len(variants)))
-    figure, ax = _figure(7, 4)
+    picture = figure(7, 4)
+    ax = picture.add_subplot()
     curves = []
     for name, own in pairs.items():
-        y = np.array([np.nan if (m := _main(own[v])) is None else m for v in variants])
+        y = np.array([np.nan if (m := main_metric(own[v])) is None else m for v in variants])
         ax.plot(x, y, "o-", lw=1, ms=3, alpha=0.7, label=name)
         curves.append(y)
     if len(curves) > 1:
@@ -187,11 +186,11 @@ def plot_variants(
     else:
         ax.set_ylim(bottom=0)
     ax.set(xlabel=axis, ylabel=f"MRE ({rows[0]['presets'][0]})")
-    figure.suptitle(title, fontsize=10)
+    picture.suptitle(title, fontsize=10)
     ax.grid(alpha=0.3)
     if len(pairs) <= 14:
-        figure.legend(loc="outside right center", fontsize=6)
-    figure.savefig(path, format="png")
+        picture.legend(loc="outside right center", fontsize=6)
+    save(picture, path)
 
 
 def plot_energy(path: Path, rows: Sequence[Row]) -> None:
@@ -202,10 +201,9 @@ def plot_energy(path: Path, rows: Sequence[Row]) -> None:
     good = [r for r in rows if r.get("ok")]
     columns = min(5, max(1, len(good)))
     lines = max(1, -(-len(good) // columns))
-    figure = Figure(figsize=(2.4 * columns + 1, 3.2 * lines), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
-    for k, (title, row) in enumerate(zip(_titles(good), good, strict=True)):
-        ax = figure.add_subplot(lines, columns, k + 1)
+    picture = figure(2.4 * columns + 1, 3.2 * lines)
+    for k, (title, row) in enumerate(zip(titles(good), good, strict=True)):
+        ax = picture.add_subplot(lines, columns, k + 1)
         unit = row["energy"]["solution"]["total"] or 1.0
         soups = list(row["energy"])
         bottom = np.zeros(len(soups))
@@ -221,4 +219,49 @@ def plot_energy(path: Path, rows: Sequence[Row]) -> None:
             ax.set_ylabel("E / E(solution)")
         if k == 0:
             ax.legend(fontsize=6)
-    figure.savefig(path, format="png")
+    save(picture, path)
+
+
+def text_flow(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
+    """Table of flow errors: the means of complete pairs by source, and every pair and source."""
+
+    def cells(numbers: Iterable[float | None]) -> list[str]:
+        form = {"over_3px": ".1%", "used": ".1%"}
+        return [show(x, form.get(k, ".3f")) for k, x in zip(FLOW_ERRORS, numbers, strict=True)]
+
+    lines = [f"# Analysis: {name}", ""]
+    lines += [f"{text[0].upper()}{text[1:]}. {note} Code {codes(rows)}.", ""]
+    good = [r for r in rows if r.get("ok")]
+    variants, pairs = _variants(good), _pairs(good, pair_names(good))
+    complete = [own for own in pairs.values() if len(own) == len(variants)]
+    means = [
+        [v, *cells(mean(own[v]["flow_error"][k] for own in complete) for k in FLOW_ERRORS)]
+        for v in variants
+    ]
+    every = [
+        [pair, v, *cells(row["flow_error"][k] for k in FLOW_ERRORS)]
+        for pair, own in pairs.items()
+        for v, row in own.items()
+    ]
+    lines += [f"Mean of {len(complete)} pairs, pixels:", ""]
+    lines += [*table(["source", *FLOW_ERRORS.values()], means), "", "By pair:", ""]
+    lines += table(["pair", "source", *FLOW_ERRORS.values()], every)
+    return joined([*lines, *failures(rows)])
+
+
+def plot_flow(path: Path, rows: Sequence[Row]) -> None:
+    """Weighted error by pair, a bar a source."""
+    good = [r for r in rows if r.get("ok")]
+    variants, pairs = _variants(good), _pairs(good, pair_names(good))
+    picture = figure(max(5.0, 1.1 * len(pairs)), 4)
+    ax = picture.add_subplot()
+    width = 0.8 / max(1, len(variants))
+    for k, v in enumerate(variants):
+        x = np.arange(len(pairs)) + (k - (len(variants) - 1) / 2) * width
+        own = [p[v]["flow_error"]["weighted_mean"] if v in p else np.nan for p in pairs.values()]
+        ax.bar(x, own, width, label=v)
+    ax.set_xticks(np.arange(len(pairs)), list(pairs), rotation=30, ha="right", fontsize=7)
+    ax.set(ylabel="flow error weighted with confidence, px", title="Flow sources")
+    if good:
+        ax.legend(fontsize=7)
+    save(picture, path)

@@ -1,25 +1,37 @@
-"""Speed: which runs there are, each in a process of its own, and the file that remembers them."""
+"""One run with clocks: seconds, energy and memory of every stage, beside the reference solver."""
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
+import resource
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from soup_nlp.bench.machine import code_version
-from soup_nlp.errors import DataError
+import numpy as np
+from numpy.typing import NDArray
 
-Record = dict[str, Any]
-YARDSTICKS = ("same", "wide")
+from soup_nlp.bench.reference_solvers import EPS, ReferenceSolve, levenberg_marquardt
+from soup_nlp.bench.rows import Job, Row, Say, alone, measure_all
+from soup_nlp.config.problem import Problem, dump_problem, make_problem
+from soup_nlp.evaluate.scoring import score_depths
+from soup_nlp.geometry.soup import reconstruct
+from soup_nlp.pipeline import Case, make_run, prepare
+from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.stages import solve_soup
+
+Float = NDArray[np.float64]
+
+REFERENCES = ("same", "wide")
 """Levenberg-Marquardt on the solver's own smoothing widths, or from a wide smoothing."""
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+REFERENCE_ITERATIONS = 100
+"""Limit of Levenberg-Marquardt's steps for every smoothing width."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +45,7 @@ class Spec:
         seed: Of the scene and of all draws.
         width: Columns of a rendered scene.
         height: Rows of a rendered scene.
-        yardsticks: Of YARDSTICKS.
+        references: Of REFERENCES.
         overrides: Of the problem, e.g. "solver.max_iter=200".
     """
 
@@ -43,7 +55,7 @@ class Spec:
     seed: int = 0
     width: int = 1024
     height: int = 436
-    yardsticks: tuple[str, ...] = ("same",)
+    references: tuple[str, ...] = ("same",)
     overrides: tuple[str, ...] = ()
 
     @property
@@ -57,11 +69,8 @@ class Spec:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Spec:
         """The spec that `dataclasses.asdict` took apart."""
-        known = {f.name for f in fields(cls)}
-        own = {k: v for k, v in values.items() if k in known}
-        for name in ("yardsticks", "overrides"):
-            own[name] = tuple(own.get(name, ()))
-        return cls(**own)
+        lists = {k: tuple(values[k]) for k in ("references", "overrides")}
+        return cls(**{**values, **lists})
 
 
 def plan(
@@ -79,103 +88,198 @@ def plan(
     return out
 
 
-def read_records(path: Path) -> list[Record]:
-    """Records of a JSON-lines file, in order; a line that was cut off is left out."""
-    out = []
-    if path.is_file():
-        for line in path.read_text(encoding="utf-8").splitlines():
-            try:
-                out.append(json.loads(line))
-            except json.JSONDecodeError:
-                continue
-    return out
-
-
-def find(records: Sequence[Record], spec: Spec, code: str) -> Record | None:
-    """The stored record of a spec by this code that has all its yardsticks, if there is one."""
-    for record in reversed(records):
-        same = record.get("key") == spec.key and record.get("code") == code
-        if same and "error" not in record and set(spec.yardsticks) <= set(record["yardstick"]):
-            return record
-    return None
-
-
-def run_alone(spec: Spec, seconds: float = 7200.0) -> Record:
-    """Measure a spec in a process of its own, with one thread.
-
-    Args:
-        spec: The run.
-        seconds: The process is ended after this.
-
-    Returns:
-        What `timed.measure` says; {"error": ...} where the process failed.
-    """
+def run_alone(spec: Spec, seconds: float = 7200.0) -> Row:
+    """`measure` in a process of its own with one thread; {"error": ...} where it failed."""
     with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder) / "spec.json", Path(folder) / "record.json"
-        source.write_text(json.dumps(asdict(spec)), encoding="utf-8")
-        command = [sys.executable, "-m", "soup_nlp.bench.timed", str(source), str(target)]
-        env = {**os.environ, **dict.fromkeys(THREADS, "1")}
-        try:
-            done = subprocess.run(
-                command, env=env, capture_output=True, text=True, timeout=seconds, check=False
-            )
-        except subprocess.TimeoutExpired:
-            return {"error": f"no answer after {seconds:g} s"}
-        if done.returncode or not target.is_file():
-            lines = (
-                done.stderr.split("\n") if done.returncode == 2 else done.stderr.splitlines()[-1:]
-            )
-            text = "; ".join(line.strip() for line in lines if line.strip())
-            return {"error": text or f"exit code {done.returncode}"}
-        record: Record = json.loads(target.read_text(encoding="utf-8"))
-        return record
+        return alone(partial(measure, spec), Path(folder), seconds)
 
 
-def _append(path: Path, line: str) -> None:
-    """Add a line, after a line end where a crash left none."""
-    with path.open("ab+") as file:
-        if file.tell():
-            file.seek(-1, os.SEEK_END)
-            if file.read(1) != b"\n":
-                line = "\n" + line
-        file.write((line + "\n").encode())
-
-
-def measure_all(
+def measure_specs(
     specs: Sequence[Spec],
     path: Path,
     *,
     fresh: bool = False,
-    measure: Callable[[Spec], Record] = run_alone,
-    say: Callable[[str], None] | None = None,
-) -> Iterator[Record]:
-    """Measure what the file does not hold yet; every record is appended as soon as it is there.
+    work: Callable[[Spec], Row] = run_alone,
+    say: Say | None = None,
+    after: Callable[[list[Row]], None] | None = None,
+) -> list[Row]:
+    """The row of every spec, measured where the file does not hold it yet; see `measure_all`.
 
     Args:
         specs: Runs.
-        path: JSON-lines file; its folder must exist.
+        path: JSON-lines file.
         fresh: Measure again what is there.
-        measure: Measures one run.
-        say: Called with a line before every run.
+        work: Measures one run.
+        say: Called after every new row.
+        after: Called with all rows so far after every new row.
+    """
+    jobs = [Job({"key": s.key, "spec": asdict(s)}, partial(work, s), fresh) for s in specs]
+    return measure_all(jobs, path, say=say, after=after)
 
-    Yields:
-        A record a spec, in order: "spec", "key", "code", and the measurement or "error".
+
+class Clocks:
+    """Wall and CPU seconds by stage."""
+
+    def __init__(self) -> None:
+        self.wall: dict[str, float] = {}
+        self.cpu: dict[str, float] = {}
+        self.restart()
+
+    def restart(self) -> None:
+        """Start the next lap now."""
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def lap(self, stage: str) -> None:
+        """End a lap."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        self.wall[stage] = self.wall.get(stage, 0.0) + wall - self._wall
+        self.cpu[stage] = self.cpu.get(stage, 0.0) + cpu - self._cpu
+        self._wall, self._cpu = wall, cpu
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """A lap of its own."""
+        self.restart()
+        yield
+        self.lap(name)
+
+
+def problem_of(spec: Spec) -> Problem:
+    """The merged problem of a spec; the NLP alone, without refinement.
 
     Raises:
-        DataError: the file cannot be written.
+        ConfigError: an override is wrong.
     """
-    code = code_version()
-    stored = [] if fresh else read_records(path)
-    for count, spec in enumerate(specs, 1):
-        record = find(stored, spec, code)
-        if say:
-            say(f"{count}/{len(specs)} {spec.key}{' (stored)' if record else ''}")
-        if record is None:
-            record = {"key": spec.key, "code": code, "spec": asdict(spec), **measure(spec)}
-            try:
-                _append(path, json.dumps(record))
-            except OSError as error:
-                raise DataError(
-                    "measurements cannot be written", where=path, found=error.strerror
-                ) from error
-        yield record
+    source: dict[str, Any] = {"kind": "motorcycle"}
+    if spec.scene != "motorcycle":
+        source = {"kind": "scene", "scene": spec.scene, "seed": spec.seed}
+        source |= {"width": spec.width, "height": spec.height}
+    raw = {
+        "name": spec.scene,
+        "seed": spec.seed,
+        "input": source,
+        "segmentation": {"superpixels": spec.superpixels, "neighbours": spec.neighbours},
+        "refine": {"enabled": False},
+    }
+    return make_problem(raw, spec.overrides, where="bench speed")
+
+
+def measure(spec: Spec) -> dict[str, Any]:
+    """Solve a problem and say what every stage cost.
+
+    Args:
+        spec: What to solve.
+
+    Returns:
+        Plain numbers: "sizes", "wall" and "cpu" (seconds by stage; build, functions and linear
+        algebra are parts of nlp's wall time, presolve, build and solve of its CPU time),
+        "stages", "iterations" in all, "status", "energy", "mre", "residuals", "peak_bytes"
+        (before the reference solver), and "reference" with its own.
+
+    Raises:
+        SoupError: the input cannot be used.
+    """
+    clocks = Clocks()
+    problem = problem_of(spec)
+    case = prepare(problem, on_stage=clocks.lap)
+    clocks.lap("weights")
+    with clocks.stage("nlp"):
+        solution = solve_soup(case.soup, case.data, case.weights, case.formulation(), case.options)
+    clocks.cpu["compiler"] = solution.seconds["compile"]
+    with clocks.stage("evaluation"):
+        run = make_run(case, solution)
+    run = replace(run, seconds=dict(clocks.wall))
+    with clocks.stage("output"), tempfile.TemporaryDirectory() as folder:
+        write_folder(prepare_folder(folder), run, dump_problem(problem), "")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    stages = solution.stages
+    functions = sum(sum(s.calls.values()) for s in stages)
+    ipopt = sum(s.seconds for s in stages)
+    split = {
+        # what the NLP's wall time is made of; all but Ipopt and its functions is building
+        "build": max(0.0, clocks.wall["nlp"] - ipopt),
+        "functions": functions,
+        "linear algebra": max(0.0, ipopt - functions),
+    }
+    return {
+        "sizes": {
+            "superpixels": len(case),
+            "knn_edges": len(case.segmentation.edges),
+            "pairs": len(case.segmentation.pairs),
+            **solution.nlp,
+        },
+        "wall": {**clocks.wall, **split},
+        "cpu": {**clocks.cpu, **solution.cpu_seconds},
+        "iterations": sum(s.iterations for s in stages),
+        "stages": [
+            {
+                "name": s.name,
+                "status": s.status,
+                "iterations": s.iterations,
+                "seconds": s.seconds,
+                **{k: _last(s.history.get(k)) for k in ("inf_du", "inf_pr")},
+            }
+            for s in stages
+        ],
+        "status": solution.status,
+        "converged": solution.converged,
+        "delivered": run.delivered,
+        "energy": dict(solution.energy),
+        "energy_start": dict(solution.energy_start),
+        "mre": {k: m.mre for k, m in run.metrics.items()},
+        "residuals": dict(solution.residuals),
+        "peak_bytes": peak,
+        "reference": {kind: _reference(case, kind) for kind in spec.references},
+    }
+
+
+def _last(values: Float | None) -> float | None:
+    """Last finite entry of an array; None where there is none."""
+    if values is None or not len(values) or not np.isfinite(values[-1]):
+        return None
+    return float(values[-1])
+
+
+def schedule(kind: str, options: SolverOptions) -> tuple[float, ...]:
+    """Widths of the reference solver: the solver's own ("same") or from a wide start ("wide")."""
+    if kind == "wide":
+        return EPS
+    own = tuple(options.presolve_eps) if options.presolve else ()
+    return own if own and own[-1] <= options.eps else (*own, options.eps)
+
+
+def _reference(case: Case, kind: str) -> dict[str, Any]:
+    """Levenberg-Marquardt from the same start on the same energy."""
+    y: ReferenceSolve = levenberg_marquardt(
+        case.soup,
+        case.data,
+        case.weights,
+        case.formulation(),
+        eps=schedule(kind, case.options),
+        iterations=REFERENCE_ITERATIONS,
+        seconds=case.options.max_seconds,
+    )
+    mre = None
+    if case.pair.truth is not None:
+        pair, size = case.pair, (case.pair.image_next.shape[0], case.pair.image_next.shape[1])
+        dense = reconstruct(y.soup, case.segmentation.labels, pair.K_ref, pair.K_next, size)
+        depth = dense.depth_ref
+        expected = case.problem.expected
+        scores = score_depths(case.pair.truth, {"y": depth}, expected.scale, expected.cap)
+        mre = scores["y"].mre if scores else None
+    return {
+        "name": y.name,
+        "status": y.status,
+        "energy": dict(y.energy),
+        "iterations": y.iterations,
+        "seconds": y.seconds,
+        "cpu_seconds": y.cpu_seconds,
+        "mre": mre,
+        "history": np.round(_thin(y.history), 6).tolist(),
+    }
+
+
+def _thin(history: Float, most: int = 60) -> Float:
+    """At most `most` rows, first and last among them: enough for a plot."""
+    index = np.linspace(0, len(history) - 1, min(most, len(history))).round().astype(int)
+    return history[index]

@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
-Record = Mapping[str, Any]
+from soup_nlp.bench.rows import failed
 
-COSTS: dict[str, Callable[[Record], float]] = {
+Row = Mapping[str, Any]
+Cell = Callable[[Row], str]
+
+COSTS: dict[str, Callable[[Row], float]] = {
     "NLP, CPU s": lambda r: r["cpu"]["nlp"],
     "CPU s an iteration": lambda r: r["cpu"]["nlp"] / max(1, r["iterations"]),
     "functions, s": lambda r: r["wall"]["functions"],
@@ -29,7 +32,7 @@ OUTSIDE = ("flow", "segmentation", "start", "weights", "evaluation", "output")
 """Stages that are not Ipopt's and not the loading or rendering of frames."""
 
 
-def outside(record: Record) -> float:
+def outside(record: Row) -> float:
     """CPU seconds of every stage but loading and the NLP."""
     return float(sum(record["cpu"].get(stage, 0.0) for stage in OUTSIDE))
 
@@ -86,16 +89,16 @@ def fit(
     return Growth(slope, error, float(n[use].min()), float(n[use].max()), len(x))
 
 
-def growth(records: Sequence[Record], least: int = 0) -> dict[tuple[str, int], dict[str, Growth]]:
+def growth(records: Sequence[Row], least: int = 0) -> dict[tuple[str, int], dict[str, Growth]]:
     """Growth of every cost by scene and K, seeds together, and of all scenes (ALL) where several.
 
     Args:
         records: Measured runs.
         least: Leave out runs with fewer wanted superpixels than this.
     """
-    groups: dict[tuple[str, int], list[Record]] = defaultdict(list)
+    groups: dict[tuple[str, int], list[Row]] = defaultdict(list)
     for record in records:
-        if "error" not in record and record["spec"]["superpixels"] >= least:
+        if not failed(record) and record["spec"]["superpixels"] >= least:
             groups[record["spec"]["scene"], record["spec"]["neighbours"]].append(record)
     for k in sorted({k for _, k in groups}):
         own = [group for (_, other), group in groups.items() if other == k]

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from soup_nlp.bench.rows import failed
 from soup_nlp.bench.speed import Spec
 from soup_nlp.errors import DataError
 
-Record = Mapping[str, Any]
+Row = Mapping[str, Any]
 
 LIMITS: dict[str, tuple[float, float]] = {
     "iterations": (1.3, 3.0),
     "energy": (1.005, 0.0),
-    "energy_to_yardstick": (1.005, 0.0),
+    "energy_to_reference": (1.005, 0.0),
     "nonzeros": (1.01, 0.0),
-    "time_to_yardstick": (1.5, 0.0),
+    "time_to_reference": (1.5, 0.0),
 }
 """Allowed (factor, addition) of the baseline's value: a value above factor x old + addition fails.
-Rounding differs between machines, so iterations and energies have room; seconds are measured
-against the yardstick's in the same process, which a slower or busier machine slows down alike."""
+Rounding differs between machines, so iterations and energies have room; seconds are compared with
+the reference solver's in the same process, which a slower machine slows down alike."""
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Finding:
         return f"{word:<6} {self.key}  {self.name} {self.old:.6g} -> {self.new:.6g} ({ratio})"
 
 
-def values(record: Record) -> dict[str, float]:
+def values(record: Row) -> dict[str, float]:
     """What the gate looks at."""
     total = float(record["energy"]["total"])
     out = {
@@ -62,22 +63,22 @@ def values(record: Record) -> dict[str, float]:
         ),
         "converged": float(record["converged"]),
     }
-    yard = record["yardstick"].get("same")
-    if yard:
-        out["energy_to_yardstick"] = total / yard["energy"]["total"]
-        out["time_to_yardstick"] = record["cpu"]["nlp"] / yard["cpu_seconds"]
+    reference = record["reference"].get("same")
+    if reference:
+        out["energy_to_reference"] = total / reference["energy"]["total"]
+        out["time_to_reference"] = record["cpu"]["nlp"] / reference["cpu_seconds"]
     return out
 
 
-def baseline(records: Sequence[Record], machine: Mapping[str, str]) -> dict[str, Any]:
+def baseline(records: Sequence[Row], machine: Mapping[str, str]) -> dict[str, Any]:
     """What is committed.
 
     Raises:
         DataError: a run failed, so it cannot be a baseline.
     """
-    failed = [r["key"] for r in records if "error" in r]
-    if failed or not records:
-        raise DataError("no baseline of runs that failed", found=", ".join(failed) or "no run")
+    bad = [r["key"] for r in records if failed(r)]
+    if bad or not records:
+        raise DataError("no baseline of runs that failed", found=", ".join(bad) or "no run")
     return {
         "version": VERSION,
         "machine": dict(machine),
@@ -108,13 +109,13 @@ def read_baseline(path: Path) -> tuple[list[Spec], dict[str, dict[str, float]]]:
     return specs, kept
 
 
-def check(records: Sequence[Record], kept: Mapping[str, Mapping[str, float]]) -> list[Finding]:
+def check(records: Sequence[Row], kept: Mapping[str, Mapping[str, float]]) -> list[Finding]:
     """Every value of every run of the baseline; a run that failed or is missing fails the gate."""
     by_key = {r["key"]: r for r in records}
     out = []
     for key, old in kept.items():
         record = by_key.get(key)
-        if record is None or "error" in record:
+        if record is None or failed(record):
             out.append(Finding(key, "run", 1.0, 0.0, False))
             continue
         new = values(record)
@@ -124,7 +125,6 @@ def check(records: Sequence[Record], kept: Mapping[str, Mapping[str, float]]) ->
                 out.append(
                     Finding(key, name, old[name], value, value <= factor * old[name] + addition)
                 )
-        claim = Finding(key, "converged", old["converged"], new["converged"], True)
-        ok = new["converged"] >= old["converged"]
-        out.append(Finding(**{**asdict(claim), "ok": ok}))
+        both = old["converged"], new["converged"]
+        out.append(Finding(key, "converged", *both, both[1] >= both[0]))
     return out

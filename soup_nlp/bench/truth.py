@@ -90,6 +90,22 @@ def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
     return TrueSoup(soup.normalised(), component, known, purity)
 
 
+def moves_by_itself(truth: Truth) -> Bools:
+    """(B,) which components move otherwise than component 0, the static scene.
+
+    Without known motions every component but 0 does.
+
+    Args:
+        truth: With components.
+    """
+    assert truth.components is not None
+    own = np.arange(int(truth.components.max()) + 1) > 0
+    if truth.motions is not None:
+        near = np.isclose(truth.motions, truth.motions[0], rtol=0, atol=1e-9).all(axis=(1, 2))
+        own[: len(near)] &= ~near[: len(own)]
+    return own
+
+
 SCALES = np.geomspace(1 / 3, 3, 41)
 """Factors that `rescaled` tries."""
 

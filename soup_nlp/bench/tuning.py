@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from soup_nlp.bench.accuracy import Job, Row, measure
-from soup_nlp.bench.accuracy_runner import Function, Say, Where, measure_all
-from soup_nlp.bench.accuracy_table import energy_ratio, get
+from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
+from soup_nlp.bench.rows import Row, Say, Where, measure_all
 from soup_nlp.bench.suites import Item
+from soup_nlp.bench.tables import energy_ratio, main_metric
 from soup_nlp.errors import ConfigError
 
 Float = NDArray[np.float64]
@@ -151,8 +151,7 @@ def loss(row: Row) -> float:
     """
     if not row.get("ok"):
         return FAILED
-    main = row["presets"][0]
-    own, constant = get(row, main, "solution"), get(row, main, "constant")
+    own, constant = main_metric(row), main_metric(row, method="constant")
     if own is None or constant is None:
         return FAILED
     value = min(math.log(max(own, LEAST) / max(constant, LEAST)), FAILED)
@@ -195,7 +194,7 @@ def search(
     where: Where | None = None,
     say: Say | None = None,
     any_code: bool = False,
-    function: Function = measure,
+    measure: Measure = measure_pair,
 ) -> Found:
     """Search and validate.
 
@@ -211,7 +210,7 @@ def search(
         where: Processes or cluster.
         say: Progress.
         any_code: Also take stored rows of other code versions.
-        function: What measures a job, for tests.
+        measure: Makes the row of a pair.
 
     Raises:
         ConfigError: pairs are missing or stand on both sides, a parameter is wrong, or no trial
@@ -222,8 +221,9 @@ def search(
     _check(space, train, validation)
 
     def scored(trial: Trial, items: Sequence[Item]) -> Trial:
-        jobs = [Job(i, (*overrides, *trial.overrides), trial.name) for i in items]
-        rows = measure_all(jobs, path, where, say=say, any_code=any_code, function=function)
+        whole = (*overrides, *trial.overrides)
+        jobs = [pair_job(i, whole, trial.name, measure=measure) for i in items]
+        rows = measure_all(jobs, path, where, say=say, any_code=any_code)
         return Trial(trial.name, trial.overrides, trial.unit, tuple(rows))
 
     first = Trial("t000", (), np.full(len(space), np.nan))
@@ -280,13 +280,10 @@ def split(
     real = sorted({i.name for i in items if "seed" not in i.input})
     odd = set(real[1::2])
 
-    def side(item: Item) -> str:
-        if "seed" in item.input:
-            if item.input["seed"] in validation_seeds:
-                return "validation"
-            return "train" if item.input["seed"] in seeds else "none"
-        return "validation" if item.name in odd else "train"
+    def among(item: Item, own_seeds: Sequence[int], names: set[str]) -> bool:
+        seed = item.input.get("seed")
+        return item.name in names if seed is None else seed in own_seeds
 
-    sides = [side(i) for i in items]
-    train = [i for i, s in zip(items, sides, strict=True) if s == "train"]
-    return train, [i for i, s in zip(items, sides, strict=True) if s == "validation"]
+    train_seeds = [s for s in seeds if s not in validation_seeds]
+    train = [i for i in items if among(i, train_seeds, set(real) - odd)]
+    return train, [i for i in items if among(i, validation_seeds, odd)]

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Sequence
-from datetime import date
 
 import numpy as np
 from scipy.stats import spearmanr
 
-from soup_nlp.bench.accuracy import Row
-from soup_nlp.bench.accuracy_table import energy_ratio, get, mean, pair_names, show, table
+from soup_nlp.bench.rows import Row
+from soup_nlp.bench.tables import energy_ratio, joined, made, main_metric, mean, show, table, titles
 from soup_nlp.bench.tuning import ABOVE, FAILED, LEAST, Found, Parameter, Trial, loss
 
 TOP = 10
@@ -26,14 +24,12 @@ def text_search(found: Found, command: str) -> str:
     """
     best, default = found.best, found.train[0]
     rows = [r for t in found.train for r in t.rows]
-    codes = ", ".join(sorted({str(r.get("code")) for r in rows}))
-    cpu = sum(float(r.get("cpu_seconds") or 0) for r in rows)
     lines = [
         "# Search for defaults",
         "",
         _verdict(found),
         "",
-        f"{date.today()}, {platform.machine()}, {cpu:.0f} CPU seconds of training; code {codes}.",
+        f"{made(rows)}.",
         "",
         f"    {command}",
         "",
@@ -59,7 +55,7 @@ def text_search(found: Found, command: str) -> str:
     if found.validation:
         own = {t.name: t for t in found.validation}
         lines += ["", *_by_pair("validation", own["t000"].rows, _winner(found).rows)]
-    return "\n".join(lines).rstrip() + "\n"
+    return joined(lines)
 
 
 def _winner(found: Found) -> Trial:
@@ -88,7 +84,7 @@ def _varied(found: Found, best: Trial) -> list[str]:
     """Ranges, the best value, and how the score moves with each parameter."""
     tried = found.train[1:]
     chosen = dict(o.split("=", 1) for o in best.overrides)
-    component = [
+    entries = [
         [
             f"`{p.key}`",
             p.kind,
@@ -99,7 +95,7 @@ def _varied(found: Found, best: Trial) -> list[str]:
         for k, p in enumerate(found.space)
     ]
     head = ["setting", "scale", "range", "best trial", "rank correlation with the score"]
-    return table(head, component)
+    return table(head, entries)
 
 
 def _tendency(p: Parameter, k: int, tried: Sequence[Trial]) -> str:
@@ -114,40 +110,39 @@ def _tendency(p: Parameter, k: int, tried: Sequence[Trial]) -> str:
 
 
 def _trials(trials: Sequence[Trial], default: Trial) -> list[str]:
-    component = []
+    entries = []
     for t in trials:
         good = [r for r in t.rows if r.get("ok")]
-        component.append(
+        entries.append(
             [
                 t.name if t.name != default.name else f"{t.name} (default)",
                 f"{t.loss:.3f}",
-                show(mean(get(r, r["presets"][0], "solution") for r in good)),
+                show(mean(main_metric(r) for r in good)),
                 show(mean(energy_ratio(r) for r in good), ".2f"),
                 str(len(t.rows) - len(good)),
                 " ".join(f"`{o}`" for o in t.overrides) or "-",
             ]
         )
     return table(
-        ["trial", "score", "mean MRE", "E truth / solution", "failed", "settings"], component
+        ["trial", "score", "mean MRE", "E truth / solution", "failed", "settings"], entries
     )
 
 
 def _by_pair(side: str, before: Sequence[Row], after: Sequence[Row]) -> list[str]:
     own = {_name(r): r for r in after}
-    component = []
-    for pair, row in zip(pair_names(before), before, strict=True):
+    entries = []
+    for title, row in zip(titles(before), before, strict=True):
         other = own[_name(row)]
-        main = row["presets"][0]
-        component.append(
+        entries.append(
             [
-                *[f"{pair}, {row['flow']}", side],
-                show(get(row, main, "constant")),
-                *[show(get(r, main, "solution")) for r in (row, other)],
+                *[title, side],
+                show(main_metric(row, method="constant")),
+                *[show(main_metric(r)) for r in (row, other)],
                 *[f"{loss(r):.3f}" for r in (row, other)],
             ]
         )
     head = ["pair, flow", "side", "constant", "MRE default", "MRE best", "score default", "best"]
-    return table(head, component)
+    return table(head, entries)
 
 
 def _name(row: Row) -> str:

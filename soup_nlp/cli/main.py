@@ -2,283 +2,27 @@
 
 from __future__ import annotations
 
-import json
-import os
 import sys
-import warnings
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Any, TextIO, cast, get_args
+from collections.abc import Callable, Sequence
 
 import typer
-from rich.console import Console
 
-from soup_nlp.cli.bench import register as register_bench
-from soup_nlp.cli.export import register as register_export
-from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
-from soup_nlp.data.flow.sources import is_path
-from soup_nlp.data.formats.images import DataWarning
-from soup_nlp.data.scenes.catalogue import SCENES
-from soup_nlp.errors import ConfigError, SoupError
-from soup_nlp.evaluate.metrics import Scale
-from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
+from soup_nlp.cli import bench_all, bench_studies
+from soup_nlp.cli.bench_accuracy import accuracy
+from soup_nlp.cli.bench_search import search
+from soup_nlp.cli.bench_speed import speed
+from soup_nlp.cli.check import check
+from soup_nlp.cli.compare import compare
+from soup_nlp.cli.evaluate import evaluate
+from soup_nlp.cli.export import export
+from soup_nlp.cli.import_ import import_
+from soup_nlp.cli.show import list_, show
+from soup_nlp.cli.solve import solve
+from soup_nlp.errors import SoupError
 from soup_nlp.pipeline.run import StoppedError
-from soup_nlp.pipeline.run import run as run_problem
-from soup_nlp.report.folder import prepare_folder, write_folder
-from soup_nlp.report.verdict import accuracy, missed, protocol, verdict
-from soup_nlp.solve.interrupt import interruptible
-from soup_nlp.solve.ipopt import Progress
-from soup_nlp.storage.atomic import write_text
-
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    help="Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.",
-)
 
 ABORTED = 130
 """Exit code of what Ctrl-C ended without a result, as shells have it."""
-
-Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
-
-
-class _Teller:
-    """Lines for the terminal and the log; iterations rewrite one line on a terminal."""
-
-    def __init__(self, quiet: bool) -> None:
-        self.console = Console(stderr=True, highlight=False)
-        self.quiet = quiet
-        self.lines: list[str] = []
-        self.live = self.console.is_terminal and not quiet
-
-    def say(self, line: str) -> None:
-        """A line after a stage."""
-        self.lines.append(line)
-        if not self.quiet:
-            self._clear()
-            self.console.print(line, markup=False, soft_wrap=True)
-
-    def iteration(self, progress: Progress) -> None:
-        """A line per iteration."""
-        line = str(progress)
-        self.lines.append(line)
-        if self.live:
-            self._clear()
-            self.console.file.write(line[: max(1, self.console.width - 1)])
-            self.console.file.flush()
-
-    def warn(
-        self,
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
-        """What a reader doubts, as a line; warnings of libraries are for developers."""
-        if issubclass(category, DataWarning):
-            self.say(f"warning: {message}")
-
-    def interrupted(self, line: str) -> None:
-        """A line from a signal handler, where Python's own streams must not be entered again."""
-        self.lines.append(line)
-        os.write(2, f"\n{line}\n".encode())
-
-    def _clear(self) -> None:
-        if self.live:
-            self.console.file.write("\r\x1b[2K")
-
-
-@app.command()
-def solve(
-    problem: Annotated[Path | None, typer.Argument(help="Problem file, see problems/.")] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Result folder.")] = Path("out/run"),
-    overrides: Set = None,
-    ref: Annotated[str | None, typer.Option(help="Reference image.")] = None,
-    next_: Annotated[str | None, typer.Option("--next", help="Next image.")] = None,
-    intrinsics: Annotated[
-        str | None, typer.Option(help="fx,fy,cx,cy in pixels, or a file.")
-    ] = None,
-    intrinsics_next: Annotated[
-        str | None, typer.Option(help="The same of the next frame, if it differs.")
-    ] = None,
-    flow: Annotated[str | None, typer.Option(help=".flo, KITTI .png or .npy; default DIS.")] = None,
-    depth: Annotated[str | None, typer.Option(help="True depth of the reference frame.")] = None,
-    no_refine: Annotated[
-        bool, typer.Option("--no-refine", help="The NLP alone, as refine.enabled=false.")
-    ] = False,
-    no_nlp: Annotated[
-        bool, typer.Option("--no-nlp", help="Refine the start, as refine.from_start=true.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
-) -> None:
-    """Solve a pair of frames and write a result folder."""
-    if no_refine and no_nlp:
-        raise ConfigError(
-            "nothing is left to do",
-            found="--no-nlp and --no-refine",
-            expected="one of them at most",
-        )
-    halves = {"refine.enabled=false": no_refine, "refine.from_start=true": no_nlp}
-    overrides = [*(overrides or []), *(item for item, on in halves.items() if on)]
-    if problem is not None:
-        pair = {
-            "--ref": ref,
-            "--next": next_,
-            "--intrinsics": intrinsics,
-            "--intrinsics-next": intrinsics_next,
-            "--depth": depth,
-        }
-        if any(pair.values()):
-            raise ConfigError(
-                "a problem file says itself what its pair is",
-                found=f"{problem} and {', '.join(k for k, v in pair.items() if v)}",
-                expected="a problem file, or the options of a pair",
-                hint="--set input.KEY=VALUE changes the input of a problem file",
-            )
-        if flow:
-            # a path on the command line starts here, one in a problem file from the file
-            overrides = [f"flow.source={json.dumps(_flow_source(flow))}", *overrides]
-        chosen = load_problem(problem, overrides)
-    else:
-        chosen = _from_options(ref, next_, intrinsics, intrinsics_next, flow, depth, overrides)
-    folder = prepare_folder(out, chosen.input_paths())
-    teller = _Teller(quiet)
-    interrupt = interruptible(teller.interrupted)
-    with interrupt as stop, warnings.catch_warnings():
-        warnings.simplefilter("always", DataWarning)
-        warnings.showwarning = teller.warn
-        try:
-            run = run_problem(
-                chosen,
-                listener=teller.iteration,
-                stop=stop,
-                log=teller.say,
-                ipopt_log=str(folder / "ipopt.log"),
-            )
-            if interrupt.aborted:
-                raise KeyboardInterrupt
-        except BaseException as error:
-            teller.lines.append(f"failed: {str(error) or type(error).__name__}")
-            write_text(folder / "log.txt", "\n".join(teller.lines) + "\n")
-            raise
-        # half a folder is of no use, and writing takes seconds
-        interrupt.deferred = True
-        files = write_folder(folder, run, dump_problem(chosen), "\n".join(teller.lines) + "\n")
-        # what a problem file expects holds for the file as it is
-        text = verdict(run, folder, files, None if overrides else chosen.expected.mre_at_most)
-        write_text(folder / "log.txt", "\n".join([*teller.lines, text]) + "\n")
-    print(text)
-    good = run.good and not (not overrides and missed(run))
-    raise typer.Exit(0 if good else 1)
-
-
-def _camera(text: str, option: str) -> list[float] | str:
-    """Four numbers, or the file that has them, as the key `intrinsics` of a problem file."""
-    try:
-        values = [float(x) for x in text.split(",")]
-    except ValueError:
-        values = []
-    if not values and Path(text).expanduser().is_file():
-        return text
-    if len(values) != 4:
-        raise ConfigError(
-            "camera is neither four numbers nor a file",
-            where=option,
-            found=text,
-            expected="fx,fy,cx,cy or a text file of 4 or 9 numbers",
-        )
-    return values
-
-
-def _flow_source(text: str) -> str:
-    """A flow source with its path, if it is one, from the working directory."""
-    return str(Path(text).expanduser().resolve()) if is_path(text) else text
-
-
-def _from_options(
-    ref: str | None,
-    next_: str | None,
-    intrinsics: str | None,
-    intrinsics_next: str | None,
-    flow: str | None,
-    depth: str | None,
-    overrides: Sequence[str] | None,
-) -> Problem:
-    if not (ref and next_ and intrinsics):
-        raise ConfigError(
-            "nothing to solve",
-            found="no problem file",
-            expected="PROBLEM.yaml, or --ref, --next and --intrinsics",
-            hint="soup-nlp solve problems/motorcycle.yaml --out out/motorcycle",
-        )
-    source: dict[str, Any] = {
-        "kind": "files",
-        "ref": ref,
-        "next": next_,
-        "intrinsics": _camera(intrinsics, "--intrinsics"),
-    }
-    if intrinsics_next:
-        source["intrinsics_next"] = _camera(intrinsics_next, "--intrinsics-next")
-    if depth:
-        source["depth"] = depth
-    raw: dict[str, Any] = {"name": Path(ref).stem, "input": source, "base": str(Path.cwd())}
-    if flow:
-        raw["flow"] = {"source": flow}
-    return make_problem(raw, overrides or [], where="command line")
-
-
-@app.command()
-def evaluate(
-    folder: Annotated[Path, typer.Argument(help="Result folder.")],
-    depth: Annotated[Path, typer.Option(help="True depth: .dpt, .npy, .pfm or 16-bit .png.")],
-    scale: Annotated[str, typer.Option(help="median, mre, lsq or none.")] = "median",
-    cap: Annotated[float | None, typer.Option(help="Drop truth beyond this depth.")] = None,
-    depth_scale: Annotated[
-        float, typer.Option(help="Values per unit of length of a .png (KITTI 256).")
-    ] = 1000.0,
-) -> None:
-    """Score a result against a truth file."""
-    rules = get_args(Scale)
-    if scale not in rules:
-        raise ConfigError(
-            "unknown scale rule", where="--scale", found=scale, expected=", ".join(rules)
-        )
-    scores = evaluate_folder(
-        folder, depth, scale=cast(Scale, scale), cap=cap, depth_scale=depth_scale
-    )
-    print(protocol(scores))
-    print("\n".join(accuracy(scores)))
-
-
-@app.command()
-def show(
-    problem: Annotated[Path, typer.Argument(help="Problem file.")], overrides: Set = None
-) -> None:
-    """Print the merged problem and its hash."""
-    chosen = load_problem(problem, overrides or [])
-    print(dump_problem(chosen), end="")
-    print(f"# hash {chosen.digest()}")
-
-
-@app.command(name="list")
-def list_(
-    folder: Annotated[Path, typer.Argument(help="Folder of problem files.")] = Path("problems"),
-) -> None:
-    """Print the problem files of a folder and the rendered scenes."""
-    for path in sorted(folder.glob("*.yaml")):
-        first = path.read_text(encoding="utf-8").partition("\n")[0]
-        print(f"{path!s:<28} {first.removeprefix('#').strip() if first[:1] == '#' else ''}")
-    if folder.is_dir():
-        print()
-    for name, text in SCENES.items():
-        print(f"scene {name:<22} {text}")
-
-
-register_export(app)
-register_bench(app)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -316,3 +60,39 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _aborted() -> int:
     print("interrupted: no result is written", file=sys.stderr)
     return ABORTED
+
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.",
+)
+bench = typer.Typer(no_args_is_help=True, help="Measure over many runs; tables, plots and gates.")
+COMMANDS: dict[typer.Typer, dict[str, Callable[..., None]]] = {
+    app: {
+        "solve": solve,
+        "check": check,
+        "evaluate": evaluate,
+        "show": show,
+        "list": list_,
+        "export": export,
+        "import": import_,
+        "compare": compare,
+    },
+    bench: {
+        "accuracy": accuracy,
+        "speed": speed,
+        "search": search,
+        "refine": bench_studies.refine,
+        "methods": bench_studies.methods,
+        "formulations": bench_studies.formulations,
+        "cut-off": bench_studies.cut_off,
+        "trws": bench_studies.trws,
+        "all": bench_all.command(main),
+    },
+}
+for group, commands in COMMANDS.items():
+    for name, function in commands.items():
+        group.command(name=name)(function)
+app.add_typer(bench, name="bench")

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from soup_nlp.data.datasets.driving import load_kitti, load_vkitti1, load_vkitti2
+from soup_nlp.data.datasets.driving import load_kitti, load_vkitti
 from soup_nlp.data.datasets.folders import load_folder, load_motorcycle, load_tum
+from soup_nlp.data.datasets.layout import make_pair
 from soup_nlp.data.datasets.sintel import load_sintel
 from soup_nlp.data.formats.camera_files import read_intrinsics
-from soup_nlp.data.formats.images import read_image
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.data.scenes.catalogue import render_scene
@@ -74,11 +74,11 @@ class FilesInput(PairInput):
         def depth(name: str | None) -> Float | None:
             return None if name is None else read_depth(path(name), self.depth_scale)
 
-        ref, following = (read_image(path(x), self.white) for x in (self.ref, self.next))
+        images = [path(self.ref), path(self.next)]
         truth = Truth(depth(self.depth), depth(self.depth_next), unit=self.unit)
         K = camera(self.intrinsics)
         K_next = K if self.intrinsics_next is None else camera(self.intrinsics_next)
-        return Pair(ref, following, K, K_next, truth=truth if truth.known() else None)
+        return make_pair(images, [K, K_next], truth, "files", self.white)
 
     def files(self) -> list[str]:
         """See `PairInput`."""
@@ -191,8 +191,8 @@ class VkittiInput(PairInput):
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        load = load_vkitti1 if self.kind == "vkitti1" else load_vkitti2
-        return load(path(self.root), self.scene, self.frame, self.variation, self.step)
+        root, scene = path(self.root), self.scene
+        return load_vkitti(self.kind, root, scene, self.frame, self.variation, self.step)
 
 
 class TumInput(PairInput):
@@ -213,7 +213,7 @@ class TumInput(PairInput):
 
 
 class MemoryInput(PairInput):
-    """A pair that was in memory: a problem with it tells runs apart, but cannot be solved again."""
+    """A pair that was in memory: its hash identifies a run, but it cannot be loaded again."""
 
     kind: Literal["memory"]
     """Kind of input."""
@@ -252,7 +252,7 @@ Input = Annotated[
     | MemoryInput,
     Field(discriminator="kind"),
 ]
-"""What a problem may take as its input, told apart by `kind`."""
+"""Input of a problem, discriminated by `kind`."""
 
 
 def pair_hash(pair: Pair) -> str:

@@ -1,4 +1,4 @@
-"""The record that enters the house: two images, two cameras, a flow and, where known, the truth."""
+"""The input of every solve: two images, two cameras, a flow and, where known, the truth."""
 
 from __future__ import annotations
 
@@ -13,6 +13,32 @@ Float = NDArray[np.float64]
 
 SHORTEST = 0.05
 """Focal length, in sides of the image, below which it cannot be in pixels (168 degrees of view)."""
+
+
+def check_size(
+    what: str,
+    found: tuple[int, ...],
+    expected: tuple[int, ...],
+    where: object,
+    hint: str | None = None,
+) -> None:
+    """Raise DataError unless two arrays have the same (height, width).
+
+    Args:
+        what: Names of the two, e.g. "flow and reference image".
+        found: Shape of the first.
+        expected: Shape of the second; both may have more axes.
+        where: File or array concerned.
+        hint: What to try.
+    """
+    if found[:2] != expected[:2]:
+        raise DataError(
+            f"{what} differ in size",
+            where=where,
+            found=found,
+            expected=f"{expected[:2]} (height, width)",
+            hint=hint,
+        )
 
 
 @dataclass(frozen=True)
@@ -30,20 +56,14 @@ class Flow:
     source: str = "unknown"
 
     def __post_init__(self) -> None:
-        if self.uv.ndim != 3 or self.uv.shape[2] != 2:
+        if self.uv.shape[2:] != (2,) or self.confidence.ndim != 2:
             raise DataError(
                 "flow has the wrong shape",
                 where=self.source,
-                found=self.uv.shape,
-                expected="(H, W, 2)",
+                found=f"{self.uv.shape}, confidence {self.confidence.shape}",
+                expected="(H, W, 2), confidence (H, W)",
             )
-        if self.confidence.shape != self.uv.shape[:2]:
-            raise DataError(
-                "flow confidence does not fit the flow",
-                where=self.source,
-                found=self.confidence.shape,
-                expected=self.uv.shape[:2],
-            )
+        check_size("flow confidence and flow", self.confidence.shape, self.uv.shape, self.source)
         # false for NaN too
         fits = (self.confidence >= 0) & (self.confidence <= 1)
         if not fits.all():
@@ -139,38 +159,20 @@ class Pair:
                     expected="uint8 (H, W, 3)",
                 )
         for what in ("K_ref", "K_next"):
-            K = _matrix(getattr(self, what), what)
+            K = check_intrinsics(getattr(self, what), what)
             object.__setattr__(self, what, K)
-            check_intrinsics(K, what)
-        _check_focal(self.K_ref, self.image_ref, "K_ref")
-        _check_focal(self.K_next, self.image_next, "K_next")
-        if self.flow is not None and self.flow.uv.shape[:2] != self.image_ref.shape[:2]:
-            raise DataError(
-                "flow and reference image differ in size",
-                where=self.flow.source,
-                found=f"flow {self.flow.uv.shape[:2]}",
-                expected=f"image {self.image_ref.shape[:2]} (height, width)",
-            )
-        if self.truth is not None:
-            self._check_truth(self.truth)
-
-    def _check_truth(self, truth: Truth) -> None:
-        for what in ("depth_ref", "flow", "occluded", "components", "scene_flow"):
-            value = getattr(truth, what)
-            if value is not None and value.shape[:2] != self.image_ref.shape[:2]:
-                raise DataError(
-                    "truth and reference image differ in size",
-                    where=f"truth.{what}",
-                    found=value.shape[:2],
-                    expected=self.image_ref.shape[:2],
-                )
-        if truth.depth_next is not None and truth.depth_next.shape != self.image_next.shape[:2]:
-            raise DataError(
-                "truth and next image differ in size",
-                where="truth.depth_next",
-                found=truth.depth_next.shape,
-                expected=self.image_next.shape[:2],
-            )
+            _check_focal(K, getattr(self, what.replace("K", "image")), what)
+        if self.flow is not None:
+            hint = "compute the flow at the size of the image; it is not resized"
+            size, source = self.flow.uv.shape, self.flow.source
+            check_size("flow and reference image", size, self.image_ref.shape, source, hint)
+        for what in self.truth.known() if self.truth else []:
+            name, image = "reference image", self.image_ref
+            if what == "depth_next":
+                name, image = "next image", self.image_next
+            if what not in ("motions", "points"):
+                found = getattr(self.truth, what).shape
+                check_size(f"truth and {name}", found, image.shape, f"truth.{what}")
 
     @property
     def size(self) -> tuple[int, int]:
@@ -184,16 +186,6 @@ class Pair:
     def __str__(self) -> str:
         h, w = self.size
         return f"Pair({self.name}, {w}x{h}, {self.flow or 'no flow'}, {self.truth or 'no truth'})"
-
-
-def _matrix(K: object, where: str) -> Float:
-    """Intrinsics as an array, whatever rows of numbers they are given as."""
-    try:
-        return np.asarray(K, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DataError(
-            "intrinsics are no matrix of numbers", where=where, found=repr(K), expected="(3, 3)"
-        ) from error
 
 
 def _check_focal(K: Float, image: NDArray[np.uint8], where: str) -> None:
@@ -210,10 +202,20 @@ def _check_focal(K: Float, image: NDArray[np.uint8], where: str) -> None:
             )
 
 
-def check_intrinsics(K: Float, where: str) -> None:
-    """Raise DataError unless K is a finite, upper-triangular 3x3 with positive focal lengths."""
-    if np.shape(K) != (3, 3):
-        raise DataError("intrinsics must be 3x3", where=where, found=np.shape(K), expected="(3, 3)")
+def check_intrinsics(given: object, where: object) -> Float:
+    """Rows of numbers as (3, 3) intrinsics.
+
+    Raises:
+        DataError: it is no finite, upper-triangular 3x3 matrix with positive focal lengths.
+    """
+    try:
+        K = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            "intrinsics are no matrix of numbers", where=where, found=repr(given), expected="(3, 3)"
+        ) from error
+    if K.shape != (3, 3):
+        raise DataError("intrinsics must be 3x3", where=where, found=K.shape, expected="(3, 3)")
     if not np.isfinite(K).all():
         raise DataError("intrinsics are not finite", where=where, found=K.tolist())
     if not (K[0, 0] > 0 and K[1, 1] > 0):
@@ -223,11 +225,11 @@ def check_intrinsics(K: Float, where: str) -> None:
             found=f"fx {K[0, 0]:g}, fy {K[1, 1]:g}",
             expected="fx > 0 and fy > 0, in pixels",
         )
-    lower = [K[1, 0], K[2, 0], K[2, 1]]
-    if np.any(lower) or K[2, 2] != 1:
+    if np.any(np.tril(K, -1)) or K[2, 2] != 1:
         raise DataError(
             "intrinsics must be upper triangular with K[2, 2] = 1",
             where=where,
             found=K.tolist(),
             expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]]",
         )
+    return K

@@ -1,7 +1,7 @@
-"""Energy, constraints, depth and scores from stored arrays, written once more from the equations.
+"""Independent computation of energy, constraints, depth and scores from stored arrays.
 
-Nothing of `soup_nlp.model`, `soup_nlp.solve` or `soup_nlp.evaluate.metrics` is used, so that a
-mistake there cannot confirm itself.
+Nothing of `soup_nlp.model`, `soup_nlp.solve` or `soup_nlp.evaluate.metrics` is used, so that an
+error there cannot confirm itself.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 DOUBT = 1e-6
-"""Pixels within which of a border a target may be rounded to either side."""
+"""Distance from a pixel border, in pixels, within which a target may round to either side."""
 State = Mapping[str, Float]
 """lam (N,), n (N, 3), d (N,), R (N, 3, 3), t (N, 3) of a soup."""
 
@@ -131,10 +131,10 @@ def depth_map(s: State, labels: Int, K: Float) -> Float:
 def next_depth_map(
     s: State, labels: Int, K_ref: Float, K_next: Float, size: tuple[int, int]
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Depth of the next frame, and where it hangs on the rounding of a target.
+    """Depth of the next frame, and where rounding decides it.
 
-    Every reference pixel goes to the pixel nearest to its target, the nearest surface wins; pixels
-    that are then still empty take the nearest surface among the 2 x 2 footprints that cover them.
+    Every reference pixel is moved to the pixel nearest to its target, and the nearest surface is
+    kept; pixels that stay empty take the nearest surface of the 2 x 2 footprints that cover them.
 
     Args:
         s: Soup.
@@ -144,8 +144,8 @@ def next_depth_map(
         size: (H', W') of the next frame.
 
     Returns:
-        (H', W') z, NaN where nothing lands; (H', W') True where a target lies so near to a border
-        between two pixels that either may take it.
+        (H', W') z, NaN where there is no target; (H', W') True where a target lies so near to a
+        border between two pixels that either may receive it.
     """
     z = depth_map(s, labels, K_ref).ravel()
     v, u = (x.ravel() for x in np.mgrid[0 : labels.shape[0], 0 : labels.shape[1]])
@@ -153,7 +153,7 @@ def next_depth_map(
     X = z[:, None] * (np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K_ref).T)
     Y = np.matmul(s["R"][who], X[..., None])[..., 0] + (s["lam"][:, None] * s["t"])[who]
     Y = Y[Y[:, 2] > 0]
-    # farthest first: the last one to be written is the nearest
+    # farthest first, so that the nearest one is written last
     Y = Y[np.argsort(-Y[:, 2], kind="stable")]
     image = Y @ K_next.T
     at = image[:, :2] / image[:, 2:]
@@ -231,7 +231,7 @@ def at_points(z: Float, points: Float) -> tuple[Float, Float]:
 
 
 def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, float]:
-    """How far the stored numbers of the energy are from labels, flow, cameras and the start.
+    """Differences of the energy's stored data from labels, flow, cameras and the start.
 
     Args:
         tree: Arrays of result.h5.
@@ -265,9 +265,9 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
     weight = seg["edge_multiplicity"] * np.exp(-float(settings["segmentation"]["beta"]) * gap)
     weight[component[i] != component[k]] *= float(settings["energy"]["arap_across"])
     bending = settings["energy"]["bending"]
-    weight[_torn(tree, settings["energy"], "edges")] *= float(bending["arap_across"])
+    weight[_discontinuous(tree, settings["energy"], "edges")] *= float(bending["arap_across"])
     held = np.full(len(e["pairs"]), 2.0)
-    held[_torn(tree, settings["energy"], "pairs")] *= float(bending["orient_across"])
+    held[_discontinuous(tree, settings["energy"], "pairs")] *= float(bending["orient_across"])
     return {
         "anchors": _gap(centre, seg["anchors"]),
         "anchor rays": _gap(rays(centre), e["anchor_ray"]),
@@ -283,8 +283,7 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
 
 
 def _pair_weights(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Float:
-    """w4 of the image, less where one component of the start hides another and where the flow
-    tears."""
+    """w4 of the image, reduced where a component occludes another and at flow discontinuities."""
     start, seg = tree["start"], tree["segmentation"]
     weight = seg["pair_weight"].copy()
     middle = tree["energy"]["boundary_ray"].mean(1)
@@ -295,12 +294,14 @@ def _pair_weights(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Float:
     weight[open_gap & (start["component"][i] != start["component"][k])] *= float(
         form["cont_occluded"]
     )
-    weight[_torn(tree, form, "pairs")] *= float(form["bending"]["cont_across"])
+    weight[_discontinuous(tree, form, "pairs")] *= float(form["bending"]["cont_across"])
     return np.asarray(weight)
 
 
-def _torn(tree: Mapping[str, Any], form: Mapping[str, Any], graph: str) -> NDArray[np.bool_]:
-    """Which edges of a graph lead from one surface to another where surfaces bend."""
+def _discontinuous(
+    tree: Mapping[str, Any], form: Mapping[str, Any], graph: str
+) -> NDArray[np.bool_]:
+    """Edges of a graph between two surfaces, if surfaces are taken to bend."""
     start = tree["start"]
     i, k = tree["energy"][graph].T
     bends = form["units"] == "pixel" and bool(start["bending"])

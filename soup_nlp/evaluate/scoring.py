@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.data.formats.map_files import read_depth
-from soup_nlp.data.pair import Pair, Truth
+from soup_nlp.data.pair import Truth
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.baselines import RigidBaseline, rigid_depth
 from soup_nlp.evaluate.metrics import (
     DepthMetrics,
     Scale,
@@ -27,14 +25,6 @@ Float = NDArray[np.float64]
 
 DEPTHS = {"solution": "ref", "nlp": "nlp_ref", "start": "start_ref", "rigid": "rigid_ref"}
 """Depth maps of the reference frame that a result stores, by the name of their metrics."""
-
-
-def rigid_baseline(pair: Pair) -> RigidBaseline | None:
-    """One rigid motion for the whole image, where there is truth to compare with and it fits."""
-    if pair.truth is not None:
-        with contextlib.suppress(DataError):
-            return rigid_depth(pair)
-    return None
 
 
 def score_depths(

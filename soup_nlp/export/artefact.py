@@ -21,7 +21,7 @@ from soup_nlp.export.manifest import (
     remove_stale,
 )
 from soup_nlp.export.names import readable_names
-from soup_nlp.export.nl import write_nl
+from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import GAUGES, MatrixLayout
@@ -105,13 +105,31 @@ def export_case(
                 getattr(nlp, function).save(str(temporary))
             files.append(f"{function}.casadi")
     write_text(folder / "problem.yaml", dump_problem(case.problem))
-    manifest: dict[str, Any] = {
+    manifest = {
+        **_description(case, form, nlp, layout, file),
+        "start": "presolve" if presolved else "proposal",
+        "best_known": best,
+        "files": files,
+    }
+    # the functions are of no use without parameters, start and bounds
+    if "h5" in formats or "casadi" in formats:
+        attrs = {k: manifest[k] for k in ("name", "problem_hash", "formulation", "smoothing")}
+        _write_start_h5(folder / f"{STUB}.h5", nlp, names, attrs)
+        files.append(f"{STUB}.h5")
+    write_json(folder / MANIFEST, manifest)
+    return manifest
+
+
+def _description(
+    case: Case, form: Formulation, nlp: NLP, layout: MatrixLayout, file: NLFile
+) -> dict[str, Any]:
+    """Entries of the manifest that follow from the problem and its .nl file."""
+    return {
         "name": case.problem.name,
         "problem_hash": case.problem.digest(),
         "versions": versions(),
         "formulation": {k: getattr(form, k) for k in CHOICES},
         "smoothing": {"eps": form.eps, "eps_pixel": form.eps_pixel},
-        "start": "presolve" if presolved else "proposal",
         "sizes": {
             "superpixels": len(case),
             "knn_edges": len(case.segmentation.edges),
@@ -126,16 +144,7 @@ def export_case(
         "objective_at_start": float(nlp.oracle(nlp.x0, nlp.p)[0]),
         "exact_energy_at_start": oracle.energy(case.soup, case.data, case.weights),
         "fingerprint": fingerprint(case, nlp, layout),
-        "best_known": best,
-        "files": files,
     }
-    # the functions are of no use without parameters, start and bounds
-    if "h5" in formats or "casadi" in formats:
-        attrs = {k: manifest[k] for k in ("name", "problem_hash", "formulation", "smoothing")}
-        _write_start_h5(folder / f"{STUB}.h5", nlp, names, attrs)
-        manifest["files"].append(f"{STUB}.h5")
-    write_json(folder / MANIFEST, manifest)
-    return manifest
 
 
 def fingerprint(case: Case, nlp: NLP, layout: MatrixLayout) -> dict[str, float]:

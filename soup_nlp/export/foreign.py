@@ -40,13 +40,13 @@ LIMITS = Limits()
 
 @dataclass(frozen=True)
 class Imported:
-    """A foreign answer, made a run.
+    """A foreign answer as a run.
 
     Attributes:
         run: As `pipeline.run` returns it; "converged" means claimed and verified.
-        sol: What the solver wrote.
-        manifest: Of the export, best_known renewed.
-        violations: Of bounds (nx,) and rows (ng,) by the point as it is.
+        sol: The solver's file.
+        manifest: Of the export, with the new best_known.
+        violations: Of bounds (nx,) and rows (ng,) by the solver's point.
     """
 
     run: Run
@@ -77,18 +77,9 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
         **manifest["formulation"], **manifest["smoothing"], hessian="exact", compiled=False
     )
     nlp, layout = case.nlp(form)
-    for key, value in fingerprint(case, nlp, layout).items():
-        then = float(manifest["fingerprint"][key])
-        if abs(value - then) > SAME * max(1.0, abs(then)):
-            raise ExportError(
-                "problem is not the one that was exported",
-                where=folder,
-                found=f"{key} {value!r}",
-                expected=repr(then),
-                hint="its images, its problem.yaml or the program have changed; export again",
-            )
+    _require_same_problem(folder, manifest, fingerprint(case, nlp, layout))
     answer = read_sol(sol, *_orders(folder, nlp, layout))
-    # a point may be anything: what cannot be computed is infinite or NaN, and never verified
+    # at an arbitrary point, values may be infinite or NaN; it is then not verified
     with np.errstate(all="ignore"):
         run = foreign_run(case, form, nlp, layout, answer, source=Path(sol).name)
     best = manifest["best_known"]
@@ -104,8 +95,24 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
     return Imported(run, answer, manifest, violations(nlp, answer.x))
 
 
+def _require_same_problem(
+    folder: Path, manifest: Mapping[str, Any], found: Mapping[str, float]
+) -> None:
+    """Raise ExportError unless the problem has the fingerprint that it had when exported."""
+    for key, value in found.items():
+        then = float(manifest["fingerprint"][key])
+        if abs(value - then) > SAME * max(1.0, abs(then)):
+            raise ExportError(
+                "problem is not the one that was exported",
+                where=folder,
+                found=f"{key} {value!r}",
+                expected=repr(then),
+                hint="its images, its problem.yaml or the program have changed; export again",
+            )
+
+
 def sol_table(imported: Imported) -> list[Kind]:
-    """Residuals by kind of a foreign answer as it is, before it is retracted."""
+    """Residuals by kind of a foreign answer, before it is retracted."""
     run = imported.run
     state = {k: getattr(run.answer, k) for k in ("lam", "n", "d", "R", "t")}
     limits = dict.fromkeys(EQUATIONS, KKT_LIMIT)
@@ -140,7 +147,7 @@ def _orders(folder: Path, nlp: NLP, layout: MatrixLayout) -> tuple[Any, Any]:
 def foreign_run(
     case: Case, form: Formulation, nlp: NLP, layout: MatrixLayout, answer: Sol, source: str
 ) -> Run:
-    """A run whose solution is a foreign solver's answer; nothing that it says is believed.
+    """A run whose solution is a foreign solver's answer; its claims are recomputed.
 
     It converged when success is claimed, the recomputed KKT residuals are within LIMITS and
     KKT_LIMIT, and the exact energy is not above the proposal's.

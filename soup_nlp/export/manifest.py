@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError, create_model
 
 from soup_nlp.errors import ExportError
 from soup_nlp.model.layout import GAUGES
@@ -22,50 +22,28 @@ OWN = {f"{STUB}{s}" for s in (".nl", ".col", ".row", ".h5")} | {f"{f}.casadi" fo
 """Every file beside problem.yaml and the manifest that an export may write."""
 
 
-class _Part(BaseModel):
-    """A part of the manifest; entries beyond these are for people."""
-
-    model_config = ConfigDict(strict=True)
-
-
-class _Formulation(_Part):
-    gauge: Literal[GAUGES]  # type: ignore[valid-type]
-    norm: Literal[NORMS]  # type: ignore[valid-type]
-    truncation: Literal[TRUNCATIONS]  # type: ignore[valid-type]
+def _record(name: str, **kinds: Any) -> type[BaseModel]:
+    """A model whose fields are all required; entries beyond these are for people."""
+    fields: dict[str, Any] = {key: (kind, ...) for key, kind in kinds.items()}
+    return create_model(name, __config__=ConfigDict(strict=True), **fields)
 
 
-class _Smoothing(_Part):
-    eps: FiniteFloat
-    eps_pixel: FiniteFloat
-
-
-class _Fingerprint(_Part):
-    objective: FiniteFloat
-    constraints: FiniteFloat
-
-
-class _Energy(_Part):
-    total: FiniteFloat
-
-
-class _File(_Part):
-    sha256: str
-
-
-class _Best(_Part):
-    exact_energy: FiniteFloat
-    found_by: str
-
-
-class _Manifest(_Part):
-    """Entries that an import needs."""
-
-    formulation: _Formulation
-    smoothing: _Smoothing
-    fingerprint: _Fingerprint
-    exact_energy_at_start: _Energy
-    nl: _File
-    best_known: _Best | None
+_Best = _record("Best", exact_energy=FiniteFloat, found_by=str)
+_Manifest = _record(
+    "Manifest",
+    formulation=_record(
+        "Formulation",
+        gauge=Literal[GAUGES],
+        norm=Literal[NORMS],
+        truncation=Literal[TRUNCATIONS],
+    ),
+    smoothing=_record("Smoothing", eps=FiniteFloat, eps_pixel=FiniteFloat),
+    fingerprint=_record("Fingerprint", objective=FiniteFloat, constraints=FiniteFloat),
+    exact_energy_at_start=_record("Energy", total=FiniteFloat),
+    nl=_record("File", sha256=str),
+    best_known=_Best | None,
+)
+"""Entries that an import needs."""
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -84,7 +62,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             hint="soup-nlp export PROBLEM.yaml -o DIR makes one",
         ) from error
     try:
-        known = _Manifest.model_validate(manifest)
+        known = _Manifest.model_validate(manifest).model_dump()
     except ValidationError as error:
         first = error.errors()[0]
         raise ExportError(
@@ -93,11 +71,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             found=first["msg"],
             hint="export again",
         ) from None
-    return {
-        **manifest,
-        "formulation": known.formulation.model_dump(),
-        "smoothing": known.smoothing.model_dump(),
-    }
+    return manifest | {key: known[key] for key in ("formulation", "smoothing")}
 
 
 def kept_best(folder: Path, sha256: str) -> dict[str, Any] | None:

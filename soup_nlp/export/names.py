@@ -1,4 +1,4 @@
-"""Names that a person understands: `R[17,2,1]`, `so3[17,3]`, `epigraph_gap_ref[17,23]`."""
+"""Readable names of variables and rows: `R[17,2,1]`, `so3[17,3]`, `epigraph_gap_ref[17,23]`."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Int = NDArray[np.int64]
 
 
 def readable_names(nlp: NLP, layout: MatrixLayout) -> tuple[list[str], list[str]]:
-    """Names of variables and constraints of the constrained NLP; all differ.
+    """Unique names of variables and constraints of the constrained NLP.
 
-    The first index is the superpixel, for an edge or a neighbour pair the first two are the two
-    superpixels. A third counts, from 1, what a superpixel has several of: rows of R'R = I in the
-    order 11 12 22 13 23 33, rim rays (the anchor is 1), sampled pixels.
+    The first index is the superpixel; for an edge or a neighbour pair the first two are the two
+    superpixels. A further index counts, from 1, the rows of R'R = I in the order 11 12 22 13 23 33,
+    rim rays (the anchor is 1), or sampled pixels.
 
     Args:
         nlp: From `build_matrix_nlp`.

@@ -185,7 +185,7 @@ def _write(
     lbg, ubg = (v[rows] for v in g)
     longest = [max(map(len, n or ()), default=0) for n in (names[1], names[0])]
     lines = chain(
-        header(program, lbg, ubg, J.nnz, G.nnz, longest, body.classes),
+        header(program, (lbg, ubg), longest, body.classes),
         body.segments(),
         start(x0, None if lam_g0 is None else lam_g0[rows]),
         bounds("r", lbg, ubg),

@@ -1,4 +1,4 @@
-"""Constraints by kind: largest violation, how many violate, and the worst superpixels."""
+"""Constraints by kind: largest violation, number of violations, and the worst superpixels."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Kind:
         largest: Largest violation.
         limit: Largest that is allowed.
         count: Superpixels (or entries) beyond the limit.
-        total: Of how many.
-        worst: (superpixel, violation), worst first; empty where no one superpixel is to blame.
+        total: Number of superpixels (or entries).
+        worst: (superpixel, violation), worst first; empty where entries are no superpixels.
     """
 
     name: str
@@ -60,8 +60,8 @@ class Kind:
 
 
 def kind(name: str, violation: Float, limit: float, superpixels: bool = True) -> Kind:
-    """Row of a table from violations (M,) that are >= 0."""
-    # what is not a number is as wrong as can be
+    """Summary of violations (M,) that are >= 0."""
+    # NaN counts as an infinite violation
     v = np.where(np.isfinite(violation), violation, np.inf)
     order = np.argsort(-v, kind="stable")[:WORST]
     worst = tuple((int(k), float(v[k])) for k in order if v[k] > 0) if superpixels else ()
@@ -85,7 +85,7 @@ def residual_table(
 
 
 def table_text(rows: list[Kind]) -> str:
-    """The table with its head."""
+    """The table with its header."""
     head = (
         f"     {'kind':<9} {'equation':<17}{'largest':>9} {'limit':>9} {'beyond':>9}"
         f"{'':<8}worst superpixels"

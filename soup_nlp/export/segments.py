@@ -15,46 +15,38 @@ Float = NDArray[np.float64]
 
 
 def header(
-    program: Program,
-    lbg: Float,
-    ubg: Float,
-    jacobian_nonzeros: int,
-    gradient_nonzeros: int,
-    longest: Sequence[int],
-    defined: Sequence[int],
-) -> Iterator[str]:
+    program: Program, bounds: tuple[Float, Float], longest: Sequence[int], defined: Sequence[int]
+) -> list[str]:
     """The ten lines of counts.
 
     Args:
         program: The NLP in parts.
-        lbg: (ng,) lower bounds of the rows.
-        ubg: (ng,) upper bounds of the rows.
-        jacobian_nonzeros: Entries of the J segments.
-        gradient_nonzeros: Entries of the G segment.
+        bounds: (ng,) lower and upper bounds of the rows.
         longest: Length of the longest name of a row and of a variable.
         defined: Defined variables by use, see `nl.NLFile`.
     """
-    equations = lbg == ubg
-    ranges = np.isfinite(lbg) & np.isfinite(ubg) & ~equations
-    in_rows = int(program.in_rows.sum())
-    both = int((program.in_rows & program.in_objective).sum())
-    only = int((program.in_objective & ~program.in_rows).sum())
+    lower, upper = bounds
+    equations = lower == upper
+    ranges = np.isfinite(lower) & np.isfinite(upper) & ~equations
+    in_rows, both = program.in_rows.sum(), (program.in_rows & program.in_objective).sum()
+    only = program.in_objective.sum() - both
     # the count for objectives spans the constraints' variables where it has some of its own
     in_objective = in_rows + only if only else both
-    yield "g3 1 1 0"
-    yield (
-        f" {len(program.in_rows)} {len(lbg)} 1 {ranges.sum()} {equations.sum()}"
-        "\t# vars, constraints, objectives, ranges, eqns"
-    )
-    curved = int(program.curved_rows.sum()), int(program.curved_objective)
-    yield f" {curved[0]} {curved[1]}\t# nonlinear constraints, objectives"
-    yield " 0 0\t# network constraints: nonlinear, linear"
-    yield f" {in_rows} {in_objective} {both}\t# nonlinear vars in constraints, objectives, both"
-    yield " 0 0 0 1\t# linear network variables; functions; arith, flags"
-    yield " 0 0 0 0 0\t# discrete variables: binary, integer, nonlinear (b,c,o)"
-    yield f" {jacobian_nonzeros} {gradient_nonzeros}\t# nonzeros in Jacobian, gradients"
-    yield f" {longest[0]} {longest[1]}\t# max name lengths: constraints, variables"
-    yield " " + " ".join(map(str, defined)) + "\t# common exprs: b,c,o,c1,o1"
+    n, m = len(program.in_rows), len(lower)
+    return [
+        "g3 1 1 0",
+        f" {n} {m} 1 {ranges.sum()} {equations.sum()}"
+        "\t# vars, constraints, objectives, ranges, eqns",
+        f" {program.curved_rows.sum()} {int(program.curved_objective)}"
+        "\t# nonlinear constraints, objectives",
+        " 0 0\t# network constraints: nonlinear, linear",
+        f" {in_rows} {in_objective} {both}\t# nonlinear vars in constraints, objectives, both",
+        " 0 0 0 1\t# linear network variables; functions; arith, flags",
+        " 0 0 0 0 0\t# discrete variables: binary, integer, nonlinear (b,c,o)",
+        f" {program.jacobian.nnz} {program.gradient.nnz}\t# nonzeros in Jacobian, gradients",
+        f" {longest[0]} {longest[1]}\t# max name lengths: constraints, variables",
+        f" {' '.join(map(str, defined))}\t# common exprs: b,c,o,c1,o1",
+    ]
 
 
 def start(x0: Float, lam: Float | None) -> Iterator[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +13,8 @@ from soup_nlp.errors import ExportError
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+N = TypeVar("N", int, float)
 
-COUNT_LIMIT = 2**31
-"""No count in a file is as large as this."""
 OPTIONS = "Options"
 """Line that ends the message."""
 CLASSES = ("solved", "uncertain", "infeasible", "unbounded", "limit", "failure")
@@ -25,7 +25,7 @@ class Sol:
     """A solver's answer in the order of the NLP (not of the file).
 
     Attributes:
-        message: What the solver says.
+        message: The solver's message.
         code: AMPL's solve_result_num, -1 where the file has none.
         x: (nx,) point.
         lam_g: (ng,) multipliers in CasADi's sign (positive at upper bounds), or None.
@@ -65,27 +65,20 @@ class _Lines:
                 "solution file ends early",
                 where=f"{self.path}, line {self.at}",
                 expected=expected,
-                hint="did the solver reach its end?",
+                hint="was the solver stopped before its end?",
             )
         self.at += 1
         return self.lines[self.at - 1].strip()
 
-    def numbers(self, count: int, expected: str) -> Float:
-        out = np.empty(count)
-        for k in range(count):
+    def numbers(self, count: int, expected: str, kind: type[N]) -> list[N]:
+        out = []
+        for _ in range(count):
             text = self.next(expected)
             try:
-                out[k] = float(text)
+                out.append(kind(text))
             except ValueError:
                 raise self.wrong(text, expected) from None
         return out
-
-    def integers(self, count: int, expected: str) -> list[int]:
-        values = self.numbers(count, expected)
-        for value in values:
-            if not (value >= 0 and value == np.floor(value) and value < COUNT_LIMIT):
-                raise self.wrong(repr(float(value)), f"{expected}: a whole number, not negative")
-        return [int(v) for v in values]
 
     def wrong(self, found: str, expected: str) -> ExportError:
         return ExportError(
@@ -112,14 +105,14 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
     message = []
     while (line := lines.next(OPTIONS)) != OPTIONS:
         message.append(line)
-    (count,) = lines.integers(1, "number of options")
-    # two more options say that a tolerance follows
+    said = [line for line in message if line]
+    (count,) = lines.numbers(1, "number of options", int)
+    # two more options announce a tolerance
     tolerance = count > 4
     for _ in range(count - 2 * tolerance):
         lines.next("an option")
-    sizes = lines.integers(4, "number of constraints, duals, variables, values")
-    if tolerance:
-        lines.numbers(1, "tolerance")
+    sizes = lines.numbers(4, "number of constraints, duals, variables, values", int)
+    lines.numbers(int(tolerance), "tolerance", float)
     if (sizes[0], sizes[2]) != (len(rows), len(variables)):
         raise ExportError(
             "solution is for another problem",
@@ -132,18 +125,12 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
             "solution holds no point",
             where=path,
             found=f"{sizes[3]} of {len(variables)} values, {sizes[1]} duals",
-            hint="; ".join(m for m in message if m) or None,
+            hint="; ".join(said) or None,
         )
-    y = lines.numbers(sizes[1], "a dual value")
-    z = lines.numbers(sizes[3], "a value of a variable")
-    for values, what in ((z, "a value"), (y, "a dual")):
-        if not np.isfinite(values).all():
-            raise ExportError(
-                "solution is not finite",
-                where=path,
-                found=f"{what} is not a number or infinite",
-                hint="; ".join(m for m in message if m) or None,
-            )
+    y = np.array(lines.numbers(sizes[1], "a dual value", float))
+    z = np.array(lines.numbers(sizes[3], "a value of a variable", float))
+    if not (np.isfinite(y).all() and np.isfinite(z).all()):
+        raise ExportError("solution is not finite", where=path, hint="; ".join(said) or None)
     code = -1
     # suffixes may follow: multipliers of the bounds are computed from the point instead
     for line in lines.lines[lines.at :]:
@@ -158,4 +145,4 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
     if sizes[1]:
         lam_g = np.empty(len(rows))
         lam_g[rows] = -y
-    return Sol("\n".join(m for m in message if m), code, x, lam_g)
+    return Sol("\n".join(said), code, x, lam_g)

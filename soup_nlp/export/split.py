@@ -22,8 +22,8 @@ class Split:
     Attributes:
         nonlinear: (m,) expressions without the variables that enter them linearly.
         row, column: (k,) output and local variable of every Jacobian nonzero.
-        is_linear: (k,) the nonzero is a number, wherever the variables are.
-        coefficient: (E, k) that number for every element; 0 where it is not one.
+        is_linear: (k,) the nonzero does not depend on the variables.
+        coefficient: (E, k) its value for every element where it is linear, else 0.
         objective: The kernel has an objective (output 0).
     """
 

@@ -52,73 +52,69 @@ class _Graph:
     number: dict[int, Float] = field(default_factory=dict)
     roots: list[int] = field(default_factory=list)
 
-    def add(self, op: int, args: tuple[int, ...]) -> int:
+    known: dict[object, int] = field(default_factory=dict)
+
+    def leaf(self, key: object, number: Float | None = None, variable: int | None = None) -> int:
+        """Node of a number or a variable: the one of this key, if there is one."""
+        if key not in self.known:
+            node = self._add(key, -1, ())
+            if number is not None:
+                self.number[node] = number
+            if variable is not None:
+                self.variable[node] = variable
+        return self.known[key]
+
+    def apply(self, op: int, args: tuple[int, ...]) -> int:
+        """Node of an operation: an existing one if there is one, a number without variables."""
+        key = (op, tuple(sorted(args)) if op in COMMUTATIVE else args)
+        if key in self.known:
+            return self.known[key]
+        if not all(a in self.number for a in args):
+            return self._add(key, op, args)
+        with np.errstate(all="ignore"):
+            return self.leaf(key, OPS[op].fold(*(self.number[a] for a in args)))
+
+    def _add(self, key: object, op: int, args: tuple[int, ...]) -> int:
         self.op.append(op)
         self.args.append(args)
-        return len(self.op) - 1
+        self.known[key] = len(self.op) - 1
+        return self.known[key]
 
 
 def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
-    """Instructions of the outputs; a number is a scalar, or (E,) where it depends on the data."""
+    """Instructions of the outputs; a number is a scalar, or (E,) where it depends on the data.
+
+    Raises:
+        ExportError: an operation has no opcode.
+    """
     kernel, table = group.kernel, group.table
     function = ca.Function("f", [kernel.x, kernel.row, kernel.theta], [ca.densify(outputs)])
     graph = _Graph(roots=[-1] * outputs.numel())
-    known: dict[object, int] = {}
     work: dict[int, int] = {}
-
-    def once(key: object, value: Float | None = None, variable: int | None = None) -> int:
-        if key not in known:
-            node = graph.add(-1, ())
-            known[key] = node
-            if value is not None:
-                graph.number[node] = value
-            if variable is not None:
-                graph.variable[node] = variable
-        return known[key]
-
     for k in range(function.n_instructions()):
-        op = function.instruction_id(k)
+        op, inputs = function.instruction_id(k), function.instruction_input(k)
         if op == ca.OP_OUTPUT:
-            graph.roots[function.instruction_output(k)[1]] = work[function.instruction_input(k)[0]]
+            graph.roots[function.instruction_output(k)[1]] = work[inputs[0]]
             continue
         target = function.instruction_output(k)[0]
         if op == ca.OP_CONST:
             value = function.instruction_constant(k)
-            work[target] = once(("const", value), np.float64(value))  # type: ignore[arg-type]
+            work[target] = graph.leaf(("const", value), np.asarray(value, float))
+        elif op == ca.OP_INPUT and inputs[0] == 0:
+            work[target] = graph.leaf((0, inputs[1]), variable=inputs[1])
         elif op == ca.OP_INPUT:
-            which, place = function.instruction_input(k)
-            if which == 0:
-                work[target] = once((0, place), variable=place)
-            else:
-                values = table.data[:, place] if which == 1 else np.float64(theta[place])
-                work[target] = once((which, place), values)  # type: ignore[arg-type]
+            which, place = inputs
+            values = table.data[:, place] if which == 1 else np.asarray(theta[place])
+            work[target] = graph.leaf((which, place), values)
+        elif op == ca.OP_ASSIGN:
+            work[target] = work[inputs[0]]
+        elif op in OPS:
+            work[target] = graph.apply(op, tuple(work[a] for a in inputs))
         else:
-            args = tuple(work[a] for a in function.instruction_input(k))
-            work[target] = _apply(name, graph, known, op, args)
+            raise ExportError(
+                "operation cannot be written to .nl", where=name, found=NAMES.get(op, str(op))
+            )
     return graph
-
-
-def _apply(
-    name: str, graph: _Graph, known: dict[object, int], op: int, args: tuple[int, ...]
-) -> int:
-    """Node of an operation: an old one where it is there, a number where no variable enters."""
-    if op == ca.OP_ASSIGN:
-        return args[0]
-    if op not in OPS:
-        raise ExportError(
-            "operation cannot be written to .nl", where=name, found=NAMES.get(op, str(op))
-        )
-    key = (op, tuple(sorted(args)) if op in COMMUTATIVE else args)
-    if key in known:
-        return known[key]
-    if all(a in graph.number for a in args):
-        node = graph.add(-1, ())
-        with np.errstate(all="ignore"):
-            graph.number[node] = OPS[op].fold(*(graph.number[a] for a in args))
-    else:
-        node = graph.add(op, args)
-    known[key] = node
-    return node
 
 
 @dataclass(frozen=True)

@@ -151,24 +151,21 @@ def assemble_functions(
     """
     made = [g.kernel.first_order() for g in groups]
     made = _compiled(made) if compiled else made
-    symbols = _Symbols.of(nx, ng, thetas + sum(g.table.data.size for g in groups))
-    x, p = symbols.x, symbols.p
+    symbols = _symbols(nx, ng, thetas + sum(g.table.data.size for g in groups))
+    x, p, *_ = symbols
     local = _mapped(groups, made, thetas, symbols)
     f = ca.MX(0.0)
     grad = ca.MX.zeros(nx)
     g = ca.MX.zeros(ng)
-    objective = [(grp, v) for grp, v in zip(groups, local) if "f" in v]
     constrained = [(grp, v) for grp, v in zip(groups, local) if "con" in v]
-    for group, values in objective:
-        f += ca.sum1(values["f"])
-        grad += _sum_into(nx, group.table.index, values["grad"])
-    for group, values in constrained:
-        g += _sum_into(ng, group.table.rows, values["con"])
-
-    jac = ca.MX(ng, nx)
-    if constrained:
-        pattern = Pattern.of((ng, nx), [jacobian_entries(group) for group, _ in constrained])
-        jac = _matrix(pattern, [v["jac"] for _, v in constrained])
+    for group, values in zip(groups, local):
+        if "f" in values:
+            f += ca.sum1(values["f"])
+            grad += _sum_into(nx, group.table.index, values["grad"])
+        if "con" in values:
+            g += _sum_into(ng, group.table.rows, values["con"])
+    pattern = Pattern.of((ng, nx), [jacobian_entries(group) for group, _ in constrained])
+    jac = _matrix(pattern, [v["jac"] for _, v in constrained])
     return Functions(
         oracle=ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]),
         grad_f=ca.Function("nlp_grad_f", [x, p], [f, grad], ["x", "p"], ["f", "grad_f_x"]),
@@ -197,28 +194,23 @@ def assemble_hessian(
     second = [g.kernel.second_order(hessian) for g in groups]
     made = [{"hess": h} if h else {} for h in second]
     nx = pattern.shape[0]
-    symbols = _Symbols.of(nx, ng, thetas + sum(g.table.data.size for g in groups))
+    symbols = _symbols(nx, ng, thetas + sum(g.table.data.size for g in groups))
     local = _mapped(groups, _compiled(made) if compiled else made, thetas, symbols)
     entries = [v["hess"] for v in local if "hess" in v]
     return ca.Function(
         "nlp_hess_l",
         list(symbols),
-        [_matrix(pattern, entries) if entries else ca.MX(nx, nx)],
+        [_matrix(pattern, entries)],
         ["x", "p", "lam_f", "lam_g"],
         ["triu_hess_gamma_x_x"],
     )
 
 
-class _Symbols(NamedTuple):
-    x: ca.MX
-    p: ca.MX
-    lam_f: ca.MX
-    lam_g: ca.MX
-
-    @classmethod
-    def of(cls, nx: int, ng: int, np_: int) -> _Symbols:
-        sym = ca.MX.sym
-        return cls(sym("x", nx), sym("p", np_), sym("lam_f"), sym("lam_g", ng))
+def _symbols(nx: int, ng: int, np_: int) -> tuple[ca.MX, ca.MX, ca.MX, ca.MX]:
+    """x, p, lam_f, lam_g."""
+    sizes = {"x": nx, "p": np_, "lam_f": 1, "lam_g": ng}
+    x, p, lam_f, lam_g = (ca.MX.sym(name, size) for name, size in sizes.items())
+    return x, p, lam_f, lam_g
 
 
 def _compiled(made: list[dict[str, ca.Function]]) -> list[dict[str, ca.Function]]:
@@ -234,7 +226,7 @@ def _mapped(
     groups: Sequence[Group],
     made: list[dict[str, ca.Function]],
     thetas: int,
-    symbols: _Symbols,
+    symbols: tuple[ca.MX, ca.MX, ca.MX, ca.MX],
 ) -> list[dict[str, ca.MX]]:
     """Every group's functions over its table, element by element in one column."""
     x, p, lam_f, lam_g = symbols
@@ -250,12 +242,8 @@ def _mapped(
         for key, function in functions.items():
             extra = []
             if key == "hess":
-                nc = group.kernel.nc
-                lam_c = (
-                    ca.reshape(lam_g[_constant(group.table.rows)], nc, size)
-                    if nc
-                    else ca.MX(0, size)
-                )
+                rows = _constant(group.table.rows)
+                lam_c = ca.reshape(lam_g[rows], -1, size) if rows else ca.MX(0, size)
                 extra = [ca.repmat(lam_f, 1, size), lam_c]
             values[key] = ca.vec(function.map(size)(*args, *extra))
         out.append(values)
@@ -263,5 +251,7 @@ def _mapped(
 
 
 def _matrix(pattern: Pattern, local: list[ca.MX]) -> ca.MX:
+    if not local:
+        return ca.MX(*pattern.shape)
     places = np.concatenate(pattern.places)
     return ca.MX(pattern.sparsity(), _sum_into(len(pattern.rows), places, ca.vertcat(*local)))

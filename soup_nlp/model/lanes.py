@@ -10,7 +10,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -134,21 +133,10 @@ def compile_lanes(functions: Sequence[ca.Function]) -> ctypes.CDLL:
     path = shared_library(key, lambda: "\n".join([_HEAD, *(c_source(f) for f in functions)]))
     if path is None:
         raise NoLanesError("no working compiler")
-    return _load(path)
-
-
-def _load(path: Path) -> ctypes.CDLL:
     try:
         return ctypes.CDLL(str(path))
     except OSError as error:
         raise NoLanesError(str(error)) from error
-
-
-def summing(library: ctypes.CDLL, function: ca.Function) -> Callable[..., None]:
-    """A function's loop in a library of `compile_lanes`."""
-    call = library[f"{function.name()}_sum"]
-    call.restype = None
-    return call
 
 
 @dataclass(frozen=True)
@@ -187,9 +175,21 @@ class Summed(NamedTuple):
     lanes: Lanes
     place: NDArray[np.int32]
 
-    def add(
-        self, out: Float, x: Float, theta: Float, lam_f: float = 1.0, lam_g: Float | None = None
-    ) -> None:
+    @classmethod
+    def of(
+        cls,
+        library: ctypes.CDLL,
+        function: ca.Function,
+        lanes: Lanes,
+        place: NDArray[np.integer],
+        size: int,
+    ) -> Summed:
+        """A function of a library of `compile_lanes`, its entries (E, k) added to `size` sums."""
+        call = library[f"{function.name()}_sum"]
+        call.restype = None
+        return cls(call, lanes, in_lanes(place, np.int32, fill=size))
+
+    def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
         """Add the elements' entries to `out`.
 
         Args:

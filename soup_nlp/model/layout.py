@@ -74,16 +74,11 @@ class MatrixLayout:
     def pack(self, soup: Soup) -> Float:
         """Solver vector (size,) of a soup, brought to this gauge and length unit."""
         s = soup.normalised(self.share)
-        D, T = s.distance, s.translation
-        lam = self.count * s.lam
-        x = np.empty((self.count, self.stride))
-        R = s.R.transpose(0, 2, 1).reshape(-1, 9)
-        if self.gauge == "unit-offset":
-            x[:] = np.column_stack([lam, s.n, R, T / lam[:, None]])
-            return x.ravel()
-        if self.gauge == "free":
-            x[:] = np.column_stack([lam, s.n, self.offset, R, T / lam[:, None]])
-            return x.ravel()
+        D, T, R = s.distance, s.translation, s.R.transpose(0, 2, 1).reshape(-1, 9)
+        if self.gauge != "unit-translation":
+            lam = self.count * s.lam
+            offset = [] if self.gauge == "unit-offset" else [self.offset]
+            return np.column_stack([lam, s.n, *offset, R, T / lam[:, None]]).ravel()
         length = np.linalg.norm(T, axis=1)
         # a superpixel at rest has no direction in this gauge: give it a tiny one
         floor = 1e-3 * max(float(np.median(length)), 1e-6)
@@ -91,17 +86,16 @@ class MatrixLayout:
         length = np.linalg.norm(T, axis=1)
         tau = float(length.mean())
         lam = length / tau
-        x[:] = np.column_stack([lam, s.n, D / lam, R, T / lam[:, None]])
+        x = np.column_stack([lam, s.n, D / lam, R, T / lam[:, None]])
         return np.append(x.ravel(), tau)
 
     def unpack(self, x: Float) -> Soup:
         """Soup of a solver vector, sum(lam) as the vector has it (1 at a feasible point)."""
-        a = np.asarray(x, float)[: self.count * self.stride].reshape(self.count, self.stride)
         n = self.count
-        rest = a[:, 4:] if self.gauge == "unit-offset" else a[:, 5:]
-        d = self.offset * n if self.gauge == "unit-offset" else a[:, 4] * n
-        R = rest[:, :9].reshape(-1, 3, 3).transpose(0, 2, 1)
-        return Soup(a[:, 0] / n, a[:, 1:4].copy(), d, R, rest[:, 9:] * n)
+        a = np.asarray(x, float)[: n * self.stride].reshape(n, self.stride)
+        d = self.offset if self.gauge == "unit-offset" else a[:, 4]
+        R = a[:, -12:-3].reshape(-1, 3, 3).transpose(0, 2, 1)
+        return Soup(a[:, 0] / n, a[:, 1:4].copy(), d * n, R, a[:, -3:] * n)
 
     def names(self) -> list[str]:
         """Readable names in order: `lam[17]`, `n[17,2]`, `R[17,2,1]` (row, column from 1)."""

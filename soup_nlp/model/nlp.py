@@ -19,7 +19,7 @@ from soup_nlp.model.assemble import (
     assemble_hessian,
     hessian_pattern,
 )
-from soup_nlp.model.kernel import HESSIANS, Group
+from soup_nlp.model.kernel import Group, Hessian
 
 Float = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class NLP:
     ubg: Float
     p: Float
     theta: tuple[str, ...]
-    hessian: str
+    hessian: Hessian
     x_names: Callable[[], list[str]]
     g_names: Callable[[], list[str]]
     compiled: bool = True
@@ -68,19 +68,14 @@ class NLP:
     def hess_lag(self) -> ca.Function:
         """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian; by itself, since
         assembling it takes seconds at real sizes."""
-        return self.other_hessian(self.hessian)
+        sizes = self.ng, len(self.theta)
+        pattern = self.hessian_pattern
+        return assemble_hessian(self.groups, pattern, *sizes, self.hessian, self.compiled)
 
     def assembled(self) -> NLP:
-        """The same, with all its functions assembled now: what is timed later does not pay."""
+        """The same, with all its functions assembled now, so that later timings exclude it."""
         _ = self.functions, self.hess_lag
         return self
-
-    def other_hessian(self, hessian: str) -> ca.Function:
-        """`hess_lag` of any kind."""
-        own = hessian == self.hessian
-        pattern = self.hessian_pattern if own else hessian_pattern(self.groups, self.nx, hessian)
-        sizes = self.ng, len(self.theta)
-        return assemble_hessian(self.groups, pattern, *sizes, hessian, self.compiled)
 
     @property
     def oracle(self) -> ca.Function:
@@ -154,6 +149,7 @@ class NLP:
 
 
 def _bound_bars(label: str, lower: Float, upper: Float) -> list[str]:
+    """A line with a bar for every kind of bound that occurs."""
     lo, up = np.isfinite(lower), np.isfinite(upper)
     fixed = lo & up & (lower == upper)
     kinds = {
@@ -163,14 +159,9 @@ def _bound_bars(label: str, lower: Float, upper: Float) -> list[str]:
         "range": lo & up & ~fixed,
         "fixed": fixed,
     }
-    total = max(1, len(lower))
-    out = []
-    for kind, mask in kinds.items():
-        count = int(mask.sum())
-        if count:
-            bar = "#" * max(1, round(20 * count / total))
-            out.append(f"  {label:<11} {kind:<6} {bar:<20} {count}")
-    return out
+    counts = {kind: int(mask.sum()) for kind, mask in kinds.items() if mask.any()}
+    bars = {kind: "#" * max(1, round(20 * c / len(lower))) for kind, c in counts.items()}
+    return [f"  {label:<11} {kind:<6} {bars[kind]:<20} {c}" for kind, c in counts.items()]
 
 
 def assemble(
@@ -183,33 +174,27 @@ def assemble(
     lbg: Float,
     ubg: Float,
     theta: Mapping[str, float],
-    hessian: str,
+    hessian: Hessian,
     x_names: Callable[[], list[str]],
     g_names: Callable[[], list[str]],
     compiled: bool = True,
 ) -> NLP:
-    """The NLP of kernels and tables.
+    """The NLP of kernels and tables, empty tables left out.
 
     Args:
-        name: For reports.
+        name: As of `NLP`, like all that are not named here.
         groups: Kernels and tables.
-        x0: (nx,) start.
-        lbx: (nx,) lower bounds of x.
-        ubx: (nx,) upper bounds of x.
-        lbg: (ng,) lower bounds of g.
-        ubg: (ng,) upper bounds of g.
+        x0: Start.
+        lbx: Lower bounds of x.
+        ubx: Upper bounds of x.
+        lbg: Lower bounds of g.
+        ubg: Upper bounds of g.
         theta: Values of the shared parameters, in the kernels' order.
-        hessian: "exact", "gauss-newton" (positive semidefinite objective part, no constraint
-            curvature) or "gauss-newton+constraints".
+        hessian: Kind of the Hessian.
         x_names: Makes the variables' names.
         g_names: Makes the constraints' names.
         compiled: Use the C compiler where there is one.
-
-    Raises:
-        ModelError: no such Hessian.
     """
-    if hessian not in HESSIANS:
-        raise ModelError("unknown Hessian", found=hessian, expected=", ".join(HESSIANS))
     groups = tuple(g for g in groups if g.size)
     data = [g.table.data.ravel() for g in groups]
     return NLP(

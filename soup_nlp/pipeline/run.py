@@ -8,13 +8,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import SoupError
-from soup_nlp.evaluate.baselines import RigidBaseline
+from soup_nlp.evaluate.baselines import rigid_depth
 from soup_nlp.evaluate.metrics import DepthMetrics
-from soup_nlp.evaluate.scoring import rigid_baseline, score_depths
+from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.model import oracle
@@ -29,6 +32,8 @@ from soup_nlp.solve.ipopt import Listener
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.propose import Start
+
+Float = NDArray[np.float64]
 
 
 class StoppedError(SoupError):
@@ -49,7 +54,8 @@ class Run:
         solution: Result of the constrained NLP, before any refinement.
         start_reconstruction: Dense 3D of the start.
         reconstruction: Dense 3D of `soup`.
-        rigid: One rigid motion for the whole image; None without truth or where none fits.
+        rigid: (H, W) depth by one rigid motion for the whole image, in lengths of its translation;
+            None without truth or where none fits.
         metrics: By "solution" (delivered), "nlp" (where refined), "start", "constant", "rigid",
             and "solution_next" for the next frame; a key without truth is absent.
         seconds: Wall time by stage; those that start with nlp_ are parts of "nlp".
@@ -66,7 +72,7 @@ class Run:
     solution: Solution
     start_reconstruction: Reconstruction
     reconstruction: Reconstruction
-    rigid: RigidBaseline | None
+    rigid: Float | None
     metrics: Mapping[str, DepthMetrics] = field(repr=False)
     seconds: Mapping[str, float]
     refined: Refined | None = None
@@ -161,18 +167,8 @@ def run(
     case = prepare(problem, pair=pair, log=log, on_stage=clock)
 
     def nlp(soup: Soup) -> Solution:
-        form, options = case.formulation(), case.options
-        return solve_soup(
-            soup,
-            case.data,
-            case.weights,
-            form,
-            options,
-            listener=listener,
-            stop=stop,
-            say=log,
-            log_file=ipopt_log,
-        )
+        own = soup, case.data, case.weights, case.formulation(), case.options
+        return solve_soup(*own, listener=listener, stop=stop, say=log, log_file=ipopt_log)
 
     if problem.refine.enabled and problem.refine.from_start:
         solution = _skipped(case)
@@ -221,12 +217,12 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     before, middle = dense(case.start.soup), dense(solution.soup)
     after = middle if refined is None else dense(refined.soup)
     between = middle if refined is not None and solution.stages else None
-    rigid = rigid_baseline(pair)
+    rigid = rigid_depth(pair) if pair.truth is not None else None
     depths = {"solution": after.depth_ref, "start": before.depth_ref}
     if between is not None:
         depths["nlp"] = between.depth_ref
     if rigid is not None:
-        depths["rigid"] = rigid.depth
+        depths["rigid"] = rigid
     return Run(
         problem=case.problem,
         pair=pair,

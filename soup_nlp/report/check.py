@@ -17,7 +17,7 @@ from soup_nlp.evaluate import recompute
 from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.storage.store import read_attrs, read_h5, require
 
-Claims: TypeAlias = Mapping[str, Any]
+Entries: TypeAlias = Mapping[str, Any]
 TERMS = ("arap", "proj", "cont", "orient")
 LIMITS = {
     "so3": 1e-8,
@@ -39,17 +39,17 @@ NOT_CHECKED = "dual infeasibility and complementarity need the model's derivativ
 
 
 @dataclass(frozen=True)
-class Row:
-    """One claim.
+class Claim:
+    """One claim of a result folder.
 
     Attributes:
-        name: What is claimed.
+        name: Subject of the claim.
         claimed: Value in summary.json.
         found: Value recomputed from the arrays.
         limit: Largest allowed found value (constraints) or difference (numbers, relative).
         ok: Whether the claim holds.
         worst: Superpixel with the largest residual, -1 where there is none.
-        note: More about it.
+        note: Explanation.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Row:
 class CheckReport:
     """All rows of a check."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[Claim, ...]
 
     @property
     def ok(self) -> bool:
@@ -109,13 +109,13 @@ def check_folder(folder: str | Path) -> CheckReport:
         ) from error
 
 
-def _rows(folder: Path, claims: Claims, tree: Claims, attrs: Claims) -> Iterator[Row]:
+def _rows(folder: Path, claims: Entries, tree: Entries, attrs: Entries) -> Iterator[Claim]:
     yield from _labels(claims, attrs, (folder / "config.yaml").read_text(encoding="utf-8"))
     settings = yaml.safe_load(str(attrs["config"]))
     weights = {k: float(v) for k, v in tree["weights"].items()}
     yield from _weights(tree, settings["energy"], weights)
     for name, gap in recompute.data_errors(tree, settings).items():
-        yield Row(f"data {name}", 0.0, gap, RELATIVE, gap <= RELATIVE)
+        yield Claim(f"data {name}", 0.0, gap, RELATIVE, gap <= RELATIVE)
     slack = _rounding(tree, weights)
     for which in ("start", "nlp", "solution"):
         found = recompute.energy(_state(tree, which), tree["energy"], weights)
@@ -126,14 +126,14 @@ def _rows(folder: Path, claims: Claims, tree: Claims, attrs: Claims) -> Iterator
     if claims["converged"]:
         before, after = (float(claims["energy"][k]["total"]) for k in ("start", "solution"))
         ok = after <= before * (1 + RELATIVE) + slack
-        yield Row("energy falls", before, after, before, ok)
+        yield Claim("energy falls", before, after, before, ok)
     yield from _rounds(claims, slack)
     yield from _constraints(claims, tree, weights)
     yield from _depths(tree)
     yield from _metrics(tree, claims["metrics"])
 
 
-def _weights(tree: Claims, form: Claims, weights: Mapping[str, float]) -> Iterator[Row]:
+def _weights(tree: Entries, form: Entries, weights: Mapping[str, float]) -> Iterator[Claim]:
     """The stored weights are those of the problem."""
     own = form["weights"]
     if form["units"] == "pixel" and bool(tree["start"].get("bending", False)):
@@ -144,7 +144,7 @@ def _weights(tree: Claims, form: Claims, weights: Mapping[str, float]) -> Iterat
         yield _same(f"weight {key}", own[key], weights[key])
 
 
-def _rounding(tree: Claims, weights: Mapping[str, float]) -> float:
+def _rounding(tree: Entries, weights: Mapping[str, float]) -> float:
     """Rounding error of an energy that should be zero.
 
     E sums differences of numbers as large as pixel coordinates and focal lengths, so its absolute
@@ -157,8 +157,8 @@ def _rounding(tree: Claims, weights: Mapping[str, float]) -> float:
     return ROUNDINGS * float(np.finfo(float).eps) * len(e["anchor_ray"]) * size * factor
 
 
-def _rounds(claims: Claims, slack: float) -> Iterator[Row]:
-    """E never rises from round to round, and no round claims less than its lower bound."""
+def _rounds(claims: Entries, slack: float) -> Iterator[Claim]:
+    """E never rises from round to round, and no round has an energy below its lower bound."""
     refinement = claims.get("refinement")
     if not refinement or not refinement["rounds"]:
         return
@@ -167,31 +167,31 @@ def _rounds(claims: Claims, slack: float) -> Iterator[Row]:
     totals = np.array([float(e["total"]) for e in path])
     rise = float(np.diff(totals).max())
     within = RELATIVE * abs(totals[0]) + slack
-    yield Row("no round raises E", 0.0, rise, 0.0, rise <= within)
+    yield Claim("no round raises E", 0.0, rise, 0.0, rise <= within)
     under = max(float(r["bound"]) - float(r["mrf_energy"]) for r in rounds)
-    yield Row("no choice below its bound", 0.0, under, 0.0, under <= within)
+    yield Claim("no choice below its bound", 0.0, under, 0.0, under <= within)
     if not refinement["polish_gain"]:
         yield _same("last round is delivered", totals[-2], totals[-1], absolute=slack)
 
 
 def _number(value: Any) -> float:
-    """A claim as a number; JSON has null for what is not finite."""
+    """A claim as a number; JSON has null where it is not finite."""
     return float("nan") if value is None else float(value)
 
 
 def _same(
     name: str, claimed: Any, found: float, of: float = 0.0, absolute: float = ABSOLUTE
-) -> Row:
-    """A claim that must equal what was found, to rounding of it, of the sum `of`, or `absolute`."""
+) -> Claim:
+    """A claim that must equal `found` up to rounding of it, of the sum `of`, or `absolute`."""
     value = _number(claimed)
     gap = abs(value - found)
     ok = gap <= RELATIVE * max(abs(found), abs(of)) + absolute or (
         np.isnan(value) and np.isnan(found)
     )
-    return Row(name, value, found, RELATIVE, bool(ok))
+    return Claim(name, value, found, RELATIVE, bool(ok))
 
 
-def _labels(claims: Claims, attrs: Claims, config: str) -> Iterator[Row]:
+def _labels(claims: Entries, attrs: Entries, config: str) -> Iterator[Claim]:
     """summary.json, config.yaml and result.h5 agree; 1 is agreement."""
     pairs = {
         "status": claims["status"] == attrs["status"],
@@ -202,10 +202,10 @@ def _labels(claims: Claims, attrs: Claims, config: str) -> Iterator[Row]:
         "config.yaml": config == attrs["config"],
     }
     for name, ok in pairs.items():
-        yield Row(f"{name} as in result.h5", 1.0, float(ok), 0.0, ok)
+        yield Claim(f"{name} as in result.h5", 1.0, float(ok), 0.0, ok)
 
 
-def _state(tree: Claims, which: str) -> dict[str, recompute.Float]:
+def _state(tree: Entries, which: str) -> dict[str, recompute.Float]:
     """The arrays of a soup.
 
     Raises:
@@ -226,23 +226,23 @@ def _state(tree: Claims, which: str) -> dict[str, recompute.Float]:
     return out
 
 
-def _constraints(claims: Claims, tree: Claims, weights: Mapping[str, float]) -> Iterator[Row]:
+def _constraints(claims: Entries, tree: Entries, weights: Mapping[str, float]) -> Iterator[Claim]:
     rim, facing = require(tree, "energy/rim_ray"), weights["min_facing"]
 
-    def satisfied(which: str, key: str, limits: Mapping[str, float]) -> Iterator[Row]:
-        """Constraints of one soup, and what is claimed of them."""
+    def satisfied(which: str, key: str, limits: Mapping[str, float]) -> Iterator[Claim]:
+        """Constraints of one soup, and the claims about them."""
         found = recompute.constraints(_state(tree, which), rim, facing)
         for name, limit in limits.items():
             value, claimed = float(found[name].max()), _number(claims[key][name])
             ok = value <= limit and abs(value - claimed) <= 1e-3 * value + ABSOLUTE
             worst = int(found[name].argmax()) if name != "simplex" and value > 0 else -1
-            yield Row(f"{which} {name}", claimed, value, limit, bool(ok), worst)
+            yield Claim(f"{which} {name}", claimed, value, limit, bool(ok), worst)
 
     yield from satisfied("solution", "residuals", LIMITS)
     if claims["status"] == "Skipped":
         return
     yield from satisfied("nlp", "nlp_residuals", LIMITS)
-    # Ipopt's answer may violate its constraints by as much as it says, the delivered soup by less
+    # Ipopt's answer may violate its constraints by as much as claimed, the delivered soup by less
     within = float(claims["residuals"]["nlp_infeasibility"]) * (1 + 1e-6) + ABSOLUTE
     own = dict.fromkeys(("so3", "normal", "simplex"), within)
     yield from satisfied("answer", "answer_residuals", own)
@@ -251,10 +251,10 @@ def _constraints(claims: Claims, tree: Claims, weights: Mapping[str, float]) -> 
         gap = max(float(np.abs(a[k] - b[k]).max()) for k in ("n", "R"))
         gap = max(gap, float(np.abs(a["lam"] / b["lam"] - 1).max()))
         limit = 10 * within + RELATIVE
-        yield Row("nlp is Ipopt's answer", 0.0, gap, limit, gap <= limit)
+        yield Claim("nlp is Ipopt's answer", 0.0, gap, limit, gap <= limit)
 
 
-def _depths(tree: Claims) -> Iterator[Row]:
+def _depths(tree: Entries) -> Iterator[Claim]:
     """The stored depth maps are those of the stored planes and motions."""
     labels = require(tree, "segmentation/labels")
     K_ref, K_next = require(tree, "input/K_ref"), require(tree, "input/K_next")
@@ -271,7 +271,7 @@ def _depths(tree: Claims) -> Iterator[Row]:
 
 def _same_depth(
     which: str, depth: recompute.Float, z: recompute.Float, doubt: NDArray[np.bool_]
-) -> Row:
+) -> Claim:
     """A stored depth map must equal a recomputed one where no rounding decides."""
     # a pixel exactly at the horizon may fall on either side
     one = (np.isfinite(depth) != np.isfinite(z)) & ~doubt
@@ -284,10 +284,10 @@ def _same_depth(
     if doubt.mean() > 1e-3:
         notes.append(f"{doubt.mean():.1%} of the pixels are not compared: rounding decides")
     ok = off <= RELATIVE and lost <= 1e-4
-    return Row(f"depth map {which}", 0.0, off, RELATIVE, ok, note="; ".join(notes))
+    return Claim(f"depth map {which}", 0.0, off, RELATIVE, ok, note="; ".join(notes))
 
 
-def _metrics(tree: Claims, claims: Claims) -> Iterator[Row]:
+def _metrics(tree: Entries, claims: Entries) -> Iterator[Claim]:
     """The scores are those of the stored depth maps against the stored truth."""
     constant = float("nan")
     # the skill of the others needs the score of the constant depth
@@ -303,10 +303,10 @@ def _metrics(tree: Claims, claims: Claims) -> Iterator[Row]:
         bad = [row for row in others if not row.ok]
         note = ", ".join(f"{r.name} is {r.found:.6g}, not {r.claimed:.6g}" for r in bad)
         count = float(len(others))
-        yield Row(f"other scores {name}", count, count - len(bad), 0.0, not bad, note=note)
+        yield Claim(f"other scores {name}", count, count - len(bad), 0.0, not bad, note=note)
 
 
-def _compared(tree: Claims, name: str) -> tuple[recompute.Float, recompute.Float]:
+def _compared(tree: Entries, name: str) -> tuple[recompute.Float, recompute.Float]:
     """Estimate and truth of a row of metrics."""
     if name == "solution_next":
         return require(tree, "depth/next"), require(tree, "truth/depth_next")

@@ -12,13 +12,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from soup_nlp.data.pair import Pair
+from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import depth_metrics, sample_at_points
 from soup_nlp.report.colour import (
+    ERROR_LIMIT,
     Image,
-    as_map,
-    check_rgb,
     colourise_depth,
     colourise_error,
     colourise_flow,
@@ -55,12 +54,8 @@ def overview_strip(
         panel_width: Width of a panel, inches at 100 dpi.
 
     Raises:
-        DataError: no panels, a panel that is not RGB, or a folder that cannot be written.
+        DataError: the folder cannot be written.
     """
-    if not panels:
-        raise DataError("overview needs at least one panel", where=path)
-    for panel in panels:
-        check_rgb(panel[1], f"panel {panel[0]!r}")
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     # layout in inches, from the top
@@ -121,18 +116,16 @@ def _axes(figure: Figure, left: float, bottom: float, width: float, height: floa
 def overview(
     path: PathLike,
     pair: Pair,
-    *,
-    labels: NDArray[np.integer] | None = None,
-    depths: Mapping[str, Float] | None = None,
-    normals: Float | None = None,
-    limit: float = 0.2,
-    title: str | None = None,
+    labels: NDArray[np.integer],
+    depths: Mapping[str, Float],
+    normals: Float,
+    title: str,
 ) -> None:
     """Write the overview of a result: input, superpixels, flow, depths, truth, error, normals.
 
-    What is None is left out. The depths share one colour range, that of the truth (without one, of
-    the last of them), to which each is brought by the median ratio; a caption says the MRE by that
-    rule and the coverage. The error shown is that of the last depth.
+    The depths share one colour range, that of the truth (without one, of the last of them), to
+    which each is scaled by the median ratio; a caption holds the MRE by that rule and the coverage.
+    The error shown is that of the last depth.
 
     Args:
         path: PNG file to write; its folder must exist.
@@ -140,35 +133,35 @@ def overview(
         labels: (H, W) superpixels.
         depths: (H, W) z by stage, in order, such as "start", "solution", "refined".
         normals: (H, W, 3) unit normals.
-        limit: Relative error at the upper end of its colour bar.
-        title: Above the panels; None takes the name of the pair.
+        title: Above the panels.
 
     Raises:
-        DataError: an array does not fit the pair, or the folder cannot be written.
+        DataError: the folder cannot be written.
     """
     panels: list[Panel] = [("reference frame", pair.image_ref), ("next frame", pair.image_next)]
-    if labels is not None:
-        count = f"{np.unique(labels).size} superpixels"
-        panels.append((count, draw_superpixels(pair.image_ref, labels)))
+    count = f"{np.unique(labels).size} superpixels"
+    panels.append((count, draw_superpixels(pair.image_ref, labels)))
     if pair.flow is not None:
+        panels.append((f"flow ({pair.flow.source})", flow_picture(pair.flow)))
         sure = np.clip(pair.flow.confidence, 0, 1).astype(np.float64)
-        uv = np.where(sure[:, :, None] > 0, pair.flow.uv, np.nan)
-        panels.append((f"flow ({pair.flow.source})", colourise_flow(uv)))
         grey = np.repeat((255 * sure).round().astype(np.uint8)[:, :, None], 3, axis=2)
         panels.append((f"confidence, {np.mean(sure > 0):.0%} above 0 (black)", grey))
-    panels += _depth_panels(pair, depths or {}, limit)
-    if normals is not None:
-        panels.append(("normals", colourise_normals(normals)))
-    overview_strip(path, panels, pair.name if title is None else title)
+    panels += _depth_panels(pair, depths)
+    panels.append(("normals", colourise_normals(normals)))
+    overview_strip(path, panels, title)
 
 
-def _depth_panels(pair: Pair, depths: Mapping[str, Float], limit: float) -> list[Panel]:
+def flow_picture(flow: Flow) -> Image:
+    """A flow in colour, black where it has no confidence."""
+    sure = (flow.confidence > 0)[..., None]
+    return colourise_flow(np.where(sure, flow.uv.astype(np.float64), np.nan))
+
+
+def _depth_panels(pair: Pair, depths: Mapping[str, Float]) -> list[Panel]:
     """Panels of the depths on one scale, of the true depth and of the relative error."""
     truth = pair.truth.depth_ref if pair.truth is not None else None
-    if truth is None and not depths:
-        return []
     common = truth if truth is not None else [*depths.values()][-1]
-    maps = {name: _scaled(pair, name, z, common) for name, z in depths.items()}
+    maps = {name: _scaled(pair, z, common) for name, z in depths.items()}
     near, far = depth_range(common if truth is not None else [*maps.values()][-1][0])
     levels = 1 / np.linspace(1 / far, 1 / near, 64)[None]
     bar = (colourise_depth(levels, near, far), f"{far:.3g}", f"{near:.3g}")
@@ -181,20 +174,15 @@ def _depth_panels(pair: Pair, depths: Mapping[str, Float], limit: float) -> list
             known = (truth > 0) & (z > 0)
             error = np.full(truth.shape, np.nan)
             error[known] = np.abs(truth[known] - z[known]) / truth[known]
-            shown = colourise_error(np.linspace(0, limit, 64)[None], limit)
-            picture = colourise_error(error, limit)
-            out.append((f"relative error, {name}", picture, (shown, "0", f"{limit:g}")))
+            shown = colourise_error(np.linspace(0, ERROR_LIMIT, 64)[None])
+            bar = (shown, "0", f"{ERROR_LIMIT:g}")
+            out.append((f"relative error, {name}", colourise_error(error), bar))
     return out
 
 
-def _scaled(pair: Pair, name: str, depth: Float, common: Float) -> tuple[Float, str]:
+def _scaled(pair: Pair, depth: Float, common: Float) -> tuple[Float, str]:
     """A depth times its median ratio to the truth (to `common` without one), and its score."""
-    z = as_map(depth, name)
-    if z.shape != pair.size:
-        raise DataError(
-            "depth does not fit the pair", where=name, found=z.shape, expected=pair.size
-        )
-    z = np.where(np.isfinite(z) & (z > 0), z, np.nan)
+    z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
     known = pair.truth is not None and pair.truth.depth_ref is not None
     estimate, target = z, common
     if not known and pair.truth is not None and pair.truth.points is not None:
@@ -211,9 +199,8 @@ def write_png(path: PathLike, rgb: Image) -> None:
     """Write an (H, W, 3) uint8 RGB image as PNG, whole or not at all.
 
     Raises:
-        DataError: the image is not RGB, or the folder cannot be written.
+        DataError: the folder cannot be written.
     """
-    check_rgb(rgb, "rgb")
     _encode(path, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 
 
@@ -232,15 +219,13 @@ def write_clipped_depth_png16(path: PathLike, depth: Float, scale: float | None 
         The scale, which a reader needs: depth = value / scale.
 
     Raises:
-        DataError: not a map, a scale that is not positive, or a folder that cannot be written.
+        DataError: the folder cannot be written.
     """
-    z = as_map(depth, "depth")
+    z = np.asarray(depth, np.float64)
     known = np.isfinite(z) & (z > 0)
     if scale is None:
         far = float(np.percentile(z[known], 99.9)) if known.any() else 1.0
         scale = float(2.0 ** np.floor(np.log2(65535.0) - np.log2(far)))
-    if not 0 < scale < np.inf:
-        raise DataError("depth scale must be positive", where="scale", found=scale, expected="> 0")
     value = np.clip(np.round(np.where(known, z, 0.0) * scale), 1, 65535)
     _encode(path, np.where(known, value, 0).astype(np.uint16))
     return float(scale)

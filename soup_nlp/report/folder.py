@@ -15,11 +15,15 @@ from soup_nlp.evaluate.metrics import skill
 from soup_nlp.report.colour import (
     colourise_depth,
     colourise_error,
-    colourise_flow,
     depth_range,
     draw_superpixels,
 )
-from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_png
+from soup_nlp.report.figures import (
+    flow_picture,
+    overview,
+    write_clipped_depth_png16,
+    write_png,
+)
 from soup_nlp.report.pointcloud import write_ply
 from soup_nlp.report.tree import attributes, result_tree
 from soup_nlp.solve.kkt import constraint_residuals
@@ -225,9 +229,7 @@ def _pictures(folder: Path, run: Run) -> dict[str, float]:
         write_png(folder / f"depth_{name}_colour.png", colourise_depth(depth, near, far))
     write_png(folder / "superpixels.png", draw_superpixels(pair.image_ref, labels))
     assert pair.flow is not None
-    sure = (pair.flow.confidence > 0)[..., None]
-    uv = np.where(sure, pair.flow.uv.astype(np.float64), np.nan)
-    write_png(folder / "flow.png", colourise_flow(uv))
+    write_png(folder / "flow.png", flow_picture(pair.flow))
     truth = pair.truth.depth_ref if pair.truth is not None else None
     if truth is not None and "solution" in run.metrics:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -238,9 +240,9 @@ def _pictures(folder: Path, run: Run) -> dict[str, float]:
     overview(
         folder / "overview.png",
         pair,
-        labels=labels,
-        depths={"start": run.start_reconstruction.depth_ref, "solution": rec.depth_ref},
-        normals=run.soup.n[labels],
-        title=run.problem.name,
+        labels,
+        {"start": run.start_reconstruction.depth_ref, "solution": rec.depth_ref},
+        run.soup.n[labels],
+        run.problem.name,
     )
     return scales

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from soup_nlp.errors import DataError
 from soup_nlp.storage.atomic import PathLike, write_bytes
 
 
@@ -27,20 +26,11 @@ def write_ply(
         The number of points written.
 
     Raises:
-        DataError: shapes or types do not fit, or the folder cannot be written.
+        DataError: the folder cannot be written.
     """
-    parts = {"xyz": _triples(xyz, "xyz")}
-    if normals is not None:
-        parts["normals"] = _triples(normals, "normals")
-    colours = _triples(rgb, "rgb")
-    if colours.dtype != np.uint8:
-        raise DataError("colours must be 8-bit", where="rgb", found=colours.dtype, expected="uint8")
-    lengths = {name: len(part) for name, part in {**parts, "rgb": colours}.items()}
-    if len(set(lengths.values())) > 1:
-        raise DataError(
-            "point cloud arrays differ in length", where=", ".join(lengths), found=lengths
-        )
-    numbers = np.concatenate(list(parts.values()), axis=1).astype(np.float64)
+    parts = [xyz] if normals is None else [xyz, normals]
+    numbers = np.concatenate([np.reshape(part, (-1, 3)) for part in parts], 1, dtype=np.float64)
+    colours = np.reshape(np.asarray(rgb, np.uint8), (-1, 3))
     good = (np.abs(numbers) <= np.finfo(np.float32).max).all(axis=1)
     floats = ("x", "y", "z", "nx", "ny", "nz")[: numbers.shape[1]]
     table = np.empty(int(good.sum()), [("position", "<f4", (len(floats),)), ("colour", "u1", (3,))])
@@ -55,16 +45,3 @@ def write_ply(
     ]
     write_bytes(path, ("\n".join(header) + "\n").encode("ascii") + table.tobytes())
     return len(table)
-
-
-def _triples(value: ArrayLike, where: str) -> NDArray[np.generic]:
-    """(M, 3) view of an array (..., 3)."""
-    array = np.asarray(value)
-    if array.ndim < 2 or array.shape[-1] != 3 or array.dtype.kind not in "iuf":
-        raise DataError(
-            "point cloud array has the wrong shape or type",
-            where=where,
-            found=f"{array.dtype} {array.shape}",
-            expected="numbers (..., 3)",
-        )
-    return array.reshape(-1, 3)

@@ -132,7 +132,7 @@ def result_tree(run: Run) -> Tree:
         "ref": rec.depth_ref,
         "next": rec.depth_next,
         "start_ref": run.start_reconstruction.depth_ref,
-        "rigid_ref": None if run.rigid is None else run.rigid.depth,
+        "rigid_ref": run.rigid,
         "nlp_ref": None if nlp is None else nlp.depth_ref,
     }
     flow = {"flow": pair.flow.uv, "confidence": pair.flow.confidence}

@@ -1,4 +1,4 @@
-"""The dozen lines that end a solve: what happened, how good it is, where the files are."""
+"""Printed summary of a run: status, energy, accuracy, times and files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ OF_ANSWER = ("nlp_infeasibility", "dual_infeasibility", "complementarity")
 """Residuals of Ipopt's own answer; the others are those of the delivered soup."""
 
 GUESSED = 0.5
-"""Share of superpixels without a depth of their own from which the verdict says so."""
+"""Share of superpixels without a depth of their own above which the summary warns."""
 
 PAD = " " * 12
 
@@ -98,7 +98,7 @@ def verdict(run: Run, folder: Path, files: Sequence[str], limit: float | None = 
 
 
 def refinement(r: Refined) -> list[str]:
-    """What the refinement did, and how far its choice can be from the best one."""
+    """Result of the refinement, and the gap of its last choice."""
     if not r.rounds:
         return [f"refinement: {r.status} before its first round"]
     last = r.rounds[-1]
@@ -113,7 +113,7 @@ def refinement(r: Refined) -> list[str]:
 
 
 def protocol(metrics: Mapping[str, DepthMetrics]) -> str:
-    """Scale rule and cap that scores are after, in words."""
+    """Scale rule and cap of the scores, in words."""
     first = next(iter(metrics.values()))
     cap = "no depth cap" if first.cap is None else f"depth cap {first.cap:g}"
     rule = "no scale" if first.scale_rule == "none" else f"one global {first.scale_rule} scale each"
@@ -141,9 +141,9 @@ def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
 
 
 def missed(run: Run) -> bool:
-    """Whether a known truth is missed by more than the problem file expects."""
+    """Whether the MRE is larger than the problem file expects."""
     limit = run.problem.expected.mre_at_most
-    # an MRE that is not a number has not met anything
+    # NaN misses every limit
     return (
         limit is not None and "solution" in run.metrics and not run.metrics["solution"].mre <= limit
     )

@@ -19,9 +19,9 @@ iterations.
 
 from __future__ import annotations
 
-import threading
+import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.solve.factor import Back, Factorise, diagonal_places, factorisation, same_pattern
-from soup_nlp.solve.ipopt import Listener, Progress, Stage
+from soup_nlp.solve.ipopt import Progress, Stage, Watch
 from soup_nlp.solve.line_search import (
     TO_BOUNDARY,
     Move,
@@ -81,9 +81,7 @@ class Descent:
         *,
         after: Descent | None = None,
         deadline: float = np.inf,
-        listener: Listener | None = None,
-        stop: threading.Event | None = None,
-        log_file: str | None = None,
+        watch: Watch | None = None,
     ) -> None:
         """Prepare; nothing is solved.
 
@@ -92,14 +90,9 @@ class Descent:
             after: A descent in another chart, whose soup is this problem's base: its point,
                 multipliers and damping are where this one begins.
             deadline: Of time.perf_counter().
-            listener: Called at every iteration.
-            stop: Set it to end at the next iteration.
-            log_file: A line of every iteration is appended here.
+            watch: Listener, stop and log file.
         """
-        self.problem = problem
-        self.deadline, self.listener = deadline, listener
-        self.stop = stop or threading.Event()
-        self.log_file = log_file
+        self.problem, self.deadline, self.watch = problem, deadline, watch or Watch()
         self.library: str
         self._factorise: Factorise
         if after and same_pattern(problem.upper, after.problem.upper):
@@ -108,10 +101,9 @@ class Descent:
         else:
             self.library, self._factorise = factorisation(problem.upper)
         self._diagonal = diagonal_places(problem.upper)
-        n = problem.layout.count
         self.x: Float = problem.nlp.x0
         self.z: Float | None = None
-        self.damping: Float = np.full(n, 1e-2)
+        self.damping: Float = np.full(problem.layout.count, 1e-2)
         if after:
             # at their base charts agree to first order
             self.x, self.z, self.damping = problem.layout.pack(after.soup), after.z, after.damping
@@ -131,8 +123,7 @@ class Descent:
 
     def run(self, phase: Phase) -> Stage:
         """Descend until the phase ends; x, multipliers and damping stay for the next one."""
-        begin = time.perf_counter()
-        problem = self.problem
+        begin, problem = time.perf_counter(), self.problem
         calls = problem.calls()
         problem.smoothing(phase.eps)
         at = evaluate(problem, self.x, phase.barrier)
@@ -141,13 +132,12 @@ class Descent:
             self.z = phase.barrier / at.slack
         self.damping = np.minimum(self.damping, 1e-2 if phase.hessian != "exact" else 1e-4)
         gradient = problem.gradient(at.x)
-        fresh, blend, small = True, 0.0, 0
+        curvature: tuple[Float, Float] | None = None
+        blend, small = 0.0, 0
         barrier = max(phase.highest, phase.barrier)
         history: list[tuple[float, ...]] = []
         reached: Reached | None = None
-        status = "Maximum_Iterations_Exceeded"
-        nu = 0.0
-        for iteration in range(phase.iterations + 1):
+        for iteration in itertools.count():
             nu, dual = self._dual(gradient, at.jacobian)
             gap = float((at.slack * self.z).max())
             history.append((at.f, dual, gap, float(np.median(self.damping)), 0.0))
@@ -158,46 +148,60 @@ class Descent:
                 reached = Reached(at, self.z, history[-1])
             if enough or (good and not phase.beyond) or (reached and reached.done(phase)):
                 break
-            if small >= 2:
-                status = "Stagnated"
-                break
-            if self.stop.is_set():
-                status = "Interrupted"
-                break
-            if time.perf_counter() > self.deadline:
-                status = "Time_Limit"
-                break
-            if iteration == phase.iterations:
+            status = self._stopped(phase, iteration, small)
+            if status:
                 break
             barrier = max(phase.barrier, min(barrier, 1e-6 * dual))
             at = at._replace(merit=merit(at.f, at.slack, barrier))
-            if fresh:
+            if curvature is None:
                 curvature = self._curvature(at, phase.hessian)
             step = self._newton(at, curvature, blend, gradient, barrier, phase.hessian)
-            h, blend = step.h, step.blend
-            search = Search(problem, at, h, barrier, step.newton)
-            move = search.run(gradient, self._times(step.H, h))
+            search = Search(problem, at, step.h, barrier, step.newton)
+            move = search.run(gradient, self._times(step.H, step.h))
             self._adapt(move)
-            moved = move.point
-            fresh = moved is not None
-            if moved is not None:
-                fell = at.merit - moved.merit
-                small = small + 1 if fell <= phase.stagnation * abs(at.f) else 0
-                self._step_multipliers(at, h, barrier, moved)
-                at, self.x = moved, moved.x
-                gradient = search.gradient(at.x)
-            else:
-                # the majorant's steps descend
-                blend = min(1.0, max(BLENDS[1], 9 * blend))
             history[-1] = (*history[-1][:4], float(move.length.min()))
+            if move.point is None:
+                # the majorant's steps descend
+                blend = min(1.0, max(BLENDS[1], 9 * step.blend))
+                continue
+            fell = at.merit - move.point.merit
+            small = small + 1 if fell <= phase.stagnation * abs(at.f) else 0
+            self._step_multipliers(at, step.h, barrier, move.point)
+            at, self.x, blend, curvature = move.point, move.point.x, step.blend, None
+            gradient = search.gradient(at.x)
         if reached:
             status = "Solve_Succeeded"
             # the last step may have been one too many
             at, self.z, history[-1] = reached
             self.x = at.x
             nu, _ = self._dual(problem.gradient(at.x), at.jacobian)
-        columns = np.array(history).T
-        lam_x, lam_g = problem.multipliers(self.z, nu)
+        spent = {k: v - calls[k] for k, v in problem.calls().items()}
+        return self._stage(phase, status, at, nu, history, time.perf_counter() - begin, spent)
+
+    def _stopped(self, phase: Phase, iteration: int, small: int) -> str:
+        """Status of a phase that ends here without having converged, else nothing."""
+        if small >= 2:
+            return "Stagnated"
+        if self.watch.stop.is_set():
+            return "Interrupted"
+        if time.perf_counter() > self.deadline:
+            return "Time_Limit"
+        return "Maximum_Iterations_Exceeded" if iteration == phase.iterations else ""
+
+    def _stage(
+        self,
+        phase: Phase,
+        status: str,
+        at: Point,
+        nu: float,
+        history: list[tuple[float, ...]],
+        seconds: float,
+        calls: Mapping[str, float],
+    ) -> Stage:
+        """The record of a phase that ended at a point with the simplex's multiplier nu."""
+        assert self.z is not None
+        lam_x, lam_g = self.problem.multipliers(self.z, nu)
+        names = ("obj", "inf_du", "mu", "regularization_size", "alpha_pr")
         return Stage(
             name=phase.name,
             status=status,
@@ -206,25 +210,19 @@ class Descent:
             lam_x=lam_x,
             lam_g=lam_g,
             objective=at.f,
-            iterations=iteration,
-            seconds=time.perf_counter() - begin,
-            history={
-                "obj": columns[0],
-                "inf_pr": np.zeros(len(history)),
-                "inf_du": columns[1],
-                "mu": columns[2],
-                "regularization_size": columns[3],
-                "alpha_pr": columns[4],
-            },
-            calls={k: v - calls[k] for k, v in problem.calls().items()},
+            iterations=len(history) - 1,
+            seconds=seconds,
+            history={"inf_pr": np.zeros(len(history)), **dict(zip(names, np.array(history).T))},
+            calls=calls,
         )
 
     def _tell(self, phase: Phase, iteration: int, row: tuple[float, ...], begin: float) -> None:
+        """Pass an iteration on to the listener and to the log file."""
         now = time.perf_counter() - begin
-        if self.listener:
-            self.listener(Progress(phase.name, iteration, row[0], 0.0, now))
-        if self.log_file:
-            with open(self.log_file, "a") as log:
+        if self.watch.listener:
+            self.watch.listener(Progress(phase.name, iteration, row[0], 0.0, now))
+        if self.watch.log_file:
+            with open(self.watch.log_file, "a") as log:
                 if not iteration:
                     log.write(f"\n{phase.name}: {phase.hessian} Hessian, {self.library}\n")
                     log.write("iter    objective    inf_du   compl  damping\n")

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.sums import Sums, make_sums
+from soup_nlp.model.sums import Sums
 
 
 class LagrangianHessian(ca.Callback):
@@ -58,7 +58,7 @@ class LagrangianHessian(ca.Callback):
         """Its nonzeros."""
         nlp = self._nlp
         if self._sums is None:
-            self._sums = make_sums(nlp, [nlp.hessian], first_order=False)
+            self._sums = Sums(nlp, [nlp.hessian], first_order=False)
         x, p, lam_f, lam_g = (np.frombuffer(a, dtype=float) for a in arg)
         self._sums.theta = p[: len(nlp.theta)].copy()
         out = np.frombuffer(res[0], dtype=float)

@@ -32,6 +32,11 @@ DEFAULTS: Mapping[str, Any] = {
     "mumps_permuting_scaling": 0,
     "watchdog_shortened_iter_trigger": 0,
 }
+CALLS: Mapping[str, str] = {
+    **{k: f"nlp_{k}" for k in ("f", "grad_f", "g", "jac_g")},
+    "hess_lag": "nlp_hess_l",
+}
+"""What CasADi calls the functions in its statistics."""
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -61,6 +66,23 @@ class Progress:
 
 
 Listener = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Who follows a solve, and how it is stopped.
+
+    Attributes:
+        listener: Called at every iteration.
+        stop: Set it to end at the next iteration.
+        say: Called with a line after every stage.
+        log_file: A line of every iteration is appended here.
+    """
+
+    listener: Listener | None = None
+    stop: threading.Event = field(default_factory=threading.Event)
+    say: Callable[[str], None] = lambda line: None
+    log_file: str | None = None
 
 
 @dataclass(frozen=True)
@@ -100,7 +122,7 @@ class Stage:
         )
 
 
-class _Watch(IterationCallback):
+class _Iterations(IterationCallback):
     """CasADi's iteration callback: progress, limits, the best iterate."""
 
     def __init__(
@@ -109,16 +131,13 @@ class _Watch(IterationCallback):
         stage: str,
         listener: Listener | None,
         deadline: float,
-        stagnation: float | None,
         stop: threading.Event,
     ) -> None:
         super().__init__()
         self.nlp, self.stage, self.listener = nlp, stage, listener
-        self.deadline, self.stagnation, self.stop = deadline, stagnation, stop
+        self.deadline, self.stop = deadline, stop
         self.begin = time.perf_counter()
         self.count = 0
-        self.small = 0
-        self.last = np.inf
         self.best = self.best_f = np.inf
         self.best_x = nlp.x0
         self.best_lam: tuple[Float, Float] | None = None
@@ -151,12 +170,6 @@ class _Watch(IterationCallback):
             self.reason = "Interrupted"
         elif now > self.deadline:
             self.reason = "Time_Limit"
-        elif self.stagnation is not None:
-            still = abs(self.last - f) <= self.stagnation * max(abs(f), 1e-9)
-            self.small = self.small + 1 if still else 0
-            if self.small >= 2:
-                self.reason = "Stagnated"
-        self.last = f
         return int(bool(self.reason))
 
 
@@ -169,7 +182,7 @@ class Ipopt:
         # CasADi does not keep a callback alive
         self.hess_lag = LagrangianHessian(nlp)
 
-    def _solver(self, watch: _Watch, max_iter: int, tol: float, log_file: str | None) -> Any:
+    def _solver(self, watch: _Iterations, max_iter: int, tol: float, log_file: str | None) -> Any:
         nlp = self.nlp
         x, p = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", len(nlp.p))
         f, g = nlp.oracle(x, p)
@@ -216,7 +229,6 @@ class Ipopt:
         max_iter: int = 100,
         tol: float = 1e-4,
         seconds: float = np.inf,
-        stagnation: float | None = None,
         stage: str = "solve",
         listener: Listener | None = None,
         stop: threading.Event | None = None,
@@ -232,7 +244,6 @@ class Ipopt:
             max_iter: Iteration limit.
             tol: Ipopt's tol and dual_inf_tol.
             seconds: Time limit; the best iterate is kept.
-            stagnation: Stop when f changes by less than this share, twice in a row.
             stage: Name for progress.
             listener: Called at every iteration.
             stop: Event that ends the solve at the next iteration.
@@ -241,21 +252,11 @@ class Ipopt:
         nlp = self.nlp
         begin = time.perf_counter()
         stop = stop or threading.Event()
-        watch = _Watch(nlp, stage, listener, begin + seconds, stagnation, stop)
+        watch = _Iterations(nlp, stage, listener, begin + seconds, stop)
         solver = self._solver(watch, max_iter, tol, log_file)
-        args: dict[str, Any] = {
-            "x0": x0,
-            "p": nlp.p if p is None else p,
-            "lbx": nlp.lbx,
-            "ubx": nlp.ubx,
-            "lbg": nlp.lbg,
-            "ubg": nlp.ubg,
-        }
-        if lam_x0 is not None:
-            args["lam_x0"] = lam_x0
-        if lam_g0 is not None:
-            args["lam_g0"] = lam_g0
-        out = solver(**args)
+        given = {"p": nlp.p if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
+        bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}
+        out = solver(x0=x0, **bounds, **{k: v for k, v in given.items() if v is not None})
         stats = solver.stats()
         status = watch.reason or str(stats.get("return_status", "Unknown"))
         converged = status in GOOD
@@ -277,14 +278,5 @@ class Ipopt:
             iterations=int(stats.get("iter_count", watch.count)),
             seconds=time.perf_counter() - begin,
             history={k: np.asarray(v, float) for k, v in stats.get("iterations", {}).items()},
-            calls={
-                k: float(stats.get(f"t_wall_{s}", 0.0))
-                for k, s in (
-                    ("f", "nlp_f"),
-                    ("grad_f", "nlp_grad_f"),
-                    ("g", "nlp_g"),
-                    ("jac_g", "nlp_jac_g"),
-                    ("hess_lag", "nlp_hess_l"),
-                )
-            },
+            calls={k: float(stats.get(f"t_wall_{s}", 0.0)) for k, s in CALLS.items()},
         )

@@ -17,11 +17,11 @@ from soup_nlp.model.compile import compiler_seconds
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import Chart, MatrixLayout
+from soup_nlp.model.layout import Chart
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.descent import Descent
-from soup_nlp.solve.ipopt import Ipopt, Listener, Stage
+from soup_nlp.solve.ipopt import Ipopt, Listener, Stage, Watch
 from soup_nlp.solve.kkt import residuals
 from soup_nlp.solve.phase import Phase
 from soup_nlp.solve.solver_options import SolverOptions
@@ -112,69 +112,51 @@ def solve_soup(
     Returns:
         The solution; a solve that fails is a Solution with its status, not an exception.
     """
-    form = form or Formulation()
-    o = options or SolverOptions()
-    stop = stop or threading.Event()
-    say = say or (lambda line: None)
-    begin, cpu, compiling = time.perf_counter(), [time.process_time()], compiler_seconds()
-    seconds = {"presolve": 0.0}
-    soup, presolved = start, None
+    form, o = form or Formulation(), options or SolverOptions()
+    watch = Watch(listener, stop or threading.Event(), say or (lambda line: None), log_file)
+    laps, compiling = _Laps(), compiler_seconds()
+    deadline = laps.begin + o.max_seconds
     stages: list[Stage] = []
+    presolved, rim = None, None
     if o.presolve:
-        presolved, rim = _presolve(
-            start,
-            data,
-            weights,
-            form,
-            o,
-            stages,
-            say,
-            deadline=begin + 0.7 * o.max_seconds,
-            listener=listener,
-            stop=stop,
-            log_file=log_file,
-        )
-        soup = presolved
-        seconds["presolve"] = time.perf_counter() - begin
-    cpu.append(time.process_time())
+        limit = laps.begin + 0.7 * o.max_seconds
+        presolved, rim = _presolve(start, data, weights, form, o, stages, watch, limit)
+    laps.end("presolve")
 
     def energy(soup: Soup) -> float:
         return oracle.energy(soup, data, weights)["total"]
 
-    near = bool(stages) and _near(stages[-1])
-    # where the presolve has come near its minimum, smoothing alone may have raised the exact energy
-    if not near and energy(soup) > energy(start):
-        soup = start
-    mark = time.perf_counter()
+    near, far = bool(stages) and _near(stages[-1]), _far(stages)
+    # far from its minimum the presolve may have raised the exact energy
+    worse = not near and presolved is not None and energy(presolved) > energy(start)
+    soup = start if presolved is None or worse else presolved
     nlp, layout = build_matrix_nlp(soup, data, weights, form.replace(eps=o.eps, eps_pixel=o.eps))
-    say(str(nlp))
+    watch.say(str(nlp))
     warm: dict[str, Any] = {}
     # the lifted truncation has another solution than the presolve's
     if form.truncation == "smooth" and soup is presolved and o.polish_iterations and near:
+        assert rim is not None
         warm = warm_start(nlp, data, soup, rim)
     solver = Ipopt(nlp, {**(WARM if warm else {}), **o.ipopt})
-    seconds["build"] = time.perf_counter() - mark
-    cpu.append(time.process_time())
-    mark = time.perf_counter()
-    far = _far(stages)
+    laps.end("build")
     if far:
-        say(f"far from a minimum: Ipopt has {o.far_iterations} iterations (solver.far_iterations)")
+        watch.say(
+            f"far from a minimum: Ipopt has {o.far_iterations} iterations (solver.far_iterations)"
+        )
     stage = solver(
         x0=nlp.x0,
         **warm,
         max_iter=min(o.max_iter, o.far_iterations) if far else o.max_iter,
         tol=o.tol,
-        seconds=max(1.0, o.max_seconds - (mark - begin)),
+        seconds=max(1.0, deadline - time.perf_counter()),
         stage="constrained NLP",
         listener=listener,
-        stop=stop,
+        stop=watch.stop,
         log_file=log_file,
     )
-    seconds["solve"] = time.perf_counter() - mark
-    seconds["compile"] = compiler_seconds() - compiling
-    cpu.append(time.process_time())
+    laps.end("solve")
     stages.append(stage)
-    say(str(stage))
+    watch.say(str(stage))
     found = {"constrained NLP": layout.unpack(stage.x), "presolve": presolved, "start": start}
     ends = {k: s.normalised(data.share).retracted() for k, s in found.items() if s is not None}
     delivered = min(ends, key=lambda k: energy(ends[k]))
@@ -187,14 +169,30 @@ def solve_soup(
         energy_start=oracle.energy(start, data, weights),
         energy=oracle.energy(final, data, weights),
         residuals=residuals(nlp, final, stage, data, form.min_facing),
-        multipliers=_multipliers(nlp, layout, stage),
+        multipliers=_multipliers(nlp, stage),
         nlp=nlp.sizes(),
         description=str(nlp),
-        seconds=seconds,
-        cpu_seconds=dict(zip(("presolve", "build", "solve"), np.diff(cpu).tolist())),
+        seconds={**laps.wall, "compile": compiler_seconds() - compiling},
+        cpu_seconds=laps.cpu,
         delivered=delivered,
         far=far,
     )
+
+
+class _Laps:
+    """Wall and CPU seconds of consecutive stages."""
+
+    def __init__(self) -> None:
+        self.wall: dict[str, float] = {}
+        self.cpu: dict[str, float] = {}
+        self.begin = self._wall = time.perf_counter()
+        self._cpu = time.process_time()
+
+    def end(self, stage: str) -> None:
+        """A stage ends here."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        self.wall[stage], self.cpu[stage] = wall - self._wall, cpu - self._cpu
+        self._wall, self._cpu = wall, cpu
 
 
 def _near(stage: Stage) -> bool:
@@ -209,6 +207,24 @@ def _far(stages: Sequence[Stage]) -> bool:
     return ended and not _near(stages[-1])
 
 
+def _phases(o: SolverOptions) -> list[Phase]:
+    """The reweighted phases: barriers from 1e-3 down to 1e-5 while the smoothing shrinks."""
+    last = len(o.presolve_eps) - 1
+    barriers = np.geomspace(1e-3, 1e-5, last + 1) if last else np.array([1e-5])
+    return [
+        Phase(
+            name=f"presolve {eps:g}",
+            hessian="gauss-newton",
+            eps=eps,
+            barrier=float(barrier),
+            iterations=o.presolve_iterations,
+            stagnation=o.stagnation * (0.01 if k == last else 1.0),
+            tol=o.presolve_tol,
+        )
+        for k, (eps, barrier) in enumerate(zip(o.presolve_eps, barriers))
+    ]
+
+
 def _presolve(
     start: Soup,
     data: EnergyData,
@@ -216,30 +232,15 @@ def _presolve(
     form: Formulation,
     o: SolverOptions,
     stages: list[Stage],
-    say: Callable[[str], None],
-    **watch: Any,
+    watch: Watch,
+    deadline: float,
 ) -> tuple[Soup, Float]:
-    """The presolve's soup, and its multipliers of rim visibility."""
-    steps = len(o.presolve_eps)
-    # barriers from 1e-3 down to 1e-5 while the norms are reweighted, 1e-10 for the KKT point
-    barriers = np.geomspace(1e-3, 1e-5, steps) if steps > 1 else np.array([1e-5])
-    phases = [
-        Phase(
-            name=f"presolve {eps:g}",
-            hessian="gauss-newton",
-            eps=eps,
-            barrier=float(barrier),
-            iterations=o.presolve_iterations,
-            stagnation=o.stagnation * (0.01 if k == steps - 1 else 1.0),
-            tol=o.presolve_tol,
-        )
-        for k, (eps, barrier) in enumerate(zip(o.presolve_eps, barriers))
-    ]
+    """The presolve's soup and its multipliers of rim visibility; appends its phases to stages."""
     problem = TangentProblem(start, data, weights, form, exact=False)
-    descent = Descent(problem, **watch)
-    for phase in phases:
+    descent = Descent(problem, watch=watch, deadline=deadline)
+    for phase in _phases(o):
         stages.append(descent.run(phase))
-        say(str(stages[-1]))
+        watch.say(str(stages[-1]))
         if stages[-1].status in STOPPED:
             return descent.soup, descent.rim
     if o.polish_iterations:
@@ -247,7 +248,7 @@ def _presolve(
         # on depths ends at lower energies. The paper's units need a length unit that is linear.
         chart: Chart = "inverse-depth" if data.local_units else "depth"
         problem = TangentProblem(descent.soup, data, weights, form, chart=chart)
-        descent = Descent(problem, after=descent, **watch)
+        descent = Descent(problem, after=descent, watch=watch, deadline=deadline)
         polish = Phase(
             name=POLISH,
             hessian="exact",
@@ -260,12 +261,12 @@ def _presolve(
             highest=1e-5,
         )
         stages.append(descent.run(polish))
-        say(str(stages[-1]))
+        watch.say(str(stages[-1]))
     return descent.soup, descent.rim
 
 
-def _multipliers(nlp: NLP, layout: MatrixLayout, stage: Stage) -> dict[str, Float]:
-    """lam_g cut into its kinds of constraint (in the order of nlp.g_blocks), and lam_x."""
+def _multipliers(nlp: NLP, stage: Stage) -> dict[str, Float]:
+    """lam_g cut into its kinds of constraint, and lam_x."""
     out = {"lam_x": stage.lam_x}
     for group in nlp.groups:
         if group.kernel.nc:

@@ -13,7 +13,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Chart
-from soup_nlp.model.sums import make_sums
+from soup_nlp.model.sums import Sums
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.solve.factor import numbered
 
@@ -71,7 +71,7 @@ class TangentProblem:
         self._kinds = {"gauss-newton": nlp.hessian, **({"exact": "exact"} if exact else {})}
         self.triangle = np.array(np.triu_indices(9))
         own, (r, c) = 9 * np.arange(n)[:, None], self.triangle
-        self.sums = make_sums(nlp, list(self._kinds.values()), (own + r, own + c))
+        self.sums = Sums(nlp, list(self._kinds.values()), (own + r, own + c))
         upper = self.sums.upper
         self.block = upper.places[-1].reshape(n, -1)
         self.upper: sparse.csc_matrix = numbered(upper.rows, upper.columns, nlp.nx)

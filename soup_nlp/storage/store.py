@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import platform
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, is_dataclass
 from os import PathLike as _PathLike
 from pathlib import Path
 from typing import Any, TypeAlias, Union
@@ -52,101 +52,44 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
     """Write a result file, whole or not at all.
 
     Each array becomes a dataset with the attributes `units`, `description` and `shape_letters`;
-    each mapping a group. The root gets `attrs` (None is left out; mappings and lists that HDF5
-    cannot hold are stored as JSON text) plus `schema`, `versions` (JSON text) and `machine`.
+    each mapping a group. The root gets `attrs` (None is left out; what HDF5 cannot hold is stored
+    as JSON text) plus `schema`, `versions` (JSON text) and `machine`.
 
     Args:
         path: File to write; its folder must exist.
         tree: Arrays by name, in nested mappings.
-        attrs: Root attributes; must not use the three names above.
+        attrs: Root attributes.
 
     Raises:
-        DataError: a name or a leaf is not allowed, or the file cannot be written.
+        DataError: an array cannot be stored, or the file cannot be written.
     """
-    leaves = list(_leaves(tree, ""))
-    reserved: dict[str, object] = {
-        "schema": SCHEMA,
-        "versions": json.dumps(versions()),
-        "machine": platform.platform(),
-    }
-    clash = sorted(reserved.keys() & attrs.keys())
-    if clash:
-        raise DataError("root attribute is reserved", where=path, found=clash)
-    root = {key: _attr(value) for key, value in attrs.items() if value is not None} | reserved
+    own = {"schema": SCHEMA, "versions": json.dumps(versions()), "machine": platform.platform()}
     with atomic_path(path) as temporary:
         try:
             with h5py.File(temporary, "w", track_order=True) as file:
-                file.attrs.update(root)
-                for name, leaf in leaves:
-                    _write_leaf(file, name, leaf)
+                for key, value in (dict(attrs) | own).items():
+                    if value is not None:
+                        simple = isinstance(value, str | bool | int | float | np.generic)
+                        file.attrs[key] = value if simple else json.dumps(plain(value))
+                _write_group(file, tree)
         except (OSError, TypeError, ValueError, RuntimeError) as error:
             raise DataError("cannot write the HDF5 file", where=path, found=error) from error
 
 
-def _leaves(tree: Tree, prefix: str) -> Iterator[tuple[str, Array | None]]:
-    """(name, array) of every array, and (name, None) of every group; arrays in HDF5's types."""
-    for key, item in tree.items():
-        name = f"{prefix}{key}"
-        if not isinstance(key, str) or not key or "/" in key or key in (".", ".."):
-            raise DataError(
-                "name is not allowed in a result tree",
-                where=prefix or "/",
-                found=repr(key),
-                expected="a non-empty string without '/'",
-            )
-        if isinstance(item, Array):
-            yield name, replace(item, value=_data(name, item.value))
-        elif isinstance(item, Mapping):
-            yield name, None
-            yield from _leaves(item, f"{name}/")
-        else:
-            raise DataError(
-                "result tree holds something other than arrays",
-                where=name,
-                found=type(item).__name__,
-                expected="Array(value, units, description) or a mapping of them",
-            )
-
-
-def _data(name: str, value: ArrayLike) -> NDArray[Any]:
-    """The array of a leaf in a type that HDF5 holds."""
-    try:
-        data = np.asarray(value)
-    except ValueError as error:  # ragged
-        raise DataError("array of a result tree is ragged", where=name, found=error) from error
-    if data.dtype.kind == "U":
-        return data.astype(h5py.string_dtype())
-    if data.dtype.kind not in "biufcS":
-        raise DataError(
-            "array of a result tree has a type that cannot be stored",
-            where=name,
-            found=data.dtype,
-            expected="bool, integer, float, complex or text",
-        )
-    return data
-
-
-def _write_leaf(file: h5py.File, name: str, leaf: Array | None) -> None:
-    if leaf is None:
-        file.require_group(name)
-        return
-    data, options = np.asarray(leaf.value), {}
-    if data.nbytes > COMPRESS_ABOVE and data.ndim > 0:
-        options = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-    dataset = file.create_dataset(name, data=data, **options)
-    for key in ("units", "description", "shape_letters"):
-        dataset.attrs[key] = getattr(leaf, key)
-
-
-def _attr(value: object) -> object:
-    """A root attribute in a type that HDF5 holds: numbers and text as they are, the rest JSON."""
-    if isinstance(value, str | bool | int | float | np.generic):
-        return value
-    if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
-        return value
-    if isinstance(value, list | tuple) and value and all(type(v) in (int, float) for v in value):
-        return np.asarray(value)
-    return json.dumps(plain(value))
+def _write_group(group: h5py.Group, tree: Tree) -> None:
+    for name, item in tree.items():
+        if not isinstance(item, Array):
+            _write_group(group.require_group(name), item)
+            continue
+        data = np.asarray(item.value)
+        if data.dtype.kind == "U":
+            data = data.astype(h5py.string_dtype())
+        options: dict[str, Any] = {}
+        if data.nbytes > COMPRESS_ABOVE and data.ndim > 0:
+            options = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+        dataset = group.create_dataset(name, data=data, **options)
+        for key in ("units", "description", "shape_letters"):
+            dataset.attrs[key] = getattr(item, key)
 
 
 def read_h5(path: PathLike) -> ReadTree:
@@ -171,21 +114,17 @@ def read_h5(path: PathLike) -> ReadTree:
         return walk(file)
 
 
-def read_attrs(path: PathLike, name: str = "/") -> dict[str, Any]:
-    """Attributes of the root of a result file, or of the array or group `name` in it.
+def read_attrs(path: PathLike) -> dict[str, Any]:
+    """Root attributes of a result file.
 
-    `versions` comes back as a dict; other JSON texts as they were stored.
+    `versions` is returned as a dict, other JSON texts as they were stored.
 
     Raises:
-        DataError: the file is missing or is not HDF5, or has nothing of that name.
+        DataError: the file is missing or is not HDF5.
     """
     with _open(path) as file:
-        if name not in file:
-            raise DataError(
-                "result file has no such entry", where=path, found=sorted(file), expected=name
-            )
-        out = dict(file[name].attrs)
-    if name == "/" and isinstance(out.get("versions"), str):
+        out = dict(file.attrs)
+    if isinstance(out.get("versions"), str):
         out["versions"] = json.loads(out["versions"])
     return {k: v.item() if isinstance(v, np.generic) else v for k, v in out.items()}
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from soup_nlp.bench.solvers.profiles import cost_table, problem_key, problem_names
+from soup_nlp.bench.tables import codes, columns, show, table
 
 Row = Mapping[str, Any]
 
@@ -20,12 +21,12 @@ LIMITS = (
     "how quickly a solver proves a point that is almost optimal. From the proposal it is harder.",
     "Local solvers end in local minima: an energy says where this start led, not what is best.",
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
-    "Solvers run with the options in `soup_nlp/compare/plugins.py`, the package's own ones being "
-    "tuned on problems of this kind; the others are as they come, but for tolerances and limits.",
+    "Solvers run with the options in `soup_nlp/bench/solvers/plugins.py`, the package's own ones "
+    "being tuned on such problems; the others are as they come, but for tolerances and limits.",
     "alpaqa and sleqp differentiate an expanded expression graph, which costs set-up time; "
     "every other plug-in gets this package's own derivatives, and readers of .nl make theirs.",
-    "lm and lbfgs, the yardsticks on the manifold, end where the energy stops falling and claim "
-    "no optimum; their rows are for the energy.",
+    "lm and lbfgs, the reference solvers on the manifold, end where the energy stops falling and "
+    "claim no optimum; their rows are for the energy.",
     "SCIP is a global solver: here it shows what its time limit allows from the same start.",
 )
 
@@ -62,7 +63,7 @@ def page(rows: Sequence[Row]) -> str:
         "",
         *(f"- {m}" for m in machine),
         f"- {', '.join(packages)}",
-        f"- code {', '.join(sorted({str(r['code']) for r in rows}))}",
+        f"- code {codes([dict(r) for r in rows])}",
         "",
     ]
     return "\n".join(lines)
@@ -123,57 +124,41 @@ def _feasible(row: Row) -> bool:
 
 def by_solver(rows: Sequence[Row]) -> list[str]:
     """Table: how many runs, claims, true claims."""
-    out = ["| solver | runs | claimed | verified | claims that were true | ended otherwise |"]
-    out.append("|---|---|---|---|---|---|")
+    lines = []
     for solver in sorted({str(r["solver"]) for r in rows}):
         here = [r for r in rows if r["solver"] == solver]
         claimed = sum(bool(r["claimed"]) for r in here)
         verified = sum(bool(r["verified"]) for r in here)
         share = f"{verified} of {claimed}" if claimed else "-"
-        other = sorted({str(r["status"])[:50] for r in here if not r["claimed"]})
-        out.append(
-            f"| {solver} | {len(here)} | {claimed} | {verified} | {share} |"
-            f" {'; '.join(_cell(o) for o in other)} |"
-        )
-    return out
+        other = "; ".join(sorted({_status(r) for r in here if not r["claimed"]}))
+        lines.append([solver, str(len(here)), str(claimed), str(verified), share, other])
+    head = ["solver", "runs", "claimed", "verified", "claims that were true", "ended otherwise"]
+    return table(head, lines)
 
 
 def by_run(rows: Sequence[Row]) -> list[str]:
     """Table of every run."""
-    head = (
-        "problem", "N", "formulation", "solver", "verified", "exact E", "start E", "primal",
-        "dual", "compl.", "iterations", "seconds", "CPU s", "MB", "status",
-    )  # fmt: skip
-    out = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-
-    def text(row: Row, key: str, form: str) -> str:
-        value = row.get(key)
-        return "-" if value is None else format(value, form)
-
     names = problem_names(rows)
-    for row in sorted(rows, key=lambda r: (problem_key(r), not r["verified"], r["seconds"])):
-        word = "yes" if row["verified"] else "claimed" if row["claimed"] else "no"
-        steps = row["iterations"]
-        cells = [
-            names[problem_key(row)],
-            str(row["superpixels"]),
-            str(row["formulation"]),
-            str(row["solver"]),
-            word,
-            text(row, "energy", ".6g"),
-            text(row, "energy_start", ".6g"),
-            text(row, "primal", ".0e"),
-            text(row, "dual", ".0e"),
-            text(row, "complementarity", ".0e"),
-            str(steps) if steps >= 0 else "-",
-            text(row, "seconds", ".2f"),
-            text(row, "cpu_seconds", ".2f"),
-            str(row["peak_bytes"] >> 20) if row["peak_bytes"] else "-",
-            _cell(str(row["status"])[:50]),
-        ]
-        out.append(f"| {' | '.join(cells)} |")
-    return out
+    cells: dict[str, Callable[[Row], str]] = {
+        "problem": lambda r: names[problem_key(r)],
+        "N": lambda r: str(r["superpixels"]),
+        "formulation": lambda r: str(r["formulation"]),
+        "solver": lambda r: str(r["solver"]),
+        "verified": lambda r: "yes" if r["verified"] else "claimed" if r["claimed"] else "no",
+        "exact E": lambda r: show(r.get("energy"), ".6g"),
+        "start E": lambda r: show(r.get("energy_start"), ".6g"),
+        "primal": lambda r: show(r.get("primal"), ".0e"),
+        "dual": lambda r: show(r.get("dual"), ".0e"),
+        "compl.": lambda r: show(r.get("complementarity"), ".0e"),
+        "iterations": lambda r: str(r["iterations"]) if r["iterations"] >= 0 else "-",
+        "seconds": lambda r: show(r.get("seconds"), ".2f"),
+        "CPU s": lambda r: show(r.get("cpu_seconds"), ".2f"),
+        "MB": lambda r: str(r["peak_bytes"] >> 20) if r["peak_bytes"] else "-",
+        "status": _status,
+    }
+    order = sorted(rows, key=lambda r: (problem_key(r), not r["verified"], r["seconds"]))
+    return columns(cells, order)
 
 
-def _cell(text: str) -> str:
-    return " ".join(text.replace("|", "/").split())
+def _status(row: Row) -> str:
+    return " ".join(str(row["status"])[:50].replace("|", "/").split())

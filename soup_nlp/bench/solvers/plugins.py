@@ -70,6 +70,19 @@ def _sqp(limits: Limits, qpsol: str, qp: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _uno(limits: Limits) -> dict[str, Any]:
+    return {
+        "max_iterations": limits.iterations,
+        "dual_tolerance": limits.tol,
+        "primal_tolerance": limits.feasibility,
+        "logger": "SILENT",
+    }
+
+
+def _limited(limits: Limits) -> dict[str, Any]:
+    return {"max_iter": limits.iterations, "tol": limits.tol, "print_level": 0}
+
+
 NEAR = {k: v for k, v in DEFAULTS.items() if k.startswith(("mu_", "bound_", "nlp_scaling"))}
 """Options of a start near the end, for solvers of Ipopt's family."""
 QUIET_OSQP = {"osqp": {"verbose": False, "eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20000}}
@@ -84,51 +97,17 @@ PLUGINS: Mapping[str, tuple[str, str, bool, Callable[[Limits], dict[str, Any]]]]
         lambda m: {"ipopt": _ipopt(m) | {"hessian_approximation": "limited-memory"}},
     ),
     "sqpmethod": ("sqpmethod", "gauss-newton", True, lambda m: _sqp(m, "osqp", QUIET_OSQP)),
-    "uno": (
-        "uno",
-        "exact",
-        False,
-        lambda m: {
-            "uno": {
-                "max_iterations": m.iterations,
-                "dual_tolerance": m.tol,
-                "primal_tolerance": m.feasibility,
-                "logger": "SILENT",
-            }
-        },
-    ),
+    "uno": ("uno", "exact", False, lambda m: {"uno": _uno(m)}),
     "alpaqa": ("alpaqa", "exact", False, lambda m: {}),
     "sleqp": ("sleqp", "exact", False, lambda m: {"max_iter": m.iterations}),
-    "bonmin": (
-        "bonmin",
-        "exact",
-        False,
-        lambda m: {"bonmin": {"max_iter": m.iterations, "tol": m.tol, "print_level": 0}},
-    ),
-    "fatrop": (
-        "fatrop",
-        "exact",
-        False,
-        lambda m: {"fatrop": {"max_iter": m.iterations, "tol": m.tol, "print_level": 0}},
-    ),
-    "bonmin-tuned": (
-        "bonmin",
-        "exact",
-        False,
-        lambda m: {"bonmin": {**NEAR, "max_iter": m.iterations, "tol": m.tol, "print_level": 0}},
-    ),
+    "bonmin": ("bonmin", "exact", False, lambda m: {"bonmin": _limited(m)}),
+    "fatrop": ("fatrop", "exact", False, lambda m: {"fatrop": _limited(m)}),
+    "bonmin-tuned": ("bonmin", "exact", False, lambda m: {"bonmin": {**NEAR, **_limited(m)}}),
     "fatrop-tuned": (
         "fatrop",
         "exact",
         False,
-        lambda m: {
-            "fatrop": {
-                "mu_init": NEAR["mu_init"],
-                "max_iter": m.iterations,
-                "tol": m.tol,
-                "print_level": 0,
-            }
-        },
+        lambda m: {"fatrop": {"mu_init": NEAR["mu_init"], **_limited(m)}},
     ),
 }
 """Plug-in, Hessian, whether it calls back at every iteration, options. "ipopt-soup" is how `solve`

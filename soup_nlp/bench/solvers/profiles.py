@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.bench.tables import figure, save
 
 Float = NDArray[np.float64]
 Row = Mapping[str, Any]
@@ -37,17 +36,8 @@ class Problem(NamedTuple):
 def problem_key(row: Row) -> Problem:
     """The problem that a row is of."""
     limits = row["limits"]
-    return Problem(
-        str(row["problem"]),
-        int(row["superpixels"]),
-        str(row["formulation"]),
-        str(row["start"]),
-        float(limits["tol"]),
-        float(limits["seconds"]),
-        int(limits["iterations"]),
-        int(limits["memory"]),
-        str(row["problem_hash"]),
-    )
+    own = {name: limits[name] if name in limits else row[name] for name in Problem._fields}
+    return Problem(**own)
 
 
 def problem_names(rows: Sequence[Row]) -> dict[Problem, str]:
@@ -74,7 +64,7 @@ def cost_table(rows: Sequence[Row], measure: str) -> tuple[list[Problem], list[s
 
     Args:
         rows: Runs.
-        measure: "time" (seconds), or "energy" (1 + relative gap to the best verified energy).
+        measure: "time" (seconds) or "energy" (exact energy).
     """
     problems = sorted({problem_key(r) for r in rows})
     solvers = sorted({str(r["solver"]) for r in rows})
@@ -106,9 +96,9 @@ def profile(cost: Float) -> tuple[Float, Float]:
 
 def draw_profiles(path: Path, rows: Sequence[Row]) -> None:
     """Picture of both profiles: time, and final exact energy."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    picture = figure(9, 3.6)
     for k, measure in enumerate(("time", "energy")):
-        axes = figure.add_subplot(1, 2, k + 1)
+        axes = picture.add_subplot(1, 2, k + 1)
         problems, solvers, cost = cost_table(rows, measure)
         steps, share = profile(cost)
         x = steps if measure == "time" else steps - 1
@@ -124,9 +114,8 @@ def draw_profiles(path: Path, rows: Sequence[Row]) -> None:
             axes.set_xlabel("relative gap of the exact energy to the best")
         axes.set_ylim(-0.02, 1.05)
         axes.set_ylabel(f"share of {len(problems)} problems")
-        axes.grid(alpha=0.3)
-        _legend(axes, fontsize=7, loc="lower right")
-    _save(path, figure)
+        _finish(axes, 7)
+    save(picture, path)
 
 
 def draw_curves(path: Path, rows: Sequence[Row]) -> None:
@@ -135,9 +124,9 @@ def draw_curves(path: Path, rows: Sequence[Row]) -> None:
     problems = sorted(names)
     columns = min(2, len(problems)) or 1
     lines = -(-len(problems) // columns) or 1
-    figure = Figure(figsize=(5.2 * columns, 3.4 * lines), layout="constrained")
+    picture = figure(5.2 * columns, 3.4 * lines)
     for k, problem in enumerate(problems):
-        axes = figure.add_subplot(lines, columns, k + 1)
+        axes = picture.add_subplot(lines, columns, k + 1)
         here = [r for r in rows if problem_key(r) == problem]
         start = min(r["energy_start"] for r in here)
         for row in sorted(here, key=lambda r: str(r["solver"])):
@@ -155,17 +144,12 @@ def draw_curves(path: Path, rows: Sequence[Row]) -> None:
         axes.set_title(title, fontsize=8)
         axes.set_xlabel("seconds")
         axes.set_ylabel("exact energy")
-        _legend(axes, fontsize=6)
-        axes.grid(alpha=0.3)
-    _save(path, figure)
+        _finish(axes, 6)
+    save(picture, path)
 
 
-def _legend(axes: Axes, **style: Any) -> None:
-    """A legend, where something was drawn that has a name."""
+def _finish(axes: Axes, size: int) -> None:
+    """Grid, and a legend where a drawn line has a name."""
+    axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(**style)
-
-
-def _save(path: Path, figure: Figure) -> None:
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110, metadata={"Software": ""})
+        axes.legend(fontsize=size)

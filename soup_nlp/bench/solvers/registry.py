@@ -1,4 +1,4 @@
-"""Solvers by name: CasADi's plug-ins, executables that read .nl, SCIP, and two yardsticks."""
+"""Solvers by name: CasADi's plug-ins, executables that read .nl, SCIP, two reference solvers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -15,9 +15,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.bench.reference_solvers import EPS, ReferenceSolve, lbfgs, levenberg_marquardt
 from soup_nlp.bench.solvers.plugins import NEAR, PLUGINS, plugin
 from soup_nlp.bench.solvers.task import Answer, Solver, Task, Trace
-from soup_nlp.bench.yardstick import EPS, Yardstick, lbfgs, levenberg_marquardt
 from soup_nlp.errors import SolverError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import read_sol
@@ -26,7 +26,7 @@ from soup_nlp.model.matrix import build_matrix_nlp
 Float = NDArray[np.float64]
 
 
-def executable(command: str, task: Task, options: tuple[str, ...] = ()) -> Answer:
+def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
     """Solve with a program of the AMPL convention, `solver stub -AMPL key=value ...`."""
     begin = time.perf_counter()
     file = write_nl(task.folder / "soup.nl", task.nlp)
@@ -58,21 +58,13 @@ def executable(command: str, task: Task, options: tuple[str, ...] = ()) -> Answe
 def _ampl(name: str, task: Task, near: bool = False) -> Answer:
     """An executable that is found on the path or beside Python."""
     m = task.limits
-    options: dict[str, tuple[str, ...]] = {
-        "pounce": (
-            f"tol={m.tol}",
-            f"dual_inf_tol={m.tol}",
-            f"compl_inf_tol={m.tol}",
-            f"constr_viol_tol={m.feasibility}",
-            f"max_iter={m.iterations}",
-            "acceptable_iter=0",
-            f"max_wall_time={0.9 * m.seconds}",
-            "print_level=0",
-        ),
-    }
-    words = options.get(name, ())
+    words: list[str] = []
+    if name == "pounce":
+        words = [f"{k}={m.tol}" for k in ("tol", "dual_inf_tol", "compl_inf_tol")]
+        words += [f"constr_viol_tol={m.feasibility}", f"max_iter={m.iterations}"]
+        words += ["acceptable_iter=0", f"max_wall_time={0.9 * m.seconds}", "print_level=0"]
     if near:
-        words = (*words, *(f"{k}={v}" for k, v in NEAR.items()))
+        words += [f"{k}={v}" for k, v in NEAR.items()]
     return executable(_find(name) or name, task, words)
 
 
@@ -113,25 +105,19 @@ def scip(task: Task) -> Answer:
     return Answer(x, None, status, status == "optimal", nodes, time.perf_counter() - begin)
 
 
-def yardstick(method: Callable[..., Yardstick], task: Task) -> Answer:
-    """On the manifold, without multipliers; it ends where the energy stops falling.
+def reference(method: Callable[..., ReferenceSolve], task: Task) -> Answer:
+    """A solver on the manifold, without multipliers; it ends where the energy stops falling.
 
-    That is no claim of an optimum: whether the point is one, the residuals say.
+    It claims no optimum: whether its point is one, the residuals say.
     """
     last = task.form.eps
-    record = method(
-        task.soup,
-        task.data,
-        task.weights,
-        task.form,
-        eps=[*(e for e in EPS if e > last), last],
-        seconds=0.8 * task.limits.seconds,
-    )
+    eps = [*(e for e in EPS if e > last), last]
+    own = task.soup, task.data, task.weights, task.form
+    record = method(*own, eps=eps, seconds=0.8 * task.limits.seconds)
     # slack variables and switches at their best for this soup
     x = build_matrix_nlp(record.soup, task.data, task.weights, task.form)[0].x0.copy()
     x[: task.layout.size] = task.layout.pack(record.soup)
-    history = np.asarray(record.history, float)
-    return Answer(x, None, record.status, False, record.iterations, record.seconds, history)
+    return Answer(x, None, record.status, False, record.iterations, record.seconds, record.history)
 
 
 def available() -> dict[str, Solver]:
@@ -142,8 +128,8 @@ def available() -> dict[str, Solver]:
     if _find("pounce"):
         out["pounce"] = partial(_ampl, "pounce")
         out["pounce-tuned"] = partial(_ampl, "pounce", near=True)
-    out["lm"] = partial(yardstick, levenberg_marquardt)
-    out["lbfgs"] = partial(yardstick, lbfgs)
+    out["lm"] = partial(reference, levenberg_marquardt)
+    out["lbfgs"] = partial(reference, lbfgs)
     if importlib.util.find_spec("pyscipopt"):
         out["scip"] = scip
     return out

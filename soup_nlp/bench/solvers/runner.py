@@ -1,68 +1,91 @@
-"""Runs of solvers as rows of a JSON lines file: resumable, verified, a crash is a row."""
+"""Runs of solvers as rows: every solver in its own process, every claim verified."""
 
 from __future__ import annotations
 
-import json
 import platform
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.bench.solvers.isolate import isolated
+from soup_nlp.bench.rows import Job, Row, isolated, measure_all, processor, read_rows
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import Answer, Task, Trace
-from soup_nlp.errors import DataError
-from soup_nlp.export.verify import Limits, examine
+from soup_nlp.export.artefact import form_label
+from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
 from soup_nlp.model import oracle
-from soup_nlp.storage.atomic import atomic_path
-from soup_nlp.storage.store import plain as jsonable
-from soup_nlp.storage.versions import code_version, versions
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.pipeline.case import Case
+from soup_nlp.storage.versions import versions
 
 Float = NDArray[np.float64]
-Row = dict[str, Any]
+Label = Mapping[str, Any]
+Maker = Callable[[Path], Task]
 
 CURVE_POINTS = 40
 """Iterates of a trace whose exact energy is taken."""
-KEY = ("problem", "problem_hash", "superpixels", "formulation", "start", "solver", "limits", "code")
-"""What makes a row: a run with the same key is not repeated."""
+KEY = ("problem", "problem_hash", "superpixels", "formulation", "start")
+"""What identifies a task."""
 
 
-def read_rows(path: Path) -> list[Row]:
-    """Rows of a file; none where there is no file. A last line cut short is left out.
+def make_tasks(
+    case: Case, forms: Sequence[Mapping[str, str]], limits: Limits, presolved: bool
+) -> Iterator[tuple[Label, Maker]]:
+    """Label and maker of the task of every formulation.
 
-    Raises:
-        DataError: a line that is not the last is not a row.
+    Args:
+        case: Problem with its start.
+        forms: Gauge, norm, truncation, each or none.
+        limits: For every solver.
+        presolved: The case starts at the presolve's answer.
     """
-    if not path.is_file():
-        return []
-    lines = path.read_text(encoding="utf-8").splitlines()
-    rows = []
-    for k, line in enumerate(lines):
-        try:
-            rows.append(json.loads(line))
-        except ValueError:
-            if k < len(lines) - 1:
-                raise DataError("line is not a row", where=f"{path}, line {k + 1}") from None
-    return rows
+    ceiling = oracle.energy(case.start.soup, case.data, case.weights)["total"]
+    for chosen in forms:
+        form = case.formulation(**chosen, hessian="exact", compiled=False)
+        label = {
+            "problem": case.problem.name,
+            "problem_hash": case.problem.digest(),
+            "superpixels": len(case),
+            "formulation": form_label(form),
+            "start": "presolve" if presolved else "proposal",
+            "energy_limit": ceiling * (1 + ENERGY_SLACK),
+        }
+        yield label, _maker(case, form, limits)
 
 
-def key_of(row: Mapping[str, Any]) -> str:
-    """Identity of a row."""
-    return json.dumps([row[k] for k in KEY], sort_keys=True)
+def _maker(case: Case, form: Formulation, limits: Limits) -> Maker:
+    @cache
+    def built() -> Task:
+        nlp, layout = case.nlp(form)
+        second, _ = case.nlp(form.replace(hessian="gauss-newton+constraints"))
+        # assemble now, so that no solver's time includes it
+        return Task(
+            nlp.assembled(),
+            second.assembled(),
+            layout,
+            case.soup,
+            case.data,
+            case.weights,
+            form,
+            limits,
+            Path(),
+        )
+
+    return lambda folder: replace(built(), folder=folder)
 
 
-def run_row(task: Task, label: Mapping[str, Any], solver: str) -> Row:
+def run_row(task: Task, label: Label, solver: str) -> Row:
     """Run one solver in its own process, verify what it says, and make the row.
 
     Args:
         task: NLP, start and limits.
-        label: The first five entries of KEY.
-        solver: Name, see `solvers.find_solver`.
+        label: What the row is of, and "energy_limit".
+        solver: Name, see `find_solver`.
     """
     work = find_solver(solver)
     trace = Trace(task.folder / "trace", task.nlp.nx)
@@ -71,9 +94,6 @@ def run_row(task: Task, label: Mapping[str, Any], solver: str) -> Row:
     ended = isolated(lambda: work(task), task.folder, limits.seconds, limits.memory)
     row: Row = {
         **label,
-        "solver": solver,
-        "limits": asdict(limits),
-        "code": code_version(),
         "variables": task.nlp.nx,
         "constraints": task.nlp.ng,
         "how": ended.how,
@@ -86,26 +106,17 @@ def run_row(task: Task, label: Mapping[str, Any], solver: str) -> Row:
         "peak_bytes": ended.peak_bytes,
         "energy_start": oracle.energy(task.soup, task.data, task.weights)["total"],
         "versions": versions(),
-        "machine": f"{platform.system()} {platform.machine()}, {_processor()}",
+        "machine": f"{platform.system()} {platform.machine()}, {processor()}",
+        "curve": _curve(task, *trace.read()),
     }
-    seconds, points = trace.read()
-    row["curve"] = _curve(task, seconds, points)
-    if isinstance(ended.value, Answer) and ended.value.curve is not None:
-        row["curve"] = ended.value.curve
     if isinstance(ended.value, Answer):
+        if ended.value.curve is not None:
+            row["curve"] = ended.value.curve
         row |= _verified(task, ended.value, float(label["energy_limit"]))
     elif row["curve"]:
-        # killed, but its iterates are there
-        row |= {"energy": row["curve"][-1][1]}
-    return dict(jsonable(row))
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(x.partition(":")[2].strip() for x in lines if x.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor()
+        # the solver was killed, but its iterates are there
+        row["energy"] = row["curve"][-1][1]
+    return row
 
 
 def _energy(task: Task, x: Float) -> float:
@@ -131,7 +142,7 @@ def _curve(task: Task, seconds: Float, points: Float) -> list[list[float]]:
 
 
 def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
-    # a claim that comes when the time is over is none
+    # a claim after the time limit does not count
     late = not answer.seconds <= task.limits.seconds
     row: Row = {
         "status": f"over the time limit: {answer.status}" if late else answer.status,
@@ -153,14 +164,14 @@ def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
 
 
 def compare(
-    tasks: Sequence[tuple[Mapping[str, Any], Callable[[Path], Task]]],
+    tasks: Sequence[tuple[Label, Maker]],
     solvers: Sequence[str],
     limits: Limits,
     path: Path,
     scratch: Path,
     say: Callable[[str], None],
 ) -> list[Row]:
-    """Run what is not in the file yet; the file grows by a whole line per run.
+    """Run every solver on every task, unless the file holds the run already.
 
     Args:
         tasks: (label, maker of the task in a scratch folder).
@@ -173,25 +184,20 @@ def compare(
     Returns:
         Every row of the file.
     """
-    rows = read_rows(path)
-    done = {key_of(r) for r in rows}
-    code = code_version()
-    for label, make in tasks:
-        for solver in solvers:
-            head = {**label, "solver": solver, "limits": asdict(limits), "code": code}
-            if key_of(head) in done:
-                continue
-            done.add(key_of(head))
+
+    def job(label: Label, make: Maker, solver: str) -> Job:
+        def work() -> Row:
             # a solver may be named by its path
             folder = scratch / re.sub(r"[^\w-]+", "_", solver)
             folder.mkdir(parents=True, exist_ok=True)
-            row = run_row(make(folder), label, solver)
-            rows.append(row)
-            with atomic_path(path) as temporary:
-                text = "".join(json.dumps(r, allow_nan=False) + "\n" for r in rows)
-                temporary.write_text(text, encoding="utf-8")
-            say(one_line(row))
-    return rows
+            return run_row(make(folder), label, solver)
+
+        name = {k: label[k] for k in KEY} | {"solver": solver, "limits": asdict(limits)}
+        return Job(name, work)
+
+    jobs = [job(label, make, solver) for label, make in tasks for solver in solvers]
+    measure_all(jobs, path, say=lambda done, total, row: say(one_line(row)))
+    return read_rows(path)
 
 
 def one_line(row: Row) -> str:

@@ -18,7 +18,7 @@ from soup_nlp.data.formats.map_files import (
     read_vkitti_depth,
     read_vkitti_flow,
 )
-from soup_nlp.data.pair import Float, Pair, Truth
+from soup_nlp.data.pair import Float, Pair, Truth, check_size
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics, pixel_grid, rays
 
@@ -53,13 +53,20 @@ _KITTI = {
     ),
 }
 
-VKITTI1_LAYOUT = (
-    "vkitti_*_rgb/WORLD/VARIATION/NNNNN.png; optional vkitti_*_depthgt, vkitti_*_flowgt likewise"
-)
-VKITTI2_LAYOUT = (
-    "SCENE/VARIATION/intrinsic.txt, SCENE/VARIATION/frames/rgb/Camera_0/rgb_NNNNN.jpg; optional "
-    "frames/depth/Camera_0/depth_NNNNN.png, frames/forwardFlow/Camera_0/flow_NNNNN.png"
-)
+_VKITTI = {
+    "vkitti1": (
+        "vkitti_*_rgb/{}/{}/{:05d}.png",
+        "vkitti_*_depthgt/{}/{}/{:05d}.png",
+        "vkitti_*_flowgt/{}/{}/{:05d}.png",
+    ),
+    "vkitti2": (
+        "{}/{}/frames/rgb/Camera_0/rgb_{:05d}.jpg",
+        "{}/{}/frames/depth/Camera_0/depth_{:05d}.png",
+        "{}/{}/frames/forwardFlow/Camera_0/flow_{:05d}.png",
+    ),
+}
+"""Paths of image, depth and flow by scene, variation and frame; * is the version of an archive."""
+
 VKITTI1_CAMERA = (725.0, 725.0, 620.5, 187.0)
 """fx, fy, cx, cy of every Virtual KITTI 1 image (1242 x 375), pixels."""
 
@@ -137,13 +144,7 @@ def _kitti_flow(
     visible = None if flow is None else read_if(read_kitti_flow, visible_file)
     if flow is None or visible is None:
         return flow, None
-    if visible.shape != flow.shape:
-        raise DataError(
-            "flow_occ and flow_noc differ in size",
-            where=visible_file,
-            found=visible.shape[:2],
-            expected=flow.shape[:2],
-        )
+    check_size("flow_noc and flow_occ", visible.shape, flow.shape, visible_file)
     return flow, np.isfinite(flow[:, :, 0]) & ~np.isfinite(visible[:, :, 0])
 
 
@@ -153,26 +154,29 @@ def _scene_flow(
     """(H, W, 3) difference of the points of a pixel, metres, where all three parts are known."""
     if depth is None or depth_after is None or flow is None:
         return None
-    if not depth.shape == depth_after.shape == flow.shape[:2]:
-        raise DataError(
-            "disparities and flow differ in size",
-            where=where,
-            found=f"{depth.shape}, {depth_after.shape}, {flow.shape[:2]}",
-        )
+    for disparity in (depth, depth_after):
+        check_size("disparity and flow", disparity.shape, flow.shape, where)
     uv = pixel_grid(*depth.shape)
     return np.asarray(
         rays(K, uv + flow) * depth_after[:, :, None] - rays(K, uv) * depth[:, :, None]
     )
 
 
-def load_vkitti1(
-    root: PathLike, world: str, frame: int, variation: str = "clone", step: int = 1
+def load_vkitti(
+    benchmark: str,
+    root: PathLike,
+    scene: str,
+    frame: int,
+    variation: str = "clone",
+    step: int = 1,
 ) -> Pair:
-    """Load a pair of Virtual KITTI 1.
+    """Load a pair of Virtual KITTI.
 
     Args:
-        root: Folder that holds vkitti_1.3.1_rgb and, for truth, _depthgt and _flowgt.
-        world: For example "0001".
+        benchmark: "vkitti1", or "vkitti2" (left camera).
+        root: Folder that holds vkitti_1.3.1_rgb and, for truth, _depthgt and _flowgt (1), or
+            Scene01 and so on (2).
+        scene: For example "0001" (1) or "Scene01" (2).
         frame: Number of the reference frame (the first is 0).
         variation: For example "clone", "fog".
         step: Distance of the next frame; truth flow exists for 1 only.
@@ -181,65 +185,27 @@ def load_vkitti1(
         Pair with depth of both frames and flow where the files exist; sky is unknown.
 
     Raises:
-        DataError: an image is missing, or a file is wrong for its format or its image.
+        DataError: an image or the intrinsics of Virtual KITTI 2 are missing, or a file is wrong.
     """
-    root = need_folder(root, VKITTI1_LAYOUT)
-    names = [f"{world}/{variation}/{number:05d}.png" for number in (frame, frame + step)]
-    # the folder of one archive, of any version
-    rgb, depth, flow = (
-        max(root.glob(f"vkitti_*_{part}"), default=root / f"vkitti_1.3.1_{part}")
-        for part in ("rgb", "depthgt", "flowgt")
-    )
-    return make_pair(
-        [need(rgb / name, VKITTI1_LAYOUT) for name in names],
-        [intrinsics(*VKITTI1_CAMERA)] * 2,
-        _vkitti_truth([depth / name for name in names], flow / names[0] if step == 1 else None),
-        f"vkitti1_{world}_{variation}_{frame:05d}",
-    )
+    image, depth, flow = _VKITTI[benchmark]
+    layout = f"{image}; optional {depth}, {flow}"
+    layout = layout.replace("{:05d}", "NNNNN").format(*["SCENE", "VARIATION"] * 3)
+    root = need_folder(root, layout)
 
+    def path(pattern: str, number: int) -> Path:
+        head, rest = pattern.format(scene, variation, number).split("/", 1)
+        return max(root.glob(head), default=root / head) / rest
 
-def load_vkitti2(
-    root: PathLike, scene: str, frame: int, variation: str = "clone", step: int = 1
-) -> Pair:
-    """Load a pair of the left camera of Virtual KITTI 2.
-
-    Args:
-        root: Folder that holds Scene01 and so on.
-        scene: For example "Scene01".
-        frame: Number of the reference frame (the first is 0).
-        variation: For example "clone", "fog".
-        step: Distance of the next frame; truth flow exists for 1 only.
-
-    Returns:
-        Pair with depth of both frames and flow where the files exist; sky is unknown.
-
-    Raises:
-        DataError: an image, intrinsic.txt or a row of it is missing, or a file is wrong.
-    """
-    base = need_folder(root, VKITTI2_LAYOUT) / scene / variation
     numbers = (frame, frame + step)
-    images = [base / f"frames/rgb/Camera_0/rgb_{number:05d}.jpg" for number in numbers]
-    images = [need(path, VKITTI2_LAYOUT) for path in images]
-    table_file = need(base / "intrinsic.txt", VKITTI2_LAYOUT)
-    table = read_vkitti2_intrinsics(table_file)
-    for number in numbers:
-        if (number, 0) not in table:
-            raise DataError(
-                "intrinsics of the frame are missing",
-                where=table_file,
-                found=f"{len(table)} rows",
-                expected=f"a row of frame {number}, camera 0",
-            )
-    depths = [base / f"frames/depth/Camera_0/depth_{number:05d}.png" for number in numbers]
-    flow = base / f"frames/forwardFlow/Camera_0/flow_{frame:05d}.png" if step == 1 else None
-    return make_pair(
-        images,
-        [table[number, 0] for number in numbers],
-        _vkitti_truth(depths, flow),
-        f"vkitti2_{scene}_{variation}_{frame:05d}",
+    images = [need(path(image, number), layout) for number in numbers]
+    if benchmark == "vkitti1":
+        cameras = [intrinsics(*VKITTI1_CAMERA)] * 2
+    else:
+        table = need(root / scene / variation / "intrinsic.txt", layout)
+        cameras = read_vkitti2_intrinsics(table, numbers)
+    truth = Truth(
+        depth_ref=read_if(read_vkitti_depth, path(depth, frame)),
+        depth_next=read_if(read_vkitti_depth, path(depth, frame + step)),
+        flow=read_if(read_vkitti_flow, path(flow, frame) if step == 1 else None),
     )
-
-
-def _vkitti_truth(depths: list[Path], flow_file: Path | None) -> Truth:
-    ref, following = (read_if(read_vkitti_depth, path) for path in depths)
-    return Truth(ref, following, read_if(read_vkitti_flow, flow_file))
+    return make_pair(images, cameras, truth, f"{benchmark}_{scene}_{variation}_{frame:05d}")

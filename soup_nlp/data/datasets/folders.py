@@ -11,6 +11,8 @@ import re
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from skimage.measure import label
 
 from soup_nlp.data.datasets.layout import MARK, is_result, make_pair, need, need_folder, read_if
 from soup_nlp.data.flow.consistency import leaves
@@ -23,7 +25,8 @@ from soup_nlp.geometry.camera import intrinsics
 
 LAYOUT = (
     "frame_0.png and frame_1.png (or image_ref.png and image_next.png), K.txt; optional "
-    "K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, flow.flo|png|npy, occluded.png, points.npz"
+    "K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, flow.flo|png|npy, occluded.png, moving.png, "
+    "points.npz"
 )
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp")
 _DEPTHS = (".npy", ".dpt", ".pfm", ".png")
@@ -61,7 +64,8 @@ def load_folder(
     - `frame_0.png` or `image_ref.png`; `frame_1.png` or `image_next.png`
     - `K.txt`: 3x3 intrinsics, or fx fy cx cy; `K_next.txt` if the next frame's differ
     - optional truth: `depth`, `depth_0` or `depth_ref` (.npy, .dpt, .pfm, 16-bit .png),
-      `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `occluded.png` (white = occluded)
+      `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `occluded.png` (white = occluded),
+      `moving.png` (white = moves by itself; every connected region is one component)
     - optional sparse truth `points.npz`: `uv_0` (M, 2) pixels and `xyz_mm_0` (M, 3) millimetres in
       the reference camera; z is converted to `unit` when that is "m" and kept when it is "mm".
       (`xyz_mm_1`, the same points in the next frame, has no place in `Truth` and is not read.)
@@ -103,12 +107,18 @@ def load_folder(
         depth_next=read_if(read_depth, depth_next, depth_scale),
         flow=read_if(read_flow, _find(folder, ("flow",), _FLOWS)),
         occluded=read_if(read_mask, _find(folder, ("occluded",), _IMAGES)),
+        components=read_if(_moving_components, _find(folder, ("moving",), _IMAGES)),
         points=read_if(_read_points, folder / "points.npz", unit),
         unit=unit,
     )
     return make_pair(
         images, [K, K if K_next is None else K_next], truth, folder.resolve().name, white
     )
+
+
+def _moving_components(path: PathLike) -> NDArray[np.int32]:
+    """(H, W) labels of the connected regions of a mask of moving pixels; 0 elsewhere."""
+    return np.asarray(label(read_mask(path), connectivity=2), np.int32)
 
 
 def _read_points(path: Path, unit: str) -> Float:

@@ -13,8 +13,7 @@ from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_cam
 from soup_nlp.data.formats.images import DataWarning, PathLike, read_mask
 from soup_nlp.data.formats.map_files import read_dpt, read_flo
-from soup_nlp.data.pair import Float, Pair, Truth
-from soup_nlp.errors import DataError
+from soup_nlp.data.pair import Float, Pair, Truth, check_size
 from soup_nlp.geometry.camera import intrinsics
 
 LAYOUT = (
@@ -73,13 +72,8 @@ def _flow_truth(base: Path, name: str) -> tuple[Float | None, NDArray[np.bool_] 
     if flow is None:
         return None, occluded
     for mask, file in zip((occluded, invalid), files, strict=True):
-        if mask is not None and mask.shape != flow.shape[:2]:
-            raise DataError(
-                "mask and flow differ in size",
-                where=file,
-                found=mask.shape,
-                expected=flow.shape[:2],
-            )
+        if mask is not None:
+            check_size("mask and flow", mask.shape, flow.shape, file)
     if occluded is not None:
         occluded |= np.isfinite(flow[:, :, 0]) & leaves(flow, flow.shape[:2])
     if invalid is not None:

@@ -63,12 +63,12 @@ def follow_flow(
         border = near & (flow.confidence > 0) & np.any([side != current for side in sides], axis=0)
         v, u = np.nonzero(border)
         own, uv = current[v, u], flow.uv[v, u].astype(np.float64)
-        best, least = own.copy(), fit.miss(own, u, v, uv) - margin_px
+        best, least = own.copy(), fit.residual(own, u, v, uv) - margin_px
         for side in sides:
             other = side[v, u]
-            miss = fit.miss(other, u, v, uv)
-            better = (miss < least) & (other != own)
-            best[better], least[better] = other[better], miss[better]
+            residual = fit.residual(other, u, v, uv)
+            better = (residual < least) & (other != own)
+            best[better], least[better] = other[better], residual[better]
         moved = best != own
         if not moved.any():
             break

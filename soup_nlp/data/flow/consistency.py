@@ -1,4 +1,4 @@
-"""How far a flow can be trusted: where it leaves the image, and whether the way back agrees."""
+"""Confidence of a flow from its round trip: forward, then backward."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from soup_nlp.data.pair import Flow
 FloatMap = NDArray[np.float32]
 
 SUPPORT = 15
-"""Side of the window over which the round trip must close as well, pixels: a wrong flow may agree
-with itself in a pixel, less so all around it."""
+"""Side of the window over which the round-trip error is averaged, pixels: a wrong flow may be
+consistent in one pixel, rarely in all pixels around it."""
 
-_NOISE_CAP = 5.0  # pixels; keeps one wild pixel from condemning its whole window
+_NOISE_CAP = 5.0  # pixels; bounds the effect of an outlier on its window
 
 
 def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:

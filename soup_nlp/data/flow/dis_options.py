@@ -18,14 +18,15 @@ class DisOptions(Section):
     """Options of `dis_flow`.
 
     The defaults are the medium preset at full resolution with denser patches (stride 2 for 3)
-    and a longer, smoother refinement (20 iterations for 5, alpha 30 for 20) that trusts gradients
-    over intensities (delta 1 for 5); the error falls on driving, indoor and rendered pairs alike.
+    and a longer, smoother refinement (20 iterations for 5, alpha 30 for 20) that weighs
+    gradients above intensities (delta 1 for 5); the error falls on driving, indoor and rendered
+    pairs.
     """
 
     finest_scale: Annotated[int, Field(ge=0, le=5)] = 0
     """Finest pyramid level; 0 is full resolution, each level halves it."""
     preset: Literal["ultrafast", "fast", "medium"] = "medium"
-    """Starting point for what is not given here."""
+    """Values of the settings that are not given here."""
     patch_size: Annotated[int, Field(ge=4, le=32)] = 8
     """Side of a patch, pixels."""
     patch_stride: Annotated[int, Field(ge=1, le=32)] = 2
@@ -47,7 +48,7 @@ class DisOptions(Section):
     support: Annotated[int, Field(ge=1, le=10_001)] = SUPPORT
     """Side of the window for the mean error, odd, pixels; 1 is the pixel itself."""
     planes: Annotated[int, Field(ge=0, le=20)] = 4
-    """Dominant homographies under which the flow is looked for again; 0 for none."""
+    """Dominant homographies under which the flow is computed again; 0 for none."""
 
     @model_validator(mode="after")
     def _fits(self) -> Self:

@@ -21,11 +21,11 @@ Match = Callable[[Image, Image], tuple[FloatMap, FloatMap]]
 """Forward and backward flow of two grey images of one size."""
 
 _STEP = 4  # homographies are fitted to every fourth pixel of both directions
-_SURE = 0.5  # confidence from which a pixel votes
-_LEAST = 0.03  # share of the sure pixels that a homography must explain
+_SURE = 0.5  # confidence above which a pixel is fitted
+_LEAST = 0.03  # share of the confident pixels that a homography must explain
 _INLIER = 2.0  # pixels
 _ROUND_TRIP_CAP = 3.0  # pixels
-_GREY_CAP, _PER_GREY = 30.0, 0.05  # a grey level of difference counts like so many pixels
+_GREY_CAP, _PER_GREY = 30.0, 0.05  # pixels that one grey level of difference counts for
 
 
 def dominant_homographies(flow: FloatMap, confidence: FloatMap, count: int) -> list[Float]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,21 +15,32 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 
 Image = NDArray[np.uint8]
-Network = Callable[[Image, Image], FloatMap]
 
-MODELS: Mapping[str, str] = MappingProxyType(
-    {"raft_small": "Raft_Small_Weights", "raft_large": "Raft_Large_Weights"}
-)
+MODELS = {"raft_small": "Raft_Small_Weights", "raft_large": "Raft_Large_Weights"}
 """Networks of torchvision by name, with the name of their weights (fetched once by torchvision)."""
 
-RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
-    {"255": (0.0, 255.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
-)
+RANGES = {"255": (0.0, 255.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
 """What black and white are to an ONNX network; a file says which by the metadata key
 `input_range`, "255" where it does not."""
 
 RAFT_SIDE = 128
 """Smallest image side of RAFT, pixels: its correlation pyramid has four levels of 1/8 size."""
+
+
+class Network(NamedTuple):
+    """A network that maps two images to a flow.
+
+    Attributes:
+        predict: Outputs for two images (1, 3, H, W); flows among them are (1, 2, h, w), pixels.
+        levels: Values of black and white.
+        size: (H, W) of its images where that is fixed; they are resized to it then.
+        least: Smallest side of its images; they are padded to it and to a multiple of 8.
+    """
+
+    predict: Callable[[list[FloatMap]], list[Any]]
+    levels: tuple[float, float]
+    size: tuple[int, int] | None = None
+    least: int = 8
 
 
 def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
@@ -53,7 +63,8 @@ def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
     if source not in MODELS and not Path(source).is_file():
         raise DataError("file of a network is missing", where=source)
     network = onnx_network(Path(source)) if source.endswith(".onnx") else raft_network(source)
-    forward, backward = network(image_ref, image_next), network(image_next, image_ref)
+    forward = _run(network, image_ref, image_next, source)
+    backward = _run(network, image_next, image_ref, source)
     return checked_flow(forward, backward, Path(source).name)
 
 
@@ -61,9 +72,7 @@ def onnx_network(path: Path) -> Network:
     """A network of an ONNX file, run by onnxruntime on the CPU.
 
     It takes two images (1, 3, H, W) or one stack (1, 6, H, W), float, RGB, and gives one or more
-    flows (1, 2, h, w) in pixels; the largest one, the last of equals, is taken. Images are padded
-    to multiples of 8, or resized where the file fixes H and W; the flow is brought back to the
-    image's size and pixels.
+    flows (1, 2, h, w) in pixels; the largest one, the last of equals, is taken.
 
     Raises:
         DataError: onnxruntime is not installed, or the file is no such network.
@@ -93,30 +102,21 @@ def onnx_network(path: Path) -> Network:
             found=[i.shape for i in inputs],
             expected="two inputs (1, 3, H, W), or one (1, 6, H, W)",
         )
-    meta = session.get_modelmeta().custom_metadata_map
-    word = meta.get("input_range", "255")
+    word = session.get_modelmeta().custom_metadata_map.get("input_range", "255")
     if word not in RANGES:
         raise DataError(
             "unknown input range of a network", where=path, found=word, expected=", ".join(RANGES)
         )
-    black, white = RANGES[word]
     kind = np.float16 if "float16" in inputs[0].type else np.float32
-    fixed = tuple(inputs[0].shape[2:])
+    height, width = inputs[0].shape[2:]
 
-    def run(first: Image, second: Image) -> FloatMap:
-        size = first.shape[:2]
-        work = fixed if all(isinstance(s, int) for s in fixed) else _multiple(size, 8)
-        resized = work == fixed
-        planes = [_fit(image, work, resized) for image in (first, second)]
-        planes = [((p / 255.0) * (white - black) + black).astype(kind) for p in planes]
-        feed = planes if len(inputs) == 2 else [np.concatenate(planes, axis=1)]
-        try:
-            out = session.run(None, {i.name: p for i, p in zip(inputs, feed, strict=True)})
-        except Exception as error:
-            raise DataError("network failed", where=path, found=_first_line(error)) from error
-        return _flow_of(out, size, work, resized, str(path))
+    def predict(images: list[FloatMap]) -> list[Any]:
+        feed = images if len(inputs) == 2 else [np.concatenate(images, axis=1)]
+        named = {i.name: x.astype(kind) for i, x in zip(inputs, feed, strict=True)}
+        return list(session.run(None, named))
 
-    return run
+    fixed = isinstance(height, int) and isinstance(width, int)
+    return Network(predict, RANGES[word], (height, width) if fixed else None)
 
 
 def raft_network(source: str) -> Network:
@@ -151,35 +151,30 @@ def raft_network(source: str) -> Network:
         ) from error
     model.eval()
 
-    def run(first: Image, second: Image) -> FloatMap:
-        size = first.shape[:2]
-        work = _multiple((max(size[0], RAFT_SIDE), max(size[1], RAFT_SIDE)), 8)
-        planes = [_fit(image, work, False) / 127.5 - 1.0 for image in (first, second)]
+    def predict(images: list[FloatMap]) -> list[Any]:
         with torch.inference_mode():
-            out = model(*(torch.from_numpy(p.astype(np.float32)) for p in planes))
-        return _flow_of([out[-1].numpy()], size, work, False, source)
+            return [model(*(torch.from_numpy(image) for image in images))[-1].numpy()]
 
-    return run
-
-
-def _multiple(size: tuple[int, int], of: int) -> tuple[int, int]:
-    return (-(-size[0] // of) * of, -(-size[1] // of) * of)
+    return Network(predict, RANGES["signed"], least=RAFT_SIDE)
 
 
-def _fit(image: Image, size: tuple[int, int], resize: bool) -> FloatMap:
-    """(1, 3, H, W) image of a size, resized or padded at its right and lower edge."""
-    if resize:
-        out = cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA)
-    else:
-        below, right = size[0] - image.shape[0], size[1] - image.shape[1]
-        out = np.pad(image, ((0, below), (0, right), (0, 0)), mode="edge")
-    return np.ascontiguousarray(np.moveaxis(out, 2, 0)[None], dtype=np.float32)
-
-
-def _flow_of(
-    outputs: list[Any], size: tuple[int, int], work: tuple[int, int], resized: bool, where: str
-) -> FloatMap:
-    """(H, W, 2) flow in pixels of the image from a network's outputs."""
+def _run(network: Network, first: Image, second: Image, where: str) -> FloatMap:
+    """(H, W, 2) flow of a network, in pixels of the images (H, W, 3)."""
+    height, width = first.shape[:2]
+    rows, cols = network.size or (-(-max(n, network.least) // 8) * 8 for n in (height, width))
+    black, white = network.levels
+    images = []
+    for image in (first, second):
+        if network.size:
+            seen = cv2.resize(image, (cols, rows), interpolation=cv2.INTER_AREA)
+        else:
+            seen = np.pad(image, ((0, rows - height), (0, cols - width), (0, 0)), mode="edge")
+        plane = np.ascontiguousarray(np.moveaxis(seen, 2, 0)[None], dtype=np.float32)
+        images.append((plane / np.float32(255.0)) * np.float32(white - black) + np.float32(black))
+    try:
+        outputs = network.predict(images)
+    except Exception as error:  # each library raises its own
+        raise DataError("network failed", where=where, found=_first_line(error)) from error
     flows = [o for o in outputs if np.ndim(o) == 4 and o.shape[:2] == (1, 2)]
     if not flows:
         raise DataError(
@@ -190,14 +185,12 @@ def _flow_of(
         )
     best = max(reversed(flows), key=lambda o: o.shape[2] * o.shape[3])
     flow = np.moveaxis(best[0].astype(np.float32), 0, 2)
-    target = size if resized else work
-    h, w = flow.shape[:2]
-    if (h, w) != target:
-        flow = cv2.resize(flow, (target[1], target[0]), interpolation=cv2.INTER_LINEAR)
     # displacements are in pixels of the images that the network saw
-    scale = (size[1] / work[1], size[0] / work[0]) if resized else (1.0, 1.0)
-    out = flow[: size[0], : size[1]] * np.array(scale, np.float32)
-    return np.ascontiguousarray(out, dtype=np.float32)
+    target = (width, height) if network.size else (cols, rows)
+    scale = np.array([target[0] / cols, target[1] / rows], np.float32)
+    if flow.shape[1::-1] != target:
+        flow = cv2.resize(flow, target, interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(flow[:height, :width] * scale, dtype=np.float32)
 
 
 def _first_line(error: Exception) -> str:

@@ -18,11 +18,6 @@ MIN_SIDE = 32
 """Smallest image side, pixels."""
 
 
-def rlof_available() -> bool:
-    """Whether the installed OpenCV has its contributed module of optical flow."""
-    return hasattr(cv2, "optflow") and hasattr(cv2.optflow, "DenseRLOFOpticalFlow")
-
-
 def rlof_flow(image_ref: Image, image_next: Image) -> Flow:
     """Dense RLOF with forward-backward confidence.
 
@@ -36,7 +31,7 @@ def rlof_flow(image_ref: Image, image_next: Image) -> Flow:
     Raises:
         DataError: OpenCV has no contributed modules, or the images do not fit.
     """
-    if not rlof_available():
+    if not hasattr(cv2, "optflow"):
         raise DataError(
             "this OpenCV has no DenseRLOF",
             where="flow source 'rlof'",

@@ -7,7 +7,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.pair import Flow
+from soup_nlp.data.pair import Flow, check_size
 from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
@@ -16,12 +16,12 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class AffineFlow:
-    """What a small plane that moves rigidly does nearly: an affine flow for every superpixel.
+    """An affine flow for every superpixel: nearly that of a small plane that moves rigidly.
 
     Attributes:
         coefficients: (N, 3, 2) of (1, (u - u0) / size, (v - v0) / size) -> flow, pixels.
         centre: (N, 2) u0, v0.
-        size: (N,) root of the number of sure pixels.
+        size: (N,) root of the number of pixels with positive confidence.
         known: (N,) False where a superpixel has fewer than six of them, and its fit means nothing.
     """
 
@@ -30,13 +30,13 @@ class AffineFlow:
     size: Float
     known: NDArray[np.bool_]
 
-    def basis(self, which: Ints, u: NDArray[np.integer], v: NDArray[np.integer]) -> Float:
+    def basis(self, which: Ints, u: Ints, v: Ints) -> Float:
         """(P, 3) the three functions at pixels of superpixels `which` (P,)."""
         du, dv = u - self.centre[which, 0], v - self.centre[which, 1]
         return np.stack([np.ones(len(which)), du / self.size[which], dv / self.size[which]], axis=1)
 
-    def miss(self, which: Ints, u: NDArray[np.integer], v: NDArray[np.integer], uv: Float) -> Float:
-        """(P,) pixels between flows (P, 2) at pixels and what superpixels `which` (P,) do there."""
+    def residual(self, which: Ints, u: Ints, v: Ints, uv: Float) -> Float:
+        """(P,) distance, pixels, of flows (P, 2) from those of superpixels `which` (P,)."""
         own = np.einsum("pa,pac->pc", self.basis(which, u, v), self.coefficients[which])
         return np.where(self.known[which], np.linalg.norm(uv - own, axis=1), np.inf)
 
@@ -47,12 +47,12 @@ def fit_affine(
     """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
 
     The first weights are by the distance from the superpixel's median flow: least squares would
-    lay a slope across two motions and suspect neither.
+    fit a slope across two motions, with no outlier in either.
 
     Args:
         flow: Flow with confidence, which multiplies the weights.
         labels: (H, W) superpixel labels 0..N-1.
-        scale_px: Residual, pixels, below which nothing is suspected; s is at least this, and at
+        scale_px: Smallest residual, pixels, that an outlier can have; s is at least this, and at
             least the superpixel's own spread (1.48 times the weighted mean absolute residual).
         rounds: Re-weighted fits.
 
@@ -62,10 +62,7 @@ def fit_affine(
     Raises:
         DataError: sizes differ, or the scale is not positive.
     """
-    if labels.shape != flow.confidence.shape:
-        raise DataError(
-            "labels and flow differ in size", found=labels.shape, expected=flow.confidence.shape
-        )
+    check_size("labels and flow", labels.shape, flow.uv.shape, flow.source)
     if not scale_px > 0:
         raise DataError("scale of residuals must be positive", found=scale_px, expected="> 0 px")
     v, u = np.nonzero(flow.confidence > 0)
@@ -80,23 +77,13 @@ def refit_affine(
     scale_px: float,
     rounds: int = 8,
 ) -> AffineFlow:
-    """The fits of `fit_affine`, some of them made before.
-
-    Args:
-        fit: Right where nothing changed.
-        flow: Flow with confidence.
-        labels: (H, W) superpixel labels 0..N-1.
-        changed: (N,) superpixels to fit.
-        scale_px: Residual, pixels, below which nothing is suspected.
-        rounds: Re-weighted fits.
-    """
+    """The fits of `fit_affine`, computed only for superpixels (N,) that `changed` since `fit`."""
     v, u = np.nonzero((flow.confidence > 0) & changed[labels])
     number = np.cumsum(changed) - 1
     new, _ = _fit(flow, number[labels[v, u]], u, v, int(changed.sum()), scale_px, rounds)
-    merged = []
-    for old, own in zip(astuple(fit), astuple(new)):
-        merged.append(old.copy())
-        merged[-1][changed] = own
+    merged = [np.copy(field) for field in astuple(fit)]
+    for field, own in zip(merged, astuple(new), strict=True):
+        field[changed] = own
     return AffineFlow(*merged)
 
 
@@ -146,7 +133,7 @@ def reweighted(
     Args:
         flow: Flow with confidence.
         labels: (H, W) superpixel labels 0..N-1.
-        scale_px: Residual, pixels, below which nothing is suspected.
+        scale_px: Smallest residual, pixels, that an outlier can have.
         rounds: Re-weighted fits.
 
     Returns:

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from soup_nlp.data.flow.consistency import FloatMap, confidence_of
 from soup_nlp.data.flow.dis_options import DisOptions
 from soup_nlp.data.flow.guided import guided_flow
-from soup_nlp.data.flow.learned import MODELS, learned_flow
-from soup_nlp.data.flow.noise import PREFIX, noise_level, noisy
+from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.flow.rlof import rlof_flow
 from soup_nlp.data.formats.images import PathLike
 from soup_nlp.data.formats.map_files import read_flow
-from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.pair import Flow, Pair, check_size
 from soup_nlp.errors import DataError
 from soup_nlp.schema.section import Positive, Section, Share
 
@@ -32,6 +31,9 @@ FlowSource = Callable[[Image, Image], Flow]
 
 ENTRY_POINTS = "soup_nlp.flow"
 """Entry-point group in which other packages announce flow methods."""
+
+NOISE = "truth+noise:"
+"""Name of the true flow with noise, followed by the standard deviation in pixels."""
 
 MIN_SIDE = 16
 """Smallest image side for DIS, pixels."""
@@ -134,26 +136,13 @@ def flow_from_array(uv: NDArray[np.floating], source: str) -> Flow:
     return Flow(filled, known.astype(np.float32), source)
 
 
-def load_flow(path: PathLike, shape: tuple[int, int]) -> Flow:
+def load_flow(path: PathLike) -> Flow:
     """A Flow of a file (.flo, KITTI .png, .npy): confidence 1 where the file knows it, else 0.
 
-    Args:
-        path: Flow file, see `soup_nlp.data.formats.map_files.read_flow`.
-        shape: (H, W) of the reference image.
-
     Raises:
-        DataError: the file is wrong, of another size than the image, or knows no pixel.
+        DataError: the file is wrong (`read_flow`), or knows no pixel.
     """
-    uv = read_flow(path)
-    if uv.shape[:2] != tuple(shape):
-        raise DataError(
-            "flow and reference image differ in size",
-            where=path,
-            found=f"flow {uv.shape[1]}x{uv.shape[0]}",
-            expected=f"{shape[1]}x{shape[0]} (width x height)",
-            hint="compute the flow at the size of the image; it is not resized here",
-        )
-    flow = flow_from_array(uv, Path(path).name)
+    flow = flow_from_array(read_flow(path), Path(path).name)
     if not flow.confidence.any():
         raise DataError("flow file marks every pixel as unknown", where=path)
     return flow
@@ -169,7 +158,7 @@ def flow_from_truth(pair: Pair, occluded_confidence: float = 1.0) -> Flow:
             that matches images must.
 
     Raises:
-        DataError: the pair has no true flow, or the confidence is out of range.
+        DataError: the pair has no true flow.
     """
     if pair.truth is None or pair.truth.flow is None:
         raise DataError(
@@ -178,14 +167,46 @@ def flow_from_truth(pair: Pair, occluded_confidence: float = 1.0) -> Flow:
             found=pair.truth or "no truth",
             hint="use the flow source 'dis' or give a flow file",
         )
-    if not 0.0 <= occluded_confidence <= 1.0:
-        raise DataError(
-            "occluded confidence is out of range", found=occluded_confidence, expected="0 to 1"
-        )
     flow = flow_from_array(pair.truth.flow, "truth")
     if pair.truth.occluded is not None:
         flow.confidence[pair.truth.occluded] *= np.float32(occluded_confidence)
     return flow
+
+
+def add_noise(flow: Flow, sigma: float, correlation: float = 5.0) -> Flow:
+    """A flow with Gaussian noise that is correlated over a few pixels, as errors of real flows are.
+
+    White noise would average out within a superpixel. The noise is the same in every call.
+
+    Args:
+        flow: Any flow.
+        sigma: Standard deviation of either component, pixels.
+        correlation: Standard deviation of the Gaussian that blurs white noise, pixels; 0 for none.
+    """
+    height, width = flow.confidence.shape
+    pad = int(np.ceil(4 * correlation))
+    shape = (height + 2 * pad, width + 2 * pad, 2)
+    noise = np.random.default_rng(0).standard_normal(shape).astype(np.float32)
+    if correlation > 0:
+        noise = np.asarray(cv2.GaussianBlur(noise, (0, 0), correlation), np.float32)
+    noise = noise[pad : pad + height, pad : pad + width]
+    # in a small image the deviation of blurred noise differs from its expectation
+    noise = noise * np.float32(sigma / max(float(noise.std()), 1e-12))
+    uv = np.where(flow.confidence[:, :, None] > 0, flow.uv + noise, flow.uv)
+    return Flow(uv.astype(np.float32), flow.confidence.copy(), f"{flow.source}+noise:{sigma:g}")
+
+
+def _noise_level(source: str) -> float:
+    """Standard deviation in pixels that a source such as "truth+noise:0.5" names."""
+    try:
+        sigma = float(source.removeprefix(NOISE))
+    except ValueError:
+        sigma = np.nan
+    if not 0 <= sigma < 1000:
+        raise DataError(
+            "noise of the flow is not a number of pixels", found=source, expected=f"{NOISE}0.5"
+        )
+    return sigma
 
 
 class FlowOptions(Section):
@@ -225,8 +246,7 @@ def flow_sources() -> dict[str, EntryPoint]:
 
 def is_named(source: str) -> bool:
     """Whether a flow source is a name rather than the path of a file."""
-    named = source in ("dis", "truth", "rlof", *MODELS) or source.startswith(PREFIX)
-    return named or source in flow_sources()
+    return source in METHODS or source.startswith(NOISE) or source in flow_sources()
 
 
 def is_path(source: str) -> bool:
@@ -239,40 +259,47 @@ def is_network(source: str) -> bool:
     return Path(source).suffix in (".onnx", ".pth")
 
 
+METHODS: dict[str, Callable[[Pair], Flow]] = {
+    "dis": lambda pair: dis_flow(pair.image_ref, pair.image_next),
+    "truth": flow_from_truth,
+    "rlof": lambda pair: rlof_flow(pair.image_ref, pair.image_next),
+    "raft_small": lambda pair: learned_flow("raft_small", pair.image_ref, pair.image_next),
+    "raft_large": lambda pair: learned_flow("raft_large", pair.image_ref, pair.image_next),
+}
+"""Flow methods of this package by name; rlof needs opencv-contrib, raft needs torchvision."""
+
+
 def resolve_flow(pair: Pair, source: str) -> Flow:
     """The flow of a pair from a named source.
 
     Args:
         pair: The pair; its own `flow` is not looked at.
-        source: "dis" (`dis_flow` with its defaults), "truth" (`flow_from_truth`),
-            "truth+noise:SIGMA" (`noisy`), "rlof" (needs opencv-contrib), "raft_small" or
-            "raft_large" (need torchvision), the name of an installed plug-in (entry-point group
-            `soup_nlp.flow`), the path of a network (.onnx, or .pth for RAFT) or of a flow file.
+        source: One of `METHODS`, with their defaults, "truth+noise:SIGMA" (`add_noise`), the name
+            of an installed plug-in (entry-point group `soup_nlp.flow`), the path of a network
+            (.onnx, or .pth for RAFT) or of a flow file.
 
     Raises:
         DataError: the source is unknown or fails, or its flow does not fit the pair.
     """
-    if source == "dis":
-        return dis_flow(pair.image_ref, pair.image_next)
-    if source == "truth":
-        return flow_from_truth(pair)
-    if source.startswith(PREFIX):
-        return noisy(flow_from_truth(pair), noise_level(source))
-    if source == "rlof":
-        return rlof_flow(pair.image_ref, pair.image_next)
-    if source in MODELS or is_network(source):
+    if source in METHODS:
+        return METHODS[source](pair)
+    if source.startswith(NOISE):
+        return add_noise(flow_from_truth(pair), _noise_level(source))
+    if is_network(source):
         return learned_flow(source, pair.image_ref, pair.image_next)
     plugins = flow_sources()
     if source in plugins:
         return _run_plugin(plugins[source], pair)
     if not Path(source).suffix and not Path(source).exists():
-        names = ["dis", "truth", f"{PREFIX}SIGMA", "rlof", *MODELS, *sorted(plugins)]
+        names = [*METHODS, f"{NOISE}SIGMA", *sorted(plugins)]
         raise DataError(
             "unknown flow source",
             found=repr(source),
             expected=f"{', '.join(names)}, or the path of a flow file or network",
         )
-    return load_flow(source, pair.size)
+    flow = load_flow(source)
+    pair.with_flow(flow)  # checks its size
+    return flow
 
 
 def _run_plugin(point: EntryPoint, pair: Pair) -> Flow:
@@ -293,11 +320,5 @@ def _run_plugin(point: EntryPoint, pair: Pair) -> Flow:
             found=type(flow).__name__,
             expected="soup_nlp.data.pair.Flow",
         )
-    if flow.uv.shape[:2] != pair.size:
-        raise DataError(
-            "flow and reference image differ in size",
-            where=where,
-            found=flow.uv.shape[:2],
-            expected=f"{pair.size} (height, width)",
-        )
+    check_size("flow and reference image", flow.uv.shape, pair.size, where)
     return flow

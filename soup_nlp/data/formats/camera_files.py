@@ -1,4 +1,7 @@
-"""Camera files: Sintel .cam, KITTI calibration, Virtual KITTI intrinsics, plain text."""
+"""Camera files: Sintel .cam, KITTI calibration, Virtual KITTI intrinsics, plain text.
+
+Every reader raises `DataError` for a file that is missing or of another kind, or holds no camera.
+"""
 
 from __future__ import annotations
 
@@ -40,9 +43,6 @@ def read_intrinsics(path: PathLike) -> Float:
 
     Returns:
         (3, 3) intrinsics, pixels.
-
-    Raises:
-        DataError: the file is missing, holds other than 9 or 4 numbers, or no valid camera.
     """
     lines = [x for x in read_text(path, "intrinsics").splitlines() if not x.strip().startswith("#")]
     values = _numbers("\n".join(lines), path, "intrinsics file")
@@ -53,9 +53,8 @@ def read_intrinsics(path: PathLike) -> Float:
             found=len(values),
             expected="9 (the 3x3 matrix by rows) or 4 (fx fy cx cy)",
         )
-    K = np.array(values).reshape(3, 3) if len(values) == 9 else intrinsics(*values)
-    check_intrinsics(K, str(path))
-    return K
+    K = np.reshape(values, (3, 3)) if len(values) == 9 else intrinsics(*values)
+    return check_intrinsics(K, path)
 
 
 def read_cam(path: PathLike) -> Float:
@@ -63,16 +62,11 @@ def read_cam(path: PathLike) -> Float:
 
     Returns:
         (3, 3) intrinsics, pixels.
-
-    Raises:
-        DataError: the file is missing, has another magic number or length, or no valid camera.
     """
     content = read_bytes(path, "camera file")
     check_magic(content, path, "camera file")
     check_body(len(content) - 4, _CAM_BYTES, path, "camera file")
-    K = np.frombuffer(content, "<f8", count=9, offset=4).reshape(3, 3).astype(np.float64)
-    check_intrinsics(K, str(path))
-    return K
+    return check_intrinsics(np.frombuffer(content, "<f8", 9, offset=4).reshape(3, 3), path)
 
 
 def read_kitti_projections(path: PathLike, names: Sequence[str]) -> list[Float]:
@@ -111,19 +105,23 @@ def read_kitti_projections(path: PathLike, names: Sequence[str]) -> list[Float]:
     return out
 
 
-def read_vkitti2_intrinsics(path: PathLike) -> dict[tuple[int, int], Float]:
-    """Read a Virtual KITTI 2 intrinsic.txt.
+def read_vkitti2_intrinsics(path: PathLike, frames: Sequence[int]) -> list[Float]:
+    """Read intrinsics of the left camera from a Virtual KITTI 2 intrinsic.txt.
 
     Its columns are: frame cameraID K[0,0] K[1,1] K[0,2] K[1,2].
 
+    Args:
+        path: The file.
+        frames: Numbers of frames.
+
     Returns:
-        (frame, camera) -> (3, 3) intrinsics, pixels.
+        (3, 3) intrinsics of these frames, pixels.
 
     Raises:
-        DataError: the file or a column is missing, a row is not numeric, or no valid camera.
+        DataError: the file, a column or a frame is missing, a row is not numeric, or no camera.
     """
-    lines = read_text(path, "intrinsics file").splitlines()
-    header = (lines[0] if lines else "").split()
+    lines = [line.split() for line in read_text(path, "intrinsics file").splitlines()]
+    header = lines[0] if lines else []
     if not set(_VKITTI2_COLUMNS) <= set(header):
         raise DataError(
             "intrinsics file lacks columns",
@@ -131,22 +129,22 @@ def read_vkitti2_intrinsics(path: PathLike) -> dict[tuple[int, int], Float]:
             found=" ".join(header),
             expected=" ".join(_VKITTI2_COLUMNS),
         )
-    columns = [header.index(name) for name in _VKITTI2_COLUMNS]
-    out: dict[tuple[int, int], Float] = {}
-    for number, line in enumerate(lines[1:], 2):
-        where = f"{path}, line {number}"
-        row = _numbers(line, where, "intrinsics file")
-        if not row:
-            continue
-        if len(row) <= max(columns):
+    rows = {}
+    for words in lines[1:]:
+        # a row that is too short lacks a column
+        row = dict(zip(header, words))
+        if row.keys() >= set(_VKITTI2_COLUMNS):
+            rows[row["frame"], row["cameraID"]] = row
+    out = []
+    for frame in frames:
+        if (str(frame), "0") not in rows:
             raise DataError(
-                "intrinsics row is too short",
-                where=where,
-                found=f"{len(row)} values",
-                expected=f"{max(columns) + 1} values",
+                "intrinsics of the frame are missing",
+                where=path,
+                found=f"{len(rows)} complete rows",
+                expected=f"a row of frame {frame}, camera 0",
             )
-        frame, camera, *parameters = (row[c] for c in columns)
-        K = intrinsics(*parameters)
-        check_intrinsics(K, where)
-        out[int(frame), int(camera)] = K
+        row, where = rows[str(frame), "0"], f"{path}, frame {frame}"
+        numbers = _numbers(" ".join(row[c] for c in _VKITTI2_COLUMNS[2:]), where, "intrinsics row")
+        out.append(check_intrinsics(intrinsics(*numbers), where))
     return out

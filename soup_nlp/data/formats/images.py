@@ -1,7 +1,11 @@
-"""Images, and the checks that readers of every format share."""
+"""Images, and the checks that readers of every format share.
+
+Every reader raises `DataError` for a file that is missing, empty, truncated or of another kind.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import warnings
 from pathlib import Path
@@ -59,11 +63,7 @@ def _neighbours(path: Path) -> str:
 
 
 def read_text(path: PathLike, what: str) -> str:
-    """The content of a UTF-8 text file.
-
-    Raises:
-        DataError: as `read_bytes`, or the file is not text.
-    """
+    """The content of a UTF-8 text file."""
     try:
         return read_bytes(path, what).decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -86,11 +86,7 @@ def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
 
 
 def decode(path: PathLike, what: str) -> NDArray[Any]:
-    """Decode an image file without changing its depth or channels (OpenCV order: BGR, BGRA).
-
-    Raises:
-        DataError: the file is missing, truncated, or no image.
-    """
+    """Decode an image file without changing its depth or channels (OpenCV order: BGR, BGRA)."""
     content = read_bytes(path, what)
     png = content.startswith(b"\x89PNG\r\n\x1a\n") and b"IEND" not in content
     last_scan, end = content.rfind(b"\xff\xda"), content.rfind(b"\xff\xd9")
@@ -102,12 +98,9 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
             found=f"a {'PNG' if png else 'JPEG'} without its end marker",
             hint="copy or download the file again",
         )
-    try:
+    image = None
+    with contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise DataError(
-            f"{what} cannot be decoded", where=path, found=str(error).strip()
-        ) from error
     if image is None:
         raise DataError(
             f"{what} cannot be decoded",
@@ -120,11 +113,7 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
 
 
 def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]:
-    """Decode a 16-bit PNG with a fixed number of channels (1: (H, W), 3: (H, W, 3) in BGR order).
-
-    Raises:
-        DataError: the file is missing, damaged, not 16-bit, or has other channels.
-    """
+    """Decode a 16-bit PNG: (H, W) for one channel, (H, W, 3) in BGR order for three."""
     image = decode(path, what)
     found = 1 if image.ndim == 2 else image.shape[2]
     if image.dtype != np.uint16 or found != channels:
@@ -155,9 +144,6 @@ def read_image(path: PathLike, white: int | None = None) -> NDArray[np.uint8]:
 
     Warns:
         DataWarning: no `white` is given and a 16-bit image is dark throughout.
-
-    Raises:
-        DataError: the file is missing, not decodable, or neither 8- nor 16-bit.
     """
     image = decode(path, "image")
     if image.ndim == 2:
@@ -195,9 +181,5 @@ def read_image(path: PathLike, white: int | None = None) -> NDArray[np.uint8]:
 
 
 def read_mask(path: PathLike) -> NDArray[np.bool_]:
-    """Read a black-and-white picture as (H, W) bool, True above half of the range.
-
-    Raises:
-        DataError: as `read_image`.
-    """
+    """Read a black-and-white picture as (H, W) bool, True above half of the range."""
     return np.asarray(read_image(path, white=65535)[:, :, 0] > 127)

@@ -178,9 +178,6 @@ def read_flow(path: PathLike) -> Float:
 
     Returns:
         (H, W, 2) float64, pixels; NaN where unknown.
-
-    Raises:
-        DataError: the suffix is unknown or the file is wrong for its format.
     """
     readers: dict[str, Reader] = {
         ".flo": read_flo,
@@ -286,9 +283,6 @@ def read_depth(path: PathLike, png_scale: float = 1000.0) -> Float:
 
     Returns:
         (H, W) float64 depth in the unit of the file; NaN where unknown, not positive or infinite.
-
-    Raises:
-        DataError: the suffix is unknown or the file is wrong for its format.
     """
     readers: dict[str, Reader] = {
         ".dpt": read_dpt,

@@ -16,15 +16,6 @@ from soup_nlp.data.scenes.shapes import Box, Float, Plane, Shape, Sheet, Sphere
 from soup_nlp.data.scenes.texture import Colour, Panels, Texture
 from soup_nlp.geometry import camera, rotation
 
-SCENES: dict[str, str] = {
-    "street": "driving camera, two moving cars on a street between houses; depth to 80 m",
-    "room": "camera moving sideways, three independently moving bodies among furniture",
-    "sheet": "a bending, non-rigid sheet at about 1 m before a wall",
-    "orbit": "camera orbiting a still life; one rigid motion",
-    "still": "camera at rest, one moving body",
-}
-"""Names that `render_scene` knows, with one line on each."""
-
 Random = np.random.Generator
 
 
@@ -56,10 +47,8 @@ def render_scene(name: str, seed: int = 0, width: int = 1024, height: int = 436)
 def _pose(x: float, y: float, z: float, yaw: float = 0.0, pitch: float = 0.0) -> Float:
     """(4, 4) pose at a position (m), turned by `yaw` about y after `pitch` about x (degrees)."""
     out = np.eye(4)
-    out[:3, :3] = rotation.exp(np.radians([0.0, yaw, 0.0])) @ rotation.exp(
-        np.radians([pitch, 0.0, 0.0])
-    )
-    out[:3, 3] = x, y, z
+    turns = [rotation.exp(np.radians(w)) for w in ([0.0, yaw, 0.0], [pitch, 0.0, 0.0])]
+    out[:3, :3], out[:3, 3] = turns[0] @ turns[1], (x, y, z)
     return out
 
 
@@ -162,6 +151,7 @@ def _car(m: _Materials, x: float, z: float, yaw: float) -> tuple[Part, ...]:
 
 
 def _street(rng: Random, half_width: float, half_height: float) -> Scene:
+    """driving camera, two moving cars on a street between houses; depth to 80 m"""
     m = _Materials(rng)
     lanes = Panels((3.6, 5.0), (0.035, 0.5), (0.78, 0.78, 0.74), (-0.06, rng.uniform(0, 5)))
     parts = [
@@ -187,7 +177,7 @@ def _street(rng: Random, half_width: float, half_height: float) -> Scene:
     drive = rng.uniform(0.5, 0.6)
     lane = 2.0
     ahead, coming = rng.uniform(11, 13.5), rng.uniform(15, 20)
-    bodies = [Body("street", tuple(parts))]
+    bodies = [Body(tuple(parts))]
     speeds = rng.uniform(0.3, 0.6, 2) * drive
     if rng.random() < 0.5:
         same = _car(m, lane, ahead, 0.0)
@@ -199,11 +189,9 @@ def _street(rng: Random, half_width: float, half_height: float) -> Scene:
         same = _car(m, lane, ahead, yaw)
         nose = rotation.exp(np.radians([0, yaw, 0])) @ [0, 0, speeds[0]]
         move = _about(np.array([lane, 0, ahead]), np.array([0.0, 0, 0]), nose)
-    bodies.append(Body("car ahead", same, move))
+    bodies.append(Body(same, move))
     shift = np.array([0, 0, -speeds[1]])
-    bodies.append(
-        Body("car coming", _car(m, -lane, coming, 180.0), _about(np.zeros(3), np.zeros(3), shift))
-    )
+    bodies.append(Body(_car(m, -lane, coming, 180.0), _about(np.zeros(3), np.zeros(3), shift)))
     turn = np.array([rng.uniform(-0.1, 0.1), _sign(rng) * rng.uniform(0.2, 0.4), 0.1])
     view = _views(
         _pose(rng.uniform(-0.4, 0.4), -rng.uniform(2.1, 2.4), 0, yaw=rng.uniform(-2, 2)),
@@ -260,11 +248,12 @@ def _interior(rng: Random, m: _Materials, half_width: float) -> list[Part]:
 
 
 def _room(rng: Random, half_width: float, half_height: float) -> Scene:
+    """camera moving sideways, three independently moving objects among furniture"""
     m = _Materials(rng)
     objects = _objects(rng, m, _FRONT + _BACK, half_width)
     moving = [rng.integers(3), *(3 + rng.permutation(4)[:2])]
     rest = [part for k, (part, _) in enumerate(objects) if k not in moving]
-    bodies = [Body("room", (*_interior(rng, m, half_width), *rest))]
+    bodies = [Body((*_interior(rng, m, half_width), *rest))]
     for rank, k in enumerate(moving):
         part, foot = objects[k]
         shift = np.array([_sign(rng), 0, _sign(rng)]) * rng.uniform(
@@ -273,7 +262,7 @@ def _room(rng: Random, half_width: float, half_height: float) -> Scene:
         if rank == 2:
             shift[1] = -rng.uniform(0.02, 0.05)  # lifted off the floor
         turn = np.array([0, _sign(rng) * rng.uniform(2, 4), 0])
-        bodies.append(Body(f"mover {rank}", (part,), _about(foot, turn, shift)))
+        bodies.append(Body((part,), _about(foot, turn, shift)))
     side = _sign(rng)
     view = _views(
         _pose(0, -1.35, 0, yaw=side, pitch=-9),
@@ -284,6 +273,7 @@ def _room(rng: Random, half_width: float, half_height: float) -> Scene:
 
 
 def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
+    """a bending, non-rigid sheet at about 1 m before a wall"""
     m = _Materials(rng)
     bend, change = _sign(rng) * rng.uniform(0.7, 1.0), _sign(rng) * rng.uniform(0.15, 0.25)
     axis = rng.uniform(-0.25, 0.25)
@@ -298,8 +288,8 @@ def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
     cloth = Part(shape, _pose(0, 0, 1.0, yaw=rng.uniform(-8, 8)), m.paint(0.12, dots), glow=0.6)
     shift = rng.uniform([-0.003, -0.003, -0.01], [0.003, 0.003, 0.01])
     bodies = (
-        Body("wall", (_backdrop(1.7, m.wall(0.3)),)),
-        Body("sheet", (cloth,), _about(np.array([0, 0, 1.0]), rng.uniform(-0.4, 0.4, 3), shift)),
+        Body((_backdrop(1.7, m.wall(0.3)),)),
+        Body((cloth,), _about(np.array([0, 0, 1.0]), rng.uniform(-0.4, 0.4, 3), shift)),
     )
     view = _views(
         np.eye(4),
@@ -310,10 +300,11 @@ def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
 
 
 def _orbit(rng: Random, half_width: float, half_height: float) -> Scene:
+    """camera orbiting a still life; one rigid motion"""
     m = _Materials(rng)
     objects = _objects(rng, m, _FRONT + _BACK, half_width)
-    bodies = [Body("room", tuple(_interior(rng, m, half_width)))]
-    bodies += [Body(f"object {k}", (part,)) for k, (part, _) in enumerate(objects)]
+    bodies = [Body(tuple(_interior(rng, m, half_width)))]
+    bodies += [Body((part,)) for k, (part, _) in enumerate(objects)]
     pose = _pose(0, -1.45, 0, pitch=-9)
     around = _about(
         np.array([0, 0, 4.2]),
@@ -324,6 +315,7 @@ def _orbit(rng: Random, half_width: float, half_height: float) -> Scene:
 
 
 def _still(rng: Random, half_width: float, half_height: float) -> Scene:
+    """camera at rest, one moving object"""
     m = _Materials(rng)
     objects = _objects(rng, m, _FRONT + _BACK, half_width)
     mover = int(rng.integers(3))
@@ -331,8 +323,8 @@ def _still(rng: Random, half_width: float, half_height: float) -> Scene:
     turn = np.array([0, _sign(rng) * rng.uniform(3, 6), 0])
     shift = np.array([_sign(rng) * rng.uniform(0.05, 0.09), 0, rng.uniform(-0.08, 0.08)])
     bodies = (
-        Body("room", (*_interior(rng, m, half_width), *(p for p, _ in objects))),
-        Body("mover", (part,), _about(foot, turn, shift)),
+        Body((*_interior(rng, m, half_width), *(p for p, _ in objects))),
+        Body((part,), _about(foot, turn, shift)),
     )
     pose = inverse(_pose(0, -1.35, 0, pitch=-9))
     return Scene(bodies, pose, pose)
@@ -346,3 +338,6 @@ _LAYOUTS: dict[str, tuple[Callable[[Random, float, float], Scene], float]] = {
     "still": (_still, 0.8),
 }
 """Layout and focal length (in image widths) of each scene."""
+
+SCENES = {name: str(layout.__doc__) for name, (layout, _) in _LAYOUTS.items()}
+"""Names that `render_scene` knows, with one line on each."""

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.data.scenes.shapes import NEAR, Shape
 from soup_nlp.data.scenes.texture import Texture
-from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera
 
 Float = NDArray[np.float64]
@@ -60,7 +59,7 @@ class Part:
     glow: float = 0.45
 
     def colour(self, points: Float, footprint: Float, frame: int) -> NDArray[np.float32]:
-        """Colours (N, 3) of points (N, 3) in part coordinates; shading is fixed in the matter."""
+        """Colours (N, 3) of points (N, 3) in part coordinates; shading moves with the surface."""
         material = self.shape.material(points, frame)
         normals = self.shape.normals(self.shape.place(material, 0), 0)
         light = self.scene_from_part[:3, :3].T @ LIGHT
@@ -74,12 +73,10 @@ class Body:
     """Parts that move together.
 
     Attributes:
-        name: For messages.
         parts: What the body is made of.
         motion: (4, 4) motion in scene coordinates from the reference to the next time.
     """
 
-    name: str
     parts: tuple[Part, ...]
     motion: Float = field(default_factory=lambda: np.eye(4))
 
@@ -89,7 +86,7 @@ class Scene:
     """Bodies and a camera at two times, in any right-handed scene coordinates.
 
     Attributes:
-        bodies: Their order gives the labels 0, 1, ...
+        bodies: Their order gives the component labels 0, 1, ...
         ref_from_scene: (4, 4) camera pose at the reference time.
         next_from_scene: (4, 4) camera pose at the next time.
     """
@@ -176,23 +173,13 @@ def render(scene: Scene, K: Float, height: int, width: int, name: str = "scene")
     Returns:
         A `Pair` without a flow but with full truth in the unit of the scene. A reference pixel is
         occluded when its point is hidden in the next frame, or projects outside the rectangle of
-        the next frame's pixel centres, or lies behind its camera (its flow is NaN then).
-
-    Raises:
-        DataError: a ray of either frame misses every surface, so that depth is not finite.
+        the next frame's pixel centres, or lies behind its camera (its flow is NaN then). Every ray
+        must hit a surface, such as an infinite plane behind the bodies.
     """
     uv = camera.pixel_grid(height, width).reshape(-1, 2)
     depths, images, hits = [], [], []
     for frame in (0, 1):
         depth, part = scene.trace(K, uv, frame)
-        if (part < 0).any():
-            raise DataError(
-                "scene is open: some rays hit nothing",
-                where=f"{name}, frame {frame}",
-                found=f"{np.mean(part < 0):.1%} of the pixels",
-                expected="a surface behind every pixel",
-                hint="add an infinite background plane",
-            )
         images.append(_paint(scene, K, depth, part, (height, width), frame))
         depths.append(depth)
         hits.append(part)
@@ -249,8 +236,6 @@ def _paint(
     offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(1, -1, 2)
     at = (uv[edge, None] + offsets).reshape(-1, 2)
     z, p = scene.trace(K, at, frame)
-    missed, centre = p < 0, np.repeat(edge, TAPS**2)
-    z[missed], p[missed] = depth[centre[missed]], part[centre[missed]]
     samples, _ = _shade(scene, K, at, z, p, frame, 1)
     colour[edge] = np.clip(samples, 0, 1).reshape(-1, TAPS**2, 3).mean(axis=1)
     return np.round(255 * np.clip(colour, 0, 1)).astype(np.uint8).reshape(*shape, 3)

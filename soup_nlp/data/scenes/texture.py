@@ -1,4 +1,4 @@
-"""Procedural textures: seeded solid noise, limited to what a pixel can show.
+"""Procedural textures: seeded solid noise, band-limited to the size of a pixel.
 
 A texture is a function of a body's own (material) coordinates, so that it sticks to the body
 while the body moves, turns or bends: the two frames of a rendered pair then show the same colours

@@ -1,0 +1,139 @@
+"""What analyses measure of a pair beside its scores: energy at the truth, flow errors, views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+
+from soup_nlp.bench.accuracy import flow_error, measure_pair
+from soup_nlp.bench.pair_views import cropped, mirrored
+from soup_nlp.bench.rows import Row
+from soup_nlp.bench.suites import Item
+from soup_nlp.bench.truth import moves_by_itself, rescaled, true_soup
+from soup_nlp.config.problem import Problem
+from soup_nlp.data.flow.robust import reweighted
+from soup_nlp.data.pair import Pair
+from soup_nlp.errors import DataError
+from soup_nlp.evaluate.protocols import preset
+from soup_nlp.geometry.soup import Soup, reconstruct
+from soup_nlp.model import oracle
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.pipeline.case import solver_options, superpixels
+from soup_nlp.pipeline.run import Run, run
+from soup_nlp.refine.mppbp import refine_soup
+from soup_nlp.refine.records import Refined
+from soup_nlp.solve.stages import solve_soup
+
+VIEWS: Mapping[str, Callable[[Pair], Pair] | None] = MappingProxyType(
+    {
+        "as it is": None,
+        "mirrored": mirrored,
+        "cropped 7x5": lambda pair: cropped(pair, 7, 5),
+        "cropped 25x17": lambda pair: cropped(pair, 16, 11, 9, 6),
+        "mirrored and cropped 7x5": lambda pair: mirrored(cropped(pair, 7, 5)),
+        "mirrored and cropped 25x17": lambda pair: mirrored(cropped(pair, 16, 11, 9, 6)),
+    }
+)
+"""What is made of a pair, by the name of a variant; columns x rows that are cut off."""
+
+
+def measure_view(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> Row:
+    """Solve and score one pair, changed as its variant says."""
+    return measure_pair(item, overrides, change=VIEWS[variant])
+
+
+def measure_flow(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> Row:
+    """End-point error of the flow of one pair against its truth; nothing is solved.
+
+    The error that counts is weighted with the confidence, as in the energy.
+
+    Raises:
+        DataError: the pair has no true flow.
+    """
+    problem = item.problem(overrides)
+    pair = problem.load_pair()
+    flow = problem.flow.load(pair, problem.path)
+    if problem.flow.reweight_px is not None:
+        labels = superpixels(problem, pair.with_flow(flow))
+        flow = reweighted(flow, labels, problem.flow.reweight_px)
+    error = flow_error(pair.with_flow(flow))
+    if error is None:
+        raise DataError("pair has no true flow", where=pair.name)
+    return {"metrics": {}, "flow_error": error}
+
+
+def measure_energy(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> Row:
+    """Exact energies by term and depth errors of start, solution, truth and solves from the truth.
+
+    E(truth) well above E(solution) is an error of the model; below it, of the solver. What a solve
+    from the truth loses in depth, the minimum of the energy has lost.
+
+    Raises:
+        DataError: the pair has no dense truth of depth and motion.
+    """
+    result, convention = run(item.problem(overrides)), item.presets[0]
+    true = true_soup(result.pair, result.segmentation)
+
+    def energy(soup: Soup) -> dict[str, float]:
+        return oracle.energy(soup, result.data, result.weights)
+
+    soups = {"start": result.start.soup, "solution": result.soup, "truth": true.soup}
+    truth = result.pair.truth
+    assert truth is not None
+    if truth.components is not None:
+        own = moves_by_itself(truth)[true.component]
+        if own.any():
+            apart = replace(true, component=np.where(own, true.component, 0))
+            soups["truth rescaled"] = rescaled(apart, lambda soup: energy(soup)["total"])
+    soups |= from_soup(result, true.soup)
+    p = result.pair
+    assert truth.depth_ref is not None
+    metrics = {}
+    for name, soup in soups.items():
+        rec = reconstruct(soup, result.segmentation.labels, p.K_ref, p.K_next)
+        m = preset(convention).score(rec.depth_ref, truth.depth_ref)
+        metrics[name] = {"mre": m.mre, "median_relative": m.median_relative}
+    return {
+        "status": result.solution.status,
+        "good": result.good,
+        "superpixels": len(result.segmentation),
+        "size": list(p.size),
+        "mixed": float((true.purity < 0.95).mean()),
+        "energy": {name: energy(soup) for name, soup in soups.items()},
+        "metrics": {convention: metrics},
+        "flow_error": flow_error(p),
+    }
+
+
+def from_soup(result: Run, soup: Soup) -> dict[str, Soup]:
+    """What the NLP, and then the refinement where it is on, make of another start."""
+    problem = result.problem
+    form = Formulation(**dict(problem.formulation))
+    options = solver_options(problem, result.start)
+    solved = solve_soup(soup, result.data, result.weights, form, options)
+    out = {"NLP from truth": solved.soup}
+    if problem.refine.enabled:
+        out["refined from truth"] = refined(
+            problem, form, solved.soup, result.data, result.weights
+        ).soup
+    return out
+
+
+def refined(
+    problem: Problem, form: Formulation, soup: Soup, data: EnergyData, weights: Weights
+) -> Refined:
+    """The refinement of a soup as the problem has it."""
+    return refine_soup(
+        soup,
+        data,
+        weights,
+        problem.refine,
+        seed=problem.seed,
+        min_facing=form.min_facing,
+        depth_ratio=form.depth_ratio,
+    )

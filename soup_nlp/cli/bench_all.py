@@ -1,0 +1,77 @@
+"""Command bench all: everything under results/ again, one command after the other."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from soup_nlp.cli.options import Data
+
+TERSE = "--set segmentation.superpixels=500"
+THREE = "--suite rendered --only street --only room --only orbit"
+NLP = "--set refine.enabled=false"
+ANALYSIS = "bench accuracy -o {out}/accuracy --analysis"
+COMMANDS = (
+    "solve problems/motorcycle.yaml -o out/motorcycle",
+    "bench accuracy -o {out}/accuracy --suite rendered --suite shared --data {data}",
+    f"{ANALYSIS} ablation {THREE} --flow dis {TERSE} {NLP}",
+    f"{ANALYSIS} superpixels {THREE} --flow dis {NLP}",
+    f"{ANALYSIS} neighbours {THREE} --flow dis {TERSE} {NLP}",
+    f"{ANALYSIS} pattern {THREE} --flow dis {TERSE} {NLP}",
+    f"{ANALYSIS} flow {THREE} {TERSE} {NLP}",
+    f"{ANALYSIS} stages {THREE} --flow dis {TERSE}",
+    f"{ANALYSIS} energy --suite rendered {TERSE} {NLP}",
+    f"{ANALYSIS} flows --suite rendered --suite shared --data {{data}} --flow truth",
+    f"{ANALYSIS} views --suite shared --data {{data}} --flow dis {NLP}",
+    f"bench search -o {{out}}/accuracy {THREE} --flow dis --trials 8 --seeds 0"
+    f" --validation-seeds 1,2 --width 512 --set segmentation.superpixels=300 {NLP}",
+    "bench accuracy -o {out}/accuracy --name sheets --suite rendered --only sheet"
+    f" --seeds 0,1,2,3,4,5 --flow truth --flow dis {NLP}",
+    "bench accuracy -o {out}/accuracy --name bodies --suite rendered --only street --only room"
+    " --seeds 1,2,3,4,5,6,10,11,12,13,14,15,16,17,18 --flow truth --flow dis"
+    f" {NLP}",
+    "bench cut-off -o {out}/accuracy",
+    "bench refine -o {out}/refine",
+    "bench speed -o {out}/speed --sizes 500,1000,2000 --neighbours 20",
+    "bench speed -o {out}/speed/neighbours --scenes street --sizes 250,500,1000 --seeds 0",
+    "bench methods -o {out}/speed",
+    "bench methods -o {out}/speed --unrefined --seeds 0,1,2,3,4 --superpixels 1000,2000",
+    "bench formulations -o {out}/speed",
+    "bench trws -o {out}/speed",
+    "compare problems/orbit.yaml problems/street.yaml -o {out}/solvers --superpixels 100"
+    " --seconds 45 --set flow.source=truth",
+)
+"""What is run, in this order."""
+
+
+def command(main: Callable[[Sequence[str]], int]) -> Callable[..., None]:
+    """The command; it runs others through `main`."""
+
+    def everything(
+        data: Data = None,
+        out: Annotated[Path, typer.Option("--out", "-o", help="Folder.")] = Path("results"),
+        dry: Annotated[bool, typer.Option(help="Print the commands only.")] = False,
+    ) -> None:
+        """Make every table and picture of results/ again; a run that was stopped goes on."""
+        ended = {}
+        for text in COMMANDS:
+            if "{data}" in text and data is None:
+                text = text.replace("--suite shared --data {data}", "")
+                if "--suite" not in text:
+                    continue
+            words = [w.format(out=out, data=data) for w in shlex.split(text)]
+            print(f"soup-nlp {shlex.join(words)}", flush=True)
+            if not dry:
+                ended[shlex.join(words)] = main(words)
+        if not dry:
+            shutil.copy("out/motorcycle/overview.png", out / "motorcycle.png")
+        bad = [f"{words}: exit code {code}" for words, code in ended.items() if code]
+        print("\n".join(bad) or "every command ended well")
+        raise typer.Exit(1 if bad else 0)
+
+    return everything

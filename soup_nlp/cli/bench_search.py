@@ -1,0 +1,99 @@
+"""Command bench search: better defaults, chosen on some pairs and checked on others."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from soup_nlp.bench.rows import Where
+from soup_nlp.bench.suites import Options, list_suite
+from soup_nlp.bench.tuning import DEFAULT_SPACE, parameter, split
+from soup_nlp.bench.tuning import search as run_search
+from soup_nlp.bench.tuning_report import text_search
+from soup_nlp.cli.bench_accuracy import told
+from soup_nlp.cli.options import (
+    AnyCode,
+    Dask,
+    Data,
+    Flow,
+    Only,
+    Out,
+    Progress,
+    Quiet,
+    Seeds,
+    Set,
+    SuiteName,
+    Width,
+    Workers,
+    numbers,
+)
+from soup_nlp.storage.atomic import write_text
+
+
+def search(
+    suite: SuiteName = None,
+    data: Data = None,
+    out: Out = Path("results/accuracy"),
+    params: Annotated[
+        list[str] | None,
+        typer.Option("--param", help="KEY=log|linear|int:LOW:HIGH or KEY=choice:A:B instead."),
+    ] = None,
+    trials: Annotated[int, typer.Option(help="Configurations beside the default.", min=1)] = 24,
+    finalists: Annotated[int, typer.Option(help="Best trials that are validated.", min=1)] = 3,
+    seed: Annotated[int, typer.Option(help="Of the trials.", min=0)] = 0,
+    seeds: Seeds = "0,1",
+    validation_seeds: Annotated[
+        str, typer.Option(help="Seeds of rendered scenes that only validate.")
+    ] = "2,3",
+    overrides: Set = None,
+    flow: Flow = None,
+    width: Width = 512,
+    only: Only = None,
+    workers: Workers = 1,
+    dask: Dask = "",
+    any_code: AnyCode = False,
+    quiet: Quiet = False,
+) -> None:
+    """Search for better defaults on some pairs and check them on others; OUT/search.md, .jsonl."""
+    ours, theirs = numbers(seeds, "--seeds"), numbers(validation_seeds, "--validation-seeds")
+    options = Options(
+        flows=tuple(flow) if flow else None,
+        width=width,
+        seeds=tuple(dict.fromkeys((*ours, *theirs))),
+        only=tuple(only or ()),
+    )
+    space = tuple(parameter(p) for p in params) if params else DEFAULT_SPACE
+    items = [i for name in suite or ["rendered"] for i in list_suite(name, data, options).items]
+    train, validation = split(items, ours, theirs)
+    if not quiet:
+        print(
+            f"{trials} trials of {len(space)} settings on {len(train)} pairs,"
+            f" {len(validation)} validate",
+            file=sys.stderr,
+        )
+    progress = Progress(quiet, told)
+    found = run_search(
+        space,
+        train,
+        validation,
+        out / "search.jsonl",
+        trials=trials,
+        finalists=finalists,
+        seed=seed,
+        overrides=tuple(overrides or ()),
+        where=Where(workers, dask),
+        say=progress,
+        any_code=any_code,
+    )
+    words = [f"--suite {s}" for s in suite or ["rendered"]] + (["--data DIR"] if data else [])
+    words += [f"--trials {trials} --seed {seed} --seeds {seeds}"]
+    words += [f"--validation-seeds {validation_seeds} --width {width}"]
+    words += [f"--flow {f}" for f in flow or []] + [f"--only '{o}'" for o in only or []]
+    words += [f"--set '{o}'" for o in overrides or []] + [f"--param '{p}'" for p in params or []]
+    write_text(out / "search.md", text_search(found, f"soup-nlp bench search {' '.join(words)}"))
+    print((out / "search.md").read_text(encoding="utf-8"))
+    print(f"files       {out}/search.md, {out}/search.jsonl")
+    raise typer.Exit(1 if progress.failed else 0)

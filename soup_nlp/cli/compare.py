@@ -1,0 +1,74 @@
+"""Command compare: other solvers on the same NLP, verified."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from soup_nlp.bench.solvers.page import conclusion, page
+from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
+from soup_nlp.bench.solvers.registry import available, find_solver
+from soup_nlp.bench.solvers.runner import compare as run_all
+from soup_nlp.bench.solvers.runner import make_tasks
+from soup_nlp.cli.options import Formulations, Out, Presolve, Set, Superpixels
+from soup_nlp.config.problem import load_problem
+from soup_nlp.errors import ConfigError
+from soup_nlp.export.artefact import parse_formulation
+from soup_nlp.export.verify import Limits
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.report.folder import prepare_folder
+from soup_nlp.storage.atomic import write_text
+
+
+def compare(
+    problems: Annotated[list[Path], typer.Argument(help="Problem files.")],
+    solvers: Annotated[
+        str, typer.Option(help="Comma-separated, or all; a program that reads .nl may be named.")
+    ] = "all",
+    formulation: Formulations = None,
+    superpixels: Superpixels = None,
+    seconds: Annotated[float, typer.Option(help="Time limit of a run.")] = 60.0,
+    iterations: Annotated[int, typer.Option(help="Iteration limit of a run.")] = 300,
+    tol: Annotated[float, typer.Option(help="Dual infeasibility; constraints get 1/100.")] = 1e-4,
+    memory: Annotated[float, typer.Option(help="Memory limit of a run, GiB.")] = 4.0,
+    presolve: Presolve = True,
+    out: Out = Path("results/solvers"),
+    overrides: Set = None,
+) -> None:
+    """Run real solvers on problems, verify their claims, write table and profiles."""
+    if not (seconds > 0 and iterations > 0 and tol > 0 and memory > 0):
+        raise ConfigError(
+            "limits must be positive",
+            where="compare",
+            found=f"{seconds:g} s, {iterations} iterations, tol {tol:g}, {memory:g} GiB",
+        )
+    wanted = available() if solvers == "all" else [w.strip() for w in solvers.split(",")]
+    names = list(dict.fromkeys(w for w in wanted if w))
+    if not names:
+        raise ConfigError("no solver is named", where="--solvers", found=solvers)
+    for name in names:
+        find_solver(name)
+    forms = [parse_formulation(text) for text in formulation or []] or [{}]
+    limits = Limits(seconds, iterations, tol, int(memory * 2**30))
+    sizes = [[f"segmentation.superpixels={n}"] for n in superpixels or ()] or [[]]
+    # a file that is wrong is found before hours of runs, not after
+    chosen = [load_problem(path, [*(overrides or []), *own]) for path in problems for own in sizes]
+    folder = prepare_folder(out)
+    rows: list[dict[str, Any]] = []
+    try:
+        with tempfile.TemporaryDirectory() as scratch:
+            for problem in chosen:
+                tasks = list(make_tasks(prepare(problem, presolve), forms, limits, presolve))
+                rows = run_all(tasks, names, limits, folder / "runs.jsonl", Path(scratch), print)
+    finally:
+        # an input that cannot be used does not take the others' page away
+        if rows:
+            write_text(folder / "README.md", page(rows))
+            draw_profiles(folder / "profile.png", rows)
+            draw_curves(folder / "curves.png", rows)
+    print("\n".join(conclusion(rows)))
+    print(f"files       {folder}/: README.md, profile.png, curves.png, runs.jsonl")
+    raise typer.Exit(0 if any(r["verified"] for r in rows) else 1)

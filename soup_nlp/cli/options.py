@@ -1,0 +1,115 @@
+"""What commands share: options of the same name and meaning, lists in options, progress."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from soup_nlp.bench.rows import Row, failed
+from soup_nlp.bench.suites import SUITES
+from soup_nlp.bench.tables import reason
+from soup_nlp.errors import ConfigError
+
+Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of what is written.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+Problem = Annotated[Path, typer.Argument(help="Problem file.")]
+Presolve = Annotated[
+    bool, typer.Option(help="Start where the tangent presolve ends, not at the proposal.")
+]
+Formulations = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--formulation", help="gauge/norm/truncation, e.g. free/epigraph/lifted; may be repeated."
+    ),
+]
+Superpixels = Annotated[
+    list[int] | None, typer.Option(help="Wanted number, 50 to 2000; may be repeated.")
+]
+SuiteName = Annotated[
+    list[str] | None, typer.Option("--suite", help=f"{', '.join(SUITES)}; may be repeated.")
+]
+Data = Annotated[Path | None, typer.Option(help="Root folder of the dataset.")]
+Flow = Annotated[
+    list[str] | None, typer.Option(help="Flow source instead of the suite's own; may be repeated.")
+]
+Only = Annotated[list[str] | None, typer.Option(help="Only pairs whose name holds this word.")]
+Width = Annotated[int, typer.Option(help="Columns of rendered scenes.", min=64)]
+Seeds = Annotated[str, typer.Option(help="Seeds of rendered scenes, such as 0,1,2.")]
+Workers = Annotated[int, typer.Option(help="Processes of this machine (extra: bench).", min=1)]
+Dask = Annotated[str, typer.Option(help="Address of a Dask scheduler (extra: dask).")]
+AnyCode = Annotated[bool, typer.Option(help="Also take stored rows of other code versions.")]
+
+
+def numbers(text: str, option: str, least: int = 0) -> list[int]:
+    """Whole numbers of a comma-separated list.
+
+    Raises:
+        ConfigError: a word is no whole number, or one is smaller than `least`.
+    """
+    try:
+        found = [int(word) for word in text.split(",")]
+    except ValueError:
+        found = []
+    if not found or min(found) < least:
+        raise ConfigError(
+            "not a list of whole numbers",
+            where=option,
+            found=text,
+            expected=f"whole numbers from {least}, comma separated",
+        )
+    return found
+
+
+def words(text: str, option: str, known: list[str]) -> list[str]:
+    """Names of a comma-separated list.
+
+    Raises:
+        ConfigError: it is empty, or a name is not known.
+    """
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    wrong = [name for name in names if name not in known]
+    if wrong or not names:
+        raise ConfigError(
+            "unknown name",
+            where=option,
+            found=", ".join(wrong) or text,
+            expected=", ".join(known),
+        )
+    return names
+
+
+class Progress:
+    """Rows done and time left: one rewritten line on a terminal, a line per row in a log.
+
+    Args:
+        quiet: Print nothing.
+        told: The result of a row that did not fail, in a few words.
+
+    Attributes:
+        failed: Number of new rows that failed; a stored row never did.
+    """
+
+    def __init__(self, quiet: bool, told: Callable[[Row], str] = lambda row: "done") -> None:
+        self.quiet, self.told = quiet, told
+        self.live = sys.stderr.isatty()
+        self.spent: list[float] = []
+        self.failed = 0
+
+    def __call__(self, done: int, total: int, row: Row) -> None:
+        """Tell a new row."""
+        self.failed += failed(row)
+        if self.quiet:
+            return
+        self.spent.append(float(row.get("seconds") or 0.0))
+        left = sum(self.spent) / len(self.spent) * (total - done)
+        result = f"failed: {reason(row)}" if failed(row) else self.told(row)
+        line = f"{done}/{total}  {row['key']}  {result}  {self.spent[-1]:.0f} s"
+        if total > done:
+            line += f"  (about {left:.0f} s of work left)"
+        start, end = ("\r\x1b[2K", "\n" if done == total else "") if self.live else ("", "\n")
+        print(f"{start}{line}", end=end, file=sys.stderr, flush=True)

@@ -1,0 +1,166 @@
+"""Reference solvers without Ipopt: same energy, similar minima, records that are true."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from soup_nlp.bench import reference_solvers
+from soup_nlp.bench.reference_solvers import ReferenceSolve, lbfgs, levenberg_marquardt
+from soup_nlp.config.problem import make_problem
+from soup_nlp.model import oracle
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.solve import factor
+from soup_nlp.solve.kkt import constraint_residuals
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.stages import solve_soup
+
+SCHEDULE = (0.1, 0.03)
+# so small a problem is solved before its kernels are compiled
+FORM = Formulation(compiled=False)
+
+
+def small(**settings: object) -> Case:
+    scene = {"kind": "scene", "scene": "street", "seed": 0, "width": 256, "height": 128}
+    problem = {"input": scene, "segmentation": {"superpixels": 60}, **settings}
+    return prepare(make_problem(problem))
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    return small()
+
+
+@pytest.fixture(scope="module")
+def far() -> Case:
+    """The same with components that start further away: their scale is that of their outline."""
+    return small(start={"upright": False}, energy={"cont_occluded": 1.0})
+
+
+@pytest.fixture(scope="module")
+def lm(case: Case) -> ReferenceSolve:
+    return levenberg_marquardt(case.soup, case.data, case.weights, FORM, eps=SCHEDULE)
+
+
+def check(case: Case, y: ReferenceSolve) -> None:
+    """What holds for every record."""
+    exact = oracle.energy(y.soup, case.data, case.weights)
+    assert dict(y.energy) == pytest.approx(exact, rel=1e-12)
+    assert exact["total"] == pytest.approx(y.history[:, 1].min(), rel=1e-12)
+    assert y.history.shape[1] == 2
+    assert (np.diff(y.history[:, 0]) > 0).all()
+    assert 1 < len(y.history) <= y.iterations + 1
+    assert y.seconds >= y.history[-1, 0]
+    worst = constraint_residuals(y.soup, case.data.rim_ray, 0.0)
+    assert max(worst.values()) < 1e-9
+
+
+def test_levenberg_marquardt_lowers_the_energy(case, lm):
+    check(case, lm)
+    before = oracle.energy(case.soup, case.data, case.weights)["total"]
+    assert lm.energy["total"] < 0.9 * before
+    assert lm.history[0, 1] == pytest.approx(before, rel=0.05)
+    assert lm.name.startswith("levenberg-marquardt")
+
+
+def test_lbfgs_lowers_the_energy(far):
+    y = lbfgs(far.soup, far.data, far.weights, FORM, eps=SCHEDULE, iterations=60)
+    check(far, y)
+    assert y.name == "l-bfgs"
+    assert y.status == "Iteration_Limit"
+    assert y.iterations <= 120
+    assert y.energy["total"] < 0.9 * y.history[0, 1]
+
+
+def test_ipopt_and_levenberg_marquardt_agree(case, lm):
+    options = SolverOptions(presolve_eps=SCHEDULE, eps=SCHEDULE[-1], max_iter=20)
+    s = solve_soup(case.soup, case.data, case.weights, FORM, options)
+    assert lm.energy["total"] == pytest.approx(s.energy["total"], rel=0.04)
+
+
+def test_it_is_the_same_energy(case):
+    # without truncations the smoothed energy tends to the exact one
+    free = Weights().replace(
+        sigma_cont=np.inf, sigma_orient=np.inf, sigma_arap=np.inf, sigma_proj=np.inf
+    )
+    problem = reference_solvers._Tangent(case.soup, case.data, free, FORM)
+    x = problem.project(problem.nlp.x0)
+    exact = oracle.energy(problem.layout.unpack(x), case.data, free)["total"]
+    problem.smoothing(1e-7)
+    assert problem.value(x) == pytest.approx(exact, rel=1e-5)
+    problem.smoothing(1.0)
+    assert problem.value(x) < exact
+
+
+def test_projection_keeps_bounds_and_visibility(case):
+    problem = reference_solvers._Tangent(case.soup, case.data, case.weights, FORM)
+    inside = problem.project(problem.nlp.x0)
+    np.testing.assert_allclose(problem.project(inside), inside, rtol=1e-12, atol=1e-12)
+    rng = np.random.default_rng(0)
+    wild = inside + rng.normal(0, 3.0, inside.shape)
+    assert (problem.rows @ wild < problem.lower).any()
+    kept = problem.project(wild)
+    assert (problem.rows @ kept >= problem.lower - 1e-12).all()
+    assert (kept >= problem.nlp.lbx).all()
+    assert (kept <= problem.nlp.ubx).all()
+    # nothing but scales and slopes moves
+    np.testing.assert_array_equal(kept.reshape(-1, 9)[:, 3:], wild.reshape(-1, 9)[:, 3:])
+
+
+def test_factorisations_agree():
+    rng = np.random.default_rng(1)
+    J = sparse.random(60, 30, 0.1, "csr", rng=rng) + sparse.eye(60, 30)
+    H = sparse.triu(J.T @ J).tocsc()
+    H.sort_indices()
+    nonzeros = H.data.copy()
+    upper = sparse.csc_matrix((np.arange(H.nnz, dtype=float), H.indices, H.indptr), H.shape)
+    b = rng.normal(size=30)
+    full = (J.T @ J).toarray()
+    diagonal = factor.diagonal_places(upper)
+    methods = [factor.superlu(upper), factor.factorisation(upper)[1]]
+    with contextlib.suppress(ImportError):
+        methods.append(factor.cholmod(upper))
+    for factorise in methods:
+        for scale, damping in ((1.0, 0.1), (2.0, 0.7)):
+            expected = np.linalg.solve(scale * full + damping * np.eye(30), b)
+            damped = scale * nonzeros
+            damped[diagonal] += damping
+            back = factorise(damped)
+            np.testing.assert_allclose(back(b), expected, atol=1e-10)
+            np.testing.assert_allclose(back(2 * b), 2 * expected, atol=1e-10)
+
+
+def test_one_analysis_serves_equal_patterns_alone():
+    plain = factor.numbered(np.array([0, 1, 2]), np.array([0, 1, 2]), 3)
+    upper = factor.numbered(np.array([0, 0, 1, 2]), np.array([0, 1, 1, 2]), 3)
+    # as many nonzeros in every column
+    other = factor.numbered(np.array([0, 0, 1, 1, 2]), np.array([0, 1, 1, 2, 2]), 3)
+    third = factor.numbered(np.array([0, 0, 1, 0, 2]), np.array([0, 1, 1, 2, 2]), 3)
+    matrices = [plain, upper, other, third]
+    for i, one in enumerate(matrices):
+        assert [factor.same_pattern(one, m) for m in matrices] == [i == k for k in range(4)]
+    assert factor.same_pattern(plain, plain.copy())
+
+
+def test_a_matrix_without_its_diagonal_is_refused():
+    upper = factor.numbered(np.array([0, 0]), np.array([0, 1]), 2)
+    with pytest.raises(ValueError, match="diagonal"):
+        factor.diagonal_places(upper)
+
+
+@pytest.mark.parametrize("method", [levenberg_marquardt, lbfgs])
+def test_a_time_limit_ends_with_the_best_iterate(case, method):
+    late = method(case.soup, case.data, case.weights, FORM, seconds=0.0)
+    assert late.status == "Time_Limit"
+    assert late.iterations <= 1
+
+
+def test_an_iteration_limit_is_told(case):
+    y = levenberg_marquardt(case.soup, case.data, case.weights, FORM, eps=(0.1,), iterations=5)
+    assert y.status == "Iteration_Limit"
+    assert y.iterations == 5
