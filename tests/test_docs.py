@@ -14,12 +14,14 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import typer
 from helpers_model import PAPER, Tiny
 from pydantic import BaseModel, Field
 from test_layers import ALLOWED
 
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import Task
+from soup_nlp.cli.main import app
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.sources import flow_sources, resolve_flow
 from soup_nlp.data.inputs import Input, PairInput, Resolve
@@ -122,6 +124,22 @@ def test_keys_that_are_named_exist(page):
         assert key in known or key.endswith(".png"), key
     for key in re.findall(rf"--set ((?:{SECTIONS})\.[a-z_.]+)=", text):
         assert key in known, key
+
+
+def commands() -> set[str]:
+    """Every command and subcommand of the command line."""
+    group = typer.main.get_command(app)
+    out = set(group.commands)
+    return out | {f"bench {name}" for name in group.commands["bench"].commands}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_commands_that_are_named_exist(page):
+    known = commands()
+    assert {"solve", "bench speed"} <= known
+    text = page.read_text(encoding="utf-8")
+    for command in re.findall(r"soup-nlp (bench [a-z][a-z-]+|[a-z]+)\b", text):
+        assert command in known, command
 
 
 def test_the_rooms_are_those_of_the_layering_test():
