@@ -16,7 +16,8 @@ from soup_nlp.bench.accuracy import head, input_hash, moving, pair_job, settings
 from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.depth_maps import METHODS
 from soup_nlp.bench.rows import Job, Row, Where, append_row, attempt, measure_all, read_rows
-from soup_nlp.bench.suites import SUITES, Item
+from soup_nlp.bench.suite_pairs import Item
+from soup_nlp.bench.suites import SUITES
 from soup_nlp.cli import bench_accuracy
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem

@@ -25,7 +25,8 @@ from soup_nlp.bench.analyses_report import (
     text_variants,
 )
 from soup_nlp.bench.rows import attempt
-from soup_nlp.bench.suites import Item, Options, list_suite
+from soup_nlp.bench.suite_pairs import Item, Options
+from soup_nlp.bench.suites import list_suite
 from soup_nlp.bench.tables import reason
 from soup_nlp.bench.tuning import (
     DEFAULT_SPACE,

@@ -11,7 +11,8 @@ import pytest
 from scipy.stats import linregress
 
 from soup_nlp.bench import speed, speed_fit, speed_gate, speed_report
-from soup_nlp.bench.rows import machine, read_rows
+from soup_nlp.bench.processes import machine
+from soup_nlp.bench.rows import read_rows
 from soup_nlp.bench.speed import Spec, problem_of, schedule
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
@@ -127,7 +128,7 @@ def test_a_run_that_fails_says_why(monkeypatch):
     record = speed.run_alone(Spec("nowhere", 100, 8))
     assert "nowhere" in record["error"]
     assert "street" in record["error"]
-    monkeypatch.setattr("soup_nlp.bench.rows.GRACE", 0.0)
+    monkeypatch.setattr("soup_nlp.bench.processes.GRACE", 0.0)
     late = speed.run_alone(Spec("street", 60, 8), seconds=0.2)
     assert late["error"] == "no answer after 0.2 s"
 

@@ -1,4 +1,4 @@
-"""Floors and truths by construction: planes of the truth, its soup, rivals without assembly."""
+"""Floors and truths by construction: planes of the truth, its soup, baselines without assembly."""
 
 from __future__ import annotations
 

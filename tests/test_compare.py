@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from helpers_model import PAPER, Tiny
 
-from soup_nlp.bench.rows import isolated
+from soup_nlp.bench.processes import isolated
 from soup_nlp.bench.solvers.page import page
 from soup_nlp.bench.solvers.plugins import PLUGINS
 from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profiles, profile
@@ -78,7 +78,7 @@ def test_crashes_are_answers(tmp_path):
 
 
 def test_time_and_memory_are_limited(tmp_path, monkeypatch):
-    monkeypatch.setattr("soup_nlp.bench.rows.GRACE", 0.2)
+    monkeypatch.setattr("soup_nlp.bench.processes.GRACE", 0.2)
     assert isolated(lambda: time.sleep(60), tmp_path, 0.1, MANY).how == "killed: time"
     ended = isolated(lambda: np.ones(10**9), tmp_path, 20, MANY)
     assert ended.how == "killed: memory"

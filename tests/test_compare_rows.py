@@ -13,8 +13,8 @@ from helpers_model import PAPER, Tiny
 from helpers_sol import write_sol
 from test_compare import LABEL, MANY, PROBLEMS, ROWS, row
 
+from soup_nlp.bench.processes import isolated
 from soup_nlp.bench.reference_solvers import levenberg_marquardt
-from soup_nlp.bench.rows import isolated
 from soup_nlp.bench.solvers.page import by_run, conclusion, page
 from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profiles, problem_names
 from soup_nlp.bench.solvers.registry import executable, find_solver, reference

@@ -10,7 +10,8 @@ from helpers_files import write_flo
 
 from soup_nlp.bench.analyses_measures import VIEWS, measure_view
 from soup_nlp.bench.pair_views import cropped, mirrored
-from soup_nlp.bench.suites import Options, list_suite
+from soup_nlp.bench.suite_pairs import Options
+from soup_nlp.bench.suites import list_suite
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.data.scenes.catalogue import render_scene
@@ -135,10 +136,10 @@ def test_frames_of_two_widths_have_two_mirrors():
 
 
 def test_nothing_left_is_said(pair):
-    with pytest.raises(DataError, match="margins are wider"):
+    with pytest.raises(DataError, match="margins do not fit"):
         cropped(pair, 100, 0, 28)
     assert cropped(pair, 100, 0, 27).size == (96, 1)
-    with pytest.raises(DataError, match=r"negative margin(.|\n)*\(0, 0, -3, 0\)"):
+    with pytest.raises(DataError, match=r"margins do not fit(.|\n)*\(0, 0, -3, 0\)"):
         cropped(pair, 0, 0, -3)
 
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from soup_nlp.bench.depth_maps import depth_maps, true_depth
 from soup_nlp.bench.rows import Job, Row, attempt
-from soup_nlp.bench.suites import SUITES, Item
+from soup_nlp.bench.suite_pairs import Item
+from soup_nlp.bench.suites import SUITES
 from soup_nlp.bench.truth import moves_by_itself, true_soup
 from soup_nlp.config.problem import Problem, dump_problem
 from soup_nlp.data.flow.sources import is_named, is_network

@@ -9,16 +9,7 @@ import numpy as np
 from soup_nlp.bench.depth_maps import BASELINES, METHODS
 from soup_nlp.bench.published import PROTOCOL, SOURCE, data_note, published
 from soup_nlp.bench.rows import Row
-from soup_nlp.bench.tables import (
-    energy_ratio,
-    failures,
-    get,
-    joined,
-    made,
-    mean,
-    show,
-    table,
-)
+from soup_nlp.bench.tables import energy_ratio, failures, get, joined, made, mean, show, table
 from soup_nlp.evaluate.protocols import preset
 
 

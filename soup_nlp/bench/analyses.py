@@ -138,7 +138,7 @@ _ALL = (
     ),
     Analysis(
         "energy",
-        "energy at the truth against the solution, by term; what is made of the truth",
+        "energy at the truth against the solution, by term; solves that start from the truth",
         {"": ()},
         "",
         function=measure_energy,

@@ -11,7 +11,7 @@ import numpy as np
 from soup_nlp.bench.accuracy import flow_error, measure_pair
 from soup_nlp.bench.pair_views import cropped, mirrored
 from soup_nlp.bench.rows import Row
-from soup_nlp.bench.suites import Item
+from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.truth import moves_by_itself, rescaled, true_soup
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.robust import reweighted

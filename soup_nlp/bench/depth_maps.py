@@ -38,7 +38,7 @@ BASELINES = ("unorganised", "rigid", "rigid_filled", "plane", "constant")
 """Those that the solution has to beat."""
 
 SPARSE = 4.0
-"""True pixels per superpixel below which the superpixel floor says nothing."""
+"""True pixels per superpixel below which the superpixel floor is meaningless."""
 
 
 def unorganised(soup: Soup) -> Soup:

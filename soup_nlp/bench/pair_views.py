@@ -1,7 +1,7 @@
-"""The same pair seen otherwise, mirrored or cropped, with its truth: what luck has to do with it.
+"""The same pair mirrored or cropped, with its truth: how much a figure depends on chance.
 
-Superpixels, flow and choices come out differently on pixels that are the same but for their order
-and their margin, so a figure that holds on all of them is worth more than one on a single pair.
+Superpixels, flow and choices come out differently on the same pixels in another order or with
+other margins, so a figure that holds on all views is worth more than one on a single pair.
 """
 
 from __future__ import annotations
@@ -89,18 +89,14 @@ def cropped(pair: Pair, left: int, top: int, right: int = 0, bottom: int = 0) ->
         DataError: a margin is negative, or nothing would be left.
     """
     margins = (left, top, right, bottom)
-    if min(margins) < 0:
+    height, width = np.minimum(pair.image_ref.shape[:2], pair.image_next.shape[:2])
+    if min(margins) < 0 or left + right >= width or top + bottom >= height:
         raise DataError(
-            "negative margin", where=pair.name, found=str(margins), expected="0 or more pixels"
+            "margins do not fit the images",
+            where=pair.name,
+            found=f"left, top, right, bottom {margins}",
+            expected=f"0 or more, less than {width} columns and {height} rows together",
         )
-    for image in (pair.image_ref, pair.image_next):
-        if left + right >= image.shape[1] or top + bottom >= image.shape[0]:
-            raise DataError(
-                "margins are wider than the image",
-                where=pair.name,
-                found=f"{left} + {right} columns, {top} + {bottom} rows",
-                expected=f"less than {image.shape[1]} and {image.shape[0]}",
-            )
 
     def cut(array: NDArray[Any]) -> NDArray[Any]:
         rows, columns = array.shape[:2]

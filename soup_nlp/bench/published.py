@@ -8,18 +8,6 @@ from types import MappingProxyType
 SOURCE = "Superpixel Soup (Kumar, Dai, Li, TPAMI), table of the performance comparison"
 PROTOCOL = "MRE after one global scale; the paper names neither the scale rule nor a depth cap"
 
-METHODS: Mapping[str, str] = MappingProxyType(
-    {
-        "DT": "Depth Transfer (Karsch et al.), single frame",
-        "GLRT": "low-rank reconstruction (Fragkiadaki et al.), many frames",
-        "BMM": "Block Matrix Method (Dai et al.), many frames",
-        "PTA": "Point Trajectory Approach (Akhter et al.), many frames",
-        "DMDE": "dense monocular depth (Ranftl et al.), two frames, numbers of its authors",
-        "ULDEMV": "unsupervised learning of depth and ego-motion (Zhou et al.)",
-        "Superpixel Soup": "the paper, two frames",
-    }
-)
-
 _COLUMNS = ("DT", "GLRT", "BMM", "PTA", "DMDE", "Superpixel Soup")
 _TABLE: dict[str, tuple[float | None, ...]] = {
     "sintel": (0.4833, 0.4101, 0.3121, 0.3177, 0.297, 0.1643),

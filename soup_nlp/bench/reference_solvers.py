@@ -76,11 +76,7 @@ class _Tangent:
     ) -> None:
         # theta = 0 and no ridge: the Hessian is that of reweighted least squares, sum w/s J^T J
         form = (form or Formulation()).replace(
-            norm="smooth",
-            truncation="smooth",
-            hessian="gauss-newton",
-            theta=0.0,
-            ridge=0.0,
+            norm="smooth", truncation="smooth", hessian="gauss-newton", theta=0.0, ridge=0.0
         )
         self.nlp: NLP
         self.layout: TangentLayout

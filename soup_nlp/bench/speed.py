@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.bench.processes import alone
 from soup_nlp.bench.reference_solvers import EPS, ReferenceSolve, levenberg_marquardt
-from soup_nlp.bench.rows import Job, Row, Say, alone, measure_all
+from soup_nlp.bench.rows import Job, Row, Say, measure_all
 from soup_nlp.config.problem import Problem, dump_problem, make_problem
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
@@ -234,10 +235,8 @@ def measure(spec: Spec) -> dict[str, Any]:
 
 
 def _last(values: Float | None) -> float | None:
-    """Last finite entry of an array; None where there is none."""
-    if values is None or not len(values) or not np.isfinite(values[-1]):
-        return None
-    return float(values[-1])
+    """Last entry of an array; None where there is none."""
+    return None if values is None or not len(values) else float(values[-1])
 
 
 def schedule(kind: str, options: SolverOptions) -> tuple[float, ...]:

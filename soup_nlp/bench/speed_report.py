@@ -55,18 +55,8 @@ COLUMNS: dict[str, Cell] = {
 """The main table."""
 
 IDENTITY = {name: COLUMNS[name] for name in ("pair", "seed", "N", "K")}
-PHASES = (
-    "load",
-    "flow",
-    "segmentation",
-    "start",
-    "weights",
-    "build",
-    "functions",
-    "linear algebra",
-    "evaluation",
-    "output",
-)
+NLP_PARTS = ("build", "functions", "linear algebra")
+PHASES = ("load", "flow", "segmentation", "start", "weights", *NLP_PARTS, "evaluation", "output")
 """Stages of a run; build, functions and linear algebra are the NLP."""
 
 
@@ -215,18 +205,6 @@ def report(records: Sequence[Row], machine: Mapping[str, str], day: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-PARTS = (
-    "flow",
-    "segmentation",
-    "start",
-    "build",
-    "functions",
-    "linear algebra",
-    "evaluation",
-    "output",
-)
-
-
 def _groups(records: Sequence[Row]) -> dict[tuple[str, int], list[Row]]:
     out: dict[tuple[str, int], list[Row]] = defaultdict(list)
     for r in records:
@@ -275,7 +253,7 @@ def plot_phases(path: Path, records: Sequence[Row]) -> None:
     figure = Figure(figsize=(9, 0.32 * len(records) + 1.4))
     axes: Axes = figure.subplots()
     begin = np.zeros(len(records))
-    for index, part in enumerate(PARTS):
+    for index, part in enumerate(p for p in PHASES if p not in ("load", "weights")):
         width = np.array([r["wall"].get(part, 0.0) for r in records])
         axes.barh(np.arange(len(records)), width, left=begin, label=part, color=f"C{index}")
         begin += width

@@ -14,7 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from soup_nlp.bench.rows import Job, Row, Say, alone, failed, measure_all
+from soup_nlp.bench.processes import alone
+from soup_nlp.bench.rows import Job, Row, Say, failed, measure_all
 from soup_nlp.bench.tables import failures, joined, table
 from soup_nlp.storage.atomic import write_text
 

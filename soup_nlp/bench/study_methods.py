@@ -126,12 +126,7 @@ def measure_formulation(
 
 
 def study_formulations(
-    out: Path,
-    scene: str,
-    superpixels: int,
-    iterations: int,
-    seconds: float,
-    say: Say | None = None,
+    out: Path, scene: str, superpixels: int, iterations: int, seconds: float, say: Say | None = None
 ) -> list[Row]:
     """Write OUT/formulations.md: status, iterations, residuals and energy of all twelve."""
     note = (

@@ -9,7 +9,7 @@ from pathlib import Path
 from soup_nlp.bench.accuracy import scores
 from soup_nlp.bench.rows import Row, Say
 from soup_nlp.bench.studies import made_on, run_study
-from soup_nlp.bench.suites import RENDERED
+from soup_nlp.bench.suite_pairs import RENDERED
 from soup_nlp.bench.tables import table
 from soup_nlp.config.problem import make_problem
 from soup_nlp.pipeline.run import run

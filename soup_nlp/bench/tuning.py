@@ -19,7 +19,7 @@ from scipy.stats import qmc
 
 from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
 from soup_nlp.bench.rows import Row, Say, Where, measure_all
-from soup_nlp.bench.suites import Item
+from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import energy_ratio, main_metric
 from soup_nlp.errors import ConfigError
 

@@ -13,7 +13,8 @@ from soup_nlp.bench.accuracy import pair_job
 from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
 from soup_nlp.bench.rows import Row, Where, measure_all
-from soup_nlp.bench.suites import SUITES, Options, list_suite
+from soup_nlp.bench.suite_pairs import Options
+from soup_nlp.bench.suites import SUITES, list_suite
 from soup_nlp.bench.tables import main_metric, show
 from soup_nlp.cli.options import (
     AnyCode,
@@ -36,8 +37,8 @@ from soup_nlp.evaluate.protocols import preset
 from soup_nlp.storage.atomic import write_text
 
 
-def told(row: Row) -> str:
-    """The error of a row."""
+def mre_of(row: Row) -> str:
+    """The main error of a row, for the progress line."""
     return f"MRE {show(main_metric(row))}"
 
 
@@ -87,7 +88,7 @@ def accuracy(
         limit=limit,
         only=tuple(only or ()),
     )
-    where, progress = Where(workers, dask), Progress(quiet, told)
+    where, progress = Where(workers, dask), Progress(quiet, mre_of)
     names: Sequence[str] = suite or ["rendered"]
     listings = [list_suite(suite_name, data, options) for suite_name in names]
     if analysis:

@@ -68,8 +68,11 @@ def command(main: Callable[[Sequence[str]], int]) -> Callable[..., None]:
             print(f"soup-nlp {shlex.join(words)}", flush=True)
             if not dry:
                 ended[shlex.join(words)] = main(words)
-        if not dry:
-            shutil.copy("out/motorcycle/overview.png", out / "motorcycle.png")
+        if dry:
+            return
+        overview = Path("out/motorcycle/overview.png")
+        if overview.is_file():
+            shutil.copy(overview, out / "motorcycle.png")
         bad = [f"{words}: exit code {code}" for words, code in ended.items() if code]
         print("\n".join(bad) or "every command ended well")
         raise typer.Exit(1 if bad else 0)

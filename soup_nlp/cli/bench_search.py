@@ -9,11 +9,12 @@ from typing import Annotated
 import typer
 
 from soup_nlp.bench.rows import Where
-from soup_nlp.bench.suites import Options, list_suite
+from soup_nlp.bench.suite_pairs import Options
+from soup_nlp.bench.suites import list_suite
 from soup_nlp.bench.tuning import DEFAULT_SPACE, parameter, split
 from soup_nlp.bench.tuning import search as run_search
 from soup_nlp.bench.tuning_report import text_search
-from soup_nlp.cli.bench_accuracy import told
+from soup_nlp.cli.bench_accuracy import mre_of
 from soup_nlp.cli.options import (
     AnyCode,
     Dask,
@@ -74,7 +75,7 @@ def search(
             f" {len(validation)} validate",
             file=sys.stderr,
         )
-    progress = Progress(quiet, told)
+    progress = Progress(quiet, mre_of)
     found = run_search(
         space,
         train,

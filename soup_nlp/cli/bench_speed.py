@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.bench.rows import Row, failed, machine
+from soup_nlp.bench.processes import machine
+from soup_nlp.bench.rows import Row, failed
 from soup_nlp.bench.speed import measure_specs, plan, problem_of
 from soup_nlp.bench.speed_gate import baseline, check, read_baseline
 from soup_nlp.bench.speed_report import plot_energy, plot_growth, plot_phases, report
@@ -77,7 +78,7 @@ def speed(
         if table and gate is None:
             _write(out, rows)
 
-    progress = Progress(quiet, _told)
+    progress = Progress(quiet, _result_of)
     records = measure_specs(specs, out / RECORDS, fresh=fresh, say=progress, after=after)
     if write_baseline is not None:
         text = json.dumps(baseline(records, machine()), indent=1)
@@ -93,7 +94,7 @@ def speed(
     raise typer.Exit(1 if bad else 0)
 
 
-def _told(record: Row) -> str:
+def _result_of(record: Row) -> str:
     """The result of a run in a few words."""
     text = (
         f"{record['status']}, {record['cpu']['nlp']:.1f} CPU s, {record['iterations']}"

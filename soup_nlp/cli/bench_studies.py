@@ -9,7 +9,7 @@ import typer
 
 from soup_nlp.bench import study_methods, study_parts, study_refine
 from soup_nlp.bench.rows import Row, failed
-from soup_nlp.bench.suites import RENDERED
+from soup_nlp.bench.suite_pairs import RENDERED
 from soup_nlp.cli.options import Out, Progress, Quiet, Seeds, numbers, words
 
 Size = Annotated[int, typer.Option(help="Superpixels wanted.")]

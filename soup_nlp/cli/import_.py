@@ -43,7 +43,7 @@ def import_(
 
 
 def foreign_verdict(imported: Imported) -> str:
-    """What the solver says, and what is true of it."""
+    """The solver's message, and whether energy and residuals confirm it."""
     s, sol = imported.run.solution, imported.sol
     word = "verified" if s.converged else "not verified" if sol.solved else "no success claimed"
     start = imported.manifest["exact_energy_at_start"]["total"]

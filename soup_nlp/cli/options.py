@@ -15,7 +15,7 @@ from soup_nlp.bench.tables import reason
 from soup_nlp.errors import ConfigError
 
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of what is written.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Output folder.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Problem = Annotated[Path, typer.Argument(help="Problem file.")]
 Presolve = Annotated[
@@ -75,10 +75,7 @@ def words(text: str, option: str, known: list[str]) -> list[str]:
     wrong = [name for name in names if name not in known]
     if wrong or not names:
         raise ConfigError(
-            "unknown name",
-            where=option,
-            found=", ".join(wrong) or text,
-            expected=", ".join(known),
+            "unknown name", where=option, found=", ".join(wrong) or text, expected=", ".join(known)
         )
     return names
 
@@ -88,14 +85,14 @@ class Progress:
 
     Args:
         quiet: Print nothing.
-        told: The result of a row that did not fail, in a few words.
+        result_of: The result of a row that did not fail, in a few words.
 
     Attributes:
         failed: Number of new rows that failed; a stored row never did.
     """
 
-    def __init__(self, quiet: bool, told: Callable[[Row], str] = lambda row: "done") -> None:
-        self.quiet, self.told = quiet, told
+    def __init__(self, quiet: bool, result_of: Callable[[Row], str] = lambda row: "done") -> None:
+        self.quiet, self.result_of = quiet, result_of
         self.live = sys.stderr.isatty()
         self.spent: list[float] = []
         self.failed = 0
@@ -107,7 +104,7 @@ class Progress:
             return
         self.spent.append(float(row.get("seconds") or 0.0))
         left = sum(self.spent) / len(self.spent) * (total - done)
-        result = f"failed: {reason(row)}" if failed(row) else self.told(row)
+        result = f"failed: {reason(row)}" if failed(row) else self.result_of(row)
         line = f"{done}/{total}  {row['key']}  {result}  {self.spent[-1]:.0f} s"
         if total > done:
             line += f"  (about {left:.0f} s of work left)"

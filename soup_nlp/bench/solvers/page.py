@@ -17,8 +17,8 @@ FEASIBLE = 1e-5
 LIMITS = (
     "Times are wall times of one run each, set-up included, on the machine named; where it was "
     "shared with other work, CPU seconds stand beside them.",
-    "From the presolve's answer little is left to do: energies hardly move, what is compared is "
-    "how quickly a solver proves a point that is almost optimal. From the proposal it is harder.",
+    "The presolve's answer is almost optimal: energies hardly move, and the comparison is of how "
+    "quickly a solver proves it. From the proposal it is harder.",
     "Local solvers end in local minima: an energy says where this start led, not what is best.",
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
     "Solvers run with the options in `soup_nlp/bench/solvers/plugins.py`, the package's own ones "

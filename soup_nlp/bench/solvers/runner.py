@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.bench.rows import Job, Row, isolated, measure_all, processor, read_rows
+from soup_nlp.bench.processes import isolated, processor
+from soup_nlp.bench.rows import Job, Row, measure_all, read_rows
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import Answer, Task, Trace
 from soup_nlp.export.artefact import form_label

@@ -30,7 +30,7 @@ class Task:
         gauss_newton: The same NLP with the Gauss-Newton Hessian.
         layout: Of both.
         soup: Start.
-        data, weights, form: Of the energy (for yardsticks that take no NLP).
+        data, weights, form: Of the energy (for reference solvers, which take no NLP).
         limits: Time, iterations, tolerance, memory.
         folder: Scratch folder of this run.
     """
@@ -48,12 +48,12 @@ class Task:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a solver says.
+    """The answer of a solver.
 
     Attributes:
         x: (nx,) point, or None where it returned none.
         lam_g: (ng,) multipliers, or None.
-        status: The solver's words.
+        status: In the words of the solver.
         claimed: It claims an optimum.
         iterations: Outer iterations, -1 where it does not say.
         seconds: Wall time of set-up and solve.

@@ -1,0 +1,191 @@
+"""Functions in processes of their own, with limits, and the machine that they run on."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import platform
+import resource
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from soup_nlp.bench.rows import Row, attempt, failure
+from soup_nlp.errors import SolverError, SoupError
+from soup_nlp.storage.versions import code_version, versions
+
+GRACE = 5.0
+"""Seconds beyond its time limit before a process is killed."""
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a process ended.
+
+    Attributes:
+        how: "returned", "raised", "killed: time", "killed: memory" or "crashed: SIGNAL".
+        value: What the function returned, or its exception in one line.
+        seconds: Wall time of the process.
+        cpu_seconds: CPU time of it and its children.
+        peak_bytes: Largest resident size of it or a child; 0 where it could not say.
+    """
+
+    how: str
+    value: Any
+    seconds: float
+    cpu_seconds: float
+    peak_bytes: int
+
+
+def isolated(
+    work: Callable[[], Any],
+    folder: Path,
+    seconds: float,
+    memory: int | None = None,
+    *,
+    fresh: bool = False,
+) -> Ended:
+    """Call a function in a process of its own; a crash is an answer as well.
+
+    Args:
+        work: Takes nothing; its value must pickle.
+        folder: For the value and the output; must exist.
+        seconds: Wall time limit.
+        memory: Bytes that a forked process may have more than this one has now; None for no limit.
+        fresh: Start a new interpreter, so that the peak memory is that of the work alone; the work
+            must pickle. Else the process is forked and sees everything of this one.
+
+    Raises:
+        SolverError: the system cannot fork.
+    """
+    method = "spawn" if fresh else "fork"
+    if method not in multiprocessing.get_all_start_methods():
+        raise SolverError(
+            "comparing needs a system that forks processes", found=sys.platform, expected="POSIX"
+        )
+    target = folder / "value.pickle"
+    target.unlink(missing_ok=True)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    begin = time.perf_counter()
+    context: Any = multiprocessing.get_context(method)
+    process = context.Process(target=_child, args=(work, target, memory))
+    process.start()
+    process.join(seconds + GRACE)
+    late = process.is_alive()
+    if late:
+        process.kill()
+        process.join()
+    spent = time.perf_counter() - begin
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    code = process.exitcode or 0
+    process.close()
+    try:
+        how, value, peak = pickle.loads(target.read_bytes())
+    except (OSError, EOFError, pickle.UnpicklingError):
+        how, value, peak = "crashed: no answer", None, 0
+        if late:
+            how = "killed: time"
+        elif code < 0:
+            how = f"crashed: {signal.Signals(-code).name}"
+        elif code:
+            how = f"crashed: exit code {code}"
+    return Ended(how, value, spent, cpu, peak)
+
+
+def alone(work: Callable[[], Row], folder: Path, seconds: float = 7200.0) -> Row:
+    """The row of `attempt(work)` in a new interpreter with one thread.
+
+    "peak_bytes" is the largest resident size of the process, unless the work says it itself.
+    """
+    kept = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        ended = isolated(partial(attempt, work), folder, seconds, fresh=True)
+    finally:
+        for name, value in kept.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+    if ended.how == "returned":
+        return {"peak_bytes": ended.peak_bytes, **ended.value}
+    late = ended.how == "killed: time"
+    return failure(f"no answer after {seconds:g} s" if late else f"{ended.how} {ended.value}")
+
+
+def _child(work: Callable[[], Any], target: Path, memory: int | None) -> None:
+    # what the work prints belongs beside its files
+    with target.with_name("output.log").open("wb") as log:
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+    if memory is not None:
+        limit = _virtual_bytes() + memory
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    # a Ctrl-C belongs to the parent, which ends this process
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        answer = ("returned", work())
+    except MemoryError:
+        answer = ("killed: memory", None)
+    except BaseException as error:
+        memory_gone = "bad_alloc" in str(error)
+        answer = ("killed: memory", None) if memory_gone else ("raised", _reason(error))
+    peak = max(
+        resource.getrusage(who).ru_maxrss
+        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    part = target.with_suffix(".part")
+    part.write_bytes(pickle.dumps((*answer, peak * 1024)))
+    part.rename(target)
+
+
+def _reason(error: BaseException) -> str:
+    """An exception in one line."""
+    if isinstance(error, SoupError):
+        found = "" if error.found is None else f", found {error.found}"
+        return f"{type(error).__name__}: {error.what}{found}"
+    # the last line of a library's message is its cause
+    text = "".join(traceback.format_exception_only(error)).strip().splitlines()
+    return text[-1] if text else type(error).__name__
+
+
+def _virtual_bytes() -> int:
+    """Address space of this process now; 0 where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+    except (OSError, ValueError):
+        return 0
+    return pages * resource.getpagesize()
+
+
+def processor() -> str:
+    """Name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(x.partition(":")[2].strip() for x in lines if x.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def machine() -> dict[str, str]:
+    """Processor, cores, memory, system and versions, as text."""
+    memory = 0.0
+    if "SC_PHYS_PAGES" in os.sysconf_names:
+        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
+    return {
+        "processor": processor(),
+        "cores": str(os.cpu_count()),
+        "memory": f"{memory:.0f} GB" if memory else "unknown",
+        "system": f"{platform.system()} {platform.machine()}",
+        **versions(),
+        "code": code_version(),
+    }
