@@ -9,11 +9,12 @@ import pytest
 from helpers_model import Tiny, random_soup, weights_for
 
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.refine.costs import PairCosts, Particles, anchor_depth, feasible, unary_costs
 from soup_nlp.refine.mppbp import length_slope
-from soup_nlp.refine.select import conditional_costs, diverse, upright, within_reach
+from soup_nlp.refine.select import conditional_costs, diverse, within_reach
 
 
 def cloud(tiny: Tiny, labels: int, seed: int = 3, spread: float = 1.0) -> Particles:
@@ -214,7 +215,7 @@ def test_planes_that_turn_away_are_tilted_about_their_anchor():
     n[4] = steep / np.linalg.norm(steep)
     broken = Soup(soup.lam, n, soup.d, soup.R, soup.t)
     assert not feasible(Particles.of(broken), rays, 1e-3)[4, 0]
-    good = upright(broken, data.anchor_ray, rays, 1e-3)
+    good = tilt_to_camera(broken, data.anchor_ray, rays, 1e-3)
     assert feasible(Particles.of(good), rays, 1e-3).all()
     before, after = broken.depth_at(data.anchor_ray), good.depth_at(data.anchor_ray)
     assert before[4] > 0
