@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -208,5 +206,5 @@ def test_objective_is_e_without_images_and_its_parts_add_up(two):
     own = objective(two.truth, data, w, photo)
     assert own["photo"] == pytest.approx(photo.energy(two.truth))
     assert own["total"] == pytest.approx(sum(v for k, v in own.items() if k != "total"))
-    weak = oracle.energy(two.truth, data, replace(w, proj=0.6, sigma_proj=2.0))
+    weak = oracle.energy(two.truth, data, w.replace(proj=0.6, sigma_proj=2.0))
     assert own["proj"] == pytest.approx(weak["proj"])

@@ -307,7 +307,7 @@ def test_an_interrupt_within_a_round_ends_the_refinement():
             raise KeyboardInterrupt
 
     # no round ends by its gap before the second iteration
-    o, stop = FEW.replace(trws_gap=0.0), threading.Event()
+    o, stop = FEW.replace(trws_gap=-1.0), threading.Event()
     done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, stop=stop, listener=listener)
     assert done.status == "interrupted"
     assert len(heard) == 2
@@ -318,7 +318,7 @@ def test_an_interrupt_within_a_round_ends_the_refinement():
 
 def test_a_time_limit_within_a_round_is_no_interruption():
     tiny = Tiny("pixels", samples=6)
-    o = FEW.replace(trws_gap=0.0, max_seconds=0.5)
+    o = FEW.replace(trws_gap=-1.0, max_seconds=0.5)
 
     def listener(progress: object) -> None:
         time.sleep(0.55)

@@ -9,7 +9,15 @@ from typing import Annotated
 from pydantic import Field
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.schema.section import Count, NonNegative, Section, Tolerance, Truncation, Whole
+from soup_nlp.schema.section import (
+    Count,
+    Finite,
+    NonNegative,
+    Section,
+    Tolerance,
+    Truncation,
+    Whole,
+)
 
 
 class RefineOptions(Section):
@@ -30,8 +38,8 @@ class RefineOptions(Section):
     at least their lower quartile over this squared."""
     trws_iterations: Whole = 15
     """Most iterations of TRW-S in a round."""
-    trws_gap: NonNegative = 1e-4
-    """TRW-S stops at this relative gap."""
+    trws_gap: Finite = 1e-4
+    """TRW-S stops at this relative gap; negative: never."""
     stagnation: NonNegative = 1e-3
     """End when two rounds in a row lower E by less than this share; 0 never."""
     photo: NonNegative = 10.0
