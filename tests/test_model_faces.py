@@ -37,7 +37,7 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp
 UNITS = ("paper", "pixels")
 NORMS = ("smooth", "epigraph")
 TRUNCATIONS = ("smooth", "lifted")
-EXACT = {"arap": 1e-11, "proj": 1e-12, "cont": 1e-12, "orient": 1e-12}
+EXACT = {"arap": 1e-11, "proj": 1e-12, "cont": 1e-12, "orient": 1e-12, "prior": 1e-12}
 """Relative. The kernel takes distances of anchors as sqrt(|v|^2 + 1e-12): 2e-12 of E_arap."""
 EVERY = list(itertools.product(GAUGES, NORMS, TRUNCATIONS, UNITS, (False, True)))
 

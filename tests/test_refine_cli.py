@@ -26,7 +26,7 @@ SMALL = [
     "--set", "flow.source=truth", "--set", "refine.rounds=3", "--set", "refine.particles=20",
     "--set", "refine.stagnation=0",
 ]  # fmt: skip
-TERMS = ("total", "arap", "proj", "cont", "orient")
+TERMS = ("total", "arap", "proj", "cont", "orient", "prior")
 
 
 def solve(folder: Path, *options: str) -> tuple[int, dict]:

@@ -14,7 +14,7 @@ from soup_nlp.geometry.graph import Segmentation
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-TERMS = ("arap", "proj", "cont", "orient")
+TERMS = ("arap", "proj", "cont", "orient", "prior")
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,9 @@ class EnergyData:
         edges: (E, 2) K-NN edges i < k.
         edge_weight: (E,) w1 = w2, both directions folded.
         edge_unit: (E,) length unit of the edge (1: the mean plane distance).
+        prior_weight: (E,) weight of E_prior: 1 / K for each direction of the edge, so that it is
+            the mean over the neighbours of a superpixel, times the flow's noise in pixels where
+            that is known.
         rotation_scale: Factor of |R_i - R_k| (1 in the paper's units, focal in pixel units).
         pairs: (P, 2) neighbours i < k.
         boundary_ray: (P, B, 3) sampled shared boundary points.
@@ -57,6 +60,7 @@ class EnergyData:
     edges: Int
     edge_weight: Float
     edge_unit: Float
+    prior_weight: Float
     rotation_scale: float
     pairs: Int
     boundary_ray: Float
@@ -162,6 +166,7 @@ def build_energy_data(
         edges=seg.edges,
         edge_weight=seg.edge_weight,
         edge_unit=np.ones(len(seg.edges)),
+        prior_weight=seg.edge_multiplicity / max(1, seg.knn.shape[1]),
         rotation_scale=1.0,
         pairs=seg.pairs,
         boundary_ray=rays(K_ref, seg.boundary),

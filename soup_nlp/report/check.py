@@ -18,7 +18,7 @@ from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.storage.store import read_attrs, read_h5, require
 
 Entries: TypeAlias = Mapping[str, Any]
-TERMS = ("arap", "proj", "cont", "orient")
+TERMS = ("arap", "proj", "cont", "orient", "prior")
 LIMITS = {
     "so3": 1e-8,
     "normal": 1e-8,
