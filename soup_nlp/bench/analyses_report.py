@@ -41,7 +41,7 @@ FLOW_ERRORS = {
     "used": "used",
 }
 
-COLOURS = {"arap": "#4477aa", "proj": "#66ccee", "cont": "#228833", "orient": "#ccbb44"}
+COLOURS = dict(zip(TERMS, ("#4477aa", "#66ccee", "#228833", "#ccbb44", "#aa3377")))
 
 
 def _variants(rows: Sequence[Row]) -> list[str]:
