@@ -10,7 +10,7 @@ f does not fall.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -125,11 +125,6 @@ class _Descent:
         self.x = problem.project(problem.nlp.x0)
         self.damping, self.growth = FIRST_DAMPING, 2.0
 
-    @property
-    def soup(self) -> Soup:
-        """The iterate."""
-        return self.problem.layout.unpack(self.x)
-
     def smoothing(self, eps: float) -> None:
         """Go on with other smoothing widths."""
         self.problem.smoothing(eps)
@@ -170,35 +165,36 @@ class _Descent:
         self.H = self.problem.normal_matrix(x)
 
 
-class _Record:
-    """Clocks that stand still while exact energies are taken, and the best soup."""
-
-    def __init__(self, data: EnergyData, weights: Weights) -> None:
-        self.data, self.weights = data, weights
-        self.wall, self.cpu = time.perf_counter(), time.process_time()
-        self.history: list[tuple[float, float]] = []
-        self.best: tuple[Mapping[str, float], Soup] | None = None
-
-    def seconds(self) -> float:
-        """Wall time so far."""
-        return time.perf_counter() - self.wall
-
-    def note(self, soup: Soup) -> None:
-        """Take the exact energy of an iterate."""
-        wall, cpu = time.perf_counter(), time.process_time()
-        energy = oracle.energy(soup, self.data, self.weights)
-        self.history.append((wall - self.wall, energy["total"]))
-        if self.best is None or energy["total"] < self.best[0]["total"]:
-            self.best = energy, soup
-        self.wall += time.perf_counter() - wall
-        self.cpu += time.process_time() - cpu
-
-    def finish(self, iterations: int, status: str) -> ReferenceSolve:
-        """The record that is returned."""
-        assert self.best is not None
-        energy, soup = self.best
-        spent = self.seconds(), time.process_time() - self.cpu
-        return ReferenceSolve(soup, energy, iterations, *spent, np.array(self.history), status)
+def _descend(
+    descent: _Descent,
+    eps: Sequence[float],
+    iterations: int,
+    end: float,
+    note: Callable[[], None],
+) -> tuple[int, str]:
+    """Every smoothing width in turn until the time `end`; number of steps and status."""
+    count, status = 0, "Converged"
+    for width in eps:
+        last = width == eps[-1]
+        descent.smoothing(width)
+        steps = small = 0
+        while small < 2:
+            if time.perf_counter() > end:
+                return count, "Time_Limit"
+            if steps == iterations:
+                status = "Iteration_Limit" if last else status
+                break
+            steps, count = steps + 1, count + 1
+            fall = descent.step()
+            if fall is not None:
+                small = small + 1 if fall <= (TOLERANCE if last else STAGNATION) else 0
+                note()
+            elif descent.damping > MOST_DAMPING:
+                # no descent at any length: the point is as good as this eps makes it
+                small = 2
+        else:
+            descent.relax()
+    return count, status
 
 
 def levenberg_marquardt(
@@ -226,28 +222,18 @@ def levenberg_marquardt(
         iterations: Limit of steps for every eps.
         seconds: Time limit.
     """
-    record = _Record(data, weights)
+    wall, cpu = time.perf_counter(), time.process_time()
     descent = _Descent(Tangent(start, data, weights, form))
-    record.note(descent.soup)
-    count, status = 0, "Converged"
-    for width in eps:
-        last = width == eps[-1]
-        descent.smoothing(width)
-        steps = small = 0
-        while small < 2:
-            if record.seconds() > seconds:
-                return record.finish(count, "Time_Limit")
-            if steps == iterations:
-                status = "Iteration_Limit" if last else status
-                break
-            steps, count = steps + 1, count + 1
-            fall = descent.step()
-            if fall is not None:
-                small = small + 1 if fall <= (TOLERANCE if last else STAGNATION) else 0
-                record.note(descent.soup)
-            elif descent.damping > MOST_DAMPING:
-                # no descent at any length: the point is as good as this eps makes it
-                small = 2
-        else:
-            descent.relax()
-    return record.finish(count, status)
+    path = [(time.perf_counter() - wall, descent.x)]
+
+    def note() -> None:
+        path.append((time.perf_counter() - wall, descent.x))
+
+    count, status = _descend(descent, eps, iterations, wall + seconds, note)
+    spent = time.perf_counter() - wall, time.process_time() - cpu
+    # exact energies only now, so that the times exclude them
+    soups = [descent.problem.layout.unpack(x) for _, x in path]
+    energies = [oracle.energy(soup, data, weights) for soup in soups]
+    history = np.array([(t, energy["total"]) for (t, _), energy in zip(path, energies)])
+    best = int(history[:, 1].argmin())
+    return ReferenceSolve(soups[best], energies[best], count, *spent, history, status)
