@@ -15,10 +15,9 @@ import pytest
 from soup_nlp.bench.accuracy import head, input_hash, moving, pair_job, settings_hash
 from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.depth_maps import METHODS
-from soup_nlp.bench.rows import Job, Row, Where, append_row, attempt, measure_all, read_rows
+from soup_nlp.bench.rows import Job, Row, append_row, attempt, measure_all, read_rows
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import SUITES
-from soup_nlp.cli import bench_accuracy
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Pair, Truth
@@ -227,40 +226,13 @@ def test_parallel_processes_and_one_that_dies(tmp_path):
     os.environ["PYTHONPATH"] = os.pathsep.join(
         [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
     )
-    rows = measure_all(fake_jobs(), tmp_path / "a.jsonl", Where(workers=2))
+    rows = measure_all(fake_jobs(), tmp_path / "a.jsonl", workers=2)
     assert [r["key"] for r in rows] == ["orbit", "street", "sheet", "room"]
     assert [r["ok"] for r in rows] == [True, True, False, True]
-    rows = measure_all(fake_jobs(dies=True), tmp_path / "b.jsonl", Where(workers=2))
+    rows = measure_all(fake_jobs(dies=True), tmp_path / "b.jsonl", workers=2)
     assert [r["ok"] for r in rows] == [True, True, False, False]
     assert "process died" in rows[3]["error"]
     assert read_rows(tmp_path / "b.jsonl")
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_a_local_dask_cluster(tmp_path):
-    distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra dask)")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
-    ) as cluster:
-        address = cluster.scheduler_address
-        rows = measure_all(fake_jobs(), tmp_path / "rows.jsonl", Where(dask=address))
-    assert [r["ok"] for r in rows] == [True, True, False, True]
-    assert len(read_rows(tmp_path / "rows.jsonl")) == 4
-
-
-def test_result_folders_are_the_same_for_workers_elsewhere(tmp_path, monkeypatch):
-    asked: list[Path | None] = []
-
-    def stored(jobs, *_, **__):
-        asked.extend(job.work.args[0].keywords["folder"] for job in jobs)
-        return []
-
-    monkeypatch.setattr(bench_accuracy, "measure_all", stored)
-    monkeypatch.chdir(tmp_path)
-    words = ["bench", "accuracy", "--suite", "rendered", "--only", "orbit", "--flow", "truth"]
-    assert main([*words, "-q", "--folders", "runs", "--out", "."]) == 0
-    (folder,) = asked
-    assert folder.is_relative_to(tmp_path / "runs")
 
 
 def test_command_line(tmp_path, capsys):

@@ -31,8 +31,11 @@ from soup_nlp.bench.tables import reason
 from soup_nlp.bench.tuning import (
     DEFAULT_SPACE,
     FAILED,
+    Found,
     Parameter,
     Trial,
+    accepted,
+    leave_one_family_out,
     loss,
     parameter,
     search,
@@ -187,6 +190,33 @@ def test_loss_charges_failures_and_a_minimum_far_from_the_truth():
     worse = fake(items(0)[0], ("segmentation.neighbours=400",))
     assert plain < loss(worse) <= FAILED
     assert Trial("t", (), np.zeros(1)).loss == math.inf
+
+
+def test_one_family_at_a_time_has_no_part_in_the_choice():
+    def trial(name: str, **mre: float) -> Trial:
+        rows = [
+            {**fake(Item("s", family, family, "dis", {})), "sequence": family} for family in mre
+        ]
+        for row, value in zip(rows, mre.values(), strict=True):
+            row["metrics"]["paper"]["solution"]["mre"] = value
+        return Trial(name, (), np.zeros(2), tuple(rows))
+
+    default = trial("t000", a=0.1, b=0.1, c=0.1)
+    narrow, wide = trial("t001", a=0.2, b=0.02, c=0.02), trial("t002", a=0.08, b=0.09, c=0.104)
+    left_out = leave_one_family_out([default, narrow, wide])
+    assert [(f.family, f.trial) for f in left_out] == [("a", "t001"), ("b", "t001"), ("c", "t001")]
+    assert [f.change for f in left_out] == pytest.approx([1.0, -0.8, -0.8])
+    # the families gain together, but one of them loses more than 5 %
+    assert not accepted(left_out)
+    alone = leave_one_family_out([default, wide])
+    assert [f.change for f in alone] == pytest.approx([-0.2, -0.1, 0.04])
+    assert accepted(alone)
+    assert not accepted(leave_one_family_out([default, default]))
+    assert leave_one_family_out([trial("t000", a=0.1)]) == ()
+    text = text_search(Found(SPACE, (default, narrow, wide), ()), "x")
+    assert "| a | t001 | +100.0% |" in text
+    assert "the worst +100.0%" in text
+    assert "not met" in text
 
 
 def test_split_keeps_scenes_apart():

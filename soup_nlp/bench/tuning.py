@@ -1,9 +1,9 @@
 """Search for defaults: what is varied in which range, scored how, on which pairs; repeatable.
 
 Trial 0 is the default. The first trials fill the ranges evenly (scrambled Sobol sequence), the
-others vary the best so far with a radius that shrinks. The best few are then scored on pairs that
-had no part in the choice. The same seed, pairs and code give the same trials, and rows that are
-already measured are not measured again, so a stopped search goes on.
+others vary the best so far with a radius that shrinks. Two checks follow: one family of pairs at a
+time is left out of the choice, and the best trials are scored on pairs that had no part in it. The
+same seed, pairs and code give the same trials, and an interrupted search can be continued.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
-from soup_nlp.bench.rows import Row, Say, Where, measure_all
+from soup_nlp.bench.rows import Row, Say, measure_all
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import energy_ratio, main_metric
 from soup_nlp.errors import ConfigError
@@ -27,12 +27,12 @@ Float = NDArray[np.float64]
 
 FAILED = math.log(3.0)
 """Loss of a pair that failed: as if it were three times worse than a constant depth."""
-
 LEAST = 2e-3
 """MRE below which a pair is not worth more."""
-
 ABOVE = 1.10
 """E(truth) / E(solution) up to which nothing is charged."""
+LOSS_ALLOWED = 0.05
+"""Share by which the MRE of a family that was left out may grow."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,6 @@ class Parameter:
     key: str
     kind: str
     values: tuple[str, ...]
-
-    def __str__(self) -> str:
-        if self.kind == "choice":
-            return f"{self.key} in {{{', '.join(self.values)}}}"
-        return f"{self.key} in [{self.values[0]}, {self.values[1]}], {self.kind}"
 
     def at(self, x: float) -> str:
         """The value at a share x of the range, in [0, 1], as YAML."""
@@ -80,16 +75,15 @@ def parameter(text: str) -> Parameter:
     """
     key, _, rest = text.partition("=")
     kind, *values = rest.split(":")
-    good = bool(key) and kind in ("log", "linear", "int", "choice")
-    if good and kind == "choice":
-        good = len(values) >= 2
-    elif good:
-        try:
+    try:
+        if kind == "choice":
+            good = len(values) >= 2
+        else:
             low, high = (float(v) for v in values)
-            good = low < high and (kind != "log" or low > 0)
-        except ValueError:
-            good = False
-    if not good:
+            good = kind in ("linear", "int", "log") and low < high and (kind != "log" or low > 0)
+    except ValueError:
+        good = False
+    if not good or not key:
         raise ConfigError(
             "not a parameter to search",
             where="--param",
@@ -142,23 +136,67 @@ class Trial:
         return float(np.mean([loss(r) for r in self.rows])) if self.rows else math.inf
 
 
-def loss(row: Row) -> float:
-    """How bad a pair is: ln(MRE / MRE of a constant depth), and what the energy prefers to truth.
+def error(row: Row) -> float:
+    """ln(MRE / MRE of a constant depth); at most `FAILED`, which a pair that failed has.
 
-    The logarithm makes a pair that is twice as good count the same on easy and hard pairs. Where
-    the truth has a soup, ln of E(truth) / E(solution) beyond 1.1 is added: a minimum far from the
-    truth is a wrong model even where this start happens to end well.
+    The logarithm makes a pair that is twice as good count the same on easy and hard pairs.
     """
-    if not row.get("ok"):
-        return FAILED
     own, constant = main_metric(row), main_metric(row, method="constant")
     if own is None or constant is None:
         return FAILED
-    value = min(math.log(max(own, LEAST) / max(constant, LEAST)), FAILED)
-    ratio = energy_ratio(row)
-    if ratio is not None and ratio > ABOVE:
-        value += math.log(ratio / ABOVE)
-    return value
+    return min(math.log(max(own, LEAST) / max(constant, LEAST)), FAILED)
+
+
+def loss(row: Row) -> float:
+    """How bad a pair is: its `error`, and what the energy prefers to the truth.
+
+    Where the truth has a soup, ln of E(truth) / E(solution) beyond 1.1 is added: a minimum far
+    from the truth is a wrong model even where this start happens to end well.
+    """
+    if main_metric(row) is None:
+        return FAILED
+    return error(row) + max(0.0, math.log((energy_ratio(row) or 1.0) / ABOVE))
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A family of pairs that had no part in the choice of a trial.
+
+    Attributes:
+        family: Its name (the sequence of its rows).
+        trial: The best trial on all other families.
+        change: Relative change of the family's MRE (geometric mean) from the default to the trial.
+    """
+
+    family: str
+    trial: str
+    change: float
+
+
+def leave_one_family_out(trials: Sequence[Trial]) -> tuple[LeftOut, ...]:
+    """For every family, what the best trial on the others changes there; () for one family.
+
+    Args:
+        trials: The default first; all with rows of the same pairs.
+    """
+    families = dict.fromkeys(r["sequence"] for r in trials[0].rows)
+    out = []
+    for family in families if len(families) > 1 else ():
+        chosen = min(
+            trials, key=lambda t: np.mean([loss(r) for r in t.rows if r["sequence"] != family])
+        )
+        before, after = (
+            np.mean([error(r) for r in t.rows if r["sequence"] == family])
+            for t in (trials[0], chosen)
+        )
+        out.append(LeftOut(family, chosen.name, float(np.expm1(after - before))))
+    return tuple(out)
+
+
+def accepted(left_out: Sequence[LeftOut]) -> bool:
+    """Whether left-out families gain together and none loses more than `LOSS_ALLOWED`."""
+    changes = [f.change for f in left_out]
+    return bool(changes) and np.log1p(changes).sum() < 0 and max(changes) <= LOSS_ALLOWED
 
 
 @dataclass(frozen=True)
@@ -191,7 +229,7 @@ def search(
     finalists: int = 3,
     seed: int = 0,
     overrides: tuple[str, ...] = (),
-    where: Where | None = None,
+    workers: int = 1,
     say: Say | None = None,
     any_code: bool = False,
     measure: Measure = measure_pair,
@@ -207,7 +245,7 @@ def search(
         finalists: So many of the best are validated, and the default.
         seed: Of the trials.
         overrides: Of every problem; trials come after them.
-        where: Processes or cluster.
+        workers: Processes.
         say: Progress.
         any_code: Also take stored rows of other code versions.
         measure: Makes the row of a pair.
@@ -223,7 +261,7 @@ def search(
     def scored(trial: Trial, items: Sequence[Item]) -> Trial:
         whole = (*overrides, *trial.overrides)
         jobs = [pair_job(i, whole, trial.name, measure=measure) for i in items]
-        rows = measure_all(jobs, path, where, say=say, any_code=any_code)
+        rows = measure_all(jobs, path, workers, say=say, any_code=any_code)
         return Trial(trial.name, trial.overrides, trial.unit, tuple(rows))
 
     first = Trial("t000", (), np.full(len(space), np.nan))

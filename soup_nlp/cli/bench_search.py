@@ -8,36 +8,21 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.bench.rows import Where
 from soup_nlp.bench.suite_pairs import Options
 from soup_nlp.bench.suites import list_suite
 from soup_nlp.bench.tuning import DEFAULT_SPACE, parameter, split
 from soup_nlp.bench.tuning import search as run_search
 from soup_nlp.bench.tuning_report import text_search
+from soup_nlp.cli import options
 from soup_nlp.cli.bench_accuracy import mre_of
-from soup_nlp.cli.options import (
-    AnyCode,
-    Dask,
-    Data,
-    Flow,
-    Only,
-    Out,
-    Progress,
-    Quiet,
-    Seeds,
-    Set,
-    SuiteName,
-    Width,
-    Workers,
-    numbers,
-)
+from soup_nlp.cli.options import Progress, numbers
 from soup_nlp.storage.atomic import write_text
 
 
 def search(
-    suite: SuiteName = None,
-    data: Data = None,
-    out: Out = Path("results/accuracy"),
+    suite: options.SuiteName = None,
+    data: options.Data = None,
+    out: options.Out = Path("results/accuracy"),
     params: Annotated[
         list[str] | None,
         typer.Option("--param", help="KEY=log|linear|int:LOW:HIGH or KEY=choice:A:B instead."),
@@ -45,29 +30,28 @@ def search(
     trials: Annotated[int, typer.Option(help="Configurations beside the default.", min=1)] = 24,
     finalists: Annotated[int, typer.Option(help="Best trials that are validated.", min=1)] = 3,
     seed: Annotated[int, typer.Option(help="Of the trials.", min=0)] = 0,
-    seeds: Seeds = "0,1",
+    seeds: options.Seeds = "0,1",
     validation_seeds: Annotated[
         str, typer.Option(help="Seeds of rendered scenes that only validate.")
     ] = "2,3",
-    overrides: Set = None,
-    flow: Flow = None,
-    width: Width = 512,
-    only: Only = None,
-    workers: Workers = 1,
-    dask: Dask = "",
-    any_code: AnyCode = False,
-    quiet: Quiet = False,
+    overrides: options.Set = None,
+    flow: options.Flow = None,
+    width: options.Width = 512,
+    only: options.Only = None,
+    workers: options.Workers = 1,
+    any_code: options.AnyCode = False,
+    quiet: options.Quiet = False,
 ) -> None:
-    """Search for better defaults on some pairs and check them on others; OUT/search.md, .jsonl."""
+    """Search for better defaults and check them on pairs and families that did not choose."""
     ours, theirs = numbers(seeds, "--seeds"), numbers(validation_seeds, "--validation-seeds")
-    options = Options(
+    whose = Options(
         flows=tuple(flow) if flow else None,
         width=width,
         seeds=tuple(dict.fromkeys((*ours, *theirs))),
         only=tuple(only or ()),
     )
     space = tuple(parameter(p) for p in params) if params else DEFAULT_SPACE
-    items = [i for name in suite or ["rendered"] for i in list_suite(name, data, options).items]
+    items = [i for name in suite or ["rendered"] for i in list_suite(name, data, whose).items]
     train, validation = split(items, ours, theirs)
     if not quiet:
         print(
@@ -85,7 +69,7 @@ def search(
         finalists=finalists,
         seed=seed,
         overrides=tuple(overrides or ()),
-        where=Where(workers, dask),
+        workers=workers,
         say=progress,
         any_code=any_code,
     )
