@@ -11,7 +11,7 @@ from types import MappingProxyType
 from soup_nlp.bench import analyses_report as reports
 from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
 from soup_nlp.bench.analyses_measures import VIEWS, measure_energy, measure_flow, measure_view
-from soup_nlp.bench.rows import Row, Say, measure_all
+from soup_nlp.bench.rows import MeasureRows, Row, measure_all
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import Listing
 from soup_nlp.errors import ConfigError
@@ -155,12 +155,10 @@ def run_analysis(
     listings: Sequence[Listing],
     out: Path,
     overrides: Overrides = (),
-    workers: int = 1,
+    measure_rows: MeasureRows = measure_all,
     *,
     values: Sequence[str] | None = None,
     presets: Sequence[str] = (),
-    say: Say | None = None,
-    any_code: bool = False,
 ) -> Path:
     """Measure every variant on every pair and write OUT/NAME.md, .png and .jsonl.
 
@@ -169,11 +167,9 @@ def run_analysis(
         listings: Pairs.
         out: Folder.
         overrides: Of every problem; a variant's own come after them.
-        workers: Processes.
+        measure_rows: Measures the jobs; `measure_all` with its options.
         values: Only these variants; of a numeric analysis other values as well.
         presets: Metric conventions instead of the suites' own, the main one first.
-        say: Progress.
-        any_code: Also take stored rows of other code versions.
 
     Returns:
         The table's file.
@@ -193,7 +189,7 @@ def run_analysis(
         for item in items
         for variant, own in analysis.variants.items()
     ]
-    rows = measure_all(jobs, out / f"{name}.jsonl", workers, say=say, any_code=any_code)
+    rows = measure_rows(jobs, out / f"{name}.jsonl")
     note = f"Overrides of every pair: {', '.join(f'`{o}`' for o in overrides) or 'none'}."
     page, picture = out / f"{name}.md", out / f"{name}.png"
     write_text(page, analysis.page(name, analysis.text, rows, note))

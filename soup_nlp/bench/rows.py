@@ -38,6 +38,10 @@ class Job:
     stale: bool = False
 
 
+MeasureRows = Callable[[Sequence[Job], Path], list[Row]]
+"""`measure_all` with its options."""
+
+
 def failed(row: Mapping[str, Any]) -> bool:
     """Whether a row has an error instead of numbers."""
     return bool(row.get("error"))

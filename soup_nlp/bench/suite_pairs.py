@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.datasets.sintel import DEFAULT_SCENE
@@ -81,17 +81,10 @@ class Options:
     only: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One pair of a suite.
+class Entry(NamedTuple):
+    """One pair of a suite, as in `Item`, and whether its true flow may be solved with.
 
-    Attributes:
-        sequence: What it is averaged with first.
-        name: Unique in its suite.
-        input: The section `input` of its problem.
-        needs: Files that must be there.
-        true_flow: Its true flow may be solved with.
-        presets: Metric conventions instead of the suite's; empty for those.
+    Without `presets` it is scored under the suite's.
     """
 
     sequence: str

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
-from soup_nlp.bench.rows import Row, Say, measure_all
+from soup_nlp.bench.rows import MeasureRows, Row, measure_all
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import energy_ratio, main_metric
 from soup_nlp.errors import ConfigError
@@ -229,9 +229,7 @@ def search(
     finalists: int = 3,
     seed: int = 0,
     overrides: tuple[str, ...] = (),
-    workers: int = 1,
-    say: Say | None = None,
-    any_code: bool = False,
+    measure_rows: MeasureRows = measure_all,
     measure: Measure = measure_pair,
 ) -> Found:
     """Search and validate.
@@ -245,9 +243,7 @@ def search(
         finalists: So many of the best are validated, and the default.
         seed: Of the trials.
         overrides: Of every problem; trials come after them.
-        workers: Processes.
-        say: Progress.
-        any_code: Also take stored rows of other code versions.
+        measure_rows: Measures the jobs; `measure_all` with its options.
         measure: Makes the row of a pair.
 
     Raises:
@@ -261,8 +257,7 @@ def search(
     def scored(trial: Trial, items: Sequence[Item]) -> Trial:
         whole = (*overrides, *trial.overrides)
         jobs = [pair_job(i, whole, trial.name, measure=measure) for i in items]
-        rows = measure_all(jobs, path, workers, say=say, any_code=any_code)
-        return Trial(trial.name, trial.overrides, trial.unit, tuple(rows))
+        return replace(trial, rows=tuple(measure_rows(jobs, path)))
 
     first = Trial("t000", (), np.full(len(space), np.nan))
     done = [scored(first, train)]
@@ -316,12 +311,12 @@ def split(
     All flows of a pair are on one side.
     """
     real = sorted({i.name for i in items if "seed" not in i.input})
-    odd = set(real[1::2])
-
-    def among(item: Item, own_seeds: Sequence[int], names: set[str]) -> bool:
+    train: list[Item] = []
+    validation: list[Item] = []
+    for item in items:
         seed = item.input.get("seed")
-        return item.name in names if seed is None else seed in own_seeds
-
-    train_seeds = [s for s in seeds if s not in validation_seeds]
-    train = [i for i in items if among(i, train_seeds, set(real) - odd)]
-    return train, [i for i in items if among(i, validation_seeds, odd)]
+        if seed in validation_seeds or (seed is None and real.index(item.name) % 2):
+            validation.append(item)
+        elif seed is None or seed in seeds:
+            train.append(item)
+    return train, validation

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -74,6 +75,7 @@ def accuracy(
         only=tuple(only or ()),
     )
     progress, changes = Progress(quiet, mre_of), tuple(overrides or ())
+    measure_rows = partial(measure_all, workers=workers, say=progress, any_code=any_code)
     listings = [list_suite(known, data, whose) for known in suite or ["rendered"]]
     if analysis and (folders or name):
         raise ConfigError(
@@ -92,11 +94,9 @@ def accuracy(
             listings,
             out,
             changes,
-            workers,
+            measure_rows,
             values=None if values is None else split_values(analysis, values),
             presets=conventions or (),
-            say=progress,
-            any_code=any_code,
         )
         _tell(page)
     for listing in [] if analysis else listings:
@@ -111,8 +111,7 @@ def accuracy(
             )
             for item in listing.items
         ]
-        own = page.with_suffix(".jsonl")
-        rows = measure_all(jobs, own, workers, say=progress, any_code=any_code)
+        rows = measure_rows(jobs, page.with_suffix(".jsonl"))
         write_text(page, report(f"Accuracy on {page.stem}", rows, _note(listing, changes)))
         _tell(page)
     raise typer.Exit(1 if progress.failed else 0)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from soup_nlp.bench.rows import measure_all
 from soup_nlp.bench.suite_pairs import Options
 from soup_nlp.bench.suites import list_suite
 from soup_nlp.bench.tuning import DEFAULT_SPACE, parameter, split
@@ -69,9 +71,7 @@ def search(
         finalists=finalists,
         seed=seed,
         overrides=tuple(overrides or ()),
-        workers=workers,
-        say=progress,
-        any_code=any_code,
+        measure_rows=partial(measure_all, workers=workers, say=progress, any_code=any_code),
     )
     words = [f"--suite {s}" for s in suite or ["rendered"]] + (["--data DIR"] if data else [])
     words += [f"--trials {trials} --seed {seed} --seeds {seeds}"]
