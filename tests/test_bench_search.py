@@ -160,8 +160,6 @@ def test_search_refuses_what_cannot_be_right(tmp_path):
         search(SPACE, items(0), items(0), path, measure=fake)
     with pytest.raises(ConfigError, match="no training pair"):
         search(SPACE, [], items(0), path, measure=fake)
-    with pytest.raises(ConfigError, match="finalist"):
-        search(SPACE, items(0), items(1), path, finalists=0, measure=fake)
     with pytest.raises(ConfigError):
         search([Parameter("energy.wieghts", "linear", ("0", "1"))], items(0), [], path)
 

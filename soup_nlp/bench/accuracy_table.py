@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from soup_nlp.bench.depth_maps import BASELINES, METHODS
-from soup_nlp.bench.published import PROTOCOL, SOURCE, data_note, published
+from soup_nlp.bench.published import PROTOCOL, SOURCE, published
 from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import (
     energy_ratio,
@@ -207,7 +207,7 @@ def _moved(error: Mapping[str, float] | None) -> str:
 
 
 def _published(suite: str, rows: Sequence[Row]) -> list[str]:
-    numbers = published(suite)
+    numbers, about = published(suite)
     if not numbers:
         return []
     lines = [[f"{m} (published)", show(v)] for m, v in numbers.items()]
@@ -216,7 +216,7 @@ def _published(suite: str, rows: Sequence[Row]) -> list[str]:
         count = f"{len(group)} pair{'' if len(group) == 1 else 's'}"
         own = mean(get(r, name) for r in group)
         lines.append([f"this program, flow {flow}, {name}, {count} (measured)", show(own)])
-    text = f"Published rows are copied, not measured: {SOURCE}. {PROTOCOL}. {data_note(suite)}."
+    text = f"Published rows are copied, not measured: {SOURCE}. {PROTOCOL}. {about}."
     text += "".join(f" Measured: {preset(n)}." for n in dict.fromkeys(n for n, _, _ in measured))
     head = f"## {suite} beside published numbers"
     return [head, "", *table(["method", "MRE"], lines), "", text, ""]

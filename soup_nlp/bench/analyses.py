@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -243,24 +242,11 @@ def _known(name: str) -> Analysis:
     return ANALYSES[name]
 
 
-def _is_number(text: str) -> bool:
-    """Whether a value has a place on the axis of a plot."""
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
-
-
 def _chosen(analysis: Analysis, values: Sequence[str] | None) -> Analysis:
     """The analysis with these variants only."""
     if not values:
         return analysis
     if analysis.free:
-        wrong = [v for v in values if analysis.numeric and not _is_number(v)]
-        if wrong:
-            raise ConfigError(
-                "value is no number", where=analysis.name, found=wrong[0], expected="100,250"
-            )
         return replace(analysis, variants=_over(analysis.free, values))
     variants = analysis.variants
     wrong = [v for v in values if v not in variants]

@@ -54,11 +54,7 @@ DATA: Mapping[str, str] = MappingProxyType(
 _DATASET = {"kitti2012": "kitti", "kitti2015": "kitti"}
 
 
-def published(suite: str) -> dict[str, float | None]:
-    """Published MRE by method for the dataset of a suite; {} where the paper has none."""
-    return dict(COMPARISON.get(_DATASET.get(suite, suite), {}))
-
-
-def data_note(suite: str) -> str:
-    """What is not the same about the data of published and of measured rows; "" where none are."""
-    return DATA.get(_DATASET.get(suite, suite), "")
+def published(suite: str) -> tuple[dict[str, float | None], str]:
+    """Published MRE by method, and how those data differ from the measured; ({}, "") for none."""
+    dataset = _DATASET.get(suite, suite)
+    return dict(COMPARISON.get(dataset, {})), DATA.get(dataset, "")

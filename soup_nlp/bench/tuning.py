@@ -11,7 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,14 +160,10 @@ def loss(row: Row) -> float:
     return error(row) + max(0.0, math.log((energy_ratio(row) or 1.0) / ABOVE))
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """A family of pairs that had no part in the choice of a trial.
+class LeftOut(NamedTuple):
+    """A family of pairs, the best trial on all others, and what it changes on this one.
 
-    Attributes:
-        family: Its name (the sequence of its rows).
-        trial: The best trial on all other families.
-        change: Relative change of the family's MRE (geometric mean) from the default to the trial.
+    The change is that of the family's MRE (geometric mean), relative to the default.
     """
 
     family: str
@@ -174,23 +172,26 @@ class LeftOut:
 
 
 def leave_one_family_out(trials: Sequence[Trial]) -> tuple[LeftOut, ...]:
-    """For every family, what the best trial on the others changes there; () for one family.
+    """Every family (sequence of rows) left out of the choice in turn; () where there is only one.
 
     Args:
         trials: The default first; all with rows of the same pairs.
     """
     families = dict.fromkeys(r["sequence"] for r in trials[0].rows)
-    out = []
-    for family in families if len(families) > 1 else ():
-        chosen = min(
-            trials, key=lambda t: np.mean([loss(r) for r in t.rows if r["sequence"] != family])
-        )
-        before, after = (
-            np.mean([error(r) for r in t.rows if r["sequence"] == family])
-            for t in (trials[0], chosen)
-        )
-        out.append(LeftOut(family, chosen.name, float(np.expm1(after - before))))
-    return tuple(out)
+    if len(families) < 2:
+        return ()
+
+    def without(family: str, trial: Trial) -> float:
+        return float(np.mean([loss(r) for r in trial.rows if r["sequence"] != family]))
+
+    def within(family: str, trial: Trial) -> float:
+        return float(np.mean([error(r) for r in trial.rows if r["sequence"] == family]))
+
+    chosen = {f: min(trials, key=partial(without, f)) for f in families}
+    return tuple(
+        LeftOut(f, t.name, math.expm1(within(f, t) - within(f, trials[0])))
+        for f, t in chosen.items()
+    )
 
 
 def accepted(left_out: Sequence[LeftOut]) -> bool:
@@ -247,11 +248,8 @@ def search(
         measure: Makes the row of a pair.
 
     Raises:
-        ConfigError: pairs are missing or stand on both sides, a parameter is wrong, or no trial
-            is to be validated.
+        ConfigError: pairs are missing or stand on both sides, or a parameter is wrong.
     """
-    if finalists < 1:
-        raise ConfigError("no finalist", where="search", found=finalists, expected="at least 1")
     _check(space, train, validation)
 
     def scored(trial: Trial, items: Sequence[Item]) -> Trial:
