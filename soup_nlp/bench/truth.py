@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from soup_nlp.bench.piecewise_planar import fit_planes
+from soup_nlp.bench.depth_maps import fit_planes
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import pixel_grid, rays
