@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers_rows import fake_row
 
 from soup_nlp.bench.accuracy import head, input_hash, moving, pair_job, settings_hash
 from soup_nlp.bench.accuracy_table import report
@@ -150,15 +151,7 @@ def test_moving_pixels_are_told_apart_under_one_scale():
     assert moving(still, estimate, preset("paper")) is None
 
 
-def fake(scene: str, dies: bool = False) -> Row:
-    """A row without a solve; the process of the room may die."""
-    if scene == "room" and dies:
-        os._exit(3)
-    ok = scene != "sheet"
-    return {"ok": ok, "error": None if ok else "no", "seconds": 0.0}
-
-
-def fake_jobs(seed: int = 0, function=fake, **options) -> list[Job]:
+def fake_jobs(seed: int = 0, function=fake_row, **options) -> list[Job]:
     scenes = ("orbit", "street", "sheet", "room")
     return [Job({"key": s, "seed": seed}, partial(function, s, **options)) for s in scenes]
 
@@ -169,7 +162,7 @@ def test_rows_are_kept_and_what_failed_is_tried_again(tmp_path):
 
     def counted(scene):
         seen.append(scene)
-        return fake(scene)
+        return fake_row(scene)
 
     def jobs(seed=0):
         return fake_jobs(seed, counted)
@@ -226,13 +219,16 @@ def test_parallel_processes_and_one_that_dies(tmp_path):
     os.environ["PYTHONPATH"] = os.pathsep.join(
         [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
     )
-    rows = measure_all(fake_jobs(), tmp_path / "a.jsonl", workers=2)
+    path = tmp_path / "rows.jsonl"
+    rows = measure_all(fake_jobs(dies=True), path, workers=2)
     assert [r["key"] for r in rows] == ["orbit", "street", "sheet", "room"]
-    assert [r["ok"] for r in rows] == [True, True, False, True]
-    rows = measure_all(fake_jobs(dies=True), tmp_path / "b.jsonl", workers=2)
     assert [r["ok"] for r in rows] == [True, True, False, False]
+    assert rows[2]["error"] == "no"
     assert "process died" in rows[3]["error"]
-    assert read_rows(tmp_path / "b.jsonl")
+    assert len(read_rows(path)) == 4
+    # without the job that dies nothing has to run again
+    rows = measure_all(fake_jobs(1)[:2], path, workers=2)
+    assert [r["ok"] for r in rows] == [True, True]
 
 
 def test_command_line(tmp_path, capsys):

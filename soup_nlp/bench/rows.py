@@ -177,7 +177,7 @@ def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]
         again = [name for name in names if name in left]
         if not again:
             continue
-        pool = ProcessPoolExecutor(max_workers=workers, env=ONE_THREAD)
+        pool = ProcessPoolExecutor(max_workers=min(workers, len(again)), env=ONE_THREAD)
         try:
             futures = {pool.submit(left[name].work): name for name in again}
             for future in as_completed(futures):
