@@ -1,12 +1,13 @@
 # make demo: solve the embedded default;  make test: lint, types, tests;  make quick: the fast tests;
-# make results: every table and picture of results/ again (hours; DATA=folder of the real pairs).
+# make docs: the documentation;  make results: every table and picture of results/ again (hours;
+# DATA=folder of the real pairs).
 # Needs Python 3.11+ only.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/motorcycle
 
-.PHONY: demo test quick lint results clean
+.PHONY: demo test quick lint docs results clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/.installed: pyproject.toml
@@ -32,6 +33,13 @@ test: lint $(VENV)/.optional
 
 quick: $(VENV)/.installed
 	$(BIN)/python -m pytest -m 'not slow'
+
+$(VENV)/.docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,docs]' && touch $@
+
+# the documentation in site/; a warning is an error
+docs: $(VENV)/.docs
+	$(BIN)/mkdocs build --strict --quiet
 
 results: $(VENV)/.optional
 	$(BIN)/soup-nlp bench all $(if $(DATA),--data $(DATA))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, render
-from soup_nlp.data.scenes.shapes import Plane
+from soup_nlp.data.scenes.shapes import Box, Plane
 from soup_nlp.data.scenes.texture import Texture
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
@@ -40,13 +40,14 @@ PAPER = Weights(
     proj=0.3,
     cont=0.7,
     orient=0.9,
+    prior=0.6,
     sigma_cont=0.4,
     sigma_cont_ref=np.inf,
     sigma_orient=0.05,
     sigma_arap=np.inf,
     sigma_proj=np.inf,
 )
-"""Truncated as the paper has it; some elements are on either side of both truncations."""
+"""Truncated as in the paper, with E_prior; elements lie on either side of both truncations."""
 TRUNCATED = PAPER.replace(sigma_cont_ref=0.3, sigma_arap=0.25, leak_arap=0.2, sigma_proj=2.0)
 """Everything truncated."""
 GREY = Texture(((0.5, 0.5, 0.5), (0.3, 0.4, 0.6)), cell=0.2)
@@ -207,7 +208,7 @@ def plane_world(
 ) -> Pair:
     """Rendered pair of one infinite plane under one rigid camera motion, with true flow."""
     K = camera.intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2)
-    scene = Scene((Body("wall", (Part(Plane(), pose, GREY),)),), np.eye(4), move)
+    scene = Scene((Body((Part(Plane(), pose, GREY),)),), np.eye(4), move)
     return with_true_flow(render(scene, K, height, width, "plane"))
 
 
@@ -250,15 +251,15 @@ def corner_scene(move: Float, component: Float | None = None, turn: float = 0.0)
         Part(Plane(), plane_pose(6.0, yaw=-45), GREY),
         Part(Plane(), plane_pose(0.0, pitch=-90) @ shift(0, 0, -1.2), GREY),
     )
-    components = [Body("room", room)]
+    components = [Body(room)]
     if component is not None:
-        half = Plane((0.7, 0.8))
+        half = Box((0.7, 0.8, 1e-6))
         wedge = []
         for side in (-1.0, 1.0):
             yaw = turn + side * 40.0
             pose = plane_pose(3.0, yaw=yaw) @ shift(side * 0.7, 0, 0)
             wedge.append(Part(half, pose, GREY))
-        components.append(Body("wedge", tuple(wedge), component))
+        components.append(Body(tuple(wedge), component))
     return Scene(tuple(components), np.eye(4), move)
 
 

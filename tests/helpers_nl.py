@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 
 import casadi as ca
@@ -24,10 +25,15 @@ class ReadBack:
         s = ca.SX.sym("x", x.numel())
         lam_f, lam_g = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", g.numel())
         f, g = plain(s)
-        lagrangian = lam_f * f + (ca.dot(lam_g, g) if g.numel() else 0)
-        # the Lagrangian's Hessian at (x, lam_f, lam_g)
-        self.hess = ca.Function("h", [s, lam_f, lam_g], [ca.hessian(lagrangian, s)[0]])
+        self._inputs = [s, lam_f, lam_g]
+        self._lagrangian = lam_f * f + (ca.dot(lam_g, g) if g.numel() else 0)
         self.values = ca.Function("v", [s], [f, g, ca.gradient(f, s), ca.jacobian(g, s)])
+
+    @cached_property
+    def hess(self) -> ca.Function:
+        """The Lagrangian's Hessian at (x, lam_f, lam_g)."""
+        H = ca.hessian(self._lagrangian, self._inputs[0])[0]
+        return ca.Function("h", self._inputs, [H])
 
 
 def close(found: object, expected: object) -> None:

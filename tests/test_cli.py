@@ -68,7 +68,9 @@ def test_a_solve_writes_every_file(solved):
         assert (solved / name).stat().st_size > 0, name
     summary = json.loads((solved / "summary.json").read_text())
     assert summary["converged"]
-    assert summary["energy"]["solution"]["total"] < summary["energy"]["start"]["total"]
+    assert summary["energy"]["nlp"]["total"] < summary["energy"]["start"]["total"]
+    refined = summary["refinement"]
+    assert refined["end"]["total"] < refined["begin"]["total"]
     assert summary["residuals"]["so3"] < 1e-8
     assert summary["residuals"]["normal"] < 1e-8
     assert summary["metrics"]["solution"]["mre"] < summary["metrics"]["constant"]["mre"]

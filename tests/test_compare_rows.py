@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers_model import PAPER, Tiny
-from helpers_sol import write_sol
 from test_compare import LABEL, MANY, PROBLEMS, ROWS, row
 
 from soup_nlp.bench.processes import isolated
@@ -23,6 +22,7 @@ from soup_nlp.bench.solvers.task import Answer, Task
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError, SolverError
+from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare

@@ -60,6 +60,9 @@ def test_folder_with_everything(folder: Path) -> None:
     write_dpt(folder / "depth_next.dpt", np.full((H, W), 2.5))
     write_flo(folder / "flow.flo", np.full((H, W, 2), np.nan))
     cv2.imwrite(str(folder / "occluded.png"), np.full((H, W), 255, np.uint8))
+    moving = np.zeros((H, W), np.uint8)
+    moving[:2, :2] = moving[4:, 4:] = 255
+    cv2.imwrite(str(folder / "moving.png"), moving)
     xyz = np.array([[1.0, 2.0, 550.0], [1.0, 2.0, np.nan]])
     np.savez(folder / "points.npz", uv_0=np.array([[3.5, 2.5], [1, 1]]), xyz_mm_0=xyz)
     pair = load_folder(folder)
@@ -74,6 +77,9 @@ def test_folder_with_everything(folder: Path) -> None:
     assert np.isnan(truth.flow).all()
     assert truth.occluded is not None
     assert truth.occluded.all()
+    assert truth.components is not None
+    # the static scene and two connected regions
+    assert sorted(np.bincount(truth.components.ravel())) == [4, 10, H * W - 14]
     np.testing.assert_allclose(truth.points, [[3.5, 2.5, 0.55]])
     millimetres = load_folder(folder, depth_scale=1.0, unit="mm").truth
     assert millimetres is not None

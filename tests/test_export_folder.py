@@ -11,12 +11,12 @@ import h5py
 import numpy as np
 import pytest
 from helpers_nl import ReadBack, close
-from helpers_sol import write_sol
 from test_export import problem_of, write
 
 from soup_nlp.cli.main import main
 from soup_nlp.errors import ExportError
 from soup_nlp.export.foreign import import_sol
+from soup_nlp.export.sol import write_sol
 
 
 def test_the_casadi_format_includes_the_start(tmp_path):

@@ -10,6 +10,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry.plane import (
+    about_anchor,
+    at_anchor,
+    inverse_depth,
+    normal_and_distance,
+    tilt_to_camera,
+)
 from soup_nlp.geometry.soup import Soup, reconstruct, splat_depth
 
 unit = st.floats(-1.0, 1.0)
@@ -109,6 +116,47 @@ def test_nearest_keeps_a_rotation_and_flips_no_reflection_into_det_minus_one(w):
     np.testing.assert_allclose(rotation.nearest(R), R, atol=1e-12)
     assert_rotations(rotation.nearest(R @ np.diag([1.0, 1.0, -1.0])))
     np.testing.assert_allclose(rotation.nearest(2.5 * R), R, atol=1e-12)
+
+
+# --- planes ------------------------------------------------------------------------------------
+
+
+def test_forms_of_a_plane_are_inverse_of_each_other_and_give_its_depth():
+    soup, ray = random_soup(0, 7), np.tile(camera.rays(K_REF, [20.0, 11.0]), (7, 1))
+    anchor = camera.rays(K_REF, np.random.default_rng(1).uniform(0, 48, (7, 2)))
+    m = inverse_depth(soup.n, soup.distance)
+    np.testing.assert_allclose(1 / np.sum(m * ray, axis=1), soup.depth_at(ray), rtol=1e-12)
+    for back, expected in zip(normal_and_distance(m), (soup.n, soup.distance)):
+        np.testing.assert_allclose(back, expected, rtol=1e-12, atol=1e-14)
+    Z, g = at_anchor(m, anchor)
+    np.testing.assert_allclose(Z, soup.depth_at(anchor), rtol=1e-12)
+    np.testing.assert_allclose(about_anchor(Z, g, anchor), m, rtol=1e-12, atol=1e-14)
+
+
+def test_slopes_are_relative_changes_of_the_inverse_depth():
+    anchor, g = np.array([0.1, -0.2, 1.0]), np.array([0.5, -0.3])
+    m = about_anchor(np.array(4.0), g, anchor)
+    ray = anchor + np.array([0.02, 0.01, 0.0])
+    assert m @ ray == pytest.approx((1 + g @ [0.02, 0.01]) / 4.0)
+
+
+def test_planes_are_tilted_about_their_anchors_until_they_are_visible():
+    anchor = camera.rays(K_REF, np.array([[20.0, 30.0], [40.0, 10.0], [30.0, 25.0]]))
+    corners = np.array([[0.1, 0.1, 0], [-0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0]])
+    rays = anchor[:, None] + corners
+    # steep enough that a corner is behind the plane's horizon; gentle; behind the camera
+    Z, g = np.array([2.0, 3.0, -1.0]), np.array([[15.0, 5.0], [0.5, 0.2], [0.0, 0.0]])
+    n, D = normal_and_distance(about_anchor(Z, g, anchor))
+    soup = Soup(np.ones(3), n, D, np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)))
+    done = tilt_to_camera(soup, anchor, rays, 1e-3)
+    facing = -np.einsum("nc,nvc->nv", done.n, rays)
+    assert (facing > 1e-3 - 1e-6).all()
+    np.testing.assert_allclose(done.depth_at(anchor), [2.0, 3.0, 2.5], rtol=1e-12)
+    np.testing.assert_allclose(done.n[1], soup.n[1], rtol=1e-12)
+    _, slope = at_anchor(inverse_depth(done.n, done.distance), anchor)
+    assert slope[0, 0] / slope[0, 1] == pytest.approx(3.0)
+    assert 1.0 < slope[0, 0] < 14.0
+    np.testing.assert_allclose(slope[2], 0.0, atol=1e-12)
 
 
 # --- soup --------------------------------------------------------------------------------------

@@ -46,7 +46,7 @@ DOORS = {
     ("start", "data"): {"data.pair"},
     ("start", "model"): {"model.energy_data"},
     ("solve", "data"): {"data.pair"},
-    ("refine", "data"): {"data.pair"},
+    ("refine", "data"): {"data.pair", "data.census"},
 }
 """Where one room may enter another only through some of its modules."""
 

@@ -37,7 +37,7 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp
 UNITS = ("paper", "pixels")
 NORMS = ("smooth", "epigraph")
 TRUNCATIONS = ("smooth", "lifted")
-EXACT = {"arap": 1e-11, "proj": 1e-12, "cont": 1e-12, "orient": 1e-12}
+EXACT = {"arap": 1e-11, "proj": 1e-12, "cont": 1e-12, "orient": 1e-12, "prior": 1e-12}
 """Relative. The kernel takes distances of anchors as sqrt(|v|^2 + 1e-12): 2e-12 of E_arap."""
 EVERY = list(itertools.product(GAUGES, NORMS, TRUNCATIONS, UNITS, (False, True)))
 
@@ -304,6 +304,7 @@ def assert_twins(a: NLP, b: NLP, x: np.ndarray) -> None:
             np.testing.assert_allclose(p, q, rtol=1e-12, atol=1e-12 * np.abs(q).max())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
 def test_machine_code_equals_the_virtual_machine_and_is_cached(own_cache):
     problem, weights = tiny("pixels"), weights_for("pixels")
@@ -319,6 +320,7 @@ def test_machine_code_equals_the_virtual_machine_and_is_cached(own_cache):
     assert {p: p.stat().st_mtime_ns for p in own_cache.glob("*")} == stamps
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
 def test_machine_code_of_the_presolve_equals_the_virtual_machine(own_cache):
     problem, weights = tiny("pixels"), weights_for("pixels")

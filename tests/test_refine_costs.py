@@ -9,11 +9,12 @@ import pytest
 from helpers_model import Tiny, random_soup, weights_for
 
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.refine.costs import PairCosts, Particles, anchor_depth, feasible, unary_costs
 from soup_nlp.refine.mppbp import length_slope
-from soup_nlp.refine.select import conditional_costs, diverse, upright, within_reach
+from soup_nlp.refine.select import conditional_costs, diverse, within_reach
 
 
 def cloud(tiny: Tiny, labels: int, seed: int = 3, spread: float = 1.0) -> Particles:
@@ -83,6 +84,7 @@ def test_every_entry_is_the_energy_of_its_pair_however_close_the_particles():
             edges=np.array([[i, k]]) if costs.arap_row[e] >= 0 else np.zeros((0, 2), int),
             edge_weight=tiny.data.edge_weight[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
             edge_unit=tiny.data.edge_unit[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
+            prior_weight=tiny.data.prior_weight[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
             pairs=np.array([[i, k]]) if costs.cont_row[e] >= 0 else np.zeros((0, 2), int),
             **{
                 key: getattr(tiny.data, key)[[max(costs.cont_row[e], 0)]]
@@ -108,7 +110,9 @@ def test_alike_motions_and_planes_cost_exactly_nothing():
     one = Particles.of(tiny.soup)
     n = len(tiny.soup)
     same = Particles(*(np.repeat(v[:1], n, axis=0) for v in (one.n, one.D, one.R, one.T)))
-    table = PairCosts(tiny.data, weights_for("pixels")).tables(same.joined(one))
+    # their anchors differ in depth
+    weights = weights_for("pixels").replace(prior=0.0)
+    table = PairCosts(tiny.data, weights).tables(same.joined(one))
     # rotation, translation, gaps and turn vanish; the distances are kept up to rounding
     assert np.abs(table[:, 0, 0]).max() < 1e-12 * table.max()
 
@@ -214,7 +218,7 @@ def test_planes_that_turn_away_are_tilted_about_their_anchor():
     n[4] = steep / np.linalg.norm(steep)
     broken = Soup(soup.lam, n, soup.d, soup.R, soup.t)
     assert not feasible(Particles.of(broken), rays, 1e-3)[4, 0]
-    good = upright(broken, data.anchor_ray, rays, 1e-3)
+    good = tilt_to_camera(broken, data.anchor_ray, rays, 1e-3)
     assert feasible(Particles.of(good), rays, 1e-3).all()
     before, after = broken.depth_at(data.anchor_ray), good.depth_at(data.anchor_ray)
     assert before[4] > 0

@@ -10,6 +10,7 @@ from helpers_model import Tiny, weights_for
 from test_refine import FEW, Planar
 
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.mrf.trws import mrf_energy
@@ -19,7 +20,6 @@ from soup_nlp.refine.costs import PairCosts, Particles
 from soup_nlp.refine.mppbp import SHARES, refine_soup
 from soup_nlp.refine.particles import KINDS, Proposer
 from soup_nlp.refine.records import RefineOptions
-from soup_nlp.refine.select import upright
 
 
 def test_the_mrf_follows_the_exact_energy_when_the_length_unit_changes():
@@ -134,7 +134,7 @@ def test_a_plane_is_tilted_no_further_than_it_must_be():
         return -np.einsum("nc,nvc->nv", soup.n, rays).max(axis=1)
 
     assert (facing(made) < 0).all()
-    done = upright(made, data.anchor_ray, rays, 1e-3)
+    done = tilt_to_camera(made, data.anchor_ray, rays, 1e-3)
     assert (facing(done) >= 1e-3 - 1e-6).all()
     after = Local.of(done, data.anchor_ray)
     np.testing.assert_allclose(after.Z, now.Z, rtol=1e-12)

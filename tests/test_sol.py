@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers_model import PAPER, Tiny
-from helpers_sol import write_sol
 
 from soup_nlp.errors import ExportError
 from soup_nlp.export.nl import write_nl
-from soup_nlp.export.sol import read_sol
+from soup_nlp.export.sol import read_sol, write_sol
 from soup_nlp.export.verify import bound_multipliers, least_squares_multipliers
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.solve.kkt import optimality

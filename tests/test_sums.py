@@ -224,6 +224,7 @@ def test_an_assembled_program_is_not_assembled_again(monkeypatch):
 # --- the cache, and where there is no way --------------------------------------------------------
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_kernels_serve_another_camera(case, own_cache):
     TangentProblem(case.soup, case.data, case.weights, Formulation())

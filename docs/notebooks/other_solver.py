@@ -71,8 +71,6 @@ def solve_by_casadi() -> None:
     import casadi as ca
     import numpy as np
 
-    from soup_nlp.export.sol import write_sol
-
     builder = ca.NlpBuilder()
     builder.import_nl(str(exported / "soup.nl"), {})
     x, g = ca.vertcat(*builder.x), ca.densify(ca.vertcat(*builder.g))
@@ -85,16 +83,13 @@ def solve_by_casadi() -> None:
         x0=builder.x_init, lbx=builder.x_lb, ubx=builder.x_ub, lbg=builder.g_lb, ubg=builder.g_ub
     )
     status = solver.stats()["return_status"]
-    write_sol(
-        exported / "soup.sol",
-        np.asarray(answer["x"]).ravel(),
-        np.asarray(answer["lam_g"]).ravel(),
-        # x and g are in the order of the file already
-        np.arange(x.numel()),
-        np.arange(g.numel()),
-        f"Ipopt on the imported file: {status}",
-        0 if status == "Solve_Succeeded" else 400,
-    )
+    # x and g are in the order of the file already; AMPL's multipliers have the other sign
+    duals, values = -np.asarray(answer["lam_g"]).ravel(), np.asarray(answer["x"]).ravel()
+    sizes = [len(duals), len(duals), len(values), len(values)]
+    lines = [f"Ipopt on the imported file: {status}", "", "Options", 3, 0, 1, 0, *sizes]
+    lines += [*map(repr, duals.tolist()), *map(repr, values.tolist())]
+    lines += [f"objno 0 {0 if status == 'Solve_Succeeded' else 400}"]
+    (exported / "soup.sol").write_text("\n".join(map(str, lines)) + "\n")
 
 
 if pounce:

@@ -43,7 +43,7 @@ problem = soup_nlp.make_problem(settings)
 # refinement, one after the other.
 
 # %%
-run = soup_nlp.run(problem, say=print)
+run = soup_nlp.run(problem, log=print)
 
 # %%
 for stage in run.solution.stages:

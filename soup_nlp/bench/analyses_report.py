@@ -51,7 +51,7 @@ MEASURES: dict[str, tuple[str, Callable[[Row], float | None]]] = {
     ),
 }
 """Format and number of every table of variants."""
-COLOURS = {"arap": "#4477aa", "proj": "#66ccee", "cont": "#228833", "orient": "#ccbb44"}
+COLOURS = dict(zip(TERMS, ("#4477aa", "#66ccee", "#228833", "#ccbb44", "#aa3377")))
 LONG = 60
 """Letters of all variants from which their labels are slanted."""
 

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+NOISE = (0.05, 0.6)
+"""Limits of the flow's noise that E_prior is measured in, pixels."""
 DOUBT = 1e-6
 """Distance from a pixel border, in pixels, within which a target may round to either side."""
 State = Mapping[str, Float]
@@ -55,7 +57,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
             return np.asarray((1 / A[pairs, 2] ** 4).mean(axis=1) ** -0.25)
         return np.full(len(pairs), scene)
 
-    arap = cont = orient = 0.0
+    arap = cont = orient = prior = 0.0
     if len(e["edges"]):
         i, k = e["edges"].T
         length = unit(e["edges"]) * e["edge_unit"]
@@ -72,6 +74,10 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
         leak = w["leak_arap"]
         cut = sum((1 - leak) * np.minimum(p, w["sigma_arap"]) + leak * p for p in parts)
         arap = float((e["edge_weight"] * cut).sum())
+        apart = _length(e["anchor_ray"][i] - e["anchor_ray"][k])
+        rho = 1 / A[:, 2]
+        change = np.abs(rho[i] - rho[k]) / ((rho[i] ** 4 + rho[k] ** 4) / 2) ** 0.25
+        prior = float((e["prior_weight"] * change / apart).sum())
 
     image = lift(s, e["pixel_ray"], every)[1] @ e["K_next"].T
     miss = _length(image[..., :2] / image[..., 2:] - e["pixel_target"])
@@ -88,7 +94,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
         cont = float((e["pair_weight"] * gap).sum())
         turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
         orient = float((e["orient_weight"] * np.minimum(turn, w["sigma_orient"])).sum())
-    terms = {"arap": arap, "proj": proj, "cont": cont, "orient": orient}
+    terms = {"arap": arap, "proj": proj, "cont": cont, "orient": orient, "prior": prior}
     terms = {name: w[name] * value for name, value in terms.items()}
     return {"total": sum(terms.values()), **terms}
 
@@ -263,9 +269,13 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
     directed = np.unique(np.minimum(own, near) * n + np.maximum(own, near))
     component = tree["start"]["component"]
     weight = seg["edge_multiplicity"] * np.exp(-float(settings["segmentation"]["beta"]) * gap)
-    weight[component[i] != component[k]] *= float(settings["energy"]["arap_across"])
+    across = np.where(component[i] == component[k], 1.0, float(settings["energy"]["arap_across"]))
+    weight *= across
     bending = settings["energy"]["bending"]
     weight[_discontinuous(tree, settings["energy"], "edges")] *= float(bending["arap_across"])
+    bends = _bends(tree, settings["energy"])
+    noise = 1.0 if bends else float(np.clip(np.median(tree["start"]["error"]), *NOISE))
+    prior = noise * across * seg["edge_multiplicity"] / max(1, seg["knn"].shape[1])
     held = np.full(len(e["pairs"]), 2.0)
     held[_discontinuous(tree, settings["energy"], "pairs")] *= float(bending["orient_across"])
     return {
@@ -277,6 +287,7 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
         "pixel targets": _gap(target, e["pixel_target"][used]),
         "K-NN edges": float(len(np.setxor1d(directed, i * n + k))),
         "edge weights": _gap(weight, e["edge_weight"]),
+        "prior weights": _gap(prior, e["prior_weight"]),
         "pair counts": _gap(held, e["orient_weight"]),
         "pair weights": _gap(_pair_weights(tree, settings["energy"]), e["pair_weight"]),
     }
@@ -302,10 +313,14 @@ def _discontinuous(
     tree: Mapping[str, Any], form: Mapping[str, Any], graph: str
 ) -> NDArray[np.bool_]:
     """Edges of a graph between two surfaces, if surfaces are taken to bend."""
-    start = tree["start"]
+    surface = tree["start"]["surface"]
     i, k = tree["energy"][graph].T
-    bends = form["units"] == "pixel" and bool(start["bending"])
-    return np.asarray(bends & (start["surface"][i] != start["surface"][k]))
+    return np.asarray(_bends(tree, form) & (surface[i] != surface[k]))
+
+
+def _bends(tree: Mapping[str, Any], form: Mapping[str, Any]) -> bool:
+    """Whether the energy of bending surfaces is in force."""
+    return form["units"] == "pixel" and bool(tree["start"]["bending"])
 
 
 def _gap(a: Float, b: Float) -> float:

@@ -1,4 +1,4 @@
-"""Reader of AMPL's .sol text format, a solver's answer."""
+"""AMPL's .sol text format: a solver's answer read, and written."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.errors import ExportError
+from soup_nlp.export.opcodes import number
+from soup_nlp.storage.atomic import write_text
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -146,3 +148,32 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
         lam_g = np.empty(len(rows))
         lam_g[rows] = -y
     return Sol("\n".join(said), code, x, lam_g)
+
+
+def write_sol(
+    path: str | Path,
+    x: Float,
+    lam_g: Float | None,
+    variables: Int,
+    rows: Int,
+    message: str = "",
+    code: int = 0,
+) -> None:
+    """Write an answer as a .sol file, whole or not at all.
+
+    Args:
+        path: The file.
+        x: (nx,) point, in the order of the NLP.
+        lam_g: (ng,) multipliers in CasADi's sign, or None.
+        variables: (nx,) order of the .nl file, see `NLFile`.
+        rows: (ng,) order of the .nl file.
+        message: First lines; empty lines are left out, and one that would end it is quoted.
+        code: solve_result_num, 0 solved, 400 limit.
+    """
+    duals = [] if lam_g is None else [number(-v) for v in lam_g[rows].tolist()]
+    head = [line for line in message.splitlines() if line.strip()]
+    head = [f'"{line.strip()}"' if line.strip() == OPTIONS else line for line in head]
+    sizes = (len(rows), len(duals), len(variables), len(variables))
+    values = [number(v) for v in np.asarray(x, float)[variables].tolist()]
+    lines = [*head, "", OPTIONS, "3", "0", "1", "0", *map(str, sizes), *duals, *values]
+    write_text(path, "\n".join([*lines, f"objno 0 {code}"]) + "\n")

@@ -54,9 +54,9 @@ def segment(
     if method == "grid" or np.ptp(image) == 0:
         # SLIC has nothing to follow on an image of one colour: its limit is the grid
         return _grid(height, width, count)
+    least = int(min_fraction * height * width / count)
     from skimage.segmentation import slic
 
-    least = int(min_fraction * height * width / count)
     # texture as fine as pixels shatters SLIC's clusters, and shards join to a few large ones
     for smoothing in (sigma, *(wider for wider in (1.0, 2.0, 4.0) if wider > sigma)):
         raw = slic(
@@ -87,19 +87,10 @@ def split_components(labels: Labels, min_size: int) -> Labels:
 
     A small piece takes the label of the nearest pixel (Euclidean) of a piece that stays.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    from skimage.measure import label
 
-    # all labels in one pass: components of the graph of equal neighbours
-    index = np.arange(labels.size).reshape(labels.shape)
-    right = labels[:, :-1] == labels[:, 1:]
-    down = labels[:-1] == labels[1:]
-    a = np.concatenate([index[:, :-1][right], index[:-1][down]])
-    b = np.concatenate([index[:, 1:][right], index[1:][down]])
-    graph = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(labels.size, labels.size))
-    _, flat = connected_components(graph, directed=False)
-    pieces = flat.reshape(labels.shape).astype(np.int32)
-    sizes = np.bincount(flat)
+    pieces = label(labels, background=-1, connectivity=1).astype(np.int32) - 1
+    sizes = np.bincount(pieces.ravel())
     small = sizes < max(1, min_size)
     if small.all():
         small[np.argmax(sizes)] = False

@@ -100,8 +100,8 @@ def hessian_entries(group: Group, local: tuple[Int, Int]) -> Entries:
 def _sum_into(size: int, index: Int, local: ca.MX) -> ca.MX:
     """(size,) sums of local entries at their places: out[index[j]] += local[j].
 
-    It is the transposed derivative of `out -> out[index]`, which CasADi runs as one loop; a
-    constant 0/1 matrix times `local` takes twenty times as long to make and twice to apply.
+    It is the transposed derivative of `out -> out[index]`, which CasADi runs as one loop. A
+    constant 0/1 matrix takes twenty times as long to build and twice as long to apply.
     """
     out = ca.MX.sym("out", size)
     return ca.jtimes(out[_constant(index)], out, local, True)
@@ -124,7 +124,7 @@ def hessian_pattern(groups: Sequence[Group], nx: int, hessian: str) -> Pattern:
 
 
 class Functions(NamedTuple):
-    """What a solver calls, but the Hessian.
+    """What a solver calls, apart from the Hessian.
 
     Attributes:
         oracle: (x, p) -> f, g.
@@ -140,7 +140,7 @@ class Functions(NamedTuple):
 def assemble_functions(
     groups: Sequence[Group], nx: int, ng: int, thetas: int, compiled: bool = True
 ) -> Functions:
-    """Map every kernel over its table and scatter what it gives.
+    """Map every kernel over its table and scatter its results.
 
     Args:
         groups: Kernels and tables, none of them empty.

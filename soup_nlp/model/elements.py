@@ -1,4 +1,4 @@
-"""The four terms of the energy as kinds of elements: their norms, data columns and views."""
+"""The terms of the energy as kinds of elements: their norms, data columns and views."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Element:
 
 
 def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]:
-    """The four terms as element kinds, with the columns that the layout's views need.
+    """The terms as element kinds, with the columns that the layout's views need.
 
     Args:
         data: Pixels, graphs and weights of the pair.
@@ -61,7 +61,7 @@ def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]
         layout: Whose variables the views are made of.
 
     Returns:
-        "arap", "proj", "cont", "orient".
+        "arap", "proj", "cont", "orient", and "prior" where it has a weight.
     """
     kinds = {
         "arap": _arap(data, w),
@@ -69,6 +69,8 @@ def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]
         "cont": _cont(data, w),
         "orient": _orient(data, w),
     }
+    if w.prior > 0:
+        kinds["prior"] = _prior(data, w)
     return {name: element.placed(layout) for name, element in kinds.items()}
 
 
@@ -132,6 +134,21 @@ def _cont(data: EnergyData, w: Weights) -> Element:
         return terms.continuity(v[0], v[1], row, eps, samples, *truncated, data.local_units)
 
     return Element(pairs, columns, norms, 2)
+
+
+def _prior(data: EnergyData, w: Weights) -> Element:
+    ray_i, ray_k = (data.anchor_ray[who] for who in data.edges.T)
+    columns = {
+        "weight": w.prior * data.prior_weight,
+        "reach": np.linalg.norm(ray_i - ray_k, axis=1),
+        "ray_i": ray_i,
+        "ray_k": ray_k,
+    }
+
+    def norms(v: list[View], row: dict[str, ca.SX], eps: ca.SX, _: ca.SX) -> list[Norm]:
+        return terms.prior(v[0], v[1], row, eps)
+
+    return Element(data.edges, columns, norms, 2)
 
 
 def _orient(data: EnergyData, w: Weights) -> Element:

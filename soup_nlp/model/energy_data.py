@@ -14,7 +14,7 @@ from soup_nlp.geometry.graph import Segmentation
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-TERMS = ("arap", "proj", "cont", "orient")
+TERMS = ("arap", "proj", "cont", "orient", "prior")
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,9 @@ class EnergyData:
         edges: (E, 2) K-NN edges i < k.
         edge_weight: (E,) w1 = w2, both directions folded.
         edge_unit: (E,) length unit of the edge (1: the mean plane distance).
+        prior_weight: (E,) weight of E_prior: 1 / K for each direction of the edge, so that it is
+            the mean over the neighbours of a superpixel, times the flow's noise in pixels where
+            that is known.
         rotation_scale: Factor of |R_i - R_k| (1 in the paper's units, focal in pixel units).
         pairs: (P, 2) neighbours i < k.
         boundary_ray: (P, B, 3) sampled shared boundary points.
@@ -38,8 +41,8 @@ class EnergyData:
         pair_factor: (P,) sqrt(boundary length / B): the sampled Frobenius norm times this stands
             for the norm over the whole boundary.
         pair_unit: (P,) length unit of the pair.
-        orient_weight: (P,) weight of E_orient: 2, directed pairs folded into one, less where the
-            flow of a bending surface tears.
+        orient_weight: (P,) weight of E_orient: 2, directed pairs folded into one, less at flow
+            discontinuities of bending surfaces.
         rim_ray: (N, V, 3) rays where visibility is imposed, the anchor first.
         local_units: edge_unit and pair_unit are shares of the depth of the two anchors, mostly the
             nearer one (E is then independent of scale, term by term), instead of lengths.
@@ -57,6 +60,7 @@ class EnergyData:
     edges: Int
     edge_weight: Float
     edge_unit: Float
+    prior_weight: Float
     rotation_scale: float
     pairs: Int
     boundary_ray: Float
@@ -96,7 +100,7 @@ class EnergyData:
 def sample_pixels(
     labels: NDArray[np.int32], flow: Flow, samples: int | None, seed: int
 ) -> tuple[Int, NDArray[np.bool_]]:
-    """Sampled pixels of every superpixel, confident ones first come.
+    """A random sample of every superpixel's pixels of nonzero confidence.
 
     Args:
         labels: (H, W) superpixel labels.
@@ -133,7 +137,17 @@ def build_energy_data(
     seed: int = 0,
     arap_at_anchors: bool = False,
 ) -> EnergyData:
-    """Collect rays, targets and weights of a segmented pair."""
+    """Collect rays, targets and weights of a segmented pair, in the paper's units.
+
+    Args:
+        seg: Superpixels and graphs.
+        flow: Flow with confidence.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        K_next: (3, 3) intrinsics of the next frame.
+        samples: Pixels per superpixel in E_proj, None for all.
+        seed: Of the sample.
+        arap_at_anchors: Motion difference taken at the anchors.
+    """
     width = seg.labels.shape[1]
     index, there = sample_pixels(seg.labels, flow, samples, seed)
     uv = np.stack([index % width, index // width], axis=-1).astype(float)
@@ -152,6 +166,7 @@ def build_energy_data(
         edges=seg.edges,
         edge_weight=seg.edge_weight,
         edge_unit=np.ones(len(seg.edges)),
+        prior_weight=seg.edge_multiplicity / max(1, seg.knn.shape[1]),
         rotation_scale=1.0,
         pairs=seg.pairs,
         boundary_ray=rays(K_ref, seg.boundary),

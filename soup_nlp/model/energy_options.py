@@ -1,4 +1,4 @@
-"""What a problem file says about the energy: weights, truncations, units, departures."""
+"""Options of the energy: weights, truncations, units and departures from the paper."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from soup_nlp.schema.section import NonNegative, Positive, Section, Share, Trunc
 
 
 class Weights(Section):
-    """Constants of E = E_arap + alpha1 E_proj + alpha2 E_cont + alpha3 E_orient.
+    """Constants of E = E_arap + alpha1 E_proj + alpha2 E_cont + alpha3 E_orient + alpha4 E_prior.
+
+    E_prior is not in the paper. It draws depth that the flow leaves undetermined (little parallax,
+    a camera at rest, a motion of few superpixels) to that of the neighbours. It is the un-squared
+    slope of the inverse depth relative to the nearer of the two, so that it pulls with a constant
+    force and does not draw a far background to what stands before it.
 
     The defaults belong to `in_pixels`, where every term is measured in pixels; in the paper's
     units (lengths with sum_i c_i D_i = 1) other values are needed. beta, w1 to w4 live in the
@@ -26,6 +31,9 @@ class Weights(Section):
     """alpha2."""
     orient: NonNegative = 5e-3
     """alpha3."""
+    prior: NonNegative = 0.15
+    """alpha4, cost of a relative change of inverse depth by 1 per ray unit, in units of the flow's
+    noise (pixels where surfaces bend); 0 is the paper's form."""
     sigma_cont: Truncation = 1.0
     """Truncation of E_cont's second-frame gap (rho), length."""
     sigma_cont_ref: Truncation = np.inf
@@ -35,8 +43,8 @@ class Weights(Section):
     sigma_arap: Truncation = 0.5
     """Truncation of every ARAP norm; inf is the paper's form."""
     leak_arap: Share = 0.01
-    """Share of an ARAP norm that is not truncated: it pulls motions that nothing else holds back
-    to their neighbours', where a full truncation leaves them adrift."""
+    """Share of an ARAP norm that is not truncated: it pulls a motion that no other term determines
+    towards its neighbours'."""
     sigma_proj: Truncation = np.inf
     """Truncation of a pixel's re-projection error, pixels; inf is the paper's form."""
 
@@ -86,7 +94,7 @@ class EnergyOptions(Section):
     arap_at_anchors: bool = False
     """Motion difference at the anchors instead of the camera's origin."""
     arap_across: Share = 0.03
-    """Factor of E_arap between superpixels that the start gives to different components; 1 is the
+    """Factor of E_arap and E_prior between superpixels of different components; 1 is the
     paper's."""
     cont_occluded: Share = 0.03
     """Factor of E_cont where one of these components hides another; 1 is the paper's."""

@@ -1,8 +1,8 @@
 """Kernels as machine code that works on eight elements at a time, summed over their table in C.
 
-CasADi's own C code is scalar, and mapping it over a table copies the table's data at every call;
-a kernel's instructions on vectors of the compiler (GCC, clang) with its gathers and sums in one
-loop take a fifth of the time.
+CasADi's own C code is scalar, and mapping it over a table copies the table's data at every call.
+The kernel's instructions on the compiler's vectors (GCC, clang), with gathers and sums in one loop,
+take a fifth of the time.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ _OPERATIONS: Mapping[int, str] = {
 
 
 class NoLanesError(Exception):
-    """A function cannot be had this way; CasADi's own is there."""
+    """A function cannot be vectorised; `mapped` replaces it."""
 
 
 def c_source(function: ca.Function) -> str:
@@ -168,7 +168,7 @@ class Summed(NamedTuple):
         call: The loop, of a library of `compile_lanes`.
         lanes: The table.
         place: (B, entries, LANES) where each is added; what fills the last block belongs in an
-            entry that nobody reads.
+            entry that is dropped.
     """
 
     call: Callable[..., None]

@@ -66,7 +66,7 @@ def smooth_min(y: ca.SX, sigma: ca.SX, width: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def _corner(eps: ca.SX, sigma: ca.SX) -> ca.SX:
-    """Width of a truncation's corner: as sharp as eps it would be as hard as the norm itself."""
+    """Width of a truncation's corner; one as sharp as eps would be as stiff as the norm itself."""
     return ca.fmax(eps, 0.3 * sigma)
 
 

@@ -1,6 +1,6 @@
-"""The exact energy in plain numpy: text for newcomers, oracle for tests, referee for reports.
+"""The exact energy in plain NumPy, for reports and as reference of the symbolic model.
 
-Shares nothing with the symbolic model. Every function follows its equation of the paper; lengths
+It shares nothing with the symbolic model. Every function follows its equation of the paper; lengths
 are measured in the depth of their anchors or with sum_i c_i D_i = 1: either makes E independent
 of the free global scale.
 """
@@ -18,21 +18,22 @@ Float = NDArray[np.float64]
 
 
 def energy(soup: Soup, data: EnergyData, weights: Weights) -> dict[str, float]:
-    """E and its four weighted terms.
+    """E and its weighted terms.
 
     Args:
         soup: State; only its geometry matters, not its gauge nor its global scale.
         data: Pixels, graphs and weights of the pair.
-        weights: alpha1 to alpha3 and the truncations.
+        weights: alpha1 to alpha4 and the truncations.
 
     Returns:
-        {"total", "arap", "proj", "cont", "orient"}; the terms include their factors.
+        {"total", "arap", "proj", "cont", "orient", "prior"}; the terms include their factors.
     """
     terms = {
         "arap": weights.arap * float(arap(soup, data, weights).sum()),
         "proj": weights.proj * float(reprojection(soup, data, weights).sum()),
         "cont": weights.cont * float(continuity(soup, data, weights).sum()),
         "orient": weights.orient * float(orientation(soup, data, weights).sum()),
+        "prior": weights.prior * float(prior(soup, data).sum()),
     }
     return {"total": sum(terms.values()), **terms}
 
@@ -110,3 +111,16 @@ def orientation(soup: Soup, data: EnergyData, weights: Weights) -> Float:
     i, k = data.pairs.T
     turn = np.abs(1.0 - np.einsum("pc,pc->p", soup.n[i], soup.n[k]))
     return data.orient_weight * np.minimum(turn, weights.sigma_orient)
+
+
+def prior(soup: Soup, data: EnergyData) -> Float:
+    """(E,) E_prior of every edge: slope of the inverse depth between its anchors, relative to it.
+
+    `|1 / Z_i - 1 / Z_k| / (m |r_i - r_k|)` with anchor rays r and m the mean of both inverse depths
+    that is near the larger.
+    """
+    i, k = data.edges.T
+    inverse, ray = 1 / soup.depth_at(data.anchor_ray), data.anchor_ray
+    larger = np.mean(inverse[data.edges] ** 4, axis=1) ** 0.25
+    change = np.abs(inverse[i] - inverse[k]) / larger
+    return data.prior_weight * change / np.linalg.norm(ray[i] - ray[k], axis=1)

@@ -11,13 +11,16 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 
+Float = NDArray[np.float64]
+
 
 def across_components(data: EnergyData, component: NDArray[np.int64], factor: float) -> EnergyData:
-    """The same data with E_arap's weights times `factor` on edges from one component to another.
+    """The same data with E_arap and E_prior times `factor` on edges between two components.
 
     As-rigid-as-possible holds inside a component. Across components it pulls a component that the
     camera's motion explains at a wrong depth to that depth: with equal motions such an edge costs
-    nothing.
+    nothing. The prior would pull a component to its background, against the contact that fixes its
+    scale.
 
     Args:
         data: Data of the pair.
@@ -25,9 +28,25 @@ def across_components(data: EnergyData, component: NDArray[np.int64], factor: fl
         factor: 1 is the paper's energy.
     """
     i, k = data.edges.T
-    return replace(
-        data, edge_weight=np.where(component[i] == component[k], 1.0, factor) * data.edge_weight
-    )
+    held = np.where(component[i] == component[k], 1.0, factor)
+    return replace(data, edge_weight=held * data.edge_weight, prior_weight=held * data.prior_weight)
+
+
+LEAST_NOISE, MOST_NOISE = 0.05, 0.6
+"""Limits of the flow's noise, pixels."""
+
+
+def in_noise(data: EnergyData, error: Float) -> EnergyData:
+    """The same data with E_prior measured in units of the flow's noise.
+
+    Relief that explains less of the flow than a share of its noise is not to be believed.
+
+    Args:
+        data: Data of the pair.
+        error: (N,) mean re-projection error of every superpixel at the start, pixels.
+    """
+    noise = float(np.clip(np.median(error), LEAST_NOISE, MOST_NOISE))
+    return replace(data, prior_weight=noise * data.prior_weight)
 
 
 def at_occlusions(
@@ -62,8 +81,8 @@ def across_discontinuities(
 ) -> EnergyData:
     """The same data with terms times a factor each from one surface to another.
 
-    Where the flow tears, two surfaces pass each other: their gap in depth is nothing to close, they
-    need not move alike, nor face the same way. What ties them flattens the relief of both.
+    At a flow discontinuity one surface passes in front of another: their gap in depth is real, and
+    they need neither move alike nor face the same way. Ties between them flatten both reliefs.
 
     Args:
         data: Data of the pair.

@@ -98,9 +98,6 @@ def matrix_view(x: ca.SX, gauge: str, offset: ca.SX) -> View:
     return View(lam=lam, m=-n / d, n=n, turn=ca.reshape(rest[0:9], 3, 3), t=t, drift=lam * t)
 
 
-TANGENT_SIZE = 9
-
-
 def tangent_view(
     x: ca.SX,
     anchor: ca.SX,

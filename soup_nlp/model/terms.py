@@ -1,7 +1,7 @@
-"""The four energy terms and every constraint, each written once for one element.
+"""The energy terms and every constraint, each written once for one element.
 
 A term takes the views of its superpixels and its row of data, and returns its robust norms; see
-`energy.EnergyData` for the columns and `plain` for the same in numpy.
+`elements` for the columns and `oracle` for the same in numpy.
 """
 
 from __future__ import annotations
@@ -102,6 +102,13 @@ def orientation(a: View, b: View, row: Row, eps: ca.SX, truncated: bool) -> list
     """
     sigma = row["sigma"] if truncated else None
     return [Norm("turn", row["weight"], a.n - b.n, eps, sigma, kind="half_square")]
+
+
+def prior(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
+    """E_prior of an edge: slope of the inverse depth between two anchors, relative to it."""
+    Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
+    change = (1 / Xa[2] - 1 / Xb[2]) / _nearness(Xa, Xb)
+    return [Norm("slope", row["weight"], change / row["reach"], eps)]
 
 
 def so3(a: View) -> ca.SX:

@@ -24,6 +24,7 @@ from soup_nlp.model.reweighting import (
     across_components,
     across_discontinuities,
     at_occlusions,
+    in_noise,
     in_pixels,
 )
 from soup_nlp.solve.solver_options import SolverOptions
@@ -158,6 +159,9 @@ def build_energy(
     data = build_energy_data(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, bends or e.arap_at_anchors
     )
+    if not bends:
+        # a start without relief says nothing of the flow's noise
+        data = in_noise(data, start.error)
     data = across_components(data, start.component, e.arap_across)
     data = at_occlusions(data, start.soup, start.component, e.occlusion_gap, e.cont_occluded)
     if bends:

@@ -19,15 +19,16 @@ from soup_nlp.evaluate.baselines import rigid_depth
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.pipeline.case import Case, prepare
-from soup_nlp.refine.mppbp import refine_soup
+from soup_nlp.refine.mppbp import objective, refine_soup
+from soup_nlp.refine.photometric import look
 from soup_nlp.refine.records import Refined
-from soup_nlp.refine.select import upright
 from soup_nlp.solve.ipopt import Listener
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.stages import Solution, solve_soup
@@ -100,8 +101,10 @@ class Run:
 
     @property
     def energy(self) -> Mapping[str, float]:
-        """Exact energy by term of `soup`."""
-        return self.refined.energy if self.refined else self.solution.energy
+        """Exact energy E by term of `soup`; E_photo of the refinement is not part of it."""
+        if self.refined is None:
+            return self.solution.energy
+        return oracle.energy(self.refined.soup, self.data, self.weights)
 
     @property
     def residuals(self) -> dict[str, float]:
@@ -177,11 +180,13 @@ def run(
         clock("nlp")
     refined = None
     if problem.refine.enabled:
+        photo = look(case.pair, case.segmentation.labels, solution.soup, problem.refine)
         refined = refine_soup(
             solution.soup,
             case.data,
             case.weights,
             problem.refine,
+            photo=photo,
             seed=problem.seed,
             min_facing=problem.formulation.min_facing,
             depth_ratio=problem.formulation.depth_ratio,
@@ -190,7 +195,8 @@ def run(
             say=log,
         )
         if problem.refine.polish and refined.status != "interrupted":
-            refined = _polished(refined, nlp(refined.soup))
+            again = nlp(refined.soup).soup
+            refined = _polished(refined, again, objective(again, case.data, case.weights, photo))
         if log:
             log(str(refined))
         clock("refine")
@@ -245,7 +251,7 @@ def _skipped(case: Case) -> Solution:
     """The start in place of the NLP's solution, its planes tilted until they face the camera."""
     start, data, form = case.start.soup, case.data, case.problem.formulation
     rays = data.visibility_ray(form.depth_ratio)
-    soup = upright(start, data.anchor_ray, rays, form.min_facing)
+    soup = tilt_to_camera(start, data.anchor_ray, rays, form.min_facing)
     soup = soup.normalised(data.share).retracted()
     return Solution(
         soup=soup,
@@ -263,13 +269,13 @@ def _skipped(case: Case) -> Solution:
     )
 
 
-def _polished(refined: Refined, again: Solution) -> Refined:
-    """The refined soup, or the NLP's answer from it where that has the lower exact energy."""
-    gain = refined.energy["total"] - again.energy["total"]
-    # a smaller gain may be rounding
+def _polished(refined: Refined, again: Soup, energy: Mapping[str, float]) -> Refined:
+    """The refined soup, or the NLP's answer from it where the refinement's objective is lower."""
+    gain = refined.energy["total"] - energy["total"]
+    # a gain of rounding size is none
     if gain <= 1e-9 * refined.energy["total"]:
         return replace(refined, polish_gain=0.0)
-    return replace(refined, soup=again.soup, energy=again.energy, polish_gain=gain)
+    return replace(refined, soup=again, energy=energy, polish_gain=gain)
 
 
 def solve_pair(pair: Pair, **options: Any) -> Run:

@@ -8,6 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.plane import (
+    about_anchor,
+    at_anchor,
+    inverse_depth,
+    normal_and_distance,
+)
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.refine.costs import Particles
 
@@ -33,20 +39,14 @@ class Local:
 
     def particles(self, anchor_ray: Float) -> Particles:
         """The same as planes with unit normals."""
-        a = anchor_ray[:, None, :2]
-        last = 1.0 - np.sum(self.g * a, axis=-1)
-        m = np.concatenate([self.g, last[..., None]], axis=-1) / self.Z[..., None]
-        length = np.linalg.norm(m, axis=-1)
-        return Particles(-m / length[..., None], 1.0 / length, self.R, self.T)
+        n, D = normal_and_distance(about_anchor(self.Z, self.g, anchor_ray[:, None]))
+        return Particles(n, D, self.R, self.T)
 
     @classmethod
     def of(cls, soup: Soup, anchor_ray: Float) -> Local:
         """A soup, C = 1."""
-        m = -soup.n / soup.distance[:, None]
-        Z = 1.0 / np.einsum("nc,nc->n", m, anchor_ray)
-        return cls(
-            Z[:, None], (m[:, :2] * Z[:, None])[:, None], soup.R[:, None], soup.translation[:, None]
-        )
+        Z, g = at_anchor(inverse_depth(soup.n, soup.distance), anchor_ray)
+        return cls(Z[:, None], g[:, None], soup.R[:, None], soup.translation[:, None])
 
     def repeated(self, count: int) -> Local:
         """C = 1 to C = count."""

@@ -144,7 +144,7 @@ class PairCosts:
     def tables(
         self, p: Particles, unit: float = 1.0, dtype: type | np.dtype = np.float64
     ) -> NDArray[np.floating]:
-        """(E, L, L) `E_arap + alpha2 E_cont + alpha3 E_orient` of every pair of labels.
+        """(E, L, L) weighted sum of every term but E_proj, of every pair of labels.
 
         Args:
             p: (N, L) particles.
@@ -167,10 +167,7 @@ class PairCosts:
         """1 / length unit of a block, (b, L, L) or (b, 1, 1)."""
         if not self.data.local_units:
             return np.full((len(i), 1, 1), 1.0 / unit)
-        q = 0.5 * s.Z**-4.0
-        np.add(q[i][:, :, None], q[k][:, None, :], out=out)
-        np.sqrt(out, out=out)
-        return np.sqrt(out, out=out)
+        return _nearness(s, i, k, out)
 
     def _arap(self, s: _State, rows: Int, unit: float, buffers: Float) -> Float:
         d, w = self.data, self.weights
@@ -205,6 +202,14 @@ class PairCosts:
         x *= per
         total += _leaky(x, sigma, w.leak_arap)
         total *= w.arap * d.edge_weight[rows][:, None, None]
+
+        reach = np.linalg.norm(d.anchor_ray[i] - d.anchor_ray[k], axis=1)
+        inverse = 1 / s.Z
+        np.subtract(inverse[i][:, :, None], inverse[k][:, None, :], out=x)
+        np.abs(x, out=x)
+        x /= _nearness(s, i, k, scale)
+        x *= (w.prior * d.prior_weight[rows] / reach)[:, None, None]
+        total += x
         return total
 
     def _cont(self, s: _State, rows: Int, unit: float, buffers: Float) -> Float:
@@ -276,6 +281,14 @@ class _State:
         ]
         points = np.concatenate([z * v + T[c] for c, v in enumerate(turned)])
         return z * np.sqrt(np.sum(r * r, axis=1)), points
+
+
+def _nearness(s: _State, i: Int, k: Int, out: Float) -> Float:
+    """Inverse depth (b, L, L) of the anchors of a block, mostly of the nearer one."""
+    q = 0.5 * s.Z**-4.0
+    np.add(q[i][:, :, None], q[k][:, None, :], out=out)
+    np.sqrt(out, out=out)
+    return np.sqrt(out, out=out)
 
 
 def _first(values: Float) -> Float:

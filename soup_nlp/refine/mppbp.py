@@ -2,7 +2,7 @@
 
 Every round draws particles around the current soup, lays the exact energy out over them as a
 pairwise MRF, finds a good joint choice with TRW-S, and goes on from there. The current belief is
-always particle 0 and a choice is taken only if `oracle.energy` says that it is lower: E never
+always particle 0 and a choice is taken only if the exact energy (`objective`) is lower: it never
 rises. Feasibility holds by construction: rotations by the exponential map, normals on the sphere,
 positive distances, visibility by an infinite cost, the simplex by the free global scale.
 
@@ -23,6 +23,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
@@ -31,8 +32,10 @@ from soup_nlp.mrf.trws import TRWSResult, solve_trws
 from soup_nlp.refine.anchored import neighbours
 from soup_nlp.refine.costs import PairCosts, Particles, feasible, unary_costs
 from soup_nlp.refine.particles import COMMON, KINDS, WALKS, Proposals, Proposer
+from soup_nlp.refine.photometric import Photometric
 from soup_nlp.refine.records import Refined, RefineOptions, Round
-from soup_nlp.refine.select import conditional_costs, diverse, upright, within_reach
+from soup_nlp.refine.select import conditional_costs, diverse, within_reach
+from soup_nlp.refine.sweep import swept
 from soup_nlp.solve.ipopt import Listener, Progress
 
 Float = NDArray[np.float64]
@@ -65,6 +68,7 @@ def refine_soup(
     weights: Weights,
     options: RefineOptions | None = None,
     *,
+    photo: Photometric | None = None,
     seed: int = 0,
     min_facing: float = 1e-3,
     depth_ratio: float = 5.0,
@@ -74,11 +78,15 @@ def refine_soup(
 ) -> Refined:
     """Lower the exact energy of a soup by particles; see the module.
 
+    With images the energy is that of `objective`, and planes swept over depth under the commonest
+    motions are among the particles of the first round.
+
     Args:
         soup: Current belief. Planes that break visibility are first tilted until they do not.
         data: Numbers of the energy.
         weights: Its constants.
         options: Rounds, particles, limits.
+        photo: What the images say; None leaves it to the flow.
         seed: Of every draw.
         min_facing: Visibility, as in the constrained NLP.
         depth_ratio: The same.
@@ -94,12 +102,18 @@ def refine_soup(
     begin = time.perf_counter()
     deadline = begin + o.max_seconds
     rays = data.visibility_ray(depth_ratio)
-    best = upright(soup, data.anchor_ray, rays, min_facing).normalised(data.share).retracted()
-    energy = energy_begin = oracle.energy(best, data, weights)
+    best = (
+        tilt_to_camera(soup, data.anchor_ray, rays, min_facing).normalised(data.share).retracted()
+    )
+    energy = energy_begin = objective(best, data, weights, photo)
+    if photo is not None:
+        weights = photo.beside(weights)
     pair_costs = PairCosts(data, weights)
     proposer = Proposer(data, neighbours(pair_costs.edges, data.anchor_ray), seed)
     shares = dict(SHARES)
     kept: Particles | None = None
+    if photo is not None and o.sweep:
+        kept = swept(best, *proposer.commonest(best, 2), data, photo, o.sweep)
     rounds: list[Round] = []
     status, slow, interrupted = "rounds", 0, False
     for number in range(o.rounds):
@@ -109,6 +123,8 @@ def refine_soup(
         drawn = _draw(proposer, best, kept, o, shares)
         p = drawn.particles
         unary, pairwise = _costs(best, p, data, weights, pair_costs, o)
+        if photo is not None:
+            unary += photo.costs(p, photo.unit(best))
         unary[~feasible(p, rays, min_facing)] = np.inf
         unary[~within_reach(p, best, proposer.near, data.anchor_ray, o.depth_reach)] = np.inf
         unary[:, 0] = _current_cost(unary, best, data, weights)
@@ -135,7 +151,7 @@ def refine_soup(
         interrupted = result.status == "interrupted" and time.perf_counter() <= deadline
         labels = result.labels
         new = p.soup(labels, data.share).retracted()
-        new_energy = oracle.energy(new, data, weights)
+        new_energy = _energy(new, data, weights, photo)
         taken = new_energy["total"] < energy["total"]
         if not taken:
             labels = np.zeros(len(best), np.int64)
@@ -161,6 +177,30 @@ def refine_soup(
     elif len(rounds) < o.rounds and status == "rounds":
         status = "time limit"
     return Refined(best, energy_begin, energy, tuple(rounds), status, time.perf_counter() - begin)
+
+
+def objective(
+    soup: Soup, data: EnergyData, weights: Weights, photo: Photometric | None = None
+) -> Mapping[str, float]:
+    """What the refinement lowers, by term: E; with images a weaker E_proj, and E_photo.
+
+    Args:
+        soup: State.
+        data: Numbers of the energy.
+        weights: Its constants, without images.
+        photo: What the images say, if anything.
+    """
+    return _energy(soup, data, photo.beside(weights) if photo else weights, photo)
+
+
+def _energy(
+    soup: Soup, data: EnergyData, weights: Weights, photo: Photometric | None
+) -> Mapping[str, float]:
+    own = oracle.energy(soup, data, weights)
+    if photo is None:
+        return own
+    seen = photo.energy(soup)
+    return {**own, "total": own["total"] + seen, "photo": seen}
 
 
 def _draw(

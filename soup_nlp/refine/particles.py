@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.refine.anchored import Local, fit_motion
@@ -231,7 +232,7 @@ class Proposer:
 
     def _extrapolated(self, soup: Soup, who: Int, own: Local) -> tuple[Float, Float]:
         """Depth and slope at the own anchor of the planes of others (N, C)."""
-        m = (-soup.n / soup.distance[:, None])[who]
+        m = inverse_depth(soup.n, soup.distance)[who]
         inverse = np.einsum("ncj,nj->nc", m, self.data.anchor_ray)
         # a plane that does not meet the anchor's ray in front: its depth is borrowed instead
         bad = inverse * own.Z < 0.1
@@ -273,6 +274,11 @@ class Proposer:
         R, T, _ = self._explaining(soup, now, count)
         R, T = (np.broadcast_to(v, (n, *v.shape)) for v in (R, T))
         return self._with_motion(now, R, T, slopes=False), None
+
+    def commonest(self, soup: Soup, count: int) -> tuple[Float, Float]:
+        """(C, 3, 3), (C, 3) few present motions that explain most superpixels, C <= count."""
+        R, T, _ = self._explaining(soup, Local.of(soup, self.data.anchor_ray), count)
+        return R, T
 
     def _explaining(self, soup: Soup, now: Local, count: int) -> tuple[Float, Float, Float]:
         """Few present motions that bring most anchors where their own do.

@@ -9,7 +9,15 @@ from typing import Annotated
 from pydantic import Field
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.schema.section import Count, NonNegative, Section, Tolerance, Whole
+from soup_nlp.schema.section import (
+    Count,
+    Finite,
+    NonNegative,
+    Section,
+    Tolerance,
+    Truncation,
+    Whole,
+)
 
 
 class RefineOptions(Section):
@@ -19,7 +27,7 @@ class RefineOptions(Section):
     """Refine at all."""
     from_start: bool = False
     """Refine the start: the NLP is skipped."""
-    rounds: Count = 10
+    rounds: Count = 4
     """Most rounds of particles."""
     particles: Annotated[int, Field(ge=2)] = 50
     """Labels of every superpixel, the current belief among them."""
@@ -30,10 +38,19 @@ class RefineOptions(Section):
     at least their lower quartile over this squared."""
     trws_iterations: Whole = 15
     """Most iterations of TRW-S in a round."""
-    trws_gap: NonNegative = 1e-4
-    """TRW-S stops at this relative gap."""
+    trws_gap: Finite = 1e-4
+    """TRW-S stops at this relative gap; negative: never."""
     stagnation: NonNegative = 1e-3
     """End when two rounds in a row lower E by less than this share; 0 never."""
+    photo: NonNegative = 10.0
+    """Factor of E_photo, which measures how far the images contradict a superpixel's homography
+    (`refine.photometric`); 0 leaves the images out."""
+    photo_proj: NonNegative = 0.3
+    """Factor of alpha1 beside the images."""
+    photo_sigma_proj: Truncation = 2.0
+    """Truncation of a pixel's re-projection error beside the images, pixels."""
+    sweep: Count = 6
+    """Planes swept over depth that every superpixel is offered, where images count."""
     max_seconds: Tolerance = 300.0
     """Time limit of the rounds together."""
     float32: bool = False
@@ -47,7 +64,7 @@ class Round:
     """One round as it went.
 
     Attributes:
-        energy: Exact E by term afterwards.
+        energy: What is lowered (`mppbp.objective`), by term, afterwards.
         mrf_energy: Energy of the chosen labels in the MRF.
         bound: TRW-S's lower bound on every choice among these particles.
         iterations: Of TRW-S.
@@ -91,8 +108,8 @@ class Refined:
 
     Attributes:
         soup: Best soup.
-        energy_begin: Exact E by term before.
-        energy: Exact E by term of `soup`.
+        energy_begin: What was lowered (`mppbp.objective`), by term, before.
+        energy: The same of `soup`.
         rounds: Every round.
         status: "rounds" (all of them), "stagnated", "interrupted" or "time limit".
         seconds: Wall time.

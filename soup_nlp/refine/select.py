@@ -1,4 +1,4 @@
-"""Which particles stay for the next round, and planes made to face the camera."""
+"""Which particles stay for the next round."""
 
 from __future__ import annotations
 
@@ -11,9 +11,6 @@ from soup_nlp.refine.costs import Particles, anchor_depth
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
-TOLERANCE = 1e-7
-"""Violation of visibility that a given soup may have."""
 
 
 def conditional_costs(
@@ -109,37 +106,3 @@ def within_reach(
     low = np.minimum(low / reach**2, own) * (1 - 1e-9)
     inside = np.less_equal(Z, high[:, None]) & np.greater_equal(Z, low[:, None])
     return np.asarray(inside)
-
-
-def upright(soup: Soup, anchor_ray: Float, visibility_ray: Float, min_facing: float) -> Soup:
-    """The soup with planes that break visibility tilted about their anchors until they do not.
-
-    The depth at the anchor stays. A plane parallel to the image satisfies every row.
-
-    Args:
-        soup: State.
-        anchor_ray: (N, 3).
-        visibility_ray: (N, V, 3), see `EnergyData.visibility_ray`.
-        min_facing: c of `-n . v >= c`.
-    """
-    m = -soup.n / soup.distance[:, None]
-    Z = 1.0 / np.einsum("nc,nc->n", m, anchor_ray)
-    bad_depth = Z <= 0
-    Z = np.where(bad_depth, np.median(Z[~bad_depth]) if (~bad_depth).any() else 1.0, Z)
-    g = np.where(bad_depth[:, None], 0.0, m[:, :2] * Z[:, None])
-    share = np.ones(len(soup))
-    n, D = soup.n.copy(), soup.distance.copy()
-    for _ in range(60):
-        facing = -np.einsum("nc,nvc->nv", n, visibility_ray).max(axis=1)
-        # an NLP's answer keeps its inequalities to a tolerance: it stays as it is
-        bad = (facing < min_facing - TOLERANCE) | bad_depth
-        bad_depth = np.zeros(len(soup), bool)
-        if not bad.any():
-            break
-        share = np.where(bad, 0.8 * share, share)
-        tilt = g * share[:, None]
-        plane = np.column_stack([tilt, 1 - np.sum(tilt * anchor_ray[:, :2], axis=1)]) / Z[:, None]
-        length = np.linalg.norm(plane, axis=1)
-        n[bad] = (-plane / length[:, None])[bad]
-        D[bad] = (1 / length)[bad]
-    return Soup(np.ones(len(soup)), n, D, soup.R, soup.translation)

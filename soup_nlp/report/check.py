@@ -18,7 +18,7 @@ from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.storage.store import read_attrs, read_h5, require
 
 Entries: TypeAlias = Mapping[str, Any]
-TERMS = ("arap", "proj", "cont", "orient")
+TERMS = ("arap", "proj", "cont", "orient", "prior")
 LIMITS = {
     "so3": 1e-8,
     "normal": 1e-8,
@@ -124,10 +124,11 @@ def _rows(folder: Path, claims: Entries, tree: Entries, attrs: Entries) -> Itera
             claimed = claims["energy"][which][term]
             yield _same(f"energy {which} {term}", claimed, value, of=found["total"], absolute=slack)
     if claims["converged"]:
-        before, after = (float(claims["energy"][k]["total"]) for k in ("start", "solution"))
+        before, after = (float(claims["energy"][k]["total"]) for k in ("start", "nlp"))
         ok = after <= before * (1 + RELATIVE) + slack
         yield Claim("energy falls", before, after, before, ok)
     yield from _rounds(claims, slack)
+    yield from _refined(claims, tree, settings, weights, slack)
     yield from _constraints(claims, tree, weights)
     yield from _depths(tree)
     yield from _metrics(tree, claims["metrics"])
@@ -163,7 +164,7 @@ def _rounds(claims: Entries, slack: float) -> Iterator[Claim]:
     if not refinement or not refinement["rounds"]:
         return
     rounds = refinement["rounds"]
-    path = [refinement["begin"], *(r["energy"] for r in rounds), claims["energy"]["solution"]]
+    path = [refinement["begin"], *(r["energy"] for r in rounds), refinement["end"]]
     totals = np.array([float(e["total"]) for e in path])
     rise = float(np.diff(totals).max())
     within = RELATIVE * abs(totals[0]) + slack
@@ -172,6 +173,28 @@ def _rounds(claims: Entries, slack: float) -> Iterator[Claim]:
     yield Claim("no choice below its bound", 0.0, under, 0.0, under <= within)
     if not refinement["polish_gain"]:
         yield _same("last round is delivered", totals[-2], totals[-1], absolute=slack)
+
+
+def _refined(
+    claims: Entries,
+    tree: Entries,
+    settings: Entries,
+    weights: Mapping[str, float],
+    slack: float,
+) -> Iterator[Claim]:
+    """Objective that the refinement ended with; the share of the images is taken as claimed."""
+    refinement = claims.get("refinement")
+    if not refinement:
+        return
+    end, own = refinement["end"], dict(weights)
+    if "photo" in end:
+        own["proj"] *= float(settings["refine"]["photo_proj"])
+        sigma = float(settings["refine"]["photo_sigma_proj"])
+        own["sigma_proj"] = min(own["sigma_proj"], sigma)
+    found = recompute.energy(_state(tree, "solution"), tree["energy"], own)
+    found["total"] += _number(end.get("photo", 0.0))
+    for term, value in found.items():
+        yield _same(f"refined {term}", end[term], value, of=found["total"], absolute=slack)
 
 
 def _number(value: Any) -> float:

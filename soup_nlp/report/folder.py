@@ -215,6 +215,7 @@ def _refinement(run: Run) -> dict[str, Any] | None:
         "polish_gain": r.polish_gain,
         "seconds": r.seconds,
         "begin": r.energy_begin,
+        "end": r.energy,
         "rounds": [{key: getattr(one, key) for key in _ROUND} for one in r.rounds],
     }
 

@@ -43,6 +43,7 @@ _ENERGY: Table = {
     "pixel_weight": ("1", "N,S", "confidence x usable share / sample size; 0 drops a pixel"),
     "edges": ("1", "E,2", "K-NN edges i < k"),
     "edge_weight": ("1", "E", "w1 = w2, both directions folded, less between two components"),
+    "prior_weight": ("1", "E", "weight of E_prior: noise of the flow / K for each direction"),
     "edge_unit": ("1", "E", "length unit of an edge, see local_units"),
     "rotation_scale": ("1", "", "factor of |R_i - R_k|"),
     "pairs": ("1", "P,2", "neighbours i < k that share boundary"),

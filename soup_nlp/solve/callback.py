@@ -1,4 +1,4 @@
-"""The iteration callback of CasADi's nlpsol, as far as every watcher has it alike."""
+"""Base class of iteration callbacks of CasADi's nlpsol."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import casadi as ca
 
 
 class IterationCallback(ca.Callback):
-    """Base of what is called at every iteration; `eval` gets nlpsol's outputs, 1 says stop.
+    """Called at every iteration: `eval` gets nlpsol's outputs and returns 1 to stop.
 
     A subclass sets what its `eval` needs and then calls `start`.
     """
@@ -33,14 +33,14 @@ class IterationCallback(ca.Callback):
         return 1
 
     def get_name_in(self, i: int) -> str:
-        """As nlpsol names its outputs."""
+        """Name of nlpsol's output i."""
         return str(ca.nlpsol_out(i))
 
     def get_name_out(self, i: int) -> str:
-        """As nlpsol asks for it."""
+        """The name that nlpsol asks for."""
         return "ret"
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Dense, or nothing where there is nothing."""
+        """Dense; empty outputs are 0 x 1."""
         size = self._sizes[i]
         return ca.Sparsity.dense(size) if size else ca.Sparsity(0, 1)

@@ -1,20 +1,18 @@
-"""Condensed primal-dual Newton on the tangent: what reaches the minimum before Ipopt finishes.
+"""The presolve: a condensed primal-dual Newton method on tangent coordinates.
 
 Every iteration solves one symmetric positive definite system of 9 N unknowns,
 
     (H + diag(mu_i) + sum_r z_r / c_r dc_r dc_r^T) h + nu a = -(df - sum_r b / c_r dc_r)
     a . h = 0
 
-with slacks c, their multipliers z, gradients d and the barrier b. Slacks depend on one superpixel
-each, so eliminating them costs no fill; Ipopt, which keeps them, factorises an indefinite system
-of twice the size. H is at first the reweighted Gauss-Newton majorant of the norms, whose full
-steps descend, then the exact Hessian.
+with slacks c, their multipliers z, gradients d and the barrier b. Every slack depends on one
+superpixel, so that eliminating it causes no fill; Ipopt, which keeps slacks, factorises an
+indefinite system of twice the size. H is at first the reweighted Gauss-Newton majorant of the
+norms, whose full steps descend, then the exact Hessian.
 
-Little is decided for all superpixels at once: damping mu_i, fraction to the boundary and, unless
-that is refused, shortened steps are each superpixel's own, so that a few that are on their way to
-another minimum do not hold up the others. Energies cost a tenth of an iteration, so a step is
-doubled as long as that pays: components slide along valleys of equal re-projection error in a few
-iterations.
+Damping mu_i, fraction to the boundary and step length are each superpixel's own, so that a few
+that move to another minimum do not slow down the others. Steps are doubled while the merit falls:
+components slide along valleys of equal re-projection error in a few iterations.
 """
 
 from __future__ import annotations
@@ -49,11 +47,11 @@ from soup_nlp.solve.tangent_problem import HessianKind, TangentProblem
 Float = NDArray[np.float64]
 
 DAMPING = (1e-7, 1e6)
-"""Least and most damping mu of a superpixel; scales, slopes, radians, shares of depth."""
+"""Least and most damping mu of a superpixel."""
 HELD = 1e-3
 """Least damping of a superpixel whose step went too far."""
 BLENDS = (0.0, 0.1, 0.3, 1.0)
-"""Shares of the majorant in the exact Hessian, tried until the direction is one of descent."""
+"""Shares of the majorant in the exact Hessian, tried until the step is a descent direction."""
 
 
 class Step(NamedTuple):
@@ -63,7 +61,7 @@ class Step(NamedTuple):
         h: (9 N,) the step.
         H: Nonzeros of its matrix without damping.
         blend: Share of the majorant to begin with next time.
-        newton: Step for another gradient of the merit.
+        newton: Newton step for another gradient of the merit.
     """
 
     h: Float
@@ -111,7 +109,7 @@ class Descent:
 
     @property
     def soup(self) -> Soup:
-        """Where it is."""
+        """The present iterate."""
         return self.problem.layout.unpack(self.x)
 
     @property
@@ -231,8 +229,8 @@ class Descent:
     def _dual(self, gradient: Float, jacobian: Float) -> tuple[float, float]:
         """Multiplier of the simplex and the dual infeasibility.
 
-        The multiplier is what a growth of the whole soup is worth: near 0 far from the solution as
-        well where E does not depend on scale, which one by least squares is not.
+        The multiplier is the slope of the Lagrangian as the whole soup grows. Where E does not
+        depend on scale it is near 0 also far from the solution, unlike a least-squares estimate.
         """
         assert self.z is not None
         rest = less_forces(gradient, jacobian, self.z)
@@ -287,7 +285,7 @@ class Descent:
                 continue
             newton = _held(back, a)
             h = newton(right)
-            # a library without a word on definiteness: curvature along the step tells
+            # a library that cannot see definiteness: test the curvature along the step
             # (Chiang and Zavala 2016)
             curved = float(h @ self._times(H, h)) + float(damping @ h**2)
             if np.isfinite(h).all() and curved > 0 and float(right @ h) <= 0:
@@ -300,7 +298,7 @@ class Descent:
         return np.asarray(U @ h + U.T @ h - H[self._diagonal] * h)
 
     def _adapt(self, move: Move) -> None:
-        """Damping of every superpixel by how its step went."""
+        """Change the damping of every superpixel according to its step."""
         moved, damping = move.point is not None, self.damping
         raised = np.clip(damping * (4 if moved else 8), HELD, DAMPING[1])
         if moved:
@@ -320,7 +318,7 @@ class Descent:
 
 
 def _held(back: Back, a: Float) -> Callable[[Float], Float]:
-    """Newton's step for a gradient, in the plane `a . h = 0`."""
+    """Newton step for a gradient, within the plane `a . h = 0`."""
     v = back(a)
 
     def newton(gradient: Float) -> Float:

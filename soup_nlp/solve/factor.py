@@ -1,4 +1,4 @@
-"""Factorisation of sparse symmetric positive definite matrices by the library that is there."""
+"""Factorisation of sparse symmetric positive definite matrices by CHOLMOD or SuperLU."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Back = Callable[[Float], Float]
 Factorise = Callable[[Float], Back]
-"""Nonzeros of the upper triangle -> (b -> H^-1 b). Raises ArithmeticError where a library sees
+"""Nonzeros of the upper triangle -> (b -> H^-1 b). Raises ArithmeticError where the library finds
 that the matrix is not positive definite."""
 
 
@@ -39,7 +39,7 @@ def diagonal_places(upper: sparse.csc_matrix) -> Int:
     columns = np.repeat(np.arange(upper.shape[1]), np.diff(upper.indptr))
     places = np.flatnonzero(upper.indices == columns)
     if len(places) != upper.shape[0]:
-        raise ValueError("the matrix has no whole diagonal among its nonzeros")
+        raise ValueError("a diagonal entry is not among the nonzeros of the matrix")
     return places
 
 
@@ -49,7 +49,7 @@ def same_pattern(one: sparse.csc_matrix, other: sparse.csc_matrix) -> bool:
 
 
 def cholmod(upper: sparse.csc_matrix) -> Factorise:
-    """CHOLMOD as cvxopt brings it (an extra); the symbolic analysis is made once.
+    """CHOLMOD of cvxopt (an extra); the symbolic analysis is made once.
 
     Raises:
         ImportError: cvxopt is not installed.
@@ -100,8 +100,7 @@ def superlu(upper: sparse.csc_matrix) -> Factorise:
 def factorisation(upper: sparse.csc_matrix) -> tuple[str, Factorise]:
     """CHOLMOD where cvxopt is installed (the extra "fast"), else SuperLU, five times slower.
 
-    CasADi brings MUMPS, twice as slow as CHOLMOD; it is not used since CasADi lets it print when
-    it is taken down.
+    CasADi's MUMPS, twice as slow as CHOLMOD, is not used: it prints when it is destroyed.
 
     Args:
         upper: (n, n) upper triangle whose values number its nonzeros in storage order.

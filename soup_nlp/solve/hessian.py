@@ -14,12 +14,12 @@ from soup_nlp.model.sums import Sums
 class LagrangianHessian(ca.Callback):
     """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian.
 
-    It is that of the NLP's tables: of p only the leading parameters theta are read. A start that
-    is a KKT point needs none, and assembling CasADi's takes as long as Ipopt's iterations.
+    Of p it reads the leading parameters theta; the data are those of the NLP's tables. It is
+    compiled by the first call: a start at a KKT point needs no Hessian.
     """
 
     def __init__(self, nlp: NLP) -> None:
-        """Prepare; nothing is assembled but the pattern."""
+        """Find the pattern; nothing is compiled."""
         ca.Callback.__init__(self)
         self._nlp = nlp
         self._sums: Sums | None = None
@@ -51,11 +51,11 @@ class LagrangianHessian(ca.Callback):
         return self._pattern
 
     def has_eval_buffer(self) -> bool:
-        """Numbers come and go as buffers, without CasADi's own matrices."""
+        """Numbers are passed as buffers, without CasADi's own matrices."""
         return True
 
     def eval_buffer(self, arg: Sequence[memoryview], res: Sequence[memoryview]) -> int:
-        """Its nonzeros."""
+        """Write the nonzeros of the Hessian."""
         nlp = self._nlp
         if self._sums is None:
             self._sums = Sums(nlp, [nlp.hessian], first_order=False)

@@ -1,4 +1,4 @@
-"""Ctrl-C as an event: what runs ends at its next iteration, and keeps what it has."""
+"""Ctrl-C as an event: a solve ends at its next iteration and keeps the best iterate."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from typing import Any
 class interruptible:  # noqa: N801
     """Context in which Ctrl-C sets an event instead of raising (main thread only).
 
-    The second Ctrl-C raises KeyboardInterrupt, except where `deferred` is set: what is done then
-    must come to its end. Where it is raised in a callback of CasADi it is lost on the way;
-    `aborted` says that there was one.
+    The second Ctrl-C raises KeyboardInterrupt, except while `deferred` is set, as during the
+    writing of files. CasADi swallows one that is raised in its callbacks; `aborted` records it.
 
     Args:
         say: Told what a Ctrl-C does; it is called in a signal handler.

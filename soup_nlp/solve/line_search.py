@@ -1,10 +1,10 @@
-"""Search along a step of the presolve, superpixel by superpixel.
+"""Line search of the presolve, with a step length of every superpixel's own.
 
-A step that is too long for a few superpixels is shortened for those alone, and where that does not
-do, for all alike, at last to what a bound leaves to any of them; one that still goes down at its
-end is doubled, for all and then for those that still descend. Energies cost a tenth of an
-iteration. A step that leaves the floor of a bent valley is led back by further ones with the same
-matrix.
+A step that is too long for a few superpixels is shortened for those alone; where that fails, for
+all alike, and at last to the share that the bounds leave to every superpixel. A step that still
+descends at its end is doubled, for all and then for those that still descend: an energy costs a
+tenth of an iteration. A step that leaves the floor of a curved valley is corrected by further
+Newton steps with the same matrix.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ TO_BOUNDARY = 0.99
 LEAST_SLACK = 1e-3
 """A slack keeps at least this share of itself."""
 TRIES = 4
+"""Shorter steps that are tried after the full one."""
 SHORTER = 0.25
-"""A step that was too long goes on with this share of it: those for which it was too long, then all
-superpixels alike."""
+"""Factor that shortens a step that was too long."""
 BACK = 3
-"""Most changes that bring a superpixel back to bounds that curve."""
+"""Most corrections that bring a superpixel back inside curved bounds."""
 CORRECTIONS = 6
-"""Most steps with one matrix that follow the first."""
+"""Most further Newton steps with one matrix."""
 WORTH = 0.05
-"""Share of the fall so far that another one must bring."""
+"""Least decrease of the merit by such a step, as a share of the decrease before it."""
 
 
 class Point(NamedTuple):
-    """A point with what is known of it.
+    """A point with its energy and slacks.
 
     Attributes:
         x: (9 N,) variables.
@@ -55,14 +55,14 @@ class Point(NamedTuple):
 
 
 class Move(NamedTuple):
-    """What came of a step.
+    """Result of a line search.
 
     Attributes:
-        point: Where it led, or None: refused at every length.
-        length: (N,) share of the step that every superpixel went.
-        far: (N,) its superpixels that went past their minimum.
-        calm: (N,) those that ended where the quadratic model says.
-        eager: (N,) those that went down to the end: the step was short for them.
+        point: New point, or None: the merit falls at no length.
+        length: (N,) share of the step that every superpixel took.
+        far: (N,) superpixels that went past their minimum.
+        calm: (N,) those that ended where the quadratic model predicts.
+        eager: (N,) those that still descend at the end: the step was short for them.
     """
 
     point: Point | None
@@ -114,15 +114,15 @@ def inside(problem: TangentProblem, x: Float) -> Float:
 def led_back(
     problem: TangentProblem, x: Float, aim: Float, floor: Float
 ) -> tuple[Float, Float, Float]:
-    """x, its slacks and their derivatives, superpixels that left a curved bound brought back to it.
+    """x with superpixels that left a curved bound brought back; its slacks and their derivatives.
 
-    A step along a bound that curves leaves it by its square, however small the slack: what the
-    linearised slack promises is restored by the shortest change, bound by bound.
+    A step along a curved bound leaves it by the square of its length, however small the slack. The
+    shortest change restores the slack that the linearisation predicts, bound by bound.
 
     Args:
         problem: Slacks.
         x: (9 N,) end of a step.
-        aim: (N, R) slacks by their derivatives at the begin, positive.
+        aim: (N, R) linearised slacks, positive.
         floor: (N, R) least slacks.
     """
     slack, jacobian = problem.slacks(x)
@@ -179,14 +179,14 @@ class Search:
             at: Where the step begins.
             h: (9 N,) the step.
             barrier: b of `f - b sum log c`.
-            newton: Step (9 N,) for a gradient of the merit (9 N,), by the matrix that gave h.
+            newton: Newton step (9 N,) for a gradient of the merit (9 N,), by the matrix of h.
         """
         self.problem, self.at, self.h, self.barrier = problem, at, h, barrier
         self.newton = newton
         self._known: tuple[Float, Float] | None = None
 
     def gradient(self, x: Float) -> Float:
-        """Gradient of f at a point of the search (9 N,); that of the last one asked is kept."""
+        """Gradient of f at a point of the search (9 N,); the last one is kept."""
         if self._known is None or self._known[0] is not x:
             self._known = x, self.problem.gradient(x)
         return self._known[1]
@@ -218,43 +218,42 @@ class Search:
             if not attempt:
                 least = float(length.min())
             slope = self._slope(trial.x)
-            bent_back = self._corrected(trial)
+            corrected = self._corrected(trial)
             # past its minimum along the step, by more than the quadratic model allows
             here = ~(slope <= 0.5 * scale)
             far = far | here
             calm = (slope <= 0.1 * scale) & ~far
-            # still going down at half the first rate
+            # still descending at half the first rate
             eager = (slope < 0.5 * before) & (slope < -0.02 * scale) & ~far
             falls = trial.merit < at.merit + rounding
-            if bent_back is not None and bent_back.merit < min(trial.merit, at.merit):
-                if not falls:
-                    # what went too far was the valley's bend, not the step
-                    none = np.zeros_like(far)
-                    return Move(bent_back, length, none, none, none)
-                longer = self._longer(trial, length, eager, before, rounding)
-                moved = min(longer, bent_back, key=lambda point: point.merit)
-                return Move(moved, length, far, calm, eager)
+            better = corrected is not None and corrected.merit < min(trial.merit, at.merit)
+            if better and not falls:
+                # the step left the curved valley, but was not too long
+                none = np.zeros_like(far)
+                return Move(corrected, length, none, none, none)
             if falls:
-                return Move(
-                    self._longer(trial, length, eager, before, rounding), length, far, calm, eager
-                )
+                moved = self._longer(trial, length, eager, before, rounding)
+                if corrected is not None and better and corrected.merit < moved.merit:
+                    moved = corrected
+                return Move(moved, length, far, calm, eager)
             if here.any() and attempt < TRIES // 2:
                 length = np.where(here, SHORTER * length, length)
             elif attempt < TRIES - 1:
-                # neighbours whose steps differ pull at the stiff norms between them
+                # stiff norms between neighbours oppose steps that differ
                 length, whole = SHORTER * whole, SHORTER * whole
             elif least < 1:
-                # where a bound made them differ, all go as far as it lets any
+                # bounds made them differ: all take the share that the bounds leave to every one
                 length = np.full_like(length, min(SHORTER, least))
             else:
                 break
         return Move(None, length, far, calm, eager)
 
     def _corrected(self, trial: Point) -> Point | None:
-        """The trial after further steps with the same matrix: back to the floor of a bent valley.
+        """The trial after further Newton steps with the same matrix, or None.
 
-        Norms that are nearly zero are stiff: a step along a valley of theirs leaves it by its
-        square, and would have to be short without. A step costs a tenth of a factorisation.
+        Norms near zero are stiff: a step along their curved valley leaves its floor by the square
+        of the step, and would have to be short without correction. A correction costs a tenth of a
+        factorisation.
         """
         best = None
         for _ in range(CORRECTIONS):
@@ -276,7 +275,7 @@ class Search:
         return best
 
     def _feasible(self, length: Float) -> tuple[Point, Float]:
-        """The point at these lengths, halved where a slack would vanish."""
+        """The point at these lengths and the lengths, halved where a slack would vanish."""
         length, floor = length.copy(), LEAST_SLACK * self.at.slack
         change = along(self.at.jacobian, self.h)
         for _ in range(40):
@@ -291,9 +290,9 @@ class Search:
     def _longer(
         self, moved: Point, length: Float, eager: Bool, before: Float, rounding: float
     ) -> Point:
-        """Double the step while the merit falls: of all, then of those still going down.
+        """Double the step while the merit falls: of all, then of those that still descend.
 
-        A fall by rounding is none: twice a step to the minimum is where it began.
+        A decrease within rounding does not count.
         """
         for every in (True, False):
             some = np.ones_like(eager) if every else eager

@@ -1,4 +1,4 @@
-"""A phase of the presolve: what it minimises, and what ends it."""
+"""A phase of the presolve: smoothing, Hessian, barrier and the conditions that end it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Float = NDArray[np.float64]
 FASTER = 0.3
 """Steps beyond the tolerance go on while dual infeasibility or gap fall to this share."""
 FAR_BELOW = 0.03
-"""Share of the tolerance below which a dual infeasibility need not fall any more."""
+"""Share of the tolerance at which the dual infeasibility need not fall further."""
 
 
 @dataclass(frozen=True)
 class Phase:
-    """One setting of smoothing, Hessian and barrier, and what ends it.
+    """One setting of smoothing, Hessian and barrier, and the conditions that end it.
 
     Attributes:
         name: For progress.
@@ -33,8 +33,8 @@ class Phase:
         tol: Ends when dual infeasibility is below; "Solve_Succeeded".
         beyond: Whether steps go on after that while each makes the dual infeasibility or the gap
             FASTER times as large.
-        highest: Barrier far from the solution: a superpixel slides along a bent boundary only with
-            room to it. It follows 1e-6 of the dual infeasibility down to `barrier`.
+        highest: Barrier far from the solution, where superpixels need room to slide along a curved
+            boundary. It follows 1e-6 of the dual infeasibility down to `barrier`.
     """
 
     name: str
@@ -52,9 +52,9 @@ class Reached(NamedTuple):
     """A point within the tolerance.
 
     Attributes:
-        at: It.
+        at: The point.
         z: (N, R) multipliers there.
-        row: Of the history: f, dual infeasibility, gap and what does not matter here.
+        row: Of the history: f, dual infeasibility, gap, ...
     """
 
     at: Point
@@ -62,7 +62,7 @@ class Reached(NamedTuple):
     row: tuple[float, ...]
 
     def done(self, phase: Phase) -> bool:
-        """Whether nothing is left to gain by another step: the gap is the barrier's own."""
+        """Whether another step gains nothing: the gap is the barrier's own."""
         _, dual, gap, *_ = self.row
         return dual <= FAR_BELOW * phase.tol and gap <= 1.01 * phase.barrier
 

@@ -1,4 +1,4 @@
-"""What a problem file says about the solver: stages, tolerances, limits."""
+"""Options of the solver: stages, tolerances, limits."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from typing import Annotated
 from pydantic import Field
 
 from soup_nlp.schema.section import Count, NonNegative, Positive, Section, Tolerance, Whole
-
-Widths = Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)]
 
 
 class SolverOptions(Section):

@@ -1,4 +1,4 @@
-"""The presolve's energy as a descent method wants it: numbers, blocks and slacks per superpixel."""
+"""The presolve's energy for a descent method: numbers, blocks and slacks of every superpixel."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HessianKind = Literal["gauss-newton", "exact"]
 
 
 class TangentProblem:
-    """min f(x) with slacks c(x) >= 0 of every superpixel by itself, and the simplex.
+    """min f(x) with slacks c(x) >= 0, each of one superpixel, and the simplex.
 
     Slacks (N, R) are rim visibility (concave, so the set is convex) and the bounds of
     scale and slopes; they depend on the first three of a superpixel's nine variables.

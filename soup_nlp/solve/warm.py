@@ -1,7 +1,7 @@
 """Multipliers of the constrained NLP from those of the presolve: a start at its KKT point.
 
-Without them Ipopt's least-squares guess gives active visibility rows no force; the Hessian of the
-Lagrangian is then indefinite and the first dozen iterations walk back to where they began.
+Ipopt's own least-squares estimate gives active visibility rows no multiplier; the Hessian of the
+Lagrangian is then indefinite, and the first dozen iterations leave the point and return to it.
 """
 
 from __future__ import annotations

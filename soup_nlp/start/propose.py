@@ -11,6 +11,7 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import sample_pixels
 from soup_nlp.start.bending import bending_share, constant_depth, flow_jump, surfaces
@@ -208,8 +209,5 @@ def _parallax(soup: Soup, views: Views) -> Float:
 
 
 def _soup(mu: Float, slope: Float, R: Float, t: Float, anchor: Float, radius: Float) -> Soup:
-    g = slope / radius[:, None]
-    m = mu[:, None] * np.column_stack([g, 1 - np.sum(g * anchor[:, :2], axis=1)])
-    length = np.linalg.norm(m, axis=1)
-    D = 1 / length
-    return Soup(D, -m / length[:, None], np.ones(len(D)), R.copy(), t / D[:, None])
+    n, D = normal_and_distance(about_anchor(1 / mu, slope / radius[:, None], anchor))
+    return Soup(D, n, np.ones(len(D)), R.copy(), t / D[:, None])

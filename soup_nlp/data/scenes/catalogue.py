@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
@@ -52,18 +53,17 @@ def _pose(x: float, y: float, z: float, yaw: float = 0.0, pitch: float = 0.0) ->
     return out
 
 
-def _about(pivot: Float, turn: Float, shift: Float) -> Float:
+def _about(pivot: ArrayLike, turn: ArrayLike, shift: ArrayLike) -> Float:
     """(4, 4) motion: turn by a rotation vector (degrees) about a pivot (3,), then shift (3,) m."""
-    out = np.eye(4)
+    out, centre = np.eye(4), np.array(pivot, float)
     out[:3, :3] = rotation.exp(np.radians(turn))
-    out[:3, 3] = pivot - out[:3, :3] @ pivot + shift
+    out[:3, 3] = centre - out[:3, :3] @ centre + np.asarray(shift)
     return out
 
 
-def _views(pose: Float, shift: Float, turn: Float) -> tuple[Float, Float]:
+def _views(pose: Float, shift: ArrayLike, turn: ArrayLike) -> tuple[Float, Float]:
     """(ref_from_scene, next_from_scene) of a camera at `pose` that moves in its own frame."""
-    step = _about(np.zeros(3), turn, shift)
-    return inverse(pose), inverse(pose @ step)
+    return inverse(pose), inverse(pose @ _about([0, 0, 0], turn, shift))
 
 
 def _sign(rng: Random) -> float:
@@ -181,23 +181,18 @@ def _street(rng: Random, half_width: float, half_height: float) -> Scene:
     speeds = rng.uniform(0.3, 0.6, 2) * drive
     if rng.random() < 0.5:
         same = _car(m, lane, ahead, 0.0)
-        move = _about(
-            np.array([lane, 0, ahead]), np.array([0, _sign(rng), 0]), np.array([0, 0, speeds[0]])
-        )
+        move = _about([lane, 0, ahead], [0, _sign(rng), 0], [0, 0, speeds[0]])
     else:
         yaw = -rng.uniform(50, 75)
         same = _car(m, lane, ahead, yaw)
         nose = rotation.exp(np.radians([0, yaw, 0])) @ [0, 0, speeds[0]]
-        move = _about(np.array([lane, 0, ahead]), np.array([0.0, 0, 0]), nose)
+        move = _about([lane, 0, ahead], [0, 0, 0], nose)
     bodies.append(Body(same, move))
-    shift = np.array([0, 0, -speeds[1]])
-    bodies.append(Body(_car(m, -lane, coming, 180.0), _about(np.zeros(3), np.zeros(3), shift)))
-    turn = np.array([rng.uniform(-0.1, 0.1), _sign(rng) * rng.uniform(0.2, 0.4), 0.1])
-    view = _views(
-        _pose(rng.uniform(-0.4, 0.4), -rng.uniform(2.1, 2.4), 0, yaw=rng.uniform(-2, 2)),
-        np.array([rng.uniform(-0.03, 0.03), 0, drive]),
-        turn,
-    )
+    shift = [0, 0, -speeds[1]]
+    bodies.append(Body(_car(m, -lane, coming, 180.0), _about([0, 0, 0], [0, 0, 0], shift)))
+    turn = [rng.uniform(-0.1, 0.1), _sign(rng) * rng.uniform(0.2, 0.4), 0.1]
+    pose = _pose(rng.uniform(-0.4, 0.4), -rng.uniform(2.1, 2.4), 0, yaw=rng.uniform(-2, 2))
+    view = _views(pose, [rng.uniform(-0.03, 0.03), 0, drive], turn)
     return Scene(tuple(bodies), *view)
 
 
@@ -261,13 +256,13 @@ def _room(rng: Random, half_width: float, half_height: float) -> Scene:
         )
         if rank == 2:
             shift[1] = -rng.uniform(0.02, 0.05)  # lifted off the floor
-        turn = np.array([0, _sign(rng) * rng.uniform(2, 4), 0])
+        turn = [0, _sign(rng) * rng.uniform(2, 4), 0]
         bodies.append(Body((part,), _about(foot, turn, shift)))
     side = _sign(rng)
     view = _views(
         _pose(0, -1.35, 0, yaw=side, pitch=-9),
-        np.array([side * rng.uniform(0.06, 0.085), rng.uniform(-0.01, 0.01), 0.04]),
-        np.array([0.1, -side * rng.uniform(0.2, 0.5), _sign(rng) * 0.2]),
+        [side * rng.uniform(0.06, 0.085), rng.uniform(-0.01, 0.01), 0.04],
+        [0.1, -side * rng.uniform(0.2, 0.5), _sign(rng) * 0.2],
     )
     return Scene(tuple(bodies), *view)
 
@@ -289,11 +284,11 @@ def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
     shift = rng.uniform([-0.003, -0.003, -0.01], [0.003, 0.003, 0.01])
     bodies = (
         Body((_backdrop(1.7, m.wall(0.3)),)),
-        Body((cloth,), _about(np.array([0, 0, 1.0]), rng.uniform(-0.4, 0.4, 3), shift)),
+        Body((cloth,), _about([0, 0, 1], rng.uniform(-0.4, 0.4, 3), shift)),
     )
     view = _views(
         np.eye(4),
-        np.array([_sign(rng) * rng.uniform(0.008, 0.013), rng.uniform(-0.004, 0.004), 0.004]),
+        [_sign(rng) * rng.uniform(0.008, 0.013), rng.uniform(-0.004, 0.004), 0.004],
         rng.uniform(-0.15, 0.15, 3),
     )
     return Scene(bodies, *view)
@@ -306,11 +301,8 @@ def _orbit(rng: Random, half_width: float, half_height: float) -> Scene:
     bodies = [Body(tuple(_interior(rng, m, half_width)))]
     bodies += [Body((part,)) for k, (part, _) in enumerate(objects)]
     pose = _pose(0, -1.45, 0, pitch=-9)
-    around = _about(
-        np.array([0, 0, 4.2]),
-        np.array([0, _sign(rng) * rng.uniform(1.2, 2.0), 0]),
-        np.array([0, rng.uniform(-0.03, 0.03), rng.uniform(-0.03, 0.06)]),
-    )
+    turn = [0, _sign(rng) * rng.uniform(1.2, 2.0), 0]
+    around = _about([0, 0, 4.2], turn, [0, rng.uniform(-0.03, 0.03), rng.uniform(-0.03, 0.06)])
     return Scene(tuple(bodies), inverse(pose), inverse(around @ pose))
 
 
@@ -320,8 +312,8 @@ def _still(rng: Random, half_width: float, half_height: float) -> Scene:
     objects = _objects(rng, m, _FRONT + _BACK, half_width)
     mover = int(rng.integers(3))
     part, foot = objects.pop(mover)
-    turn = np.array([0, _sign(rng) * rng.uniform(3, 6), 0])
-    shift = np.array([_sign(rng) * rng.uniform(0.05, 0.09), 0, rng.uniform(-0.08, 0.08)])
+    turn = [0, _sign(rng) * rng.uniform(3, 6), 0]
+    shift = [_sign(rng) * rng.uniform(0.05, 0.09), 0, rng.uniform(-0.08, 0.08)]
     bodies = (
         Body((*_interior(rng, m, half_width), *(p for p, _ in objects))),
         Body((part,), _about(foot, turn, shift)),

@@ -1,0 +1,52 @@
+"""A soft census: what a pixel's surroundings look like, whatever the exposure.
+
+The census transform says of each of some neighbours whether it is brighter. Here it says by how
+much, up to a few grey levels: `tanh((neighbour - centre) / 10)`. Where nothing is to be seen the
+numbers are near zero, so that flat ground contradicts nothing.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.flow.consistency import FloatMap
+
+SOFT_GREY = 10.0
+"""Grey levels at which a difference is told by tanh(1) = 0.76."""
+SIGMA_PX = 0.7
+"""Gaussian smoothing before, pixels."""
+NEIGHBOURS = ((-2, -2), (-2, 0), (-2, 2), (0, -2), (0, 2), (2, -2), (2, 0), (2, 2))
+"""(dv, du) of the neighbours, pixels."""
+
+
+def census(image: NDArray[np.uint8]) -> FloatMap:
+    """(2, H, W, 4) soft census of an image (H, W, 3) or (H, W), in two layers as OpenCV takes."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SIGMA_PX)
+    height, width = smooth.shape
+    padded = np.pad(smooth, 2, mode="edge")
+    other = np.stack(
+        [padded[2 + dv : 2 + dv + height, 2 + du : 2 + du + width] for dv, du in NEIGHBOURS], -1
+    )
+    soft = np.tanh((other - smooth[..., None]) / np.float32(SOFT_GREY))
+    return np.ascontiguousarray(np.moveaxis(soft.reshape(height, width, 2, 4), 2, 0))
+
+
+def census_at(layers: FloatMap, u: NDArray[np.floating], v: NDArray[np.floating]) -> FloatMap:
+    """(2, ..., 4) census at sub-pixel places (R, C) with C < 32768; the border repeats."""
+    x, y = np.asarray(u, np.float32), np.asarray(v, np.float32)
+    # cv2.remap takes maps of fewer than 32768 rows
+    parts = [slice(a, a + 30000) for a in range(0, len(x), 30000)]
+    return np.stack(
+        [
+            np.concatenate(
+                [
+                    cv2.remap(layer, x[s], y[s], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                    for s in parts
+                ]
+            )
+            for layer in layers
+        ]
+    )

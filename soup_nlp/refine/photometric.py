@@ -1,0 +1,150 @@
+"""E_photo: how far the images contradict what a superpixel's homography predicts.
+
+    E_photo = sum_i mean_s min(c_is, tau)
+
+c_is, 0 to 1, is the difference of soft census (`data.census`) between sampled pixel s of
+superpixel i and the pixel of the next frame where the superpixel's homography brings it. A sample
+that leaves the next frame, or that something nearer hides there, costs `UNSEEN` whatever is there:
+more than an agreement, less than a contradiction. What is nearer is read off a depth map of the
+next frame that is the same for all soups which are compared, so E_photo is one function of a soup.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.census import census, census_at
+from soup_nlp.data.pair import Pair
+from soup_nlp.geometry.camera import rays
+from soup_nlp.geometry.soup import Soup, reconstruct
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.refine.costs import Particles
+from soup_nlp.refine.records import RefineOptions
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+TAU = 0.35
+"""A contradiction counts at most this much."""
+UNSEEN = 0.25
+"""What a sample costs that the next frame does not show."""
+BEHIND = 1.1
+"""A sample is hidden where something is nearer by this factor."""
+SAMPLES = 24
+"""Pixels per superpixel."""
+BLOCK = 1 << 19
+"""Samples that are looked up at once."""
+
+
+@dataclass(frozen=True)
+class Photometric:
+    """Census of both frames, sampled where superpixels are.
+
+    Attributes:
+        ray: (N, S, 3) rays of the sampled pixels.
+        own: (2, N, S, 4) their census.
+        there: (2, H', W', 4) census of the next frame.
+        nearest: (H', W') depth of what the next frame shows; inf where nothing is known.
+        distance: (N,) distances of the planes of the soup that shows it: gives the length unit.
+        K_next: (3, 3) intrinsics of the next frame.
+        weight: Factor of E_photo.
+        proj: Factor of alpha1 beside it.
+        sigma_proj: Truncation of a pixel's re-projection error beside it, pixels.
+    """
+
+    ray: Float32
+    own: Float32
+    there: Float32
+    nearest: Float32
+    distance: Float
+    K_next: Float
+    weight: float
+    proj: float
+    sigma_proj: float
+
+    def beside(self, weights: Weights) -> Weights:
+        """The weights of the other terms: where images speak as well, the flow has less to say."""
+        sigma = min(weights.sigma_proj, self.sigma_proj)
+        return weights.replace(proj=self.proj * weights.proj, sigma_proj=sigma)
+
+    def unit(self, soup: Soup) -> float:
+        """Length unit of a soup, relative to that of `nearest`."""
+        return float(np.median(soup.distance / self.distance))
+
+    def energy(self, soup: Soup) -> float:
+        """Factor times E_photo; it does not depend on the soup's scale."""
+        return float(self.costs(Particles.of(soup), self.unit(soup)).sum())
+
+    def costs(self, p: Particles, unit: float) -> Float:
+        """(N, L) factor times E_photo's share of every particle, their length unit given."""
+        out = np.empty(p.shape)
+        step = max(1, BLOCK // (p.shape[1] * self.ray.shape[1]))
+        for a in range(0, len(out), step):
+            b = slice(a, a + step)
+            u, v, seen = self._seen(p, b, unit)
+            flat = u.shape[0] * u.shape[1], u.shape[2]
+            there = census_at(self.there, u.reshape(flat), v.reshape(flat))
+            there = there.reshape(2, *u.shape, 4)
+            there -= self.own[:, b, None]
+            np.abs(there, out=there)
+            c = np.minimum(there.sum(axis=(0, 4)) / 16.0, TAU)
+            out[b] = self.weight * np.where(seen, c, UNSEEN).mean(axis=2)
+        return out
+
+    def _seen(
+        self, p: Particles, b: slice, unit: float
+    ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
+        """Pixels (u, v) of the next frame, and whether it shows them: (n, L, S) each."""
+        n, labels = p.D[b].shape
+        ray = self.ray[b].transpose(0, 2, 1)
+        H = p.R[b] - p.T[b][..., :, None] * (p.n[b] / p.D[b][..., None])[..., None, :]
+        H = (self.K_next @ H).reshape(n, labels * 3, 3).astype(np.float32)
+        x, y, z = np.moveaxis(np.matmul(H, ray).reshape(n, labels, 3, -1), 2, 0)
+        seen = z > 1e-6
+        ahead = np.where(seen, z, 1.0)
+        u, v = x / ahead, y / ahead
+        height, width = self.nearest.shape
+        seen &= (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+        u, v = np.where(seen, u, 0.0), np.where(seen, v, 0.0)
+        facing = -np.matmul(p.n[b].astype(np.float32), ray)
+        # z is the next depth over that in the reference frame
+        depth = p.D[b][..., None].astype(np.float32) / np.maximum(facing, 1e-9) * z
+        front = self.nearest[(v + 0.5).astype(np.intp), (u + 0.5).astype(np.intp)]
+        seen &= depth < BEHIND * unit * front
+        return u, v, seen
+
+
+def look(pair: Pair, labels: NDArray[np.int32], soup: Soup, o: RefineOptions) -> Photometric | None:
+    """What the images say beside the flow; None where they are left out.
+
+    The samples are spread evenly over every superpixel, in the order of rows.
+
+    Args:
+        pair: Images and cameras.
+        labels: (H, W) superpixels.
+        soup: Where the refinement starts.
+        o: Factor of E_photo and those of the flow beside it.
+    """
+    if not o.photo:
+        return None
+    size = pair.image_next.shape[0], pair.image_next.shape[1]
+    depth_next = reconstruct(soup, labels, pair.K_ref, pair.K_next, size).depth_next
+    flat = labels.ravel()
+    count = np.bincount(flat)
+    order = np.argsort(flat, kind="stable")
+    place = ((np.arange(SAMPLES) + 0.5) / SAMPLES * count[:, None]).astype(np.int64)
+    v, u = np.divmod(order[(np.cumsum(count) - count)[:, None] + place], labels.shape[1])
+    return Photometric(
+        ray=rays(pair.K_ref, np.stack([u, v], axis=-1).astype(float)).astype(np.float32),
+        own=census(pair.image_ref)[:, v, u],
+        there=census(pair.image_next),
+        nearest=np.nan_to_num(depth_next, nan=np.inf).astype(np.float32),
+        distance=soup.distance,
+        K_next=pair.K_next,
+        weight=o.photo,
+        proj=o.photo_proj,
+        sigma_proj=o.photo_sigma_proj,
+    )

@@ -1,0 +1,210 @@
+"""E_photo is its sum, knows neither scale nor exposure, and repairs what the flow says wrongly."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from soup_nlp.data.census import census, census_at
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.geometry import camera
+from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.superpixels import segment
+from soup_nlp.model import oracle
+from soup_nlp.model.energy_data import build_energy_data
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.reweighting import in_pixels
+from soup_nlp.refine.costs import Particles
+from soup_nlp.refine.mppbp import objective, refine_soup
+from soup_nlp.refine.photometric import BEHIND, SAMPLES, TAU, UNSEEN, Photometric, look
+from soup_nlp.refine.records import RefineOptions
+from soup_nlp.refine.sweep import common_normals, swept
+
+HEIGHT, WIDTH = 60, 96
+K = camera.intrinsics(80.0, 80.0, 47.5, 29.5)
+NEAR, FAR, SHIFT = 1.0, 2.0, 0.1  # the near half moves by 8 px, the far one by 4
+OPTIONS = RefineOptions(rounds=3, particles=20, photo=10.0, sweep=6)
+
+
+def texture(height: int, width: int, seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).standard_normal((height, width))
+    grey = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    return np.clip(128 + 50 * grey / grey.std(), 0, 255)
+
+
+class TwoPlanes:
+    """A near plane on the right hides a strip of the far one; the camera moves to the left.
+
+    The near plane covers columns 48 and more; in the next frame 56 and more. Columns 44 to 51 of
+    the far plane come to 48 to 55 and stay in sight, as those right of them are hidden already.
+    """
+
+    def __init__(self) -> None:
+        back, front = texture(HEIGHT, WIDTH, 1), texture(HEIGHT, WIDTH, 2)
+        ref, nxt = back.copy(), np.roll(back, 4, axis=1)
+        ref[:, 48:] = front[:, 48:]
+        nxt[:, 56:] = front[:, 48:-8]
+        image, other = (np.repeat(x[..., None], 3, axis=2).astype(np.uint8) for x in (ref, nxt))
+        self.pair = Pair(image, other, K, K)
+        self.labels = segment(image, 40, "grid")
+        self.seg = build_segmentation(self.labels, image, 6, boundary_samples=2)
+        n = len(self.seg)
+        self.near = self.seg.anchors[:, 0] > 47.5
+        depth = np.where(self.near, NEAR, FAR)
+        self.truth = self.soup(depth)
+        uv = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+        uv[..., 0] = np.where(self.near, 8.0, 4.0)[self.labels]
+        self.flow = Flow(uv, np.ones((HEIGHT, WIDTH), np.float32), "truth")
+        self.count = n
+
+    def soup(self, depth: np.ndarray) -> Soup:
+        n = len(depth)
+        normal, turn = np.tile([0.0, 0.0, -1.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
+        return Soup(np.ones(n), normal, depth, turn, np.tile([SHIFT, 0.0, 0.0], (n, 1)))
+
+    def look(self, soup: Soup, **changes: float) -> Photometric:
+        photo = look(self.pair, self.labels, soup, OPTIONS.replace(**changes))
+        assert photo is not None
+        return photo
+
+    def data(self, flow: Flow):
+        data = build_energy_data(self.seg, flow, K, K, 16, 0)
+        return in_pixels(data, self.truth, self.seg)
+
+
+@pytest.fixture(scope="module")
+def two() -> TwoPlanes:
+    return TwoPlanes()
+
+
+def test_census_sees_structure_and_no_exposure():
+    image = texture(40, 50, 0).astype(np.uint8) // 2 + 40
+    assert np.abs(census(np.full((40, 50), 90, np.uint8))).max() == 0
+    np.testing.assert_allclose(census(image + 60), census(image), atol=1e-5)
+    assert np.abs(census(image)).mean() > 0.2
+    rgb = np.repeat(image[..., None], 3, axis=2)
+    np.testing.assert_allclose(census(rgb), census(image), atol=1e-5)
+
+
+def test_census_between_pixels_is_linear():
+    layers = census(texture(40, 50, 0).astype(np.uint8))
+    v, u = np.mgrid[0:40, 0:49].astype(np.float32)
+    np.testing.assert_allclose(census_at(layers, u, v), layers[:, :, :49], atol=1e-6)
+    middle = (layers[:, :, :49] + layers[:, :, 1:]) / 2
+    np.testing.assert_allclose(census_at(layers, u + 0.5, v), middle, atol=1e-4)
+    # more rows than OpenCV takes at once
+    tall = np.zeros((70_000, 1), np.float32)
+    np.testing.assert_allclose(census_at(layers, tall + 3, tall + 5)[:, -1, 0], layers[:, 5, 3])
+
+
+def test_costs_are_those_of_a_loop(two):
+    photo = two.look(two.truth, photo=7.0)
+    wrong = two.soup(np.where(two.near, 1.25, 1.7))
+    p = Particles.of(two.truth).joined(Particles.of(wrong))
+    found = photo.costs(p, 1.0)
+    ref, nxt = census(two.pair.image_ref), census(two.pair.image_next)
+    for i in range(0, two.count, 3):
+        at = np.flatnonzero(two.labels.ravel() == i)
+        at = at[((np.arange(SAMPLES) + 0.5) / SAMPLES * len(at)).astype(int)]
+        for c, depth in enumerate((two.truth.distance[i], wrong.distance[i])):
+            total = 0.0
+            for v, u in zip(*np.divmod(at, WIDTH)):
+                x = u + 80.0 * SHIFT / depth
+                if x > WIDTH - 1 or depth >= BEHIND * photo.nearest[v, int(x + 0.5)]:
+                    total += UNSEEN
+                    continue
+                there = census_at(nxt, np.array([[x]]), np.array([[float(v)]]))[:, 0, 0]
+                total += min(np.abs(there - ref[:, v, u]).sum() / 16.0, TAU)
+            assert found[i, c] == pytest.approx(7.0 * total / SAMPLES, abs=1e-3)
+
+
+def test_the_truth_agrees_and_the_unseen_costs_what_it_must(two):
+    cost = two.look(two.truth, photo=1.0).costs(Particles.of(two.truth), 1.0)[:, 0]
+    u = two.seg.anchors[:, 0]
+    inside = (u < 38) | ((u > 58) & (u < 76))
+    assert cost[inside].max() < 0.03
+    # eight columns leave the view
+    at_border = np.zeros((HEIGHT, WIDTH))
+    at_border[:, WIDTH - 8 :] = UNSEEN
+    for i in np.unique(two.labels[:, -1]):
+        assert cost[i] == pytest.approx(at_border[two.labels == i].mean(), abs=0.06)
+
+
+def test_what_is_hidden_is_not_held_against_it(two):
+    # the far plane on the right would come to lie behind the near one
+    hidden = two.soup(np.full(two.count, FAR))
+    cost = two.look(two.truth, photo=1.0).costs(Particles.of(hidden), 1.0)[:, 0]
+    u = two.seg.anchors[:, 0]
+    np.testing.assert_allclose(cost[(u > 62) & (u < 85)], UNSEEN, atol=1e-6)
+
+
+def test_energy_does_not_depend_on_scale(two):
+    photo = two.look(two.truth)
+    t = two.truth
+    large = Soup(3 * t.lam, t.n, t.d, t.R, t.t)
+    assert photo.energy(large) == pytest.approx(photo.energy(t), rel=1e-5)
+
+
+def test_blocks_do_not_show(two, monkeypatch):
+    photo = two.look(two.truth)
+    p = Particles.of(two.truth).joined(Particles.of(two.soup(np.full(two.count, 1.4))))
+    whole = photo.costs(p, 1.0)
+    monkeypatch.setattr("soup_nlp.refine.photometric.BLOCK", 1)
+    np.testing.assert_array_equal(photo.costs(p, 1.0), whole)
+
+
+def test_weight_zero_leaves_the_images_out(two):
+    assert look(two.pair, two.labels, two.truth, RefineOptions(photo=0)) is None
+
+
+def test_sweep_finds_depths_that_the_start_does_not_have(two):
+    rng = np.random.default_rng(0)
+    start = two.soup(np.exp(rng.uniform(np.log(0.8), np.log(3.0), two.count)))
+    t = start.translation[:1]
+    found = swept(start, np.eye(3)[None], t, two.data(two.flow), two.look(start), 6)
+    assert found.shape == (two.count, 6)
+    gap = np.abs(np.log(found.D / -found.n[..., 2] / two.truth.distance[:, None])).min(axis=1)
+    u = two.seg.anchors[:, 0]
+    assert np.median(gap[u < 85]) < 0.05
+
+
+def test_normals_start_with_the_image_plane():
+    n = np.tile([0.0, -0.6, -0.8], (10, 1))
+    centre = common_normals(n, 2)
+    np.testing.assert_allclose(centre, [[0, 0, -1], [0, -0.6, -0.8]])
+
+
+def test_images_repair_what_the_flow_says_wrongly(two):
+    # a patch of the far plane has the near one's flow, at full confidence
+    lied = two.flow.uv.copy()
+    lied[20:40, 10:30, 0] = 8.0
+    data, flow = two.data(two.flow), Flow(lied, two.flow.confidence, "lie")
+    bad = two.data(flow)
+    u, v = two.seg.anchors.T
+    patch = (u > 12) & (u < 28) & (v > 22) & (v < 38)
+    depth = np.where(patch, NEAR, two.truth.distance)
+    start, w = two.soup(depth), Weights()
+    photo = two.look(start)
+    done = refine_soup(start, bad, w, OPTIONS, photo=photo, seed=0)
+    totals = [done.energy_begin["total"], *(r.energy["total"] for r in done.rounds)]
+    assert (np.diff(totals) <= 0).all()
+    assert done.energy == objective(done.soup, bad, w, photo)
+    scale = np.median(two.truth.distance / done.soup.distance)
+    error = np.abs(scale * done.soup.depth_at(data.anchor_ray) / two.truth.distance - 1)
+    assert error[patch].max() < 0.1
+    alone = refine_soup(start, bad, w, OPTIONS, seed=0)
+    scale = np.median(two.truth.distance / alone.soup.distance)
+    assert np.abs(scale * alone.soup.depth_at(data.anchor_ray)[patch] / FAR - 1).min() > 0.3
+
+
+def test_objective_is_e_without_images_and_its_parts_add_up(two):
+    data, w = two.data(two.flow), Weights(proj=2.0)
+    assert objective(two.truth, data, w) == oracle.energy(two.truth, data, w)
+    photo = two.look(two.truth)
+    own = objective(two.truth, data, w, photo)
+    assert own["photo"] == pytest.approx(photo.energy(two.truth))
+    assert own["total"] == pytest.approx(sum(v for k, v in own.items() if k != "total"))
+    weak = oracle.energy(two.truth, data, w.replace(proj=0.6, sigma_proj=2.0))
+    assert own["proj"] == pytest.approx(weak["proj"])
