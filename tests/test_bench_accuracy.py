@@ -156,7 +156,7 @@ def fake_jobs(seed: int = 0, function=fake_row, **options) -> list[Job]:
     return [Job({"key": s, "seed": seed}, partial(function, s, **options)) for s in scenes]
 
 
-def test_rows_are_kept_and_what_failed_is_tried_again(tmp_path):
+def test_rows_are_kept_and_failed_ones_measured_again(tmp_path):
     path = tmp_path / "rows.jsonl"
     seen: list[str] = []
 
@@ -196,7 +196,7 @@ def test_a_job_whose_folder_is_gone_is_stale(tmp_path):
     assert not pair_job(item()).stale
 
 
-def test_a_line_that_was_cut_off_and_another_code_do_not_count(tmp_path):
+def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
     path = tmp_path / "rows.jsonl"
     measure_all(fake_jobs()[:2], path)
     lines = path.read_text().splitlines()

@@ -111,7 +111,7 @@ def test_every_setting_of_the_default_space_is_accepted_at_both_ends():
             problem.problem([f"{p.key}={p.at(x)}"])
 
 
-def test_search_finds_the_minimum_and_goes_on_where_it_was(tmp_path):
+def test_search_finds_the_minimum_and_can_be_continued(tmp_path):
     path = tmp_path / "rows.jsonl"
     calls = []
 
@@ -154,7 +154,7 @@ def test_steps_beyond_the_end_of_a_range_turn_back():
     assert np.abs(units - best.unit).max() < 0.9
 
 
-def test_search_refuses_what_cannot_be_right(tmp_path):
+def test_search_rejects_invalid_input(tmp_path):
     path = tmp_path / "rows.jsonl"
     with pytest.raises(ConfigError, match="both trains and validates"):
         search(SPACE, items(0), items(0), path, measure=fake)
@@ -251,7 +251,7 @@ def test_an_analysis_writes_table_and_plot(tmp_path, monkeypatch):
         run_analysis("neighbours", [], tmp_path)
 
 
-def test_values_are_names_with_commas_and_blanks_and_are_checked_first(tmp_path):
+def test_values_may_contain_commas_and_are_checked_before_any_solve(tmp_path):
     assert split_values("pattern", "slic,grid") == ["slic", "grid"]
     both = ["slic, image alone", "grid, image alone"]
     assert split_values("pattern", "slic, image alone,grid,image alone") == both
@@ -295,7 +295,7 @@ def test_conventions_and_folders_of_an_analysis_are_not_ignored(tmp_path, monkey
     assert "--folders" in capsys.readouterr().err
 
 
-def test_tables_bear_failed_rows(tmp_path):
+def test_tables_list_failed_rows(tmp_path):
     jobs = [(i, (f"segmentation.neighbours={k}",), str(k)) for i in items(0)[:2] for k in (4, 8)]
     rows = [{**fake(*j), "code": "c"} for j in jobs]
     rows[1] = {**head(*jobs[1]), "ok": False, "error": "out of luck", "code": "c"}
@@ -344,14 +344,16 @@ def test_pairs_of_one_name_in_two_suites_are_told_apart(tmp_path, monkeypatch):
 def test_energy_at_the_truth(tmp_path):
     raw = {"kind": "scene", "scene": "orbit", "seed": 0, "width": 128, "height": 64}
     item = Item("rendered", "orbit", "orbit", "truth", raw)
-    job = pair_job(item, QUICK, measure=measure_energy)
+    # the presolve lowers the energy where five iterations of Ipopt alone need not
+    quick = tuple(o for o in QUICK if o != "solver.presolve=false")
+    job = pair_job(item, quick, measure=measure_energy)
     row = {**job.name, **job.work()}
     assert row["ok"], row["error"]
     json.dumps(row, allow_nan=False)
     energy = {k: v["total"] for k, v in row["energy"].items()}
     assert set(energy) == {"start", "solution", "truth", "NLP from truth", "refined from truth"}
-    assert energy["solution"] <= energy["start"]
     tol = 1 + 1e-9
+    assert energy["solution"] <= tol * energy["start"]
     assert energy["NLP from truth"] <= tol * energy["truth"]
     assert energy["refined from truth"] <= tol * energy["NLP from truth"]
     text = text_energy("energy", "what", [{**row, "code": "c"}])

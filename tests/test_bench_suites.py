@@ -29,7 +29,7 @@ def test_suites_list_the_papers_pairs(tmp_path):
     assert spread(4, 9) == [0, 1, 2, 3]
 
 
-def test_a_suite_takes_what_is_there(tmp_path):
+def test_a_suite_lists_the_pairs_whose_files_exist(tmp_path):
     base = tmp_path / "data" / "sintel" / "training" / "clean" / "alley_1"
     base.mkdir(parents=True)
     suite = SUITES["sintel"]

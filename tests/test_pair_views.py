@@ -83,7 +83,7 @@ def test_a_crop_is_a_part_of_every_image(pair):
     assert (gone & ~pair.truth.occluded[part]).any()
 
 
-def test_what_is_not_known_stays_unknown(pair):
+def test_unknown_truth_stays_unknown(pair):
     depth = Truth(depth_ref=pair.truth.depth_ref)
     for view in CHANGED:
         seen = view(replace(pair, flow=None, truth=depth))
@@ -93,7 +93,7 @@ def test_what_is_not_known_stays_unknown(pair):
         assert view(replace(pair, truth=None)).truth is None
 
 
-def test_twice_in_the_mirror_is_the_pair_itself(pair):
+def test_mirroring_twice_gives_the_pair_back(pair):
     K = pair.K_ref.copy()
     K[0, 1] = 0.3
     skewed = replace(pair, K_ref=K)
@@ -135,7 +135,7 @@ def test_frames_of_two_widths_have_two_mirrors():
     assert (seen.K_ref[0, 2], seen.K_next[0, 2]) == (19.0, 29.0)
 
 
-def test_nothing_left_is_said(pair):
+def test_margins_that_leave_nothing_are_rejected(pair):
     with pytest.raises(DataError, match="margins do not fit"):
         cropped(pair, 100, 0, 28)
     assert cropped(pair, 100, 0, 27).size == (96, 1)
