@@ -76,14 +76,7 @@ def _each_image(pair: Pair, change: Callable[[NDArray[Any]], NDArray[Any]]) -> P
 
 
 def cropped(pair: Pair, left: int, top: int, right: int = 0, bottom: int = 0) -> Pair:
-    """The pair without the margins of both images; depths, flow and motions are what they were.
-
-    Args:
-        pair: The pair.
-        left: Columns taken away on the left, and so on.
-        top: Rows.
-        right: Columns.
-        bottom: Rows.
+    """The pair without margins (pixels) of both images; depths, flow and motions do not change.
 
     Raises:
         DataError: a margin is negative, or nothing would be left.

@@ -68,7 +68,7 @@ class Options:
 
     Attributes:
         flows: Flow sources; None for the suite's own.
-        width: Columns of rendered scenes (436 of 1024 rows).
+        width: Columns of rendered scenes; they have 436 rows per 1024 columns.
         seeds: Seeds of rendered scenes.
         limit: At most this many pairs, spread evenly, each with every flow; None for all.
         only: Keep names that contain one of these words; empty for all.
@@ -166,17 +166,8 @@ def sintel(root: Path, o: Options) -> Iterator[Entry]:
             yield Entry(scene, f"{scene}-{frame:04d}", raw, tuple(needs))
 
 
-def kitti2012(root: Path, o: Options) -> Iterator[Entry]:
-    """Training pairs of KITTI 2012."""
-    return _kitti(root, "kitti2012", "image_0", 194)
-
-
-def kitti2015(root: Path, o: Options) -> Iterator[Entry]:
-    """Training pairs of KITTI 2015."""
-    return _kitti(root, "kitti2015", "image_2", 200)
-
-
-def _kitti(root: Path, kind: str, camera: str, count: int) -> Iterator[Entry]:
+def kitti(kind: str, camera: str, count: int, root: Path, o: Options) -> Iterator[Entry]:
+    """Training pairs of KITTI 2012 or 2015."""
     base = root / "training" if (root / "training").is_dir() else root
     for index in (f"{k:06d}" for k in range(count)):
         needs = tuple(base / camera / f"{index}_{frame}.png" for frame in (10, 11))

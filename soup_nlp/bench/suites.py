@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -84,7 +85,7 @@ _ALL = (
     Suite(
         "kitti2012",
         "KITTI stereo and flow 2012, 194 training pairs",
-        pairs.kitti2012,
+        partial(pairs.kitti, "kitti2012", "image_0", 194),
         presets=KITTI_PRESETS,
         folders=(".", "kitti2012", "data_stereo_flow"),
         layout="training/image_0, training/calib, training/disp_occ, training/flow_occ",
@@ -93,7 +94,7 @@ _ALL = (
     Suite(
         "kitti2015",
         "KITTI scene flow 2015, 200 training pairs",
-        pairs.kitti2015,
+        partial(pairs.kitti, "kitti2015", "image_2", 200),
         presets=KITTI_PRESETS,
         folders=(".", "kitti2015", "data_scene_flow"),
         layout="training/image_2, training/calib_cam_to_cam, training/disp_occ_0, disp_occ_1",

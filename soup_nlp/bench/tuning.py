@@ -39,12 +39,9 @@ LOSS_ALLOWED = 0.05
 
 @dataclass(frozen=True)
 class Parameter:
-    """One setting and its range.
+    """A setting (dotted key), its scale, and its range (low, high) or its choices as YAML.
 
-    Attributes:
-        key: Dotted, as in a problem file.
-        kind: "log", "linear", "int" or "choice".
-        values: (low, high), or the choices as YAML.
+    The scale `kind` is "log", "linear", "int" or "choice".
     """
 
     key: str
@@ -118,13 +115,9 @@ DEFAULT_SPACE = tuple(
 
 @dataclass(frozen=True)
 class Trial:
-    """One configuration.
+    """One configuration and its rows, one per pair.
 
-    Attributes:
-        name: t000 is the default.
-        overrides: Of every problem; () for the default.
-        unit: (P,) place in the unit cube; NaN for the default.
-        rows: One a pair.
+    The default is t000, without overrides; its place `unit` (P,) in the unit cube is NaN.
     """
 
     name: str
@@ -202,13 +195,7 @@ def accepted(left_out: Sequence[LeftOut]) -> bool:
 
 @dataclass(frozen=True)
 class Found:
-    """A finished search.
-
-    Attributes:
-        space: Parameters.
-        train: Trials with their rows on the training pairs, in order.
-        validation: The default and the best trials with their rows on the validation pairs.
-    """
+    """All trials on the training pairs, the default and the best ones on the validation pairs."""
 
     space: tuple[Parameter, ...]
     train: tuple[Trial, ...]
@@ -259,7 +246,10 @@ def search(
 
     first = Trial("t000", (), np.full(len(space), np.nan))
     done = [scored(first, train)]
-    even = _even(len(space), trials, seed)
+    # half of the trials are spread evenly
+    half = max(1, (trials + 1) // 2)
+    sampler = qmc.Sobol(len(space), scramble=True, rng=np.random.default_rng(seed))
+    even = sampler.random_base2((half - 1).bit_length())[:half]
     for k in range(1, trials + 1):
         unit = _next(k, trials, even, done, seed)
         names = tuple(f"{p.key}={p.at(x)}" for p, x in zip(space, unit, strict=True))
@@ -278,13 +268,6 @@ def _check(space: Sequence[Parameter], train: Sequence[Item], validation: Sequen
     for p in space:
         for x in (0.0, 1.0):
             train[0].problem([f"{p.key}={p.at(x)}"])
-
-
-def _even(dimensions: int, trials: int, seed: int) -> Float:
-    """Half of the trials, spread evenly."""
-    sampler = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
-    count = max(1, (trials + 1) // 2)
-    return np.asarray(sampler.random(1 << (count - 1).bit_length())[:count])
 
 
 def _next(k: int, trials: int, even: Float, done: Sequence[Trial], seed: int) -> Float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.stats import spearmanr
 
 from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import (
@@ -111,32 +110,15 @@ def _left_out(found: Found) -> list[str]:
 
 
 def _varied(found: Found, best: Trial) -> list[str]:
-    """Ranges, the best value, and how the score moves with each parameter."""
-    tried = found.train[1:]
+    """Ranges, and the best value of every parameter."""
     chosen = dict(o.split("=", 1) for o in best.overrides)
-    entries = [
-        [
-            f"`{p.key}`",
-            p.kind,
-            ", ".join(p.values) if p.kind == "choice" else f"{p.values[0]} to {p.values[1]}",
-            chosen.get(p.key, "default"),
-            _tendency(p, k, tried),
-        ]
-        for k, p in enumerate(found.space)
-    ]
-    head = ["setting", "scale", "range", "best trial", "rank correlation with the score"]
-    return table(head, entries)
-
-
-def _tendency(p: Parameter, k: int, tried: Sequence[Trial]) -> str:
-    """Spearman's correlation of a setting and the loss; positive: larger is worse."""
-    if len(tried) < 5:
-        return "-"
-    x = [t.unit[k] for t in tried]
-    y = [t.loss for t in tried]
-    if np.ptp(x) == 0 or np.ptp(y) == 0:
-        return "-"
-    return f"{float(spearmanr(x, y).statistic):+.2f}"
+    cells: dict[str, Callable[[Parameter], str]] = {
+        "setting": lambda p: f"`{p.key}`",
+        "scale": lambda p: p.kind,
+        "range": lambda p: (", " if p.kind == "choice" else " to ").join(p.values),
+        "best trial": lambda p: chosen.get(p.key, "default"),
+    }
+    return columns(cells, found.space)
 
 
 def _trials(trials: Sequence[Trial], default: Trial) -> list[str]:
