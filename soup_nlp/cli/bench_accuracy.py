@@ -1,4 +1,4 @@
-"""Command bench accuracy: suites against truth and baselines, and the paper's analyses."""
+"""Commands bench accuracy and bench search: suites, the paper's analyses, better defaults."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from soup_nlp.bench import tuning
 from soup_nlp.bench.accuracy import pair_job
 from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
@@ -17,6 +18,7 @@ from soup_nlp.bench.rows import Row, measure_all
 from soup_nlp.bench.suite_pairs import Options
 from soup_nlp.bench.suites import SUITES, Listing, list_suite
 from soup_nlp.bench.tables import main_metric, show
+from soup_nlp.bench.tuning_report import text_search
 from soup_nlp.cli import options
 from soup_nlp.cli.options import Progress, numbers
 from soup_nlp.errors import ConfigError
@@ -67,16 +69,10 @@ def accuracy(
         raise ConfigError("no suite was named", where="--suite", expected=", ".join(SUITES))
     for convention in conventions or []:
         preset(convention)
-    whose = Options(
-        flows=tuple(flow) if flow else None,
-        width=width,
-        seeds=tuple(numbers(seeds, "--seeds")),
-        limit=limit,
-        only=tuple(only or ()),
-    )
+    wanted = _wanted(flow, width, numbers(seeds, "--seeds"), only, limit)
     progress, changes = Progress(quiet, mre_of), tuple(overrides or ())
     measure_rows = partial(measure_all, workers=workers, say=progress, any_code=any_code)
-    listings = [list_suite(known, data, whose) for known in suite or ["rendered"]]
+    listings = [list_suite(known, data, wanted) for known in suite or ["rendered"]]
     if analysis and (folders or name):
         raise ConfigError(
             "result folders and names are of suites, not of analyses",
@@ -117,6 +113,17 @@ def accuracy(
     raise typer.Exit(1 if progress.failed else 0)
 
 
+def _wanted(
+    flow: list[str] | None,
+    width: int,
+    seeds: Sequence[int],
+    only: list[str] | None,
+    limit: int | None = None,
+) -> Options:
+    flows = tuple(flow) if flow else None
+    return Options(flows, width, tuple(dict.fromkeys(seeds)), limit, tuple(only or ()))
+
+
 def _note(listing: Listing, overrides: Sequence[str]) -> str:
     note = f"Suite `{listing.suite.name}`: {listing.suite.text}."
     return note + (f" Overrides: {', '.join(f'`{o}`' for o in overrides)}." if overrides else "")
@@ -125,3 +132,61 @@ def _note(listing: Listing, overrides: Sequence[str]) -> str:
 def _tell(page: Path) -> None:
     print(page.read_text(encoding="utf-8"))
     print(f"files       {page.parent}/{page.stem}.*")
+
+
+def search(
+    suite: options.SuiteName = None,
+    data: options.Data = None,
+    out: options.Out = Path("results/accuracy"),
+    params: Annotated[
+        list[str] | None,
+        typer.Option("--param", help="KEY=log|linear|int:LOW:HIGH or KEY=choice:A:B instead."),
+    ] = None,
+    trials: Annotated[int, typer.Option(help="Configurations beside the default.", min=1)] = 24,
+    finalists: Annotated[int, typer.Option(help="Best trials that are validated.", min=1)] = 3,
+    seed: Annotated[int, typer.Option(help="Of the trials.", min=0)] = 0,
+    seeds: options.Seeds = "0,1",
+    validation_seeds: Annotated[
+        str, typer.Option(help="Seeds of rendered scenes that only validate.")
+    ] = "2,3",
+    overrides: options.Set = None,
+    flow: options.Flow = None,
+    width: options.Width = 512,
+    only: options.Only = None,
+    workers: options.Workers = 1,
+    any_code: options.AnyCode = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Search for better defaults and check them on pairs and families that did not choose."""
+    ours, theirs = numbers(seeds, "--seeds"), numbers(validation_seeds, "--validation-seeds")
+    wanted = _wanted(flow, width, (*ours, *theirs), only)
+    space = tuple(tuning.parameter(p) for p in params) if params else tuning.DEFAULT_SPACE
+    items = [i for name in suite or ["rendered"] for i in list_suite(name, data, wanted).items]
+    train, validation = tuning.split(items, ours, theirs)
+    if not quiet:
+        print(
+            f"{trials} trials of {len(space)} settings on {len(train)} pairs,"
+            f" {len(validation)} validate",
+            file=sys.stderr,
+        )
+    progress = Progress(quiet, mre_of)
+    found = tuning.search(
+        space,
+        train,
+        validation,
+        out / "search.jsonl",
+        trials=trials,
+        finalists=finalists,
+        seed=seed,
+        overrides=tuple(overrides or ()),
+        measure_rows=partial(measure_all, workers=workers, say=progress, any_code=any_code),
+    )
+    words = [f"--suite {s}" for s in suite or ["rendered"]] + (["--data DIR"] if data else [])
+    words += [f"--trials {trials} --seed {seed} --seeds {seeds}"]
+    words += [f"--validation-seeds {validation_seeds} --width {width}"]
+    words += [f"--flow {f}" for f in flow or []] + [f"--only '{o}'" for o in only or []]
+    words += [f"--set '{o}'" for o in overrides or []] + [f"--param '{p}'" for p in params or []]
+    page = out / "search.md"
+    write_text(page, text_search(found, f"soup-nlp bench search {' '.join(words)}"))
+    _tell(page)
+    raise typer.Exit(1 if progress.failed else 0)
