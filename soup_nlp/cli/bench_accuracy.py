@@ -16,7 +16,7 @@ from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
 from soup_nlp.bench.rows import Row, measure_all
 from soup_nlp.bench.suite_pairs import Options
-from soup_nlp.bench.suites import SUITES, Listing, list_suite
+from soup_nlp.bench.suites import SUITES, list_suite
 from soup_nlp.bench.tables import main_metric, show
 from soup_nlp.bench.tuning_report import text_search
 from soup_nlp.cli import options
@@ -73,17 +73,7 @@ def accuracy(
     progress, changes = Progress(quiet, mre_of), tuple(overrides or ())
     measure_rows = partial(measure_all, workers=workers, say=progress, any_code=any_code)
     listings = [list_suite(known, data, wanted) for known in suite or ["rendered"]]
-    if analysis and (folders or name):
-        raise ConfigError(
-            "result folders and names are of suites, not of analyses",
-            where="--folders" if folders else "--name",
-            found=f"--analysis {analysis}",
-            hint="give one without the other",
-        )
-    if name and len(listings) > 1:
-        raise ConfigError(
-            "one name for several suites", where="--name", found=", ".join(suite or [])
-        )
+    _check_names(analysis, folders, name, suite or [])
     if analysis:
         page = run_analysis(
             analysis,
@@ -98,7 +88,6 @@ def accuracy(
     for listing in [] if analysis else listings:
         if not quiet:
             print(listing, file=sys.stderr)
-        page = out / f"{name or listing.suite.name}.md"
         jobs = [
             pair_job(
                 item.scored_by(conventions),
@@ -107,10 +96,28 @@ def accuracy(
             )
             for item in listing.items
         ]
+        page = out / f"{name or listing.suite.name}.md"
         rows = measure_rows(jobs, page.with_suffix(".jsonl"))
-        write_text(page, report(f"Accuracy on {page.stem}", rows, _note(listing, changes)))
+        note = f"Suite `{listing.suite.name}`: {listing.suite.text}."
+        if changes:
+            note += f" Overrides: {', '.join(f'`{o}`' for o in changes)}."
+        write_text(page, report(f"Accuracy on {page.stem}", rows, note))
         _tell(page)
     raise typer.Exit(1 if progress.failed else 0)
+
+
+def _check_names(
+    analysis: str | None, folders: Path | None, name: str, suites: Sequence[str]
+) -> None:
+    if analysis and (folders or name):
+        raise ConfigError(
+            "result folders and names are of suites, not of analyses",
+            where="--folders" if folders else "--name",
+            found=f"--analysis {analysis}",
+            hint="give one without the other",
+        )
+    if name and len(suites) > 1:
+        raise ConfigError("one name for several suites", where="--name", found=", ".join(suites))
 
 
 def _wanted(
@@ -122,11 +129,6 @@ def _wanted(
 ) -> Options:
     flows = tuple(flow) if flow else None
     return Options(flows, width, tuple(dict.fromkeys(seeds)), limit, tuple(only or ()))
-
-
-def _note(listing: Listing, overrides: Sequence[str]) -> str:
-    note = f"Suite `{listing.suite.name}`: {listing.suite.text}."
-    return note + (f" Overrides: {', '.join(f'`{o}`' for o in overrides)}." if overrides else "")
 
 
 def _tell(page: Path) -> None:
