@@ -19,6 +19,9 @@ from soup_nlp.storage.atomic import write_text
 
 Overrides = tuple[str, ...]
 
+NOISE_PX = ("0.1", "0.5", "1", "2")
+"""Standard deviations of the noise on true flow, pixels."""
+
 
 @dataclass(frozen=True)
 class Analysis:
@@ -53,9 +56,9 @@ def _over(key: str, values: Sequence[object]) -> dict[str, Overrides]:
     return {str(v): (f"{key}={v}",) for v in values}
 
 
-def _numbers(name: str, text: str, axis: str, *values: int) -> Analysis:
+def _numbers(name: str, text: str, values: Sequence[int]) -> Analysis:
     key = f"segmentation.{name}"
-    return Analysis(name, text, _over(key, values), axis, free=key, numeric=True)
+    return Analysis(name, text, _over(key, values), name, free=key, numeric=True)
 
 
 def _without(*terms: str) -> Overrides:
@@ -76,11 +79,8 @@ _ALL = (
         },
         "terms",
     ),
-    _numbers(
-        *("superpixels", "number of superpixels, 100 to 2,000", "superpixels"),
-        *(100, 250, 500, 1000, 2000),
-    ),
-    _numbers("neighbours", "K of the K-NN graph, 4 to 20", "K", 4, 8, 12, 15, 20),
+    _numbers("superpixels", "number of superpixels, 100 to 2,000", (100, 250, 500, 1000, 2000)),
+    _numbers("neighbours", "K of the K-NN graph, 4 to 20", (4, 8, 12, 15, 20)),
     Analysis(
         "pattern",
         "SLIC against a regular grid, with borders that follow the flow and without",
@@ -94,10 +94,7 @@ _ALL = (
     Analysis(
         "flow",
         "flow source: true, DIS, and the truth with noise of 0.1 to 2 pixels",
-        _over(
-            "flow.source",
-            ("truth", *(f"truth+noise:{px}" for px in ("0.1", "0.5", "1", "2")), "dis"),
-        ),
+        _over("flow.source", ["truth", *(f"truth+noise:{px}" for px in NOISE_PX), "dis"]),
         "flow",
         free="flow.source",
         true_flow_only=True,
@@ -116,14 +113,11 @@ _ALL = (
         "flows",
         "error of the flow itself by source, with and without robust re-weighting (no solve)",
         {
-            source + (f", reweighted {px}" if px else ""): (
-                f"flow.source={source}",
-                *([f"flow.reweight_px={px}"] if px else []),
-            )
-            for source, px in (
-                *(("dis", ""), ("dis", "0.5"), ("dis", "0.25")),
-                *(("rlof", ""), ("rlof", "0.25")),
-            )
+            "dis": ("flow.source=dis",),
+            "dis, reweighted 0.5": ("flow.source=dis", "flow.reweight_px=0.5"),
+            "dis, reweighted 0.25": ("flow.source=dis", "flow.reweight_px=0.25"),
+            "rlof": ("flow.source=rlof",),
+            "rlof, reweighted 0.25": ("flow.source=rlof", "flow.reweight_px=0.25"),
         },
         true_flow_only=True,
         function=measure_flow,
