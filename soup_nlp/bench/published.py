@@ -16,13 +16,11 @@ _TABLE: dict[str, tuple[float | None, ...]] = {
     "kinect_paper": (0.2040, 0.0920, 0.0322, 0.0520, None, 0.0472),
     "kinect_tshirt": (0.2170, 0.1030, 0.0443, 0.0420, None, 0.0480),
 }
-COMPARISON: Mapping[str, Mapping[str, float | None]] = MappingProxyType(
-    {
-        # ULDEMV is compared in a figure of the paper, without printed numbers
-        dataset: MappingProxyType({**dict(zip(_COLUMNS, row, strict=True)), "ULDEMV": None})
-        for dataset, row in _TABLE.items()
-    }
-)
+COMPARISON: Mapping[str, Mapping[str, float | None]] = {
+    # ULDEMV is compared in a figure of the paper, without printed numbers
+    dataset: {**dict(zip(_COLUMNS, row, strict=True)), "ULDEMV": None}
+    for dataset, row in _TABLE.items()
+}
 """MRE by dataset and method; None where the paper prints none. KITTI is the odometry set 00-09
 with LiDAR truth, not the stereo and flow sets of this program's suites."""
 
