@@ -9,8 +9,8 @@ import pytest
 from typer.main import get_command
 
 from soup_nlp.bench.rows import Row, read_rows
-from soup_nlp.bench.studies import run_study, settings_table
-from soup_nlp.bench.study_parts import study_cut_off
+from soup_nlp.bench.studies import Study, grid, number, run_study, setting
+from soup_nlp.bench.study_parts import CUT_OFF
 from soup_nlp.cli.bench_all import COMMANDS
 from soup_nlp.cli.main import app, main
 
@@ -24,19 +24,17 @@ def square(number: int, breaks: bool = False) -> Row:
 
 def test_a_study_writes_its_table_and_goes_on_where_it_was(tmp_path):
     page = tmp_path / "squares.md"
-
-    def cells(row: Row) -> list[str]:
-        return [str(row["settings"]["number"]), str(row["square"])]
-
-    text = settings_table("Squares.", ["number", "square"], cells)
+    cells = {"number": setting("number"), "square": number("square", ".0f")}
+    study = Study("squares", "Squares from {number}.", square, cells)
     settings = [{"number": 3}, {"number": 4, "breaks": True}]
-    rows = run_study(page, settings, square, text)
+    rows = run_study(study, tmp_path, settings)
     assert rows[0]["process"] != os.getpid()
     assert rows[0]["peak_bytes"] > 1e6
+    assert page.read_text().startswith("Squares from 3.")
     assert "| 3 | 9 |" in page.read_text()
     assert "ValueError: out of numbers" in page.read_text()
     seen = []
-    again = run_study(page, settings, square, text, lambda *args: seen.append(args))
+    again = run_study(study, tmp_path, settings, lambda *args: seen.append(args))
     # what failed is tried again, nothing else
     assert again[0] == rows[0]
     assert [row["settings"]["number"] for _, _, row in seen] == [4]
@@ -45,8 +43,8 @@ def test_a_study_writes_its_table_and_goes_on_where_it_was(tmp_path):
 
 @pytest.mark.slow
 def test_components_that_the_border_cuts_off(tmp_path):
-    rows = study_cut_off(tmp_path, [1], superpixels=40, lower=0.3)
-    assert [r["ok"] for r in rows] == [True, True], [r["error"] for r in rows]
+    rows = run_study(CUT_OFF, tmp_path, grid(scene=["street"], seed=[1], superpixels=[40]))
+    assert [r["ok"] for r in rows] == [True], [r["error"] for r in rows]
     assert "street, mean" in (tmp_path / "cut_off.md").read_text()
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from soup_nlp.bench.rows import Row, attempt, failure
 from soup_nlp.errors import SolverError, SoupError
@@ -91,13 +92,8 @@ def isolated(
     try:
         how, value, peak = pickle.loads(target.read_bytes())
     except (OSError, EOFError, pickle.UnpicklingError):
-        how, value, peak = "crashed: no answer", None, 0
-        if late:
-            how = "killed: time"
-        elif code < 0:
-            how = f"crashed: {signal.Signals(-code).name}"
-        elif code:
-            how = f"crashed: exit code {code}"
+        word = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        how, value, peak = "killed: time" if late else f"crashed: {word}", None, 0
     return Ended(how, value, spent, cpu, peak)
 
 
@@ -106,16 +102,8 @@ def alone(work: Callable[[], Row], folder: Path, seconds: float = 7200.0) -> Row
 
     "peak_bytes" is the largest resident size of the process, unless the work says it itself.
     """
-    kept = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
+    with mock.patch.dict(os.environ, dict.fromkeys(THREADS, "1")):
         ended = isolated(partial(attempt, work), folder, seconds, fresh=True)
-    finally:
-        for name, value in kept.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
     if ended.how == "returned":
         return {"peak_bytes": ended.peak_bytes, **ended.value}
     late = ended.how == "killed: time"
@@ -139,10 +127,8 @@ def _child(work: Callable[[], Any], target: Path, memory: int | None) -> None:
     except BaseException as error:
         memory_gone = "bad_alloc" in str(error)
         answer = ("killed: memory", None) if memory_gone else ("raised", _reason(error))
-    peak = max(
-        resource.getrusage(who).ru_maxrss
-        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    )
+    both = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
+    peak = max(resource.getrusage(who).ru_maxrss for who in both)
     part = target.with_suffix(".part")
     part.write_bytes(pickle.dumps((*answer, peak * 1024)))
     part.rename(target)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from soup_nlp.bench.rows import failed
-from soup_nlp.bench.speed import Spec
 from soup_nlp.errors import DataError
 
 Row = Mapping[str, Any]
@@ -24,16 +22,21 @@ LIMITS: dict[str, tuple[float, float]] = {
 """Allowed (factor, addition) of the baseline's value: a value above factor x old + addition fails.
 Rounding differs between machines, so iterations and energies have room; seconds are compared with
 the reference solver's in the same process, which a slower machine slows down alike."""
+VERSION = 3
 
-VERSION = 2
+
+class Run(NamedTuple):
+    """A run of the baseline: its settings and its values by name."""
+
+    settings: dict[str, Any]
+    values: dict[str, float]
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """One value of one run against the baseline.
 
     Attributes:
-        key: Of the run.
+        key: Settings of the run.
         name: Of LIMITS, or "converged", "run".
         old: Baseline's value.
         new: Measured value.
@@ -54,20 +57,15 @@ class Finding:
 
 def values(record: Row) -> dict[str, float]:
     """What the gate looks at."""
-    total = float(record["energy"]["total"])
-    out = {
+    sizes, reference, total = record["sizes"], record["reference"], record["energy"]["total"]
+    return {
         "iterations": float(record["iterations"]),
         "energy": total,
-        "nonzeros": float(
-            record["sizes"]["hessian_nonzeros"] + record["sizes"]["jacobian_nonzeros"]
-        ),
+        "nonzeros": float(sizes["hessian_nonzeros"] + sizes["jacobian_nonzeros"]),
         "converged": float(record["converged"]),
+        "energy_to_reference": total / reference["energy"]["total"],
+        "time_to_reference": record["cpu"]["nlp"] / reference["cpu_seconds"],
     }
-    reference = record["reference"].get("same")
-    if reference:
-        out["energy_to_reference"] = total / reference["energy"]["total"]
-        out["time_to_reference"] = record["cpu"]["nlp"] / reference["cpu_seconds"]
-    return out
 
 
 def baseline(records: Sequence[Row], machine: Mapping[str, str]) -> dict[str, Any]:
@@ -79,15 +77,12 @@ def baseline(records: Sequence[Row], machine: Mapping[str, str]) -> dict[str, An
     bad = [r["key"] for r in records if failed(r)]
     if bad or not records:
         raise DataError("no baseline of runs that failed", found=", ".join(bad) or "no run")
-    return {
-        "version": VERSION,
-        "machine": dict(machine),
-        "runs": [{"spec": r["spec"], "values": values(r)} for r in records],
-    }
+    runs = [{"settings": r["settings"], "values": values(r)} for r in records]
+    return {"version": VERSION, "machine": dict(machine), "runs": runs}
 
 
-def read_baseline(path: Path) -> tuple[list[Spec], dict[str, dict[str, float]]]:
-    """Runs of a baseline and their values by key.
+def read_baseline(path: Path) -> list[Run]:
+    """Runs of a baseline.
 
     Raises:
         DataError: the file is missing or no baseline.
@@ -96,35 +91,28 @@ def read_baseline(path: Path) -> tuple[list[Spec], dict[str, dict[str, float]]]:
         tree = json.loads(path.read_text(encoding="utf-8"))
         if tree["version"] != VERSION:
             raise ValueError(f"version {tree['version']}")
-        specs = [Spec.from_dict(run["spec"]) for run in tree["runs"]]
-        kept = {s.key: dict(run["values"]) for s, run in zip(specs, tree["runs"])}
+        return [Run(dict(run["settings"]), dict(run["values"])) for run in tree["runs"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(
             "not a baseline of bench speed",
             where=path,
             found=error,
             expected=f"JSON of version {VERSION}",
-            hint="soup-nlp bench speed --quick --write-baseline FILE",
+            hint="soup-nlp bench speed --scenes street --sizes 250 --write-baseline FILE",
         ) from error
-    return specs, kept
 
 
-def check(records: Sequence[Row], kept: Mapping[str, Mapping[str, float]]) -> list[Finding]:
+def check(records: Sequence[Row], kept: Sequence[Run]) -> Iterator[Finding]:
     """Every value of every run of the baseline; a run that failed or is missing fails the gate."""
-    by_key = {r["key"]: r for r in records}
-    out = []
-    for key, old in kept.items():
-        record = by_key.get(key)
-        if record is None or failed(record):
-            out.append(Finding(key, "run", 1.0, 0.0, False))
+    for settings, old in kept:
+        key = " ".join(str(v) for v in settings.values() if v != [])
+        own = [r for r in records if r["settings"] == settings and not failed(r)]
+        if not own:
+            yield Finding(key, "run", 1.0, 0.0, False)
             continue
-        new = values(record)
+        new = values(own[-1])
         for name, (factor, addition) in LIMITS.items():
-            if name in old:
-                value = new.get(name, float("inf"))
-                out.append(
-                    Finding(key, name, old[name], value, value <= factor * old[name] + addition)
-                )
+            good = new[name] <= factor * old[name] + addition
+            yield Finding(key, name, old[name], new[name], good)
         both = old["converged"], new["converged"]
-        out.append(Finding(key, "converged", *both, both[1] >= both[0]))
-    return out
+        yield Finding(key, "converged", *both, both[1] >= both[0])

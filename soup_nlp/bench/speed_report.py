@@ -1,296 +1,305 @@
-"""Report of `bench speed`: growth exponents, tables with the conclusion first, and plots."""
+"""Report of `bench speed`: tables with the conclusion first, growth exponents, and plots."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from soup_nlp.bench.processes import machine
 from soup_nlp.bench.rows import failed
-from soup_nlp.bench.speed_fit import ALL, COSTS, fit, growth, outside
-from soup_nlp.bench.tables import columns, save, show, table
+from soup_nlp.bench.speed import measure
+from soup_nlp.bench.studies import Study
+from soup_nlp.bench.tables import columns, failures, figure, joined, save, show, table
+from soup_nlp.storage.atomic import write_text
 
 Row = Mapping[str, Any]
 Cell = Callable[[Row], str]
 
+OUTSIDE = ("flow", "segmentation", "start", "weights", "evaluation", "output")
+"""Stages that are not the NLP's and not the loading or rendering of frames."""
+PHASES = (
+    "load", "flow", "segmentation", "start", "weights",
+    "build", "functions", "linear algebra", "evaluation", "output",
+)  # fmt: skip
+"""Stages of a run; build, functions and linear algebra are the NLP."""
+COSTS: dict[str, Callable[[Row], float]] = {
+    "NLP, CPU s": lambda r: r["cpu"]["nlp"],
+    "CPU s an iteration": lambda r: r["cpu"]["nlp"] / max(1, r["iterations"]),
+    "functions, s": lambda r: r["wall"]["functions"],
+    "linear algebra, s": lambda r: r["wall"]["linear algebra"],
+    "outside the NLP, CPU s": lambda r: outside(r),
+    "Hessian nonzeros": lambda r: r["sizes"]["hessian_nonzeros"],
+    "peak memory": lambda r: r["peak_bytes"],
+}
+"""What growth is fitted of."""
+LIMITS = (
+    "Wall times of a shared machine vary with its load; CPU times less so. One thread."
+    " Compiling the kernels happens once a machine and is in the wall time (build) of the run"
+    " that does it, not in its CPU time. Loading is rendering for the scenes; outside: flow,"
+    " segmentation, start, weights, evaluation and output with every picture, point cloud"
+    " and HDF5."
+)
 
-def _reference(record: Row, kind: str = "same") -> Mapping[str, Any] | None:
-    found: Mapping[str, Any] | None = record["reference"].get(kind)
-    return found
+
+def outside(record: Row) -> float:
+    """CPU seconds of every stage but loading and the NLP."""
+    return float(sum(record["cpu"].get(stage, 0.0) for stage in OUTSIDE))
 
 
+def _energy_ratio(r: Row) -> float:
+    return float(r["energy"]["total"] / r["reference"]["energy"]["total"])
+
+
+def _time_ratio(r: Row) -> float:
+    return float(r["cpu"]["nlp"] / r["reference"]["cpu_seconds"])
+
+
+def _at(form: str, *path: str) -> Cell:
+    """A number of a record under some keys, as a cell."""
+
+    def cell(record: Row) -> str:
+        value: Any = record
+        for key in path:
+            value = None if value is None else value.get(key)
+        return show(value, form)
+
+    return cell
+
+
+IDENTITY: dict[str, Cell] = {
+    "pair": _at("", "settings", "scene"),
+    "seed": _at("d", "settings", "seed"),
+    "N": _at("d", "sizes", "superpixels"),
+    "K": _at("d", "settings", "neighbours"),
+}
 COLUMNS: dict[str, Cell] = {
-    "pair": lambda r: r["spec"]["scene"],
-    "seed": lambda r: str(r["spec"]["seed"]),
-    "N": lambda r: str(r["sizes"]["superpixels"]),
-    "K": lambda r: str(r["spec"]["neighbours"]),
-    "CPU s": lambda r: f"{r['cpu']['nlp']:.1f}",
-    "presolve CPU s": lambda r: show(r["cpu"].get("presolve"), ".1f"),
-    "wall s": lambda r: f"{r['wall']['nlp']:.1f}",
-    "its": lambda r: str(r["iterations"]),
-    "E start": lambda r: f"{r['energy_start']['total']:.2f}",
-    "E": lambda r: f"{r['energy']['total']:.3f}",
-    "E LM": lambda r: show((_reference(r) or {}).get("energy", {}).get("total"), ".3f"),
-    "E / LM": lambda r: (
-        f"{r['energy']['total'] / y['energy']['total']:.4f}" if (y := _reference(r)) else "-"
-    ),
-    "CPU / LM": lambda r: (
-        f"{r['cpu']['nlp'] / y['cpu_seconds']:.2f}" if (y := _reference(r)) else "-"
-    ),
-    "LM its": lambda r: str(y["iterations"]) if (y := _reference(r)) else "-",
-    "MRE start": lambda r: show(r["mre"].get("start"), ".4f"),
-    "MRE": lambda r: show(r["mre"].get("solution"), ".4f"),
-    "MRE LM": lambda r: show((_reference(r) or {}).get("mre"), ".4f"),
-    "dual inf.": lambda r: f"{r['residuals']['dual_infeasibility']:.1e}",
-    "constraints": lambda r: f"{r['residuals']['nlp_infeasibility']:.1e}",
+    **IDENTITY,
+    "CPU s": _at(".1f", "cpu", "nlp"),
+    "presolve CPU s": _at(".1f", "cpu", "presolve"),
+    "wall s": _at(".1f", "wall", "nlp"),
+    "its": _at("d", "iterations"),
+    "E start": _at(".2f", "energy_start", "total"),
+    "E": _at(".3f", "energy", "total"),
+    "E LM": _at(".3f", "reference", "energy", "total"),
+    "E / LM": lambda r: f"{_energy_ratio(r):.4f}",
+    "CPU / LM": lambda r: f"{_time_ratio(r):.2f}",
+    "LM its": _at("d", "reference", "iterations"),
+    "MRE start": _at(".4f", "mre", "start"),
+    "MRE": _at(".4f", "mre", "solution"),
+    "MRE LM": _at(".4f", "reference", "mre"),
+    "dual inf.": _at(".1e", "residuals", "dual_infeasibility"),
+    "constraints": _at(".1e", "residuals", "nlp_infeasibility"),
+    "nnz H": _at("d", "sizes", "hessian_nonzeros"),
     "GB": lambda r: f"{r['peak_bytes'] / 2**30:.2f}",
     "status": lambda r: r["status"].replace("_", " "),
 }
 """The main table."""
-
-IDENTITY = {name: COLUMNS[name] for name in ("pair", "seed", "N", "K")}
-NLP_PARTS = ("build", "functions", "linear algebra")
-PHASES = ("load", "flow", "segmentation", "start", "weights", *NLP_PARTS, "evaluation", "output")
-"""Stages of a run; build, functions and linear algebra are the NLP."""
-
-
-def _phase(name: str) -> Cell:
-    return lambda r: f"{r['wall'].get(name, 0.0):.2f}"
-
-
-def _size(name: str) -> Cell:
-    return lambda r: str(r["sizes"][name])
-
-
 STAGES: dict[str, Cell] = {
     **IDENTITY,
-    **{name: _phase(name) for name in PHASES},
-    "compiler, CPU s": lambda r: f"{r['cpu'].get('compiler', 0.0):.2f}",
+    **{name: _at(".2f", "wall", name) for name in PHASES},
+    "compiler, CPU s": _at(".2f", "cpu", "compiler"),
     "outside, CPU s": lambda r: f"{outside(r):.2f}",
 }
-SIZES: dict[str, Cell] = {
-    **IDENTITY,
-    "K-NN edges": _size("knn_edges"),
-    "pairs": _size("pairs"),
-    "variables": _size("variables"),
-    "constraints": _size("constraints"),
-    "nnz J": _size("jacobian_nonzeros"),
-    "nnz H": _size("hessian_nonzeros"),
-    "SO(3)": lambda r: f"{r['residuals']['so3']:.1e}",
-    "normals": lambda r: f"{r['residuals']['normal']:.1e}",
-    "simplex": lambda r: f"{r['residuals']['simplex']:.1e}",
-    "visible": lambda r: f"{r['residuals']['visible']:.1e}",
-    "complementarity": lambda r: f"{r['residuals']['complementarity']:.1e}",
-}
 
 
-def stage_lines(rows: Sequence[Row]) -> list[str]:
-    """A table of every phase of every run."""
-    lines = [
-        [
-            r["key"],
-            s["name"],
-            str(s["iterations"]),
-            f"{s['seconds']:.2f}",
-            show(s["inf_du"], ".1e"),
-            s["status"].replace("_", " "),
-        ]
-        for r in rows
-        for s in r["stages"]
-    ]
-    return table(["run", "stage", "iterations", "s", "dual inf.", "status"], lines)
+class Growth(NamedTuple):
+    """cost = factor N^exponent.
+
+    Attributes:
+        exponent: Slope of log cost over log N.
+        error: Standard error of the slope; NaN where no degree of freedom is left.
+    """
+
+    exponent: float
+    error: float
+
+    def __str__(self) -> str:
+        error = "" if np.isnan(self.error) else f" ± {self.error:.2f}"
+        return f"{self.exponent:.2f}{error}"
 
 
-def growth_lines(rows: Sequence[Row], least: int = 0) -> list[str]:
-    """A table of exponents, all scenes together last; empty where no size changes."""
+def fit(
+    sizes: Sequence[float], costs: Sequence[float], scenes: Sequence[str] | None = None
+) -> Growth | None:
+    """Least squares of log cost over log N; None with fewer than two different sizes.
+
+    Args:
+        sizes: N of every run.
+        costs: Positive cost of every run.
+        scenes: Scene of every run: one exponent for all, a factor for each. None: all are one.
+    """
+    n, c = np.asarray(sizes, float), np.asarray(costs, float)
+    use = (n > 0) & (c > 0)
+    _, scene = np.unique(np.asarray(scenes or [""] * len(n))[use], return_inverse=True)
+    own = np.eye(scene.max(initial=-1) + 1)[scene]
+    x = np.log(n[use])
+    # actual numbers of superpixels differ a little between seeds of one size
+    if not len(x) or np.ptp(x - own @ np.linalg.pinv(own) @ x) < 0.2:
+        return None
+    X = np.column_stack([x, own])
+    solution, rest, *_ = np.linalg.lstsq(X, np.log(c[use]))
+    free = len(x) - X.shape[1]
+    error = np.sqrt(rest[0] / free * np.linalg.inv(X.T @ X)[0, 0]) if free else np.nan
+    return Growth(float(solution[0]), float(error))
+
+
+def growth_lines(records: Sequence[Row]) -> list[str]:
+    """Table of the growth of every cost, by scene and K and over all scenes; empty without any."""
     lines = []
-    for (scene, k), fits in sorted(growth(rows, least).items(), key=lambda i: (i[0][0] == ALL, i)):
-        one = next(iter(fits.values()))
-        cells = [scene, str(k), f"{one.low:.0f} to {one.high:.0f}"]
-        lines.append([*cells, *(str(fits.get(name, "-")) for name in COSTS)])
+    groups = _groups(records)
+    for k in sorted({k for _, k in groups}):
+        own = {scene: group for (scene, other), group in groups.items() if other == k}
+        if len(own) > 1:
+            groups["all", k] = [r for group in own.values() for r in group]
+    for (scene, k), group in groups.items():
+        n = [r["sizes"]["superpixels"] for r in group]
+        scenes = [r["settings"]["scene"] for r in group]
+        fits = [fit(n, [cost(r) for r in group], scenes) for cost in COSTS.values()]
+        if any(fits):
+            told = ["-" if f is None else str(f) for f in fits]
+            lines.append([scene, str(k), f"{min(n)} to {max(n)}", *told])
     return table(["pair", "K", "N", *COSTS], lines) if lines else []
-
-
-WIDE: dict[str, Cell] = {
-    "run": lambda r: r["key"],
-    "E": lambda r: f"{r['energy']['total']:.3f}",
-    "E wide": lambda r: f"{r['reference']['wide']['energy']['total']:.3f}",
-    "MRE": lambda r: show(r["mre"].get("solution")),
-    "MRE wide": lambda r: show(r["reference"]["wide"]["mre"]),
-    "wide its": lambda r: str(r["reference"]["wide"]["iterations"]),
-    "wide CPU s": lambda r: f"{r['reference']['wide']['cpu_seconds']:.1f}",
-}
-"""The table of the reference solver that starts from a wide smoothing."""
 
 
 def conclusion(records: Sequence[Row]) -> str:
     """What the table says, in sentences made of its numbers."""
-    good = [r for r in records if not failed(r)]
-    if not good:
+    if not records:
         return "No run ended with a result."
-    converged = sum(bool(r["converged"]) for r in good)
-    text = [f"{converged} of {len(good)} runs converged to their tolerance."]
-    by_size: dict[tuple[int, int], list[float]] = defaultdict(list)
-    for r in good:
-        by_size[r["spec"]["superpixels"], r["spec"]["neighbours"]].append(r["cpu"]["nlp"])
-    n, k = max(by_size)
-    costs = by_size[n, k]
-    text.append(
-        f"At N = {n}, K = {k} the NLP takes {min(costs):.1f} to {max(costs):.1f} CPU s"
+    converged = sum(bool(r["converged"]) for r in records)
+    n, k = max((r["settings"]["superpixels"], r["settings"]["neighbours"]) for r in records)
+    large = [r for r in records if r["settings"]["superpixels"] == n]
+    costs = [r["cpu"]["nlp"] for r in large if r["settings"]["neighbours"] == k]
+    ratios, times = [_energy_ratio(r) for r in records], [_time_ratio(r) for r in records]
+    return (
+        f"{converged} of {len(records)} runs converged to their tolerance."
+        f" At N = {n}, K = {k} the NLP takes {min(costs):.1f} to {max(costs):.1f} CPU s"
         f" ({len(costs)} runs); all stages outside it at most"
-        f" {max(outside(r) for r in good if r['spec']['superpixels'] == n):.1f} CPU s."
+        f" {max(outside(r) for r in large):.1f} CPU s."
+        f" Its energy is {min(ratios):.4f} to {max(ratios):.4f} times that of"
+        f" Levenberg-Marquardt on the same smoothing, its CPU time"
+        f" {min(times):.2f} to {max(times):.2f} times."
     )
-    ratios = [r["energy"]["total"] / y["energy"]["total"] for r in good if (y := _reference(r))]
-    if ratios:
-        times = [r["cpu"]["nlp"] / y["cpu_seconds"] for r in good if (y := _reference(r))]
-        text.append(
-            f"Its energy is {min(ratios):.4f} to {max(ratios):.4f} times that of"
-            f" Levenberg-Marquardt on the same smoothing, its CPU time"
-            f" {min(times):.2f} to {max(times):.2f} times."
-        )
-    return " ".join(text)
 
 
-def report(records: Sequence[Row], machine: Mapping[str, str], day: str) -> str:
-    """results/speed/table.md.
+class SpeedStudy(Study):
+    """`bench speed`: a study whose page has several tables and plots."""
 
-    Args:
-        records: Of `measure_all`, failures included.
-        machine: Of `machine.machine`.
-        day: Date of the measurement.
-    """
-    good = [r for r in records if not failed(r)]
-    wide = [r for r in good if "wide" in r["reference"]]
-    lines = ["# Speed and growth", "", conclusion(records), ""]
-    lines += columns(COLUMNS, good)
-    lines += [
-        "",
-        "CPU s and wall s: the whole NLP (presolve, build, constrained NLP). its: of the presolve"
-        " and of Ipopt. E: exact energy, LM: on-manifold Levenberg-Marquardt with reweighting from"
-        " the same start on the same smoothing widths, in the same process. MRE after median"
-        " scale, no cap. dual inf., constraints: recomputed at Ipopt's answer. GB: peak of the"
-        " process before the reference solver runs.",
-    ]
-    for r in records:
-        if failed(r):
-            lines.append(f"\n{r['key']} failed: {r['error']}")
-    for title, body in (
-        ("Growth: cost = factor N^p", growth_lines(good)),
-        ("Growth from N = 500", growth_lines(good, 500)),
-        ("Wall seconds by stage", columns(STAGES, good)),
-        ("Phases of the presolve, and Ipopt's call", stage_lines(good)),
-        ("Sizes and residuals of the delivered soup", columns(SIZES, good)),
-        ("The reference solver from a wide smoothing", columns(WIDE, wide) if wide else []),
-    ):
-        if body:
-            lines += ["", f"## {title}", "", *body]
-    lines += ["", "## Machine", ""]
-    lines += [f"- {name}: {value}" for name, value in {"date": day, **machine}.items()]
-    lines += [
-        "",
-        "## Limits",
-        "",
-        "Wall times of a shared machine vary with its load; CPU times less so. One thread."
-        " Compiling the kernels happens once a machine and is in the wall time (build) of the run"
-        " that does it, not in its CPU time. Loading is rendering for the scenes; outside: flow,"
-        " segmentation, start, weights, evaluation and output with every picture, point cloud"
-        " and HDF5.",
-    ]
-    return "\n".join(lines) + "\n"
+    def write(self, out: Path, rows: Sequence[dict[str, Any]]) -> None:
+        """Table and plots of the runs that are there."""
+        good = [r for r in rows if not failed(r)]
+        sections = {
+            "Growth: cost = factor N^p": growth_lines(good),
+            "Wall seconds by stage": columns(STAGES, good),
+            "Machine": [f"- {k}: {v}" for k, v in {"date": date.today(), **machine()}.items()],
+            "Limits": [LIMITS],
+        }
+        lines = ["# Speed and growth", "", conclusion(good), ""]
+        lines += [*columns(self.cells, good), "", self.note, *failures(list(rows))]
+        for title, body in sections.items():
+            lines += ["", f"## {title}", "", *body] if body else []
+        write_text(out / f"{self.name}.md", joined(lines))
+        if good:
+            plot_growth(out / "growth.png", good)
+            plot_phases(out / "phases.png", good)
+            plot_energy(out / "energy.png", good)
+
+
+SPEED = SpeedStudy(
+    "table",
+    "CPU s and wall s: the whole NLP (presolve, build, constrained NLP). its: of the presolve"
+    " and of Ipopt. E: exact energy, LM: on-manifold Levenberg-Marquardt with reweighting from"
+    " the same start on the same smoothing widths, in the same process. MRE after median"
+    " scale, no cap. dual inf., constraints: recomputed at Ipopt's answer. GB: peak of the"
+    " process before the reference solver runs.",
+    measure,
+    COLUMNS,
+)
 
 
 def _groups(records: Sequence[Row]) -> dict[tuple[str, int], list[Row]]:
     out: dict[tuple[str, int], list[Row]] = defaultdict(list)
     for r in records:
-        out[r["spec"]["scene"], r["spec"]["neighbours"]].append(r)
+        out[r["settings"]["scene"], r["settings"]["neighbours"]].append(r)
     return dict(sorted(out.items()))
+
+
+def _label(r: Row) -> str:
+    s = r["settings"]
+    return f"{s['scene']}, N {s['superpixels']}, K {s['neighbours']}, seed {s['seed']}"
 
 
 def plot_growth(path: Path, records: Sequence[Row]) -> None:
     """CPU seconds of NLP, reference solver and the rest, and peak memory over N, logarithmic."""
-    figure = Figure(figsize=(11, 4))
-    left, right = figure.subplots(1, 2)
+    picture = figure(11, 4)
+    left, right = picture.subplots(1, 2)
     for index, ((scene, k), group) in enumerate(_groups(records).items()):
-        n = np.array([r["sizes"]["superpixels"] for r in group], float)
-        order, colour = np.argsort(n), f"C{index % 10}"
-        cpu = np.array([r["cpu"]["nlp"] for r in group])
-        slope = fit(n.tolist(), cpu.tolist())
+        group = sorted(group, key=lambda r: r["sizes"]["superpixels"])
+        n, colour = [r["sizes"]["superpixels"] for r in group], f"C{index % 10}"
+        cpu = [r["cpu"]["nlp"] for r in group]
+        slope = fit(n, cpu)
         label = f"{scene}, K {k}" + (f": N^{slope.exponent:.2f}" if slope else "")
-        left.loglog(n[order], cpu[order], "o-", color=colour, label=label)
-        rest = np.array([outside(r) for r in group])
-        left.loglog(n[order], rest[order], ".:", color=colour, alpha=0.6)
-        lm = [(m, r["reference"]["same"]) for m, r in zip(n, group) if "same" in r["reference"]]
-        if lm:
-            left.loglog(
-                [m for m, _ in lm], [y["cpu_seconds"] for _, y in lm], "x", color=colour, alpha=0.7
-            )
-        memory = np.array([r["peak_bytes"] for r in group]) / 2**30
-        right.loglog(n[order], memory[order], "o-", color=colour)
-    left.set(xlabel="superpixels N", ylabel="CPU s")
+        left.loglog(n, cpu, "o-", color=colour, label=label)
+        left.loglog(n, [outside(r) for r in group], ".:", color=colour, alpha=0.6)
+        reference = [r["reference"]["cpu_seconds"] for r in group]
+        left.loglog(n, reference, "x", color=colour, alpha=0.7)
+        right.loglog(n, [r["peak_bytes"] / 2**30 for r in group], "o-", color=colour)
     left.set_title("NLP (o), reference solver (x), all stages outside (.)", fontsize=10)
     left.legend(fontsize=8)
-    right.set(xlabel="superpixels N", ylabel="GB")
     right.set_title("peak memory", fontsize=10)
-    for axes in (left, right):
-        sizes = sorted({r["spec"]["superpixels"] for r in records})
+    sizes = sorted({r["settings"]["superpixels"] for r in records})
+    for axes, unit in ((left, "CPU s"), (right, "GB")):
+        axes.set(xlabel="superpixels N", ylabel=unit)
         axes.set_xticks(sizes, [str(n) for n in sizes])
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter(NullFormatter())
-    figure.tight_layout()
-    save(figure, path)
+    save(picture, path)
 
 
 def plot_phases(path: Path, records: Sequence[Row]) -> None:
     """Stacked wall seconds by stage, a bar a run."""
-    figure = Figure(figsize=(9, 0.32 * len(records) + 1.4))
-    axes: Axes = figure.subplots()
+    picture = figure(9, 0.32 * len(records) + 1.4)
+    axes = picture.subplots()
+    keys = [_label(r) for r in records]
     begin = np.zeros(len(records))
     for index, part in enumerate(p for p in PHASES if p not in ("load", "weights")):
         width = np.array([r["wall"].get(part, 0.0) for r in records])
-        axes.barh(np.arange(len(records)), width, left=begin, label=part, color=f"C{index}")
+        axes.barh(keys, width, left=begin, label=part, color=f"C{index}")
         begin += width
-    axes.set_yticks(np.arange(len(records)), [r["key"] for r in records], fontsize=7)
+    axes.tick_params("y", labelsize=7)
     axes.invert_yaxis()
     axes.set_xlabel("wall s")
-    axes.legend(fontsize=7, ncols=4, loc="upper center", bbox_to_anchor=(0.4, -0.12))
-    save(figure, path)
+    picture.legend(fontsize=7, ncols=4, loc="outside lower center")
+    save(picture, path)
 
 
 def plot_energy(path: Path, records: Sequence[Row], most: int = 12) -> None:
-    """Exact energy over seconds: the reference solvers' history, Ipopt's end as a point.
+    """Exact energy over seconds: the reference solver's history, Ipopt's end as a point.
 
     Args:
         path: PNG.
-        records: Runs with a reference solver; the largest `most` of them are drawn.
+        records: Runs; the largest `most` of them are drawn.
         most: Panels.
     """
-    have = [r for r in records if r["reference"]]
-    have = sorted(have, key=lambda r: -r["sizes"]["superpixels"])[:most]
-    if not have:
-        return
-    columns = min(4, len(have))
-    rows = -(-len(have) // columns)
-    figure = Figure(figsize=(3.4 * columns, 2.6 * rows))
-    panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
-    for panel, r in zip(panels, have):
-        for kind, y in r["reference"].items():
-            history = np.array(y["history"])
-            panel.plot(history[:, 0], history[:, 1], label=f"LM, {kind}")
+    drawn = sorted(records, key=lambda r: -r["sizes"]["superpixels"])[:most]
+    width = min(4, len(drawn))
+    rows = -(-len(drawn) // width)
+    picture = figure(3.4 * width, 2.6 * rows)
+    for index, r in enumerate(drawn):
+        panel = picture.add_subplot(rows, width, index + 1)
+        panel.plot(*np.transpose(r["reference"]["history"]), label="Levenberg-Marquardt")
         panel.plot(r["wall"]["nlp"], r["energy"]["total"], "k*", label="Ipopt, end")
-        panel.set_title(r["key"], fontsize=7)
+        panel.set_title(_label(r), fontsize=7)
         panel.tick_params(labelsize=7)
-    for panel in panels[len(have) :]:
-        panel.set_axis_off()
-    panels[0].legend(fontsize=7)
-    figure.supxlabel("wall s", fontsize=8)
-    figure.supylabel("exact energy", fontsize=8)
-    figure.tight_layout()
-    save(figure, path)
+        if not index:
+            panel.legend(fontsize=7)
+    picture.supxlabel("wall s", fontsize=8)
+    picture.supylabel("exact energy", fontsize=8)
+    save(picture, path)

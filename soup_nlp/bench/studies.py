@@ -1,4 +1,4 @@
-"""Studies of parts of the program: each has settings, one row per setting, and a table.
+"""Studies of parts of the program: one row per setting, and a table of the rows.
 
 Every row is measured in a process of its own with one thread, so that its peak memory and its time
 are its own, and is stored, so that a study that was stopped goes on where it was.
@@ -9,64 +9,90 @@ from __future__ import annotations
 import platform
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import date
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from soup_nlp.bench.processes import alone
 from soup_nlp.bench.rows import Job, Row, Say, failed, measure_all
-from soup_nlp.bench.tables import failures, joined, table
+from soup_nlp.bench.tables import columns, failures, joined
 from soup_nlp.storage.atomic import write_text
 
 Settings = Mapping[str, Any]
-Text = Callable[[Sequence[Row]], list[str]]
+Cells = Mapping[str, Callable[[Row], str]]
 
 
-def made_on() -> str:
-    """Date and machine of a table."""
-    return f"{date.today()}, {platform.machine()}."
+@dataclass(frozen=True)
+class Study:
+    """What is measured and how it is told.
+
+    Attributes:
+        name: Name of the table's file, without its suffix.
+        note: First paragraph of the page; {KEY} is a value of the first settings.
+        measure: Row of keyword arguments; a function of a module, which another process imports.
+        cells: Columns of the table; a row has its "settings" beside what was measured.
+        summary: More lines for the table, made of all rows, or None.
+    """
+
+    name: str
+    note: str
+    measure: Callable[..., Row]
+    cells: Cells
+    summary: Callable[[Sequence[Row]], list[str]] | None = None
+
+    def write(self, out: Path, rows: Sequence[Row]) -> None:
+        """Write the page of the rows that are there; those that failed are listed at its end."""
+        good = [r for r in rows if not failed(r)]
+        note = self.note.format(**rows[0]["settings"])
+        lines = [f"{note} {date.today()}, {platform.machine()}.", "", *columns(self.cells, good)]
+        lines += self.summary(good) if self.summary else []
+        write_text(out / f"{self.name}.md", joined([*lines, *failures(list(rows))]))
+
+
+def grid(**values: Sequence[Any]) -> list[Settings]:
+    """Settings of every combination; the first key varies most slowly."""
+    return [dict(zip(values, own, strict=True)) for own in product(*values.values())]
+
+
+def setting(name: str) -> Callable[[Row], str]:
+    """A cell: the value of a setting."""
+    return lambda row: str(row["settings"][name])
+
+
+def number(name: str, form: str = "") -> Callable[[Row], str]:
+    """A cell: a measured number."""
+    return lambda row: format(row[name], form)
 
 
 def run_study(
-    page: Path,
+    study: Study,
+    out: Path,
     settings: Sequence[Settings],
-    measure: Callable[..., Row],
-    text: Text,
     say: Say | None = None,
+    page: bool = True,
 ) -> list[Row]:
-    """Measure every setting and write the table after every row.
+    """Measure every setting; rows go to OUT/NAME.jsonl.
 
     Args:
-        page: Markdown file; rows go to the .jsonl beside it.
-        settings: Keyword arguments of `measure`, plain JSON values.
-        measure: A function of a module, which another process can import.
-        text: Lines of the page from the rows that are there.
+        study: What is measured.
+        out: Folder.
+        settings: Keyword arguments of `study.measure`, plain JSON values.
         say: Called after every new row.
-
-    Returns:
-        The rows; those that failed are listed at the end of the page.
+        page: Write OUT/NAME.md after every row.
     """
-
-    def work(own: Settings) -> Row:
-        with tempfile.TemporaryDirectory() as folder:
-            return alone(partial(measure, **own), Path(folder))
-
-    def write(rows: list[Row]) -> None:
-        good = [r for r in rows if not failed(r)]
-        write_text(page, joined([*text(good), *failures(rows)]))
-
-    page.parent.mkdir(parents=True, exist_ok=True)
-    jobs = [
-        Job(
-            {"key": f"{page.stem} {' '.join(map(str, s.values()))}", "settings": s},
-            partial(work, s),
-        )
-        for s in settings
-    ]
-    return measure_all(jobs, page.with_suffix(".jsonl"), say=say, after=write)
+    jobs = []
+    for own in settings:
+        key = f"{study.name} {' '.join(str(v) for v in own.values() if v != [])}"
+        jobs.append(Job({"key": key, "settings": own}, partial(run_alone, study, own)))
+    path = out / f"{study.name}.jsonl"
+    after = partial(study.write, out) if page else None
+    return measure_all(jobs, path, say=say, after=after)
 
 
-def settings_table(note: str, head: Sequence[str], cells: Callable[[Row], Sequence[str]]) -> Text:
-    """A page of one note and one table with a line per row."""
-    return lambda rows: [note, "", *table(head, [cells(r) for r in rows])]
+def run_alone(study: Study, settings: Settings, seconds: float = 7200.0) -> Row:
+    """The row of one setting, or why it failed."""
+    with tempfile.TemporaryDirectory() as folder:
+        return alone(partial(study.measure, **settings), Path(folder), seconds)

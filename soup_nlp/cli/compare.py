@@ -62,7 +62,7 @@ def compare(
         with tempfile.TemporaryDirectory() as scratch:
             for problem in chosen:
                 tasks = list(make_tasks(prepare(problem, presolve), forms, limits, presolve))
-                rows = run_all(tasks, names, limits, folder / "runs.jsonl", Path(scratch), print)
+                rows += run_all(tasks, names, limits, folder / "runs.jsonl", Path(scratch), print)
     finally:
         # an input that cannot be used does not take the others' page away
         if rows:

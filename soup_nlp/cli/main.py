@@ -10,12 +10,9 @@ import typer
 from soup_nlp.cli import bench_all, bench_studies
 from soup_nlp.cli.bench_accuracy import accuracy, search
 from soup_nlp.cli.bench_speed import speed
-from soup_nlp.cli.check import check
 from soup_nlp.cli.compare import compare
-from soup_nlp.cli.evaluate import evaluate
-from soup_nlp.cli.export import export
-from soup_nlp.cli.import_ import import_
-from soup_nlp.cli.show import list_, show
+from soup_nlp.cli.problems import export, list_, show
+from soup_nlp.cli.results import check, evaluate, import_
 from soup_nlp.cli.solve import solve
 from soup_nlp.errors import SoupError
 from soup_nlp.pipeline.run import StoppedError

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -51,13 +51,7 @@ class SolveLog:
             self.console.file.flush()
 
     def warn(
-        self,
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
+        self, message: Warning | str, category: type[Warning], *_: object, **__: object
     ) -> None:
         """Print a warning about the input; warnings of libraries are for developers."""
         if issubclass(category, DataWarning):
@@ -104,29 +98,61 @@ def solve(
         )
     halves = {"refine.enabled=false": no_refine, "refine.from_start=true": no_nlp}
     overrides = [*(overrides or []), *(item for item, on in halves.items() if on)]
-    if problem is not None:
-        pair = {
-            "--ref": ref,
-            "--next": next_,
-            "--intrinsics": intrinsics,
-            "--intrinsics-next": intrinsics_next,
-            "--depth": depth,
-        }
-        if any(pair.values()):
-            raise ConfigError(
-                "a problem file names its own pair",
-                found=f"{problem} and {', '.join(k for k, v in pair.items() if v)}",
-                expected="a problem file, or the options of a pair",
-                hint="--set input.KEY=VALUE changes the input of a problem file",
-            )
-        if flow:
-            # a path on the command line starts here, one in a problem file from the file
-            overrides = [f"flow.source={json.dumps(_flow_source(flow))}", *overrides]
-        chosen = load_problem(problem, overrides)
+    pair = {
+        "--ref": ref,
+        "--next": next_,
+        "--intrinsics": intrinsics,
+        "--intrinsics-next": intrinsics_next,
+        "--depth": depth,
+    }
+    if problem is None:
+        chosen = _from_options(pair, flow, overrides)
     else:
-        chosen = _from_options(ref, next_, intrinsics, intrinsics_next, flow, depth, overrides)
+        chosen = _from_file(problem, pair, flow, overrides)
     # a problem file's expectation is of the file without overrides
     _run(chosen, out, quiet, None if overrides else chosen.expected.mre_at_most)
+
+
+def _from_file(
+    problem: Path, pair: Mapping[str, str | None], flow: str | None, overrides: Sequence[str]
+) -> Problem:
+    """The problem of a file, with the flow of the command line."""
+    if any(pair.values()):
+        raise ConfigError(
+            "a problem file names its own pair",
+            found=f"{problem} and {', '.join(k for k, v in pair.items() if v)}",
+            expected="a problem file, or the options of a pair",
+            hint="--set input.KEY=VALUE changes the input of a problem file",
+        )
+    if flow:
+        # a path on the command line starts here, one in a problem file from the file
+        source = str(Path(flow).expanduser().resolve()) if is_path(flow) else flow
+        overrides = [f"flow.source={json.dumps(source)}", *overrides]
+    return load_problem(problem, overrides)
+
+
+def _from_options(
+    pair: Mapping[str, str | None], flow: str | None, overrides: Sequence[str]
+) -> Problem:
+    """The problem of the options of a pair."""
+    ref, following, intrinsics, intrinsics_next, depth = pair.values()
+    if not (ref and following and intrinsics):
+        raise ConfigError(
+            "nothing to solve",
+            found="no problem file",
+            expected="PROBLEM.yaml, or --ref, --next and --intrinsics",
+            hint="soup-nlp solve problems/motorcycle.yaml --out out/motorcycle",
+        )
+    source: dict[str, Any] = {"kind": "files", "ref": ref, "next": following}
+    source["intrinsics"] = _camera(intrinsics, "--intrinsics")
+    if intrinsics_next:
+        source["intrinsics_next"] = _camera(intrinsics_next, "--intrinsics-next")
+    if depth:
+        source["depth"] = depth
+    raw: dict[str, Any] = {"name": Path(ref).stem, "input": source, "base": str(Path.cwd())}
+    if flow:
+        raw["flow"] = {"source": flow}
+    return make_problem(raw, overrides, where="command line")
 
 
 def _run(chosen: Problem, out: Path, quiet: bool, mre_at_most: float | None) -> None:
@@ -181,40 +207,3 @@ def _camera(text: str, option: str) -> list[float] | str:
             expected="fx,fy,cx,cy or a text file of 4 or 9 numbers",
         )
     return values
-
-
-def _flow_source(text: str) -> str:
-    """A flow source with its path, if it is one, from the working directory."""
-    return str(Path(text).expanduser().resolve()) if is_path(text) else text
-
-
-def _from_options(
-    ref: str | None,
-    next_: str | None,
-    intrinsics: str | None,
-    intrinsics_next: str | None,
-    flow: str | None,
-    depth: str | None,
-    overrides: Sequence[str] | None,
-) -> Problem:
-    if not (ref and next_ and intrinsics):
-        raise ConfigError(
-            "nothing to solve",
-            found="no problem file",
-            expected="PROBLEM.yaml, or --ref, --next and --intrinsics",
-            hint="soup-nlp solve problems/motorcycle.yaml --out out/motorcycle",
-        )
-    source: dict[str, Any] = {
-        "kind": "files",
-        "ref": ref,
-        "next": next_,
-        "intrinsics": _camera(intrinsics, "--intrinsics"),
-    }
-    if intrinsics_next:
-        source["intrinsics_next"] = _camera(intrinsics_next, "--intrinsics-next")
-    if depth:
-        source["depth"] = depth
-    raw: dict[str, Any] = {"name": Path(ref).stem, "input": source, "base": str(Path.cwd())}
-    if flow:
-        raw["flow"] = {"source": flow}
-    return make_problem(raw, overrides or [], where="command line")

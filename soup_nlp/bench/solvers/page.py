@@ -7,26 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from soup_nlp.bench.solvers.profiles import cost_table, problem_key, problem_names
-from soup_nlp.bench.tables import codes, columns, show, table
+from soup_nlp.bench.solvers.profiles import cost_table, problem_key
+from soup_nlp.bench.tables import codes, columns, joined, show, table
 
 Row = Mapping[str, Any]
 
 FEASIBLE = 1e-5
 """Largest violation of a point whose energy counts."""
 LIMITS = (
-    "Times are wall times of one run each, set-up included, on the machine named; where it was "
-    "shared with other work, CPU seconds stand beside them.",
+    "Times are wall times of one run each, set-up included, on the machine named.",
     "The presolve's answer is almost optimal: energies hardly move, and the comparison is of how "
     "quickly a solver proves it. From the proposal it is harder.",
     "Local solvers end in local minima: an energy says where this start led, not what is best.",
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
-    "Solvers run with the options in `soup_nlp/bench/solvers/plugins.py`, the package's own ones "
-    "being tuned on such problems; the others are as they come, but for tolerances and limits.",
-    "alpaqa and sleqp differentiate an expanded expression graph, which costs set-up time; "
-    "every other plug-in gets this package's own derivatives, and readers of .nl make theirs.",
-    "lm and lbfgs, the reference solvers on the manifold, end where the energy stops falling and "
-    "claim no optimum; their rows are for the energy.",
+    "Options are those of `soup_nlp/bench/solvers/plugins.py`, the package's own ones being tuned "
+    "on such problems. alpaqa and sleqp differentiate an expanded graph, which costs set-up time.",
+    "lm, the reference solver on the manifold, claims no optimum; its rows are for the energy.",
     "SCIP is a global solver: here it shows what its time limit allows from the same start.",
 )
 
@@ -35,38 +31,21 @@ def page(rows: Sequence[Row]) -> str:
     """Markdown of all rows."""
     machine = sorted({str(r["machine"]) for r in rows})
     packages = sorted({f"{k} {v}" for r in rows for k, v in r["versions"].items()})
-    lines = [
-        "# Solvers on the Superpixel Soup NLP",
-        "",
-        *conclusion(rows),
-        "",
-        "![performance profiles](profile.png)",
-        "",
-        "![energy against time](curves.png)",
-        "",
-        "## By solver",
-        "",
+    note = (
         "Verified: the solver claims an optimum, and the KKT residuals and the exact energy,"
-        " recomputed from its point, agree.",
-        "",
-        *by_solver(rows),
-        "",
-        "## By run",
-        "",
-        *by_run(rows),
-        "",
-        "## Limits",
-        "",
-        *(f"- {text}" for text in LIMITS),
-        "",
-        "## Machine and versions",
-        "",
-        *(f"- {m}" for m in machine),
-        f"- {', '.join(packages)}",
-        f"- code {codes([dict(r) for r in rows])}",
-        "",
-    ]
-    return "\n".join(lines)
+        " recomputed from its point, agree."
+    )
+    made = [*machine, ", ".join(packages), f"code {codes([dict(r) for r in rows])}"]
+    pictures = ["![performance profiles](profile.png)", "", "![energy against time](curves.png)"]
+    lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(rows), "", *pictures]
+    for title, body in {
+        "By solver": [note, "", *by_solver(rows)],
+        "By run": by_run(rows),
+        "Limits": [f"- {text}" for text in LIMITS],
+        "Machine and versions": [f"- {text}" for text in made],
+    }.items():
+        lines += ["", f"## {title}", "", *body]
+    return joined(lines)
 
 
 def conclusion(rows: Sequence[Row]) -> list[str]:
@@ -74,18 +53,16 @@ def conclusion(rows: Sequence[Row]) -> list[str]:
     problems, solvers, time = cost_table(rows, "time")
     _, _, energy = cost_table(rows, "energy")
     solved = np.isfinite(time).sum(axis=0)
-    best = [s for s, n in zip(solvers, solved) if n and n == solved.max()]
     some = [s for s, n in zip(solvers, solved) if n]
     out = [
         f"**{len(problems)} problems, {len(solvers)} solvers, {len(rows)} runs:"
         f" {sum(bool(r['verified']) for r in rows)} verified, by {len(some)} solvers"
         f" ({', '.join(some) or 'none'}).**"
     ]
-    if best:
+    if some:
+        best = [s for s, n in zip(solvers, solved) if n == solved.max()]
         out[0] += f" Most problems ({solved.max()}): {', '.join(best)}."
-    names = problem_names(rows)
     for k, problem in enumerate(problems):
-        head = f"- {names[problem]}, N = {problem.superpixels}, {problem.formulation}:"
         energies = [
             (float(r["energy"]), str(r["solver"]), float(r["seconds"]))
             for r in rows
@@ -94,25 +71,23 @@ def conclusion(rows: Sequence[Row]) -> list[str]:
         if energies:
             value, who, when = min(energies)
             out.append(
-                f"{head} lowest exact energy of any run {value:.6g} by {who} ({when:.1f} s)."
+                f"- {problem}: lowest exact energy of any run {value:.6g} by {who} ({when:.1f} s)."
             )
         if not np.isfinite(time[k]).any():
-            out.append(f"{head} none is verified.")
+            out.append(f"- {problem}: none is verified.")
             continue
         quick, low = int(time[k].argmin()), int(energy[k].argmin())
         out.append(
-            f"{head} quickest {solvers[quick]}"
+            f"- {problem}: quickest {solvers[quick]}"
             f" ({time[k, quick]:.2f} s, E {energy[k, quick]:.6g}); lowest energy"
             f" {solvers[low]} (E {energy[k, low]:.6g} in {time[k, low]:.2f} s)."
         )
     claims = [r for r in rows if r["claimed"]]
-    false = sorted({str(r["solver"]) for r in claims if not r["verified"]})
     if claims:
+        false = sorted({str(r["solver"]) for r in claims if not r["verified"]})
         true = sum(bool(r["verified"]) for r in claims)
-        out.append(
-            f"- Claims of an optimum that were true: {true} of {len(claims)}"
-            + (f"; not always those of {', '.join(false)}." if false else ".")
-        )
+        more = f"; not always those of {', '.join(false)}" if false else ""
+        out.append(f"- Claims of an optimum that were true: {true} of {len(claims)}{more}.")
     return out
 
 
@@ -127,8 +102,7 @@ def by_solver(rows: Sequence[Row]) -> list[str]:
     lines = []
     for solver in sorted({str(r["solver"]) for r in rows}):
         here = [r for r in rows if r["solver"] == solver]
-        claimed = sum(bool(r["claimed"]) for r in here)
-        verified = sum(bool(r["verified"]) for r in here)
+        claimed, verified = (sum(bool(r[k]) for r in here) for k in ("claimed", "verified"))
         share = f"{verified} of {claimed}" if claimed else "-"
         other = "; ".join(sorted({_status(r) for r in here if not r["claimed"]}))
         lines.append([solver, str(len(here)), str(claimed), str(verified), share, other])
@@ -136,28 +110,29 @@ def by_solver(rows: Sequence[Row]) -> list[str]:
     return table(head, lines)
 
 
+CELLS: dict[str, Callable[[Row], str]] = {
+    "problem": lambda r: str(r["problem"]),
+    "N": lambda r: str(r["superpixels"]),
+    "formulation": lambda r: str(r["formulation"]),
+    "solver": lambda r: str(r["solver"]),
+    "verified": lambda r: "yes" if r["verified"] else "claimed" if r["claimed"] else "no",
+    "exact E": lambda r: show(r.get("energy"), ".6g"),
+    "start E": lambda r: show(r.get("energy_start"), ".6g"),
+    "primal": lambda r: show(r.get("primal"), ".0e"),
+    "dual": lambda r: show(r.get("dual"), ".0e"),
+    "compl.": lambda r: show(r.get("complementarity"), ".0e"),
+    "iterations": lambda r: str(r["iterations"]) if r["iterations"] >= 0 else "-",
+    "seconds": lambda r: show(r.get("seconds"), ".2f"),
+    "CPU s": lambda r: show(r.get("cpu_seconds"), ".2f"),
+    "MB": lambda r: str(r["peak_bytes"] >> 20) if r["peak_bytes"] else "-",
+    "status": lambda r: _status(r),
+}
+
+
 def by_run(rows: Sequence[Row]) -> list[str]:
     """Table of every run."""
-    names = problem_names(rows)
-    cells: dict[str, Callable[[Row], str]] = {
-        "problem": lambda r: names[problem_key(r)],
-        "N": lambda r: str(r["superpixels"]),
-        "formulation": lambda r: str(r["formulation"]),
-        "solver": lambda r: str(r["solver"]),
-        "verified": lambda r: "yes" if r["verified"] else "claimed" if r["claimed"] else "no",
-        "exact E": lambda r: show(r.get("energy"), ".6g"),
-        "start E": lambda r: show(r.get("energy_start"), ".6g"),
-        "primal": lambda r: show(r.get("primal"), ".0e"),
-        "dual": lambda r: show(r.get("dual"), ".0e"),
-        "compl.": lambda r: show(r.get("complementarity"), ".0e"),
-        "iterations": lambda r: str(r["iterations"]) if r["iterations"] >= 0 else "-",
-        "seconds": lambda r: show(r.get("seconds"), ".2f"),
-        "CPU s": lambda r: show(r.get("cpu_seconds"), ".2f"),
-        "MB": lambda r: str(r["peak_bytes"] >> 20) if r["peak_bytes"] else "-",
-        "status": _status,
-    }
     order = sorted(rows, key=lambda r: (problem_key(r), not r["verified"], r["seconds"]))
-    return columns(cells, order)
+    return columns(CELLS, order)
 
 
 def _status(row: Row) -> str:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from soup_nlp.bench.solvers.task import Answer, Task, Trace
 from soup_nlp.export.verify import Limits
@@ -16,18 +15,100 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.callback import IterationCallback
 from soup_nlp.solve.ipopt import DEFAULTS
 
-Float = NDArray[np.float64]
+Options = Mapping[str, Any]
+
+
+class Plugin(NamedTuple):
+    """How a plug-in is called.
+
+    Attributes:
+        library: Its name in CasADi.
+        limits: Its options that are `Limits`: option to attribute.
+        options: Its other options.
+        hessian: "exact" or "gauss-newton".
+    """
+
+    library: str
+    limits: Mapping[str, str]
+    options: Options
+    hessian: str = "exact"
+
+    def made_for(self, limits: Limits) -> dict[str, Any]:
+        """Options of `ca.nlpsol`; some libraries have theirs in a dictionary of their own."""
+        own = {**self.options, **{k: getattr(limits, name) for k, name in self.limits.items()}}
+        return {self.library: own} if self.library in NESTED else own
+
 
 CLAIMS = ("Solve_Succeeded", "Solved_To_Acceptable_Level", "SUCCESS", "success", "Converged")
-
-
-TRIU = ("triu_hess_gamma_x_x",)
-CACHED: Mapping[str, tuple[tuple[str, ...], ...]] = {
-    "uno": (("grad_f_x",), ("jac_g_x",), TRIU),
-    "bonmin": (("f", "grad_f_x"), ("g", "jac_g_x"), TRIU),
-    "fatrop": (("grad_f_x",), ("g", "jac_g_x"), ("grad_gamma_x", "hess_gamma_x_x")),
+NESTED = ("ipopt", "uno", "bonmin", "fatrop")
+CALLS_BACK = ("ipopt", "sqpmethod")
+"""Libraries that call back at every iteration."""
+TOLERANCES = {
+    **dict.fromkeys(("tol", "dual_inf_tol", "compl_inf_tol"), "tol"),
+    "constr_viol_tol": "feasibility",
+    "max_iter": "iterations",
 }
-"""Outputs of nlp_grad_f, nlp_jac_g and nlp_hess_l that a plug-in asks CasADi for."""
+"""Ipopt's options that are limits."""
+SHORT = {"max_iter": "iterations", "tol": "tol"}
+COLD = {"acceptable_iter": 0, "print_level": 0, "sb": "yes"}
+NEAR = {k: v for k, v in DEFAULTS.items() if k.startswith(("mu_", "bound_", "nlp_scaling"))}
+"""Options of a start near the end, for solvers of Ipopt's family."""
+SQP = {
+    "qpsol": "osqp",
+    "qpsol_options": {
+        "osqp": {"verbose": False, "eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20000}
+    },
+    **dict.fromkeys(("print_header", "print_iteration", "print_status", "error_on_fail"), False),
+}
+PLUGINS: Mapping[str, Plugin] = {
+    "ipopt": Plugin("ipopt", TOLERANCES, COLD),
+    "ipopt-soup": Plugin("ipopt", TOLERANCES, {**DEFAULTS, **COLD}, "gauss-newton"),
+    "ipopt-tuned": Plugin("ipopt", TOLERANCES, {**DEFAULTS, **COLD}),
+    "ipopt-lbfgs": Plugin("ipopt", TOLERANCES, {**COLD, "hessian_approximation": "limited-memory"}),
+    "sqpmethod": Plugin(
+        "sqpmethod",
+        {"max_iter": "iterations", "tol_du": "tol", "tol_pr": "feasibility"},
+        SQP,
+        "gauss-newton",
+    ),
+    "uno": Plugin(
+        "uno",
+        {
+            "max_iterations": "iterations",
+            "dual_tolerance": "tol",
+            "primal_tolerance": "feasibility",
+        },
+        {"logger": "SILENT"},
+    ),
+    "alpaqa": Plugin("alpaqa", {}, {}),
+    "sleqp": Plugin("sleqp", {"max_iter": "iterations"}, {}),
+    "bonmin": Plugin("bonmin", SHORT, {"print_level": 0}),
+    "fatrop": Plugin("fatrop", SHORT, {"print_level": 0}),
+    "bonmin-tuned": Plugin("bonmin", SHORT, {**NEAR, "print_level": 0}),
+    "fatrop-tuned": Plugin("fatrop", SHORT, {"mu_init": NEAR["mu_init"], "print_level": 0}),
+}
+""""ipopt-soup" is how `solve` runs Ipopt where it starts from no KKT point, "ipopt-tuned" the same
+with the exact Hessian, "ipopt" Ipopt as it comes; other names with "-tuned" have its options for a
+start near the end. blocksqp is left out: it needs a linear solver (ma27) that CasADi's wheel
+lacks."""
+
+UPPER = ("triu_hess_gamma_x_x",)
+IPOPT = {"nlp_grad_f": ("f", "grad_f_x"), "nlp_jac_g": ("g", "jac_g_x"), "nlp_hess_l": UPPER}
+CACHED: Mapping[str, Mapping[str, tuple[str, ...]]] = {
+    "ipopt": IPOPT,
+    "bonmin": IPOPT,
+    "uno": {"nlp_grad_f": ("grad_f_x",), "nlp_jac_g": ("jac_g_x",), "nlp_hess_l": UPPER},
+    "fatrop": {
+        "nlp_grad_f": ("grad_f_x",),
+        "nlp_jac_g": ("g", "jac_g_x"),
+        "nlp_hess_l": ("grad_gamma_x", "hess_gamma_x_x"),
+    },
+    "sqpmethod": {
+        "nlp_jac_fg": ("f", "grad_f_x", "g", "jac_g_x"),
+        "nlp_hess_l": ("hess_gamma_x_x",),
+    },
+}
+"""Functions that a library asks CasADi for, with their outputs."""
 
 
 class _Watch(IterationCallback):
@@ -43,131 +124,41 @@ class _Watch(IterationCallback):
         return [int(self.late)]
 
 
-def _ipopt(limits: Limits) -> dict[str, Any]:
-    return {
-        "tol": limits.tol,
-        "dual_inf_tol": limits.tol,
-        "compl_inf_tol": limits.tol,
-        "constr_viol_tol": limits.feasibility,
-        "acceptable_iter": 0,
-        "max_iter": limits.iterations,
-        "print_level": 0,
-        "sb": "yes",
-    }
-
-
-def _sqp(limits: Limits, qpsol: str, qp: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        "qpsol": qpsol,
-        "qpsol_options": dict(qp),
-        "max_iter": limits.iterations,
-        "tol_du": limits.tol,
-        "tol_pr": limits.feasibility,
-        "print_header": False,
-        "print_iteration": False,
-        "print_status": False,
-        "error_on_fail": False,
-    }
-
-
-def _uno(limits: Limits) -> dict[str, Any]:
-    return {
-        "max_iterations": limits.iterations,
-        "dual_tolerance": limits.tol,
-        "primal_tolerance": limits.feasibility,
-        "logger": "SILENT",
-    }
-
-
-def _limited(limits: Limits) -> dict[str, Any]:
-    return {"max_iter": limits.iterations, "tol": limits.tol, "print_level": 0}
-
-
-NEAR = {k: v for k, v in DEFAULTS.items() if k.startswith(("mu_", "bound_", "nlp_scaling"))}
-"""Options of a start near the end, for solvers of Ipopt's family."""
-QUIET_OSQP = {"osqp": {"verbose": False, "eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20000}}
-PLUGINS: Mapping[str, tuple[str, str, bool, Callable[[Limits], dict[str, Any]]]] = {
-    "ipopt": ("ipopt", "exact", True, lambda m: {"ipopt": _ipopt(m)}),
-    "ipopt-soup": ("ipopt", "gauss-newton", True, lambda m: {"ipopt": {**DEFAULTS, **_ipopt(m)}}),
-    "ipopt-tuned": ("ipopt", "exact", True, lambda m: {"ipopt": {**DEFAULTS, **_ipopt(m)}}),
-    "ipopt-lbfgs": (
-        "ipopt",
-        "exact",
-        True,
-        lambda m: {"ipopt": _ipopt(m) | {"hessian_approximation": "limited-memory"}},
-    ),
-    "sqpmethod": ("sqpmethod", "gauss-newton", True, lambda m: _sqp(m, "osqp", QUIET_OSQP)),
-    "uno": ("uno", "exact", False, lambda m: {"uno": _uno(m)}),
-    "alpaqa": ("alpaqa", "exact", False, lambda m: {}),
-    "sleqp": ("sleqp", "exact", False, lambda m: {"max_iter": m.iterations}),
-    "bonmin": ("bonmin", "exact", False, lambda m: {"bonmin": _limited(m)}),
-    "fatrop": ("fatrop", "exact", False, lambda m: {"fatrop": _limited(m)}),
-    "bonmin-tuned": ("bonmin", "exact", False, lambda m: {"bonmin": {**NEAR, **_limited(m)}}),
-    "fatrop-tuned": (
-        "fatrop",
-        "exact",
-        False,
-        lambda m: {"fatrop": {"mu_init": NEAR["mu_init"], **_limited(m)}},
-    ),
-}
-"""Plug-in, Hessian, whether it calls back at every iteration, options. "ipopt-soup" is how `solve`
-runs Ipopt where it starts from no KKT point, "ipopt-tuned" the same with the exact Hessian, "ipopt"
-Ipopt as it comes; other names with "-tuned" have its options for a start near the end. blocksqp is
-left out: it needs a linear solver (ma27) that CasADi's wheel lacks."""
-
-
 def plugin(name: str, task: Task) -> Answer:
-    """Solve with a plug-in of CasADi's nlpsol; every one gets this package's own derivatives."""
-    library, hessian, calls, options = PLUGINS[name]
-    nlp = task.gauss_newton if hessian == "gauss-newton" else task.nlp
+    """Solve with a plug-in of CasADi's nlpsol, with this package's derivatives where it may."""
+    chosen = PLUGINS[name]
+    library = chosen.library
+    nlp = task.gauss_newton if chosen.hessian == "gauss-newton" else task.nlp
     trace = Trace(task.folder / "trace", nlp.nx)
     watch = _Watch(trace, task.limits.seconds)
     common: dict[str, Any] = {
         "print_time": False,
         "show_eval_warnings": False,
         "error_on_fail": False,
+        "no_nlp_grad": library == "ipopt",
     }
-    p = nlp.p
-    if library in ("ipopt", "sqpmethod"):
+    # with numbers for the parameters: bonmin knows none
+    if library in CACHED:
         x = ca.MX.sym("x", nlp.nx)
-        q = ca.MX.sym("p", len(p))
-        f, g = nlp.oracle(x, q)
-        problem = {"x": x, "p": q, "f": f, "g": g}
-        common["calc_lam_p"] = False
-        if library == "ipopt":
-            common |= {"grad_f": nlp.grad_f, "jac_g": nlp.jac_g, "no_nlp_grad": True}
-            common |= {"calc_multipliers": False, "hess_lag": nlp.hess_lag}
-        else:
-            _, grad = nlp.grad_f(x, q)
-            _, jac = nlp.jac_g(x, q)
-            lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", nlp.ng)
-            hess = ca.triu2symm(nlp.hess_lag(x, q, lam_f, lam_g))
-            common["hess_lag"] = ca.Function("nlp_hess_l", [x, q, lam_f, lam_g], [hess])
-            names = ["x", "p"], ["f", "grad_f_x", "g", "jac_g_x"]
-            common["jac_fg"] = ca.Function("nlp_jac_fg", [x, q], [f, grad, g, jac], *names)
-    elif library in CACHED:
-        # with numbers for the parameters: bonmin knows none
-        x = ca.MX.sym("x", nlp.nx)
-        f, g = nlp.oracle(x, p)
-        problem, p = {"x": x, "f": f, "g": g}, np.zeros(0)
-        common["cache"] = _cache(nlp, CACHED[library])
+        f, g = nlp.oracle(x, nlp.p)
+        common["cache"] = _derivatives(nlp, CACHED[library])
     else:
-        s = ca.SX.sym("x", nlp.nx)
-        f, g = nlp.oracle.expand()(s, p)
-        problem = {"x": s, "f": f, "g": ca.densify(g)}
-        p = np.zeros(0)
-    if calls:
-        watch.start("watch", nlp.nx, nlp.ng, len(p))
+        x = ca.SX.sym("x", nlp.nx)
+        f, g = nlp.oracle.expand()(x, nlp.p)
+        g = ca.densify(g)
+    if library in CALLS_BACK:
+        watch.start("watch", nlp.nx, nlp.ng, 0)
         common["iteration_callback"] = watch
-    solver = ca.nlpsol("solver", library, problem, common | options(task.limits))
-    out = solver(x0=nlp.x0, p=p, lbx=nlp.lbx, ubx=nlp.ubx, lbg=nlp.lbg, ubg=nlp.ubg)
+    problem = {"x": x, "f": f, "g": g}
+    solver = ca.nlpsol("solver", library, problem, common | chosen.made_for(task.limits))
+    out = solver(x0=nlp.x0, lbx=nlp.lbx, ubx=nlp.ubx, lbg=nlp.lbg, ubg=nlp.ubg)
     stats = solver.stats()
     status = str(stats.get("return_status", stats.get("unified_return_status", "?")))
     claimed = bool(stats.get("success")) or status in CLAIMS
-    x_ = np.asarray(out["x"]).ravel()
-    trace.add(x_)
+    point = np.asarray(out["x"]).ravel()
+    trace.add(point)
     return Answer(
-        x_,
+        point,
         np.asarray(out["lam_g"]).ravel(),
         "Time_Limit" if watch.late else status,
         claimed and not watch.late,
@@ -176,8 +167,8 @@ def plugin(name: str, task: Task) -> Answer:
     )
 
 
-def _cache(nlp: NLP, wanted: tuple[tuple[str, ...], ...]) -> dict[str, ca.Function]:
-    """The package's derivatives under the names and with the outputs that a plug-in asks for."""
+def _derivatives(nlp: NLP, wanted: Mapping[str, tuple[str, ...]]) -> dict[str, ca.Function]:
+    """The package's derivatives under the names and with the outputs that a library asks for."""
     x, q = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", 0)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", nlp.ng)
     f, grad = nlp.grad_f(x, nlp.p)
@@ -192,10 +183,10 @@ def _cache(nlp: NLP, wanted: tuple[tuple[str, ...], ...]) -> dict[str, ca.Functi
         "hess_gamma_x_x": ca.triu2symm(upper),
         "grad_gamma_x": lam_f * grad + ca.mtimes(jac.T, lam_g),
     }
-    inputs = ([x, q], ["x", "p"]), ([x, q, lam_f, lam_g], ["x", "p", "lam_f", "lam_g"])
+    inputs = {"x": x, "p": q, "lam_f": lam_f, "lam_g": lam_g}
     out = {}
-    for name, outputs in zip(("nlp_grad_f", "nlp_jac_g", "nlp_hess_l"), wanted):
-        args, words = inputs[name == "nlp_hess_l"]
+    for name, outputs in wanted.items():
+        words = list(inputs) if name == "nlp_hess_l" else ["x", "p"]
         values = [known[k] for k in outputs]
-        out[name] = ca.Function(name, args, values, words, list(outputs))
+        out[name] = ca.Function(name, [inputs[w] for w in words], values, words, list(outputs))
     return out

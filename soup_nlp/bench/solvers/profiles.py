@@ -20,43 +20,20 @@ SHORTEST = 0.01
 
 
 class Problem(NamedTuple):
-    """What makes a problem of the profile: NLP, start and limits."""
+    """What makes a problem of the profile; the rows of a comparison have one start and limits."""
 
     problem: str
     superpixels: int
     formulation: str
-    start: str
-    tol: float
-    seconds: float
-    iterations: int
-    memory: int
     problem_hash: str
+
+    def __str__(self) -> str:
+        return f"{self.problem}, N = {self.superpixels}, {self.formulation}"
 
 
 def problem_key(row: Row) -> Problem:
     """The problem that a row is of."""
-    limits = row["limits"]
-    own = {name: limits[name] if name in limits else row[name] for name in Problem._fields}
-    return Problem(**own)
-
-
-def problem_names(rows: Sequence[Row]) -> dict[Problem, str]:
-    """A name of every problem; start, limits or hash are in it where others differ in them only."""
-    keys = sorted({problem_key(r) for r in rows})
-    out = {}
-    for key in keys:
-        alike = [k for k in keys if k[:3] == key[:3]]
-        words = {
-            "start": f"from the {key.start}",
-            "tol": f"tol {key.tol:g}",
-            "seconds": f"{key.seconds:g} s",
-            "iterations": f"{key.iterations} iterations",
-            "memory": f"{key.memory / 2**30:g} GiB",
-            "problem_hash": key.problem_hash,
-        }
-        told = [text for name, text in words.items() if len({getattr(k, name) for k in alike}) > 1]
-        out[key] = f"{key.problem} ({', '.join(told)})" if told else key.problem
-    return out
+    return Problem(*(row[name] for name in Problem._fields))
 
 
 def cost_table(rows: Sequence[Row], measure: str) -> tuple[list[Problem], list[str], Float]:
@@ -72,8 +49,7 @@ def cost_table(rows: Sequence[Row], measure: str) -> tuple[list[Problem], list[s
     for row in rows:
         if row["verified"]:
             place = problems.index(problem_key(row)), solvers.index(str(row["solver"]))
-            value = max(row["seconds"], SHORTEST) if measure == "time" else row["energy"]
-            cost[place] = min(cost[place], float(value))
+            cost[place] = max(row["seconds"], SHORTEST) if measure == "time" else row["energy"]
     return problems, solvers, cost
 
 
@@ -90,15 +66,14 @@ def profile(cost: Float) -> tuple[Float, Float]:
     with np.errstate(invalid="ignore"):
         ratio = np.where(np.isfinite(cost), cost / best[:, None], np.inf)
     steps = np.unique(np.append(1.0, ratio[np.isfinite(ratio)]))
-    share = (ratio[None] <= steps[:, None, None]).mean(axis=1) if len(cost) else np.zeros((1, 0))
-    return steps, np.asarray(share, float)
+    return steps, (ratio[None] <= steps[:, None, None]).mean(axis=1)
 
 
 def draw_profiles(path: Path, rows: Sequence[Row]) -> None:
     """Picture of both profiles: time, and final exact energy."""
     picture = figure(9, 3.6)
-    for k, measure in enumerate(("time", "energy")):
-        axes = picture.add_subplot(1, 2, k + 1)
+    labels = {"time": "time / best time", "energy": "relative gap of the exact energy to the best"}
+    for axes, measure in zip(picture.subplots(1, 2), labels):
         problems, solvers, cost = cost_table(rows, measure)
         steps, share = profile(cost)
         x = steps if measure == "time" else steps - 1
@@ -108,22 +83,19 @@ def draw_profiles(path: Path, rows: Sequence[Row]) -> None:
                 axes.step([*x, last], [*share[:, j], share[-1, j]], where="post", label=solver)
         if measure == "time":
             axes.set_xscale("log")
-            axes.set_xlabel("time / best time")
         else:
             axes.set_xscale("symlog", linthresh=1e-6)
-            axes.set_xlabel("relative gap of the exact energy to the best")
+        axes.set(xlabel=labels[measure], ylabel=f"share of {len(problems)} problems")
         axes.set_ylim(-0.02, 1.05)
-        axes.set_ylabel(f"share of {len(problems)} problems")
         _finish(axes, 7)
     save(picture, path)
 
 
 def draw_curves(path: Path, rows: Sequence[Row]) -> None:
     """Picture of exact energy against time, a panel a problem; a dot where a run ended."""
-    names = problem_names(rows)
-    problems = sorted(names)
-    columns = min(2, len(problems)) or 1
-    lines = -(-len(problems) // columns) or 1
+    problems = sorted({problem_key(r) for r in rows})
+    columns = min(2, len(problems))
+    lines = -(-len(problems) // columns)
     picture = figure(5.2 * columns, 3.4 * lines)
     for k, problem in enumerate(problems):
         axes = picture.add_subplot(lines, columns, k + 1)
@@ -133,17 +105,14 @@ def draw_curves(path: Path, rows: Sequence[Row]) -> None:
             curve = np.array(row["curve"], float).reshape(-1, 2)
             # off the constraints an iterate's energy may be anything
             curve = curve[curve[:, 1] < 3 * start]
-            if not len(curve):
-                continue
-            filled = "full" if row["verified"] else "none"
-            line = axes.plot(curve[:, 0], curve[:, 1], lw=1, label=row["solver"])[0]
-            axes.plot(*curve[-1], "o", color=line.get_color(), fillstyle=filled, ms=5)
+            if len(curve):
+                filled = "full" if row["verified"] else "none"
+                line = axes.plot(*curve.T, lw=1, label=row["solver"])[0]
+                axes.plot(*curve[-1], "o", color=line.get_color(), fillstyle=filled, ms=5)
         axes.axhline(start, color="0.6", lw=0.8, ls=":")
         axes.set_xscale("log")
-        title = f"{names[problem]}, N = {problem.superpixels}, {problem.formulation}"
-        axes.set_title(title, fontsize=8)
-        axes.set_xlabel("seconds")
-        axes.set_ylabel("exact energy")
+        axes.set_title(str(problem), fontsize=8)
+        axes.set(xlabel="seconds", ylabel="exact energy")
         _finish(axes, 6)
     save(picture, path)
 

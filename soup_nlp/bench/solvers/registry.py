@@ -1,4 +1,4 @@
-"""Solvers by name: CasADi's plug-ins, executables that read .nl, SCIP, two reference solvers."""
+"""Solvers by name: CasADi's plug-ins, executables that read .nl, SCIP, the reference solver."""
 
 from __future__ import annotations
 
@@ -7,23 +7,20 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from soup_nlp.bench.reference_solvers import EPS, ReferenceSolve, lbfgs, levenberg_marquardt
-from soup_nlp.bench.solvers.plugins import NEAR, PLUGINS, plugin
+from soup_nlp.bench.reference_solver import EPS, levenberg_marquardt
+from soup_nlp.bench.solvers.plugins import NEAR, PLUGINS, TOLERANCES, plugin
 from soup_nlp.bench.solvers.task import Answer, Solver, Task, Trace
 from soup_nlp.errors import SolverError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import read_sol
 from soup_nlp.model.matrix import build_matrix_nlp
-
-Float = NDArray[np.float64]
 
 
 def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
@@ -33,11 +30,10 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
     path = task.folder / "soup.sol"
     # the folder may hold the answer to another problem
     path.unlink(missing_ok=True)
-    words = [command, "soup", "-AMPL", *options]
     with (task.folder / "solver.log").open("w") as log:
         try:
             code = subprocess.run(
-                words,
+                [command, "soup", "-AMPL", *options],
                 cwd=task.folder,
                 stdout=log,
                 stderr=subprocess.STDOUT,
@@ -55,27 +51,24 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
     return Answer(sol.x, sol.lam_g, status, sol.solved, -1, seconds)
 
 
-def _ampl(name: str, task: Task, near: bool = False) -> Answer:
-    """An executable that is found on the path or beside Python."""
-    m = task.limits
-    words: list[str] = []
-    if name == "pounce":
-        words = [f"{k}={m.tol}" for k in ("tol", "dual_inf_tol", "compl_inf_tol")]
-        words += [f"constr_viol_tol={m.feasibility}", f"max_iter={m.iterations}"]
-        words += ["acceptable_iter=0", f"max_wall_time={0.9 * m.seconds}", "print_level=0"]
-    if near:
-        words += [f"{k}={v}" for k, v in NEAR.items()]
-    return executable(_find(name) or name, task, words)
-
-
 def _find(name: str) -> str | None:
+    """Absolute path of an executable that is found on the PATH or beside Python."""
     found = shutil.which(name) or shutil.which(str(Path(sys.executable).parent / name))
     # it runs in another folder than this one
     return None if found is None else str(Path(found).absolute())
 
 
+def pounce(command: str, task: Task, near: bool = False) -> Answer:
+    """POUNCE, which knows Ipopt's options; with those of a start near the end, if asked."""
+    m = task.limits
+    options = {option: getattr(m, name) for option, name in TOLERANCES.items()}
+    options |= {"acceptable_iter": 0, "max_wall_time": 0.9 * m.seconds, "print_level": 0}
+    options |= NEAR if near else {}
+    return executable(command, task, [f"{k}={v}" for k, v in options.items()])
+
+
 def scip(task: Task) -> Answer:
-    """SCIP, a global solver, on the .nl file: for small problems; it has no start of ours."""
+    """SCIP, a global solver, on the .nl file: for small problems."""
     import pyscipopt
 
     begin = time.perf_counter()
@@ -93,27 +86,27 @@ def scip(task: Task) -> Answer:
         model.setSolVal(start, found[name], float(task.nlp.x0[place[name]]))
     model.addSol(start)
     model.optimize()
-    best = model.getBestSol()
+    status, best = str(model.getStatus()), model.getBestSol()
     if best is None or not model.getNSols():
-        status = f"{model.getStatus()}, no point"
-        return Answer(None, None, status, False, -1, time.perf_counter() - begin)
+        seconds = time.perf_counter() - begin
+        return Answer(None, None, f"{status}, no point", False, -1, seconds)
     x = np.empty(task.nlp.nx)
     for name in names:
         x[place[name]] = best[found[name]]
-    status = str(model.getStatus())
     nodes = int(model.getNTotalNodes())
     return Answer(x, None, status, status == "optimal", nodes, time.perf_counter() - begin)
 
 
-def reference(method: Callable[..., ReferenceSolve], task: Task) -> Answer:
-    """A solver on the manifold, without multipliers; it ends where the energy stops falling.
+def reference(task: Task) -> Answer:
+    """Levenberg-Marquardt on the manifold, without multipliers.
 
-    It claims no optimum: whether its point is one, the residuals say.
+    It ends where the energy stops falling and claims no optimum: whether its point is one, the
+    residuals say.
     """
     last = task.form.eps
     eps = [*(e for e in EPS if e > last), last]
     own = task.soup, task.data, task.weights, task.form
-    record = method(*own, eps=eps, seconds=0.8 * task.limits.seconds)
+    record = levenberg_marquardt(*own, eps=eps, seconds=0.8 * task.limits.seconds)
     # slack variables and switches at their best for this soup
     x = build_matrix_nlp(record.soup, task.data, task.weights, task.form)[0].x0.copy()
     x[: task.layout.size] = task.layout.pack(record.soup)
@@ -123,13 +116,13 @@ def reference(method: Callable[..., ReferenceSolve], task: Task) -> Answer:
 def available() -> dict[str, Solver]:
     """Every solver that can run here, by name."""
     out: dict[str, Solver] = {
-        name: partial(plugin, name) for name, row in PLUGINS.items() if ca.has_nlpsol(row[0])
+        name: partial(plugin, name) for name, row in PLUGINS.items() if ca.has_nlpsol(row.library)
     }
-    if _find("pounce"):
-        out["pounce"] = partial(_ampl, "pounce")
-        out["pounce-tuned"] = partial(_ampl, "pounce", near=True)
-    out["lm"] = partial(reference, levenberg_marquardt)
-    out["lbfgs"] = partial(reference, lbfgs)
+    command = _find("pounce")
+    if command:
+        out["pounce"] = partial(pounce, command)
+        out["pounce-tuned"] = partial(pounce, command, near=True)
+    out["lm"] = reference
     if importlib.util.find_spec("pyscipopt"):
         out["scip"] = scip
     return out
@@ -144,11 +137,12 @@ def find_solver(name: str) -> Solver:
     known = available()
     if name in known:
         return known[name]
-    if name in PLUGINS or name == "scip" or not _find(name):
+    command = None if name in PLUGINS or name == "scip" else _find(name)
+    if command is None:
         raise SolverError(
             "solver is not here",
             where="--solvers",
             found=name,
             expected=", ".join(known) + ", or a program that reads .nl",
         )
-    return partial(_ampl, name)
+    return partial(executable, command)

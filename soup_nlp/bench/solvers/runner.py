@@ -6,7 +6,7 @@ import platform
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.bench.processes import isolated, processor
-from soup_nlp.bench.rows import Job, Row, measure_all, read_rows
+from soup_nlp.bench.rows import Job, Row, measure_all
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import Answer, Task, Trace
+from soup_nlp.bench.tables import show
 from soup_nlp.export.artefact import form_label
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
 from soup_nlp.model import oracle
@@ -65,17 +66,9 @@ def _maker(case: Case, form: Formulation, limits: Limits) -> Maker:
         nlp, layout = case.nlp(form)
         second, _ = case.nlp(form.replace(hessian="gauss-newton+constraints"))
         # assemble now, so that no solver's time includes it
-        return Task(
-            nlp.assembled(),
-            second.assembled(),
-            layout,
-            case.soup,
-            case.data,
-            case.weights,
-            form,
-            limits,
-            Path(),
-        )
+        programs = nlp.assembled(), second.assembled()
+        c = case
+        return Task(*programs, layout, c.soup, c.data, c.weights, form, limits, Path())
 
     return lambda folder: replace(built(), folder=folder)
 
@@ -95,8 +88,6 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
     ended = isolated(lambda: work(task), task.folder, limits.seconds, limits.memory)
     row: Row = {
         **label,
-        "variables": task.nlp.nx,
-        "constraints": task.nlp.ng,
         "how": ended.how,
         "status": str(ended.value or ended.how),
         "claimed": False,
@@ -111,8 +102,6 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
         "curve": _curve(task, *trace.read()),
     }
     if isinstance(ended.value, Answer):
-        if ended.value.curve is not None:
-            row["curve"] = ended.value.curve
         row |= _verified(task, ended.value, float(label["energy_limit"]))
     elif row["curve"]:
         # the solver was killed, but its iterates are there
@@ -122,15 +111,13 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
 
 def _energy(task: Task, x: Float) -> float:
     """Exact energy of a point, retracted to the constraints; infinite where it has none."""
-    if not np.isfinite(x).all():
-        return float("inf")
     with np.errstate(all="ignore"):
         try:
             soup = task.layout.unpack(x).retracted()
             value = oracle.energy(soup, task.data, task.weights)["total"]
         except np.linalg.LinAlgError:
             return float("inf")
-    return float(value) if np.isfinite(value) else float("inf")
+    return float(value) if np.isfinite([value, *x]).all() else float("inf")
 
 
 def _curve(task: Task, seconds: Float, points: Float) -> list[list[float]]:
@@ -143,6 +130,7 @@ def _curve(task: Task, seconds: Float, points: Float) -> list[list[float]]:
 
 
 def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
+    """What an answer adds to its row: its claim, its exact energy and its residuals."""
     # a claim after the time limit does not count
     late = not answer.seconds <= task.limits.seconds
     row: Row = {
@@ -151,17 +139,16 @@ def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
         "iterations": answer.iterations,
         "seconds": answer.seconds,
     }
+    if answer.curve is not None:
+        row["curve"] = answer.curve
     if answer.x is None:
         return row
     row["energy"] = _energy(task, answer.x)
     if not np.isfinite(answer.x).all():
         return row
     residuals = examine(task.nlp, answer.x, answer.lam_g).residuals
-    row |= vars(residuals)
-    row["objective"] = float(task.nlp.oracle(answer.x, task.nlp.p)[0])
     good = residuals.within(task.limits) and row["energy"] <= energy_limit
-    row["verified"] = bool(row["claimed"] and good)
-    return row
+    return {**row, **vars(residuals), "verified": bool(row["claimed"] and good)}
 
 
 def compare(
@@ -181,34 +168,28 @@ def compare(
         path: JSON lines.
         scratch: Folder for the runs' files.
         say: Called with a line per run.
-
-    Returns:
-        Every row of the file.
     """
 
-    def job(label: Label, make: Maker, solver: str) -> Job:
-        def work() -> Row:
-            # a solver may be named by its path
-            folder = scratch / re.sub(r"[^\w-]+", "_", solver)
-            folder.mkdir(parents=True, exist_ok=True)
-            return run_row(make(folder), label, solver)
+    def run(label: Label, make: Maker, solver: str) -> Row:
+        # a solver may be named by its path
+        folder = scratch / re.sub(r"[^\w-]+", "_", solver)
+        folder.mkdir(parents=True, exist_ok=True)
+        return run_row(make(folder), label, solver)
 
-        name = {k: label[k] for k in KEY} | {"solver": solver, "limits": asdict(limits)}
-        return Job(name, work)
-
-    jobs = [job(label, make, solver) for label, make in tasks for solver in solvers]
-    measure_all(jobs, path, say=lambda done, total, row: say(one_line(row)))
-    return read_rows(path)
+    jobs = []
+    for label, make in tasks:
+        own = {k: label[k] for k in KEY} | {"limits": asdict(limits)}
+        for solver in dict.fromkeys(solvers):
+            jobs.append(Job({**own, "solver": solver}, partial(run, label, make, solver)))
+    return measure_all(jobs, path, say=lambda done, total, row: say(one_line(row)))
 
 
 def one_line(row: Row) -> str:
     """A row in words."""
     word = "verified" if row["verified"] else "claimed" if row["claimed"] else "-"
-    energy, dual = row.get("energy"), row.get("dual")
     return (
         f"{row['problem']:<12} {row['superpixels']:>5} {row['formulation']:<28}"
         f" {row['solver']:<12} {word:<9}"
-        f" E {'-' if energy is None else format(energy, '.6g'):>9}"
-        f" dual {'-' if dual is None else format(dual, '.1e'):>8}"
+        f" E {show(row.get('energy'), '.6g'):>9} dual {show(row.get('dual'), '.1e'):>8}"
         f" {row['seconds']:>7.1f} s  {row['status'][:60]}"
     )

@@ -30,7 +30,7 @@ class Task:
         gauss_newton: The same NLP with the Gauss-Newton Hessian.
         layout: Of both.
         soup: Start.
-        data, weights, form: Of the energy (for reference solvers, which take no NLP).
+        data, weights, form: Of the energy (for the reference solver, which takes no NLP).
         limits: Time, iterations, tolerance, memory.
         folder: Scratch folder of this run.
     """
@@ -93,13 +93,7 @@ class Trace:
 
     def read(self) -> tuple[Float, Float]:
         """(k,) seconds and (k, nx) iterates; a record cut short is left out."""
-        try:
-            flat = np.frombuffer(self.path.read_bytes()[: self._whole()], float)
-        except OSError:
-            flat = np.zeros(0)
-        records = flat.reshape(-1, self.nx + 1)
+        flat = np.fromfile(self.path) if self.path.is_file() else np.zeros(0)
+        width = self.nx + 1
+        records = flat[: len(flat) // width * width].reshape(-1, width)
         return records[:, 0], records[:, 1:]
-
-    def _whole(self) -> int:
-        width = 8 * (self.nx + 1)
-        return self.path.stat().st_size // width * width

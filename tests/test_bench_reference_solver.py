@@ -1,4 +1,4 @@
-"""Reference solvers without Ipopt: same energy, similar minima, records that are true."""
+"""The reference solver without Ipopt: same energy, similar minima, records that are true."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from soup_nlp.bench import reference_solvers
-from soup_nlp.bench.reference_solvers import ReferenceSolve, lbfgs, levenberg_marquardt
+from soup_nlp.bench.reference_solver import ReferenceSolve, Tangent, levenberg_marquardt
 from soup_nlp.config.problem import make_problem
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_options import Weights
@@ -25,21 +24,10 @@ SCHEDULE = (0.1, 0.03)
 FORM = Formulation(compiled=False)
 
 
-def small(**settings: object) -> Case:
-    scene = {"kind": "scene", "scene": "street", "seed": 0, "width": 256, "height": 128}
-    problem = {"input": scene, "segmentation": {"superpixels": 60}, **settings}
-    return prepare(make_problem(problem))
-
-
 @pytest.fixture(scope="module")
 def case() -> Case:
-    return small()
-
-
-@pytest.fixture(scope="module")
-def far() -> Case:
-    """The same with components that start further away: their scale is that of their outline."""
-    return small(start={"upright": False}, energy={"cont_occluded": 1.0})
+    scene = {"kind": "scene", "scene": "street", "seed": 0, "width": 256, "height": 128}
+    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
 
 
 @pytest.fixture(scope="module")
@@ -65,16 +53,6 @@ def test_levenberg_marquardt_lowers_the_energy(case, lm):
     before = oracle.energy(case.soup, case.data, case.weights)["total"]
     assert lm.energy["total"] < 0.9 * before
     assert lm.history[0, 1] == pytest.approx(before, rel=0.05)
-    assert lm.name.startswith("levenberg-marquardt")
-
-
-def test_lbfgs_lowers_the_energy(far):
-    y = lbfgs(far.soup, far.data, far.weights, FORM, eps=SCHEDULE, iterations=60)
-    check(far, y)
-    assert y.name == "l-bfgs"
-    assert y.status == "Iteration_Limit"
-    assert y.iterations <= 120
-    assert y.energy["total"] < 0.9 * y.history[0, 1]
 
 
 def test_ipopt_and_levenberg_marquardt_agree(case, lm):
@@ -88,7 +66,7 @@ def test_it_is_the_same_energy(case):
     free = Weights().replace(
         sigma_cont=np.inf, sigma_orient=np.inf, sigma_arap=np.inf, sigma_proj=np.inf
     )
-    problem = reference_solvers._Tangent(case.soup, case.data, free, FORM)
+    problem = Tangent(case.soup, case.data, free, FORM)
     x = problem.project(problem.nlp.x0)
     exact = oracle.energy(problem.layout.unpack(x), case.data, free)["total"]
     problem.smoothing(1e-7)
@@ -98,7 +76,7 @@ def test_it_is_the_same_energy(case):
 
 
 def test_projection_keeps_bounds_and_visibility(case):
-    problem = reference_solvers._Tangent(case.soup, case.data, case.weights, FORM)
+    problem = Tangent(case.soup, case.data, case.weights, FORM)
     inside = problem.project(problem.nlp.x0)
     np.testing.assert_allclose(problem.project(inside), inside, rtol=1e-12, atol=1e-12)
     rng = np.random.default_rng(0)
@@ -153,9 +131,8 @@ def test_a_matrix_without_its_diagonal_is_refused():
         factor.diagonal_places(upper)
 
 
-@pytest.mark.parametrize("method", [levenberg_marquardt, lbfgs])
-def test_a_time_limit_ends_with_the_best_iterate(case, method):
-    late = method(case.soup, case.data, case.weights, FORM, seconds=0.0)
+def test_a_time_limit_ends_with_the_best_iterate(case):
+    late = levenberg_marquardt(case.soup, case.data, case.weights, FORM, seconds=0.0)
     assert late.status == "Time_Limit"
     assert late.iterations <= 1
 

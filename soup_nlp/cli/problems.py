@@ -1,4 +1,4 @@
-"""Command export: the NLP as files for other solvers."""
+"""Commands show, list and export: problems, merged, counted up, or as files for other solvers."""
 
 from __future__ import annotations
 
@@ -10,10 +10,30 @@ from typing import Annotated
 import typer
 
 from soup_nlp.cli.options import Formulations, Out, Presolve, Problem, Quiet, Set, Superpixels
-from soup_nlp.config.problem import load_problem
+from soup_nlp.config.problem import dump_problem, load_problem
+from soup_nlp.data.scenes.catalogue import SCENES
 from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_formulation
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.folder import prepare_folder
+
+
+def show(problem: Problem, overrides: Set = None) -> None:
+    """Print the merged problem and its hash."""
+    chosen = load_problem(problem, overrides or [])
+    print(f"{dump_problem(chosen)}# hash {chosen.digest()}")
+
+
+def list_(
+    folder: Annotated[Path, typer.Argument(help="Folder of problem files.")] = Path("problems"),
+) -> None:
+    """Print the problem files of a folder and the rendered scenes."""
+    for path in sorted(folder.glob("*.yaml")):
+        first = path.read_text(encoding="utf-8").partition("\n")[0]
+        print(f"{path!s:<28} {first.removeprefix('#').strip() if first[:1] == '#' else ''}")
+    if folder.is_dir():
+        print()
+    for name, text in SCENES.items():
+        print(f"scene {name:<22} {text}")
 
 
 def export(
@@ -33,17 +53,17 @@ def export(
     forms = [parse_formulation(text) for text in formulation or []] or [{}]
     # asked for twice is written once
     sizes: list[int | None] = [*dict.fromkeys(superpixels or ())] or [None]
+    several = len(sizes) * len(forms) > 1
     written = set()
     for size, form in product(sizes, forms):
         own = [] if size is None else [f"segmentation.superpixels={size}"]
-        words = [*(overrides or []), *own]
-        chosen = load_problem(problem, [*words, *(f"formulation.{k}={v}" for k, v in form.items())])
+        own += [f"formulation.{k}={v}" for k, v in form.items()]
+        chosen = load_problem(problem, [*(overrides or []), *own])
         if form is forms[0]:
             case = prepare(chosen, presolve)
         # the same soup in another formulation
         here = replace(case, problem=chosen)
         style = here.formulation()
-        several = len(sizes) * len(forms) > 1
         # two sizes asked for may give the same number of superpixels
         asked = chosen.segmentation.superpixels
         name = f"{chosen.name}-{asked}-{form_label(style).replace('/', '-')}"
@@ -52,8 +72,8 @@ def export(
         written.add(name)
         folder = prepare_folder(out / name if several else out)
         manifest = export_case(here, style, folder, format_ or ["nl"], presolve)
+        s = manifest["sizes"]
         if not quiet:
-            s = manifest["sizes"]
             print(
                 f"{folder}/soup.nl  {form_label(style)}  {s['superpixels']} superpixels,"
                 f" {s['variables']} variables, {s['constraints']} constraints,"

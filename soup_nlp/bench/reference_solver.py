@@ -1,0 +1,239 @@
+"""A reference solver without Ipopt on the same energy: Levenberg-Marquardt on the manifold.
+
+It works on the 9 tangent coordinates per superpixel of `build_tangent_nlp` (scale, two slopes,
+Cayley vector, translation; one chart about the start) and takes f, its gradient and the reweighted
+normal matrix from its kernels. A step of the null space keeps the simplex, which is linear in the
+scales; a projection of the trial point keeps bounds and visibility, and the point is refused where
+f does not fall.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model import oracle
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.nlp import to_scipy
+from soup_nlp.model.tangent_nlp import build_tangent_nlp
+from soup_nlp.solve.factor import diagonal_places, factorisation, numbered
+
+Float = NDArray[np.float64]
+
+EPS = (1.0, 0.3, 0.1, 0.03, 0.01)
+"""Continuation of the smoothing widths, large to small, in the energy's units (pixels)."""
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-6, 1e12
+TOLERANCE, STAGNATION = 1e-5, 1e-3
+"""A width ends (the last one, the others) when f falls by less than this share twice in a row."""
+
+
+@dataclass(frozen=True)
+class ReferenceSolve:
+    """How far the reference solver came.
+
+    Attributes:
+        soup: The iterate of lowest exact energy; its constraints hold.
+        energy: Exact energy by term of the soup.
+        iterations: Steps tried, refused ones included.
+        seconds: Wall time: building and steps, without the exact energies of `history`.
+        cpu_seconds: The same in CPU time of this process.
+        history: (I, 2) seconds and exact energy after every accepted step, the start first.
+        status: "Converged", "Iteration_Limit" or "Time_Limit".
+    """
+
+    soup: Soup
+    energy: Mapping[str, float]
+    iterations: int
+    seconds: float
+    cpu_seconds: float
+    history: Float = field(repr=False)
+    status: str
+
+
+class Tangent:
+    """f, gradient and normal matrix of the presolve's smoothed energy; its feasible set."""
+
+    def __init__(
+        self, start: Soup, data: EnergyData, weights: Weights, form: Formulation | None
+    ) -> None:
+        # theta = 0 and no ridge: the Hessian is that of reweighted least squares, sum w/s J^T J
+        form = (form or Formulation()).replace(
+            norm="smooth", truncation="smooth", hessian="gauss-newton", theta=0.0, ridge=0.0
+        )
+        self.nlp, self.layout = build_tangent_nlp(start, data, weights, form)
+        nlp = self.nlp
+        self.p = ca.DM(nlp.p)
+        # every constraint is linear: g = A x + g0
+        g, A = nlp.jac_g(nlp.x0, nlp.p)
+        A = to_scipy(A).tocsr()
+        constant = np.asarray(g).ravel() - A @ nlp.x0
+        equal = nlp.lbg == nlp.ubg
+        self.simplex = A[np.flatnonzero(equal)].toarray().sum(axis=0)
+        rows = np.flatnonzero(~equal)
+        self.rows, self.lower = A[rows], nlp.lbg[rows] - constant[rows]
+        # a row of visibility reads the slopes of one superpixel
+        self.owner = self.rows.indices[self.rows.indptr[:-1]] // 9
+        places, columns = nlp.hess_lag.sparsity_out(0).get_triplet()
+        self.upper = numbered(np.asarray(places), np.asarray(columns), nlp.nx)
+
+    def smoothing(self, eps: float) -> None:
+        """Set both smoothing widths."""
+        self.p = ca.DM(self.nlp.with_theta(eps=eps, eps_pixel=eps, theta=0.0, ridge=0.0))
+
+    def value(self, x: Float) -> float:
+        """Smoothed energy."""
+        return float(self.nlp.oracle(x, self.p)[0])
+
+    def gradient(self, x: Float) -> tuple[float, Float]:
+        """Smoothed energy and its gradient (9 N,)."""
+        f, gradient = self.nlp.grad_f(x, self.p)
+        return float(f), np.asarray(gradient).ravel()
+
+    def normal_matrix(self, x: Float) -> Float:
+        """Nonzeros of the upper triangle, in the order of `upper`."""
+        H = self.nlp.hess_lag(x, self.p, 1.0, np.zeros(self.nlp.ng))
+        return np.array(H.nonzeros())
+
+    def project(self, x: Float) -> Float:
+        """The point with bounds kept and slopes shrunk until every rim pixel is visible."""
+        x = np.clip(x, self.nlp.lbx, self.nlp.ubx)
+        value = self.rows @ x
+        # the bounds are negative and rows homogeneous in the slopes: shrinking always helps
+        factor = np.ones(len(value))
+        np.divide(self.lower, value, out=factor, where=value < self.lower)
+        worst = np.ones(self.layout.count)
+        np.minimum.at(worst, self.owner, factor)
+        x.reshape(-1, 9)[:, 1:3] *= worst[:, None]
+        return x
+
+
+class _Descent:
+    """An iterate with its damping; every step lowers f or raises the damping."""
+
+    def __init__(self, problem: Tangent) -> None:
+        self.problem = problem
+        _, self.factorise = factorisation(problem.upper)
+        self.diagonal = diagonal_places(problem.upper)
+        self.x = problem.project(problem.nlp.x0)
+        self.damping, self.growth = FIRST_DAMPING, 2.0
+
+    def smoothing(self, eps: float) -> None:
+        """Go on with other smoothing widths."""
+        self.problem.smoothing(eps)
+        self._move(self.x)
+
+    def relax(self) -> None:
+        """Forget a damping that refused steps have raised."""
+        self.damping, self.growth = min(self.damping, FIRST_DAMPING), 2.0
+
+    def step(self) -> float | None:
+        """Try a step; the relative fall of f, or None where the step is refused."""
+        a, gradient = self.problem.simplex, self.gradient
+        damped = self.H.copy()
+        damped[self.diagonal] += self.damping
+        back = self.factorise(damped)
+        u, v = back(gradient), back(a)
+        trial = self.problem.project(self.x - u + v * (a @ u) / (a @ v))
+        h = trial - self.x
+        fresh = self.problem.value(trial)
+        U = self.problem.upper.copy()
+        U.data = self.H
+        curved = 2 * (h @ (U @ h)) - np.sum(U.diagonal() * h**2)
+        promised = -(gradient @ h + 0.5 * curved)
+        gain = (self.f - fresh) / promised if promised > 0 else -1.0
+        if not (np.isfinite(fresh) and fresh < self.f and gain > 0):
+            self.damping, self.growth = self.damping * self.growth, 2 * self.growth
+            return None
+        fall = (self.f - fresh) / abs(self.f)
+        self._move(trial)
+        # Nielsen's rule
+        self.damping = max(LEAST_DAMPING, self.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3))
+        self.growth = 2.0
+        return float(fall)
+
+    def _move(self, x: Float) -> None:
+        self.x = x
+        self.f, self.gradient = self.problem.gradient(x)
+        self.H = self.problem.normal_matrix(x)
+
+
+def _descend(
+    descent: _Descent,
+    eps: Sequence[float],
+    iterations: int,
+    end: float,
+    note: Callable[[], None],
+) -> tuple[int, str]:
+    """Every smoothing width in turn until the time `end`; number of steps and status."""
+    count, status = 0, "Converged"
+    for width in eps:
+        last = width == eps[-1]
+        descent.smoothing(width)
+        steps = small = 0
+        while small < 2:
+            if time.perf_counter() > end:
+                return count, "Time_Limit"
+            if steps == iterations:
+                status = "Iteration_Limit" if last else status
+                break
+            steps, count = steps + 1, count + 1
+            fall = descent.step()
+            if fall is not None:
+                small = small + 1 if fall <= (TOLERANCE if last else STAGNATION) else 0
+                note()
+            elif descent.damping > MOST_DAMPING:
+                # no descent at any length: the point is as good as this eps makes it
+                small = 2
+        else:
+            descent.relax()
+    return count, status
+
+
+def levenberg_marquardt(
+    start: Soup,
+    data: EnergyData,
+    weights: Weights,
+    form: Formulation | None = None,
+    *,
+    eps: Sequence[float] = EPS,
+    iterations: int = 60,
+    seconds: float = np.inf,
+) -> ReferenceSolve:
+    """Reweighted least squares with Levenberg's damping, smaller and smaller smoothing.
+
+    With residuals v of weight c, s = sqrt(|v|^2 + eps^2) and truncation slope psi the step solves
+    `(sum c psi / s J^T J + mu I) h = -grad f`, `sum_i a_i h_i = 0` for the simplex. mu follows the
+    gain ratio. The smoothed energy f never rises within an eps.
+
+    Args:
+        start: Initial soup.
+        data: Pixels, graphs and weights of the pair.
+        weights: Constants of the energy.
+        form: Visibility; its norm, truncation and Hessian are not used.
+        eps: Smoothing widths in turn.
+        iterations: Limit of steps for every eps.
+        seconds: Time limit.
+    """
+    wall, cpu = time.perf_counter(), time.process_time()
+    descent = _Descent(Tangent(start, data, weights, form))
+    path = [(time.perf_counter() - wall, descent.x)]
+
+    def note() -> None:
+        path.append((time.perf_counter() - wall, descent.x))
+
+    count, status = _descend(descent, eps, iterations, wall + seconds, note)
+    spent = time.perf_counter() - wall, time.process_time() - cpu
+    # exact energies only now, so that the times exclude them
+    soups = [descent.problem.layout.unpack(x) for _, x in path]
+    energies = [oracle.energy(soup, data, weights) for soup in soups]
+    history = np.array([(t, energy["total"]) for (t, _), energy in zip(path, energies)])
+    best = int(history[:, 1].argmin())
+    return ReferenceSolve(soups[best], energies[best], count, *spent, history, status)

@@ -1,0 +1,113 @@
+"""Commands check, evaluate and import: claims, scores and foreign answers as results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, cast, get_args
+
+import numpy as np
+import typer
+
+from soup_nlp.config.problem import dump_problem
+from soup_nlp.errors import ConfigError, ExportError
+from soup_nlp.evaluate.metrics import Scale
+from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
+from soup_nlp.export.foreign import Imported, import_sol, sol_table
+from soup_nlp.export.residuals import residual_table, table_text
+from soup_nlp.report.check import LIMITS, check_folder
+from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.report.verdict import accuracy, protocol
+from soup_nlp.storage.store import read_h5
+
+
+def check(
+    folder: Annotated[Path, typer.Argument(help="Result folder, or a .sol file.")],
+    export_: Annotated[
+        Path | None,
+        typer.Option("--export", help="Exported folder of a .sol; default where the .sol lies."),
+    ] = None,
+) -> None:
+    """Recompute energy, constraints and metrics of a result, or the constraints of a .sol."""
+    if folder.is_dir() or folder.suffix != ".sol":
+        report = check_folder(folder)
+        tree = read_h5(folder / "result.h5")
+        c = float(tree["weights"]["min_facing"])
+        print(table_text(residual_table(tree["solution"], tree["energy"]["rim_ray"], c, LIMITS)))
+        print(f"\n{report}")
+        good, claim = report.ok, "claim"
+    else:
+        imported = import_sol(export_ or folder.parent, folder, renew=False)
+        rows = sol_table(imported)
+        print(table_text(rows))
+        print(foreign_verdict(imported))
+        good, claim = all(r.ok for r in rows), "constraint"
+    print(f"every {claim} holds" if good else f"a {claim} does not hold")
+    raise typer.Exit(0 if good else 1)
+
+
+def evaluate(
+    folder: Annotated[Path, typer.Argument(help="Result folder.")],
+    depth: Annotated[Path, typer.Option(help="True depth: .dpt, .npy, .pfm or 16-bit .png.")],
+    scale: Annotated[str, typer.Option(help="median, mre, lsq or none.")] = "median",
+    cap: Annotated[float | None, typer.Option(help="Drop truth beyond this depth.")] = None,
+    depth_scale: Annotated[
+        float, typer.Option(help="Values per unit of length of a .png (KITTI 256).")
+    ] = 1000.0,
+) -> None:
+    """Score a result against a truth file."""
+    rules = get_args(Scale)
+    if scale not in rules:
+        raise ConfigError(
+            "unknown scale rule", where="--scale", found=scale, expected=", ".join(rules)
+        )
+    rule = cast(Scale, scale)
+    scores = evaluate_folder(folder, depth, scale=rule, cap=cap, depth_scale=depth_scale)
+    print(protocol(scores), *accuracy(scores), sep="\n")
+
+
+def import_(
+    folder: Annotated[Path, typer.Argument(help="Exported folder.")],
+    sol: Annotated[Path, typer.Argument(help="The solver's .sol file.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Result folder; default DIR/result.")
+    ] = None,
+) -> None:
+    """Make a result folder of a foreign solver's answer: depth maps, points, residuals."""
+    imported = import_sol(folder, sol)
+    run, message = imported.run, imported.sol.message
+    s = run.solution
+    if not np.isfinite([*s.energy.values(), *s.residuals.values()]).all():
+        raise ExportError(
+            "the answer is no soup: its energy or residuals are not finite",
+            where=sol,
+            found=message.splitlines()[0] if message else None,
+            hint=f"soup-nlp check {sol} says what is wrong with it",
+        )
+    target = prepare_folder(out or folder / "result", run.problem.input_paths())
+    text = foreign_verdict(imported)
+    write_folder(target, run, dump_problem(run.problem), f"{message}\n{text}\n")
+    print(text)
+    print(f"files       {target}/")
+    print(f"next        soup-nlp check {target}")
+    raise typer.Exit(0 if s.converged else 1)
+
+
+def foreign_verdict(imported: Imported) -> str:
+    """The solver's message, and whether energy and residuals confirm it."""
+    s, sol = imported.run.solution, imported.sol
+    word = "verified" if s.converged else "not verified" if sol.solved else "no success claimed"
+    start = imported.manifest["exact_energy_at_start"]["total"]
+    said = sol.message.splitlines()[0] if sol.message else "no message"
+    lines = [
+        f"solver      {said} ({sol.status}, code {sol.code}): {word}",
+        # where the solver started, which after a presolve is not where the soup came from
+        f"energy      start {start:.6g}  solution {s.energy['total']:.6g}",
+        "residuals   " + "  ".join(f"{k} {v:.1e}" for k, v in s.residuals.items()),
+    ]
+    if imported.run.metrics:
+        lines.append(f"accuracy    {protocol(imported.run.metrics)}")
+        lines += [" " * 12 + line for line in accuracy(imported.run.metrics)]
+    best = imported.manifest["best_known"]
+    if best:
+        lines.append(f"best known  exact energy {best['exact_energy']:.6g} by {best['found_by']}")
+    return "\n".join(lines)
