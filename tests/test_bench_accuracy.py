@@ -11,14 +11,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers_rows import fake_row
 
 from soup_nlp.bench.accuracy import head, input_hash, moving, pair_job, settings_hash
 from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.depth_maps import METHODS
-from soup_nlp.bench.rows import Job, Row, Where, append_row, attempt, measure_all, read_rows
+from soup_nlp.bench.rows import Job, Row, append_row, attempt, measure_all, read_rows
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import SUITES
-from soup_nlp.cli import bench_accuracy
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Pair, Truth
@@ -151,26 +151,18 @@ def test_moving_pixels_are_told_apart_under_one_scale():
     assert moving(still, estimate, preset("paper")) is None
 
 
-def fake(scene: str, dies: bool = False) -> Row:
-    """A row without a solve; the process of the room may die."""
-    if scene == "room" and dies:
-        os._exit(3)
-    ok = scene != "sheet"
-    return {"ok": ok, "error": None if ok else "no", "seconds": 0.0}
-
-
-def fake_jobs(seed: int = 0, function=fake, **options) -> list[Job]:
+def fake_jobs(seed: int = 0, function=fake_row, **options) -> list[Job]:
     scenes = ("orbit", "street", "sheet", "room")
     return [Job({"key": s, "seed": seed}, partial(function, s, **options)) for s in scenes]
 
 
-def test_rows_are_kept_and_what_failed_is_tried_again(tmp_path):
+def test_rows_are_kept_and_failed_ones_measured_again(tmp_path):
     path = tmp_path / "rows.jsonl"
     seen: list[str] = []
 
     def counted(scene):
         seen.append(scene)
-        return fake(scene)
+        return fake_row(scene)
 
     def jobs(seed=0):
         return fake_jobs(seed, counted)
@@ -204,7 +196,7 @@ def test_a_job_whose_folder_is_gone_is_stale(tmp_path):
     assert not pair_job(item()).stale
 
 
-def test_a_line_that_was_cut_off_and_another_code_do_not_count(tmp_path):
+def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
     path = tmp_path / "rows.jsonl"
     measure_all(fake_jobs()[:2], path)
     lines = path.read_text().splitlines()
@@ -227,40 +219,16 @@ def test_parallel_processes_and_one_that_dies(tmp_path):
     os.environ["PYTHONPATH"] = os.pathsep.join(
         [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
     )
-    rows = measure_all(fake_jobs(), tmp_path / "a.jsonl", Where(workers=2))
+    path = tmp_path / "rows.jsonl"
+    rows = measure_all(fake_jobs(dies=True), path, workers=2)
     assert [r["key"] for r in rows] == ["orbit", "street", "sheet", "room"]
-    assert [r["ok"] for r in rows] == [True, True, False, True]
-    rows = measure_all(fake_jobs(dies=True), tmp_path / "b.jsonl", Where(workers=2))
     assert [r["ok"] for r in rows] == [True, True, False, False]
+    assert rows[2]["error"] == "no"
     assert "process died" in rows[3]["error"]
-    assert read_rows(tmp_path / "b.jsonl")
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_a_local_dask_cluster(tmp_path):
-    distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra dask)")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
-    ) as cluster:
-        address = cluster.scheduler_address
-        rows = measure_all(fake_jobs(), tmp_path / "rows.jsonl", Where(dask=address))
-    assert [r["ok"] for r in rows] == [True, True, False, True]
-    assert len(read_rows(tmp_path / "rows.jsonl")) == 4
-
-
-def test_result_folders_are_the_same_for_workers_elsewhere(tmp_path, monkeypatch):
-    asked: list[Path | None] = []
-
-    def stored(jobs, *_, **__):
-        asked.extend(job.work.args[0].keywords["folder"] for job in jobs)
-        return []
-
-    monkeypatch.setattr(bench_accuracy, "measure_all", stored)
-    monkeypatch.chdir(tmp_path)
-    words = ["bench", "accuracy", "--suite", "rendered", "--only", "orbit", "--flow", "truth"]
-    assert main([*words, "-q", "--folders", "runs", "--out", "."]) == 0
-    (folder,) = asked
-    assert folder.is_relative_to(tmp_path / "runs")
+    assert len(read_rows(path)) == 4
+    # without the job that dies nothing has to run again
+    rows = measure_all(fake_jobs(1)[:2], path, workers=2)
+    assert [r["ok"] for r in rows] == [True, True]
 
 
 def test_command_line(tmp_path, capsys):

@@ -31,8 +31,11 @@ from soup_nlp.bench.tables import reason
 from soup_nlp.bench.tuning import (
     DEFAULT_SPACE,
     FAILED,
+    Found,
     Parameter,
     Trial,
+    accepted,
+    leave_one_family_out,
     loss,
     parameter,
     search,
@@ -108,7 +111,7 @@ def test_every_setting_of_the_default_space_is_accepted_at_both_ends():
             problem.problem([f"{p.key}={p.at(x)}"])
 
 
-def test_search_finds_the_minimum_and_goes_on_where_it_was(tmp_path):
+def test_search_finds_the_minimum_and_can_be_continued(tmp_path):
     path = tmp_path / "rows.jsonl"
     calls = []
 
@@ -151,14 +154,12 @@ def test_steps_beyond_the_end_of_a_range_turn_back():
     assert np.abs(units - best.unit).max() < 0.9
 
 
-def test_search_refuses_what_cannot_be_right(tmp_path):
+def test_search_rejects_invalid_input(tmp_path):
     path = tmp_path / "rows.jsonl"
     with pytest.raises(ConfigError, match="both trains and validates"):
         search(SPACE, items(0), items(0), path, measure=fake)
     with pytest.raises(ConfigError, match="no training pair"):
         search(SPACE, [], items(0), path, measure=fake)
-    with pytest.raises(ConfigError, match="finalist"):
-        search(SPACE, items(0), items(1), path, finalists=0, measure=fake)
     with pytest.raises(ConfigError):
         search([Parameter("energy.wieghts", "linear", ("0", "1"))], items(0), [], path)
 
@@ -187,6 +188,33 @@ def test_loss_charges_failures_and_a_minimum_far_from_the_truth():
     worse = fake(items(0)[0], ("segmentation.neighbours=400",))
     assert plain < loss(worse) <= FAILED
     assert Trial("t", (), np.zeros(1)).loss == math.inf
+
+
+def test_one_family_at_a_time_has_no_part_in_the_choice():
+    def trial(name: str, **mre: float) -> Trial:
+        rows = [
+            {**fake(Item("s", family, family, "dis", {})), "sequence": family} for family in mre
+        ]
+        for row, value in zip(rows, mre.values(), strict=True):
+            row["metrics"]["paper"]["solution"]["mre"] = value
+        return Trial(name, (), np.zeros(2), tuple(rows))
+
+    default = trial("t000", a=0.1, b=0.1, c=0.1)
+    narrow, wide = trial("t001", a=0.2, b=0.02, c=0.02), trial("t002", a=0.08, b=0.09, c=0.104)
+    left_out = leave_one_family_out([default, narrow, wide])
+    assert [(f.family, f.trial) for f in left_out] == [("a", "t001"), ("b", "t001"), ("c", "t001")]
+    assert [f.change for f in left_out] == pytest.approx([1.0, -0.8, -0.8])
+    # the families gain together, but one of them loses more than 5 %
+    assert not accepted(left_out)
+    alone = leave_one_family_out([default, wide])
+    assert [f.change for f in alone] == pytest.approx([-0.2, -0.1, 0.04])
+    assert accepted(alone)
+    assert not accepted(leave_one_family_out([default, default]))
+    assert leave_one_family_out([trial("t000", a=0.1)]) == ()
+    text = text_search(Found(SPACE, (default, narrow, wide), ()), "x")
+    assert "| a | t001 | +100.0% |" in text
+    assert "the worst +100.0%" in text
+    assert "not met" in text
 
 
 def test_split_keeps_scenes_apart():
@@ -223,7 +251,7 @@ def test_an_analysis_writes_table_and_plot(tmp_path, monkeypatch):
         run_analysis("neighbours", [], tmp_path)
 
 
-def test_values_are_names_with_commas_and_blanks_and_are_checked_first(tmp_path):
+def test_values_may_contain_commas_and_are_checked_before_any_solve(tmp_path):
     assert split_values("pattern", "slic,grid") == ["slic", "grid"]
     both = ["slic, image alone", "grid, image alone"]
     assert split_values("pattern", "slic, image alone,grid,image alone") == both
@@ -267,7 +295,7 @@ def test_conventions_and_folders_of_an_analysis_are_not_ignored(tmp_path, monkey
     assert "--folders" in capsys.readouterr().err
 
 
-def test_tables_bear_failed_rows(tmp_path):
+def test_tables_list_failed_rows(tmp_path):
     jobs = [(i, (f"segmentation.neighbours={k}",), str(k)) for i in items(0)[:2] for k in (4, 8)]
     rows = [{**fake(*j), "code": "c"} for j in jobs]
     rows[1] = {**head(*jobs[1]), "ok": False, "error": "out of luck", "code": "c"}
@@ -316,14 +344,16 @@ def test_pairs_of_one_name_in_two_suites_are_told_apart(tmp_path, monkeypatch):
 def test_energy_at_the_truth(tmp_path):
     raw = {"kind": "scene", "scene": "orbit", "seed": 0, "width": 128, "height": 64}
     item = Item("rendered", "orbit", "orbit", "truth", raw)
-    job = pair_job(item, QUICK, measure=measure_energy)
+    # the presolve lowers the energy where five iterations of Ipopt alone need not
+    quick = tuple(o for o in QUICK if o != "solver.presolve=false")
+    job = pair_job(item, quick, measure=measure_energy)
     row = {**job.name, **job.work()}
     assert row["ok"], row["error"]
     json.dumps(row, allow_nan=False)
     energy = {k: v["total"] for k, v in row["energy"].items()}
     assert set(energy) == {"start", "solution", "truth", "NLP from truth", "refined from truth"}
-    assert energy["solution"] <= energy["start"]
     tol = 1 + 1e-9
+    assert energy["solution"] <= tol * energy["start"]
     assert energy["NLP from truth"] <= tol * energy["truth"]
     assert energy["refined from truth"] <= tol * energy["NLP from truth"]
     text = text_energy("energy", "what", [{**row, "code": "c"}])

@@ -21,7 +21,7 @@ def test_suites_list_the_papers_pairs(tmp_path):
     assert (problem.input.width, problem.input.height) == (320, 136)
     for name, count in (("sintel", 120), ("vkitti", 120), ("kitti2012", 194), ("kitti2015", 200)):
         suite = SUITES[name]
-        items = list(suite.build(suite, tmp_path, Options()))
+        items = list(suite.items(tmp_path, Options()))
         assert len({i.key for i in items}) == count
         for i in items[:: count // 5]:
             i.problem()  # is a problem that the program accepts
@@ -29,11 +29,11 @@ def test_suites_list_the_papers_pairs(tmp_path):
     assert spread(4, 9) == [0, 1, 2, 3]
 
 
-def test_a_suite_takes_what_is_there(tmp_path):
+def test_a_suite_lists_the_pairs_whose_files_exist(tmp_path):
     base = tmp_path / "data" / "sintel" / "training" / "clean" / "alley_1"
     base.mkdir(parents=True)
     suite = SUITES["sintel"]
-    frames = [i.input["frame"] for i in suite.build(suite, tmp_path, Options())][:2]
+    frames = [i.input["frame"] for i in suite.items(tmp_path, Options())][:2]
     for frame in frames:
         (base / f"frame_{frame:04d}.png").touch()
     (base / f"frame_{frames[0] + 1:04d}.png").touch()
@@ -59,7 +59,7 @@ def test_a_limit_counts_pairs_and_keeps_every_flow(tmp_path):
 
 def test_sintel_needs_its_cameras_but_for_the_scene_whose_camera_is_known(tmp_path):
     suite = SUITES["sintel"]
-    for i in suite.build(suite, tmp_path, Options()):
+    for i in suite.items(tmp_path, Options()):
         if i.sequence in ("alley_1", "temple_2"):
             for path in i.needs:
                 if path.suffix == ".png":

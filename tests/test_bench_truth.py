@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.bench.depth_maps import unorganised
-from soup_nlp.bench.piecewise_planar import fit_planes, plane_depth, points_as_map
+from soup_nlp.bench.depth_maps import fit_planes, plane_depth, points_as_map, unorganised
 from soup_nlp.bench.truth import rescaled, true_soup
 from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Pair, Truth

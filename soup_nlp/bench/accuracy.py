@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.bench.depth_maps import depth_maps, true_depth
+from soup_nlp.bench.depth_maps import depth_maps
 from soup_nlp.bench.rows import Job, Row, attempt
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import SUITES
@@ -33,8 +33,11 @@ from soup_nlp.report.folder import prepare_folder, write_folder
 Float = NDArray[np.float64]
 Measure = Callable[[Item, tuple[str, ...], str], Row]
 
-KEPT = ("mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3")
-"""Errors that a row keeps, beside scale, coverage and skill."""
+KEPT = (
+    *("mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3"),
+    *("scale", "coverage", "n_pixels"),
+)
+"""Metrics that a row keeps, beside skill."""
 LEAST_PIXELS = 50
 """Fewest true pixels of a moving component whose scale is told."""
 
@@ -63,17 +66,17 @@ def pair_job(
 
 def settings_hash(problem: Problem) -> str:
     """Hash of everything but the input: the same settings on every pair and in every place."""
-    out = ("name", "base", "input", "expected")
-    return _hash(problem.model_dump(mode="json", exclude=set(out)))
+    return _hash(problem, {"name", "base", "input", "expected"})
 
 
 def input_hash(problem: Problem) -> str:
     """Hash of the input but its place: the same frames of the same dataset in every folder."""
     places = {"root", "path", "ref", "next", "depth", "depth_next", "intrinsics"}
-    return _hash(problem.input.model_dump(mode="json", exclude=places))
+    return _hash(problem.input, places)
 
 
-def _hash(tree: Mapping[str, Any]) -> str:
+def _hash(section: Any, exclude: set[str]) -> str:
+    tree = section.model_dump(mode="json", exclude=exclude)
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -143,7 +146,7 @@ def measure_pair(
 
 
 def _no_truth(item: Item) -> DataError:
-    """What is missing where no convention gave a number, and where to get it."""
+    """What is missing where no convention gives a number, and where to get it."""
     suite = SUITES.get(item.suite)
     return DataError(
         "pair has no true depth",
@@ -161,34 +164,38 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
     sparse points, is left out.
     """
     maps = depth_maps(result)
-    s = result.solution
-    energy: dict[str, Mapping[str, float]] = {"start": s.energy_start}
+    tables = {name: _metrics(result.pair.truth, maps, preset(name)) for name in presets}
+    metrics = {name: table for name, table in tables.items() if table}
+    main = next(iter(metrics), "")
+    return {
+        "status": result.solution.status,
+        "good": result.good,
+        "superpixels": len(result.segmentation),
+        "size": list(result.pair.size),
+        "stages": dict(result.seconds),
+        "iterations": sum(stage.iterations for stage in result.solution.stages),
+        "parallax_px": float(np.median(result.start.parallax)),
+        "bending_share": float(result.start.bending_share),
+        "flow_error": flow_error(result.pair),
+        "metrics": metrics,
+        "energy": _energies(result),
+        "scene_flow": _scene_flow(result, metrics[main]["solution"]["scale"]) if main else None,
+        "moving": moving(result.pair, maps["solution"], preset(main)) if main else None,
+    }
+
+
+def _energies(result: Run) -> dict[str, dict[str, float]]:
+    """Exact energies by soup and term."""
+    energy: dict[str, Mapping[str, float]] = {"start": result.solution.energy_start}
     if result.refined is not None:
-        energy["nlp"] = s.energy
+        energy["nlp"] = result.solution.energy
     energy["solution"] = result.energy
     try:
         true = true_soup(result.pair, result.segmentation)
         energy["truth"] = oracle.energy(true.soup, result.data, result.weights)
     except DataError:
         pass  # most real pairs have no true motions
-    tables = {name: _table(result, maps, preset(name)) for name in presets}
-    metrics = {name: table for name, table in tables.items() if table}
-    main = next(iter(metrics), "")
-    return {
-        "status": s.status,
-        "good": result.good,
-        "superpixels": len(result.segmentation),
-        "size": list(result.pair.size),
-        "stages": dict(result.seconds),
-        "iterations": sum(stage.iterations for stage in s.stages),
-        "parallax_px": float(np.median(result.start.parallax)),
-        "bending_share": float(result.start.bending_share),
-        "flow_error": flow_error(result.pair),
-        "metrics": metrics,
-        "energy": {k: dict(v) for k, v in energy.items()},
-        "scene_flow": _scene_flow(result, metrics[main]) if main else None,
-        "moving": moving(result.pair, maps["solution"], preset(main)) if main else None,
-    }
+    return {name: dict(terms) for name, terms in energy.items()}
 
 
 def _applies(truth: Truth | None, convention: Preset) -> bool:
@@ -202,12 +209,11 @@ def _applies(truth: Truth | None, convention: Preset) -> bool:
     return convention.counts(truth.points[:, 2])
 
 
-def _table(
-    result: Run, maps: Mapping[str, Float], convention: Preset
+def _metrics(
+    truth: Truth | None, maps: Mapping[str, Float], convention: Preset
 ) -> dict[str, dict[str, float]]:
     """Metrics of every method under one convention; {} where it does not apply."""
-    truth = result.pair.truth
-    if truth is None or true_depth(result) is None or not _applies(truth, convention):
+    if truth is None or "constant" not in maps or not _applies(truth, convention):
         return {}
     out: dict[str, dict[str, float]] = {}
     for method, depth in maps.items():
@@ -217,7 +223,7 @@ def _table(
             assert truth.points is not None
             estimate, gt = sample_at_points(depth, truth.points)
         m = convention.score(estimate, gt).as_dict()
-        out[method] = {k: m[k] for k in (*KEPT, "scale", "coverage", "n_pixels")}
+        out[method] = {k: m[k] for k in KEPT}
     for m in out.values():
         m["skill"] = skill(m["mre"], out["constant"]["mre"])
     return out
@@ -257,9 +263,9 @@ def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
     return {"mre": mre[0], "rest": mre[1], "share": share, "components": components}
 
 
-def _scene_flow(result: Run, table: Mapping[str, Any]) -> dict[str, float | int] | None:
+def _scene_flow(result: Run, scale: float) -> dict[str, float | int] | None:
     """3D end-point error with the depth's own scale; None without truth."""
-    truth, scale = result.pair.truth, table["solution"]["scale"]
+    truth = result.pair.truth
     if truth is None or truth.scene_flow is None or not math.isfinite(scale):
         return None
     rec = result.reconstruction

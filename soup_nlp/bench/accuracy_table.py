@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
 from soup_nlp.bench.depth_maps import BASELINES, METHODS
-from soup_nlp.bench.published import PROTOCOL, SOURCE, data_note, published
+from soup_nlp.bench.published import PROTOCOL, SOURCE, published
 from soup_nlp.bench.rows import Row
-from soup_nlp.bench.tables import energy_ratio, failures, get, joined, made, mean, show, table
+from soup_nlp.bench.tables import (
+    energy_ratio,
+    failures,
+    get,
+    joined,
+    made,
+    mean,
+    show,
+    table,
+)
 from soup_nlp.evaluate.protocols import preset
+
+Group = tuple[str, str, list[Row]]
+"""Name, flow, and the rows of both."""
 
 
 def report(title: str, rows: Sequence[Row], note: str = "") -> str:
@@ -22,21 +34,21 @@ def report(title: str, rows: Sequence[Row], note: str = "") -> str:
         note: A line on what was run.
     """
     good = [r for r in rows if r.get("ok")]
-    main = next(iter(good[0]["presets"])) if good else "paper"
+    settings = ", ".join(sorted({str(r.get("settings")) for r in rows}))
     lines = [f"# {title}", ""]
     if note:
         lines += [note, ""]
-    lines += [f"{_verdict(good, len(rows))}", "", _made(rows), ""]
+    lines += [_verdict(good, len(rows)), ""]
+    lines += [f"{made(rows)}; settings {settings} (one a flow source).", ""]
     conventions = list(dict.fromkeys(p for r in good for p in r["metrics"]))
-    for name in sorted(conventions, key=lambda p: p != main):
-        lines += _convention(name, good)
+    for name in sorted(conventions, key=lambda p: p != good[0]["presets"][0]):
+        lines += _convention(name, [r for r in good if get(r, name) is not None])
     lines += families(good)
     lines += _beaten_by(good)
     for name in dict.fromkeys(_own(r) for r in good):
-        lines += _detail([r for r in good if _own(r) == name], name)
-    suites = list(dict.fromkeys(r["suite"] for r in rows))
-    for suite in suites:
-        lines += _published(suite, [r for r in good if r["suite"] == suite])
+        lines += _detail([r for r in good if name and _own(r) == name], name)
+    for suite in dict.fromkeys(r["suite"] for r in rows):
+        lines += _published(suite, [r for r in good if r["suite"] == suite and _own(r)])
     return joined([*lines[:-1], *failures(rows)])
 
 
@@ -52,16 +64,16 @@ def _verdict(good: Sequence[Row], total: int) -> str:
 
 def _own(row: Row) -> str:
     """The first of a row's conventions under which it has numbers; "" without."""
-    return next((p for p in row["presets"] if get(row, p, "solution") is not None), "")
+    return next((p for p in row["presets"] if get(row, p) is not None), "")
 
 
 def better_baselines(row: Row) -> dict[str, tuple[float, float]]:
     """Baselines that are as good as the solution or better: their MRE and the solution's.
 
-    `rigid` is met on the pixels where it has a depth.
+    `rigid` is compared on the pixels where it has a depth.
     """
     name, out = _own(row), {}
-    own, there = get(row, name, "solution"), get(row, name, "solution_rigid")
+    own, there = get(row, name), get(row, name, "solution_rigid")
     for baseline in BASELINES:
         theirs = get(row, name, baseline)
         mine = there if baseline == "rigid" and there is not None else own
@@ -70,58 +82,60 @@ def better_baselines(row: Row) -> dict[str, tuple[float, float]]:
     return out
 
 
+def _groups(rows: Sequence[Row], by: Callable[[Row], str]) -> list[Group]:
+    """Rows of one name and flow together."""
+    out: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        out.setdefault((by(row), row["flow"]), []).append(row)
+    return [(*key, own) for key, own in out.items()]
+
+
 def families(rows: Sequence[Row]) -> list[str]:
     """The solution by family (sequence) and flow and in all: means, moving pixels, worst pair."""
     own = [r for r in rows if _own(r)]
-    groups = _groups(own, lambda r: (r["sequence"], r["flow"]))
+    groups = _groups(own, lambda r: str(r["sequence"]))
     if len(groups) < 2:
         return []
-    flows = dict.fromkeys(r["flow"] for r in own)
-    groups |= {("all", flow): [r for r in own if r["flow"] == flow] for flow in flows}
-    lines = [[f"{k} ({len(g)})", flow, *_family(g)] for (k, flow), g in groups.items()]
-    head = ["family (pairs)", "flow", "MRE", "median", "d<1.25", "skill", "MRE moving"]
-    head += ["MRE of the rest there", "scale of moving components", "skill < 0", "worst pair"]
     text = (
         "Means over the pairs, each under its own convention. Moving: pixels that move by"
         " themselves, where a mask or the true motion is known; scale: median of z / z_true of"
         " every moving component after the scale of the whole image (least, median, largest)."
     )
+    head = ["family (pairs)", "flow", "MRE", "median", "d<1.25", "skill", "MRE moving"]
+    head += ["MRE of the rest there", "scale of moving components", "skill < 0", "worst pair"]
+    lines = [_family(*group) for group in (*groups, *_groups(own, lambda r: "all"))]
     return ["## By family", "", text, "", *table(head, lines), ""]
 
 
-def _family(rows: Sequence[Row]) -> list[str]:
-    def average(name: str) -> str:
-        return show(mean(get(r, _own(r), "solution", name) for r in rows))
-
+def _family(name: str, flow: str, rows: Sequence[Row]) -> list[str]:
     there = [m for r in rows if (m := r.get("moving"))]
     scales = [c["scale"] for m in there for c in m["components"]]
-    spread = " ".join(f"{np.quantile(scales, q):.2f}" for q in (0, 0.5, 1)) if scales else "-"
-    errors = {r["pair"]: get(r, _own(r), "solution") or 0.0 for r in rows}
-    worst = max(errors, key=lambda name: errors[name])
-    below = np.mean([(get(r, _own(r), "solution", "skill") or 0.0) < 0 for r in rows])
+    spread = " ".join(f"{np.quantile(scales, q):.2f}" for q in (0, 0.5, 1)) if scales else ""
+    errors = {r["pair"]: get(r, _own(r)) or 0.0 for r in rows}
+    worst = max(errors, key=lambda pair: errors[pair])
+    below = np.mean([(get(r, _own(r), name="skill") or 0.0) < 0 for r in rows])
+    numbers = [
+        mean(get(r, _own(r), name=k) for r in rows)
+        for k in ("mre", "median_relative", "delta1", "skill")
+    ]
+    numbers += [mean(m[k] for m in there) for k in ("mre", "rest")]
     return [
-        *map(average, ("mre", "median_relative", "delta1", "skill")),
-        *(show(mean(m[k] for m in there)) for k in ("mre", "rest")),
-        f"{spread} ({len(scales)})" if scales else "-",
-        f"{below:.0%}",
+        *(f"{name} ({len(rows)})", flow, *map(show, numbers)),
+        *(f"{spread} ({len(scales)})" if scales else "-", f"{below:.0%}"),
         f"{worst} {errors[worst]:.4f}",
     ]
 
 
 def _beaten_by(rows: Sequence[Row]) -> list[str]:
     """Where a baseline is better."""
-    lines = []
-    for r in rows:
-        for baseline, (theirs, mine) in better_baselines(r).items():
-            cover = get(r, _own(r), baseline, "coverage")
-            cells = [
-                baseline,
-                show(theirs),
-                show(mine),
-                show(cover, ".1%"),
-                show(theirs - mine, "+.4f"),
-            ]
-            lines.append([r["pair"], r["flow"], _own(r), *cells])
+    lines = [
+        [
+            *(r["pair"], r["flow"], _own(r), baseline, show(theirs), show(mine)),
+            *(show(get(r, _own(r), baseline, "coverage"), ".1%"), show(theirs - mine, "+.4f")),
+        ]
+        for r in rows
+        for baseline, (theirs, mine) in better_baselines(r).items()
+    ]
     if not lines:
         return []
     head = ["pair", "flow", "convention", "baseline", "its MRE", "the solution's", "its pixels"]
@@ -129,110 +143,80 @@ def _beaten_by(rows: Sequence[Row]) -> list[str]:
     return ["## Baselines that are better", "", text, "", *table([*head, "difference"], lines), ""]
 
 
-def _made(rows: Sequence[Row]) -> str:
-    settings = ", ".join(sorted({str(r.get("settings")) for r in rows}))
-    return f"{made(rows)}; settings {settings} (one a flow source)."
-
-
-def _present(rows: Sequence[Row], convention: str) -> list[str]:
-    return [m for m in METHODS if any(get(r, convention, m) is not None for r in rows)]
-
-
 def _convention(name: str, rows: Sequence[Row]) -> list[str]:
     """MRE of every method under one convention: per image, per sequence, per dataset."""
-    own = [r for r in rows if get(r, name, "solution") is not None]
-    if not own:
+    if not rows:
         return []
-    methods = _present(own, name)
-    head = ["pair", "flow", *methods, "skill", "coverage"]
+    methods = [m for m in METHODS if any(get(r, name, m) is not None for r in rows)]
 
-    def cells(group: Sequence[Row]) -> list[str]:
-        numbers = [mean(get(r, name, m) for r in group) for m in methods]
-        skill = mean(get(r, name, "solution", "skill") for r in group)
-        cover = mean(get(r, name, "solution", "coverage") for r in group)
-        return [*map(show, numbers), show(skill, ".3f"), show(cover, ".1%")]
+    cells = [*((m, "mre", ".4f") for m in methods), ("solution", "skill", ".3f")]
+    cells += [("solution", "coverage", ".1%")]
+
+    def lines(first: str, groups: Iterable[Group]) -> list[str]:
+        body = [
+            [title, flow, *(show(mean(get(r, name, m, k) for r in own), f) for m, k, f in cells)]
+            for title, flow, own in groups
+        ]
+        return table([first, "flow", *methods, "skill", "coverage"], body)
 
     text = preset(name).text
-    lines = [f"## MRE, {preset(name)}", "", f"{text[0].upper()}{text[1:]}.", ""]
-    lines += table(head, [[r["pair"], r["flow"], *cells([r])] for r in own])
-    for title, group_by in (("sequence", _sequence), ("dataset", _suite)):
-        groups = _groups(own, group_by)
-        if len(groups) < len(own):
-            lines += ["", f"Mean per {title}:", ""]
-            lines += table(
-                [f"{title} (pairs)", *head[1:]],
-                [[f"{k[0]} ({len(g)})", k[1], *cells(g)] for k, g in groups.items()],
-            )
+    out = [f"## MRE, {preset(name)}", "", f"{text[0].upper()}{text[1:]}.", ""]
+    out += lines("pair", [(r["pair"], r["flow"], [r]) for r in rows])
+    for title, groups in (
+        ("sequence", _groups(rows, lambda r: f"{r['suite']} {r['sequence']}")),
+        ("dataset", _groups(rows, lambda r: str(r["suite"]))),
+    ):
+        if len(groups) < len(rows):
+            counted = [(f"{k} ({len(own)})", flow, own) for k, flow, own in groups]
+            out += ["", f"Mean per {title}:", "", *lines(f"{title} (pairs)", counted)]
     fitted = [f"`{m}`" for m in ("plane", "floor") if m in methods]
     if fitted and (preset(name).cap is not None or preset(name).crop is not None):
         told = "fitted to all true pixels, not only to those that count here"
-        lines += ["", f"{' and '.join(fitted)}: {told}."]
-    held = [r["metrics"][name]["rigid"]["coverage"] for r in own if "rigid" in r["metrics"][name]]
+        out += ["", f"{' and '.join(fitted)}: {told}."]
+    held = [c for r in rows if (c := get(r, name, "rigid", "coverage")) is not None]
     if held:
-        lines += ["", f"`rigid` covers {min(held):.0%} to {max(held):.0%} of the true pixels."]
-    return [*lines, ""]
-
-
-def _sequence(row: Row) -> tuple[str, str]:
-    return f"{row['suite']} {row['sequence']}", row["flow"]
-
-
-def _suite(row: Row) -> tuple[str, str]:
-    return row["suite"], row["flow"]
-
-
-def _groups(
-    rows: Sequence[Row], by: Callable[[Row], tuple[str, str]]
-) -> dict[tuple[str, str], list[Row]]:
-    out: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        out.setdefault(by(row), []).append(row)
-    return out
+        out += ["", f"`rigid` covers {min(held):.0%} to {max(held):.0%} of the true pixels."]
+    return [*out, ""]
 
 
 def _detail(rows: Sequence[Row], convention: str) -> list[str]:
     """The solution's other errors, its flow, scene flow and energy."""
-    own = [r for r in rows if get(r, convention, "solution") is not None]
-    if not own:
+    if not rows:
         return []
-    names = ("median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3")
+    errors = ("median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3")
     head = ["pair", "flow", "median", "SqRel", "RMSE", "log-RMSE", "d<1.25", "d<1.25^2"]
     head += ["d<1.25^3", "flow EPE px", "3D EPE (of length)", "bending", "E truth / solution"]
-    head += ["status", "s"]
-    lines = []
-    for r in own:
-        numbers = [show(get(r, convention, "solution", k)) for k in names]
-        flow = (r["flow_error"] or {}).get("mean")
-        sf = r["scene_flow"]
-        moved = f"{show(sf['mean'], '.3g')} ({show(sf['mean_truth_length'], '.3g')})" if sf else "-"
-        lines.append(
-            [
-                *[r["pair"], r["flow"], *numbers, show(flow, ".2f"), moved],
-                show(r.get("bending_share"), ".2f"),
-                show(energy_ratio(r), ".3f"),
-                str(r["status"]),
-                f"{r['cpu_seconds']:.0f}",
-            ]
-        )
-    text = f"## The solution, {preset(convention)}"
-    return [text, "", *table(head, lines), ""]
+    lines = [
+        [
+            *(r["pair"], r["flow"], *(show(get(r, convention, name=k)) for k in errors)),
+            *(show((r["flow_error"] or {}).get("mean"), ".2f"), _moved(r["scene_flow"])),
+            *(show(r.get("bending_share"), ".2f"), show(energy_ratio(r), ".3f")),
+            *(str(r["status"]), f"{r['cpu_seconds']:.0f}"),
+        ]
+        for r in rows
+    ]
+    title = f"## The solution, {preset(convention)}"
+    return [title, "", *table([*head, "status", "s"], lines), ""]
+
+
+def _moved(error: Mapping[str, float] | None) -> str:
+    """3D end-point error, and the mean length of the true scene flow."""
+    if not error:
+        return "-"
+    return f"{show(error['mean'], '.3g')} ({show(error['mean_truth_length'], '.3g')})"
 
 
 def _published(suite: str, rows: Sequence[Row]) -> list[str]:
-    numbers = published(suite)
+    numbers, about = published(suite)
     if not numbers:
         return []
     lines = [[f"{m} (published)", show(v)] for m, v in numbers.items()]
-    measured = _groups([r for r in rows if _own(r)], lambda r: (r["flow"], _own(r)))
-    for (flow, name), group in measured.items():
-        own = mean(get(r, name, "solution") for r in group)
-        who = f"this program, flow {flow}, {name}, {_count(group)} (measured)"
-        lines.append([who, show(own)])
-    text = f"Published rows are copied, not measured: {SOURCE}. {PROTOCOL}. {data_note(suite)}."
-    text += "".join(f" Measured: {preset(name)}." for name in dict.fromkeys(n for _, n in measured))
+    measured = _groups(rows, _own)
+    for name, flow, group in measured:
+        count = f"{len(group)} pair{'' if len(group) == 1 else 's'}"
+        own = mean(get(r, name) for r in group)
+        lines.append([f"this program, flow {flow}, {name}, {count} (measured)", show(own)])
+    text = f"Published rows are copied, not measured: {SOURCE}. {PROTOCOL}. {about}."
+    text += "".join(f" Measured: {preset(n)}." for n in dict.fromkeys(n for n, _, _ in measured))
     head = f"## {suite} beside published numbers"
     return [head, "", *table(["method", "MRE"], lines), "", text, ""]
-
-
-def _count(pairs: Sequence[Row]) -> str:
-    return f"{len(pairs)} pair{'' if len(pairs) == 1 else 's'}"

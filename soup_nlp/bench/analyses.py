@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
+from soup_nlp.bench import analyses_report as reports
 from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
 from soup_nlp.bench.analyses_measures import VIEWS, measure_energy, measure_flow, measure_view
-from soup_nlp.bench.analyses_report import (
-    plot_energy,
-    plot_flow,
-    plot_variants,
-    text_energy,
-    text_flow,
-    text_variants,
-)
-from soup_nlp.bench.rows import Say, Where, measure_all
+from soup_nlp.bench.rows import MeasureRows, Row, measure_all
+from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import Listing
 from soup_nlp.errors import ConfigError
 from soup_nlp.report.folder import prepare_folder
 from soup_nlp.storage.atomic import write_text
 
 Overrides = tuple[str, ...]
+
+NOISE_PX = ("0.1", "0.5", "1", "2")
+"""Standard deviations of the noise on true flow, pixels."""
 
 
 @dataclass(frozen=True)
@@ -36,26 +32,37 @@ class Analysis:
         text: What it asks.
         variants: Overrides by the name of a variant, in the order of tables.
         axis: Label of the variants.
+        free: Key of the variants' setting where other values than these may be asked for.
         numeric: The variants are numbers, drawn on an axis.
         true_flow_only: Only pairs with a true flow.
         function: What measures a pair.
+        page: Makes the table of name, text, rows and a note.
+        plot: Draws rows into a file; None for the MRE over the variants.
     """
 
     name: str
     text: str
     variants: Mapping[str, Overrides]
-    axis: str
+    axis: str = ""
+    free: str = ""
     numeric: bool = False
     true_flow_only: bool = False
     function: Measure = measure_pair
+    page: Callable[[str, str, Sequence[Row], str], str] = reports.text_variants
+    plot: Callable[[Path, Sequence[Row]], None] | None = None
 
 
 def _over(key: str, values: Sequence[object]) -> dict[str, Overrides]:
     return {str(v): (f"{key}={v}",) for v in values}
 
 
+def _numbers(name: str, text: str, values: Sequence[int]) -> Analysis:
+    key = f"segmentation.{name}"
+    return Analysis(name, text, _over(key, values), name, free=key, numeric=True)
+
+
 def _without(*terms: str) -> Overrides:
-    # where surfaces bend, weights of their own are in force
+    # bending surfaces have weights of their own
     return tuple(f"energy.{w}.{t}=0.0" for t in terms for w in ("weights", "bending.weights"))
 
 
@@ -72,20 +79,8 @@ _ALL = (
         },
         "terms",
     ),
-    Analysis(
-        "superpixels",
-        "number of superpixels, 100 to 2,000",
-        _over("segmentation.superpixels", (100, 250, 500, 1000, 2000)),
-        "superpixels",
-        numeric=True,
-    ),
-    Analysis(
-        "neighbours",
-        "K of the K-NN graph, 4 to 20",
-        _over("segmentation.neighbours", (4, 8, 12, 15, 20)),
-        "K",
-        numeric=True,
-    ),
+    _numbers("superpixels", "number of superpixels, 100 to 2,000", (100, 250, 500, 1000, 2000)),
+    _numbers("neighbours", "K of the K-NN graph, 4 to 20", (4, 8, 12, 15, 20)),
     Analysis(
         "pattern",
         "SLIC against a regular grid, with borders that follow the flow and without",
@@ -99,11 +94,9 @@ _ALL = (
     Analysis(
         "flow",
         "flow source: true, DIS, and the truth with noise of 0.1 to 2 pixels",
-        _over(
-            "flow.source",
-            ("truth", *(f"truth+noise:{px}" for px in ("0.1", "0.5", "1", "2")), "dis"),
-        ),
+        _over("flow.source", ["truth", *(f"truth+noise:{px}" for px in NOISE_PX), "dis"]),
         "flow",
+        free="flow.source",
         true_flow_only=True,
     ),
     Analysis(
@@ -126,9 +119,10 @@ _ALL = (
             "rlof": ("flow.source=rlof",),
             "rlof, reweighted 0.25": ("flow.source=rlof", "flow.reweight_px=0.25"),
         },
-        "flow",
         true_flow_only=True,
         function=measure_flow,
+        page=reports.text_flow,
+        plot=reports.plot_flow,
     ),
     Analysis(
         "views",
@@ -141,8 +135,9 @@ _ALL = (
         "energy",
         "energy at the truth against the solution, by term; solves that start from the truth",
         {"": ()},
-        "",
         function=measure_energy,
+        page=reports.text_energy,
+        plot=reports.plot_energy,
     ),
 )
 ANALYSES: Mapping[str, Analysis] = MappingProxyType({a.name: a for a in _ALL})
@@ -154,12 +149,10 @@ def run_analysis(
     listings: Sequence[Listing],
     out: Path,
     overrides: Overrides = (),
-    where: Where | None = None,
+    measure_rows: MeasureRows = measure_all,
     *,
     values: Sequence[str] | None = None,
     presets: Sequence[str] = (),
-    say: Say | None = None,
-    any_code: bool = False,
 ) -> Path:
     """Measure every variant on every pair and write OUT/NAME.md, .png and .jsonl.
 
@@ -168,11 +161,9 @@ def run_analysis(
         listings: Pairs.
         out: Folder.
         overrides: Of every problem; a variant's own come after them.
-        where: Processes or cluster.
+        measure_rows: Measures the jobs; `measure_all` with its options.
         values: Only these variants; of a numeric analysis other values as well.
         presets: Metric conventions instead of the suites' own, the main one first.
-        say: Progress.
-        any_code: Also take stored rows of other code versions.
 
     Returns:
         The table's file.
@@ -182,20 +173,7 @@ def run_analysis(
             conventions are given where no depth is scored.
     """
     analysis = _chosen(_known(name), values)
-    listed = [i for listing in listings for i in listing.items]
-    items = [i for i in listed if i.flow == "truth" or not analysis.true_flow_only]
-    if not items:
-        raise ConfigError(
-            "no pair is left for the analysis",
-            where=name,
-            found=f"flow {', '.join(dict.fromkeys(i.flow for i in listed))}" if listed else None,
-            expected="pairs listed with their true flow" if listed else None,
-            hint="give --flow truth" if listed else None,
-        )
-    if presets:
-        if analysis.function is measure_flow:
-            raise ConfigError("analysis has no depth to score", where=name, found=presets[0])
-        items = [i.scored_by(tuple(presets)) for i in items]
+    items = _items(analysis, listings, presets)
     for own in analysis.variants.values():
         # a wrong value ends here, not as a failed row a pair
         items[0].problem((*overrides, *own))
@@ -205,18 +183,32 @@ def run_analysis(
         for item in items
         for variant, own in analysis.variants.items()
     ]
-    rows = measure_all(jobs, out / f"{name}.jsonl", where, say=say, any_code=any_code)
+    rows = measure_rows(jobs, out / f"{name}.jsonl")
     note = f"Overrides of every pair: {', '.join(f'`{o}`' for o in overrides) or 'none'}."
-    text = {"energy": text_energy, "flows": text_flow}.get(name, text_variants)
-    write_text(out / f"{name}.md", text(analysis.name, analysis.text, rows, note))
-    picture = out / f"{name}.png"
-    if name == "energy":
-        plot_energy(picture, rows)
-    elif name == "flows":
-        plot_flow(picture, rows)
+    page, picture = out / f"{name}.md", out / f"{name}.png"
+    write_text(page, analysis.page(name, analysis.text, rows, note))
+    if analysis.plot is not None:
+        analysis.plot(picture, rows)
     else:
-        plot_variants(picture, analysis.axis, analysis.text, rows, analysis.numeric)
-    return out / f"{name}.md"
+        reports.plot_variants(picture, analysis.axis, analysis.text, rows, analysis.numeric)
+    return page
+
+
+def _items(analysis: Analysis, listings: Sequence[Listing], presets: Sequence[str]) -> list[Item]:
+    """The pairs that an analysis can use, under the conventions that are asked for."""
+    listed = [i for listing in listings for i in listing.items]
+    items = [i for i in listed if i.flow == "truth" or not analysis.true_flow_only]
+    if not items:
+        raise ConfigError(
+            "no pair is left for the analysis",
+            where=analysis.name,
+            found=f"flow {', '.join(dict.fromkeys(i.flow for i in listed))}" if listed else None,
+            expected="pairs listed with their true flow" if listed else None,
+            hint="give --flow truth" if listed else None,
+        )
+    if presets and analysis.function is measure_flow:
+        raise ConfigError("analysis has no depth to score", where=analysis.name, found=presets[0])
+    return [i.scored_by(presets) for i in items]
 
 
 def split_values(name: str, text: str) -> list[str]:
@@ -245,28 +237,13 @@ def _known(name: str) -> Analysis:
     return ANALYSES[name]
 
 
-def _number(text: str) -> bool:
-    """Whether a value has a place on the axis of a plot."""
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
-
-
 def _chosen(analysis: Analysis, values: Sequence[str] | None) -> Analysis:
+    """The analysis with these variants only."""
     if not values:
         return analysis
-    variants = dict(analysis.variants)
-    if analysis.numeric:
-        wrong = [v for v in values if not _number(v)]
-        if wrong:
-            raise ConfigError(
-                "value is no number", where=analysis.name, found=wrong[0], expected="100,250"
-            )
-        key = next(iter(variants.values()))[0].partition("=")[0]
-        return replace(analysis, variants=_over(key, values))
-    if analysis.name == "flow":
-        return replace(analysis, variants=_over("flow.source", values))
+    if analysis.free:
+        return replace(analysis, variants=_over(analysis.free, values))
+    variants = analysis.variants
     wrong = [v for v in values if v not in variants]
     if wrong:
         raise ConfigError("unknown variant", found=wrong[0], expected=", ".join(variants))

@@ -101,12 +101,9 @@ def measure_energy(item: Item, overrides: tuple[str, ...] = (), variant: str = "
     return {
         "status": result.solution.status,
         "good": result.good,
-        "superpixels": len(result.segmentation),
-        "size": list(p.size),
         "mixed": float((true.purity < 0.95).mean()),
         "energy": {name: energy(soup) for name, soup in soups.items()},
         "metrics": {convention: metrics},
-        "flow_error": flow_error(p),
     }
 
 

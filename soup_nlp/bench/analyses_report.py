@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC, SOURCE
 from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import (
     codes,
+    energy_ratio,
     failures,
     figure,
     joined,
@@ -29,92 +30,71 @@ from soup_nlp.model.energy_data import TERMS
 
 WORSE = 0.01
 """Median relative error that solving from the truth may add."""
-
 ABOVE = 1.10
 """E(truth) / E(solution) beyond which the model prefers something else."""
-
 FLOW_ERRORS = {
-    "mean": "mean",
-    "weighted_mean": "weighted mean",
-    "median": "median",
-    "over_3px": "over 3 px",
-    "used": "used",
+    "mean": ("mean", ".3f"),
+    "weighted_mean": ("weighted mean", ".3f"),
+    "median": ("median", ".3f"),
+    "over_3px": ("over 3 px", ".1%"),
+    "used": ("used", ".1%"),
 }
-
+"""Title and format of every error of a flow."""
+MEASURES: dict[str, tuple[str, Callable[[Row], float | None]]] = {
+    "MRE": (".4f", main_metric),
+    "Median relative error": (".4f", lambda r: main_metric(r, "median_relative")),
+    "Skill over constant depth": (".4f", lambda r: main_metric(r, "skill")),
+    "CPU seconds (shared machines count too)": (".1f", lambda r: r.get("cpu_seconds")),
+    "Exact energy of the solution": (
+        ".1f",
+        lambda r: float(r["energy"]["solution"]["total"]) if r.get("ok") else None,
+    ),
+}
+"""Format and number of every table of variants."""
 COLOURS = dict(zip(TERMS, ("#4477aa", "#66ccee", "#228833", "#ccbb44", "#aa3377")))
+LONG = 60
+"""Letters of all variants from which their labels are slanted."""
 
 
-def _variants(rows: Sequence[Row]) -> list[str]:
-    return list(dict.fromkeys(r["variant"] for r in rows))
-
-
-def _pairs(rows: Sequence[Row], names: Sequence[str]) -> dict[str, dict[str, Row]]:
-    """Rows by name of the pair and variant."""
+def _by_pair(
+    rows: Sequence[Row], names: Sequence[str]
+) -> tuple[list[str], dict[str, dict[str, Row]]]:
+    """Variants, and rows by name of the pair and variant."""
     out: dict[str, dict[str, Row]] = {}
     for name, row in zip(names, rows, strict=True):
         out.setdefault(name, {})[row["variant"]] = row
-    return out
+    return list(dict.fromkeys(r["variant"] for r in rows)), out
 
 
 def _head(name: str, text: str, rows: Sequence[Row], note: str) -> list[str]:
     used = dict.fromkeys(r["presets"][0] for r in rows)
-    return [
-        f"# Analysis: {name}",
-        "",
-        f"{text[0].upper()}{text[1:]}. {note}",
-        "",
-        f"{made(rows)}. Depth of the reference frame; {'; '.join(str(preset(p)) for p in used)}.",
-        "",
-    ]
+    conventions = "; ".join(str(preset(p)) for p in used)
+    lines = [f"# Analysis: {name}", "", f"{text[0].upper()}{text[1:]}. {note}", ""]
+    return [*lines, f"{made(rows)}. Depth of the reference frame; {conventions}.", ""]
 
 
 def text_variants(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     """Table of an analysis: a pair a line, a variant a column."""
     lines = _head(name, text, rows, note)
-    variants, pairs = _variants(rows), _pairs(rows, titles(rows))
-    complete = {
-        t: p for t, p in pairs.items() if all(main_metric(p[v]) is not None for v in variants)
-    }
-    for title, measure in (
-        ("MRE", lambda r: main_metric(r)),
-        ("Median relative error", lambda r: main_metric(r, "median_relative")),
-        ("Skill over constant depth", lambda r: main_metric(r, "skill")),
-        ("CPU seconds (shared machines count too)", lambda r: r.get("cpu_seconds")),
-        ("Exact energy of the solution", _energy),
-    ):
-        form = ".1f" if "seconds" in title or "energy" in title else ".4f"
+    variants, pairs = _by_pair(rows, titles(rows))
+    complete = [p for p in pairs.values() if all(main_metric(p[v]) is not None for v in variants)]
+    for title, (form, measure) in MEASURES.items():
         entries = [
             [pair, *(show(measure(own[v]), form) for v in variants)] for pair, own in pairs.items()
         ]
         if len(complete) > 1:
-            averages = [mean(measure(p[v]) for p in complete.values()) for v in variants]
+            averages = [mean(measure(p[v]) for p in complete) for v in variants]
             entries.append([f"mean of {len(complete)}", *(show(a, form) for a in averages)])
         lines += [f"## {title}", "", *table(["pair, flow", *variants], entries), ""]
-    lines += _beside(name)
-    lines += failures(rows)
-    return joined(lines)
-
-
-def _energy(row: Row) -> float | None:
-    return float(row["energy"]["solution"]["total"]) if row.get("ok") else None
-
-
-def _beside(name: str) -> list[str]:
-    """What the paper prints for the same question."""
     if name == "ablation":
         entries = [[f"{k} (published)", *(f"{v:.4f}" for v in row)] for k, row in ABLATION.items()]
-        head = ["sequence", "arap", "+ proj", "+ cont", "+ orient"]
-        return [
-            "## Published MRE",
-            "",
-            *table(head, entries),
-            "",
-            f"Copied, not measured: {SOURCE}.",
-        ]
+        lines += ["## Published MRE", ""]
+        lines += table(["sequence", "arap", "+ proj", "+ cont", "+ orient"], entries)
+        lines += ["", f"Copied, not measured: {SOURCE}."]
     if name == "pattern":
         both = ", ".join(f"{k} {v:.4f}" for k, v in GRID_AGAINST_SLIC.items())
-        return [f"Published for one frame with 1,000 superpixels (copied, not measured): {both}."]
-    return []
+        lines += [f"Published for one frame with 1,000 superpixels (copied, not measured): {both}."]
+    return joined([*lines, *failures(rows)])
 
 
 def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
@@ -128,9 +108,8 @@ def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> st
             terms = [f"{e[t]:.4g}" for t in ("total", *TERMS)]
             own = [show(scores[soup]["mre"]), show(scores[soup]["median_relative"])]
             entries.append([title, soup, *terms, *own])
-        least = row["energy"]["solution"]["total"]
-        ratio = row["energy"]["truth"]["total"] / least
-        nearest = row["energy"].get("truth rescaled", row["energy"]["truth"])["total"] / least
+        ratio = energy_ratio(row) or 0.0
+        nearest = energy_ratio(row, "truth rescaled") or ratio
         last = list(scores)[-1]
         worse = scores[last]["median_relative"] - scores["truth"]["median_relative"]
         summary.append(
@@ -141,46 +120,35 @@ def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> st
         )
     head = ["pair, flow", "E truth / E solution", f"<= {ABOVE:g}", "components rescaled"]
     head += ["median error from truth", f"<= {WORSE:g}", "mixed superpixels"]
-    lines += table(head, summary)
-    lines += [
-        "",
-        "Components rescaled: E of the truth, each component at its scale of lowest E, instead.",
-    ]
-    lines += ["", "## By term", ""]
+    about = "Components rescaled: E of the truth, each component at its scale of lowest E, instead."
+    lines += [*table(head, summary), "", about, "", "## By term", ""]
     lines += table(["pair, flow", "soup", "E", *TERMS, "MRE", "median"], entries)
-    lines += failures(rows)
-    return joined(lines)
-
-
-LONG = 60
-"""Letters of all variants from which their labels are slanted."""
+    return joined([*lines, *failures(rows)])
 
 
 def plot_variants(
     path: Path, axis: str, title: str, rows: Sequence[Row], numeric: bool = False
 ) -> None:
     """MRE over the variants, a line a pair, their mean in black."""
-    variants, pairs = _variants(rows), _pairs(rows, titles(rows))
+    variants, pairs = _by_pair(rows, titles(rows))
     x = np.array([float(v) for v in variants]) if numeric else np.arange(float(len(variants)))
     picture = figure(7, 4)
     ax = picture.add_subplot()
-    curves = []
-    for name, own in pairs.items():
-        y = np.array([np.nan if (m := main_metric(own[v])) is None else m for v in variants])
+    curves = np.array(
+        [[main_metric(own[v]) for v in variants] for own in pairs.values()], np.float64
+    )
+    for name, y in zip(pairs, curves, strict=True):
         ax.plot(x, y, "o-", lw=1, ms=3, alpha=0.7, label=name)
-        curves.append(y)
-    if len(curves) > 1:
-        whole = [c for c in curves if np.isfinite(c).all()]
-        if whole:
-            ax.plot(x, np.mean(whole, axis=0), "ks-", lw=2, label=f"mean of {len(whole)}")
+    whole = curves[np.isfinite(curves).all(axis=1)]
+    if len(curves) > 1 and len(whole):
+        ax.plot(x, whole.mean(axis=0), "ks-", lw=2, label=f"mean of {len(whole)}")
     if numeric and len(x) > 1 and x.max() > 8 * x.min() > 0:
         ax.set_xscale("log")
     slanted = not numeric and len("".join(variants)) > LONG
     style: dict[str, Any] = {"rotation": 15, "ha": "right", "size": 8} if slanted else {}
     ax.set_xticks(x, variants, **style)
     ax.minorticks_off()
-    finite = np.concatenate(curves)
-    finite = finite[np.isfinite(finite)]
+    finite = curves[np.isfinite(curves)]
     if finite.size and finite.min() > 0 and finite.max() > 20 * finite.min():
         ax.set_yscale("log")
     else:
@@ -224,35 +192,28 @@ def plot_energy(path: Path, rows: Sequence[Row]) -> None:
 
 def text_flow(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     """Table of flow errors: the means of complete pairs by source, and every pair and source."""
+    good = [r for r in rows if r.get("ok")]
+    variants, pairs = _by_pair(good, pair_names(good))
+    complete = [own for own in pairs.values() if len(own) == len(variants)]
 
-    def cells(numbers: Iterable[float | None]) -> list[str]:
-        form = {"over_3px": ".1%", "used": ".1%"}
-        return [show(x, form.get(k, ".3f")) for k, x in zip(FLOW_ERRORS, numbers, strict=True)]
+    def cells(some: Iterable[Row]) -> list[str]:
+        own = [row["flow_error"] for row in some]
+        return [show(mean(e[k] for e in own), form) for k, (_, form) in FLOW_ERRORS.items()]
 
+    heads = [title for title, _ in FLOW_ERRORS.values()]
+    means = [[v, *cells(own[v] for own in complete)] for v in variants]
+    every = [[pair, v, *cells([row])] for pair, own in pairs.items() for v, row in own.items()]
     lines = [f"# Analysis: {name}", ""]
     lines += [f"{text[0].upper()}{text[1:]}. {note} Code {codes(rows)}.", ""]
-    good = [r for r in rows if r.get("ok")]
-    variants, pairs = _variants(good), _pairs(good, pair_names(good))
-    complete = [own for own in pairs.values() if len(own) == len(variants)]
-    means = [
-        [v, *cells(mean(own[v]["flow_error"][k] for own in complete) for k in FLOW_ERRORS)]
-        for v in variants
-    ]
-    every = [
-        [pair, v, *cells(row["flow_error"][k] for k in FLOW_ERRORS)]
-        for pair, own in pairs.items()
-        for v, row in own.items()
-    ]
-    lines += [f"Mean of {len(complete)} pairs, pixels:", ""]
-    lines += [*table(["source", *FLOW_ERRORS.values()], means), "", "By pair:", ""]
-    lines += table(["pair", "source", *FLOW_ERRORS.values()], every)
+    lines += [f"Mean of {len(complete)} pairs, pixels:", "", *table(["source", *heads], means)]
+    lines += ["", "By pair:", "", *table(["pair", "source", *heads], every)]
     return joined([*lines, *failures(rows)])
 
 
 def plot_flow(path: Path, rows: Sequence[Row]) -> None:
     """Weighted error by pair, a bar a source."""
     good = [r for r in rows if r.get("ok")]
-    variants, pairs = _variants(good), _pairs(good, pair_names(good))
+    variants, pairs = _by_pair(good, pair_names(good))
     picture = figure(max(5.0, 1.1 * len(pairs)), 4)
     ax = picture.add_subplot()
     width = 0.8 / max(1, len(variants))

@@ -1,4 +1,7 @@
-"""Depth maps that are scored: solution, stages before it, and baselines with the same flow."""
+"""Depth maps that are scored: solution, stages before it, baselines with the same flow, floors.
+
+The floor is the best that a piecewise planar depth can score: planes fitted to true depth.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.bench.piecewise_planar import fit_planes, plane_depth, points_as_map
+from soup_nlp.errors import DataError
 from soup_nlp.evaluate.baselines import fill_nearest
+from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.soup import Soup, reconstruct
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline.run import Run
 
 Float = NDArray[np.float64]
+Labels = NDArray[np.integer]
 
 METHODS: Mapping[str, str] = MappingProxyType(
     {
@@ -39,6 +44,9 @@ BASELINES = ("unorganised", "rigid", "rigid_filled", "plane", "constant")
 
 SPARSE = 4.0
 """True pixels per superpixel below which the superpixel floor is meaningless."""
+
+LEAST_OF_PLANE = 4
+"""Fewest true pixels of a label that make a plane; fewer get a constant depth."""
 
 
 def unorganised(soup: Soup) -> Soup:
@@ -97,3 +105,105 @@ def true_depth(run: Run) -> Float | None:
         return None
     sparse = points_as_map(truth.points, run.pair.size)
     return sparse if np.isfinite(sparse).any() else None
+
+
+def fit_planes(
+    labels: Labels, depth: Float, K: Float, rounds: int = 20, softening: float = 1e-4
+) -> Float:
+    """Inverse-depth planes m, 1 / z = m . ray, with the least mean relative error per label.
+
+    Minimises sum |z - 1 / (m . r)| / z = sum |u - 1| / u with u = z m . r by iteratively
+    re-weighted least squares from two planes, the least squares of 1 / z - m . r and of u - 1; the
+    best iterate of each label is kept, the best constant depth where no plane is better. The mean
+    relative error is not convex in m, so this is an upper bound of the best, close to it where one
+    plane suits most pixels.
+
+    Args:
+        labels: (H, W) label 0..N-1 of every pixel.
+        depth: (H, W) true z; NaN where unknown.
+        K: (3, 3) intrinsics.
+        rounds: Re-weighted fits from either start.
+        softening: Relative error below which weights stop growing.
+
+    Returns:
+        (N, 3); NaN where a label has no true pixel.
+
+    Raises:
+        DataError: shapes differ, or no depth is known.
+    """
+    if labels.shape != depth.shape:
+        raise DataError("labels and depth differ in size", found=labels.shape, expected=depth.shape)
+    known = np.isfinite(depth) & (depth > 0)
+    if not known.any():
+        raise DataError("no true depth to fit planes to")
+    n = int(labels.max()) + 1
+    which = labels[known].astype(np.int64)
+    z = depth[known].astype(np.float64)
+    zr = z[:, None] * rays(K, pixel_grid(*depth.shape))[known]
+    count = np.bincount(which, minlength=n)
+    constant = np.column_stack([np.zeros((n, 2)), _best_constant(which, z, count)])
+    best, lowest = constant.copy(), _errors(constant, which, zr, count)
+    rich = count >= LEAST_OF_PLANE
+    # equal weights of u - 1 grow with z^2 in inverse depth: some sky outweighs everything near
+    for weight in (1.0 / (z * z), np.ones(len(z))):
+        for _ in range(rounds):
+            m = _solve(which, zr, weight, n, constant)
+            cost = _errors(m, which, zr, count)
+            better = rich & (cost < lowest)
+            best[better], lowest[better] = m[better], cost[better]
+            u = np.maximum(np.einsum("pc,pc->p", zr, m[which]), 0.05)
+            weight = 1.0 / (u * u * np.maximum(np.abs(1 - 1 / u), softening))
+    best[count == 0] = np.nan
+    return best
+
+
+def _best_constant(which: Labels, z: Float, count: Labels) -> Float:
+    """(N,) inverse of the constant c that minimises sum |z - c| / z: a weighted median of z."""
+    order = np.lexsort((z, which))
+    own = which[order]
+    mass = np.cumsum(1 / z[order])
+    end = np.cumsum(count)
+    before = np.where(end - count > 0, mass[np.maximum(end - count, 1) - 1], 0.0)
+    half = 0.5 * (before + mass[np.maximum(end, 1) - 1])
+    # the first pixel of every label at which half of its weight is reached
+    reached = np.flatnonzero(mass >= half[own] * (1 - 1e-12))
+    out = np.ones(len(count))
+    label, first = np.unique(own[reached], return_index=True)
+    out[label] = 1 / z[order][reached[first]]
+    return out
+
+
+def _solve(which: Labels, zr: Float, weight: Float, n: int, prior: Float) -> Float:
+    """(N, 3) weighted least squares of m . zr = 1, with a trace of a prior."""
+    A = np.empty((n, 3, 3))
+    for a in range(3):
+        for b in range(a, 3):
+            A[:, a, b] = A[:, b, a] = np.bincount(which, weight * zr[:, a] * zr[:, b], n)
+    right = np.stack([np.bincount(which, weight * zr[:, a], n) for a in range(3)], axis=1)
+    ridge = 1e-9 * np.trace(A, axis1=1, axis2=2) + 1e-30
+    A = A + ridge[:, None, None] * np.eye(3)
+    return np.linalg.solve(A, (right + ridge[:, None] * prior)[..., None])[..., 0]
+
+
+def _errors(m: Float, which: Labels, zr: Float, count: Labels) -> Float:
+    """(N,) mean relative error of every label; infinite where a pixel has no positive depth."""
+    u = np.einsum("pc,pc->p", zr, m[which])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.where(u > 0, np.abs(1 - 1 / u), np.inf)
+        return np.asarray(np.bincount(which, error, len(m)) / count)
+
+
+def plane_depth(m: Float, labels: Labels, K: Float) -> Float:
+    """(H, W) depth of inverse-depth planes (N, 3); NaN where a plane is behind or unknown."""
+    inverse = np.einsum("hwc,hwc->hw", m[labels], rays(K, pixel_grid(*labels.shape)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(inverse > 0, 1 / inverse, np.nan)
+
+
+def points_as_map(points: Float, shape: tuple[int, int]) -> Float:
+    """Sparse truth (M, 3) of (u, v, z) as a depth map, each at its nearest pixel; NaN elsewhere."""
+    out = np.full(shape, np.nan)
+    u, v = np.floor(points[:, :2] + 0.5).astype(np.int64).T
+    inside = (u >= 0) & (v >= 0) & (u < shape[1]) & (v < shape[0])
+    out[v[inside], u[inside]] = points[inside, 2]
+    return out

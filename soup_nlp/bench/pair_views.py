@@ -6,7 +6,7 @@ other margins, so a figure that holds on all views is worth more than one on a s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.data.flow.consistency import leaves
-from soup_nlp.data.pair import Pair
+from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
+Change = Callable[[NDArray[Any]], NDArray[Any]]
 
 IMAGES = ("depth_ref", "depth_next", "flow", "occluded", "components", "scene_flow")
 """Parts of a truth that have a value for every pixel."""
@@ -42,16 +43,13 @@ def mirrored(pair: Pair) -> Pair:
         known = flow.confidence[..., None] > 0
         flow = replace(flow, uv=np.where(known, turned(flow.uv), np.float32(0.0)))
     if truth is not None:
-        own: dict[str, Any] = {}
-        if truth.flow is not None:
-            own["flow"] = turned(truth.flow)
-        if truth.scene_flow is not None:
-            own["scene_flow"] = truth.scene_flow @ _FLIP[:3, :3]
-        if truth.points is not None:
-            own["points"] = truth.points * [-1, 1, 1] + [width - 1, 0, 0]
-        if truth.motions is not None:
-            own["motions"] = _FLIP @ truth.motions @ _FLIP
-        truth = replace(truth, **own)
+        changes: dict[str, Change] = {
+            "flow": turned,
+            "scene_flow": lambda flow: flow @ _FLIP[:3, :3],
+            "points": lambda points: points * [-1, 1, 1] + [width - 1, 0, 0],
+            "motions": lambda motions: _FLIP @ motions @ _FLIP,
+        }
+        truth = _changed(truth, changes)
     K_ref, K_next = _mirrored_camera(pair.K_ref, width), _mirrored_camera(pair.K_next, there)
     return replace(seen, K_ref=K_ref, K_next=K_next, flow=flow, truth=truth)
 
@@ -62,28 +60,27 @@ def _mirrored_camera(K: Float, width: int) -> Float:
     return out
 
 
-def _each_image(pair: Pair, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Pair:
+def _changed(truth: Truth, changes: Mapping[str, Change]) -> Truth:
+    """The truth with the parts of these names changed, where they are known."""
+    own: dict[str, Any] = {
+        k: change(v) for k, change in changes.items() if (v := getattr(truth, k)) is not None
+    }
+    return replace(truth, **own)
+
+
+def _each_image(pair: Pair, change: Change) -> Pair:
     """The pair with all that it has for every pixel changed; cameras and the rest as they were."""
     flow, truth = pair.flow, pair.truth
     if flow is not None:
         flow = replace(flow, uv=change(flow.uv), confidence=change(flow.confidence))
     if truth is not None:
-        known = ((k, getattr(truth, k)) for k in IMAGES)
-        own: dict[str, Any] = {k: change(v) for k, v in known if v is not None}
-        truth = replace(truth, **own)
+        truth = _changed(truth, dict.fromkeys(IMAGES, change))
     image_ref, image_next = change(pair.image_ref), change(pair.image_next)
     return replace(pair, image_ref=image_ref, image_next=image_next, flow=flow, truth=truth)
 
 
 def cropped(pair: Pair, left: int, top: int, right: int = 0, bottom: int = 0) -> Pair:
-    """The pair without the margins of both images; depths, flow and motions are what they were.
-
-    Args:
-        pair: The pair.
-        left: Columns taken away on the left, and so on.
-        top: Rows.
-        right: Columns.
-        bottom: Rows.
+    """The pair without margins (pixels) of both images; depths, flow and motions do not change.
 
     Raises:
         DataError: a margin is negative, or nothing would be left.

@@ -16,13 +16,11 @@ _TABLE: dict[str, tuple[float | None, ...]] = {
     "kinect_paper": (0.2040, 0.0920, 0.0322, 0.0520, None, 0.0472),
     "kinect_tshirt": (0.2170, 0.1030, 0.0443, 0.0420, None, 0.0480),
 }
-COMPARISON: Mapping[str, Mapping[str, float | None]] = MappingProxyType(
-    {
-        # ULDEMV is compared in a figure of the paper, without printed numbers
-        dataset: MappingProxyType({**dict(zip(_COLUMNS, row, strict=True)), "ULDEMV": None})
-        for dataset, row in _TABLE.items()
-    }
-)
+COMPARISON: Mapping[str, Mapping[str, float | None]] = {
+    # ULDEMV is compared in a figure of the paper, without printed numbers
+    dataset: {**dict(zip(_COLUMNS, row, strict=True)), "ULDEMV": None}
+    for dataset, row in _TABLE.items()
+}
 """MRE by dataset and method; None where the paper prints none. KITTI is the odometry set 00-09
 with LiDAR truth, not the stereo and flow sets of this program's suites."""
 
@@ -54,11 +52,7 @@ DATA: Mapping[str, str] = MappingProxyType(
 _DATASET = {"kitti2012": "kitti", "kitti2015": "kitti"}
 
 
-def published(suite: str) -> dict[str, float | None]:
-    """Published MRE by method for the dataset of a suite; {} where the paper has none."""
-    return dict(COMPARISON.get(_DATASET.get(suite, suite), {}))
-
-
-def data_note(suite: str) -> str:
-    """What is not the same about the data of published and of measured rows; "" where none are."""
-    return DATA.get(_DATASET.get(suite, suite), "")
+def published(suite: str) -> tuple[dict[str, float | None], str]:
+    """Published MRE by method, and how those data differ from the measured; ({}, "") for none."""
+    dataset = _DATASET.get(suite, suite)
+    return dict(COMPARISON.get(dataset, {})), DATA.get(dataset, "")

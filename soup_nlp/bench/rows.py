@@ -1,4 +1,4 @@
-"""Rows of benchmarks: resumable files of JSON lines, measured here, by workers or on a cluster."""
+"""Rows of benchmarks: resumable files of JSON lines, measured here or by worker processes."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ from soup_nlp.storage.versions import code_version
 Row = dict[str, Any]
 Say = Callable[[int, int, Row], None]
 
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"), "1"
+)
+"""Environment of a worker process."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -33,22 +38,18 @@ class Job:
     stale: bool = False
 
 
-@dataclass(frozen=True)
-class Where:
-    """Where rows are measured.
-
-    Attributes:
-        workers: Processes of this machine; 1 measures in this process.
-        dask: Address of a Dask scheduler, such as tcp://host:8786; empty for none.
-    """
-
-    workers: int = 1
-    dask: str = ""
+MeasureRows = Callable[[Sequence[Job], Path], list[Row]]
+"""`measure_all` with its options."""
 
 
 def failed(row: Mapping[str, Any]) -> bool:
     """Whether a row has an error instead of numbers."""
     return bool(row.get("error"))
+
+
+def failure(reason: str) -> Row:
+    """The result of work that has no other than the reason why it failed."""
+    return {"ok": False, "error": reason, "seconds": 0.0, "cpu_seconds": 0.0}
 
 
 def attempt(work: Callable[[], Row]) -> Row:
@@ -60,7 +61,7 @@ def attempt(work: Callable[[], Row]) -> Row:
     try:
         row = {"ok": True, "error": None, **work()}
     except Exception as error:
-        row = {"ok": False, "error": f"{type(error).__name__}: {error}"}
+        row = failure(f"{type(error).__name__}: {error}")
     row["seconds"] = time.perf_counter() - begin
     row["cpu_seconds"] = time.process_time() - cpu
     return dict(plain(row))
@@ -104,7 +105,7 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
 def measure_all(
     jobs: Sequence[Job],
     path: Path,
-    where: Where | None = None,
+    workers: int = 1,
     *,
     say: Say | None = None,
     after: Callable[[list[Row]], None] | None = None,
@@ -113,12 +114,12 @@ def measure_all(
     """The row of every job, measured where the file does not hold it yet.
 
     A stored row serves a job of the same name and code version unless it failed. Every new row is
-    appended as soon as it is there, so that a run that was stopped goes on where it was.
+    appended as soon as it is there, so that an interrupted run can be continued.
 
     Args:
         jobs: What to measure.
         path: JSON-lines file.
-        where: Processes or cluster.
+        workers: Processes; 1 measures in this process.
         say: Called with (done, total, row) after every new row.
         after: Called with all rows that are there so far, in the order of the jobs, after every
             new row and at the end.
@@ -126,7 +127,7 @@ def measure_all(
 
     Raises:
         DataError: the file cannot be written.
-        ConfigError: joblib or Dask is needed and not installed, or the cluster does not answer.
+        ConfigError: joblib is needed and not installed.
     """
     code = code_version()
     names = [_identity(job.name) for job in jobs]
@@ -141,7 +142,7 @@ def measure_all(
     def so_far() -> list[Row]:
         return [known[name] for name in names if name in known]
 
-    for name, result in _measured(todo, where or Where()):
+    for name, result in _measured(todo, workers):
         known[name] = {**plain(todo[name].name), "code": code, **plain(result)}
         append_row(path, known[name])
         if say:
@@ -158,74 +159,35 @@ def _identity(row: Mapping[str, Any], keys: Mapping[str, Any] | None = None) -> 
     return json.dumps(plain(own), sort_keys=True)
 
 
-def _measured(todo: Mapping[str, Job], where: Where) -> Iterator[tuple[str, Row]]:
-    if where.dask:
-        yield from _by_dask(todo, where.dask)
-    elif where.workers > 1 and todo:
-        yield from _by_joblib(todo, where.workers)
-    else:
+def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]]:
+    """Names and results of the jobs, as they end."""
+    if workers < 2 or not todo:
         yield from ((name, job.work()) for name, job in todo.items())
-
-
-def _named(name: str, work: Callable[[], Row]) -> tuple[str, Row]:
-    return name, work()
-
-
-def _by_joblib(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]]:
+        return
     try:
-        from joblib import Parallel, delayed, parallel_config
-        from joblib.externals.loky import ProcessPoolExecutor
+        from joblib.externals.loky import ProcessPoolExecutor, as_completed
         from joblib.externals.loky.process_executor import BrokenProcessPool
     except ImportError as error:
         raise ConfigError(
             "parallel processes need joblib", where="--workers", hint="pip install soup-nlp[bench]"
         ) from error
     left = dict(todo)
-    try:
-        with parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1):
-            calls = (delayed(_named)(name, job.work) for name, job in todo.items())
-            for name, row in Parallel(return_as="generator_unordered", batch_size=1)(calls):
-                del left[name]
-                yield name, row
-    except BrokenProcessPool:
-        # a process died: measure what is left one by one to find out which job it was
-        for name, job in left.items():
-            pool = ProcessPoolExecutor(max_workers=1)
-            try:
-                yield name, pool.submit(job.work).result()
-            except BrokenProcessPool:
-                reason = "the process died (out of memory, or a crash of native code)"
-                yield name, failure(reason)
-            finally:
-                pool.shutdown(wait=False, kill_workers=True)
-
-
-def _by_dask(todo: Mapping[str, Job], address: str) -> Iterator[tuple[str, Row]]:
-    try:
-        from dask.distributed import Client, as_completed
-    except ImportError as error:
-        raise ConfigError(
-            "a cluster needs Dask", where="--dask", hint="pip install soup-nlp[dask]"
-        ) from error
-    try:
-        client = Client(address, timeout=10)
-    except (OSError, ValueError) as error:
-        raise ConfigError(
-            "the Dask scheduler does not answer",
-            where="--dask",
-            found=f"{address}: {error}",
-            hint="start one with: dask scheduler, and workers with: dask worker ADDRESS",
-        ) from error
-    with client:
-        # a worker should have one thread: Ipopt and its MUMPS share static memory
-        futures = {client.submit(j.work, pure=False, retries=1): n for n, j in todo.items()}
-        for future in as_completed(list(futures)):
-            wrong = future.exception()
-            result = failure(f"{type(wrong).__name__}: {wrong}") if wrong else future.result()
-            yield futures[future], result
-            future.release()
-
-
-def failure(reason: str) -> Row:
-    """The result of work that has no other than the reason why it failed."""
-    return {"ok": False, "error": reason, "seconds": 0.0, "cpu_seconds": 0.0}
+    # a broken pool does not tell which job broke it: what is left runs again, one pool per job
+    for names in ([*todo], *([name] for name in todo)):
+        again = [name for name in names if name in left]
+        if not again:
+            continue
+        pool = ProcessPoolExecutor(max_workers=min(workers, len(again)), env=ONE_THREAD)
+        try:
+            futures = {pool.submit(left[name].work): name for name in again}
+            for future in as_completed(futures):
+                try:
+                    result = future.result()
+                except BrokenProcessPool:
+                    if len(names) > 1:
+                        continue
+                    result = failure("the process died (out of memory, or a crash of native code)")
+                del left[futures[future]]
+                yield futures[future], result
+        finally:
+            pool.shutdown(wait=False, kill_workers=True)

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.datasets.sintel import DEFAULT_SCENE
 
 RENDERED = ("street", "room", "sheet", "orbit", "still")
+KITTI_PRESETS = ("kitti", "eigen80", "best")
+SINTEL_FRAMES = MappingProxyType(
+    {"alley_1": 50, "ambush_4": 33, "mountain_1": 50, "sleeping_1": 50, "temple_2": 50}
+)
+"""Sequences of the paper and their number of frames."""
+VKITTI_FRAMES = MappingProxyType({"0001": 447, "0002": 233, "0006": 270, "0018": 339})
+"""Worlds of the paper and their number of frames."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +48,9 @@ class Item:
         """Unique among all suites."""
         return f"{self.suite}/{self.name}/{self.flow}"
 
-    def scored_by(self, presets: tuple[str, ...]) -> Item:
-        """The same pair under other conventions."""
-        return replace(self, presets=presets)
+    def scored_by(self, presets: Sequence[str] | None) -> Item:
+        """The same pair under other conventions; itself where none are given."""
+        return replace(self, presets=tuple(presets)) if presets else self
 
     def problem(self, overrides: Sequence[str] = ()) -> Problem:
         """Its problem with the defaults and overrides.
@@ -61,7 +68,7 @@ class Options:
 
     Attributes:
         flows: Flow sources; None for the suite's own.
-        width: Columns of rendered scenes (436 of 1024 rows).
+        width: Columns of rendered scenes; they have 436 rows per 1024 columns.
         seeds: Seeds of rendered scenes.
         limit: At most this many pairs, spread evenly, each with every flow; None for all.
         only: Keep names that contain one of these words; empty for all.
@@ -74,36 +81,18 @@ class Options:
     only: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Suite:
-    """A list of pairs.
+class Entry(NamedTuple):
+    """One pair of a suite, as in `Item`, and whether its true flow may be solved with.
 
-    Attributes:
-        name: On the command line.
-        text: What it is.
-        build: Makes its items for a root folder.
-        flows: Flow sources by default.
-        presets: Metric conventions, the main one first.
-        folders: Where under --data its root may be; the first that holds a pair is taken.
-        layout: What the root must hold; empty where no data is needed.
-        source: Where to get it.
+    Without `presets` it is scored under the suite's.
     """
 
+    sequence: str
     name: str
-    text: str
-    build: Callable[[Suite, Path, Options], Iterable[Item]]
-    flows: tuple[str, ...] = ("dis",)
-    presets: tuple[str, ...] = ("paper", "best")
-    folders: tuple[str, ...] = (".",)
-    layout: str = ""
-    source: str = ""
-
-    def items(
-        self, sequence: str, name: str, raw: dict[str, Any], o: Options, *needs: Path
-    ) -> Iterable[Item]:
-        """One item a flow."""
-        for flow in o.flows or self.flows:
-            yield Item(self.name, sequence, name, flow, raw, self.presets, needs)
+    input: Mapping[str, Any]
+    needs: tuple[Path, ...] = ()
+    true_flow: bool = True
+    presets: tuple[str, ...] = ()
 
 
 def spread(count: int, wanted: int, first: int = 0) -> list[int]:
@@ -112,89 +101,57 @@ def spread(count: int, wanted: int, first: int = 0) -> list[int]:
     return [first + (2 * k + 1) * count // (2 * wanted) for k in range(wanted)]
 
 
-def rendered(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
+def rendered(root: Path, o: Options) -> Iterator[Entry]:
     """Every scene of every seed."""
-    height = max(48, round(o.width * 436 / 1024))
+    size = {"width": o.width, "height": max(48, round(o.width * 436 / 1024))}
     for seed in o.seeds:
         for scene in RENDERED:
-            raw = {
-                "kind": "scene",
-                "scene": scene,
-                "seed": seed,
-                "width": o.width,
-                "height": height,
-            }
-            name = f"{scene}-s{seed}-{o.width}x{height}"
-            for flow in o.flows or suite.flows:
-                yield Item(suite.name, scene, name, flow, raw, suite.presets)
+            name = f"{scene}-s{seed}-{size['width']}x{size['height']}"
+            yield Entry(scene, name, {"kind": "scene", "scene": scene, "seed": seed, **size})
 
 
-def shared(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
+def shared(root: Path, o: Options) -> Iterator[Entry]:
     """The real pairs of development by family, motorcycle first."""
+    kitti = ("kitti", "best", "eigen80")
 
-    def some(
-        family: str,
-        name: str,
-        raw: dict[str, Any],
-        needs: Path | None,
-        truth: bool = False,
-        presets: tuple[str, ...] = suite.presets,
-    ) -> Iterable[Item]:
-        for flow in o.flows or suite.flows:
-            if truth or not flow.startswith("truth"):
-                files = () if needs is None else (needs,)
-                yield Item(suite.name, family, name, flow, raw, presets, files)
+    def folders(family: str, true_flow: bool = False, **more: Any) -> Iterator[Entry]:
+        presets = kitti if family == "kitti2015" else ()
+        for path in sorted((root / family).glob("*" if family == "rgbd" else "pair_*")):
+            name = f"{family} {path.name.removeprefix('pair_')}"
+            raw = {"kind": "folder", "path": str(path), **more}
+            yield Entry(family, name, raw, (path / "frame_0.png",), true_flow, presets)
 
-    def folder(
-        path: Path, truth: bool = False, presets: tuple[str, ...] = suite.presets, **more: Any
-    ) -> Iterable[Item]:
-        raw: dict[str, Any] = {"kind": "folder", "path": str(path), **more}
-        family = path.name if path.parent == root else path.parent.name
-        name = family if path.parent == root else f"{family} {path.name.removeprefix('pair_')}"
-        return some(family, name, raw, path / "frame_0.png", truth, presets)
-
-    kitti_presets = ("kitti", "best", "eigen80")
-    yield from some("motorcycle", "motorcycle", {"kind": "motorcycle"}, None, True)
-    raw: dict[str, Any]
-    kitti = root / "kitti2012"
+    yield Entry("motorcycle", "motorcycle", {"kind": "motorcycle"})
     for index in ("000138", "000027"):
-        raw = {"kind": "kitti2012", "root": str(kitti), "index": index}
-        image = kitti / "training" / "image_0" / f"{index}_10.png"
-        yield from some("kitti2012", f"kitti2012 {index}", raw, image, True, kitti_presets)
-    yield from folder(root / "driving_synthetic", True)
-    for path in sorted((root / "kinect_paper").glob("pair_*")):
-        yield from folder(path, unit="mm")
-    raw = {"kind": "sintel", "root": str(root / "sintel")}
-    raw |= {"scene": "alley_1", "frame": 20, "step": 5}
+        raw = {"kind": "kitti2012", "root": str(root / "kitti2012"), "index": index}
+        image = root / "kitti2012" / "training" / "image_0" / f"{index}_10.png"
+        yield Entry("kitti2012", f"kitti2012 {index}", raw, (image,), True, kitti)
+    path = root / "driving_synthetic"
+    raw = {"kind": "folder", "path": str(path)}
+    yield Entry(path.name, path.name, raw, (path / "frame_0.png",))
+    yield from folders("kinect_paper", unit="mm")
+    alley: dict[str, Any] = {"scene": "alley_1", "frame": 20, "step": 5}
+    alley |= {"kind": "sintel", "root": str(root / "sintel")}
     image = root / "sintel" / "training" / "clean" / "alley_1" / "frame_0020.png"
     presets = ("sintel70", "paper", "best")
-    yield from some("sintel", "sintel alley_1-0020+5", raw, image, presets=presets)
-    tum = root / "tum_fr1"
-    raw = {"kind": "tum", "path": str(tum)}
-    yield from some("tum_fr1", "tum_fr1", raw, tum / "frame_0.png")
-    for path in sorted((root / "kitti2015").glob("pair_*")):
-        yield from folder(path, True, kitti_presets)
+    yield Entry("sintel", "sintel alley_1-0020+5", alley, (image,), False, presets)
+    path = root / "tum_fr1"
+    raw = {"kind": "tum", "path": str(path)}
+    yield Entry("tum_fr1", "tum_fr1", raw, (path / "frame_0.png",), False)
+    yield from folders("kitti2015", True)
     track = root / "kitti_tracking"
     for k in range(4):
-        names = {"ref": f"frame_{k}.png", "next": f"frame_{k + 1}.png"}
+        names = {"ref": f"frame_{k}.png", "next": f"frame_{k + 1}.png", "intrinsics": "K.txt"}
         names |= {"depth": f"depth_{k}.png", "depth_next": f"depth_{k + 1}.png"}
         files = {key: str(track / name) for key, name in names.items()}
-        raw = {"kind": "files", **files, "intrinsics": str(track / "K.txt"), "depth_scale": 256.0}
-        name = f"kitti_tracking {k}"
-        yield from some("kitti_tracking", name, raw, track / f"frame_{k + 1}.png")
-    for path in sorted((root / "rgbd").glob("*")):
-        yield from folder(path, depth_scale=5000.0)
-    for path in sorted((root / "deepdeform").glob("pair_*")):
-        yield from folder(path, depth_scale=1000.0)
+        own = {"kind": "files", **files, "depth_scale": 256.0}
+        needs = (track / names["next"],)
+        yield Entry("kitti_tracking", f"kitti_tracking {k}", own, needs, False)
+    yield from folders("rgbd", depth_scale=5000.0)
+    yield from folders("deepdeform", depth_scale=1000.0)
 
 
-SINTEL_FRAMES = MappingProxyType(
-    {"alley_1": 50, "ambush_4": 33, "mountain_1": 50, "sleeping_1": 50, "temple_2": 50}
-)
-"""Sequences of the paper and their number of frames."""
-
-
-def sintel(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
+def sintel(root: Path, o: Options) -> Iterator[Entry]:
     """Pairs of the five sequences."""
     base = root / "training" if (root / "training").is_dir() else root
     for scene, frames in SINTEL_FRAMES.items():
@@ -206,50 +163,38 @@ def sintel(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
             if scene != DEFAULT_SCENE:
                 # the loader knows the camera of one scene only
                 needs += [base / "camdata_left" / f"{name}.cam" for name in names]
-            yield from suite.items(scene, f"{scene}-{frame:04d}", raw, o, *needs)
+            yield Entry(scene, f"{scene}-{frame:04d}", raw, tuple(needs))
 
 
-def kitti(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
+def kitti(kind: str, camera: str, count: int, root: Path, o: Options) -> Iterator[Entry]:
     """Training pairs of KITTI 2012 or 2015."""
     base = root / "training" if (root / "training").is_dir() else root
-    camera, count = ("image_0", 194) if suite.name == "kitti2012" else ("image_2", 200)
-    for k in range(count):
-        raw = {"kind": suite.name, "root": str(root), "index": f"{k:06d}"}
-        needs = [base / camera / f"{k:06d}_{frame}.png" for frame in (10, 11)]
-        yield from suite.items(suite.name, f"{k:06d}", raw, o, *needs)
+    for index in (f"{k:06d}" for k in range(count)):
+        needs = tuple(base / camera / f"{index}_{frame}.png" for frame in (10, 11))
+        yield Entry(kind, index, {"kind": kind, "root": str(root), "index": index}, needs)
 
 
-VKITTI_FRAMES = MappingProxyType({"0001": 447, "0002": 233, "0006": 270, "0018": 339})
-"""Worlds of the paper and their number of frames."""
-
-
-def vkitti(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
+def vkitti(root: Path, o: Options) -> Iterator[Entry]:
     """Morning pairs of the four worlds, in version 1 or 2."""
     second = (root / "Scene01").is_dir() or (root / "Scene02").is_dir()
+    parts = sorted(root.glob("vkitti_*_rgb")) or [root / "vkitti_1.3.1_rgb"]
+    raw = {"kind": "vkitti2" if second else "vkitti1", "root": str(root), "variation": "morning"}
     for world, frames in VKITTI_FRAMES.items():
+        scene = f"Scene{world[2:]}" if second else world
         # 120 pairs of these four, 30 each, evenly spaced: the paper does not say which
         for frame in spread(frames - 1, 30):
-            scene = f"Scene{world[2:]}" if second else world
-            raw = {
-                "kind": "vkitti2" if second else "vkitti1",
-                "root": str(root),
-                "scene": scene,
-                "frame": frame,
-                "variation": "morning",
-            }
             if second:
                 folder = root / scene / "morning/frames/rgb/Camera_0"
-                needs = [folder / f"rgb_{frame + k:05d}.jpg" for k in (0, 1)]
+                needs = tuple(folder / f"rgb_{frame + k:05d}.jpg" for k in (0, 1))
             else:
-                parts = sorted(root.glob("vkitti_*_rgb")) or [root / "vkitti_1.3.1_rgb"]
                 folder = parts[-1] / world / "morning"
-                needs = [folder / f"{frame + k:05d}.png" for k in (0, 1)]
+                needs = tuple(folder / f"{frame + k:05d}.png" for k in (0, 1))
             name = f"{world}_morning-{frame:05d}"
-            yield from suite.items(f"{world}_morning", name, raw, o, *needs)
+            yield Entry(f"{world}_morning", name, {**raw, "scene": scene, "frame": frame}, needs)
 
 
-def kinect(suite: Suite, root: Path, o: Options) -> Iterable[Item]:
+def kinect(root: Path, o: Options) -> Iterator[Entry]:
     """Every folder pair_*."""
     for pair in sorted(root.glob("pair_*")):
         raw = {"kind": "folder", "path": str(pair), "unit": "mm", "depth_scale": 1.0}
-        yield from suite.items(suite.name, pair.name, raw, o, pair / "frame_0.png")
+        yield Entry("", pair.name, raw, (pair / "frame_0.png",))

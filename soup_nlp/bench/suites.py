@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
-from soup_nlp.bench.suite_pairs import (
-    RENDERED,
-    Item,
-    Options,
-    Suite,
-    kinect,
-    kitti,
-    rendered,
-    shared,
-    sintel,
-    spread,
-    vkitti,
-)
+from soup_nlp.bench import suite_pairs as pairs
+from soup_nlp.bench.suite_pairs import KITTI_PRESETS, RENDERED, Entry, Item, Options, spread
 from soup_nlp.errors import DataError
 
 _KINECT_LAYOUT = (
@@ -29,12 +19,49 @@ _KINECT_LAYOUT = (
 _KINECT_SOURCE = (
     "EPFL CVLab, deformable surface reconstruction, https://www.epfl.ch/labs/cvlab/data/data-dsr/"
 )
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A list of pairs.
+
+    Attributes:
+        name: On the command line.
+        text: What it is.
+        entries: Its pairs for a root folder.
+        flows: Flow sources by default.
+        presets: Metric conventions, the main one first.
+        folders: Where under --data its root may be; the first that holds a pair is taken.
+        layout: What the root must hold; empty where no data is needed.
+        source: Where to get it.
+    """
+
+    name: str
+    text: str
+    entries: Callable[[Path, Options], Iterable[Entry]]
+    flows: tuple[str, ...] = ("dis",)
+    presets: tuple[str, ...] = ("paper", "best")
+    folders: tuple[str, ...] = (".",)
+    layout: str = ""
+    source: str = ""
+
+    def items(self, root: Path, o: Options) -> Iterator[Item]:
+        """Every wanted pair with every flow, whether it is there or not."""
+        for e in self.entries(root, o):
+            if o.only and not any(word in e.name for word in o.only):
+                continue
+            for flow in o.flows or self.flows:
+                if e.true_flow or not flow.startswith("truth"):
+                    sequence, presets = e.sequence or self.name, e.presets or self.presets
+                    yield Item(self.name, sequence, e.name, flow, e.input, presets, e.needs)
+
+
 _ALL = (
-    Suite("rendered", f"{len(RENDERED)} rendered dynamic scenes", rendered, ("truth", "dis")),
+    Suite("rendered", f"{len(RENDERED)} rendered dynamic scenes", pairs.rendered, ("truth", "dis")),
     Suite(
         "shared",
         "the real pairs that development was done with",
-        shared,
+        pairs.shared,
         ("truth", "dis"),
         folders=(".", "../shared/data"),
         layout=(
@@ -46,7 +73,7 @@ _ALL = (
     Suite(
         "sintel",
         "MPI Sintel, the paper's five sequences, 24 pairs each",
-        sintel,
+        pairs.sintel,
         presets=("sintel70", "paper", "best"),
         folders=(".", "sintel", "MPI-Sintel-complete"),
         layout=(
@@ -58,8 +85,8 @@ _ALL = (
     Suite(
         "kitti2012",
         "KITTI stereo and flow 2012, 194 training pairs",
-        kitti,
-        presets=("kitti", "eigen80", "best"),
+        partial(pairs.kitti, "kitti2012", "image_0", 194),
+        presets=KITTI_PRESETS,
         folders=(".", "kitti2012", "data_stereo_flow"),
         layout="training/image_0, training/calib, training/disp_occ, training/flow_occ",
         source="https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php (data_stereo_flow.zip)",
@@ -67,8 +94,8 @@ _ALL = (
     Suite(
         "kitti2015",
         "KITTI scene flow 2015, 200 training pairs",
-        kitti,
-        presets=("kitti", "eigen80", "best"),
+        partial(pairs.kitti, "kitti2015", "image_2", 200),
+        presets=KITTI_PRESETS,
         folders=(".", "kitti2015", "data_scene_flow"),
         layout="training/image_2, training/calib_cam_to_cam, training/disp_occ_0, disp_occ_1",
         source=(
@@ -79,8 +106,8 @@ _ALL = (
     Suite(
         "vkitti",
         "Virtual KITTI 1 or 2, the paper's four worlds, 30 morning pairs each",
-        vkitti,
-        presets=("kitti", "eigen80", "best"),
+        pairs.vkitti,
+        presets=KITTI_PRESETS,
         folders=(".", "vkitti", "vkitti1", "vkitti2"),
         layout=(
             "vkitti_1.3.1_rgb/WORLD/morning and _depthgt, _flowgt (version 1), or"
@@ -92,7 +119,7 @@ _ALL = (
         Suite(
             f"kinect_{thing}",
             f"bending {text} of EPFL",
-            kinect,
+            pairs.kinect,
             folders=(f"kinect_{thing}", "."),
             layout=_KINECT_LAYOUT,
             source=_KINECT_SOURCE,
@@ -110,7 +137,7 @@ class Listing:
 
     Attributes:
         suite: The suite.
-        items: What to measure, an item a pair and flow.
+        items: What to measure, one item per pair and flow.
         left_out: Pairs that are there and were left out by a limit.
         missing: Pairs of the suite's list (with its filters) that are not there.
     """
@@ -146,12 +173,14 @@ def list_suite(name: str, data: Path | None = None, options: Options | None = No
     root = (data or Path()).expanduser().resolve()
     listed: list[Item] = []
     for folder in suite.folders:
-        listed = [i for i in suite.build(suite, (root / folder).resolve(), o) if _wanted(i, o)]
+        listed = list(suite.items((root / folder).resolve(), o))
         here = [i for i in listed if all(f.is_file() for f in i.needs)]
         if any(i.needs for i in here) or (here and not suite.layout):
-            items = tuple(_thinned(here, o.limit))
-            there = len(_names(here))
-            return Listing(suite, items, there - len(_names(items)), len(_names(listed)) - there)
+            names = _names(here)
+            kept = names if o.limit is None else [names[k] for k in spread(len(names), o.limit)]
+            items = tuple(i for i in here if i.name in kept)
+            missing = len(_names(listed)) - len(names)
+            return Listing(suite, items, len(names) - len(kept), missing)
     if o.only and not listed and (not suite.layout or root.is_dir()):
         raise DataError(
             "no pair of the suite has such a name", where=f"suite {name}", found=", ".join(o.only)
@@ -165,19 +194,6 @@ def list_suite(name: str, data: Path | None = None, options: Options | None = No
     )
 
 
-def _wanted(item: Item, o: Options) -> bool:
-    return not o.only or any(word in item.name for word in o.only)
-
-
 def _names(items: Iterable[Item]) -> list[str]:
     """Pairs, whatever their flow, in order."""
     return list(dict.fromkeys(i.name for i in items))
-
-
-def _thinned(items: list[Item], limit: int | None) -> list[Item]:
-    """Every flow of so many pairs, spread evenly."""
-    names = _names(items)
-    if limit is None or limit >= len(names):
-        return items
-    kept = {names[k] for k in spread(len(names), limit)}
-    return [i for i in items if i.name in kept]

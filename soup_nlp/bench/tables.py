@@ -24,9 +24,7 @@ def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> list[str]:
     return ["| " + " | ".join(cells) + " |" for cells in [head, rule, *lines]]
 
 
-def columns(
-    cells: Mapping[str, Callable[[Any], str]], rows: Sequence[Mapping[str, Any]]
-) -> list[str]:
+def columns(cells: Mapping[str, Callable[[Any], str]], rows: Iterable[Any]) -> list[str]:
     """A Markdown table with one line per row and one column per named cell."""
     return table(list(cells), [[cell(r) for cell in cells.values()] for r in rows])
 
@@ -42,7 +40,7 @@ def mean(values: Iterable[Number]) -> Number:
     return float(np.mean(known)) if known else None
 
 
-def get(row: Row, convention: str, method: str, name: str = "mre") -> Number:
+def get(row: Row, convention: str, method: str = "solution", name: str = "mre") -> Number:
     """A metric of a row; None where it is not known."""
     if not row.get("ok"):
         return None
@@ -55,12 +53,12 @@ def main_metric(row: Row, name: str = "mre", method: str = "solution") -> Number
     return get(row, row["presets"][0], method, name)
 
 
-def energy_ratio(row: Row) -> Number:
+def energy_ratio(row: Row, soup: str = "truth") -> Number:
     """E(truth) / E(solution); None where the truth has no soup."""
     energy: Mapping[str, Mapping[str, float]] = row["energy"]
-    if "truth" not in energy or not energy["solution"]["total"]:
+    if soup not in energy or not energy["solution"]["total"]:
         return None
-    return energy["truth"]["total"] / energy["solution"]["total"]
+    return energy[soup]["total"] / energy["solution"]["total"]
 
 
 def pair_names(rows: Sequence[Row]) -> list[str]:

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from soup_nlp.bench.piecewise_planar import fit_planes
+from soup_nlp.bench.depth_maps import fit_planes
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import pixel_grid, rays
@@ -22,6 +23,11 @@ from soup_nlp.geometry.soup import Soup
 
 Float = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+
+LEAST_PIXELS = 6
+"""Fewest true pixels of a superpixel whose plane and motion are fitted."""
+SCALES = np.geomspace(1 / 3, 3, 41)
+"""Factors that `rescaled` tries."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +45,6 @@ class TrueSoup:
     component: NDArray[np.int64]
     known: Bools
     purity: Float
-
-    def __str__(self) -> str:
-        mixed = int((self.purity < 0.95).sum())
-        return (
-            f"TrueSoup({len(self.soup)} superpixels, {self.known.mean():.0%} known, {mixed} mixed)"
-        )
 
 
 def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
@@ -73,7 +73,7 @@ def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
         mine &= truth.components == component[seg.labels]
     if truth.scene_flow is not None:
         mine &= np.isfinite(truth.scene_flow).all(axis=2)
-    known = np.bincount(seg.labels[mine], minlength=n) >= 6
+    known = np.bincount(seg.labels[mine], minlength=n) >= LEAST_PIXELS
     if known.sum() < max(1, n // 2):
         raise DataError(
             "too few superpixels have a truth", where=pair.name, found=int(known.sum()), expected=n
@@ -83,7 +83,8 @@ def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
     m = _facing(m, seg, pair.K_ref, depth)
     R, T, moved = _motions(truth, seg, component, mine, depth, pair.K_ref)
     known &= moved
-    fill = _nearest_known(known, seg)
+    given = np.flatnonzero(known)
+    fill = given[cKDTree(seg.anchors[given]).query(seg.anchors)[1]]
     length = np.linalg.norm(m[fill], axis=1)
     D = 1 / length
     soup = Soup(D, -m[fill] / length[:, None], np.ones(n), R[fill], T[fill] / D[:, None])
@@ -104,10 +105,6 @@ def moves_by_itself(truth: Truth) -> Bools:
         near = np.isclose(truth.motions, truth.motions[0], rtol=0, atol=1e-9).all(axis=(1, 2))
         own[: len(near)] &= ~near[: len(own)]
     return own
-
-
-SCALES = np.geomspace(1 / 3, 3, 41)
-"""Factors that `rescaled` tries."""
 
 
 def rescaled(true: TrueSoup, energy: Callable[[Soup], float]) -> Soup:
@@ -165,28 +162,17 @@ def _motions(
         R[known], T[known] = own[known, :3, :3], own[known, :3, 3]
     if truth.scene_flow is None or known.all():
         return R, T, known
-    use = mine & ~known[seg.labels]
-    which = seg.labels[use]
-    X = depth[use][:, None] * rays(K, pixel_grid(*depth.shape))[use]
-    Y = X + truth.scene_flow[use]
-    count = np.bincount(which, minlength=n)
-    rich = ~known & (count >= 6)
-    total = np.maximum(count, 1)[:, None]
-    a = np.stack([np.bincount(which, X[:, c], n) for c in range(3)], axis=1) / total
-    b = np.stack([np.bincount(which, Y[:, c], n) for c in range(3)], axis=1) / total
-    dx, dy = X - a[which], Y - b[which]
-    cross = np.stack(
-        [np.bincount(which, dy[:, r] * dx[:, c], n) for r in range(3) for c in range(3)], axis=1
-    ).reshape(n, 3, 3)
-    # a flat patch leaves the third direction to the determinant
-    R[rich] = nearest(cross[rich])
-    T[rich] = b[rich] - np.einsum("nij,nj->ni", R[rich], a[rich])
-    return R, T, known | rich
-
-
-def _nearest_known(known: Bools, seg: Segmentation) -> NDArray[np.int64]:
-    from scipy.spatial import cKDTree
-
-    rich = np.flatnonzero(known)
-    _, near = cKDTree(seg.anchors[rich]).query(seg.anchors)
-    return np.asarray(rich[near], np.int64)
+    use = np.flatnonzero(mine & ~known[seg.labels])
+    X = (depth[..., None] * rays(K, pixel_grid(*depth.shape))).reshape(-1, 3)
+    Y = X + truth.scene_flow.reshape(-1, 3)
+    which = seg.labels.ravel()[use]
+    order = np.argsort(which, kind="stable")
+    labels, first = np.unique(which[order], return_index=True)
+    for i, pixels in zip(labels, np.split(use[order], first[1:]), strict=True):
+        if len(pixels) >= LEAST_PIXELS:
+            a, b = X[pixels].mean(axis=0), Y[pixels].mean(axis=0)
+            # on a flat superpixel the determinant decides the third direction
+            R[i] = nearest((Y[pixels] - b).T @ (X[pixels] - a))
+            T[i] = b - R[i] @ a
+            known[i] = True
+    return R, T, known

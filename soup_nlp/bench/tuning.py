@@ -1,24 +1,26 @@
 """Search for defaults: what is varied in which range, scored how, on which pairs; repeatable.
 
 Trial 0 is the default. The first trials fill the ranges evenly (scrambled Sobol sequence), the
-others vary the best so far with a radius that shrinks. The best few are then scored on pairs that
-had no part in the choice. The same seed, pairs and code give the same trials, and rows that are
-already measured are not measured again, so a stopped search goes on.
+others vary the best so far with a radius that shrinks. Two checks follow: one family of pairs at a
+time is left out of the choice, and the best trials are scored on pairs that had no part in it. The
+same seed, pairs and code give the same trials, and an interrupted search can be continued.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
-from soup_nlp.bench.rows import Row, Say, Where, measure_all
+from soup_nlp.bench.rows import MeasureRows, Row, measure_all
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import energy_ratio, main_metric
 from soup_nlp.errors import ConfigError
@@ -27,32 +29,24 @@ Float = NDArray[np.float64]
 
 FAILED = math.log(3.0)
 """Loss of a pair that failed: as if it were three times worse than a constant depth."""
-
 LEAST = 2e-3
 """MRE below which a pair is not worth more."""
-
 ABOVE = 1.10
 """E(truth) / E(solution) up to which nothing is charged."""
+LOSS_ALLOWED = 0.05
+"""Share by which the MRE of a family that was left out may grow."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One setting and its range.
+    """A setting (dotted key), its scale, and its range (low, high) or its choices as YAML.
 
-    Attributes:
-        key: Dotted, as in a problem file.
-        kind: "log", "linear", "int" or "choice".
-        values: (low, high), or the choices as YAML.
+    The scale `kind` is "log", "linear", "int" or "choice".
     """
 
     key: str
     kind: str
     values: tuple[str, ...]
-
-    def __str__(self) -> str:
-        if self.kind == "choice":
-            return f"{self.key} in {{{', '.join(self.values)}}}"
-        return f"{self.key} in [{self.values[0]}, {self.values[1]}], {self.kind}"
 
     def at(self, x: float) -> str:
         """The value at a share x of the range, in [0, 1], as YAML."""
@@ -80,16 +74,15 @@ def parameter(text: str) -> Parameter:
     """
     key, _, rest = text.partition("=")
     kind, *values = rest.split(":")
-    good = bool(key) and kind in ("log", "linear", "int", "choice")
-    if good and kind == "choice":
-        good = len(values) >= 2
-    elif good:
-        try:
+    try:
+        if kind == "choice":
+            good = len(values) >= 2
+        else:
             low, high = (float(v) for v in values)
-            good = low < high and (kind != "log" or low > 0)
-        except ValueError:
-            good = False
-    if not good:
+            good = kind in ("linear", "int", "log") and low < high and (kind != "log" or low > 0)
+    except ValueError:
+        good = False
+    if not good or not key:
         raise ConfigError(
             "not a parameter to search",
             where="--param",
@@ -122,13 +115,9 @@ DEFAULT_SPACE = tuple(
 
 @dataclass(frozen=True)
 class Trial:
-    """One configuration.
+    """One configuration and its rows, one per pair.
 
-    Attributes:
-        name: t000 is the default.
-        overrides: Of every problem; () for the default.
-        unit: (P,) place in the unit cube; NaN for the default.
-        rows: One a pair.
+    The default is t000, without overrides; its place `unit` (P,) in the unit cube is NaN.
     """
 
     name: str
@@ -142,34 +131,71 @@ class Trial:
         return float(np.mean([loss(r) for r in self.rows])) if self.rows else math.inf
 
 
-def loss(row: Row) -> float:
-    """How bad a pair is: ln(MRE / MRE of a constant depth), and what the energy prefers to truth.
+def error(row: Row) -> float:
+    """ln(MRE / MRE of a constant depth); at most `FAILED`, which a pair that failed has.
 
-    The logarithm makes a pair that is twice as good count the same on easy and hard pairs. Where
-    the truth has a soup, ln of E(truth) / E(solution) beyond 1.1 is added: a minimum far from the
-    truth is a wrong model even where this start happens to end well.
+    The logarithm makes a pair that is twice as good count the same on easy and hard pairs.
     """
-    if not row.get("ok"):
-        return FAILED
     own, constant = main_metric(row), main_metric(row, method="constant")
     if own is None or constant is None:
         return FAILED
-    value = min(math.log(max(own, LEAST) / max(constant, LEAST)), FAILED)
-    ratio = energy_ratio(row)
-    if ratio is not None and ratio > ABOVE:
-        value += math.log(ratio / ABOVE)
-    return value
+    return min(math.log(max(own, LEAST) / max(constant, LEAST)), FAILED)
+
+
+def loss(row: Row) -> float:
+    """How bad a pair is: its `error`, and what the energy prefers to the truth.
+
+    Where the truth has a soup, ln of E(truth) / E(solution) beyond 1.1 is added: a minimum far
+    from the truth is a wrong model even where this start happens to end well.
+    """
+    if main_metric(row) is None:
+        return FAILED
+    return error(row) + max(0.0, math.log((energy_ratio(row) or 1.0) / ABOVE))
+
+
+class LeftOut(NamedTuple):
+    """A family of pairs, the best trial on all others, and what it changes on this one.
+
+    The change is that of the family's MRE (geometric mean), relative to the default.
+    """
+
+    family: str
+    trial: str
+    change: float
+
+
+def leave_one_family_out(trials: Sequence[Trial]) -> tuple[LeftOut, ...]:
+    """Every family (sequence of rows) left out of the choice in turn; () where there is only one.
+
+    Args:
+        trials: The default first; all with rows of the same pairs.
+    """
+    families = dict.fromkeys(r["sequence"] for r in trials[0].rows)
+    if len(families) < 2:
+        return ()
+
+    def without(family: str, trial: Trial) -> float:
+        return float(np.mean([loss(r) for r in trial.rows if r["sequence"] != family]))
+
+    def within(family: str, trial: Trial) -> float:
+        return float(np.mean([error(r) for r in trial.rows if r["sequence"] == family]))
+
+    chosen = {f: min(trials, key=partial(without, f)) for f in families}
+    return tuple(
+        LeftOut(f, t.name, math.expm1(within(f, t) - within(f, trials[0])))
+        for f, t in chosen.items()
+    )
+
+
+def accepted(left_out: Sequence[LeftOut]) -> bool:
+    """Whether left-out families gain together and none loses more than `LOSS_ALLOWED`."""
+    changes = [f.change for f in left_out]
+    return bool(changes) and np.log1p(changes).sum() < 0 and max(changes) <= LOSS_ALLOWED
 
 
 @dataclass(frozen=True)
 class Found:
-    """A finished search.
-
-    Attributes:
-        space: Parameters.
-        train: Trials with their rows on the training pairs, in order.
-        validation: The default and the best trials with their rows on the validation pairs.
-    """
+    """All trials on the training pairs, the default and the best ones on the validation pairs."""
 
     space: tuple[Parameter, ...]
     train: tuple[Trial, ...]
@@ -191,9 +217,7 @@ def search(
     finalists: int = 3,
     seed: int = 0,
     overrides: tuple[str, ...] = (),
-    where: Where | None = None,
-    say: Say | None = None,
-    any_code: bool = False,
+    measure_rows: MeasureRows = measure_all,
     measure: Measure = measure_pair,
 ) -> Found:
     """Search and validate.
@@ -207,28 +231,25 @@ def search(
         finalists: So many of the best are validated, and the default.
         seed: Of the trials.
         overrides: Of every problem; trials come after them.
-        where: Processes or cluster.
-        say: Progress.
-        any_code: Also take stored rows of other code versions.
+        measure_rows: Measures the jobs; `measure_all` with its options.
         measure: Makes the row of a pair.
 
     Raises:
-        ConfigError: pairs are missing or stand on both sides, a parameter is wrong, or no trial
-            is to be validated.
+        ConfigError: pairs are missing or stand on both sides, or a parameter is wrong.
     """
-    if finalists < 1:
-        raise ConfigError("no finalist", where="search", found=finalists, expected="at least 1")
     _check(space, train, validation)
 
     def scored(trial: Trial, items: Sequence[Item]) -> Trial:
         whole = (*overrides, *trial.overrides)
         jobs = [pair_job(i, whole, trial.name, measure=measure) for i in items]
-        rows = measure_all(jobs, path, where, say=say, any_code=any_code)
-        return Trial(trial.name, trial.overrides, trial.unit, tuple(rows))
+        return replace(trial, rows=tuple(measure_rows(jobs, path)))
 
     first = Trial("t000", (), np.full(len(space), np.nan))
     done = [scored(first, train)]
-    even = _even(len(space), trials, seed)
+    # half of the trials are spread evenly
+    half = max(1, (trials + 1) // 2)
+    sampler = qmc.Sobol(len(space), scramble=True, rng=np.random.default_rng(seed))
+    even = sampler.random_base2((half - 1).bit_length())[:half]
     for k in range(1, trials + 1):
         unit = _next(k, trials, even, done, seed)
         names = tuple(f"{p.key}={p.at(x)}" for p, x in zip(space, unit, strict=True))
@@ -247,13 +268,6 @@ def _check(space: Sequence[Parameter], train: Sequence[Item], validation: Sequen
     for p in space:
         for x in (0.0, 1.0):
             train[0].problem([f"{p.key}={p.at(x)}"])
-
-
-def _even(dimensions: int, trials: int, seed: int) -> Float:
-    """Half of the trials, spread evenly."""
-    sampler = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
-    count = max(1, (trials + 1) // 2)
-    return np.asarray(sampler.random(1 << (count - 1).bit_length())[:count])
 
 
 def _next(k: int, trials: int, even: Float, done: Sequence[Trial], seed: int) -> Float:
@@ -278,12 +292,12 @@ def split(
     All flows of a pair are on one side.
     """
     real = sorted({i.name for i in items if "seed" not in i.input})
-    odd = set(real[1::2])
-
-    def among(item: Item, own_seeds: Sequence[int], names: set[str]) -> bool:
+    train: list[Item] = []
+    validation: list[Item] = []
+    for item in items:
         seed = item.input.get("seed")
-        return item.name in names if seed is None else seed in own_seeds
-
-    train_seeds = [s for s in seeds if s not in validation_seeds]
-    train = [i for i in items if among(i, train_seeds, set(real) - odd)]
-    return train, [i for i in items if among(i, validation_seeds, odd)]
+        if seed in validation_seeds or (seed is None and real.index(item.name) % 2):
+            validation.append(item)
+        elif seed is None or seed in seeds:
+            train.append(item)
+    return train, validation

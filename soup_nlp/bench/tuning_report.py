@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.stats import spearmanr
 
 from soup_nlp.bench.rows import Row
-from soup_nlp.bench.tables import energy_ratio, joined, made, main_metric, mean, show, table, titles
-from soup_nlp.bench.tuning import ABOVE, FAILED, LEAST, Found, Parameter, Trial, loss
+from soup_nlp.bench.tables import (
+    columns,
+    energy_ratio,
+    joined,
+    made,
+    main_metric,
+    mean,
+    show,
+    table,
+    titles,
+)
+from soup_nlp.bench.tuning import (
+    ABOVE,
+    FAILED,
+    LEAST,
+    LOSS_ALLOWED,
+    Found,
+    Parameter,
+    Trial,
+    accepted,
+    leave_one_family_out,
+    loss,
+)
 
 TOP = 10
 """Trials that the record prints."""
@@ -23,7 +43,25 @@ def text_search(found: Found, command: str) -> str:
         command: How it was started, so that it can be repeated.
     """
     best, default = found.best, found.train[0]
+    own = {t.name: t for t in found.validation}
     rows = [r for t in found.train for r in t.rows]
+    score = (
+        "Mean over pairs of ln(MRE / MRE of a constant depth), MRE under the pair's own convention"
+        f" and at least {LEAST:g}; plus ln(E(truth) / E(solution) / {ABOVE:g}) where the truth has"
+        f" a soup and that is positive; {FAILED:.2f} for a pair that fails. Lower is better;"
+        " -0.69 is half the error of a constant depth."
+    )
+    top = sorted(found.train, key=lambda t: t.loss)[:TOP]
+    sections = {
+        "Score": [score],
+        "What was varied": _varied(found, best),
+        "Trials on the training pairs": _trials(top, default),
+        "One family left out at a time": _left_out(found),
+        "Validation pairs": _trials(found.validation, default) if own else [],
+        "By pair": _by_pair("train", default.rows, best.rows),
+    }
+    if own:
+        sections["By pair"] += ["", *_by_pair("validation", own["t000"].rows, own[best.name].rows)]
     lines = [
         "# Search for defaults",
         "",
@@ -32,36 +70,11 @@ def text_search(found: Found, command: str) -> str:
         f"{made(rows)}.",
         "",
         f"    {command}",
-        "",
-        "## Score",
-        "",
-        "Mean over pairs of ln(MRE / MRE of a constant depth), MRE under the pair's own convention"
-        f" and at least {LEAST:g}; plus ln(E(truth) / E(solution) / {ABOVE:g}) where the truth has"
-        f" a soup and that is positive; {FAILED:.2f} for a pair that fails. Lower is better;"
-        " -0.69 is half the error of a constant depth.",
-        "",
-        "## What was varied",
-        "",
-        *_varied(found, best),
-        "",
-        "## Trials on the training pairs",
-        "",
-        *_trials(sorted(found.train, key=lambda t: t.loss)[:TOP], default),
-        "",
     ]
-    if found.validation:
-        lines += ["## Validation pairs", "", *_trials(found.validation, found.validation[0]), ""]
-    lines += ["## By pair", "", *_by_pair("train", default.rows, best.rows)]
-    if found.validation:
-        own = {t.name: t for t in found.validation}
-        lines += ["", *_by_pair("validation", own["t000"].rows, _winner(found).rows)]
+    for title, text in sections.items():
+        if text:
+            lines += ["", f"## {title}", "", *text]
     return joined(lines)
-
-
-def _winner(found: Found) -> Trial:
-    """The training's best, with its rows on the validation pairs."""
-    own = {t.name: t for t in found.validation}
-    return own[found.best.name]
 
 
 def _verdict(found: Found) -> str:
@@ -72,78 +85,64 @@ def _verdict(found: Found) -> str:
     )
     if not found.validation:
         return f"{text} Nothing was validated."
-    own = _winner(found)
-    before = found.validation[0].loss
-    held = "holds" if own.loss < before else "does not hold"
-    if best.name == "t000":
+    if best.name == default.name:
         return f"{text} The default stays."
-    return f"{text} On the validation pairs {own.loss:.3f} against {before:.3f}: the gain {held}."
+    before, own = ({t.name: t.loss for t in found.validation}[t.name] for t in (default, best))
+    held = "holds" if own < before else "does not hold"
+    return f"{text} On the validation pairs {own:.3f} against {before:.3f}: the gain {held}."
+
+
+def _left_out(found: Found) -> list[str]:
+    """The change on every family of the trial that the other families choose, and the verdict."""
+    families = leave_one_family_out(found.train)
+    if not families:
+        return []
+    changes = [f.change for f in families]
+    whole = np.expm1(np.mean(np.log1p(changes)))
+    text = (
+        "Every family in turn has no part in the choice; MRE (geometric mean of the family) of the"
+        f" trial that the others choose against the default. Together {whole:+.1%}, the worst"
+        f" {max(changes):+.1%}; a change of defaults must gain together and lose at most"
+        f" {LOSS_ALLOWED:.0%} on any family: {'met' if accepted(families) else 'not met'}."
+    )
+    lines = [[f.family, f.trial, f"{f.change:+.1%}"] for f in families]
+    return [text, "", *table(["family left out", "chosen by the others", "change of MRE"], lines)]
 
 
 def _varied(found: Found, best: Trial) -> list[str]:
-    """Ranges, the best value, and how the score moves with each parameter."""
-    tried = found.train[1:]
+    """Ranges, and the best value of every parameter."""
     chosen = dict(o.split("=", 1) for o in best.overrides)
-    entries = [
-        [
-            f"`{p.key}`",
-            p.kind,
-            ", ".join(p.values) if p.kind == "choice" else f"{p.values[0]} to {p.values[1]}",
-            chosen.get(p.key, "default"),
-            _tendency(p, k, tried),
-        ]
-        for k, p in enumerate(found.space)
-    ]
-    head = ["setting", "scale", "range", "best trial", "rank correlation with the score"]
-    return table(head, entries)
-
-
-def _tendency(p: Parameter, k: int, tried: Sequence[Trial]) -> str:
-    """Spearman's correlation of a setting and the loss; positive: larger is worse."""
-    if len(tried) < 5:
-        return "-"
-    x = [t.unit[k] for t in tried]
-    y = [t.loss for t in tried]
-    if np.ptp(x) == 0 or np.ptp(y) == 0:
-        return "-"
-    return f"{float(spearmanr(x, y).statistic):+.2f}"
+    cells: dict[str, Callable[[Parameter], str]] = {
+        "setting": lambda p: f"`{p.key}`",
+        "scale": lambda p: p.kind,
+        "range": lambda p: (", " if p.kind == "choice" else " to ").join(p.values),
+        "best trial": lambda p: chosen.get(p.key, "default"),
+    }
+    return columns(cells, found.space)
 
 
 def _trials(trials: Sequence[Trial], default: Trial) -> list[str]:
-    entries = []
-    for t in trials:
-        good = [r for r in t.rows if r.get("ok")]
-        entries.append(
-            [
-                t.name if t.name != default.name else f"{t.name} (default)",
-                f"{t.loss:.3f}",
-                show(mean(main_metric(r) for r in good)),
-                show(mean(energy_ratio(r) for r in good), ".2f"),
-                str(len(t.rows) - len(good)),
-                " ".join(f"`{o}`" for o in t.overrides) or "-",
-            ]
-        )
-    return table(
-        ["trial", "score", "mean MRE", "E truth / solution", "failed", "settings"], entries
-    )
+    cells: dict[str, Callable[[Trial], str]] = {
+        "trial": lambda t: t.name if t.name != default.name else f"{t.name} (default)",
+        "score": lambda t: f"{t.loss:.3f}",
+        "mean MRE": lambda t: show(mean(main_metric(r) for r in t.rows)),
+        "E truth / solution": lambda t: show(
+            mean(energy_ratio(r) for r in t.rows if r.get("ok")), ".2f"
+        ),
+        "failed": lambda t: str(sum(not r.get("ok") for r in t.rows)),
+        "settings": lambda t: " ".join(f"`{o}`" for o in t.overrides) or "-",
+    }
+    return columns(cells, trials)
 
 
 def _by_pair(side: str, before: Sequence[Row], after: Sequence[Row]) -> list[str]:
-    own = {_name(r): r for r in after}
-    entries = []
-    for title, row in zip(titles(before), before, strict=True):
-        other = own[_name(row)]
-        entries.append(
-            [
-                *[title, side],
-                show(main_metric(row, method="constant")),
-                *[show(main_metric(r)) for r in (row, other)],
-                *[f"{loss(r):.3f}" for r in (row, other)],
-            ]
-        )
+    entries = [
+        [
+            *(title, side, show(main_metric(old, method="constant"))),
+            *(show(main_metric(r)) for r in (old, new)),
+            *(f"{loss(r):.3f}" for r in (old, new)),
+        ]
+        for title, old, new in zip(titles(before), before, after, strict=True)
+    ]
     head = ["pair, flow", "side", "constant", "MRE default", "MRE best", "score default", "best"]
     return table(head, entries)
-
-
-def _name(row: Row) -> str:
-    return f"{row['suite']} {row['pair']} {row['flow']}"

@@ -8,8 +8,7 @@ from collections.abc import Callable, Sequence
 import typer
 
 from soup_nlp.cli import bench_all, bench_studies
-from soup_nlp.cli.bench_accuracy import accuracy
-from soup_nlp.cli.bench_search import search
+from soup_nlp.cli.bench_accuracy import accuracy, search
 from soup_nlp.cli.bench_speed import speed
 from soup_nlp.cli.compare import compare
 from soup_nlp.cli.problems import export, list_, show

@@ -26,7 +26,7 @@ class StartOptions(Section):
     """At most this many unexplained pieces are looked at in a round."""
     piece_size: Whole = 4
     """A piece has at least this many superpixels."""
-    bending: NonNegative = 0.25
+    bending: NonNegative = 0.18
     """Surfaces are taken to bend where more than this share of the superpixels moves otherwise
     than most of its own surface; 1 for never."""
     discontinuity_px: NonNegative = 1.0
