@@ -26,6 +26,8 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.storage.versions import code_version
 
+pytestmark = pytest.mark.slow
+
 QUICK = (
     "segmentation.superpixels=40",
     "segmentation.neighbours=6",

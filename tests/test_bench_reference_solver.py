@@ -19,6 +19,8 @@ from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 
+pytestmark = pytest.mark.slow
+
 SCHEDULE = (0.1, 0.03)
 # so small a problem is solved before its kernels are compiled
 FORM = Formulation(compiled=False)

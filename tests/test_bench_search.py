@@ -46,6 +46,8 @@ from soup_nlp.cli.main import main
 from soup_nlp.cli.options import Progress
 from soup_nlp.errors import ConfigError, DataError
 
+pytestmark = pytest.mark.slow
+
 QUICK = (
     "segmentation.superpixels=40",
     "segmentation.neighbours=6",

@@ -19,6 +19,8 @@ from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.solve.solver_options import SolverOptions
 
+pytestmark = pytest.mark.slow
+
 EXPONENT = 1.3
 
 

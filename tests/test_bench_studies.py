@@ -14,6 +14,8 @@ from soup_nlp.bench.study_parts import CUT_OFF
 from soup_nlp.cli.bench_all import COMMANDS
 from soup_nlp.cli.main import app, main
 
+pytestmark = pytest.mark.slow
+
 
 def square(number: int, breaks: bool = False) -> Row:
     """A row that another process makes."""
@@ -41,7 +43,6 @@ def test_a_study_writes_its_table_and_goes_on_where_it_was(tmp_path):
     assert len(read_rows(page.with_suffix(".jsonl"))) == 3
 
 
-@pytest.mark.slow
 def test_components_that_the_border_cuts_off(tmp_path):
     rows = run_study(CUT_OFF, tmp_path, grid(scene=["street"], seed=[1], superpixels=[40]))
     assert [r["ok"] for r in rows] == [True], [r["error"] for r in rows]

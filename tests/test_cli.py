@@ -22,6 +22,8 @@ from soup_nlp.errors import ConfigError
 from soup_nlp.pipeline.run import run, solve_pair
 from soup_nlp.report.check import check_folder
 
+pytestmark = pytest.mark.slow
+
 SMALL = [
     "--set", "input.width=192", "--set", "input.height=128",
     "--set", "segmentation.superpixels=50", "--set", "segmentation.neighbours=8",

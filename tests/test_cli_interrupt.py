@@ -19,6 +19,8 @@ from soup_nlp.pipeline.run import StoppedError, run
 from soup_nlp.report import folder as folders
 from soup_nlp.solve.interrupt import interruptible
 
+pytestmark = pytest.mark.slow
+
 ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
 SMALL = [
     "--set", "input.width=160", "--set", "input.height=120", "--set", "flow.source=truth",

@@ -15,6 +15,8 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.datasets.layout import MARK
 from soup_nlp.data.scenes.catalogue import render_scene
 
+pytestmark = pytest.mark.slow
+
 ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
 SMALL = [
     "--set", "input.width=160", "--set", "input.height=120", "--set", "refine.enabled=false",

@@ -26,6 +26,8 @@ from soup_nlp.errors import SolverError
 from soup_nlp.export.verify import Limits, examine
 from soup_nlp.model.formulation import Formulation
 
+pytestmark = pytest.mark.slow
+
 PROBLEMS = Path(__file__).parent.parent / "problems"
 MANY = 1 << 30
 LABEL = {

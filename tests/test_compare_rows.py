@@ -26,6 +26,8 @@ from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
 
+pytestmark = pytest.mark.slow
+
 SMALL = [
     "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",
     "--set", "segmentation.neighbours=4", "--set", "energy.pixel_samples=4",

@@ -22,6 +22,8 @@ from soup_nlp.solve.line_search import Search, along, evaluate, reach
 from soup_nlp.solve.phase import Phase
 from soup_nlp.solve.tangent_problem import TangentProblem
 
+pytestmark = pytest.mark.slow
+
 FORM = Formulation(compiled=False)
 INVERSE: Chart = "inverse-depth"
 PHASES = (

@@ -25,6 +25,8 @@ from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.stages import solve_soup
 
+pytestmark = pytest.mark.slow
+
 PROBLEMS = Path(__file__).parent.parent / "problems"
 TINY = [
     "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",

@@ -18,6 +18,8 @@ from soup_nlp.errors import ExportError
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.sol import write_sol
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_casadi_format_includes_the_start(tmp_path):
     assert write(tmp_path, "--superpixels", "9", "--format", "casadi") == 0

@@ -34,6 +34,8 @@ from soup_nlp.model.norms import Norm, smooth_min, solver_form
 from soup_nlp.model.superpixel import tangent_view
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
+pytestmark = pytest.mark.slow
+
 UNITS = ("paper", "pixels")
 NORMS = ("smooth", "epigraph")
 TRUNCATIONS = ("smooth", "lifted")
@@ -304,7 +306,6 @@ def assert_twins(a: NLP, b: NLP, x: np.ndarray) -> None:
             np.testing.assert_allclose(p, q, rtol=1e-12, atol=1e-12 * np.abs(q).max())
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
 def test_machine_code_equals_the_virtual_machine_and_is_cached(own_cache):
     problem, weights = tiny("pixels"), weights_for("pixels")
@@ -320,7 +321,6 @@ def test_machine_code_equals_the_virtual_machine_and_is_cached(own_cache):
     assert {p: p.stat().st_mtime_ns for p in own_cache.glob("*")} == stamps
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
 def test_machine_code_of_the_presolve_equals_the_virtual_machine(own_cache):
     problem, weights = tiny("pixels"), weights_for("pixels")

@@ -28,6 +28,8 @@ from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.nlp import NLP
 
+pytestmark = pytest.mark.slow
+
 FORMS = [
     Formulation(gauge=g, norm=n, truncation=t, hessian="exact", compiled=False)
     for g, n, t in itertools.product(GAUGES, ("smooth", "epigraph"), ("smooth", "lifted"))

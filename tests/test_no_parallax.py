@@ -18,6 +18,8 @@ from soup_nlp.report.verdict import verdict
 from soup_nlp.start.components import rigid_components
 from soup_nlp.start.propose import propose
 
+pytestmark = pytest.mark.slow
+
 K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
 
 

@@ -18,6 +18,8 @@ from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import pixel_grid, project, rays
 
+pytestmark = pytest.mark.slow
+
 CHANGED = [v for v in VIEWS.values() if v is not None]
 
 

@@ -19,6 +19,8 @@ from soup_nlp.refine.particles import KINDS
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.report.check import check_folder
 
+pytestmark = pytest.mark.slow
+
 ORBIT = Path(__file__).parent.parent / "problems" / "orbit.yaml"
 SMALL = [
     "--set", "input.width=160", "--set", "input.height=96",

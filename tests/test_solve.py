@@ -37,11 +37,14 @@ from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.propose import propose
 
+pytestmark = pytest.mark.slow
+
 WEIGHTS = Weights(
     arap=0.15,
     proj=1.0,
     cont=3e-3,
     orient=5e-2,
+    prior=0.0,
     sigma_cont=1.0,
     sigma_cont_ref=np.inf,
     sigma_orient=0.5,

@@ -175,7 +175,7 @@ def test_a_rigid_plane_has_no_energy_at_the_truth(name, units, at_anchors):
 def test_the_truth_of_a_rigid_plane_is_stationary_in_every_form(name, norm, truncation):
     soup, data = world(name, "pixels", False)
     # a plane that is slanted has relief
-    flat = replace(PAPER, prior=0.0)
+    flat = PAPER.replace(prior=0.0)
     for gauge in GAUGES:
         nlp, layout = build_matrix_nlp(
             soup, data, flat, form(gauge=gauge, norm=norm, truncation=truncation, eps=0.03)

@@ -25,6 +25,8 @@ from soup_nlp.solve.hessian import LagrangianHessian
 from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.tangent_problem import TangentProblem
 
+pytestmark = pytest.mark.slow
+
 needs_compiler = pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
 
 
@@ -224,7 +226,6 @@ def test_an_assembled_program_is_not_assembled_again(monkeypatch):
 # --- the cache, and where there is no way --------------------------------------------------------
 
 
-@pytest.mark.slow
 @needs_compiler
 def test_kernels_serve_another_camera(case, own_cache):
     TangentProblem(case.soup, case.data, case.weights, Formulation())
