@@ -103,12 +103,14 @@ def refinement(r: Refined) -> list[str]:
         return [f"refinement: {r.status} before its first round"]
     last = r.rounds[-1]
     fall = 1 - r.energy["total"] / r.energy_begin["total"]
-    images = " with images" if "photo" in r.energy else ""
+    images = " with E_photo" if "photo" in r.energy else ""
     lines = [
         f"refinement {len(r.rounds)} rounds ({r.status}): E{images} {fall:.1%} lower; the last"
         f" choice is at most {max(last.gap, 0) / last.mrf_energy:.2%} above the best among its"
         " particles"
     ]
+    if images:
+        lines.append("E alone may rise: the images outweigh the flow where they contradict it")
     if r.polish_gain is not None:
         lines.append(f"polish by the NLP: E {r.polish_gain:.3g} lower")
     return lines
