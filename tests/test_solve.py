@@ -44,7 +44,6 @@ WEIGHTS = Weights(
     proj=1.0,
     cont=3e-3,
     orient=5e-2,
-    prior=0.0,
     sigma_cont=1.0,
     sigma_cont_ref=np.inf,
     sigma_orient=0.5,
@@ -360,7 +359,7 @@ def test_a_rigid_plane_is_recovered_from_a_disturbed_start(slanted, gauge, kind)
     """E >= 0 and E = 0 at the truth: the optimum is known."""
     truth, data = slanted
     start = disturbed(truth, 0.05)
-    weights = PAPER.replace(cont=0.05, sigma_cont=np.inf, sigma_orient=0.5, proj=1.0)
+    weights = PAPER.replace(cont=0.05, prior=0.0, sigma_cont=np.inf, sigma_orient=0.5, proj=1.0)
     options = OPTIONS.replace(tol=1e-6, presolve_tol=1e-5, max_iter=200)
     solution = solve_soup(start, data, weights, form(gauge=gauge, hessian=kind), options)
     before, after = solution.energy_start["total"], solution.energy["total"]
