@@ -17,6 +17,8 @@ from soup_nlp.pipeline.run import Run, solve_pair
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 
+pytestmark = pytest.mark.slow
+
 # the flow is exact, and not that of the images
 OPTIONS = {"segmentation": {"superpixels": 100, "neighbours": 8}, "refine": {"photo": 0.0}}
 

@@ -96,6 +96,7 @@ def test_labels_of_another_size_are_refused():
         follow_flow(grid()[1:], two_motions())
 
 
+@pytest.mark.slow
 def test_a_problem_has_fewer_mixed_superpixels_with_it_than_without():
     scene = {"kind": "scene", "scene": "orbit", "seed": 3, "width": 384, "height": 164}
     share = {}
