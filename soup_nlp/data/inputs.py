@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,12 +30,12 @@ Camera = Annotated[list[Finite], Field(min_length=4, max_length=4)]
 White = Annotated[int, Field(ge=1, le=65535)]
 
 
-class PairInput(Section):
+class PairInput(Section, ABC):
     """Base of every kind of input."""
 
+    @abstractmethod
     def load(self, path: Resolve) -> Pair:
         """The pair, without its flow; `path` resolves the names of files."""
-        raise NotImplementedError
 
     def files(self) -> list[str]:
         """Names of the files and folders that are read."""
