@@ -119,7 +119,7 @@ def scales(z, own, far=0.01, **options):
     facing, still = np.tile([0, 0, -1.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
     moved = np.where(np.ravel(own), far, 1.0)[:, None] * [n, 0.0, 0.0]
     soup = Soup(np.full(n, 1 / n), facing, n * np.ravel(z), still, moved)
-    found = contact_scales(soup, np.ravel(own).astype(np.int64), seg, K, **options)
+    found, _ = contact_scales(soup, np.ravel(own).astype(np.int64), seg, K, **options)
     return found.reshape(rows, columns)
 
 

@@ -18,7 +18,7 @@ from soup_nlp.start import choice as choosing
 from soup_nlp.start import merge as gathering
 from soup_nlp.start import propose as proposing
 from soup_nlp.start.choice import Choice, of_neighbourhoods, of_pieces, select
-from soup_nlp.start.components import borrow, contact_scales, depth_from_inside
+from soup_nlp.start.components import TIES, borrow, contact_scales, depth_from_inside
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.plane_fit import PlaneFit
 from soup_nlp.start.propose import propose
@@ -253,8 +253,10 @@ def test_what_is_lowest_in_a_component_places_it():
     ground = [2.0, 2, 1.2, 1.2, 1.2, 2, 2]
     z = np.array([[9.0] * 7, [9, 1, 1, 1, 1, 1, 9], gap, ground, ground])
     own = z == 1
-    found = contact_scales(facing(z.ravel()), own.ravel().astype(int), cells(5, 7), K)
+    found, tie = contact_scales(facing(z.ravel()), own.ravel().astype(int), cells(5, 7), K)
     np.testing.assert_allclose(found.reshape(z.shape), np.where(own, 2.0, 1.0), rtol=1e-12)
+    named = np.array(TIES)[tie].reshape(z.shape)
+    assert (named == np.where(own, "contact below", "reference")).all()
 
 
 def test_superpixels_of_hardly_any_confidence_borrow():

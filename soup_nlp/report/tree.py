@@ -64,6 +64,12 @@ _START: Table = {
     "motion": ("1", "N", "dominant motion, -1 for its own"),
     "component": ("1", "N", "rigid component"),
     "surface": ("1", "N", "region without a flow discontinuity"),
+    "tie": (
+        "1",
+        "N",
+        "what gives its component a scale: 0 largest, 1 contact below, 2 outline,"
+        " 3 cut off below, 4 nothing",
+    ),
     "bending_share": ("1", "", "share that moves unlike most of its surface"),
     "bending": ("1", "", "surfaces are taken to bend"),
 }

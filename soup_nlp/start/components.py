@@ -102,6 +102,9 @@ BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 UNKNOWN = np.log(100.0)
 """Contact and pace that differ by more, in logarithms, say nothing: the camera is at rest."""
+TIES = ("reference", "contact below", "outline", "cut off below", "nothing")
+"""What gives a component its scale: it is the largest one, which has the scene's; it stands on what
+is below it; it touches what is around it; the lower border hides what it stands on; or nothing."""
 UNSUPPORTED = 1e-6
 """Added to the share of a component's support that is placed: without any, longer contacts
 first."""
@@ -145,8 +148,8 @@ def outlines(label: Int, seg: Segmentation) -> Outlines:
 
 def contact_scales(
     soup: Soup, label: Int, seg: Segmentation, K_ref: Float, upright: bool = True
-) -> Float:
-    """(N,) relative scale of every component, such that components touch what is around them.
+) -> tuple[Float, Int]:
+    """Relative scale of every component, such that components touch what is around them.
 
     A component stands on what is below it: in an upright image its scale is the middle of the depth
     ratios where a neighbour lies below, which count by the square of how low they are in the
@@ -166,18 +169,24 @@ def contact_scales(
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
         upright: Whether the image's columns run down.
+
+    Returns:
+        (N,) scale of every superpixel's component, and (N,) what gave it, an index of `TIES`.
     """
     count = int(label.max()) + 1
     log_scale = np.zeros(count)
+    largest = int(np.argmax(np.bincount(label, minlength=count)))
+    tie = np.full(count, TIES.index("nothing"))
+    tie[largest] = TIES.index("reference")
     if count == 1 or not len(seg.pairs):
-        return np.ones(len(soup))
+        return np.ones(len(soup)), tie[label]
     zi, zk = depth_from_inside(soup, label, seg, K_ref)
     ratio = np.log(np.concatenate([zk / zi, zi / zk]))
     a, b, contact, below, weight, _ = outlines(label, seg)
     below = below & upright
     support = np.bincount(a[below], weight[below], minlength=count)
     placed = np.zeros(count, bool)
-    placed[np.argmax(np.bincount(label, minlength=count))] = True
+    placed[largest] = True
     while not placed.all():
         touch = ~placed[a] & placed[b]
         if not touch.any():
@@ -195,12 +204,16 @@ def contact_scales(
                 _quantile(value[ground], weight[ground], GROUND),
                 _quantile(value[mine], contact[mine], MOST),
             )
+            tie[c] = TIES.index("contact below")
         else:
             log_scale[c] = _quantile(value[mine], contact[mine], OUTLINE)
+            tie[c] = TIES.index("outline")
         placed[c] = True
     if upright:
-        log_scale -= nearer_where_cut_off(soup, label, log_scale, seg, K_ref)
-    return np.exp(log_scale)[label]
+        nearer = nearer_where_cut_off(soup, label, log_scale, seg, K_ref)
+        log_scale -= nearer
+        tie[nearer > 0] = TIES.index("cut off below")
+    return np.exp(log_scale)[label], tie[label]
 
 
 def nearer_where_cut_off(

@@ -52,6 +52,7 @@ class Start:
         motions: The dominant motions.
         surface: (N,) group that hangs together: the flow does not tear inside it; where surfaces
             bend it mostly tears along the outline.
+        tie: (N,) what gives the component of every superpixel its scale, an index of `TIES`.
         bending_share: Share of the superpixels that move otherwise than most of their surface.
         bending: Whether surfaces are taken to bend: all are one component at a constant depth.
     """
@@ -64,6 +65,7 @@ class Start:
     component: Int
     motions: list[Motion]
     surface: Int
+    tie: Int
     bending_share: float = 0.0
     bending: bool = False
 
@@ -122,7 +124,8 @@ def propose(
         soup, error = constant_depth(views)
         none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
         parallax, surface = _parallax(soup, views), surfaces(jump, seg, o.discontinuity_px)
-        return Start(soup, error, parallax, every, none, none + 1, motions, surface, share, True)
+        zero = none + 1
+        return Start(soup, error, parallax, every, none, zero, motions, surface, zero, share, True)
     choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
     own, label, parallax = choice.fit, choice.label, choice.parallax
     mu, slope = own.inverse_depth[:, 0], own.slope[:, 0]
@@ -140,9 +143,10 @@ def propose(
     t = choice.t * length[:, None]
     soup = _soup(mu, slope, choice.R, t, views.anchor, views.radius)
     component = rigid_components(label, seg)
-    scale = contact_scales(soup, component, seg, K_ref, o.upright)
+    scale, tie = contact_scales(soup, component, seg, K_ref, o.upright)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t).normalised()
-    return Start(soup, own.cost[:, 0], parallax, weak, label, component, motions, surface, share)
+    error = own.cost[:, 0]
+    return Start(soup, error, parallax, weak, label, component, motions, surface, tie, share)
 
 
 def look(
