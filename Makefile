@@ -1,11 +1,11 @@
-# make demo: solve the embedded default;  make test: lint, types, tests;  make quick: the fast tests;
+# make demo: solve a real pair and a rendered one;  make test: lint, types, tests;  make quick: the fast tests;
 # make docs: the documentation;  make results: every table and picture of results/ again (hours;
 # DATA=folder of the real pairs).
 # Needs Python 3.11+ only.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-OUT ?= out/motorcycle
+OUT ?= out/demo
 
 .PHONY: demo test quick lint docs results clean
 .DEFAULT_GOAL := demo
@@ -21,7 +21,7 @@ $(VENV)/.optional: $(VENV)/.installed
 		|| echo "optional packages could not be installed: their tests skip"
 
 demo: $(VENV)/.installed
-	$(BIN)/soup-nlp solve problems/motorcycle.yaml --out $(OUT)
+	$(BIN)/soup-nlp demo --out $(OUT)
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

@@ -1,12 +1,23 @@
 """Superpixel Soup as a nonlinear program: dense 3D of a dynamic scene from two frames."""
 
-from soup_nlp.config.problem import Problem, load_problem, make_problem
-from soup_nlp.data.pair import Flow, Pair, Truth
-from soup_nlp.errors import SoupError
-from soup_nlp.evaluate.scoring import evaluate
-from soup_nlp.geometry.soup import Reconstruction, Soup
-from soup_nlp.pipeline import Run, run, solve_pair
-from soup_nlp.storage.versions import __version__
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+# the room first: a later import of it would take the place of the function of the same name
+import soup_nlp.evaluate  # noqa: F401
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from soup_nlp.config.problem import Problem, load_problem, make_problem
+    from soup_nlp.data.pair import Flow, Pair, Truth
+    from soup_nlp.errors import SoupError
+    from soup_nlp.evaluate.metrics import DepthMetrics, Scale
+    from soup_nlp.geometry.soup import Reconstruction, Soup
+    from soup_nlp.pipeline import Run, run, solve_pair
+    from soup_nlp.storage.versions import __version__
 
 __all__ = [
     "Flow",
@@ -24,3 +35,48 @@ __all__ = [
     "run",
     "solve_pair",
 ]
+
+_HOMES = {
+    "Flow": "data.pair",
+    "Pair": "data.pair",
+    "Problem": "config.problem",
+    "Reconstruction": "geometry.soup",
+    "Run": "pipeline",
+    "Soup": "geometry.soup",
+    "SoupError": "errors",
+    "Truth": "data.pair",
+    "__version__": "storage.versions",
+    "load_problem": "config.problem",
+    "make_problem": "config.problem",
+    "run": "pipeline",
+    "solve_pair": "pipeline",
+}
+"""Module of every public name; it is imported when the name is first used."""
+
+
+def evaluate(
+    folder: str | Path,
+    depth: str | Path,
+    *,
+    scale: Scale = "median",
+    cap: float | None = None,
+    depth_scale: float = 1000.0,
+) -> dict[str, DepthMetrics]:
+    """Score the depth of a result folder against a truth file; see `evaluate.scoring.evaluate`."""
+    from soup_nlp.evaluate import scoring
+
+    return scoring.evaluate(folder, depth, scale=scale, cap=cap, depth_scale=depth_scale)
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, from its module."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    """Public names beside what is loaded."""
+    return sorted({*globals(), *__all__})

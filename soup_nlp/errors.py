@@ -58,3 +58,7 @@ class SolverError(SoupError):
 
 class ExportError(SoupError):
     """A file for, or from, another solver is wrong."""
+
+
+class StoppedError(SoupError):
+    """A run was told to stop before it had a start, so that there is nothing to keep."""

@@ -14,8 +14,9 @@ from soup_nlp.cli import solve as solve_module
 from soup_nlp.config.problem import load_problem
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import SceneInput
+from soup_nlp.errors import StoppedError
 from soup_nlp.pipeline import case as cases
-from soup_nlp.pipeline.run import StoppedError, run
+from soup_nlp.pipeline.run import run
 from soup_nlp.report import folder as folders
 from soup_nlp.solve.interrupt import interruptible
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import shutil
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -49,32 +48,30 @@ COMMANDS = (
 """What is run, in this order."""
 
 
-def command(main: Callable[[Sequence[str]], int]) -> Callable[..., None]:
-    """The command; it runs others through `main`."""
+def everything(
+    data: Data = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder.")] = Path("results"),
+    dry: Annotated[bool, typer.Option(help="Print the commands only.")] = False,
+) -> None:
+    """Make every table and picture of results/ again; a run that was stopped goes on."""
+    # it runs the other commands, and main knows this one
+    from soup_nlp.cli.main import main
 
-    def everything(
-        data: Data = None,
-        out: Annotated[Path, typer.Option("--out", "-o", help="Folder.")] = Path("results"),
-        dry: Annotated[bool, typer.Option(help="Print the commands only.")] = False,
-    ) -> None:
-        """Make every table and picture of results/ again; a run that was stopped goes on."""
-        ended = {}
-        for text in COMMANDS:
-            if "{data}" in text and data is None:
-                text = text.replace("--suite shared --data {data}", "")
-                if "--suite" not in text:
-                    continue
-            words = [w.format(out=out, data=data) for w in shlex.split(text)]
-            print(f"soup-nlp {shlex.join(words)}", flush=True)
-            if not dry:
-                ended[shlex.join(words)] = main(words)
-        if dry:
-            return
-        overview = Path("out/motorcycle/overview.png")
-        if overview.is_file():
-            shutil.copy(overview, out / "motorcycle.png")
-        bad = [f"{words}: exit code {code}" for words, code in ended.items() if code]
-        print("\n".join(bad) or "every command ended well")
-        raise typer.Exit(1 if bad else 0)
-
-    return everything
+    ended = {}
+    for text in COMMANDS:
+        if "{data}" in text and data is None:
+            text = text.replace("--suite shared --data {data}", "")
+            if "--suite" not in text:
+                continue
+        words = [w.format(out=out, data=data) for w in shlex.split(text)]
+        print(f"soup-nlp {shlex.join(words)}", flush=True)
+        if not dry:
+            ended[shlex.join(words)] = main(words)
+    if dry:
+        return
+    overview = Path("out/motorcycle/overview.png")
+    if overview.is_file():
+        shutil.copy(overview, out / "motorcycle.png")
+    bad = [f"{words}: exit code {code}" for words, code in ended.items() if code]
+    print("\n".join(bad) or "every command ended well")
+    raise typer.Exit(1 if bad else 0)

@@ -3,22 +3,80 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
-from soup_nlp.cli import bench_all, bench_studies
-from soup_nlp.cli.bench_accuracy import accuracy, search
-from soup_nlp.cli.bench_speed import speed
-from soup_nlp.cli.compare import compare
-from soup_nlp.cli.problems import export, list_, show
-from soup_nlp.cli.results import check, evaluate, import_
-from soup_nlp.cli.solve import solve
-from soup_nlp.errors import SoupError
-from soup_nlp.pipeline.run import StoppedError
+from soup_nlp.errors import SoupError, StoppedError
+from soup_nlp.storage.versions import __version__
 
 ABORTED = 130
 """Exit code of what Ctrl-C ended without a result, as shells have it."""
+
+COMMANDS: Mapping[str, tuple[str, str]] = {
+    "solve": ("solve:solve", "Solve a pair of frames and write a result folder."),
+    "demo": ("demo:demo", "Solve a real pair and a rendered street in which cars move."),
+    "check": (
+        "results:check",
+        "Recompute energy, constraints and metrics of a result, or the constraints of a .sol.",
+    ),
+    "evaluate": ("results:evaluate", "Score a result against a truth file."),
+    "show": ("problems:show", "Print the merged problem and its hash."),
+    "list": ("problems:list_", "Print the problems that come with the package, or of a folder."),
+    "export": (
+        "problems:export",
+        "Write the NLP for other solvers; several sizes or formulations make a folder each.",
+    ),
+    "import": (
+        "results:import_",
+        "Make a result folder of a foreign solver's answer: depth maps, points, residuals.",
+    ),
+    "compare": (
+        "compare:compare",
+        "Run real solvers on problems, verify their claims, write table and profiles.",
+    ),
+}
+"""Commands: module and function under `soup_nlp.cli`, and the first line of its docstring."""
+
+BENCH: Mapping[str, tuple[str, str]] = {
+    "accuracy": (
+        "bench_accuracy:accuracy",
+        "Depth against truth on a suite of pairs; interrupted runs can be continued.",
+    ),
+    "speed": (
+        "bench_speed:speed",
+        "Time the solver over N and K, each run in a process of its own; resumes what is stored.",
+    ),
+    "search": (
+        "bench_accuracy:search",
+        "Search for better defaults and check them on pairs and families that did not choose.",
+    ),
+    "refine": (
+        "bench_studies:refine",
+        "What NLP and refinement contribute: E and MRE of start, either alone and both.",
+    ),
+    "methods": (
+        "bench_studies:methods",
+        "How low every method ends on one energy, before and after refinement.",
+    ),
+    "formulations": (
+        "bench_studies:formulations",
+        "Every gauge, norm and truncation of the constrained NLP: which converge.",
+    ),
+    "cut-off": (
+        "bench_studies:cut_off",
+        "Depth of components that the lower border cuts off, by contact alone and as shipped.",
+    ),
+    "trws": ("bench_studies:trws", "Time and memory of TRW-S at the size of a refinement."),
+    "all": (
+        "bench_all:everything",
+        "Make every table and picture of results/ again; a run that was stopped goes on.",
+    ),
+}
+"""The same of `soup-nlp bench`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,37 +116,58 @@ def _aborted() -> int:
     return ABORTED
 
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    help="Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.",
+class LazyGroup(TyperGroup):
+    """A group that imports a command when it is called; `--help` needs names and sentences only."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """The command that the arguments name, imported, and the arguments that are its own."""
+        name, command, rest = super().resolve_command(ctx, args)
+        homes = BENCH if self.name == "bench" else COMMANDS
+        if name is not None and name in homes:
+            command = _load(name, homes[name][0])
+        return name, command, rest
+
+
+def _load(name: str, home: str) -> Any:
+    """The command of a function such as "solve:solve"."""
+    module, _, function = home.partition(":")
+    alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    alone.command(name=name)(getattr(import_module(f"soup_nlp.cli.{module}"), function))
+    return typer.main.get_command(alone)
+
+
+def _group(text: str, commands: Mapping[str, tuple[str, str]], **options: Any) -> typer.Typer:
+    """A group of commands that are not imported yet."""
+    group = typer.Typer(
+        cls=LazyGroup, no_args_is_help=True, pretty_exceptions_enable=False, help=text, **options
+    )
+    for name, (_, line) in commands.items():
+        group.command(name=name, help=line)(_stand_in)
+    return group
+
+
+def _stand_in() -> None:
+    """Takes a command's place until it is called."""
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"soup-nlp {__version__}")
+        raise typer.Exit()
+
+
+app = _group(
+    "Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.",
+    COMMANDS,
 )
-bench = typer.Typer(no_args_is_help=True, help="Measure over many runs; tables, plots and gates.")
-COMMANDS: dict[typer.Typer, dict[str, Callable[..., None]]] = {
-    app: {
-        "solve": solve,
-        "check": check,
-        "evaluate": evaluate,
-        "show": show,
-        "list": list_,
-        "export": export,
-        "import": import_,
-        "compare": compare,
-    },
-    bench: {
-        "accuracy": accuracy,
-        "speed": speed,
-        "search": search,
-        "refine": bench_studies.refine,
-        "methods": bench_studies.methods,
-        "formulations": bench_studies.formulations,
-        "cut-off": bench_studies.cut_off,
-        "trws": bench_studies.trws,
-        "all": bench_all.command(main),
-    },
-}
-for group, commands in COMMANDS.items():
-    for name, function in commands.items():
-        group.command(name=name)(function)
-app.add_typer(bench, name="bench")
+app.add_typer(_group("Measure over many runs; tables, plots and gates.", BENCH), name="bench")
+
+
+@app.callback()
+def every(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+    ] = False,
+) -> None:
+    """Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program."""

@@ -17,7 +17,8 @@ from soup_nlp.errors import ConfigError
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Output folder.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
-Problem = Annotated[Path, typer.Argument(help="Problem file.")]
+PROBLEM = "Problem file, or a name that `soup-nlp list` shows."
+Problem = Annotated[Path, typer.Argument(help=PROBLEM)]
 Presolve = Annotated[
     bool, typer.Option(help="Start where the tangent presolve ends, not at the proposal.")
 ]

@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 
 from soup_nlp.cli.options import Formulations, Out, Presolve, Problem, Quiet, Set, Superpixels
-from soup_nlp.config.problem import dump_problem, load_problem
-from soup_nlp.data.scenes.catalogue import SCENES
+from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
+from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_formulation
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.folder import prepare_folder
@@ -24,16 +24,19 @@ def show(problem: Problem, overrides: Set = None) -> None:
 
 
 def list_(
-    folder: Annotated[Path, typer.Argument(help="Folder of problem files.")] = Path("problems"),
+    folder: Annotated[
+        Path | None, typer.Argument(help="Folder of problem files instead of the package's own.")
+    ] = None,
 ) -> None:
-    """Print the problem files of a folder and the rendered scenes."""
-    for path in sorted(folder.glob("*.yaml")):
+    """Print the problems that come with the package, or of a folder."""
+    if folder is not None and not folder.is_dir():
+        raise ConfigError("no such folder", where=folder, hint="soup-nlp list without a folder")
+    files = {str(p): p for p in sorted(folder.glob("*.yaml"))} if folder else shipped_problems()
+    for name, path in files.items():
         first = path.read_text(encoding="utf-8").partition("\n")[0]
-        print(f"{path!s:<28} {first.removeprefix('#').strip() if first[:1] == '#' else ''}")
-    if folder.is_dir():
-        print()
-    for name, text in SCENES.items():
-        print(f"scene {name:<22} {text}")
+        print(f"{name:<14} {first.removeprefix('#').strip() if first[:1] == '#' else ''}")
+    if folder is None:
+        print("\nsoup-nlp solve NAME; templates take --set input.root=FOLDER")
 
 
 def export(

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from soup_nlp.cli.options import Out, Set
+from soup_nlp.cli.options import PROBLEM, Out, Set
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
 from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
@@ -68,7 +68,7 @@ class SolveLog:
 
 
 def solve(
-    problem: Annotated[Path | None, typer.Argument(help="Problem file, see problems/.")] = None,
+    problem: Annotated[Path | None, typer.Argument(help=PROBLEM)] = None,
     out: Out = Path("out/run"),
     overrides: Set = None,
     ref: Annotated[str | None, typer.Option(help="Reference image.")] = None,
@@ -110,7 +110,8 @@ def solve(
     else:
         chosen = _from_file(problem, pair, flow, overrides)
     # a problem file's expectation is of the file without overrides
-    _run(chosen, out, quiet, None if overrides else chosen.expected.mre_at_most)
+    limit = None if overrides else chosen.expected.mre_at_most
+    raise typer.Exit(solve_problem(chosen, out, quiet, limit))
 
 
 def _from_file(
@@ -141,7 +142,7 @@ def _from_options(
             "nothing to solve",
             found="no problem file",
             expected="PROBLEM.yaml, or --ref, --next and --intrinsics",
-            hint="soup-nlp solve problems/motorcycle.yaml --out out/motorcycle",
+            hint="soup-nlp demo, or soup-nlp solve motorcycle --out out/motorcycle",
         )
     source: dict[str, Any] = {"kind": "files", "ref": ref, "next": following}
     source["intrinsics"] = _camera(intrinsics, "--intrinsics")
@@ -155,11 +156,11 @@ def _from_options(
     return make_problem(raw, overrides, where="command line")
 
 
-def _run(chosen: Problem, out: Path, quiet: bool, mre_at_most: float | None) -> None:
+def solve_problem(chosen: Problem, out: Path, quiet: bool, mre_at_most: float | None) -> int:
     """Solve a problem, write its folder and print the verdict.
 
-    Raises:
-        typer.Exit: always, with code 0 for a good result that meets the expectation, else 1.
+    Returns:
+        0 for a good result that meets the expectation, else 1.
     """
     folder = prepare_folder(out, chosen.input_paths())
     log = SolveLog(quiet)
@@ -188,7 +189,7 @@ def _run(chosen: Problem, out: Path, quiet: bool, mre_at_most: float | None) -> 
         write_text(folder / "log.txt", "\n".join([*log.lines, text]) + "\n")
     print(text)
     good = run.good and (mre_at_most is None or not missed(run))
-    raise typer.Exit(0 if good else 1)
+    return 0 if good else 1
 
 
 def _camera(text: str, option: str) -> list[float] | str:

@@ -21,7 +21,7 @@ from soup_nlp.errors import ConfigError
 from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.refine.records import RefineOptions
-from soup_nlp.schema.explain import Place, explain
+from soup_nlp.schema.explain import Place, explain, nearest
 from soup_nlp.schema.section import Count, NonNegative, Positive, Section, Whole
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.start.start_options import StartOptions
@@ -117,18 +117,28 @@ class Problem(Section):
         return [self.path(name) for name in (*self.input.files(), self.flow.source)]
 
 
+def shipped_problems() -> dict[str, Path]:
+    """Problem files that come with the package, by bare name."""
+    package = Path(__file__).resolve().parents[1]
+    # a wheel holds them inside the package, a checkout beside it
+    homes = (package / "problems", package.parent / "problems")
+    home = next((folder for folder in homes if folder.is_dir()), homes[0])
+    return {path.stem: path for path in sorted(home.glob("*.yaml"))}
+
+
 def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
     """Read a problem file.
 
     Args:
-        path: YAML file.
+        path: YAML file, or the bare name of one that comes with the package, such as "street";
+            relative paths of the latter start from the working folder.
         overrides: `a.b=value` with the value in YAML.
 
     Raises:
         ConfigError: the file is missing or not YAML, a key is unknown or given twice, a value is
             of the wrong type or out of range.
     """
-    path = Path(path)
+    path, base = _find(Path(path))
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -136,7 +146,7 @@ def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
             "problem file cannot be read",
             where=path,
             found=getattr(error, "strerror", None) or error,
-            hint="soup-nlp list shows the problems of a folder",
+            hint="soup-nlp list shows the problems that come with the package",
         ) from error
     raw, lines = _parse(text, str(path))
     if not isinstance(raw, dict):
@@ -147,8 +157,27 @@ def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
             expected="keys such as input: {kind: motorcycle}",
         )
     raw.setdefault("name", path.stem)
-    raw.setdefault("base", str(path.resolve().parent))
+    raw.setdefault("base", str(base))
     return make_problem(raw, overrides, where=str(path), lines=lines)
+
+
+def _find(path: Path) -> tuple[Path, Path]:
+    """A problem file, and the folder that its relative paths start from.
+
+    Raises:
+        ConfigError: it is a bare name that no problem of the package has.
+    """
+    if path.is_file() or path.suffix or len(path.parts) != 1:
+        return path, path.resolve().parent
+    shipped = shipped_problems()
+    if path.name not in shipped:
+        raise ConfigError(
+            "neither a problem file nor a problem that comes with the package",
+            where=path,
+            expected=", ".join(shipped),
+            hint=nearest(path.name, [*shipped]) or "soup-nlp list says what each is",
+        )
+    return shipped[path.name], Path.cwd()
 
 
 def make_problem(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.pair import Pair
-from soup_nlp.errors import SoupError
+from soup_nlp.errors import StoppedError
 from soup_nlp.evaluate.baselines import rigid_depth
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import score_depths
@@ -35,10 +35,6 @@ from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.propose import Start
 
 Float = NDArray[np.float64]
-
-
-class StoppedError(SoupError):
-    """A run was told to stop before it had a start, so that there is nothing to keep."""
 
 
 @dataclass(frozen=True)

@@ -52,12 +52,12 @@ def explain(
             where=where,
             found=place[-1],
             expected="one of " + ", ".join(allowed),
-            hint=_near(place[-1], allowed) or (f"did you mean {homes[0]}?" if homes else None),
+            hint=nearest(place[-1], allowed) or (f"did you mean {homes[0]}?" if homes else None),
         )
     if kind in ("missing", "union_tag_not_found"):
-        hint = None if kind == "missing" else "every input has a kind, see problems/"
+        hint = None if kind == "missing" else "every input has a kind; soup-nlp list names examples"
         return ConfigError("missing key" + more, where=where, expected=key, hint=hint)
-    hint = _near(str(value), [word for item in found for word in _words(item)])
+    hint = nearest(str(value), [word for item in found for word in _words(item)])
     if kind == "string_type" and isinstance(value, int | float):
         hint = f'write it in quotes: "{value}" (YAML drops leading zeros)'
     return ConfigError(
@@ -101,7 +101,8 @@ def _sections(model: type[BaseModel], tree: Mapping[str, Any]) -> dict[Place, li
     return out
 
 
-def _near(word: str, allowed: list[str]) -> str | None:
+def nearest(word: str, allowed: list[str]) -> str | None:
+    """A question that offers the nearest spelling, if one is near."""
     near = difflib.get_close_matches(word.lower(), allowed, 1, 0.6)
     return f"did you mean {near[0]}?" if near else None
 

@@ -1,0 +1,29 @@
+"""Command demo: two pairs that need no data, a real one and one in which things move."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from soup_nlp.cli.options import Out, Quiet
+from soup_nlp.cli.solve import solve_problem
+from soup_nlp.config.problem import load_problem
+
+PAIRS = {
+    "motorcycle": "a real pair, rigid: here one rigid motion for the whole image is as good",
+    "street": "a rendered street: the camera drives and two cars move",
+}
+"""Problems of the demo, and what to see in each."""
+
+
+def demo(out: Out = Path("out/demo"), quiet: Quiet = False) -> None:
+    """Solve a real pair and a rendered street in which cars move."""
+    codes = []
+    for name, text in PAIRS.items():
+        print(f"\n{name}: {text}", flush=True)
+        problem = load_problem(name)
+        codes.append(solve_problem(problem, out / name, quiet, problem.expected.mre_at_most))
+    pictures = " and ".join(str(out / name / "overview.png") for name in PAIRS)
+    print(f"\nlook at    {pictures}")
+    raise typer.Exit(max(codes))
