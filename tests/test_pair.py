@@ -20,7 +20,7 @@ def test_rows_of_numbers_are_a_camera():
     assert pair.K_ref.dtype == pair.K_next.dtype == np.float64
 
 
-@pytest.mark.parametrize("bad", [[[1, 2], [3]], "K.txt", None, [["a"] * 3] * 3])
+@pytest.mark.parametrize("bad", [[[1, 2], [3]], "K.txt", {}, [["a"] * 3] * 3, [1, 2, 3]])
 def test_what_is_no_matrix_is_refused(bad):
     with pytest.raises(DataError, match="intrinsics"):
         Pair(IMAGE, IMAGE, K, bad)
@@ -56,3 +56,74 @@ def test_a_confidence_is_between_0_and_1(bad):
 def test_dis_options_that_opencv_would_not_survive_are_refused(name, bad):
     with pytest.raises(ConfigError, match=name):
         dis_flow(IMAGE, IMAGE, **{name: bad})
+
+
+def test_images_are_taken_as_arrays_files_and_pictures(tmp_path):
+    pil = pytest.importorskip("PIL.Image")
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    grey = rgb[:, :, 0]
+    path = tmp_path / "a.png"
+    pil.fromarray(rgb).save(path)
+    for given in (rgb, rgb.tolist(), path, str(path), pil.fromarray(rgb)):
+        given = np.array(given, np.uint8) if isinstance(given, list) else given
+        np.testing.assert_array_equal(Pair(given, given, K).image_next, rgb)
+    for given in (grey, grey[:, :, None], pil.fromarray(grey)):
+        image = Pair(given, rgb, K).image_ref
+        np.testing.assert_array_equal(image, np.repeat(grey[:, :, None], 3, axis=2))
+    with_alpha = np.dstack([rgb, grey])
+    np.testing.assert_array_equal(Pair(with_alpha, rgb, K).image_ref, rgb)
+    np.testing.assert_array_equal(Pair(pil.fromarray(with_alpha), rgb, K).image_ref, rgb)
+
+
+def test_cameras_are_taken_as_matrices_numbers_and_files(tmp_path):
+    np.savetxt(tmp_path / "K.txt", K)
+    for given in (K, K.tolist(), (60, 60, 30, 20), tmp_path / "K.txt"):
+        pair = Pair(IMAGE, IMAGE, given)
+        np.testing.assert_array_equal(pair.K_ref, K)
+        np.testing.assert_array_equal(pair.K_next, K)
+
+
+def test_flows_are_taken_in_both_layouts_and_from_files(tmp_path):
+    uv = np.random.default_rng(0).normal(size=(40, 60, 2)).astype(np.float32)
+    uv[3, 4] = np.nan
+    np.save(tmp_path / "uv.npy", uv)
+    known = np.ones((40, 60))
+    known[3, 4] = 0
+    filled = np.where(known[..., None] > 0, uv, 0)
+    for given in (uv, np.moveaxis(uv, 2, 0), tmp_path / "uv.npy", str(tmp_path / "uv.npy")):
+        for flow in (Flow(given), Pair(IMAGE, IMAGE, K, flow=given).flow):
+            np.testing.assert_array_equal(flow.uv, filled)
+            np.testing.assert_array_equal(flow.confidence, known)
+    assert Flow(tmp_path / "uv.npy").source == str(tmp_path / "uv.npy")
+    assert Flow(np.zeros((4, 5, 2), int), np.ones((4, 5), bool)).uv.dtype == np.float32
+    # two rows: the last axis decides
+    assert Flow(np.zeros((2, 5, 2))).confidence.shape == (2, 5)
+
+
+@pytest.mark.parametrize("bad", [None, 3, "missing.png", {}, [], [[1, [2]]], object(), b"x"])
+def test_what_is_no_image_or_flow_is_refused(bad):
+    with pytest.raises(DataError):
+        Pair(IMAGE, bad, K)
+    with pytest.raises(DataError):
+        Flow(bad)
+    if bad is not None:
+        with pytest.raises(DataError):
+            Pair(IMAGE, IMAGE, K, flow=bad)
+        with pytest.raises(DataError):
+            Pair(IMAGE, IMAGE, K, truth=bad)
+        with pytest.raises(DataError):
+            Flow(np.zeros((4, 5, 2)), bad)
+
+
+@pytest.mark.parametrize("bad", [IMAGE / 255.0, IMAGE.astype(np.uint16), IMAGE[:0], IMAGE[..., :2]])
+def test_images_of_other_types_are_refused(bad):
+    with pytest.raises(DataError, match="image"):
+        Pair(IMAGE, bad, K)
+
+
+def test_records_print_without_their_arrays():
+    flow = Flow(np.zeros((40, 60, 2)))
+    pair = Pair(IMAGE, IMAGE, K, flow=flow, name="x")
+    assert repr(flow) == str(flow) == "Flow(unknown, 60x40, 100.0% usable)"
+    assert repr(pair) == f"Pair(x, 60x40, {flow}, no truth)"

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.data.accept import CameraLike, FlowLike, ImageLike, camera_of, flow_of, image_of
 from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
@@ -45,17 +47,33 @@ def check_size(
 class Flow:
     """A dense flow from the reference to the next image.
 
+    It is made of an array (H, W, 2) or (2, H, W), or of a file, with or without a confidence:
+    without one it is 1 where the flow is finite, else 0.
+
     Attributes:
         uv: (H, W, 2) float32, displacement in pixels (u right, v down); 0 where unknown.
         confidence: (H, W) float32 in [0, 1]; 0 drops the pixel from every term.
         source: Where it comes from, for reports ("dis", "truth", a file name ...).
+
+    Raises:
+        DataError: it is no flow, or the confidence does not fit.
     """
 
     uv: NDArray[np.float32]
-    confidence: NDArray[np.float32]
+    confidence: NDArray[np.float32] = None  # type: ignore[assignment]
     source: str = "unknown"
 
+    if TYPE_CHECKING:
+
+        def __init__(
+            self, uv: FlowLike, confidence: object = None, source: str = "unknown"
+        ) -> None: ...
+
     def __post_init__(self) -> None:
+        for name, value in zip(
+            ("uv", "confidence", "source"), flow_of(self.uv, self.confidence, self.source)
+        ):
+            object.__setattr__(self, name, value)
         if self.uv.shape[2:] != (2,) or self.confidence.ndim != 2:
             raise DataError(
                 "flow has the wrong shape",
@@ -86,6 +104,8 @@ class Flow:
     def __str__(self) -> str:
         h, w = self.confidence.shape
         return f"Flow({self.source}, {w}x{h}, {np.mean(self.confidence > 0):.1%} usable)"
+
+    __repr__ = __str__
 
 
 @dataclass(frozen=True)
@@ -121,10 +141,16 @@ class Truth:
     def __str__(self) -> str:
         return f"Truth({', '.join(self.known()) or 'nothing'}; {self.unit})"
 
+    __repr__ = __str__
+
 
 @dataclass(frozen=True)
 class Pair:
     """Two consecutive frames with cameras, flow and truth.
+
+    Images are taken as arrays, files or PIL images, grey too; cameras as matrices, as
+    (fx, fy, cx, cy) or files, that of the next frame being the same where it is left out; a flow
+    as an array or file too.
 
     Attributes:
         image_ref: (H, W, 3) uint8 RGB reference image, indexed [v, u].
@@ -143,25 +169,42 @@ class Pair:
     image_ref: NDArray[np.uint8]
     image_next: NDArray[np.uint8]
     K_ref: Float
-    K_next: Float
+    K_next: Float = None  # type: ignore[assignment]
     flow: Flow | None = None
     truth: Truth | None = field(default=None)
     name: str = "pair"
 
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            image_ref: ImageLike,
+            image_next: ImageLike,
+            K_ref: CameraLike,
+            K_next: CameraLike = None,
+            flow: Flow | FlowLike | None = None,
+            truth: Truth | None = None,
+            name: str = "pair",
+        ) -> None: ...
+
     def __post_init__(self) -> None:
         for what in ("image_ref", "image_next"):
-            image = getattr(self, what)
-            if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-                raise DataError(
-                    "image must be 8-bit RGB",
-                    where=what,
-                    found=f"{image.dtype} {image.shape}",
-                    expected="uint8 (H, W, 3)",
-                )
+            object.__setattr__(self, what, image_of(getattr(self, what), what))
+        if self.K_next is None:
+            object.__setattr__(self, "K_next", self.K_ref)
         for what in ("K_ref", "K_next"):
-            K = check_intrinsics(getattr(self, what), what)
+            K = camera_of(getattr(self, what), what)
             object.__setattr__(self, what, K)
             _check_focal(K, getattr(self, what.replace("K", "image")), what)
+        if not isinstance(self.truth, Truth | None):
+            raise DataError(
+                "truth of a pair is no Truth",
+                where="truth",
+                found=type(self.truth).__name__,
+                expected="soup_nlp.Truth(depth_ref=..., ...) or None",
+            )
+        if not isinstance(self.flow, Flow | None):
+            object.__setattr__(self, "flow", Flow(self.flow))
         if self.flow is not None:
             hint = "compute the flow at the size of the image; it is not resized"
             size, source = self.flow.uv.shape, self.flow.source
@@ -187,6 +230,8 @@ class Pair:
         h, w = self.size
         return f"Pair({self.name}, {w}x{h}, {self.flow or 'no flow'}, {self.truth or 'no truth'})"
 
+    __repr__ = __str__
+
 
 def _check_focal(K: Float, image: NDArray[np.uint8], where: str) -> None:
     """Raise DataError for a focal length that no image of this size has."""
@@ -200,36 +245,3 @@ def _check_focal(K: Float, image: NDArray[np.uint8], where: str) -> None:
                 hint="multiply normalised intrinsics by the image's size:"
                 " fx and cx by the width, fy and cy by the height",
             )
-
-
-def check_intrinsics(given: object, where: object) -> Float:
-    """Rows of numbers as (3, 3) intrinsics.
-
-    Raises:
-        DataError: it is no finite, upper-triangular 3x3 matrix with positive focal lengths.
-    """
-    try:
-        K = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DataError(
-            "intrinsics are no matrix of numbers", where=where, found=repr(given), expected="(3, 3)"
-        ) from error
-    if K.shape != (3, 3):
-        raise DataError("intrinsics must be 3x3", where=where, found=K.shape, expected="(3, 3)")
-    if not np.isfinite(K).all():
-        raise DataError("intrinsics are not finite", where=where, found=K.tolist())
-    if not (K[0, 0] > 0 and K[1, 1] > 0):
-        raise DataError(
-            "focal lengths must be positive",
-            where=where,
-            found=f"fx {K[0, 0]:g}, fy {K[1, 1]:g}",
-            expected="fx > 0 and fy > 0, in pixels",
-        )
-    if np.any(np.tril(K, -1)) or K[2, 2] != 1:
-        raise DataError(
-            "intrinsics must be upper triangular with K[2, 2] = 1",
-            where=where,
-            found=K.tolist(),
-            expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]]",
-        )
-    return K

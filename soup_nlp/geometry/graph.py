@@ -58,6 +58,8 @@ class Segmentation:
             f" {len(self.edges)} K-NN edges, {len(self.pairs)} neighbour pairs)"
         )
 
+    __repr__ = __str__
+
 
 def build_segmentation(
     labels: NDArray[np.int32],

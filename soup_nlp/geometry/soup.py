@@ -45,6 +45,8 @@ class Soup:
             f" translation {T.min():.3g}..{T.max():.3g})"
         )
 
+    __repr__ = __str__
+
     @property
     def distance(self) -> Float:
         """(N,) distance of the plane from the reference camera, `lam d`."""
@@ -114,6 +116,8 @@ class Reconstruction:
         points_next: (H, W, 3) the same material points in the next frame.
         flow: (H, W, 2) flow that the soup induces, pixels.
         depth_next: (H', W') z of the next frame (nearest surface wins), NaN where nothing lands.
+        soup: The state that it is made of.
+        labels: (H, W) superpixel of every pixel.
     """
 
     depth_ref: Float
@@ -121,11 +125,26 @@ class Reconstruction:
     points_next: Float
     flow: Float
     depth_next: Float
+    soup: Soup
+    labels: NDArray[np.int32]
+
+    @property
+    def normals(self) -> Float:
+        """(H, W, 3) unit normals of `points_ref`, towards the reference camera."""
+        return np.asarray(self.soup.n[self.labels])
+
+    @property
+    def normals_next(self) -> Float:
+        """(H, W, 3) unit normals of `points_next`: the same surfaces, turned."""
+        turned = np.einsum("nij,nj->ni", self.soup.R, self.soup.n)
+        return np.asarray(turned[self.labels])
 
     def __str__(self) -> str:
         z = self.depth_ref[np.isfinite(self.depth_ref)]
         seen = np.isfinite(self.depth_next).mean()
         return f"Reconstruction(depth {z.min():.3g}..{z.max():.3g}, next frame {seen:.0%} covered)"
+
+    __repr__ = __str__
 
 
 def reconstruct(
@@ -157,7 +176,7 @@ def reconstruct(
     with np.errstate(divide="ignore", invalid="ignore"):
         target = project(K_next, moved)
     depth_next = splat_depth(target, moved[..., 2], size_next or (height, width))
-    return Reconstruction(z, points, moved, target - uv, depth_next)
+    return Reconstruction(z, points, moved, target - uv, depth_next, soup, labels)
 
 
 def splat_depth(target: Float, z: Float, size: tuple[int, int]) -> Float:

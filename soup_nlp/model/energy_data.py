@@ -82,6 +82,8 @@ class EnergyData:
             f" {len(self.edges)} edges, {len(self.pairs)} pairs x {self.boundary_ray.shape[1]})"
         )
 
+    __repr__ = __str__
+
     def visibility_ray(self, depth_ratio: float) -> Float:
         """(N, V, 3) rays v with `-n . v >= c` for visibility: the anchor, then r_rim - r_a / ratio.
 

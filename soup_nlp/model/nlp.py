@@ -147,6 +147,8 @@ class NLP:
         lines += [f"  {g.kernel.name:<12} {g.size:>7} x {g.kernel}" for g in self.groups]
         return "\n".join(lines)
 
+    __repr__ = __str__
+
 
 def _bound_bars(label: str, lower: Float, upper: Float) -> list[str]:
     """A line with a bar for every kind of bound that occurs."""

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,9 @@ from soup_nlp.errors import StoppedError
 from soup_nlp.evaluate.baselines import rigid_depth
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import score_depths
+from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.model import oracle
@@ -74,6 +77,45 @@ class Run:
     seconds: Mapping[str, float]
     refined: Refined | None = None
     nlp_reconstruction: Reconstruction | None = None
+
+    def __str__(self) -> str:
+        h, w = self.pair.size
+        s, energy = self.solution, self.energy["total"]
+        parts = self.components
+        scores = "no truth"
+        if "solution" in self.metrics:
+            m = self.metrics["solution"]
+            scores = f"MRE {m.mre:.4f} at {m.coverage:.1%} of the truth, {m.scale_rule} scale"
+        return "\n".join(
+            [
+                f"Run({self.problem.name}, {w}x{h}, {len(self.segmentation)} superpixels,"
+                f" {sum(v for k, v in self.seconds.items() if not k.startswith('nlp_')):.1f} s)",
+                f"  {'good' if self.good else 'not good'}: {s.status}, E"
+                f" {s.energy_start['total']:.5g} -> {energy:.5g}, delivered by {self._source}",
+                f"  {self.reconstruction}",
+                f"  camera {parts.camera}; {len(parts) - 1} components beside the background",
+                f"  {scores}",
+            ]
+        )
+
+    __repr__ = __str__
+
+    @property
+    def _source(self) -> str:
+        return "the refinement" if self.refined else self.delivered
+
+    @cached_property
+    def components(self) -> Components:
+        """What moves as one, with its rigid motion; the first is the static scene."""
+        pair, start = self.pair, self.start
+        own = self.soup, self.segmentation, start.component, pair.K_ref, pair.K_next
+        return find_components(*own, start.borrowed)
+
+    @property
+    def camera(self) -> RigidMotion:
+        """next_from_ref of the static scene, in the unit of the reconstruction; its `centre` is the
+        next camera as the reference frame sees it."""
+        return self.components.camera
 
     @property
     def delivered(self) -> str:

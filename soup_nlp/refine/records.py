@@ -96,6 +96,8 @@ class Round:
             f" {self.seconds:.1f} s"
         )
 
+    __repr__ = __str__
+
     @property
     def gap(self) -> float:
         """How far the choice can be from the best one among these particles."""
@@ -130,3 +132,5 @@ class Refined:
             f"Refined({self.status}, E {self.energy_begin['total']:.5g} ->"
             f" {self.energy['total']:.5g} in {len(self.rounds)} rounds{gap}, {self.seconds:.1f} s)"
         )
+
+    __repr__ = __str__

@@ -64,6 +64,8 @@ class Progress:
             f"  infeasibility {self.infeasibility:8.1e}  {self.seconds:6.1f} s"
         )
 
+    __repr__ = __str__
+
 
 Listener = Callable[[Progress], None]
 
@@ -120,6 +122,8 @@ class Stage:
             f"{self.name}: {self.status}, {self.iterations} iterations, f {self.objective:.6g},"
             f" {self.seconds:.1f} s"
         )
+
+    __repr__ = __str__
 
 
 class _Iterations(IterationCallback):

@@ -83,6 +83,8 @@ class Solution:
             f" {self.energy['total']:.4g}, {sum(s.iterations for s in self.stages)} iterations)"
         )
 
+    __repr__ = __str__
+
 
 def solve_soup(
     start: Soup,

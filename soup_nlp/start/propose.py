@@ -76,6 +76,8 @@ class Start:
             + (f", {self.bending_share:.0%} bending)" if self.bending else ")")
         )
 
+    __repr__ = __str__
+
 
 def propose(
     seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, options: SeededStart | None = None

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from soup_nlp.data.formats.images import PathLike, check_body, read_bytes, read_text
 from soup_nlp.data.formats.map_files import check_magic
-from soup_nlp.data.pair import check_intrinsics
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 
@@ -33,6 +32,39 @@ def _numbers(text: str, where: PathLike, what: str) -> list[float]:
                 f"{what} holds a word that is not a number", where=where, found=repr(word)
             ) from None
     return values
+
+
+def check_intrinsics(given: object, where: object) -> Float:
+    """Rows of numbers as (3, 3) intrinsics.
+
+    Raises:
+        DataError: it is no finite, upper-triangular 3x3 matrix with positive focal lengths.
+    """
+    try:
+        K = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            "intrinsics are no matrix of numbers", where=where, found=repr(given), expected="(3, 3)"
+        ) from error
+    if K.shape != (3, 3):
+        raise DataError("intrinsics must be 3x3", where=where, found=K.shape, expected="(3, 3)")
+    if not np.isfinite(K).all():
+        raise DataError("intrinsics are not finite", where=where, found=K.tolist())
+    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        raise DataError(
+            "focal lengths must be positive",
+            where=where,
+            found=f"fx {K[0, 0]:g}, fy {K[1, 1]:g}",
+            expected="fx > 0 and fy > 0, in pixels",
+        )
+    if np.any(np.tril(K, -1)) or K[2, 2] != 1:
+        raise DataError(
+            "intrinsics must be upper triangular with K[2, 2] = 1",
+            where=where,
+            found=K.tolist(),
+            expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]]",
+        )
+    return K
 
 
 def read_intrinsics(path: PathLike) -> Float:

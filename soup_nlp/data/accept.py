@@ -1,0 +1,142 @@
+"""What a caller may give for an image, a camera or a flow, made into arrays or refused."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.formats.camera_files import check_intrinsics, read_intrinsics
+from soup_nlp.data.formats.images import read_image
+from soup_nlp.data.formats.map_files import read_flow
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import intrinsics
+
+Float = NDArray[np.float64]
+
+ImageLike: TypeAlias = Any
+"""An 8-bit array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4), a file, or a PIL image."""
+CameraLike: TypeAlias = Any
+"""A 3x3 matrix, four numbers (fx, fy, cx, cy) in pixels, or a file of either."""
+FlowLike: TypeAlias = Any
+"""Displacements in pixels, (H, W, 2) or (2, H, W), or a file (.flo, KITTI .png, .npy)."""
+
+_PICTURES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
+"""Modes of PIL images of 8 bits or fewer a channel."""
+
+
+def is_path(given: object) -> bool:
+    """Whether a file is named."""
+    return isinstance(given, str | os.PathLike)
+
+
+def image_of(given: ImageLike, where: str) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB of an array, a file or a PIL image; grey is repeated, alpha dropped.
+
+    Raises:
+        DataError: it is no such image.
+    """
+    if is_path(given):
+        return read_image(Path(given))
+    if hasattr(given, "convert") and getattr(given, "mode", None) in _PICTURES:
+        given = given.convert("RGB")
+    image = _array(given, "image", where, "uint8 (H, W, 3) array, path or PIL image")
+    if image.ndim == 2:
+        image = image[:, :, None]
+    if image.ndim != 3 or image.shape[2] not in (1, 3, 4) or image.dtype != np.uint8:
+        floats = image.dtype.kind == "f"
+        raise DataError(
+            "image must be 8-bit RGB",
+            where=where,
+            found=f"{image.dtype} {np.shape(given)}",
+            expected="uint8 (H, W, 3)",
+            hint="(255 * image).round().astype(np.uint8), if its values are 0 to 1"
+            if floats
+            else None,
+        )
+    if image.size == 0:
+        raise DataError("image has no pixels", where=where, found=image.shape)
+    image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[:, :, :3]
+    return np.ascontiguousarray(image)
+
+
+def camera_of(given: CameraLike, where: str) -> Float:
+    """(3, 3) intrinsics of a matrix, of (fx, fy, cx, cy), or of a file.
+
+    Raises:
+        DataError: it is no camera.
+    """
+    if is_path(given):
+        return read_intrinsics(Path(given))
+    try:
+        four = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        return check_intrinsics(given, where)
+    return check_intrinsics(intrinsics(*four) if four.shape == (4,) else given, where)
+
+
+def flow_of(
+    given: FlowLike, confidence: object, source: str
+) -> tuple[NDArray[Any], NDArray[np.float32], str]:
+    """Displacements (H, W, 2), confidence (H, W) and source of a flow.
+
+    An array whose first axis has length 2 and whose last has not is taken as (2, H, W).
+
+    Args:
+        given: Array or file.
+        confidence: (H, W) in [0, 1]; None is 1 where the flow is finite and 0 elsewhere, where
+            the displacement becomes 0.
+        source: Its name, "unknown" for that of the file.
+
+    Raises:
+        DataError: it is no flow.
+    """
+    if is_path(given):
+        source = str(given) if source == "unknown" else source
+        given = read_flow(Path(given))
+    uv = _array(given, "flow", source, "numbers (H, W, 2) or (2, H, W) in pixels, or a path")
+    if uv.dtype.kind not in "fiu":
+        raise DataError(
+            "flow does not hold numbers", where=source, found=uv.dtype, expected="real numbers"
+        )
+    if uv.ndim == 3 and uv.shape[0] == 2 and uv.shape[2] != 2:
+        uv = np.moveaxis(uv, 0, 2)
+    if not (uv.dtype.kind == "f" and uv.dtype.itemsize >= 4):
+        uv = uv.astype(np.float32)
+    if confidence is None and uv.ndim == 3:
+        # 1e9 and more is unknown in Middlebury's files
+        known = (np.abs(uv) < 1e9).all(axis=2)
+        return np.where(known[..., None], uv, 0), known.astype(np.float32), source
+    sure = _array(confidence, "flow confidence", source, "numbers (H, W) from 0 to 1")
+    if sure.dtype.kind not in "fiub":
+        raise DataError(
+            "flow confidence does not hold numbers",
+            where=source,
+            found=sure.dtype,
+            expected="numbers (H, W) from 0 to 1",
+        )
+    return uv, sure if sure.dtype.kind == "f" else sure.astype(np.float32), source
+
+
+def _array(given: object, what: str, where: str, expected: str) -> NDArray[Any]:
+    """What NumPy makes of an object.
+
+    Raises:
+        DataError: it makes nothing of it but an object.
+    """
+    try:
+        array = np.asarray(given)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DataError(
+            f"{what} is no array",
+            where=where,
+            found=f"{type(given).__name__}: {error}",
+            expected=expected,
+        ) from error
+    if array.dtype == object or array.dtype.kind in "USmM":
+        found = f"{type(given).__name__} {given!r}"[:80]
+        raise DataError(f"{what} is no array", where=where, found=found, expected=expected)
+    return array

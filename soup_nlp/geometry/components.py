@@ -1,0 +1,198 @@
+"""The rigid components of a solved soup: which pixels move as one, and how."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.camera import project, rays
+from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.motion import RigidMotion, fit_motion
+from soup_nlp.geometry.soup import Soup
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+SAME_PX = 0.5
+"""Motions that bring a component's points to within this of each other are one, pixels."""
+LEAST_PX = 0.05
+"""Distance below which a point no longer gains weight in a robust fit, pixels."""
+FITS = 20
+"""Re-weighted fits of a motion."""
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """A group of superpixels that moves as one.
+
+    Attributes:
+        label: Its number in the maps; 0 is the background.
+        motion: next_from_ref, the camera's motion included, in the unit of the reconstruction.
+        superpixels: Number of its superpixels.
+        pixels: Number of its pixels.
+        residual_px: Median distance in the next image between where `motion` and where the
+            superpixels' own motions bring its points, pixels; large where it is not rigid.
+        borrowed: Share of its pixels whose depth is a guess from neighbours.
+        centre: (3,) median of its points in the reference frame.
+    """
+
+    label: int
+    motion: RigidMotion
+    superpixels: int
+    pixels: int
+    residual_px: float
+    borrowed: float
+    centre: Float
+
+    def __str__(self) -> str:
+        return (
+            f"Component({self.label}, {self.superpixels} superpixels, {self.pixels} pixels,"
+            f" {self.motion}, residual {self.residual_px:.2g} px)"
+        )
+
+    __repr__ = __str__
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """All rigid components, the background first, then by their pixels.
+
+    The background is the component with the most superpixels: what it does, the camera does the
+    other way round.
+
+    Attributes:
+        of_superpixel: (N,) label of every superpixel.
+        of_pixel: (H, W) label of every pixel of the reference image.
+        members: The components; `members[c].label == c`.
+    """
+
+    of_superpixel: Int
+    of_pixel: NDArray[np.int32]
+    members: tuple[Component, ...]
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    def __getitem__(self, label: int) -> Component:
+        return self.members[label]
+
+    def __iter__(self) -> Iterator[Component]:
+        return iter(self.members)
+
+    def __str__(self) -> str:
+        share = self.background.pixels / self.of_pixel.size
+        return f"Components({len(self)}, background {share:.0%} of the pixels)"
+
+    __repr__ = __str__
+
+    @property
+    def background(self) -> Component:
+        """The component of the static scene."""
+        return self.members[0]
+
+    @property
+    def camera(self) -> RigidMotion:
+        """next_from_ref of the static scene; its `centre` is where the next camera is."""
+        return self.background.motion
+
+    def own_motion(self, label: int) -> RigidMotion:
+        """What a component does by itself: its motion as the reference camera, standing still,
+        would see it. The identity for the background."""
+        return self.camera.inverse @ self[label].motion
+
+
+def find_components(
+    soup: Soup,
+    seg: Segmentation,
+    group: Int,
+    K_ref: Float,
+    K_next: Float,
+    borrowed: NDArray[np.bool_] | None = None,
+) -> Components:
+    """One rigid motion for every group of superpixels, groups of one motion joined.
+
+    A motion is fitted to what the superpixels' own motions do to their anchors and rims: least
+    absolute distances in the next image by re-weighted Procrustes fits.
+
+    Args:
+        soup: Solved state.
+        seg: Superpixels.
+        group: (N,) groups, such as the components of the start.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        K_next: (3, 3) intrinsics of the next frame.
+        borrowed: (N,) superpixels whose depth is a guess; None for none.
+    """
+    ray = rays(K_ref, np.concatenate([seg.anchors[:, None], seg.rim], axis=1))
+    before = soup.points(ray)
+    after = soup.moved(before)
+    label = np.unique(group, return_inverse=True)[1].ravel()
+    count = np.bincount(label)
+    motions: list[RigidMotion] = []
+    joined = np.empty(len(count), np.int64)
+    # large ones first: small ones join those whose motion is theirs
+    for c in np.argsort(-count, kind="stable"):
+        own = label == c
+        x, y, weight = _usable(before[own], after[own], seg.sizes[own])
+        gap = [float(np.median(_gap(m, x, y, K_next))) if len(x) else np.inf for m in motions]
+        if gap and min(gap) <= SAME_PX:
+            joined[c] = int(np.argmin(gap))
+            continue
+        joined[c] = len(motions)
+        motions.append(_fit(x, y, weight, K_next) if len(x) else _first(soup, own))
+    label = joined[label]
+    pixels = np.bincount(label, seg.sizes, len(motions)).astype(np.int64)
+    order = np.concatenate([[0], 1 + np.argsort(-pixels[1:], kind="stable")])
+    label = np.argsort(order)[label]
+    guess = np.zeros(len(soup), bool) if borrowed is None else borrowed
+    members = []
+    for c, old in enumerate(order):
+        own = label == c
+        x, y, _ = _usable(before[own], after[own], seg.sizes[own])
+        motion = motions[old]
+        members.append(
+            Component(
+                label=c,
+                motion=motion,
+                superpixels=int(own.sum()),
+                pixels=int(pixels[old]),
+                residual_px=float(np.median(_gap(motion, x, y, K_next))) if len(x) else np.nan,
+                borrowed=float(seg.sizes[own & guess].sum() / pixels[old]),
+                centre=np.median(x, axis=0) if len(x) else np.full(3, np.nan),
+            )
+        )
+    return Components(label, label[seg.labels].astype(np.int32), tuple(members))
+
+
+def _usable(before: Float, after: Float, size: Int) -> tuple[Float, Float, Float]:
+    """Points (M, 3) in front of both cameras, before and after, and their weights."""
+    x, y = before.reshape(-1, 3), after.reshape(-1, 3)
+    weight = np.repeat(size, before.shape[1]).astype(float)
+    front = np.isfinite(x).all(1) & np.isfinite(y).all(1) & (x[:, 2] > 0) & (y[:, 2] > 0)
+    return x[front], y[front], weight[front]
+
+
+def _gap(motion: RigidMotion, x: Float, y: Float, K: Float) -> Float:
+    """(M,) pixels between where a motion brings points and where they are."""
+    moved = motion(x)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gap = np.linalg.norm(project(K, moved) - project(K, y), axis=1)
+    return np.where(moved[:, 2] > 0, gap, np.inf)
+
+
+def _fit(x: Float, y: Float, size: Float, K: Float) -> RigidMotion:
+    """The motion of least absolute distances in the image."""
+    # a length counts in the depth where it is
+    base = size / y[:, 2] ** 2
+    motion = fit_motion(x, y, base)
+    for _ in range(FITS):
+        motion = fit_motion(x, y, base / np.maximum(_gap(motion, x, y, K), LEAST_PX))
+    return motion
+
+
+def _first(soup: Soup, own: NDArray[np.bool_]) -> RigidMotion:
+    """The motion of a group's first superpixel, for one that has no point in front."""
+    i = int(np.argmax(own))
+    return RigidMotion(soup.R[i], soup.translation[i])

@@ -1,0 +1,114 @@
+"""Rigid motions and rigid components of a solved soup."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soup_nlp.config.problem import make_problem
+from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.geometry.components import find_components
+from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.geometry.motion import RigidMotion, fit_motion
+from soup_nlp.geometry.rotation import exp
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.pipeline.case import prepare
+
+K = intrinsics(100.0, 100.0, 39.5, 29.5)
+CAMERA = RigidMotion(exp([0.0, 0.02, 0.0]), np.array([0.05, 0.0, -0.1]))
+CAR = RigidMotion(exp([0.0, -0.05, 0.0]), np.array([-0.2, 0.0, 0.1]))
+ROUNDING = 1e-9
+"""Of some thousand float64 operations on numbers of the order of 1."""
+
+
+def tiles():
+    """60 x 80 pixels in 12 superpixels of 20 x 20, numbered by rows."""
+    v, u = np.mgrid[0:60, 0:80] // 20
+    labels = (4 * v + u).astype(np.int32)
+    return build_segmentation(labels, np.zeros((60, 80, 3), np.uint8), neighbours=3)
+
+
+def soup_of(motions):
+    """Planes at depth 2, parallel to the image, with these motions."""
+    n = len(motions)
+    R, t = (np.array([getattr(m, name) for m in motions]) for name in ("R", "t"))
+    return Soup(np.full(n, 2.0), np.tile([0.0, 0.0, -1.0], (n, 1)), np.ones(n), R, t / 2)
+
+
+def test_motions_are_chained_and_inverted():
+    both = CAR @ CAMERA
+    x = np.random.default_rng(0).normal(size=(5, 3))
+    np.testing.assert_allclose(both(x), CAR(CAMERA(x)), atol=ROUNDING)
+    np.testing.assert_allclose(both.matrix, CAR.matrix @ CAMERA.matrix, atol=ROUNDING)
+    np.testing.assert_allclose(both.inverse(both(x)), x, atol=ROUNDING)
+    np.testing.assert_allclose(CAR(CAR.centre), 0, atol=ROUNDING)
+    # a turn of 0.05 about -y
+    assert CAR.angle == pytest.approx(np.degrees(0.05))
+    np.testing.assert_allclose(CAR.quaternion, [0, -np.sin(0.025), 0, np.cos(0.025)], atol=ROUNDING)
+    fitted = fit_motion(x, CAR(x), np.arange(5.0))
+    np.testing.assert_allclose(fitted.matrix, CAR.matrix, atol=ROUNDING)
+
+
+def test_groups_of_one_motion_are_one_component():
+    seg = tiles()
+    # the last group has the camera's motion again
+    group = np.array([0, 0, 0, 0, 0, 0, 5, 5, 0, 0, 0, 7])
+    soup = soup_of([CAR if g == 5 else CAMERA for g in group])
+    guess = group == 7
+    found = find_components(soup, seg, group, K, K, guess)
+    assert len(found) == 2
+    np.testing.assert_array_equal(found.of_superpixel, group == 5)
+    np.testing.assert_array_equal(found.of_pixel, (group == 5)[seg.labels])
+    np.testing.assert_allclose(found.camera.matrix, CAMERA.matrix, atol=ROUNDING)
+    np.testing.assert_allclose(found[1].motion.matrix, CAR.matrix, atol=ROUNDING)
+    np.testing.assert_allclose(found.own_motion(0).matrix, np.eye(4), atol=ROUNDING)
+    still = found.own_motion(1)(np.ones(3))
+    np.testing.assert_allclose(CAMERA(still), CAR(np.ones(3)), atol=ROUNDING)
+    assert [c.superpixels for c in found] == [10, 2]
+    assert [c.pixels for c in found] == [4000, 800]
+    assert found[0].borrowed == pytest.approx(0.1)
+    assert max(c.residual_px for c in found) < 1e-6
+    assert found[1].centre[2] == pytest.approx(2)
+
+
+def test_one_stray_superpixel_does_not_move_the_motion_of_its_component():
+    seg = tiles()
+    soup = soup_of([*[CAMERA] * 11, CAR])
+    found = find_components(soup, seg, np.zeros(12, int), K, K)
+    assert len(found) == 1
+    # where most agree the re-weighted fit is theirs, up to its least distance of 0.05 px
+    np.testing.assert_allclose(found.camera.matrix, CAMERA.matrix, atol=1e-3)
+
+
+def test_what_is_not_rigid_says_so():
+    rng = np.random.default_rng(1)
+    motions = [RigidMotion(np.eye(3), t) for t in rng.normal(0, 0.1, (12, 3))]
+    found = find_components(soup_of(motions), tiles(), np.zeros(12, int), K, K)
+    # translations of 0.1 at depth 2 are 5 pixels
+    assert 1 < found[0].residual_px < 15
+
+
+def test_a_component_behind_the_camera_takes_the_motion_of_its_first_superpixel():
+    seg = tiles()
+    group = np.r_[np.zeros(11, int), 1]
+    back = RigidMotion(np.eye(3), np.array([0.0, 0.0, -5.0]))
+    found = find_components(soup_of([*[CAMERA] * 11, back]), seg, group, K, K)
+    np.testing.assert_allclose(found[1].motion.matrix, back.matrix)
+    assert np.isnan(found[1].residual_px)
+
+
+def test_the_near_car_of_a_street_is_a_component():
+    scene = {"kind": "scene", "scene": "street", "seed": 0, "width": 384, "height": 164}
+    raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 150}}
+    case = prepare(make_problem(raw))
+    pair, start = case.pair, case.start
+    found = find_components(
+        start.soup, case.segmentation, start.component, pair.K_ref, pair.K_next, start.borrowed
+    )
+    for label, true in ((0, 0), (1, 1)):
+        a, b = found.of_pixel == label, pair.truth.components == true
+        # superpixels of 420 pixels, the car has 5,000
+        assert (a & b).sum() / (a | b).sum() > 0.85
+        # the rotation has no scale
+        turn = RigidMotion(found[label].motion.R.T @ pair.truth.motions[true][:3, :3], np.zeros(3))
+        assert turn.angle < 0.5
