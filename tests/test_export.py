@@ -35,7 +35,8 @@ TINY = [
 
 
 def write(out: Path, *words: str, scene: str = "orbit") -> int:
-    return main(["export", str(PROBLEMS / f"{scene}.yaml"), "-o", str(out), *TINY, *words])
+    path = str(PROBLEMS / f"{scene}.yaml")
+    return main(["export", path, "-o", str(out), "--no-presolve", *TINY, *words])
 
 
 @pytest.fixture(scope="module")

@@ -32,8 +32,8 @@ folder = Path(tempfile.mkdtemp())
 # %% [markdown]
 # ## Export
 #
-# The same as `soup-nlp export orbit.yaml -o orbit --presolve`. With `--presolve` the file's start
-# is the presolve's answer, as for Ipopt in `soup-nlp solve`.
+# The same as `soup-nlp export orbit.yaml -o orbit`. The file's start is the presolve's answer, as
+# for Ipopt in `soup-nlp solve`; with `--no-presolve` it is the proposal.
 
 # %%
 (folder / "orbit.yaml").write_text(
@@ -45,7 +45,7 @@ energy: {pixel_samples: 8}
 """
 )
 exported = folder / "orbit"
-code = main(["export", str(folder / "orbit.yaml"), "-o", str(exported), "--presolve"])
+code = main(["export", str(folder / "orbit.yaml"), "-o", str(exported)])
 assert code == 0
 print(sorted(path.name for path in exported.iterdir()))
 

@@ -98,7 +98,7 @@ def read_baseline(path: Path) -> list[Run]:
             where=path,
             found=error,
             expected=f"JSON of version {VERSION}",
-            hint="soup-nlp bench speed --scenes street --sizes 250 --write-baseline FILE",
+            hint="soup-nlp bench speed --scenes street --superpixels 250 --write-baseline FILE",
         ) from error
 
 

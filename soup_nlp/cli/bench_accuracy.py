@@ -34,7 +34,7 @@ def mre_of(row: Row) -> str:
 def accuracy(
     suite: options.SuiteName = None,
     data: options.Data = None,
-    out: options.Out = Path("results/accuracy"),
+    out: options.Out = Path("out/bench/accuracy"),
     analysis: Annotated[
         str | None, typer.Option(help="An analysis instead of the table; `list` names them.")
     ] = None,
@@ -139,7 +139,7 @@ def _tell(page: Path) -> None:
 def search(
     suite: options.SuiteName = None,
     data: options.Data = None,
-    out: options.Out = Path("results/accuracy"),
+    out: options.Out = Path("out/bench/accuracy"),
     params: Annotated[
         list[str] | None,
         typer.Option("--param", help="KEY=log|linear|int:LOW:HIGH or KEY=choice:A:B instead."),

@@ -36,8 +36,8 @@ COMMANDS = (
     f" {NLP}",
     "bench cut-off -o {out}/accuracy",
     "bench refine -o {out}/refine",
-    "bench speed -o {out}/speed --sizes 500,1000,2000 --neighbours 20",
-    "bench speed -o {out}/speed/neighbours --scenes street --sizes 250,500,1000 --seeds 0",
+    "bench speed -o {out}/speed --superpixels 500,1000,2000 --neighbours 20",
+    "bench speed -o {out}/speed/neighbours --scenes street --superpixels 250,500,1000 --seeds 0",
     "bench methods -o {out}/speed",
     "bench methods -o {out}/speed --unrefined --seeds 0,1,2,3,4 --superpixels 1000,2000",
     "bench formulations -o {out}/speed",
@@ -50,10 +50,10 @@ COMMANDS = (
 
 def everything(
     data: Data = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder.")] = Path("results"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder.")] = Path("out/bench"),
     dry: Annotated[bool, typer.Option(help="Print the commands only.")] = False,
 ) -> None:
-    """Make every table and picture of results/ again; a run that was stopped goes on."""
+    """Make every table and picture of results/ in a folder; a run that was stopped goes on."""
     # it runs the other commands, and main knows this one
     from soup_nlp.cli.main import main
 

@@ -25,7 +25,9 @@ def speed(
     scenes: Annotated[
         str, typer.Option(help="Rendered scenes and motorcycle, comma separated.")
     ] = "street,room,motorcycle",
-    sizes: Annotated[str, typer.Option(help="Superpixels N.")] = "250,500,1000,2000",
+    sizes: Annotated[
+        str, typer.Option("--superpixels", "--sizes", help="Superpixels N.")
+    ] = "250,500,1000,2000",
     neighbours: Annotated[str, typer.Option(help="K of the K-NN graph.")] = "10,15,20",
     seeds: Annotated[str, typer.Option(help="Seeds of the rendered scenes.")] = "0,1",
     width: Annotated[int, typer.Option(help="Columns of rendered scenes.", min=64)] = 1024,
@@ -38,14 +40,14 @@ def speed(
     write_baseline: Annotated[
         Path | None, typer.Option(help="Write the measurement as a baseline.")
     ] = None,
-    out: Out = Path("results/speed"),
+    out: Out = Path("out/bench/speed"),
     quiet: Quiet = False,
 ) -> None:
     """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
     kept = [] if gate is None else read_baseline(gate)
     settings: Sequence[Settings] = [run.settings for run in kept] or plan(
         words(scenes, "--scenes", [*SCENES, "motorcycle"]),
-        numbers(sizes, "--sizes", 2),
+        numbers(sizes, "--superpixels", 2),
         numbers(neighbours, "--neighbours", 1),
         numbers(seeds, "--seeds"),
         width=width,

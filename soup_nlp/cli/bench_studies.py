@@ -18,7 +18,7 @@ from soup_nlp.model.layout import GAUGES
 
 Size = Annotated[int, typer.Option(help="Superpixels wanted.")]
 SCENES = [*RENDERED, "motorcycle"]
-SPEED = Path("results/speed")
+SPEED = Path("out/bench/speed")
 
 
 def _run(study: Study, out: Path, settings: Sequence[Settings], quiet: bool) -> None:
@@ -29,13 +29,13 @@ def _run(study: Study, out: Path, settings: Sequence[Settings], quiet: bool) -> 
 
 
 def refine(
-    only: Annotated[str, typer.Option(help="Scenes.")] = ",".join(SCENES),
+    scenes: Annotated[str, typer.Option("--scenes", "--only", help="Scenes.")] = ",".join(SCENES),
     superpixels: Size = 1000,
-    out: Out = Path("results/refine"),
+    out: Out = Path("out/bench/refine"),
     quiet: Quiet = False,
 ) -> None:
     """What NLP and refinement contribute: E and MRE of start, either alone and both."""
-    settings = grid(scene=words(only, "--only", SCENES), superpixels=[superpixels])
+    settings = grid(scene=words(scenes, "--scenes", SCENES), superpixels=[superpixels])
     _run(study_energy.REFINE, out, settings, quiet)
 
 
@@ -74,7 +74,7 @@ def formulations(
 def cut_off(
     seeds: Seeds = "0,1,2,3,4,5,6,7",
     superpixels: Size = 500,
-    out: Out = Path("results/accuracy"),
+    out: Out = Path("out/bench/accuracy"),
     quiet: Quiet = False,
 ) -> None:
     """Depth of components that the lower border cuts off, by contact alone and as shipped."""

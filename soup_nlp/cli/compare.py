@@ -35,7 +35,7 @@ def compare(
     tol: Annotated[float, typer.Option(help="Dual infeasibility; constraints get 1/100.")] = 1e-4,
     memory: Annotated[float, typer.Option(help="Memory limit of a run, GiB.")] = 4.0,
     presolve: Presolve = True,
-    out: Out = Path("results/solvers"),
+    out: Out = Path("out/solvers"),
     overrides: Set = None,
 ) -> None:
     """Run real solvers on problems, verify their claims, write table and profiles."""

@@ -7,6 +7,7 @@ from pathlib import Path
 import typer
 
 from soup_nlp.cli.options import Out, Quiet
+from soup_nlp.cli.progress import SolveLog
 from soup_nlp.cli.solve import solve_problem
 from soup_nlp.config.problem import load_problem
 
@@ -23,7 +24,8 @@ def demo(out: Out = Path("out/demo"), quiet: Quiet = False) -> None:
     for name, text in PAIRS.items():
         print(f"\n{name}: {text}", flush=True)
         problem = load_problem(name)
-        codes.append(solve_problem(problem, out / name, quiet, problem.expected.mre_at_most))
+        log = SolveLog(quiet, problem=problem)
+        codes.append(solve_problem(problem, out / name, log, problem.expected.mre_at_most))
     pictures = " and ".join(str(out / name / "overview.png") for name in PAIRS)
     print(f"\nlook at    {pictures}")
     raise typer.Exit(max(codes))

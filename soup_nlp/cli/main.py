@@ -73,7 +73,7 @@ BENCH: Mapping[str, tuple[str, str]] = {
     "trws": ("bench_studies:trws", "Time and memory of TRW-S at the size of a refinement."),
     "all": (
         "bench_all:everything",
-        "Make every table and picture of results/ again; a run that was stopped goes on.",
+        "Make every table and picture of results/ in a folder; a run that was stopped goes on.",
     ),
 }
 """The same of `soup-nlp bench`."""

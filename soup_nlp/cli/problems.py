@@ -48,7 +48,7 @@ def export(
         list[str] | None,
         typer.Option("--format", help=f"{', '.join(FORMATS)} (casadi has h5); may be repeated."),
     ] = None,
-    presolve: Presolve = False,
+    presolve: Presolve = True,
     overrides: Set = None,
     quiet: Quiet = False,
 ) -> None:

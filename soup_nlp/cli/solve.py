@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
-from soup_nlp.cli.options import PROBLEM, Out, Set
+from soup_nlp.cli.options import PROBLEM, Set
+from soup_nlp.cli.progress import SolveLog
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
 from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
@@ -21,73 +20,50 @@ from soup_nlp.pipeline.run import run as run_problem
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.verdict import missed, verdict
 from soup_nlp.solve.interrupt import interruptible
-from soup_nlp.solve.ipopt import Progress
 from soup_nlp.storage.atomic import write_text
-
-
-class SolveLog:
-    """Lines for the terminal and the log; iterations rewrite one line on a terminal."""
-
-    def __init__(self, quiet: bool) -> None:
-        self.console = Console(stderr=True, highlight=False)
-        self.quiet = quiet
-        self.lines: list[str] = []
-        self.live = self.console.is_terminal and not quiet
-
-    def say(self, line: str) -> None:
-        """A line after a stage."""
-        self.lines.append(line)
-        if not self.quiet:
-            self._clear()
-            self.console.print(line, markup=False, soft_wrap=True)
-
-    def iteration(self, progress: Progress) -> None:
-        """A line per iteration."""
-        line = str(progress)
-        self.lines.append(line)
-        if self.live:
-            self._clear()
-            self.console.file.write(line[: max(1, self.console.width - 1)])
-            self.console.file.flush()
-
-    def warn(
-        self, message: Warning | str, category: type[Warning], *_: object, **__: object
-    ) -> None:
-        """Print a warning about the input; warnings of libraries are for developers."""
-        if issubclass(category, DataWarning):
-            self.say(f"warning: {message}")
-
-    def interrupted(self, line: str) -> None:
-        """A line from a signal handler, where Python's own streams must not be entered again."""
-        self.lines.append(line)
-        os.write(2, f"\n{line}\n".encode())
-
-    def _clear(self) -> None:
-        if self.live:
-            self.console.file.write("\r\x1b[2K")
 
 
 def solve(
     problem: Annotated[Path | None, typer.Argument(help=PROBLEM)] = None,
-    out: Out = Path("out/run"),
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output folder; default out/NAME.")
+    ] = None,
     overrides: Set = None,
     ref: Annotated[str | None, typer.Option(help="Reference image.")] = None,
     next_: Annotated[str | None, typer.Option("--next", help="Next image.")] = None,
     intrinsics: Annotated[
-        str | None, typer.Option(help="fx,fy,cx,cy in pixels, or a file.")
+        str | None,
+        typer.Option(help="fx,fy,cx,cy in pixels, or a file; default EXIF, else a guess."),
     ] = None,
     intrinsics_next: Annotated[
         str | None, typer.Option(help="The same of the next frame, if it differs.")
     ] = None,
-    flow: Annotated[str | None, typer.Option(help=".flo, KITTI .png or .npy; default DIS.")] = None,
+    fov: Annotated[
+        float | None, typer.Option(help="Horizontal field of view, degrees, for --intrinsics.")
+    ] = None,
+    flow: Annotated[
+        str | None, typer.Option(help=".flo, KITTI .png, .npy, .onnx or a name; default DIS.")
+    ] = None,
+    flow_backward: Annotated[
+        str | None, typer.Option(help="Flow from next to reference: its round trip is confidence.")
+    ] = None,
+    flow_confidence: Annotated[
+        str | None, typer.Option(help="Confidence of --flow: .npy in [0, 1], or a grey picture.")
+    ] = None,
     depth: Annotated[str | None, typer.Option(help="True depth of the reference frame.")] = None,
+    superpixels: Annotated[int | None, typer.Option(help="Wanted number N; default 1000.")] = None,
+    neighbours: Annotated[int | None, typer.Option(help="K of the K-NN graph; default 15.")] = None,
     no_refine: Annotated[
         bool, typer.Option("--no-refine", help="The NLP alone, as refine.enabled=false.")
     ] = False,
     no_nlp: Annotated[
         bool, typer.Option("--no-nlp", help="Refine the start, as refine.from_start=true.")
     ] = False,
+    json_: Annotated[
+        bool, typer.Option("--json", help="Print summary.json instead of the verdict.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Every phase.")] = False,
 ) -> None:
     """Solve a pair of frames and write a result folder."""
     if no_refine and no_nlp:
@@ -96,26 +72,38 @@ def solve(
             found="--no-nlp and --no-refine",
             expected="one of them at most",
         )
-    halves = {"refine.enabled=false": no_refine, "refine.from_start=true": no_nlp}
-    overrides = [*(overrides or []), *(item for item, on in halves.items() if on)]
+    short = {
+        "segmentation.superpixels": superpixels,
+        "segmentation.neighbours": neighbours,
+        "refine.enabled": "false" if no_refine else None,
+        "refine.from_start": "true" if no_nlp else None,
+    }
+    given = [f"{key}={value}" for key, value in short.items() if value is not None]
+    overrides = [*(overrides or []), *given]
     pair = {
         "--ref": ref,
         "--next": next_,
         "--intrinsics": intrinsics,
         "--intrinsics-next": intrinsics_next,
         "--depth": depth,
+        "--fov": None if fov is None else str(fov),
     }
+    flows = {"source": flow, "backward": flow_backward, "confidence": flow_confidence}
     if problem is None:
-        chosen = _from_options(pair, flow, overrides)
+        chosen = _from_options(pair, flows, overrides)
     else:
-        chosen = _from_file(problem, pair, flow, overrides)
+        chosen = _from_file(problem, pair, flows, overrides)
     # a problem file's expectation is of the file without overrides
     limit = None if overrides else chosen.expected.mre_at_most
-    raise typer.Exit(solve_problem(chosen, out, quiet, limit))
+    log = SolveLog(quiet, verbose, chosen)
+    raise typer.Exit(solve_problem(chosen, out or Path("out") / chosen.name, log, limit, json_))
 
 
 def _from_file(
-    problem: Path, pair: Mapping[str, str | None], flow: str | None, overrides: Sequence[str]
+    problem: Path,
+    pair: Mapping[str, str | None],
+    flows: Mapping[str, str | None],
+    overrides: Sequence[str],
 ) -> Problem:
     """The problem of a file, with the flow of the command line."""
     if any(pair.values()):
@@ -125,47 +113,56 @@ def _from_file(
             expected="a problem file, or the options of a pair",
             hint="--set input.KEY=VALUE changes the input of a problem file",
         )
-    if flow:
-        # a path on the command line starts here, one in a problem file from the file
-        source = str(Path(flow).expanduser().resolve()) if is_path(flow) else flow
-        overrides = [f"flow.source={json.dumps(source)}", *overrides]
+    for key, flow in flows.items():
+        if flow:
+            # a path on the command line starts here, one in a problem file from the file
+            place = key != "source" or is_path(flow)
+            source = str(Path(flow).expanduser().resolve()) if place else flow
+            overrides = [f"flow.{key}={json.dumps(source)}", *overrides]
     return load_problem(problem, overrides)
 
 
 def _from_options(
-    pair: Mapping[str, str | None], flow: str | None, overrides: Sequence[str]
+    pair: Mapping[str, str | None], flows: Mapping[str, str | None], overrides: Sequence[str]
 ) -> Problem:
     """The problem of the options of a pair."""
-    ref, following, intrinsics, intrinsics_next, depth = pair.values()
-    if not (ref and following and intrinsics):
+    ref, following, intrinsics, intrinsics_next, depth, fov = pair.values()
+    if not (ref and following):
         raise ConfigError(
             "nothing to solve",
             found="no problem file",
-            expected="PROBLEM.yaml, or --ref, --next and --intrinsics",
+            expected="PROBLEM.yaml, the name of a problem, or --ref and --next",
             hint="soup-nlp demo, or soup-nlp solve motorcycle --out out/motorcycle",
         )
     source: dict[str, Any] = {"kind": "files", "ref": ref, "next": following}
-    source["intrinsics"] = _camera(intrinsics, "--intrinsics")
+    if intrinsics:
+        source["intrinsics"] = _camera(intrinsics, "--intrinsics")
     if intrinsics_next:
         source["intrinsics_next"] = _camera(intrinsics_next, "--intrinsics-next")
+    if fov:
+        source["fov"] = float(fov)
     if depth:
         source["depth"] = depth
     raw: dict[str, Any] = {"name": Path(ref).stem, "input": source, "base": str(Path.cwd())}
-    if flow:
-        raw["flow"] = {"source": flow}
+    raw["flow"] = {key: flow for key, flow in flows.items() if flow}
     return make_problem(raw, overrides, where="command line")
 
 
-def solve_problem(chosen: Problem, out: Path, quiet: bool, mre_at_most: float | None) -> int:
-    """Solve a problem, write its folder and print the verdict.
+def solve_problem(
+    chosen: Problem,
+    out: Path,
+    log: SolveLog,
+    mre_at_most: float | None,
+    as_json: bool = False,
+) -> int:
+    """Solve a problem, write its folder and print the verdict, or summary.json.
 
     Returns:
         0 for a good result that meets the expectation, else 1.
     """
     folder = prepare_folder(out, chosen.input_paths())
-    log = SolveLog(quiet)
     interrupt = interruptible(log.interrupted)
-    with interrupt as stop, warnings.catch_warnings():
+    with interrupt as stop, warnings.catch_warnings(), log:
         warnings.simplefilter("always", DataWarning)
         warnings.showwarning = log.warn
         try:
@@ -174,6 +171,7 @@ def solve_problem(chosen: Problem, out: Path, quiet: bool, mre_at_most: float | 
                 listener=log.iteration,
                 stop=stop,
                 log=log.say,
+                on_stage=log.stage,
                 ipopt_log=str(folder / "ipopt.log"),
             )
             if interrupt.aborted:
@@ -185,9 +183,10 @@ def solve_problem(chosen: Problem, out: Path, quiet: bool, mre_at_most: float | 
         # an interruption must not leave half of the files; writing takes seconds only
         interrupt.deferred = True
         files = write_folder(folder, run, dump_problem(chosen), "\n".join(log.lines) + "\n")
+        log.stage("files")
         text = verdict(run, folder, files, mre_at_most)
         write_text(folder / "log.txt", "\n".join([*log.lines, text]) + "\n")
-    print(text)
+    print((folder / "summary.json").read_text(encoding="utf-8") if as_json else text)
     good = run.good and (mre_at_most is None or not missed(run))
     return 0 if good else 1
 

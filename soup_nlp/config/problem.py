@@ -114,7 +114,7 @@ class Problem(Section):
         Raises:
             ConfigError: the pair was in memory only.
         """
-        return [self.path(name) for name in (*self.input.files(), self.flow.source)]
+        return [self.path(name) for name in (*self.input.files(), *self.flow.files())]
 
 
 def shipped_problems() -> dict[str, Path]:

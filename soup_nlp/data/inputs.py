@@ -17,6 +17,7 @@ from soup_nlp.data.datasets.folders import load_folder, load_motorcycle, load_tu
 from soup_nlp.data.datasets.layout import make_pair
 from soup_nlp.data.datasets.sintel import load_sintel
 from soup_nlp.data.formats.camera_files import read_intrinsics
+from soup_nlp.data.formats.exif import estimated_intrinsics
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.data.scenes.catalogue import render_scene
@@ -51,8 +52,11 @@ class FilesInput(PairInput):
     """Reference image."""
     next: str
     """Next image."""
-    intrinsics: Camera | str
-    """[fx, fy, cx, cy] of the reference frame in pixels, or a file of 4 or 9 numbers."""
+    intrinsics: Camera | str | None = None
+    """[fx, fy, cx, cy] of the reference frame in pixels, or a file of 4 or 9 numbers; null for
+    `fov`, or else EXIF's focal length, or else 1.2 times the larger side."""
+    fov: Positive | None = None
+    """Horizontal field of view of both frames in degrees, where `intrinsics` is null."""
     intrinsics_next: Camera | str | None = None
     """The same of the next frame; null for the same camera."""
     depth: str | None = None
@@ -77,7 +81,10 @@ class FilesInput(PairInput):
 
         images = [path(self.ref), path(self.next)]
         truth = Truth(depth(self.depth), depth(self.depth_next), unit=self.unit)
-        K = camera(self.intrinsics)
+        if self.intrinsics is None:
+            K = estimated_intrinsics(images[0], self.fov)
+        else:
+            K = camera(self.intrinsics)
         K_next = K if self.intrinsics_next is None else camera(self.intrinsics_next)
         return make_pair(images, [K, K_next], truth, "files", self.white)
 

@@ -104,6 +104,7 @@ def _build(source: Callable[[], str], key: str, compiler: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     library = folder / f"kernels-{key}.so"
     if not library.exists():
+        log.info("compiling kernels with %s; this machine keeps them", Path(compiler).name)
         with tempfile.TemporaryDirectory(dir=folder) as work:
             c_file, made = Path(work) / "kernels.c", Path(work) / library.name
             c_file.write_text(source())

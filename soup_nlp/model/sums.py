@@ -130,7 +130,7 @@ class Sums:
                 }
             except NoLanesError as error:
                 self.vectorised = False
-                log.info("no machine code on vectors: %s", error)
+                log.debug("no machine code on vectors: %s", error)
         return {key: Mapped(f, table, place[key]) for key, f in functions.items()}
 
     def _size(self, key: str) -> int:

@@ -93,10 +93,10 @@ def prepare(
     """
 
     def done(stage: str, line: object = None) -> None:
-        if on_stage:
-            on_stage(stage)
         if log and line is not None:
             log(str(line))
+        if on_stage:
+            on_stage(stage)
 
     pair = pair or problem.load_pair()
     done("load")

@@ -161,8 +161,10 @@ class Run:
 class _Clock:
     """Wall time by stage, and a place to stop between the stages before there is a start."""
 
-    def __init__(self, stop: threading.Event | None) -> None:
-        self.stop, self.last = stop, time.perf_counter()
+    def __init__(
+        self, stop: threading.Event | None, listener: Callable[[str], None] | None = None
+    ) -> None:
+        self.stop, self.listener, self.last = stop, listener, time.perf_counter()
         self.seconds: dict[str, float] = {}
 
     def __call__(self, stage: str) -> None:
@@ -174,6 +176,8 @@ class _Clock:
         now = time.perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
         self.last = now
+        if self.listener:
+            self.listener(stage)
         if self.stop and self.stop.is_set() and stage in ("load", "flow", "segmentation"):
             raise StoppedError(
                 "interrupted before there was a start: nothing to write",
@@ -188,6 +192,7 @@ def run(
     listener: Listener | None = None,
     stop: threading.Event | None = None,
     log: Callable[[str], None] | None = None,
+    on_stage: Callable[[str], None] | None = None,
     ipopt_log: str | None = None,
 ) -> Run:
     """Solve a problem.
@@ -198,13 +203,15 @@ def run(
         listener: Called at every iteration of presolve, Ipopt and TRW-S.
         stop: Set it to end with the best iterate, or after the stage where there is no start yet.
         log: Called with a line after every stage.
+        on_stage: Called with the name of a stage at its end: those of `prepare`, "nlp", "refine",
+            "evaluation".
         ipopt_log: File for Ipopt's own log.
 
     Raises:
         StoppedError: `stop` was set before there was a start.
         SoupError: the input cannot be used.
     """
-    clock = _Clock(stop)
+    clock = _Clock(stop, on_stage)
     case = prepare(problem, pair=pair, log=log, on_stage=clock)
 
     def nlp(soup: Soup) -> Solution:

@@ -9,21 +9,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.flow.consistency import FloatMap, confidence_of
+from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
+from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.dis_options import DisOptions
-from soup_nlp.data.flow.guided import guided_flow
 from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.flow.rlof import rlof_flow
 from soup_nlp.data.formats.images import PathLike
-from soup_nlp.data.formats.map_files import read_flow
+from soup_nlp.data.formats.map_files import read_confidence, read_flow
 from soup_nlp.data.pair import Flow, Pair, check_size
-from soup_nlp.errors import DataError
+from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.schema.section import Positive, Section, Share
 
 Image = NDArray[np.uint8]
@@ -34,94 +33,6 @@ ENTRY_POINTS = "soup_nlp.flow"
 
 NOISE = "truth+noise:"
 """Name of the true flow with noise, followed by the standard deviation in pixels."""
-
-MIN_SIDE = 16
-"""Smallest image side for DIS, pixels."""
-
-_FLAT = 1.0  # standard deviation, grey levels, below which an image holds nothing to match
-_WORK_SIDE = 64  # DIS gets images of at least this side; smaller ones are padded
-
-
-def dis_flow(image_ref: Image, image_next: Image, **options: Any) -> Flow:
-    """Dense inverse search flow (Kroeger et al., ECCV 2016) with forward-backward confidence.
-
-    The flow is computed in both directions, and once more after each of the dominant homographies
-    (`planes`) has aligned the images; the better one is taken pixel by pixel (`guided_flow`): near
-    a driving camera displacements are too large for the coarse-to-fine search alone.
-
-    Its confidence is that of its round-trip error (`confidence_of`). A wrong flow that both
-    directions agree on, as on weak texture, keeps its confidence. An image without contrast
-    (standard deviation under one grey level) gives a zero flow with confidence 0 everywhere.
-
-    Args:
-        image_ref: (H, W, 3) or (H, W) uint8 reference image.
-        image_next: (H', W', 3) or (H', W') uint8 next image; it may differ in size.
-        **options: Of `DisOptions`.
-
-    Returns:
-        Flow of source "dis", size of the reference image.
-
-    Raises:
-        ConfigError: an option is unknown or out of range.
-        DataError: an image is not uint8 or too small.
-    """
-    o = DisOptions.make(options)
-    ref, nxt = _grey(image_ref, "image_ref"), _grey(image_next, "image_next")
-    height, width = ref.shape
-    if min(float(ref.std()), float(nxt.std())) < _FLAT:
-        zero = np.zeros((height, width), np.float32)
-        return Flow(np.zeros((height, width, 2), np.float32), zero, "dis")
-    if o.equalize:
-        clahe = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8))
-        ref, nxt = clahe.apply(ref), clahe.apply(nxt)
-    dis = cv2.DISOpticalFlow.create(getattr(cv2, f"DISOPTICAL_FLOW_PRESET_{o.preset.upper()}"))
-    dis.setFinestScale(o.finest_scale)
-    dis.setPatchSize(o.patch_size)
-    dis.setPatchStride(o.patch_stride)
-    dis.setVariationalRefinementIterations(o.refinement_iterations)
-    dis.setVariationalRefinementAlpha(o.alpha)
-    dis.setVariationalRefinementDelta(o.delta)
-    dis.setVariationalRefinementGamma(o.gamma)
-    side = max(_WORK_SIDE, 2 * o.patch_size << o.finest_scale)
-
-    def match(first: Image, second: Image) -> tuple[FloatMap, FloatMap]:
-        size = np.maximum(np.maximum(first.shape, second.shape), side)
-        # the last row and column are repeated up to a common size
-        a, b = (
-            np.pad(image, [(0, n - m) for n, m in zip(size, image.shape, strict=True)], mode="edge")
-            for image in (first, second)
-        )
-        (h1, w1), (h2, w2) = first.shape, second.shape
-        return dis.calc(a, b, None)[:h1, :w1], dis.calc(b, a, None)[:h2, :w2]
-
-    try:
-        forward, backward = match(ref, nxt)
-        uv, gap = guided_flow(ref, nxt, match, forward, backward, o.planes)
-    except cv2.error as error:
-        raise DataError(
-            "DIS flow failed", where=f"images {width}x{height}", found=str(error).strip()
-        ) from error
-    return Flow(np.ascontiguousarray(uv), confidence_of(gap, o.tau, o.limit, o.support), "dis")
-
-
-def _grey(image: Image, where: str) -> Image:
-    if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.ndim < 2:
-        raise DataError(
-            "image must be 8-bit, grey or RGB",
-            where=where,
-            found=f"{image.dtype} {image.shape}",
-            expected="uint8 (H, W) or (H, W, 3)",
-        )
-    if min(image.shape[:2]) < MIN_SIDE:
-        raise DataError(
-            "image is too small for DIS flow",
-            where=where,
-            found=f"{image.shape[1]}x{image.shape[0]}",
-            expected=f"at least {MIN_SIDE} pixels on each side",
-        )
-    if image.ndim == 3:
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-    return np.ascontiguousarray(image)
 
 
 def flow_from_array(uv: NDArray[np.floating], source: str) -> Flow:
@@ -146,6 +57,45 @@ def load_flow(path: PathLike) -> Flow:
     if not flow.confidence.any():
         raise DataError("flow file marks every pixel as unknown", where=path)
     return flow
+
+
+def with_confidence(
+    flow: Flow,
+    backward: PathLike | None,
+    confidence: PathLike | None,
+    size: tuple[int, int],
+    check: DisOptions,
+) -> Flow:
+    """The flow of a file with the confidence of its round trip, or of a file, or their product.
+
+    Args:
+        flow: From the reference to the next image.
+        backward: File of the flow from the next to the reference image.
+        confidence: File of a map in [0, 1], see `read_confidence`.
+        size: (H', W') of the next image.
+        check: Its `tau`, `limit` and `support` make confidence of the round-trip error.
+
+    Raises:
+        DataError: a file is wrong or does not fit.
+    """
+    own = flow.confidence.copy()
+    if backward is not None:
+        back = read_flow(backward).astype(np.float32)
+        check_size("backward flow and next image", back.shape, size, backward)
+        gap = round_trip_error(flow.uv, back)
+        own *= confidence_of(gap, check.tau, check.limit, check.support)
+    if confidence is not None:
+        given = read_confidence(confidence)
+        check_size("flow confidence and flow", given.shape, flow.uv.shape, confidence)
+        own *= given
+    if not own.any():
+        raise DataError(
+            "the flow has confidence 0 everywhere",
+            where=backward or confidence,
+            expected="a backward flow that leads back, or a map that is not black",
+            hint="the backward flow is from the next image to the reference image, in pixels",
+        )
+    return Flow(flow.uv, own, flow.source)
 
 
 def flow_from_truth(pair: Pair, occluded_confidence: float = 1.0) -> Flow:
@@ -214,6 +164,12 @@ class FlowOptions(Section):
 
     source: str = "dis"
     """dis, truth, a file (.flo, KITTI .png, .npy), or the name of a plug-in."""
+    backward: str | None = None
+    """File of the flow from the next to the reference image, beside a `source` that is a file: its
+    round trip becomes the confidence, which is 1 everywhere without it."""
+    confidence: str | None = None
+    """File of the confidence of a `source` that is a file: .npy in [0, 1], or a grey picture,
+    black for unusable."""
     occluded_confidence: Share = 1.0
     """Confidence of occluded pixels when the source is truth."""
     reweight_px: Positive | None = None
@@ -232,11 +188,32 @@ class FlowOptions(Section):
         Raises:
             DataError: the source is unknown, or its flow is damaged or does not fit.
         """
+        if self.backward or self.confidence:
+            return self._load_with_confidence(pair, path)
         if self.source == "dis":
             return dis_flow(pair.image_ref, pair.image_next, **dict(self.dis))
         if self.source == "truth":
             return flow_from_truth(pair, self.occluded_confidence)
         return resolve_flow(pair, str(path(self.source)) if is_path(self.source) else self.source)
+
+    def _load_with_confidence(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
+        if not is_path(self.source) or is_network(self.source):
+            raise ConfigError(
+                "a backward flow or a confidence goes with the file of a flow only",
+                where="flow.source",
+                found=self.source,
+                expected="a .flo, KITTI .png or .npy file",
+                hint="every other source has a confidence of its own",
+            )
+        flow = resolve_flow(pair, str(path(self.source)))
+        backward = path(self.backward) if self.backward else None
+        confidence = path(self.confidence) if self.confidence else None
+        size = pair.image_next.shape[0], pair.image_next.shape[1]
+        return with_confidence(flow, backward, confidence, size, self.dis)
+
+    def files(self) -> list[str]:
+        """Names of the files that may be read; what is no file, such as "dis", is among them."""
+        return [name for name in (self.source, self.backward, self.confidence) if name]
 
 
 def flow_sources() -> dict[str, EntryPoint]:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.formats.images import PathLike, check_body, decode_png16, read_bytes
+from soup_nlp.data.formats.images import PathLike, check_body, decode, decode_png16, read_bytes
 from soup_nlp.errors import DataError
 
 Float = NDArray[np.float64]
@@ -119,10 +119,15 @@ def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> Floa
 
 
 def _known_flow(flow: NDArray[Any], path: PathLike) -> Float:
-    """The flow with NaN in both components where either is unknown."""
+    """The flow with NaN in both components where either is unknown; (2, H, W) is turned."""
+    if flow.ndim == 3 and flow.shape[0] == 2 and flow.shape[2] != 2:
+        flow = flow.transpose(1, 2, 0)
     if flow.ndim != 3 or flow.shape[2] != 2:
         raise DataError(
-            "flow has the wrong shape", where=path, found=flow.shape, expected="(H, W, 2)"
+            "flow has the wrong shape",
+            where=path,
+            found=flow.shape,
+            expected="(H, W, 2) or (2, H, W)",
         )
     with np.errstate(over="ignore"):
         out = np.array(flow, dtype=np.float32)
@@ -174,7 +179,8 @@ def read_flow(path: PathLike) -> Float:
     """Read a flow by the suffix of its file.
 
     `.flo` is Middlebury, `.png` is KITTI (for Virtual KITTI call `read_vkitti_flow`, the two look
-    alike), `.npy` is a plain (H, W, 2) array in pixels with NaN or values over 1e9 where unknown.
+    alike), `.npy` is a plain (H, W, 2) or (2, H, W) array in pixels with NaN or values over 1e9
+    where unknown.
 
     Returns:
         (H, W, 2) float64, pixels; NaN where unknown.
@@ -185,6 +191,32 @@ def read_flow(path: PathLike) -> Float:
         ".npy": lambda p: _known_flow(_read_npy(p, "flow file"), p),
     }
     return _by_suffix(path, readers, "flow")
+
+
+def read_confidence(path: PathLike) -> NDArray[np.float32]:
+    """Read a confidence map: .npy in [0, 1], or a grey picture of 8 or 16 bits, black for 0.
+
+    Returns:
+        (H, W) float32 in [0, 1].
+    """
+    if Path(path).suffix == ".npy":
+        found = _read_npy(path, "confidence file")
+    else:
+        found = decode(path, "confidence map")
+        if found.dtype in (np.uint8, np.uint16):
+            found = found / np.iinfo(found.dtype).max
+    if found.ndim != 2:
+        raise DataError(
+            "confidence has the wrong shape", where=path, found=found.shape, expected="(H, W)"
+        )
+    if not ((found >= 0) & (found <= 1)).all():
+        raise DataError(
+            "confidence is out of range",
+            where=path,
+            found=f"{found.min():g} to {found.max():g}",
+            expected="0 to 1",
+        )
+    return np.asarray(found, np.float32)
 
 
 # --- depth ----------------------------------------------------------------------------------------

@@ -1,0 +1,105 @@
+"""Flow by OpenCV's dense inverse search, with the confidence of its round trip."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.flow.consistency import FloatMap, confidence_of
+from soup_nlp.data.flow.dis_options import DisOptions
+from soup_nlp.data.flow.guided import guided_flow
+from soup_nlp.data.pair import Flow
+from soup_nlp.errors import DataError
+
+Image = NDArray[np.uint8]
+
+MIN_SIDE = 16
+"""Smallest image side for DIS, pixels."""
+
+_FLAT = 1.0  # standard deviation, grey levels, below which an image holds nothing to match
+_WORK_SIDE = 64  # DIS gets images of at least this side; smaller ones are padded
+
+
+def dis_flow(image_ref: Image, image_next: Image, **options: Any) -> Flow:
+    """Dense inverse search flow (Kroeger et al., ECCV 2016) with forward-backward confidence.
+
+    The flow is computed in both directions, and once more after each of the dominant homographies
+    (`planes`) has aligned the images; the better one is taken pixel by pixel (`guided_flow`): near
+    a driving camera displacements are too large for the coarse-to-fine search alone.
+
+    Its confidence is that of its round-trip error (`confidence_of`). A wrong flow that both
+    directions agree on, as on weak texture, keeps its confidence. An image without contrast
+    (standard deviation under one grey level) gives a zero flow with confidence 0 everywhere.
+
+    Args:
+        image_ref: (H, W, 3) or (H, W) uint8 reference image.
+        image_next: (H', W', 3) or (H', W') uint8 next image; it may differ in size.
+        **options: Of `DisOptions`.
+
+    Returns:
+        Flow of source "dis", size of the reference image.
+
+    Raises:
+        ConfigError: an option is unknown or out of range.
+        DataError: an image is not uint8 or too small.
+    """
+    o = DisOptions.make(options)
+    ref, nxt = _grey(image_ref, "image_ref"), _grey(image_next, "image_next")
+    height, width = ref.shape
+    if min(float(ref.std()), float(nxt.std())) < _FLAT:
+        zero = np.zeros((height, width), np.float32)
+        return Flow(np.zeros((height, width, 2), np.float32), zero, "dis")
+    if o.equalize:
+        clahe = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8))
+        ref, nxt = clahe.apply(ref), clahe.apply(nxt)
+    dis = cv2.DISOpticalFlow.create(getattr(cv2, f"DISOPTICAL_FLOW_PRESET_{o.preset.upper()}"))
+    dis.setFinestScale(o.finest_scale)
+    dis.setPatchSize(o.patch_size)
+    dis.setPatchStride(o.patch_stride)
+    dis.setVariationalRefinementIterations(o.refinement_iterations)
+    dis.setVariationalRefinementAlpha(o.alpha)
+    dis.setVariationalRefinementDelta(o.delta)
+    dis.setVariationalRefinementGamma(o.gamma)
+    side = max(_WORK_SIDE, 2 * o.patch_size << o.finest_scale)
+
+    def match(first: Image, second: Image) -> tuple[FloatMap, FloatMap]:
+        size = np.maximum(np.maximum(first.shape, second.shape), side)
+        # the last row and column are repeated up to a common size
+        a, b = (
+            np.pad(image, [(0, n - m) for n, m in zip(size, image.shape, strict=True)], mode="edge")
+            for image in (first, second)
+        )
+        (h1, w1), (h2, w2) = first.shape, second.shape
+        return dis.calc(a, b, None)[:h1, :w1], dis.calc(b, a, None)[:h2, :w2]
+
+    try:
+        forward, backward = match(ref, nxt)
+        uv, gap = guided_flow(ref, nxt, match, forward, backward, o.planes)
+    except cv2.error as error:
+        raise DataError(
+            "DIS flow failed", where=f"images {width}x{height}", found=str(error).strip()
+        ) from error
+    return Flow(np.ascontiguousarray(uv), confidence_of(gap, o.tau, o.limit, o.support), "dis")
+
+
+def _grey(image: Image, where: str) -> Image:
+    if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.ndim < 2:
+        raise DataError(
+            "image must be 8-bit, grey or RGB",
+            where=where,
+            found=f"{image.dtype} {image.shape}",
+            expected="uint8 (H, W) or (H, W, 3)",
+        )
+    if min(image.shape[:2]) < MIN_SIDE:
+        raise DataError(
+            "image is too small for DIS flow",
+            where=where,
+            found=f"{image.shape[1]}x{image.shape[0]}",
+            expected=f"at least {MIN_SIDE} pixels on each side",
+        )
+    if image.ndim == 3:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    return np.ascontiguousarray(image)

@@ -1,0 +1,159 @@
+"""Pictures as people have them: no intrinsics, flows of other programs with their confidence."""
+
+from __future__ import annotations
+
+import json
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+from helpers_files import write_flo
+from PIL import ExifTags, Image
+
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.formats.exif import GUESS, estimated_intrinsics
+from soup_nlp.data.formats.images import DataWarning
+from soup_nlp.data.formats.map_files import read_flow
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.errors import ConfigError, DataError
+
+SIZE = (160, 120)
+
+
+def picture(path, tags=None):
+    image = Image.new("RGB", SIZE)
+    exif = image.getexif()
+    exif.get_ifd(ExifTags.IFD.Exif).update(tags or {})
+    image.save(path, exif=exif)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("tags", "focal"),
+    [
+        # 200 px of diagonal, 43.27 mm on film
+        ({ExifTags.Base.FocalLengthIn35mmFilm: 43}, 43 / np.hypot(36, 24) * 200),
+        # 5 mm at 100 px per mm, stored ten times as large
+        (
+            {
+                ExifTags.Base.FocalLength: 5.0,
+                ExifTags.Base.FocalPlaneXResolution: 1000.0,
+                ExifTags.Base.FocalPlaneResolutionUnit: 3,
+                ExifTags.Base.ExifImageWidth: 1600,
+            },
+            50.0,
+        ),
+        ({ExifTags.Base.FocalLength: 5.0}, GUESS * 160),
+        ({}, GUESS * 160),
+    ],
+)
+def test_focal_length_is_of_exif_or_a_guess_that_is_said(tags, focal, tmp_path):
+    path = picture(tmp_path / "a.jpg", tags)
+    said = "EXIF" if focal != GUESS * 160 else "1.2 times the larger side.*--fov"
+    with pytest.warns(DataWarning, match=said):
+        K = estimated_intrinsics(path)
+    assert K[0, 0] == pytest.approx(focal)
+    assert K[1, 1] == K[0, 0]
+    assert K[:2, 2].tolist() == [79.5, 59.5]
+
+
+def test_a_field_of_view_is_taken_without_a_word(tmp_path):
+    path = picture(tmp_path / "a.jpg", {ExifTags.Base.FocalLengthIn35mmFilm: 43})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert estimated_intrinsics(path, 90.0)[0, 0] == pytest.approx(80.0)
+    with pytest.raises(ConfigError, match="0 to 180"):
+        estimated_intrinsics(path, 180.0)
+
+
+@pytest.fixture(scope="module")
+def orbit(tmp_path_factory):
+    """A rendered pair as files, its flow in both directions, half of it marked unusable."""
+    folder, pair = tmp_path_factory.mktemp("orbit"), render_scene("orbit", 0, *SIZE)
+    for name, image in (("a", pair.image_ref), ("b", pair.image_next)):
+        cv2.imwrite(str(folder / f"{name}.png"), image[..., ::-1])
+    flow = pair.truth.flow.astype(np.float32)
+    write_flo(folder / "forward.flo", flow)
+    np.save(folder / "turned.npy", flow.transpose(2, 0, 1))
+    # wrong on the left by more than the largest error that is tolerated
+    back = cv2.calcOpticalFlowFarneback(
+        pair.image_next[..., 1], pair.image_ref[..., 1], None, 0.5, 3, 25, 3, 7, 1.5, 0
+    )
+    back[:, :60] += 30
+    write_flo(folder / "backward.flo", back)
+    half = np.full(SIZE[::-1], 255, np.uint8)
+    half[:60] = 0
+    cv2.imwrite(str(folder / "half.png"), half)
+    np.save(folder / "half.npy", half / 255)
+    return folder
+
+
+def problem(folder, **flow):
+    source = {"kind": "files", "ref": "a.png", "next": "b.png", "fov": 60}
+    return make_problem({"input": source, "flow": flow, "base": str(folder)})
+
+
+def test_a_flow_with_two_planes_first_is_turned(orbit):
+    assert (read_flow(orbit / "turned.npy") == read_flow(orbit / "forward.flo")).all()
+
+
+def test_a_backward_flow_or_a_map_is_the_confidence(orbit):
+    pair = problem(orbit).load_pair()
+
+    def confidence(**besides):
+        own = problem(orbit, source="forward.flo", **besides)
+        assert set(besides.values()) <= {p.name for p in own.input_paths()}
+        return own.flow.load(pair, own.path).confidence
+
+    assert (confidence() == 1).all()
+    checked = confidence(backward="backward.flo")
+    assert not checked[:, :30].any()
+    assert np.median(checked[20:-20, 100:-20]) > 0.5
+    for name in ("half.png", "half.npy"):
+        assert not confidence(confidence=name)[:60].any()
+        assert (confidence(confidence=name)[60:] == 1).all()
+    both = confidence(backward="backward.flo", confidence="half.png")
+    assert np.array_equal(both[60:], checked[60:])
+
+
+def test_confidence_that_does_not_fit_is_refused(orbit, tmp_path):
+    pair = problem(orbit).load_pair()
+
+    def load(**flow):
+        own = problem(orbit, **flow)
+        return own.flow.load(pair, own.path)
+
+    with pytest.raises(ConfigError, match="file of a flow only"):
+        load(source="dis", backward="backward.flo")
+    np.save(tmp_path / "small.npy", np.ones((3, 3)))
+    np.save(tmp_path / "large.npy", np.full(SIZE[::-1], 2.0))
+    np.save(tmp_path / "none.npy", np.zeros(SIZE[::-1]))
+    for name, words in (
+        ("small", "differ in size"),
+        ("large", "out of range"),
+        ("none", "0 everywhere"),
+    ):
+        with pytest.raises(DataError, match=words):
+            load(source="forward.flo", confidence=str(tmp_path / f"{name}.npy"))
+
+
+def test_two_pictures_are_enough(orbit, tmp_path, capsys):
+    pair = ["--ref", str(orbit / "a.png"), "--next", str(orbit / "b.png")]
+    flow = ["--flow", str(orbit / "forward.flo"), "--flow-confidence", str(orbit / "half.png")]
+    small = ["--superpixels", "30", "--neighbours", "5", "--no-refine", "--json"]
+    small += ["--set", "solver.presolve_iterations=5", "--set", "solver.max_iter=2"]
+    assert main(["solve", *pair, *flow, *small, "-o", str(tmp_path / "out")]) in (0, 1)
+    told = capsys.readouterr()
+    summary = json.loads(told.out)
+    assert summary["sizes"]["knn_edges"] > 0
+    assert summary["flow"].endswith("50.0% usable)")
+    # a line a stage, none an iteration
+    assert "1.2 times the larger side" in told.err
+    stages = [line.split()[0] for line in told.err.splitlines() if " s  " in f"{line}  "]
+    assert [s for s in stages if s in ("load", "flow", "nlp", "files")] == [
+        "load", "flow", "nlp", "files",
+    ]  # fmt: skip
+    assert "presolve 0.3" not in told.err
+    assert "presolve 0.3" in (tmp_path / "out" / "log.txt").read_text()
