@@ -17,7 +17,7 @@ from soup_nlp.geometry.plane import (
     normal_and_distance,
     tilt_to_camera,
 )
-from soup_nlp.geometry.soup import Soup, reconstruct, splat_depth
+from soup_nlp.geometry.soup import Soup, nearest_on_top, reconstruct
 
 unit = st.floats(-1.0, 1.0)
 vectors = hnp.arrays(float, (5, 3), elements=unit)
@@ -282,10 +282,16 @@ def test_the_next_frame_may_have_another_size():
     assert rec.depth_next.shape == (30, 20)
 
 
+def splat_depth(target, z, size):
+    source = nearest_on_top(target, z, size)
+    return np.where(source >= 0, z.ravel()[source], np.nan)
+
+
 def test_the_nearest_surface_wins_the_splat():
     target = np.array([[[2.0, 1.0], [2.2, 1.1], [2.0, 1.0], [0.0, 3.0]]])
     depth = splat_depth(target, np.array([[5.0, 3.0, 4.0, -1.0]]), (4, 5))
     assert depth[1, 2] == 3.0
+    assert nearest_on_top(target, np.array([[5.0, 3.0, 4.0, -1.0]]), (4, 5))[1, 2] == 1
     # a point behind the camera leaves no mark, and nothing lands far away
     assert np.isnan(depth[3, 0])
     assert np.isnan(depth[0]).all()

@@ -25,8 +25,8 @@ ALLOWED = {
     "start": {"errors", "schema", "data", "geometry", "mrf", "model"},
     "solve": {"errors", "schema", "data", "geometry", "model"},
     "refine": {"errors", "schema", "data", "geometry", "mrf", "model", "start", "solve"},
-    # metrics, baselines, and the referee that recomputes stored results
-    "evaluate": {"errors", "storage", "data", "geometry", "start"},
+    # metrics, baselines, confidence, and the referee that recomputes stored results
+    "evaluate": {"errors", "storage", "data", "geometry", "model", "start", "solve"},
     # the whole problem file
     "config": {"errors", "schema", "data", "model", "start", "solve", "refine"},
     "pipeline": {"errors", "config", "data", "geometry", "model", "start", "solve", "refine"}

@@ -118,6 +118,10 @@ class Reconstruction:
         depth_next: (H', W') z of the next frame (nearest surface wins), NaN where nothing lands.
         soup: The state that it is made of.
         labels: (H, W) superpixel of every pixel.
+        source_next: (H', W') reference pixel that the next frame shows there, in row order; -1
+            where nothing lands.
+        sigma_ref: (H, W) standard deviation of log z of the reference frame, scale left out
+            (`evaluate.confidence`); None where it was not computed.
     """
 
     depth_ref: Float
@@ -127,6 +131,8 @@ class Reconstruction:
     depth_next: Float
     soup: Soup
     labels: NDArray[np.int32]
+    source_next: Int
+    sigma_ref: Float | None = None
 
     @property
     def normals(self) -> Float:
@@ -138,6 +144,13 @@ class Reconstruction:
         """(H, W, 3) unit normals of `points_next`: the same surfaces, turned."""
         turned = np.einsum("nij,nj->ni", self.soup.R, self.soup.n)
         return np.asarray(turned[self.labels])
+
+    @property
+    def sigma_next(self) -> Float | None:
+        """(H', W') standard deviation of log z of the next frame; NaN where nothing lands."""
+        if self.sigma_ref is None:
+            return None
+        return np.where(self.source_next >= 0, self.sigma_ref.ravel()[self.source_next], np.nan)
 
     def __str__(self) -> str:
         z = self.depth_ref[np.isfinite(self.depth_ref)]
@@ -175,12 +188,16 @@ def reconstruct(
     moved = np.einsum("hwij,hwj->hwi", soup.R[labels], points) + soup.translation[labels]
     with np.errstate(divide="ignore", invalid="ignore"):
         target = project(K_next, moved)
-    depth_next = splat_depth(target, moved[..., 2], size_next or (height, width))
-    return Reconstruction(z, points, moved, target - uv, depth_next, soup, labels)
+    depth = moved[..., 2]
+    source = nearest_on_top(target, depth, size_next or (height, width))
+    depth_next = np.where(source >= 0, depth.ravel()[source], np.nan)
+    return Reconstruction(z, points, moved, target - uv, depth_next, soup, labels, source)
 
 
-def splat_depth(target: Float, z: Float, size: tuple[int, int]) -> Float:
-    """Forward-warped depth map: nearest surface wins, one-pixel cracks are closed.
+def nearest_on_top(target: Float, z: Float, size: tuple[int, int]) -> Int:
+    """Which reference pixel every pixel of the next frame shows: the nearest surface wins.
+
+    Cracks of one pixel in a stretched surface are closed.
 
     Args:
         target: (H, W, 2) pixel in the next frame of every reference pixel.
@@ -188,25 +205,27 @@ def splat_depth(target: Float, z: Float, size: tuple[int, int]) -> Float:
         size: (height, width) of the next frame.
 
     Returns:
-        (height, width) depth, NaN where nothing lands.
+        (height, width) index of the reference pixel in row order, -1 where nothing lands.
     """
     height, width = size
-    ok = np.isfinite(target).all(-1) & (z > 0)
-    at, z = target[ok], z[ok]
+    ok = np.flatnonzero((np.isfinite(target).all(-1) & (z > 0)).ravel())
+    at, depth = target.reshape(-1, 2)[ok], z.ravel()[ok]
+    far_first = np.argsort(-depth, kind="stable")
 
-    def nearest(corners: Float) -> Float:
-        """Least depth that lands on every pixel; corners (C, P, 2)."""
-        out = np.full(height * width, np.inf)
-        for u, v in corners.transpose(0, 2, 1):
-            inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-            np.minimum.at(out, (v[inside] * width + u[inside]).astype(np.int64), z[inside])
+    def last(corners: Float) -> Int:
+        """Index of the nearest pixel that lands on every pixel; corners (C, P, 2)."""
+        out = np.full(height * width, -1)
+        u, v = corners[:, far_first].astype(np.int64).transpose(2, 1, 0)
+        inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        which = np.broadcast_to(ok[far_first, None], u.shape)
+        # where an index is repeated the last value stays: that of the nearest pixel
+        out[(v * width + u)[inside]] = which[inside]
         return out
 
-    out = nearest(np.floor(at + 0.5)[None])
+    out = last(np.floor(at + 0.5)[None])
     # cracks of a stretched surface alone take what covers them: taken everywhere, a footprint of
     # 2 x 2 pixels makes silhouettes grow and slanted surfaces nearer
     footprint = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
-    crack = np.isinf(out)
-    out[crack] = nearest(np.floor(at) + footprint[:, None])[crack]
-    out[np.isinf(out)] = np.nan
+    crack = out < 0
+    out[crack] = last(np.floor(at) + footprint[:, None])[crack]
     return out.reshape(height, width)

@@ -17,6 +17,7 @@ from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import StoppedError
 from soup_nlp.evaluate.baselines import rigid_depth
+from soup_nlp.evaluate.confidence import Confidence, confidence
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.components import Components, find_components
@@ -59,6 +60,7 @@ class Run:
         metrics: By "solution" (delivered), "nlp" (where refined), "start", "constant", "rigid",
             and "solution_next" for the next frame; a key without truth is absent.
         seconds: Wall time by stage; those that start with nlp_ are parts of "nlp".
+        confidence: How sure `reconstruction` is.
         refined: Result of the refinement of `solution`; None where it is off.
         nlp_reconstruction: Dense 3D of `solution`, where there is an NLP and it was refined.
     """
@@ -75,6 +77,7 @@ class Run:
     rigid: Float | None
     metrics: Mapping[str, DepthMetrics] = field(repr=False)
     seconds: Mapping[str, float]
+    confidence: Confidence
     refined: Refined | None = None
     nlp_reconstruction: Reconstruction | None = None
 
@@ -268,6 +271,10 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     before, middle = dense(case.start.soup), dense(solution.soup)
     after = middle if refined is None else dense(refined.soup)
     between = middle if refined is not None and solution.stages else None
+    form = case.formulation()
+    own = refined.soup if refined else solution.soup
+    sure = confidence(own, case.data, case.weights, form, labels, pair.K_ref, case.start)
+    after = replace(after, sigma_ref=sure.sigma)
     rigid = rigid_depth(pair) if pair.truth is not None else None
     depths = {"solution": after.depth_ref, "start": before.depth_ref}
     if between is not None:
@@ -287,6 +294,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         rigid=rigid,
         metrics=score_depths(pair.truth, depths, expected.scale, expected.cap, after.depth_next),
         seconds={},
+        confidence=sure,
         refined=refined,
         nlp_reconstruction=between,
     )

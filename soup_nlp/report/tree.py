@@ -86,6 +86,23 @@ _DEPTH: Table = {
     "start_ref": ("soup", "H,W", "the start's z, reference frame"),
     "rigid_ref": ("translations", "H,W", "z by one rigid motion, reference frame"),
     "nlp_ref": ("soup", "H,W", "the NLP's z, reference frame"),
+    "sigma_ref": (
+        "1",
+        "H,W",
+        "standard deviation of log z, reference frame, global scale left out",
+    ),
+    "sigma_next": ("1", "H,W", "the same of the next frame, NaN where nothing is seen"),
+}
+_CONFIDENCE: Table = {
+    "plane": (
+        "1",
+        "N,3,3",
+        "marginal covariance of relative inverse depth at the anchor and of its"
+        " slopes over the radius, not calibrated",
+    ),
+    "spread": ("1", "H,W", "standard deviation of log z by the marginals, not calibrated"),
+    "component_sigma": ("1", "C", "standard deviation of a rigid component's log scale"),
+    "noise": ("px", "", "median re-projection error of the start, which the calibration uses"),
 }
 _IPOPT = {
     "obj": "objective of the solver's form",
@@ -141,6 +158,14 @@ def result_tree(run: Run) -> Tree:
         "start_ref": run.start_reconstruction.depth_ref,
         "rigid_ref": run.rigid,
         "nlp_ref": None if nlp is None else nlp.depth_ref,
+        "sigma_ref": rec.sigma_ref,
+        "sigma_next": rec.sigma_next,
+    }
+    sure = {
+        "plane": run.confidence.marginals.plane,
+        "spread": run.confidence.spread,
+        "component_sigma": run.confidence.component_sigma,
+        "noise": np.float64(run.confidence.noise),
     }
     flow = {"flow": pair.flow.uv, "confidence": pair.flow.confidence}
     start = vars(run.start) | {"bending": np.float64(run.start.bending)}
@@ -164,6 +189,7 @@ def result_tree(run: Run) -> Tree:
             for k, stage in enumerate(run.solution.stages)
         },
         "depth": _arrays(_DEPTH, depth),
+        "confidence": _arrays(_CONFIDENCE, sure),
         "truth": {} if truth is None else _arrays(_TRUTH, truth, truth.unit),
     }
 

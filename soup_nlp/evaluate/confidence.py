@@ -1,0 +1,223 @@
+"""How sure depth is: marginal variances of the whole assembly, calibrated against true depth.
+
+See docs/confidence.md. The information is that of the energy at the answer, in nine coordinates per
+superpixel. Of its inverse the blocks of the planes are kept: marginal variances, which know that
+a neighbour is as unsure, not the conditional ones of a superpixel whose neighbours are held.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from soup_nlp.geometry.camera import pixel_grid, rays
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import TangentLayout
+from soup_nlp.solve.selected_inverse import BlockCholesky
+from soup_nlp.solve.tangent_problem import TangentProblem
+from soup_nlp.start.propose import Start
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+SMOOTHING = 0.03
+"""Width in pixels within which a norm is taken for its square: no flow is more exact."""
+
+
+@dataclass(frozen=True)
+class Information:
+    """Gauss-Newton information of the energy at a soup.
+
+    Attributes:
+        matrix: (9 N, 9 N) `sum c J^T J` over all norms, c their weight over their smoothed length,
+            both triangles. Coordinates of a superpixel: relative inverse depth at the anchor and
+            its two slopes, rotation (3), shift of the moved anchor over depth (3).
+        growth: (9 N,) direction in which all depths grow alike; the information has none there.
+        plane: (N, 3) relative inverse depth and slopes at the soup.
+        layout: Anchors and radii that these refer to.
+    """
+
+    matrix: sparse.csr_matrix
+    growth: Float
+    plane: Float
+    layout: TangentLayout
+
+
+def information(
+    soup: Soup, data: EnergyData, weights: Weights, form: Formulation, smoothing: float = SMOOTHING
+) -> Information:
+    """The information of the energy at a soup.
+
+    Args:
+        soup: The answer.
+        data: Pixels, graphs and weights of the pair.
+        weights: Constants of the energy.
+        form: Visibility and whether kernels are compiled; constraints carry no information.
+        smoothing: Width of all norms, pixels.
+    """
+    problem = TangentProblem(soup, data, weights, form, exact=False, chart="inverse-depth")
+    problem.smoothing(smoothing)
+    x = problem.nlp.x0
+    slacks = np.zeros((problem.layout.count, problem.rims + 5))
+    upper = problem.upper.copy()
+    upper.data = problem.hessian(x, slacks, "gauss-newton")
+    matrix = (upper + sparse.triu(upper, 1).T).tocsr()
+    return Information(matrix, problem.growth(x), x.reshape(-1, 9)[:, :3], problem.layout)
+
+
+@dataclass(frozen=True)
+class Marginals:
+    """Marginal covariances of the planes, the global scale left out.
+
+    Attributes:
+        plane: (N, 3, 3) covariance of a superpixel's relative inverse depth and slopes.
+        component: (C,) variance of the mean log depth of every component.
+    """
+
+    plane: Float
+    component: Float
+
+
+def marginals(info: Information, sizes: Int, component: Int) -> Marginals:
+    """Marginal covariances where the mean log depth of all pixels is held.
+
+    Args:
+        info: Information at the soup.
+        sizes: (N,) pixels of every superpixel.
+        component: (N,) rigid component of every superpixel, 0 to C - 1.
+
+    Raises:
+        ArithmeticError: the information is no positive semidefinite matrix.
+    """
+    n, g = len(sizes), info.growth
+    # any weight on the global scale makes the matrix definite; what it is cancels below
+    weight = np.zeros(9 * n)
+    largest = 9 * int(np.argmax(sizes))
+    weight[largest] = info.matrix[largest, largest]
+    solver = BlockCholesky(info.matrix + sparse.diags(weight), info.layout.anchor[:, :2])
+    mean = _mean_log_depth(info, sizes, np.zeros(n, np.int64))[:, 0]
+    mean /= mean @ g
+    h = solver.solve(mean)
+    # covariance of P x, with P = I - g mean^T: depths relative to their mean
+    own = solver.inverse_blocks()[:, :3, :3]
+    g3, h3 = (v.reshape(n, -1)[:, :3] for v in (g, h))
+    cross = g3[:, :, None] * h3[:, None]
+    both = g3[:, :, None] * g3[:, None] * (mean @ h)
+    plane = own - cross - cross.transpose(0, 2, 1) + both
+    rows = _mean_log_depth(info, sizes, component)
+    solved = solver.solve(rows)
+    along = g @ rows
+    spread = np.einsum("xc,xc->c", rows, solved) - 2 * along * (h @ rows) + along**2 * (mean @ h)
+    return Marginals(plane, np.maximum(spread, 0.0))
+
+
+def _mean_log_depth(info: Information, sizes: Int, component: Int) -> Float:
+    """(9 N, C) derivatives of the components' mean log depth, by pixels."""
+    count = int(component.max()) + 1
+    share = sizes / np.bincount(component, sizes, minlength=count)[component]
+    rows = np.zeros((len(sizes), 9, count))
+    rows[np.arange(len(sizes)), 0, component] = -share / info.plane[:, 0]
+    return rows.reshape(-1, count)
+
+
+def spread_in_image(
+    info: Information, plane: Float, labels: NDArray[np.int32], K_ref: Float
+) -> Float:
+    """(H, W) standard deviation of log depth of every pixel, as the marginals have it.
+
+    Args:
+        info: Where the planes are.
+        plane: (N, 3, 3) marginal covariances.
+        labels: (H, W) superpixel of every pixel.
+        K_ref: (3, 3) intrinsics of the reference frame.
+    """
+    ray = rays(K_ref, pixel_grid(*labels.shape))[..., :2]
+    layout = info.layout
+    off = (ray - layout.anchor[labels][..., :2]) / layout.radius[labels][..., None]
+    # log depth is -log(rho + slope . off)
+    a = np.concatenate([np.ones((*labels.shape, 1)), off], axis=-1)
+    a /= np.einsum("hwc,hwc->hw", a, info.plane[labels])[..., None]
+    return np.asarray(np.sqrt(np.maximum(np.einsum("hwi,hwij,hwj->hw", a, plane[labels], a), 0.0)))
+
+
+SIGMA_PRIOR = 0.5
+"""Standard deviation of log depth where the pair says nothing: scenes vary by about that much."""
+PRIOR_SHARE = 0.01
+"""Factor of E_prior in the information: it holds depth where nothing else does, knowing little."""
+FACTOR, POWER_NOISE, POWER_SPREAD = 0.3, 0.0, 1.0
+"""Calibration: sigma = FACTOR noise^POWER_NOISE spread^POWER_SPREAD."""
+GUESS = 0.25
+"""A pixel whose sigma is larger is a guess."""
+
+
+@dataclass(frozen=True)
+class Confidence:
+    """How sure the depth of an answer is.
+
+    Attributes:
+        sigma: (H, W) calibrated standard deviation of log depth, the global scale left out.
+        spread: (H, W) standard deviation of log depth as the marginals have it.
+        marginals: Of the planes and of the components' scales.
+        noise: Median re-projection error of the start, pixels, that the calibration starts from.
+    """
+
+    sigma: Float
+    spread: Float
+    marginals: Marginals
+    noise: float
+
+    @property
+    def guessed(self) -> float:
+        """Share of the pixels whose depth is a guess."""
+        return float(np.mean(self.sigma > GUESS))
+
+    @property
+    def component_sigma(self) -> Float:
+        """(C,) calibrated standard deviation of the components' log scale."""
+        return calibrated(np.sqrt(self.marginals.component), self.noise)
+
+
+def calibrated(spread: Float, noise: float) -> Float:
+    """Standard deviation of log depth that errors keep to, at most `SIGMA_PRIOR`.
+
+    Args:
+        spread: What the marginals say.
+        noise: Median re-projection error of the start, pixels.
+    """
+    sigma = FACTOR * noise**POWER_NOISE * spread**POWER_SPREAD
+    return np.asarray(np.minimum(sigma, SIGMA_PRIOR))
+
+
+def confidence(
+    soup: Soup,
+    data: EnergyData,
+    weights: Weights,
+    form: Formulation,
+    labels: NDArray[np.int32],
+    K_ref: Float,
+    start: Start,
+) -> Confidence:
+    """How sure the depth of an answer is.
+
+    Args:
+        soup: The answer.
+        data: Pixels, graphs and weights of the pair.
+        weights: Constants of the energy.
+        form: Visibility and whether kernels are compiled.
+        labels: (H, W) superpixel of every pixel.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        start: Rigid components and the flow's noise.
+    """
+    weak = weights.replace(prior=PRIOR_SHARE * weights.prior)
+    info = information(soup, data, weak, form)
+    sizes = np.bincount(labels.ravel(), minlength=len(soup))
+    own = marginals(info, sizes, start.component)
+    spread = spread_in_image(info, own.plane, labels, K_ref)
+    noise = float(np.median(start.error))
+    return Confidence(calibrated(spread, noise), spread, own, noise)

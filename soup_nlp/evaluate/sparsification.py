@@ -1,0 +1,72 @@
+"""How well an uncertainty tells large errors from small ones, and how often errors keep to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from soup_nlp.errors import DataError
+
+Float = NDArray[np.float64]
+
+STEPS = 50
+"""Points of a sparsification curve."""
+LAST = 0.02
+"""Share of the pixels that its last point keeps."""
+
+
+@dataclass(frozen=True)
+class Sparsification:
+    """Mean error of the pixels that are kept when the most uncertain ones are removed.
+
+    Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", ECCV 2018.
+
+    Attributes:
+        kept: (STEPS,) shares of the pixels, from 1 down.
+        error: (STEPS,) mean error of that share with the least uncertainty.
+        oracle: (STEPS,) mean error of that share with the least error.
+        ause: Area between the two curves over the mean error: 0 is perfect, about 1 is chance.
+    """
+
+    kept: Float
+    error: Float
+    oracle: Float
+    ause: float
+
+
+def sparsification(error: ArrayLike, uncertainty: ArrayLike) -> Sparsification:
+    """Sort pixels by uncertainty and compare with sorting them by error.
+
+    Pixels of equal uncertainty are removed in the order in which they are given.
+
+    Args:
+        error: (M,) errors, not negative.
+        uncertainty: (M,) larger where the error is expected to be larger.
+
+    Raises:
+        DataError: lengths differ, there is no pixel, or an error is negative or not finite.
+    """
+    e, s = np.asarray(error, float), np.asarray(uncertainty, float)
+    if e.ndim != 1 or e.shape != s.shape or not len(e):
+        raise DataError(
+            "errors and uncertainties do not fit",
+            found=f"{e.shape} and {s.shape}",
+            expected="two vectors of one length, at least 1",
+        )
+    if not (np.isfinite(e).all() and (e >= 0).all()) or np.isnan(s).any():
+        raise DataError("errors must be finite and not negative, uncertainties not NaN")
+    kept = np.linspace(1.0, LAST, STEPS)
+    last = np.maximum((kept * len(e)).astype(int) - 1, 0)
+    mean = [np.cumsum(e[np.argsort(key, kind="stable")]) for key in (s, e)]
+    own, best = (m[last] / (last + 1) for m in mean)
+    whole = float(e.mean())
+    return Sparsification(kept, own, best, float((own - best).mean() / whole) if whole > 0 else 0.0)
+
+
+def coverage(error: ArrayLike, sigma: ArrayLike, factors: Sequence[float] = (1, 2)) -> list[float]:
+    """Share of the errors (M,) that are at most each factor times their sigma (M,)."""
+    e, s = np.abs(np.asarray(error, float)), np.asarray(sigma, float)
+    return [float(np.mean(e <= k * s)) for k in factors]

@@ -1,0 +1,134 @@
+"""Marginal variances of depth: dense inverses, derivatives, scale, missing flow, calibration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from soup_nlp.evaluate.confidence import information, marginals, spread_in_image
+from soup_nlp.geometry.soup import Soup, reconstruct
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.solve import selected_inverse
+from soup_nlp.solve.selected_inverse import BlockCholesky, dissect
+
+FORM = Formulation(compiled=False)
+
+
+@pytest.fixture(scope="module")
+def info(small_room):
+    return information(small_room.soup, small_room.data, small_room.weights, FORM)
+
+
+@pytest.fixture(scope="module")
+def dense(small_room, info):
+    """Covariance where the mean log depth of all pixels is held, by a dense pseudo-inverse."""
+    sizes = small_room.segmentation.sizes
+    mean = np.zeros(len(info.growth))
+    mean[::9] = -sizes / sizes.sum() / info.plane[:, 0]
+    scale = 1 / np.sqrt(info.matrix.diagonal())
+    held = info.matrix.toarray() * np.outer(scale, scale)
+    # holding the mean is a constraint: its KKT matrix is regular
+    row = mean * scale
+    row /= np.linalg.norm(row)
+    kkt = np.block([[held, row[:, None]], [row[None], np.zeros((1, 1))]])
+    return np.linalg.inv(kkt)[:-1, :-1] * np.outer(scale, scale)
+
+
+def blocks_of(matrix: np.ndarray, size: int) -> np.ndarray:
+    n = len(matrix) // size
+    return matrix.reshape(n, size, n, size)[np.arange(n), :, np.arange(n)]
+
+
+@pytest.mark.parametrize("piece", [1, 4, 1000])
+@pytest.mark.parametrize("seed", range(4))
+def test_diagonal_blocks_of_the_inverse_are_those_of_a_dense_inverse(monkeypatch, piece, seed):
+    """Random graphs; the third and fourth have parts that nothing couples."""
+    monkeypatch.setattr(selected_inverse, "PIECE", piece)
+    rng = np.random.default_rng(seed)
+    n, size = 30, 3
+    place = rng.uniform(0, 1, (n, 2))
+    near = np.linalg.norm(place[:, None] - place, axis=-1) < (0.35 if seed < 2 else 0.15)
+    J = rng.normal(size=(n * size, n * size)) * np.kron(near, np.ones((size, size)))
+    A = J.T @ J * np.kron(near, np.ones((size, size))) + 40 * n * np.eye(n * size)
+    solver = BlockCholesky(sparse.csr_matrix(A), place)
+    inverse = np.linalg.inv(A)
+    np.testing.assert_allclose(solver.inverse_blocks(), blocks_of(inverse, size), rtol=1e-8)
+    b = rng.normal(size=(n * size, 2))
+    np.testing.assert_allclose(solver.solve(b), inverse @ b, rtol=1e-7, atol=1e-12)
+    assert np.array_equal(np.sort(np.concatenate([f.own for f in solver.fronts])), np.arange(n))
+
+
+def test_a_matrix_that_is_not_positive_is_refused():
+    with pytest.raises(ArithmeticError, match="diagonal"):
+        BlockCholesky(sparse.csr_matrix(np.diag([1.0, 0.0])), np.zeros((2, 2)))
+    with pytest.raises(ArithmeticError, match="positive definite"):
+        BlockCholesky(sparse.csr_matrix([[1.0, 2.0], [2.0, 1.0]]), np.array([[0.0, 0], [1, 1]]))
+
+
+def test_superpixels_in_one_place_are_one_piece():
+    fronts = dissect(sparse.csr_matrix(np.ones((40, 40))), np.zeros((40, 2)))
+    assert len(fronts) == 1
+
+
+def test_marginals_are_those_of_a_dense_inverse(small_room, info, dense):
+    component = np.arange(len(small_room)) % 3
+    found = marginals(info, small_room.segmentation.sizes, component)
+    np.testing.assert_allclose(found.plane, blocks_of(dense, 9)[:, :3, :3], rtol=1e-4, atol=1e-12)
+    for c in range(3):
+        row = np.zeros(len(info.growth))
+        own = np.where(component == c, small_room.segmentation.sizes, 0)
+        row[::9] = -own / own.sum() / info.plane[:, 0]
+        assert found.component[c] == pytest.approx(row @ dense @ row, rel=1e-4)
+
+
+def test_all_depths_growing_alike_costs_nothing(info):
+    size = abs(info.matrix) @ abs(info.growth)
+    assert abs(info.matrix @ info.growth).max() < 1e-9 * size.max()
+
+
+def test_the_variance_of_a_pixel_is_that_of_its_log_depth(small_room, info, dense):
+    """By the derivative of the log depth of a plane, by differences."""
+    seg, K = small_room.segmentation, small_room.pair.K_ref
+    found = marginals(info, seg.sizes, np.zeros(len(small_room), int))
+    sigma = spread_in_image(info, found.plane, seg.labels, K)
+    v, u = 40, 100
+    i = seg.labels[v, u]
+
+    def log_depth(x):
+        z = reconstruct(info.layout.unpack(x), seg.labels, K, K).depth_ref
+        # the length unit of the answer changes with every plane
+        return np.log(z[v, u] / z[0, 0])
+
+    # the start's planes were tilted until they face the camera
+    x0, h = info.layout.pack(small_room.soup), 1e-5
+    x0.reshape(-1, 9)[:, :3] = info.plane
+    slope = np.zeros(9)
+    for k in range(3):
+        e = np.zeros(len(x0))
+        e[9 * i + k] = h
+        slope[k] = (log_depth(x0 + e) - log_depth(x0 - e)) / (2 * h)
+    expected = np.sqrt(slope @ blocks_of(dense, 9)[i] @ slope)
+    assert sigma[v, u] == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_scene_ten_times_as_large_is_as_sure(small_room, info):
+    s = small_room.soup
+    large = Soup(10 * s.lam, s.n, s.d, s.R, s.t)
+    again = information(large, small_room.data, small_room.weights, FORM)
+    sizes, one = small_room.segmentation.sizes, np.zeros(len(small_room), int)
+    a, b = (marginals(each, sizes, one).plane for each in (info, again))
+    np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-12)
+
+
+def test_a_superpixel_without_flow_is_less_sure(small_room, info):
+    seg, one = small_room.segmentation, np.zeros(len(small_room), int)
+    blind = 25
+    weight = small_room.data.pixel_weight.copy()
+    weight[blind] = 0.0
+    data = replace(small_room.data, pixel_weight=weight)
+    without = information(small_room.soup, data, small_room.weights, FORM)
+    before, after = (marginals(i, seg.sizes, one).plane[blind, 0, 0] for i in (info, without))
+    assert after > 1.5 * before
