@@ -11,6 +11,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """(M, 3) positions, (M, 3) colours, and (M, 3) normals or None, after the file's own header."""
     header, body = path.read_bytes().split(b"end_header\n", 1)
     lines = [line.split() for line in header.decode("ascii").splitlines()]
+    lines = [line for line in lines if line[0] != "comment"]
     assert lines[:2] == [["ply"], ["format", "binary_little_endian", "1.0"]]
     assert lines[2][:2] == ["element", "vertex"]
     types = {"float": "<f4", "uchar": "u1"}

@@ -43,6 +43,8 @@ FILES = [
     "flow.png",
     "error.png",
     "overview.png",
+    "motions.json",
+    "trajectory.tum",
     "points_ref.ply",
     "points_next.ply",
 ]
@@ -77,7 +79,8 @@ def test_a_solve_writes_every_file(solved):
     assert summary["residuals"]["normal"] < 1e-8
     assert summary["metrics"]["solution"]["mre"] < summary["metrics"]["constant"]["mre"]
     xyz, rgb, _ = read_ply(solved / "points_ref.ply")
-    assert len(xyz) == len(rgb) > 0.9 * 192 * 128
+    # less what is hidden or at jumps of the depth
+    assert 192 * 128 > len(xyz) == len(rgb) > 0.7 * 192 * 128
     with h5py.File(solved / "result.h5") as file:
         assert file["solution/R"].attrs["units"] == "1"
         assert file["depth/ref"].shape == (128, 192)

@@ -59,6 +59,8 @@ LIBRARIES = {
     "yaml": {"config", "data", "report", "cli"},
     "cv2": {"data", "start", "report"},
     "skimage": {"data", "geometry"},
+    "trimesh": {"report"},
+    "rerun": {"report"},
 }
 """Which rooms may import a library; `importlib.metadata` names versions without importing."""
 

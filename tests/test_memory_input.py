@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from dataclasses import replace
 
@@ -72,3 +73,51 @@ def test_arrays_of_truth_and_history_are_described(run, tmp_path):
             assert ("complementarity" in said) == ("presolve" in name)
             damped = stage["regularization_size"].attrs["description"]
             assert ("damping" in damped) == ("presolve" in name)
+
+
+def test_a_run_prints_itself_in_five_lines(run):
+    lines = repr(run).splitlines()
+    assert len(lines) == 5
+    assert max(map(len, lines)) <= 110
+    assert f"MRE {run.metrics['solution'].mre:.4f}" in repr(run)
+    records = run.pair, run.segmentation, run.start, run.solution, run.soup, run.reconstruction
+    for record in (*records, run.components, run.camera, run.data):
+        assert len(repr(record)) < 300, type(record)
+
+
+def test_a_run_saves_itself_and_is_converted(run, tmp_path, capsys):
+    out, other = tmp_path / "out", tmp_path / "other"
+    files = run.save(out, formats=["npy", "motions"])
+    assert set(files) >= {"result.h5", "points_ref.ply", "motions.json", "depth_ref.npy"}
+    assert all((out / name).exists() for name in files)
+    assert check_folder(out).ok
+    assert main(["convert", str(out), "--to", "npy,motions, glb,colmap", "-o", str(other)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert f"{other / 'mesh_next.glb'}" in printed
+    # the folder holds what the run held
+    for name in ("motions.json", "trajectory.tum", "depth_ref.npy", "depth_next.npy"):
+        assert (other / name).read_bytes() == (out / name).read_bytes(), name
+    told = json.loads((out / "motions.json").read_text())
+    np.testing.assert_array_equal(told["camera"]["next_from_ref"], run.camera.matrix)
+    assert main(["convert", str(out), "--to", "colmap"]) == 0
+    assert (out / "colmap" / "sparse" / "0" / "points3D.txt").is_file()
+
+
+def test_what_cannot_be_converted_is_refused(run, tmp_path, capsys):
+    out, foreign = tmp_path / "out", tmp_path / "foreign"
+    run.save(out)
+    foreign.mkdir()
+    (foreign / "mesh_ref.glb").write_text("mine")
+    for arguments, said in (
+        ([str(out), "--to", "glb", "--out", str(foreign)], "files"),
+        ([str(out), "--to", "obj"], "unknown format"),
+        ([str(out), "--to", ""], "no format"),
+        ([str(foreign), "--to", "glb"], "result"),
+    ):
+        assert main(["convert", *arguments]) == 2
+        assert said in capsys.readouterr().err
+    assert (foreign / "mesh_ref.glb").read_text() == "mine"
+    with h5py.File(out / "result.h5", "a") as file:
+        del file["input/image_ref"]
+    assert main(["convert", str(out), "--to", "glb"]) == 2
+    assert "older version" in capsys.readouterr().err

@@ -23,6 +23,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "results:check",
         "Recompute energy, constraints and metrics of a result, or the constraints of a .sol.",
     ),
+    "convert": (
+        "convert:convert",
+        "Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions.",
+    ),
     "evaluate": ("results:evaluate", "Score a result against a truth file."),
     "show": ("problems:show", "Print the merged problem and its hash."),
     "list": ("problems:list_", "Print the problems that come with the package, or of a folder."),

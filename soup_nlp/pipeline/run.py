@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.config.problem import Problem, make_problem
+from soup_nlp.config.problem import Problem, dump_problem, make_problem
 from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import StoppedError
@@ -119,6 +121,24 @@ class Run:
         """next_from_ref of the static scene, in the unit of the reconstruction; its `centre` is the
         next camera as the reference frame sees it."""
         return self.components.camera
+
+    def save(self, folder: str | Path, formats: Sequence[str] = ()) -> list[str]:
+        """Write a result folder, as `soup-nlp solve` does.
+
+        Args:
+            folder: A new or empty folder, or that of an earlier result.
+            formats: Files for other programs beside: "glb", "colmap", "npy", "pfm", "rrd" ...
+
+        Returns:
+            Names of the files.
+
+        Raises:
+            ConfigError: a format is not known.
+            DataError: the folder cannot be written, or holds what is not to be overwritten.
+        """
+        # the report room imports this one
+        write = import_module("soup_nlp.report.save").save
+        return list(write(self, folder, dump_problem(self.problem), formats))
 
     @property
     def delivered(self) -> str:

@@ -24,7 +24,8 @@ from soup_nlp.report.figures import (
     write_clipped_depth_png16,
     write_png,
 )
-from soup_nlp.report.pointcloud import write_ply
+from soup_nlp.report.formats import write_formats
+from soup_nlp.report.result import result_of
 from soup_nlp.report.tree import attributes, result_tree
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.storage.atomic import write_text
@@ -48,6 +49,8 @@ FILES = (
     "flow.png",
     "error.png",
     "overview.png",
+    "motions.json",
+    "trajectory.tum",
     "points_ref.ply",
     "points_next.ply",
 )
@@ -153,11 +156,7 @@ def write_folder(folder: Path, run: Run, config: str, log: str) -> list[str]:
     write_text(folder / "log.txt", log)
     write_h5(folder / "result.h5", result_tree(run), attributes(run, config))
     scales = _pictures(folder, run)
-    rec, image = run.reconstruction, run.pair.image_ref
-    labels, soup = run.segmentation.labels, run.soup
-    turned = np.einsum("nij,nj->ni", soup.R, soup.n)
-    write_ply(folder / "points_ref.ply", rec.points_ref, image, soup.n[labels])
-    write_ply(folder / "points_next.ply", rec.points_next, image, turned[labels])
+    write_formats(folder, result_of(run), ("motions", "ply"))
     write_json(folder / "summary.json", {**summary(run), "depth_png_scale": scales})
     return [name for name in FILES if (folder / name).is_file()]
 

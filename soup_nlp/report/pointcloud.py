@@ -2,25 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from soup_nlp.storage.atomic import PathLike, write_bytes
 
+if TYPE_CHECKING:
+    from soup_nlp.report.result import Mask, Result
+
+AXES = "x right, y down, z ahead"
+"""Axes of a camera, in words."""
+
 
 def write_ply(
-    path: PathLike, xyz: ArrayLike, rgb: ArrayLike, normals: ArrayLike | None = None
+    path: PathLike,
+    xyz: ArrayLike,
+    rgb: ArrayLike,
+    normals: ArrayLike | None = None,
+    scalars: Mapping[str, ArrayLike] | None = None,
+    comments: Sequence[str] = (),
 ) -> int:
     """Write a coloured point cloud (binary little endian, float32 and uchar) atomically.
 
-    Points with a coordinate or normal that is not a finite float32 are left out, so that a depth
-    map with unknown pixels can be given as it is.
+    Points with a number that is not a finite float32 are left out, so that a depth map with unknown
+    pixels can be given as it is.
 
     Args:
         path: File to write; its folder must exist.
         xyz: (..., 3) positions, camera frame (x right, y down, z forward), any length unit.
         rgb: (..., 3) uint8 colours, same leading shape.
         normals: (..., 3) unit normals, same leading shape, or None.
+        scalars: (...) numbers by the name of their property, such as "confidence".
+        comments: Lines of the header, ASCII.
 
     Returns:
         The number of points written.
@@ -28,20 +44,61 @@ def write_ply(
     Raises:
         DataError: the folder cannot be written.
     """
-    parts = [xyz] if normals is None else [xyz, normals]
-    numbers = np.concatenate([np.reshape(part, (-1, 3)) for part in parts], 1, dtype=np.float64)
+    parts = [np.reshape(part, (-1, 3)) for part in (xyz, normals) if part is not None]
+    parts += [np.reshape(part, (-1, 1)) for part in (scalars or {}).values()]
+    numbers = np.concatenate(parts, 1, dtype=np.float64)
     colours = np.reshape(np.asarray(rgb, np.uint8), (-1, 3))
     good = (np.abs(numbers) <= np.finfo(np.float32).max).all(axis=1)
-    floats = ("x", "y", "z", "nx", "ny", "nz")[: numbers.shape[1]]
-    table = np.empty(int(good.sum()), [("position", "<f4", (len(floats),)), ("colour", "u1", (3,))])
-    table["position"], table["colour"] = numbers[good], colours[good]
+    floats = ["x", "y", "z", *(["nx", "ny", "nz"] if normals is not None else [])]
+    floats += list(scalars or {})
+    table = np.empty(int(good.sum()), [("numbers", "<f4", (len(floats),)), ("colour", "u1", (3,))])
+    table["numbers"], table["colour"] = numbers[good], colours[good]
     header = [
         "ply",
         "format binary_little_endian 1.0",
+        *(f"comment {line}" for line in comments),
         f"element vertex {len(table)}",
         *(f"property float {name}" for name in floats),
         *(f"property uchar {name}" for name in ("red", "green", "blue")),
         "end_header",
     ]
-    write_bytes(path, ("\n".join(header) + "\n").encode("ascii") + table.tobytes())
+    text = "\n".join(header) + "\n"
+    write_bytes(path, text.encode("ascii", "replace") + table.tobytes())
     return len(table)
+
+
+def write_cloud(path: PathLike, result: Result, frame: int, keep: Mask | None = None) -> int:
+    """Write the points of the reference image, where they are in one of the frames, as PLY.
+
+    Properties beside position, normal and colour: `confidence` of the flow, `component`, and
+    `sigma_log_depth` where it is known.
+
+    Args:
+        path: File to write; its folder must exist.
+        result: What was solved.
+        frame: 0 for the reference frame, 1 for the next one.
+        keep: (H, W) points that are written; default `result.sure`.
+
+    Returns:
+        The number of points written.
+    """
+    keep = result.sure if keep is None else keep
+    scalars = {"confidence": result.flow_confidence, "component": result.components.of_pixel}
+    if result.sigma is not None:
+        scalars["sigma_log_depth"] = result.sigma
+    name = ("reference", "next")[frame]
+    comments = [
+        f"{result.name}: points of the reference image in the {name} frame",
+        f"frame: camera of the {name} frame, {AXES}",
+        f"unit: {result.unit}",
+        "confidence: of the flow, 0 to 1; component: what moves as one, 0 is the background",
+        f"{keep.mean():.1%} of the pixels: without hidden ones and those at jumps of the depth",
+    ]
+    return write_ply(
+        path,
+        result.points[frame][keep],
+        result.images[0][keep],
+        result.normals[frame][keep],
+        {key: value[keep] for key, value in scalars.items()},
+        comments,
+    )

@@ -17,6 +17,8 @@ Table: TypeAlias = Mapping[str, tuple[str, str, str]]
 """Unit, axes and description by name; the unit "truth" stands for that of the truth."""
 
 _INPUT: Table = {
+    "image_ref": ("1", "H,W,3", "reference image, 8-bit RGB"),
+    "image_next": ("1", "H,W,3", "next image, 8-bit RGB"),
     "K_ref": ("px", "3,3", "intrinsics of the reference frame"),
     "K_next": ("px", "3,3", "intrinsics of the next frame"),
     "flow": ("px", "H,W,2", "flow from reference to next"),
@@ -79,6 +81,12 @@ _SOUP: Table = {
     "d": ("soup", "N", "plane offsets; lam d is the plane's distance"),
     "R": ("1", "N,3,3", "rotations, next_from_ref"),
     "t": ("soup", "N,3", "translations; lam t is next_from_ref"),
+}
+_COMPONENTS: Table = {
+    "of_superpixel": ("1", "N", "what moves as one in the solution; 0 is the background"),
+    "motion": ("soup", "C,4,4", "next_from_ref of every component, the camera's motion included"),
+    "residual_px": ("px", "C", "median distance from where the superpixels' own motions lead"),
+    "borrowed": ("1", "C", "share of the pixels whose depth is a guess"),
 }
 _DEPTH: Table = {
     "ref": ("soup", "H,W", "z of the reference frame, NaN if none"),
@@ -171,7 +179,7 @@ def result_tree(run: Run) -> Tree:
     start = vars(run.start) | {"bending": np.float64(run.start.bending)}
     truth = pair.truth
     return {
-        "input": _arrays(_INPUT, {"K_ref": pair.K_ref, "K_next": pair.K_next, **flow}),
+        "input": _arrays(_INPUT, {**vars(pair), **flow}),
         "segmentation": _arrays(_SEGMENTATION, run.segmentation),
         "energy": _arrays(_ENERGY, run.data.arrays()),
         "weights": _weights(run),
@@ -190,6 +198,7 @@ def result_tree(run: Run) -> Tree:
         },
         "depth": _arrays(_DEPTH, depth),
         "confidence": _arrays(_CONFIDENCE, sure),
+        "components": _arrays(_COMPONENTS, _components(run)),
         "truth": {} if truth is None else _arrays(_TRUTH, truth, truth.unit),
     }
 
@@ -201,6 +210,17 @@ def _arrays(table: Table, values: object, unit: str = "") -> dict[str, Array]:
         key: Array(found[key], unit if own == "truth" else own, text, axes)
         for key, (own, axes, text) in table.items()
         if found.get(key) is not None
+    }
+
+
+def _components(run: Run) -> dict[str, Any]:
+    """Rigid components of the solution (C)."""
+    found = run.components
+    return {
+        "of_superpixel": found.of_superpixel,
+        "motion": np.stack([c.motion.matrix for c in found]),
+        "residual_px": np.array([c.residual_px for c in found]),
+        "borrowed": np.array([c.borrowed for c in found]),
     }
 
 
@@ -266,4 +286,7 @@ def attributes(run: Run, config: str) -> dict[str, Any]:
         "delivered": run.delivered,
         "config": config,
         "nlp": run.solution.description,
+        # None is left out
+        "scale_to_truth": run.metrics["solution"].scale if "solution" in run.metrics else None,
+        "truth_unit": None if run.pair.truth is None else run.pair.truth.unit,
     }

@@ -1,0 +1,110 @@
+"""The surface of a reconstruction: where it hangs together, what is hidden, its triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.camera import pixel_grid, rays
+from soup_nlp.geometry.soup import Reconstruction
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+BEHIND = 0.05
+"""Share of its depth by which a hidden point lies behind the nearest surface."""
+JUMP = 0.1
+"""Share of the depth by which two planes may differ where they meet."""
+
+
+def hidden(rec: Reconstruction) -> Mask:
+    """(H, W) True where a reference pixel is not seen in the next frame.
+
+    It lies behind a nearer surface there, or outside the image. Nothing in the next image says
+    what its depth is.
+    """
+    height, width = rec.depth_next.shape
+    target = rec.flow + pixel_grid(*rec.depth_ref.shape)
+    z = rec.points_next[..., 2]
+    with np.errstate(invalid="ignore"):
+        u, v = np.floor(target[..., 0] + 0.5), np.floor(target[..., 1] + 0.5)
+        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    u, v = (np.where(inside, x, 0).astype(np.int64) for x in (u, v))
+    nearest = rec.depth_next[v, u]
+    return ~inside | ~(z <= nearest * (1 + BEHIND))
+
+
+def joined(rec: Reconstruction, K: Float, group: NDArray[np.integer]) -> tuple[Mask, Mask]:
+    """Where the surface goes on between neighbouring pixels.
+
+    It does within a superpixel, and between two whose planes meet there and which belong to the
+    same group.
+
+    Args:
+        rec: Reconstruction.
+        K: (3, 3) intrinsics of the reference frame.
+        group: (H, W) such as rigid components.
+
+    Returns:
+        (H, W - 1) for every pixel and the one to its right, (H - 1, W) and the one below.
+    """
+    ray = rays(K, pixel_grid(*rec.labels.shape))
+    out = []
+    for a, b in (
+        ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
+        ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
+    ):
+        i, k = rec.labels[a], rec.labels[b]
+        hold = (i == k) & np.isfinite(rec.depth_ref[a]) & np.isfinite(rec.depth_ref[b])
+        across = (i != k) & (group[a] == group[b])
+        if across.any():
+            who = np.stack([i[across], k[across]], axis=1)
+            z = rec.soup.depth_across(who, 0.5 * (ray[a][across] + ray[b][across]))
+            near, far = z.min(axis=0), z.max(axis=0)
+            hold[across] = (far - near) <= JUMP * near
+        out.append(hold)
+    return out[0], out[1]
+
+
+def at_jumps(right: Mask, below: Mask) -> Mask:
+    """(H, W) True for the pixels on both sides of where the surface breaks off, see `joined`.
+
+    Images and flow are mixed there, and what is in between hangs like a curtain.
+    """
+    out = np.zeros((len(right), right.shape[1] + 1), bool)
+    for a, b, hold in ((out[:, :-1], out[:, 1:], right), (out[:-1], out[1:], below)):
+        a |= ~hold
+        b |= ~hold
+    return out
+
+
+def triangles(right: Mask, below: Mask, keep: Mask, step: int = 1) -> NDArray[np.int64]:
+    """(M, 3) triangles of pixels v W + u, counter-clockwise as the camera sees them.
+
+    Every cell of `step` pixels whose border and inside hang together has two.
+
+    Args:
+        right: (H, W - 1) whether the surface goes on to the right, see `joined`.
+        below: (H - 1, W) the same downwards.
+        keep: (H, W) pixels that are part of the surface.
+        step: Pixels of a side of a cell.
+    """
+    height, width = keep.shape
+
+    def full(mask: Mask, tall: int, wide: int) -> Mask:
+        """(h, w) whether a mask holds everywhere in windows of tall x wide at every cell."""
+        total = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), np.int64)
+        total[1:, 1:] = (~mask).cumsum(0).cumsum(1)
+        v = np.arange(0, height - step, step)[:, None]
+        u = np.arange(0, width - step, step)
+        missing = total[v + tall, u + wide] - total[v, u + wide] - total[v + tall, u] + total[v, u]
+        return missing == 0
+
+    whole = full(keep, step + 1, step + 1)
+    whole &= full(right, step + 1, step) & full(below, step, step + 1)
+    v, u = np.nonzero(whole)
+    a = (v * width + u) * step
+    b, c = a + step, a + step * width
+    d = c + step
+    # the image's y runs down: a, c, b turns to the left for who looks along z
+    return np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])

@@ -1,0 +1,121 @@
+"""COLMAP's text model: two cameras, two images and the points of the static scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.report.figures import write_png
+from soup_nlp.storage.atomic import write_text
+
+if TYPE_CHECKING:
+    from soup_nlp.report.result import Result
+
+POINTS = 50_000
+"""Most points of a model."""
+IMAGES = ("ref.png", "next.png")
+"""Names of the images in a model."""
+
+
+def write_colmap(folder: Path, result: Result) -> int:
+    """Write `images/`, `masks/` and `sparse/0/` as COLMAP and what reads its models expect them.
+
+    The world is the reference camera (x right, y down, z ahead); both images have poses
+    cam_from_world. A model of COLMAP stands still: its points are those of the background, seen in
+    both images, and the masks are black where something else moves.
+
+    Args:
+        folder: Folder to write into; it must exist.
+        result: What was solved.
+
+    Returns:
+        The number of points.
+
+    Raises:
+        DataError: a camera has skew, which none of COLMAP's models has.
+    """
+    for K in result.K:
+        if K[0, 1] != 0:
+            raise DataError("COLMAP has no camera with skew", found=K.tolist(), expected="s = 0")
+    model = folder / "sparse" / "0"
+    for place in (model, folder / "images", folder / "masks"):
+        place.mkdir(parents=True, exist_ok=True)
+    moving = result.components.of_pixel > 0
+    masks = np.where(moving, 0, 255), np.where(_moved(result, moving), 0, 255)
+    for name, image, mask in zip(IMAGES, result.images, masks):
+        write_png(folder / "images" / name, image)
+        write_png(folder / "masks" / f"{name}.png", np.repeat(mask[..., None], 3, 2).astype("u1"))
+    pixels, points, colours = _points(result, ~moving)
+    write_text(model / "cameras.txt", _cameras(result))
+    write_text(model / "images.txt", _images(result, pixels))
+    ids = np.arange(1, len(points) + 1)
+    rows = [
+        f"{i} {x:.9g} {y:.9g} {z:.9g} {r} {g} {b} 0 1 {i - 1} 2 {i - 1}"
+        for i, (x, y, z), (r, g, b) in zip(ids, points, colours)
+    ]
+    head = [
+        f"# {result.name}; unit: {result.unit}",
+        "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+    ]
+    write_text(model / "points3D.txt", "\n".join([*head, *rows]) + "\n")
+    return len(points)
+
+
+def _cameras(result: Result) -> str:
+    """PINHOLE cameras; the first pixel's centre is (0.5, 0.5) in COLMAP, (0, 0) here."""
+    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] as fx, fy, cx, cy"]
+    for i, (K, image) in enumerate(zip(result.K, result.images), 1):
+        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
+        size = f"{image.shape[1]} {image.shape[0]}"
+        lines.append(f"{i} PINHOLE {size} {fx:.17g} {fy:.17g} {cx:.17g} {cy:.17g}")
+    return "\n".join(lines) + "\n"
+
+
+def _images(result: Result, pixels: tuple[NDArray[np.float64], NDArray[np.float64]]) -> str:
+    lines = [
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME (cam_from_world)",
+        "# POINTS2D[] as (X, Y, POINT3D_ID)",
+    ]
+    poses = RigidMotion(np.eye(3), np.zeros(3)), result.components.camera
+    for i, (pose, name, uv) in enumerate(zip(poses, IMAGES, pixels), 1):
+        x, y, z, w = pose.quaternion
+        numbers = " ".join(f"{a:.17g}" for a in (w, x, y, z, *pose.t))
+        lines.append(f"{i} {numbers} {i} {name}")
+        lines.append(" ".join(f"{u:.6g} {v:.6g} {k}" for k, (u, v) in enumerate(uv + 0.5, 1)))
+    return "\n".join(lines) + "\n"
+
+
+def _points(
+    result: Result, still: NDArray[np.bool_]
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64], NDArray[np.uint8]]:
+    """Pixels (P, 2) in both images, points (P, 3) and colours (P, 3) on an even grid."""
+    keep = still & result.sure
+    step = max(1, int(np.ceil(np.sqrt(keep.sum() / POINTS))))
+    grid = np.zeros_like(keep)
+    grid[step // 2 :: step, step // 2 :: step] = True
+    v, u = np.nonzero(keep & grid)
+    rec = result.reconstruction
+    uv = np.stack([u, v], axis=1).astype(float)
+    return (uv, uv + rec.flow[v, u]), rec.points_ref[v, u], result.images[0][v, u]
+
+
+def _moved(result: Result, moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(H', W') where what moves by itself lands in the next image, its cracks closed."""
+    rec = result.reconstruction
+    height, width = rec.depth_next.shape
+    v, u = np.nonzero(moving & np.isfinite(rec.flow).all(axis=2))
+    at = np.floor(np.stack([u, v], 1) + rec.flow[v, u] + 0.5)
+    # nearest surface: what is hidden by the static scene stays out
+    inside = (at >= 0).all(1) & (at < [width, height]).all(1)
+    u2, v2 = at[inside].astype(np.int64).T
+    z = rec.points_next[v[inside], u[inside], 2]
+    seen = z <= 1.05 * rec.depth_next[v2, u2]
+    out = np.zeros((height, width), np.uint8)
+    out[v2[seen], u2[seen]] = 1
+    return np.asarray(cv2.morphologyEx(out, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0)

@@ -1,0 +1,123 @@
+"""Files for other programs, by the name of their format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from soup_nlp.errors import ConfigError
+from soup_nlp.report.colmap import write_colmap
+from soup_nlp.report.depth_files import write_npy, write_pfm
+from soup_nlp.report.figures import write_clipped_depth_png16
+from soup_nlp.report.mesh import write_glb
+from soup_nlp.report.motions import motions, trajectory
+from soup_nlp.report.pointcloud import write_cloud
+from soup_nlp.report.rerun_file import write_rrd
+from soup_nlp.report.result import FRAMES, Result
+from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.store import write_json
+
+Writer = Callable[[Path, Result], list[str]]
+"""Writes into a folder; the names of what it wrote."""
+
+
+def _ply(folder: Path, result: Result) -> list[str]:
+    names = [f"points_{frame}.ply" for frame in FRAMES]
+    for k, name in enumerate(names):
+        write_cloud(folder / name, result, k)
+    return names
+
+
+def _glb(folder: Path, result: Result) -> list[str]:
+    names = [f"mesh_{frame}.glb" for frame in FRAMES]
+    for k, name in enumerate(names):
+        write_glb(folder / name, result, k)
+    return names
+
+
+def _colmap(folder: Path, result: Result) -> list[str]:
+    (folder / "colmap").mkdir(exist_ok=True)
+    write_colmap(folder / "colmap", result)
+    return ["colmap"]
+
+
+def _npy(folder: Path, result: Result) -> list[str]:
+    names = [f"depth_{frame}.npy" for frame in FRAMES]
+    for name, depth in zip(names, result.depths):
+        write_npy(folder / name, depth)
+    return names
+
+
+def _pfm(folder: Path, result: Result) -> list[str]:
+    names = [f"depth_{frame}.pfm" for frame in FRAMES]
+    for name, depth in zip(names, result.depths):
+        write_pfm(folder / name, depth)
+    return names
+
+
+def _png(folder: Path, result: Result) -> list[str]:
+    names = [f"depth_{frame}.png" for frame in FRAMES]
+    scale = {
+        frame: write_clipped_depth_png16(folder / name, depth)
+        for frame, name, depth in zip(FRAMES, names, result.depths)
+    }
+    write_json(folder / "depth_png.json", {"values_per_unit": scale, "unit": result.unit})
+    return [*names, "depth_png.json"]
+
+
+def _rrd(folder: Path, result: Result) -> list[str]:
+    write_rrd(folder / "scene.rrd", result)
+    return ["scene.rrd"]
+
+
+def _motions(folder: Path, result: Result) -> list[str]:
+    write_json(folder / "motions.json", motions(result))
+    write_text(folder / "trajectory.tum", trajectory(result))
+    return ["motions.json", "trajectory.tum"]
+
+
+FORMATS: Mapping[str, tuple[Writer, str]] = {
+    "ply": (_ply, "point clouds with normals, confidence and component"),
+    "glb": (_glb, "textured meshes, glTF 2.0"),
+    "colmap": (_colmap, "COLMAP's text model with images and masks of what moves"),
+    "npy": (_npy, "depth as float32 arrays"),
+    "pfm": (_pfm, "depth as portable float maps"),
+    "png": (_png, "depth as 16-bit PNG"),
+    "rrd": (_rrd, "a recording for the Rerun viewer (extra: rerun)"),
+    "motions": (_motions, "motions.json and the camera's trajectory (TUM)"),
+}
+"""Writer of every format, and what it writes."""
+
+
+def check_formats(names: Sequence[str]) -> list[str]:
+    """Names of formats, each once.
+
+    Raises:
+        ConfigError: a name is not known, or there is none.
+    """
+    wrong = [name for name in names if name not in FORMATS]
+    if wrong or not names:
+        raise ConfigError(
+            "unknown format" if wrong else "no format is named",
+            found=", ".join(map(repr, wrong)) or None,
+            expected=", ".join(FORMATS),
+        )
+    return list(dict.fromkeys(names))
+
+
+def write_formats(folder: Path, result: Result, names: Sequence[str]) -> list[str]:
+    """Write a result in several formats into an existing folder.
+
+    Args:
+        folder: The folder.
+        result: What was solved.
+        names: Keys of `FORMATS`.
+
+    Returns:
+        Names of the files and folders that were written.
+
+    Raises:
+        ConfigError: a format is not known.
+        DataError: a file cannot be written, or a package is missing.
+    """
+    return [file for name in check_formats(names) for file in FORMATS[name][0](folder, result)]

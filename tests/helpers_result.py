@@ -1,0 +1,47 @@
+"""A small result by hand: a wall, and a board before it that moves by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.geometry.components import find_components
+from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.geometry.rotation import exp
+from soup_nlp.geometry.soup import Soup, reconstruct
+from soup_nlp.report.result import Result
+
+K = intrinsics(100.0, 100.0, 39.5, 29.5)
+CAMERA = RigidMotion(exp([0.0, 0.01, 0.0]), np.array([0.05, 0.02, -0.1]))
+BOARD = RigidMotion(exp([0.0, 0.0, 0.05]), np.array([-0.1, 0.0, -0.1]))
+"""next_from_ref."""
+WALL_Z, BOARD_Z = 4.0, 2.0
+
+
+def board() -> np.ndarray:
+    """(60, 80) where the board is."""
+    out = np.zeros((60, 80), bool)
+    out[20:40, 20:60] = True
+    return out
+
+
+def small_result() -> Result:
+    """60 x 80 pixels in 12 superpixels of 20 x 20, all planes parallel to the image."""
+    v, u = np.mgrid[0:60, 0:80]
+    labels = (4 * (v // 20) + u // 20).astype(np.int32)
+    image = np.stack([3 * u, 4 * v, 200 - u - v], axis=2).astype(np.uint8)
+    seg = build_segmentation(labels, image, neighbours=3)
+    mine = np.isin(np.arange(12), (5, 6))
+    motions = [BOARD if m else CAMERA for m in mine]
+    R, t = (np.array([getattr(m, name) for m in motions]) for name in ("R", "t"))
+    soup = Soup(np.ones(12), np.tile([0.0, 0.0, -1.0], (12, 1)), np.where(mine, 2.0, 4.0), R, t)
+    return Result(
+        name="board",
+        images=(image, image[::-1].copy()),
+        K=(K, K),
+        reconstruction=reconstruct(soup, labels, K, K),
+        components=find_components(soup, seg, mine.astype(int), K, K),
+        flow_confidence=(u / 100).astype(np.float32),
+        metre=10.0,
+    )

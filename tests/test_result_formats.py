@@ -1,0 +1,214 @@
+"""Files for other programs, read back by other programs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from helpers_result import BOARD, BOARD_Z, CAMERA, WALL_Z, K, board, small_result
+from scipy.spatial.transform import Rotation
+
+from soup_nlp.data.formats.map_files import read_pfm
+from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.report.formats import FORMATS, write_formats
+from soup_nlp.report.mesh import surface_mesh
+from soup_nlp.report.result import Result
+
+FLOAT32 = 1e-6
+"""Relative rounding of what files hold in single precision."""
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    return small_result()
+
+
+def around_board(width: int) -> np.ndarray:
+    """Where the board is, grown by some pixels."""
+    return cv2.dilate(board().astype(np.uint8), np.ones((2 * width + 1,) * 2)) > 0
+
+
+def test_clouds_leave_out_jumps_and_what_is_hidden(result):
+    inside = cv2.erode(board().astype(np.uint8), np.ones((3, 3))) > 0
+    at_jump = around_board(1) & ~inside
+    # the corners of the grown outline touch the board by no side
+    cross = cv2.dilate(board().astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)))
+    assert not result.sure[at_jump & (cross > 0)].any()
+    assert result.sure[inside].all()
+    # the camera goes ahead: the border leaves the image; the board hides wall beside it
+    uv = np.stack(np.meshgrid(np.arange(80), np.arange(60)), axis=2) + result.reconstruction.flow
+    out = ((uv < -0.5) | (uv > [79.5, 59.5])).any(axis=2)
+    assert out.any()
+    assert not result.sure[out].any()
+    left = result.sure & ~out & ~around_board(10)
+    assert left.sum() == (~out & ~around_board(10)).sum()
+
+
+@pytest.mark.parametrize("frame", [0, 1])
+def test_ply_is_read_by_trimesh(tmp_path, result, frame):
+    trimesh = pytest.importorskip("trimesh")
+    assert write_formats(tmp_path, result, ["ply"]) == ["points_ref.ply", "points_next.ply"]
+    path = tmp_path / ("points_ref.ply", "points_next.ply")[frame]
+    cloud = trimesh.load(path)
+    keep = result.sure
+    np.testing.assert_allclose(cloud.vertices, result.points[frame][keep], rtol=FLOAT32, atol=1e-6)
+    np.testing.assert_array_equal(cloud.colors[:, :3], result.images[0][keep])
+    raw = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(raw["confidence"], result.flow_confidence[keep])
+    np.testing.assert_array_equal(raw["component"], board()[keep])
+    normals = np.stack([raw[name] for name in ("nx", "ny", "nz")], axis=1)
+    turned = [0, 0, -1.0] @ np.array([np.eye(3), CAMERA.R])[frame].T
+    np.testing.assert_allclose(
+        normals[~board()[keep]], [turned] * (~board() & keep).sum(), atol=1e-6
+    )
+    head = path.read_bytes().split(b"end_header")[0].decode()
+    assert "unit: soup unit" in head
+    assert "about 10 m" in head
+    assert f"camera of the {('reference', 'next')[frame]} frame, x right, y down, z ahead" in head
+
+
+def test_ply_has_the_uncertainty_where_it_is_known(tmp_path, result):
+    rec = replace(result.reconstruction)
+    object.__setattr__(rec, "sigma_ref", np.full((60, 80), 0.25))
+    write_formats(tmp_path, replace(result, reconstruction=rec), ["ply"])
+    head = (tmp_path / "points_ref.ply").read_bytes().split(b"end_header")[0]
+    assert b"property float sigma_log_depth" in head
+
+
+@pytest.mark.parametrize("frame", [0, 1])
+def test_glb_is_read_by_trimesh(tmp_path, result, frame):
+    trimesh = pytest.importorskip("trimesh")
+    write_formats(tmp_path, result, ["glb"])
+    scene = trimesh.load(tmp_path / ("mesh_ref.glb", "mesh_next.glb")[frame])
+    assert scene.metadata["unit"] == result.unit
+    (mesh,) = scene.geometry.values()
+    vertices, faces, pixels = surface_mesh(result, frame)
+    # glTF: x right, y up, the camera looks along -z
+    np.testing.assert_allclose(mesh.vertices, vertices * [1, -1, -1], rtol=FLOAT32, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, faces)
+    assert (mesh.vertices[:, 2] < 0).all()
+    top_left = np.argmin(pixels.sum(axis=1))
+    assert mesh.vertices[top_left, 0] < 0 < mesh.vertices[top_left, 1]
+    # counter-clockwise from the camera: normals towards it
+    assert (np.sum(mesh.face_normals * mesh.triangles_center, axis=1) < 0).all()
+    # every vertex has the colour of its pixel; the gradient is 4 levels a pixel, JPEG a few
+    colour = mesh.visual.material.baseColorTexture.convert("RGB")
+    texture = np.asarray(colour, float)
+    at = mesh.visual.uv * [80, -60] + [0, 60] - 0.5
+    u, v = np.rint(at).astype(int).T
+    np.testing.assert_allclose(np.stack([u, v], 1), pixels)
+    gap = np.abs(texture[v, u] - result.images[0][v, u])
+    assert np.median(gap) < 5
+    assert gap.max() < 40
+
+
+def test_meshes_have_no_curtains(result):
+    vertices, faces, _ = surface_mesh(result, 0)
+    depth = vertices[:, 2][faces]
+    np.testing.assert_allclose(depth, depth[:, :1].repeat(3, axis=1))
+    np.testing.assert_allclose(np.unique(depth.round(9)), [BOARD_Z, WALL_Z])
+    # all cells but those that the outline of the board passes
+    assert len(faces) == 2 * (59 * 79 - (2 * (41 + 21) - 4))
+
+
+def test_large_meshes_are_thinned(result, monkeypatch):
+    monkeypatch.setattr("soup_nlp.report.mesh.CELLS", 60 * 80 // 4)
+    vertices, faces, pixels = surface_mesh(result, 0)
+    assert not (pixels % 2).any()
+    assert 0.7 * 60 * 80 / 2 < len(faces) < 60 * 80 / 2
+    np.testing.assert_allclose(np.unique(vertices[:, 2].round(9)), [BOARD_Z, WALL_Z])
+    assert (np.ptp(vertices[:, 2][faces], axis=1) < 1e-9).all()
+
+
+def test_colmap_models_are_read_by_pycolmap(tmp_path, result):
+    pycolmap = pytest.importorskip("pycolmap")
+    write_formats(tmp_path, result, ["colmap"])
+    model = pycolmap.Reconstruction(str(tmp_path / "colmap" / "sparse" / "0"))
+    assert {image.name for image in model.images.values()} == {"ref.png", "next.png"}
+    wall = result.sure & ~board()
+    assert model.num_points3D() == wall.sum()
+    for image in model.images.values():
+        second = image.name == "next.png"
+        # the first pixel's centre is (0.5, 0.5) there
+        np.testing.assert_allclose(image.camera.calibration_matrix()[:2, 2], K[:2, 2] + 0.5)
+        pose = image.cam_from_world().matrix()
+        np.testing.assert_allclose(pose, (CAMERA.matrix if second else np.eye(4))[:3], atol=1e-9)
+        assert image.num_points3D == wall.sum()
+        gaps = [
+            np.linalg.norm(image.project_point(model.points3D[p.point3D_id].xyz) - p.xy)
+            for p in image.points2D
+        ]
+        # pixels are written with 6 digits, points with 9
+        assert max(gaps) < 1e-3
+    for name in ("ref.png", "next.png"):
+        mask = cv2.imread(str(tmp_path / "colmap" / "masks" / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
+        assert set(np.unique(mask)) == {0, 255}
+        # the board comes nearer
+        share = (mask == 0).mean() / board().mean()
+        assert (0.999 < share < 1.001) if name == "ref.png" else (1.0 < share < 1.3)
+
+
+def test_cameras_with_skew_have_no_colmap_model(tmp_path, result):
+    skewed = K.copy()
+    skewed[0, 1] = 2
+    with pytest.raises(DataError, match="skew"):
+        write_formats(tmp_path, replace(result, K=(K, skewed)), ["colmap"])
+
+
+def test_depth_is_read_by_numpy_opencv_and_pillow(tmp_path, result):
+    pil = pytest.importorskip("PIL.Image")
+    write_formats(tmp_path, result, ["npy", "pfm", "png"])
+    scale = json.loads((tmp_path / "depth_png.json").read_text())["values_per_unit"]
+    for name, depth in zip(("ref", "next"), result.depths):
+        known = np.isfinite(depth)
+        found = np.load(tmp_path / f"depth_{name}.npy")
+        np.testing.assert_array_equal(found, depth.astype(np.float32))
+        found = cv2.imread(str(tmp_path / f"depth_{name}.pfm"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(found, np.where(known, depth, np.inf).astype(np.float32))
+        np.testing.assert_array_equal(read_pfm(tmp_path / f"depth_{name}.pfm")[known], found[known])
+        found = np.asarray(pil.open(tmp_path / f"depth_{name}.png"), float) / scale[name]
+        np.testing.assert_allclose(found[known], depth[known], atol=0.5 / scale[name])
+        assert not found[~known].any()
+
+
+def test_recordings_are_read_by_rerun(tmp_path, result):
+    chunk = pytest.importorskip("rerun.chunk", reason="needs rerun-sdk (extra: rerun)")
+    write_formats(tmp_path, result, ["rrd"])
+    rows: dict[str, int] = {}
+    for part in chunk.RrdReader(str(tmp_path / "scene.rrd")).stream():
+        rows[str(part.entity_path)] = rows.get(str(part.entity_path), 0) + part.num_rows
+    both = ("background", "component_1", "camera/image/depth", "camera/image/rgb")
+    assert [rows.get(f"/world/{name}") for name in both] == [2] * 4
+
+
+def test_motions_and_trajectory(tmp_path, result):
+    write_formats(tmp_path, result, ["motions"])
+    told = json.loads((tmp_path / "motions.json").read_text())
+    np.testing.assert_allclose(told["camera"]["next_from_ref"], CAMERA.matrix, atol=1e-9)
+    np.testing.assert_allclose(told["camera"]["position_in_ref"], CAMERA.centre, atol=1e-9)
+    background, own = told["components"]
+    assert background["background"]
+    assert not own["background"]
+    np.testing.assert_allclose(own["next_from_ref"], BOARD.matrix, atol=1e-9)
+    np.testing.assert_allclose(CAMERA.matrix @ own["own_motion"]["matrix"], BOARD.matrix, atol=1e-9)
+    turn = np.radians(own["rotation_deg"])
+    np.testing.assert_allclose(Rotation.from_rotvec(turn).as_matrix(), BOARD.R, atol=1e-9)
+    assert "soup unit" in told["unit"]
+    # the trajectory holds ref_from_camera
+    first, second = np.loadtxt(tmp_path / "trajectory.tum")
+    np.testing.assert_allclose(first, [0, 0, 0, 0, 0, 0, 0, 1])
+    np.testing.assert_allclose(second[1:4], CAMERA.centre, atol=1e-8)
+    found = Rotation.from_quat(second[4:]).as_matrix()
+    np.testing.assert_allclose(found, CAMERA.R.T, atol=1e-8)
+
+
+def test_unknown_formats_are_refused(tmp_path, result):
+    with pytest.raises(ConfigError, match="obj"):
+        write_formats(tmp_path, result, ["ply", "obj"])
+    with pytest.raises(ConfigError, match="no format"):
+        write_formats(tmp_path, result, [])
+    assert not list(tmp_path.iterdir())
+    assert set(FORMATS) >= {"ply", "glb", "colmap", "npy", "pfm", "png", "rrd"}
