@@ -9,6 +9,7 @@ import pytest
 from soup_nlp.config.problem import make_problem
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.pipeline.run import Run, make_run, skipped
 from soup_nlp.solve.tangent_problem import TangentProblem
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
@@ -27,6 +28,12 @@ def small_room() -> Case:
     """Sixty superpixels of a rendered room."""
     scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
     return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+
+
+@pytest.fixture(scope="session")
+def small_run(small_room: Case) -> Run:
+    """The start of that room as a run: every record is there, nothing was solved."""
+    return make_run(small_room, skipped(small_room))
 
 
 @pytest.fixture(scope="module", params=["depth", "inverse-depth"])

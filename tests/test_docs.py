@@ -111,7 +111,7 @@ def keys(model: type[BaseModel], prefix: str = "") -> set[str]:
     return out
 
 
-SECTIONS = "segmentation|flow|start|energy|formulation|solver|refine|expected"
+SECTIONS = "segmentation|flow|start|energy|formulation|solver|refine|expected|output"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=ids)

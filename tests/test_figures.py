@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import os
 
 import cv2
@@ -8,20 +7,28 @@ import matplotlib
 import numpy as np
 import pytest
 
-from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import depth_metrics
-from soup_nlp.report import figures
 from soup_nlp.report.colour import (
+    UNKNOWN,
     colour_wheel,
     colourise_depth,
     colourise_error,
     colourise_flow,
     colourise_normals,
+    component_colours,
     depth_range,
     draw_superpixels,
+    flow_limit,
+    wheel_key,
 )
-from soup_nlp.report.figures import overview, overview_strip, write_clipped_depth_png16, write_png
+from soup_nlp.report.figures import (
+    overview,
+    overview_strip,
+    write_clipped_depth_png16,
+    write_picture,
+    write_png,
+)
+from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 
 
 def turbo(level):
@@ -37,8 +44,8 @@ def test_depth_colours():
     np.testing.assert_array_equal(out[1, 0], turbo(255))
     np.testing.assert_array_equal(out[1, 1], turbo(0))
     np.testing.assert_array_equal(out[0, 1], turbo(128))
-    assert not out[1, 2].any()
-    assert not out[2].any()
+    assert (out[1, 2] == UNKNOWN).all()
+    assert (out[2] == UNKNOWN).all()
 
 
 def test_depth_range_is_robust():
@@ -50,8 +57,8 @@ def test_depth_range_is_robust():
     near, far = depth_range(np.full((2, 2), 5.0))
     assert near < 5.0 < far
     assert depth_range(np.full((2, 2), np.nan)) == (1.0, 2.0)
-    assert not colourise_depth(np.full((2, 2), np.nan)).any()
-    assert colourise_depth(np.full((2, 2), 5.0)).any()
+    assert (colourise_depth(np.full((2, 2), np.nan)) == UNKNOWN).all()
+    assert (colourise_depth(np.full((2, 2), 5.0)) != UNKNOWN).any()
 
 
 def test_flow_wheel():
@@ -88,16 +95,51 @@ def test_flow_colour_is_continuous_but_for_the_seam_of_the_wheel():
 
 def test_error_colours():
     out = colourise_error(np.array([[0.0, 0.2, 7.0, np.nan]])).astype(int)[0]
-    assert out[0].any()  # a small error is not the black of the unknown
     np.testing.assert_array_equal(out[1], out[2])
     assert out[1].sum() > out[0].sum()
-    assert not out[3].any()
+    assert (out[3] == UNKNOWN).all()
+
+
+@pytest.mark.parametrize("name", ["turbo", "inferno", "viridis"])
+def test_no_scale_has_the_grey_of_the_unknown(name):
+    """Not even nearly: "no truth" must not be taken for "exact", nor for any number."""
+    scale = 255 * matplotlib.colormaps[name](np.arange(256))[:, :3]
+    assert np.abs(scale - UNKNOWN).max(axis=1).min() > 20
+
+
+def test_component_colours():
+    colours = component_colours(30).astype(int)
+    assert colours.shape == (30, 3)
+    assert component_colours(1).shape == (1, 3)
+    apart = np.abs(colours[:, None] - colours[None]).sum(-1) + 999 * np.eye(30, dtype=int)
+    assert apart[:10, :10].min() > 60
+    assert apart.min() > 10
+    # none is the grey of the unknown
+    assert np.ptp(colours, axis=1).min() > 20
+
+
+def test_the_limit_of_a_flow_is_its_longest_vector_without_outliers():
+    uv = np.zeros((10, 100, 2))
+    uv[..., 0] = np.linspace(0, 10, 1000).reshape(10, 100)
+    assert flow_limit(uv) == pytest.approx(10)
+    uv[0, 0] = (300, 400)
+    assert flow_limit(uv) == pytest.approx(15, rel=0.02)
+    assert flow_limit(np.full((2, 2, 2), np.nan)) == 1.0
+
+
+def test_wheel_key():
+    key = wheel_key(65).astype(int)
+    assert (key[0, 0] == 255).all()
+    np.testing.assert_allclose(key[32, 32], 255, atol=4)
+    # motion to the right is red, as in the flow
+    assert key[32, 63][0] > 240
+    assert key[32, 63][1] < 30
 
 
 def test_normal_colours():
     n = np.array([[[0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0], [np.nan, 0, 0]]])
     np.testing.assert_array_equal(
-        colourise_normals(n)[0], [[128, 128, 255], [255, 128, 128], [128, 0, 128], [0, 0, 0]]
+        colourise_normals(n)[0], [[128, 128, 255], [255, 128, 128], [128, 0, 128], [UNKNOWN] * 3]
     )
 
 
@@ -113,127 +155,102 @@ def test_superpixel_boundaries():
     assert (image == 9).all()
 
 
-def panels():
-    flat = np.full((30, 60, 3), (200, 30, 30), np.uint8)
-    tall = np.full((80, 40, 3), (30, 30, 200), np.uint8)
-    return [("a red panel, 5 $ and 6 $", flat), ("blue", tall), ("red again", flat)]
+def flat(colour, name="", title="a title", height=30, width=60, legend=None):
+    image = np.full((height, width, 3), colour, np.uint8)
+    return Picture(name, title, image, legend)
 
 
-def test_overview(tmp_path):
-    path = tmp_path / "overview.png"
-    overview_strip(path, panels(), "title with $x_1$", columns=2, panel_width=2.0)
-    image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+RED, BLUE = (200, 30, 30), (30, 30, 200)
+
+
+def read(path):
+    return cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+
+
+def area(image, colour):
+    """Pixels of a colour."""
+    return int((np.abs(image.astype(int) - colour).max(axis=2) < 3).sum())
+
+
+def test_overview_strip(tmp_path):
+    panels = [
+        flat(RED, title="a red panel, 5 $ and 6 $"),
+        flat(BLUE, height=80, width=40),
+        flat(RED),
+    ]
+    overview_strip(tmp_path / "o.png", panels, "title with $x_1$", columns=2, panel_width=2.0)
+    image = read(tmp_path / "o.png")
     assert abs(image.shape[1] - (2 * 2.08 + 0.08) * 100) <= 2
     assert abs(image.shape[0] - (0.42 + 4.0 + 1.0 + 2 * 0.36) * 100) <= 2
-    for colour, area in (((200, 30, 30), 2 * 200 * 100), ((30, 30, 200), 200 * 400)):
-        found = (np.abs(image.astype(int) - colour).max(axis=2) < 3).sum()
-        assert found == pytest.approx(area, rel=0.05)
-    assert os.listdir(tmp_path) == ["overview.png"]
+    assert area(image, RED) == pytest.approx(2 * 200 * 100, rel=0.05)
+    assert area(image, BLUE) == pytest.approx(200 * 400, rel=0.05)
+    assert os.listdir(tmp_path) == ["o.png"]
 
 
 def test_overview_does_not_touch_global_state(tmp_path):
     import sys
 
     before = dict(matplotlib.rcParams)
-    overview_strip(tmp_path / "a.png", panels()[:1], "")
+    overview_strip(tmp_path / "a.png", [flat(RED)], "")
     assert dict(matplotlib.rcParams) == before
     if "matplotlib.pyplot" in sys.modules:
         assert not sys.modules["matplotlib.pyplot"].get_fignums()
 
 
-def small_pair(**known):
-    """8 x 6 pair with a flow that half of the pixels trust."""
-    image = np.full((6, 8, 3), 90, np.uint8)
-    confidence = np.tile(np.array([0, 1] * 4, np.float32), (6, 1))
-    flow = Flow(np.ones((6, 8, 2), np.float32), confidence, "made")
-    K = np.array([[9.0, 0, 4], [0, 9.0, 3], [0, 0, 1]])
-    truth = Truth(**known) if known else None
-    return Pair(image, image[:5], K, K, flow, truth, "small")
+@pytest.mark.parametrize(
+    "legend",
+    [
+        Bar(np.full((1, 8, 3), BLUE, np.uint8), ("0", "1 m")),
+        Swatches(((BLUE, "a car"), ((255, 255, 255), "none"))),
+        Wheel(np.full((8, 8, 3), BLUE, np.uint8), "rim = 3 px"),
+    ],
+    ids=["bar", "swatches", "wheel"],
+)
+def test_a_legend_is_drawn_below_its_picture(legend, tmp_path):
+    write_picture(tmp_path / "p.png", flat(RED, height=300, width=600, legend=legend))
+    image = read(tmp_path / "p.png")
+    write_picture(tmp_path / "bare.png", flat(RED, height=300, width=600))
+    bare = read(tmp_path / "bare.png")
+    # at its own size, and not a pixel of it covered
+    assert abs(area(image, RED) - area(bare, RED)) < 600
+    assert area(bare, RED) == pytest.approx(300 * 600, rel=0.02)
+    rows = np.flatnonzero((np.abs(image.astype(int) - BLUE).max(axis=2) < 3).any(axis=1))
+    assert rows.min() > np.flatnonzero((np.abs(image.astype(int) - RED).max(2) < 3).any(1)).max()
+    assert area(bare, BLUE) == 0
 
 
-ONE, FLAT = np.zeros((6, 8), int), np.tile([0.0, 0.0, -1.0], (6, 8, 1))
+def test_a_title_that_is_too_long_is_made_smaller(tmp_path):
+    long = flat(RED, title="a title that is far too long for its picture " * 3)
+    overview_strip(tmp_path / "o.png", [long, flat(BLUE)], "")
+    image = read(tmp_path / "o.png")
+    # the caption of the second panel begins with an empty margin
+    title = image[8:36, 428:432]
+    assert (title > 250).all()
 
 
-def drawn(monkeypatch, pair, depths, labels=ONE):
-    """Arguments of `overview_strip` in `overview`: panels by caption, and the title."""
+def test_an_overview_has_no_gaps(monkeypatch):
+    from soup_nlp.report import figures
+
     seen = {}
-
-    def catch(path, panels, title):
-        seen.update(panels={p[0]: p[1:] for p in panels}, title=title)
-
-    monkeypatch.setattr(figures, "overview_strip", catch)
-    overview("unused.png", pair, labels, depths, FLAT, "a title")
-    return seen["panels"], seen["title"]
-
-
-def test_overview_of_everything(monkeypatch):
-    truth = np.linspace(2, 4, 48).reshape(6, 8)
-    truth[0, 0] = np.nan
-    start, solution = np.ones((6, 8)), 10 * truth
-    solution[:, 4:] = np.nan
-    solution[5, 0] *= 1.5
-    panels, title = drawn(
-        monkeypatch,
-        small_pair(depth_ref=truth),
-        {"start": start, "solution": solution},
-        np.arange(48).reshape(6, 8) // 24,
+    monkeypatch.setattr(
+        figures, "overview_strip", lambda path, panels, title: seen.update(p=panels)
     )
-    assert title == "a title"
-    # 47 true pixels, 23 with an estimate, one of them 50 % too deep: 0.5 / 23
-    mre = depth_metrics(start, truth).mre
-    assert list(panels) == [
-        "reference frame",
-        "next frame",
-        "2 superpixels",
-        "flow (made)",
-        "confidence, 50% above 0 (black)",
-        f"start, MRE {mre:.3f} (median), coverage 100%",
-        "solution, MRE 0.022 (median), coverage 49%",
-        "true depth (m)",
-        "relative error, solution",
-        "normals",
-    ]
-    flow = panels["flow (made)"][0]
-    assert not flow[:, ::2].any()
-    assert flow[:, 1::2].any(axis=2).all()
-    # one colour range: where the solution is right it has the colours of the truth
-    right = panels["solution, MRE 0.022 (median), coverage 49%"][0][:5, 1:4]
-    np.testing.assert_array_equal(right, panels["true depth (m)"][0][:5, 1:4])
-    error, (bar, low, high) = panels["relative error, solution"]
-    assert (low, high) == ("0", "0.2")
-    np.testing.assert_array_equal(error[1, 1], bar[0, 0])
-    np.testing.assert_array_equal(error[5, 0], bar[0, -1])  # 0.5 is beyond the bar
-    assert not error[0, 0].any()
-    assert not error[:, 4:].any()
+    always = [f"panel_{k}" for k in range(8)]
 
+    def names(*extra):
+        found = {name: flat(RED, name) for name in (*always, *extra)}
+        overview("unused.png", found, "")
+        return {picture.name for picture in seen["p"]}
 
-def test_overview_leaves_out_what_is_unknown(monkeypatch):
-    bare = dataclasses.replace(small_pair(), flow=None)
-    panels, _ = drawn(monkeypatch, bare, {"a": np.full((6, 8), 2.0)})
-    assert list(panels) == ["reference frame", "next frame", "1 superpixels", "a", "normals"]
-    panels, _ = drawn(monkeypatch, bare, {"nothing": np.full((6, 8), np.nan)})
-    assert not panels["nothing"][0].any()
-    points = np.array([[0.0, 0, 3.0], [1.2, 2, 3.0], [7, 5, 6.0]])
-    panels, _ = drawn(monkeypatch, small_pair(points=points), {"a": np.full((6, 8), 2.0)})
-    # scale 3/2 at the median; |6 - 3| / 6 at one point of three
-    assert list(panels)[-2] == "a, MRE 0.167 (median), coverage 100%"
-
-
-def test_overview_file(tmp_path):
-    truth = np.linspace(2, 4, 48).reshape(6, 8)
-    given = {"labels": ONE, "normals": FLAT, "title": "t"}
-    overview(tmp_path / "o.png", small_pair(depth_ref=truth), depths={"solution": truth}, **given)
-    image = cv2.imread(str(tmp_path / "o.png"))
-    # three rows, the second and third with bars: panels 4.2 in wide, 4.2 * 6 / 8 in high
-    assert image.shape[1] == pytest.approx(100 * (3 * 4.28 + 0.08), abs=2)
-    rows = 3 * (3.15 + 0.36)
-    assert image.shape[0] == pytest.approx(100 * (0.42 + rows + 2 * 0.2), abs=2)
-    assert os.listdir(tmp_path) == ["o.png"]
+    assert len(names("normals")) == 9
+    assert names("depth_start", "normals") == {*always, "normals"}
+    assert len(names("depth_start", "normals", "a", "b")) == 12
+    assert names("depth_start", "normals", "a") == {*always, "a"}
 
 
 def test_a_white_panel_has_a_frame(tmp_path):
     white = np.full((60, 100, 3), 255, np.uint8)
-    overview_strip(tmp_path / "o.png", [("", white)], "")
+    overview_strip(tmp_path / "o.png", [Picture("", "", white)], "")
     picture = cv2.imread(str(tmp_path / "o.png"))
     dark = (picture < 230).all(2)
     rows, columns = np.flatnonzero(dark.any(1)), np.flatnonzero(dark.any(0))

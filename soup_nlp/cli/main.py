@@ -19,6 +19,7 @@ ABORTED = 130
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "solve": ("solve:solve", "Solve a pair of frames and write a result folder."),
     "demo": ("demo:demo", "Solve a real pair and a rendered street in which cars move."),
+    "view": ("view:view", "Open the page of a result in a browser, or serve it."),
     "check": (
         "results:check",
         "Recompute energy, constraints and metrics of a result, or the constraints of a .sol.",

@@ -85,7 +85,7 @@ def import_(
         )
     target = prepare_folder(out or folder / "result", run.problem.input_paths())
     text = foreign_verdict(imported)
-    write_folder(target, run, dump_problem(run.problem), f"{message}\n{text}\n")
+    write_folder(target, run, dump_problem(run.problem), f"{message}\n{text}\n", text)
     print(text)
     print(f"files       {target}/")
     print(f"next        soup-nlp check {target}")

@@ -62,6 +62,13 @@ class Expected(Section):
     """Truth beyond this depth is left out, unit of the truth; null for none."""
 
 
+class OutputOptions(Section):
+    """What a result folder holds beside what it always holds."""
+
+    page: bool = True
+    """Write report.html, the page with the 3D view."""
+
+
 class Problem(Section):
     """One problem file."""
 
@@ -87,6 +94,8 @@ class Problem(Section):
     """Discrete refinement by particles."""
     expected: Expected = Expected()
     """What the run should score."""
+    output: OutputOptions = OutputOptions()
+    """What the result folder holds."""
     base: str = "."
     """Folder that relative paths start from (the file's own)."""
 
@@ -95,8 +104,8 @@ class Problem(Section):
         return (Path(self.base) / Path(name).expanduser()).resolve()
 
     def digest(self) -> str:
-        """Hash of everything that decides the result; neither the name nor the place does."""
-        tree = self.model_dump(mode="json", exclude={"name", "base"})
+        """Hash of everything that decides the result: not of the name, the place and the files."""
+        tree = self.model_dump(mode="json", exclude={"name", "base", "output"})
         return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
 
     def load_pair(self) -> Pair:

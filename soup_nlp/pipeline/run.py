@@ -242,7 +242,7 @@ def run(
         return solve_soup(*own, listener=listener, stop=stop, say=log, log_file=ipopt_log)
 
     if problem.refine.enabled and problem.refine.from_start:
-        solution = _skipped(case)
+        solution = skipped(case)
     else:
         solution = nlp(case.start.soup)
         clock("nlp")
@@ -320,7 +320,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     )
 
 
-def _skipped(case: Case) -> Solution:
+def skipped(case: Case) -> Solution:
     """The start in place of the NLP's solution, its planes tilted until they face the camera."""
     start, data, form = case.start.soup, case.data, case.problem.formulation
     rays = data.visibility_ray(form.depth_ratio)

@@ -1,4 +1,7 @@
-"""Depth, error, flow, normals and superpixels in colour: (H, W, 3) uint8 RGB, unknown is black."""
+"""Depth, error, flow, normals and superpixels in colour, (H, W, 3) uint8 RGB.
+
+What is unknown is grey, a colour that none of the scales has; flow that cannot be used is black.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,12 @@ Mask = NDArray[np.bool_]
 
 ERROR_LIMIT = 0.2
 """Relative depth error at the upper end of the colours."""
+
+UNKNOWN = 150
+"""Grey level of what is unknown; no scale of depth, error, sigma or normals has a grey."""
+
+SIGMA_LIMIT = 0.3
+"""Standard deviation of log depth at the upper end of the colours."""
 
 _WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 
@@ -39,7 +48,7 @@ def colourise_depth(depth: Float, near: float | None = None, far: float | None =
     """Depth in colour by even steps of 1/z: near is red, far is blue.
 
     Args:
-        depth: (H, W) z; black where not finite or not positive.
+        depth: (H, W) z; grey where not finite or not positive.
         near: Depth of the near end; None takes `depth_range`.
         far: Depth of the far end; None takes `depth_range`.
     """
@@ -54,23 +63,53 @@ def colourise_depth(depth: Float, near: float | None = None, far: float | None =
 def colourise_error(relative_error: Float) -> Image:
     """Relative depth error in colour, from 0 (dark) to `ERROR_LIMIT` and above (bright).
 
-    The lowest tenth of the colour map is left out, so that a small error differs from black, the
-    colour of the unknown.
-
     Args:
-        relative_error: (H, W) |z_gt - z| / z_gt; black where not finite.
+        relative_error: (H, W) |z_gt - z| / z_gt; grey where not finite.
     """
     error = np.abs(relative_error)
     known = np.isfinite(error)
     level = np.minimum(np.where(known, error, 0.0) / ERROR_LIMIT, 1.0)
-    return _paint(0.1 + 0.9 * level, known, "inferno")
+    return _paint(level, known, "inferno")
+
+
+def colourise_sigma(sigma: Float, limit: float = SIGMA_LIMIT) -> Image:
+    """Standard deviation of log depth in colour, from 0 (yellow) to `limit` and above (dark).
+
+    Args:
+        sigma: (H, W); grey where not finite.
+        limit: At the dark end.
+    """
+    known = np.isfinite(sigma)
+    level = np.clip(np.where(known, sigma, 0.0) / limit, 0.0, 1.0)
+    return _paint(1 - level, known, "viridis")
+
+
+def component_colours(count: int) -> Image:
+    """(count, 3) colours of components: the first, the largest, is slate, others are vivid."""
+    vivid = (matplotlib.colormaps["tab10"](np.arange(10))[:, :3] * 255).round()
+    # the grey of tab10 is for what is unknown
+    vivid = np.delete(vivid, 7, axis=0)[[1, 2, 3, 4, 5, 6, 7, 8, 0]]
+    turns = np.arange(max(count - 1, 0))
+    faded = 0.75 ** (turns // len(vivid))[:, None]
+    return np.vstack([[[126, 150, 190]], vivid[turns % len(vivid)] * faded]).astype(np.uint8)[
+        :count
+    ]
+
+
+def wheel_key(size: int = 64) -> Image:
+    """(size, size, 3) key of the flow's colours: the centre is no motion, the rim the limit."""
+    at = (np.arange(size) + 0.5) / size * 2 - 1
+    u, v = np.meshgrid(at, at)
+    out = colourise_flow(np.stack([u, v], axis=2), 1.0)
+    out[np.hypot(u, v) > 1] = 255
+    return out
 
 
 def _paint(level: NDArray[np.float64], known: Mask, name: str) -> Image:
-    """(H, W, 3) colours of levels (H, W) in [0, 1] by a matplotlib map, black where not known."""
+    """(H, W, 3) colours of levels (H, W) in [0, 1] by a matplotlib map, grey where not known."""
     table = (matplotlib.colormaps[name](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
     out = table[(level * 255).round().astype(np.intp)]
-    out[~known] = 0
+    out[~known] = UNKNOWN
     return np.asarray(out)
 
 
@@ -84,19 +123,29 @@ def colour_wheel() -> NDArray[np.float64]:
     return np.concatenate(parts)
 
 
+def flow_limit(uv: Float) -> float:
+    """Length, pixels, of full saturation of a flow (H, W, 2), NaN where unknown.
+
+    It is the longest, but at most 1.5 times the 99th percentile.
+    """
+    length = np.hypot(uv[..., 0], uv[..., 1])
+    length = length[np.isfinite(length)]
+    if not length.size:
+        return 1.0
+    return max(float(min(length.max(), 1.5 * np.percentile(length, 99))), 1e-6)
+
+
 def colourise_flow(uv: Float, limit: float | None = None) -> Image:
     """Flow in the colours of the Middlebury wheel: hue is direction, white is no motion.
 
     Args:
         uv: (H, W, 2) displacement, pixels; black where not finite.
-        limit: Length, pixels, of full saturation; longer is darker. None takes the 99th
-            percentile.
+        limit: Length, pixels, of full saturation; longer is darker. None takes `flow_limit`.
     """
     known: Mask = np.asarray(np.isfinite(uv).all(axis=2))
     flow = np.where(known[:, :, None], uv, 0.0).astype(np.float64)
     length = np.hypot(flow[:, :, 0], flow[:, :, 1])
-    if limit is None:
-        limit = max(float(np.percentile(length[known], 99)), 1e-6) if known.any() else 1.0
+    limit = flow_limit(np.asarray(uv)) if limit is None else limit
     radius = (length / limit)[:, :, None]
     wheel = colour_wheel() / 255
     turn = np.arctan2(-flow[:, :, 1], -flow[:, :, 0]) / np.pi
@@ -114,13 +163,13 @@ def colourise_normals(n_map: Float) -> Image:
     """Normals in colour: (x, -y, -z) from [-1, 1] to RGB, so one that faces the camera is blue.
 
     Args:
-        n_map: (H, W, 3) unit normals in the camera frame (x right, y down, z forward); black where
+        n_map: (H, W, 3) unit normals in the camera frame (x right, y down, z forward); grey where
             not finite.
     """
     known: Mask = np.asarray(np.isfinite(n_map).all(axis=2))
     signed = np.where(known[:, :, None], n_map, 0.0) * np.array([1.0, -1.0, -1.0])
     out = ((np.clip(signed, -1, 1) + 1) * 127.5).round().astype(np.uint8)
-    out[~known] = 0
+    out[~known] = UNKNOWN
     return np.asarray(out)
 
 

@@ -1,4 +1,4 @@
-"""Overviews of a result for reports, panel by panel, and images written as PNG."""
+"""Pictures with titles and legends as PNG, alone and as an overview; 16-bit depth maps."""
 
 from __future__ import annotations
 
@@ -10,45 +10,40 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
-from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import depth_metrics, sample_at_points
-from soup_nlp.report.colour import (
-    ERROR_LIMIT,
-    Image,
-    colourise_depth,
-    colourise_error,
-    colourise_flow,
-    colourise_normals,
-    depth_range,
-    draw_superpixels,
-)
+from soup_nlp.report.colour import Image
+from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.storage.atomic import PathLike, atomic_path, write_bytes
 
 Float = NDArray[np.floating]
-Bar = tuple[Image, str, str]
-"""Colour bar of a panel: (1, M, 3) colours, text at their left end, text at their right end."""
-Panel = tuple[str, Image] | tuple[str, Image, Bar]
-"""Caption, (H, W, 3) uint8 RGB picture and, where colours are numbers, their bar."""
 
 _DPI = 100
 _FRAME = 0.6  # points
-_BAR_HEIGHT, _CAPTION, _GAP = 0.2, 0.28, 0.08  # inches
+_CAPTION, _GAP = 0.28, 0.08  # inches
+_LEGEND = {Bar: 0.32, Swatches: 0.24, Wheel: 0.62}
+"""Height of a legend, inches."""
+_SPARE = ("depth_start", "normals")
+"""Panels that an overview leaves out, in this order, where its last row would have gaps."""
 
 
 def overview_strip(
-    path: PathLike, panels: Sequence[Panel], title: str, columns: int = 3, panel_width: float = 4.2
+    path: PathLike,
+    panels: Sequence[Picture],
+    title: str,
+    columns: int = 3,
+    panel_width: float = 4.2,
 ) -> None:
-    """Write a PNG of captioned panels in a grid, under a title.
+    """Write a PNG of titled pictures with their legends in a grid, under a title.
 
     Panels keep their aspect; a row is as high as its highest panel. No global state of matplotlib
     is touched, so it may run in any thread.
 
     Args:
         path: PNG file to write; its folder must exist.
-        panels: (caption, (H, W, 3) uint8 RGB[, colour bar]) in reading order.
+        panels: In reading order.
         title: Above the panels; "" for none.
         columns: Largest number of panels in a row.
         panel_width: Width of a panel, inches at 100 dpi.
@@ -61,8 +56,8 @@ def overview_strip(
     # layout in inches, from the top
     head = 0.42 if title else _GAP
     heights = [
-        panel_width * max(panel[1].shape[0] / panel[1].shape[1] for panel in row)
-        + _BAR_HEIGHT * any(len(panel) == 3 for panel in row)
+        panel_width * max(p.image.shape[0] / p.image.shape[1] for p in row)
+        + max(_legend_height(p) for p in row)
         for row in rows
     ]
     width = columns * (panel_width + _GAP) + _GAP
@@ -76,13 +71,30 @@ def overview_strip(
             _draw_panel(figure, panel, _GAP + k * (panel_width + _GAP), top, panel_width)
         top -= row_height + _CAPTION + _GAP
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=_DPI)
+        # half the time of the default level, and files a tenth larger
+        figure.savefig(temporary, format="png", dpi=_DPI, pil_kwargs={"compress_level": 3})
 
 
-def _draw_panel(figure: Figure, panel: Panel, left: float, top: float, width: float) -> None:
-    """Caption, picture and colour bar of a panel; inches from the lower left corner."""
-    caption, image = panel[0], panel[1]
-    _write(figure, left, top - 0.5 * _CAPTION, caption)
+def write_picture(path: PathLike, picture: Picture) -> None:
+    """Write a picture at its own size with its title above and its legend below, as PNG.
+
+    Raises:
+        DataError: the folder cannot be written.
+    """
+    # narrower than this a title does not fit
+    width = max(picture.image.shape[1] / _DPI, 5.0)
+    overview_strip(path, [picture], "", panel_width=width)
+
+
+def _legend_height(picture: Picture) -> float:
+    return 0.0 if picture.legend is None else _LEGEND[type(picture.legend)]
+
+
+def _draw_panel(figure: Figure, panel: Picture, left: float, top: float, width: float) -> None:
+    """Title, picture and legend of a panel; inches from the lower left corner."""
+    image = panel.image
+    text = _write(figure, left, top - 0.5 * _CAPTION, panel.title)
+    _shrink(figure, text, width)
     tall = width * image.shape[0] / image.shape[1]
     bottom = top - _CAPTION - tall
     axes = _axes(figure, left, bottom, width, tall)
@@ -91,20 +103,60 @@ def _draw_panel(figure: Figure, panel: Panel, left: float, top: float, width: fl
     # so that a white panel is seen on white paper
     for side in axes.spines.values():
         side.set(linewidth=_FRAME, color="0.6")
-    if len(panel) == 3:
-        colours, low, high = panel[2]
-        middle = bottom - 0.5 * _BAR_HEIGHT
-        _write(figure, left, middle, low, fontsize=8)
-        _write(figure, left + width, middle, high, fontsize=8, ha="right")
-        axes = _axes(figure, left + 0.45, bottom - _BAR_HEIGHT + 0.05, width - 0.9, 0.1)
-        axes.imshow(colours, interpolation="nearest", aspect="auto")
+    if isinstance(panel.legend, Bar):
+        _draw_bar(figure, panel.legend, left, bottom, width)
+    elif isinstance(panel.legend, Swatches):
+        _draw_swatches(figure, panel.legend, left, bottom, width)
+    elif isinstance(panel.legend, Wheel):
+        size = 0.52
+        axes = _axes(figure, left, bottom - size - 0.05, size, size)
+        axes.imshow(panel.legend.image, interpolation="antialiased")
         axes.set_axis_off()
+        x, y = left + size + 0.1, bottom - 0.5 * size - 0.05
+        _shrink(figure, _write(figure, x, y, panel.legend.text, fontsize=8), width - size - 0.1)
 
 
-def _write(figure: Figure, x: float, y: float, text: str, **style: Any) -> None:
+def _draw_bar(figure: Figure, bar: Bar, left: float, bottom: float, width: float) -> None:
+    axes = _axes(figure, left, bottom - 0.15, width, 0.1)
+    axes.imshow(bar.colours, interpolation="nearest", aspect="auto")
+    axes.set_axis_off()
+    last = len(bar.texts) - 1
+    for k, text in enumerate(bar.texts):
+        side = "left" if k == 0 else "right" if k == last else "center"
+        _write(figure, left + width * k / last, bottom - 0.24, text, fontsize=8, ha=side)
+
+
+def _draw_swatches(figure: Figure, key: Swatches, left: float, bottom: float, width: float) -> None:
+    x, y = left, bottom - 0.13
+    for colour, name in key.entries:
+        axes = _axes(figure, x, y - 0.05, 0.12, 0.1)
+        axes.imshow(np.array(colour, np.uint8)[None, None], aspect="auto")
+        axes.set_axis_off()
+        text = _write(figure, x + 0.16, y, name, fontsize=8)
+        x += 0.16 + _wide(figure, text) + 0.15
+        if x > left + width:
+            text.set_visible(False)
+            axes.set_visible(False)
+            break
+
+
+def _wide(figure: Figure, text: Text) -> float:
+    """Width of a text, inches."""
+    return float(text.get_window_extent(figure.canvas.get_renderer()).width) / _DPI  # type: ignore[attr-defined]
+
+
+def _shrink(figure: Figure, text: Text, width: float) -> None:
+    """Make a text small enough for a width in inches."""
+    found = _wide(figure, text)
+    if found > width:
+        # font sizes are rounded when drawn
+        text.set_fontsize(float(text.get_fontsize()) * 0.96 * width / found)
+
+
+def _write(figure: Figure, x: float, y: float, text: str, **style: Any) -> Text:
     """Text as it is, without mathematics, at (x, y) inches."""
     wide, tall = figure.get_size_inches()
-    figure.text(x / wide, y / tall, text, va="center", parse_math=False, **style)
+    return figure.text(x / wide, y / tall, text, va="center", parse_math=False, **style)
 
 
 def _axes(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
@@ -113,86 +165,22 @@ def _axes(figure: Figure, left: float, bottom: float, width: float, height: floa
     return figure.add_axes((left / wide, bottom / tall, width / wide, height / tall))
 
 
-def overview(
-    path: PathLike,
-    pair: Pair,
-    labels: NDArray[np.integer],
-    depths: Mapping[str, Float],
-    normals: Float,
-    title: str,
-) -> None:
-    """Write the overview of a result: input, superpixels, flow, depths, truth, error, normals.
-
-    The depths share one colour range, that of the truth (without one, of the last of them), to
-    which each is scaled by the median ratio; a caption holds the MRE by that rule and the coverage.
-    The error shown is that of the last depth.
+def overview(path: PathLike, found: Mapping[str, Picture], title: str) -> None:
+    """Write the overview of a result: its pictures in a grid of three columns without gaps.
 
     Args:
         path: PNG file to write; its folder must exist.
-        pair: Images, flow and truth (dense, or sparse points: an MRE without a picture).
-        labels: (H, W) superpixels.
-        depths: (H, W) z by stage, in order, such as "start", "solution", "refined".
-        normals: (H, W, 3) unit normals.
+        found: See `pictures`.
         title: Above the panels.
 
     Raises:
         DataError: the folder cannot be written.
     """
-    panels: list[Panel] = [("reference frame", pair.image_ref), ("next frame", pair.image_next)]
-    count = f"{np.unique(labels).size} superpixels"
-    panels.append((count, draw_superpixels(pair.image_ref, labels)))
-    if pair.flow is not None:
-        panels.append((f"flow ({pair.flow.source})", flow_picture(pair.flow)))
-        sure = np.clip(pair.flow.confidence, 0, 1).astype(np.float64)
-        grey = np.repeat((255 * sure).round().astype(np.uint8)[:, :, None], 3, axis=2)
-        panels.append((f"confidence, {np.mean(sure > 0):.0%} above 0 (black)", grey))
-    panels += _depth_panels(pair, depths)
-    panels.append(("normals", colourise_normals(normals)))
-    overview_strip(path, panels, title)
-
-
-def flow_picture(flow: Flow) -> Image:
-    """A flow in colour, black where it has no confidence."""
-    sure = (flow.confidence > 0)[..., None]
-    return colourise_flow(np.where(sure, flow.uv.astype(np.float64), np.nan))
-
-
-def _depth_panels(pair: Pair, depths: Mapping[str, Float]) -> list[Panel]:
-    """Panels of the depths on one scale, of the true depth and of the relative error."""
-    truth = pair.truth.depth_ref if pair.truth is not None else None
-    common = truth if truth is not None else [*depths.values()][-1]
-    maps = {name: _scaled(pair, z, common) for name, z in depths.items()}
-    near, far = depth_range(common if truth is not None else [*maps.values()][-1][0])
-    levels = 1 / np.linspace(1 / far, 1 / near, 64)[None]
-    bar = (colourise_depth(levels, near, far), f"{far:.3g}", f"{near:.3g}")
-    out: list[Panel] = [
-        (f"{name}{score}", colourise_depth(z, near, far), bar) for name, (z, score) in maps.items()
-    ]
-    if pair.truth is not None and truth is not None:
-        out.append((f"true depth ({pair.truth.unit})", colourise_depth(truth, near, far), bar))
-        for name, (z, _) in [*maps.items()][-1:]:
-            known = (truth > 0) & (z > 0)
-            error = np.full(truth.shape, np.nan)
-            error[known] = np.abs(truth[known] - z[known]) / truth[known]
-            shown = colourise_error(np.linspace(0, ERROR_LIMIT, 64)[None])
-            bar = (shown, "0", f"{ERROR_LIMIT:g}")
-            out.append((f"relative error, {name}", colourise_error(error), bar))
-    return out
-
-
-def _scaled(pair: Pair, depth: Float, common: Float) -> tuple[Float, str]:
-    """A depth times its median ratio to the truth (to `common` without one), and its score."""
-    z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
-    known = pair.truth is not None and pair.truth.depth_ref is not None
-    estimate, target = z, common
-    if not known and pair.truth is not None and pair.truth.points is not None:
-        estimate, target = sample_at_points(z, pair.truth.points)
-        known = True
-    if not (np.isfinite(target) & (target > 0)).any():
-        return z, ""
-    m = depth_metrics(estimate, target)
-    score = f", MRE {m.mre:.3f} ({m.scale_rule}), coverage {m.coverage:.0%}" if known else ""
-    return (z * m.scale if m.n_pixels else z), score
+    panels = dict(found)
+    for name in _SPARE:
+        if len(panels) % 3:
+            panels.pop(name, None)
+    overview_strip(path, [*panels.values()], title)
 
 
 def write_png(path: PathLike, rgb: Image) -> None:

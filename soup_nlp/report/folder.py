@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from soup_nlp.data.datasets.layout import MARK, is_result
+from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import skill
-from soup_nlp.report.colour import (
-    colourise_depth,
-    colourise_error,
-    depth_range,
-    draw_superpixels,
-)
-from soup_nlp.report.figures import (
-    flow_picture,
-    overview,
-    write_clipped_depth_png16,
-    write_png,
-)
+from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture
 from soup_nlp.report.formats import write_formats
+from soup_nlp.report.page import page
+from soup_nlp.report.pictures import Picture, pictures
 from soup_nlp.report.result import result_of
+from soup_nlp.report.shown import PAGE, of_folder, of_run
 from soup_nlp.report.tree import attributes, result_tree
+from soup_nlp.report.verdict import facts
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.store import write_h5, write_json
@@ -46,15 +40,39 @@ FILES = (
     "depth_ref_colour.png",
     "depth_next_colour.png",
     "superpixels.png",
+    "components.png",
     "flow.png",
+    "flow_confidence.png",
+    "normals.png",
+    "confidence.png",
     "error.png",
     "overview.png",
+    PAGE,
     "motions.json",
     "trajectory.tum",
     "points_ref.ply",
     "points_next.ply",
 )
-"""Files of a result folder; error.png is there with dense truth only."""
+"""Files of a result folder; error.png is there with dense truth only, confidence.png where the
+uncertainty of the depth is known."""
+
+PICTURES = {
+    "depth_ref": "depth_ref_colour.png",
+    "depth_next": "depth_next_colour.png",
+    **{
+        name: f"{name}.png"
+        for name in (
+            "superpixels",
+            "components",
+            "flow",
+            "flow_confidence",
+            "normals",
+            "confidence",
+            "error",
+        )
+    },
+}
+"""Files of the pictures that are written alone, by name."""
 
 _ROUND = (
     "energy",
@@ -134,7 +152,9 @@ def _refuse_overwriting(folder: Path, inputs: Iterable[Path]) -> None:
         )
 
 
-def write_folder(folder: Path, run: Run, config: str, log: str) -> list[str]:
+def write_folder(
+    folder: Path, run: Run, config: str, log: str, verdict: str | None = None
+) -> list[str]:
     """Write every file of a run, summary.json last: where it exists, the others are complete.
 
     The summary.json of an earlier result is removed first.
@@ -144,6 +164,7 @@ def write_folder(folder: Path, run: Run, config: str, log: str) -> list[str]:
         run: The run.
         config: Merged problem as YAML.
         log: Lines of the log.
+        verdict: What the page shows as printed; None for `facts`.
 
     Returns:
         Names of the files.
@@ -155,9 +176,16 @@ def write_folder(folder: Path, run: Run, config: str, log: str) -> list[str]:
     write_text(folder / "config.yaml", config)
     write_text(folder / "log.txt", log)
     write_h5(folder / "result.h5", result_tree(run), attributes(run, config))
-    scales = _pictures(folder, run)
+    told = summary(run)
+    shown = of_run(run, told, facts(run) if verdict is None else verdict)
+    drawn = pictures(shown)
+    scales = _pictures(folder, run, drawn)
     write_formats(folder, result_of(run), ("motions", "ply"))
-    write_json(folder / "summary.json", {**summary(run), "depth_png_scale": scales})
+    if run.problem.output.page:
+        write_text(folder / PAGE, page(shown, drawn))
+    else:
+        (folder / PAGE).unlink(missing_ok=True)
+    write_json(folder / "summary.json", {**told, "depth_png_scale": scales})
     return [name for name in FILES if (folder / name).is_file()]
 
 
@@ -219,30 +247,41 @@ def _refinement(run: Run) -> dict[str, Any] | None:
     }
 
 
-def _pictures(folder: Path, run: Run) -> dict[str, float]:
+def _pictures(folder: Path, run: Run, drawn: Mapping[str, Picture]) -> dict[str, float]:
     """Write the pictures; values per unit of length of the two 16-bit depth maps."""
-    rec, pair, labels = run.reconstruction, run.pair, run.segmentation.labels
-    scales = {}
-    near, far = depth_range(rec.depth_ref)
-    for name, depth in (("ref", rec.depth_ref), ("next", rec.depth_next)):
-        scales[name] = write_clipped_depth_png16(folder / f"depth_{name}.png", depth)
-        write_png(folder / f"depth_{name}_colour.png", colourise_depth(depth, near, far))
-    write_png(folder / "superpixels.png", draw_superpixels(pair.image_ref, labels))
-    assert pair.flow is not None
-    write_png(folder / "flow.png", flow_picture(pair.flow))
-    truth = pair.truth.depth_ref if pair.truth is not None else None
-    if truth is not None and "solution" in run.metrics:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            error = np.abs(rec.depth_ref * run.metrics["solution"].scale - truth) / truth
-        write_png(folder / "error.png", colourise_error(error))
-    else:
-        (folder / "error.png").unlink(missing_ok=True)
-    overview(
-        folder / "overview.png",
-        pair,
-        labels,
-        {"start": run.start_reconstruction.depth_ref, "solution": rec.depth_ref},
-        run.soup.n[labels],
-        run.problem.name,
-    )
+    rec = run.reconstruction
+    scales = {
+        name: write_clipped_depth_png16(folder / f"depth_{name}.png", depth)
+        for name, depth in (("ref", rec.depth_ref), ("next", rec.depth_next))
+    }
+    for name, file in PICTURES.items():
+        if name in drawn:
+            write_picture(folder / file, drawn[name])
+        else:
+            (folder / file).unlink(missing_ok=True)
+    overview(folder / "overview.png", drawn, run.problem.name)
     return scales
+
+
+def renew_page(folder: Path, pair: Pair | None = None) -> Path:
+    """Make the page of a result folder from its arrays; what else is there stays as it is.
+
+    Args:
+        folder: A result folder, of an earlier version too.
+        pair: Its input, see `of_folder`.
+
+    Returns:
+        The page.
+
+    Raises:
+        DataError: the folder holds no result, or cannot be written.
+    """
+    shown = of_folder(folder, pair)
+    try:
+        text = page(shown, pictures(shown))
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise DataError(
+            "result lacks what a page shows", where=folder, found=repr(error), hint="solve it again"
+        ) from error
+    write_text(folder / PAGE, text)
+    return folder / PAGE

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from soup_nlp.evaluate.metrics import DepthMetrics, skill
+from soup_nlp.report.shown import PAGE
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline.run import Run
@@ -41,12 +42,24 @@ PAD = " " * 12
 
 
 def verdict(run: Run, folder: Path, files: Sequence[str], limit: float | None = None) -> str:
-    """Status, energy, residuals, accuracy, times, files and the next command.
+    """The facts of a run, its files and the next command.
 
     Args:
         run: The run.
         folder: Where its files are.
         files: Their names.
+        limit: Largest MRE that the problem file allows, if it says so.
+    """
+    look = [f"look        soup-nlp view {folder}"] if PAGE in files else []
+    lines = [f"files       {folder}/: {', '.join(files)}", *look]
+    return "\n".join([facts(run, limit), *lines, f"next        soup-nlp check {folder}"])
+
+
+def facts(run: Run, limit: float | None = None) -> str:
+    """Status, energy, residuals, accuracy and times.
+
+    Args:
+        run: The run.
         limit: Largest MRE that the problem file allows, if it says so.
     """
     s = run.solution
@@ -91,8 +104,6 @@ def verdict(run: Run, folder: Path, files: Sequence[str], limit: float | None = 
         f"seconds     {sum(whole.values()):.1f}: "
         + "  ".join(f"{k} {v:.1f}" for k, v in whole.items()),
         *([f"{PAD}of nlp: " + "  ".join(f"{k} {v:.1f}" for k, v in inner.items())] * bool(inner)),
-        f"files       {folder}/: " + ", ".join(files),
-        f"next        soup-nlp check {folder}",
     ]
     return "\n".join(lines)
 

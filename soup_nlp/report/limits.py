@@ -1,0 +1,82 @@
+"""What limits a result, in sentences: flow, parallax, guesses, components, convergence."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from soup_nlp.report.shown import Shown
+
+USABLE = 0.8
+"""Share of usable flow below which the flow is named as a limit."""
+PARALLAX = 1.0
+"""Pixels of parallax below which the flow's own error decides the depth."""
+SHARE = 0.05
+"""Share of the image from which a limit is worth a sentence."""
+
+
+def limits(shown: Shown) -> list[str]:
+    """What limits a result, one sentence or two each, and what to try; at least one line."""
+    found = [*_convergence(shown), *_flow(shown), *_parallax(shown), *_parts(shown)]
+    return found or ["Nothing stands out: flow, parallax and convergence are good."]
+
+
+def _convergence(shown: Shown) -> list[str]:
+    s = shown.summary
+    if s["converged"] or s["status"] == "Skipped":
+        return []
+    return [f"The NLP did not converge ({s['status']}): try a larger solver.max_iter."]
+
+
+def _flow(shown: Shown) -> list[str]:
+    """Flow that cannot be used, and pixels that leave the image."""
+    confidence = shown.array("input/confidence")
+    share = float((np.asarray(confidence) > 0).mean())
+    out = []
+    if share < USABLE:
+        out.append(
+            f"The flow is usable at {share:.0%} of the pixels; the rest takes its depth from its"
+            " surroundings. Try a better flow (flow.source), or frames closer in time."
+        )
+    return out
+
+
+def _parallax(shown: Shown) -> list[str]:
+    """Superpixels whose depth the images say little about."""
+    start = shown.tree["start"]
+    if shown.bending:
+        return [
+            "Surfaces are taken to bend: without one rigid motion depth follows from the surfaces'"
+            " own stretching, and relief is weakly determined."
+        ]
+    pixels = np.asarray(shown.tree["segmentation"]["sizes"], float)
+    pixels = pixels / pixels.sum()
+    borrowed = float(pixels[np.asarray(start["borrowed"], bool)].sum())
+    parallax = np.asarray(start["parallax"], float)
+    little = float(pixels[parallax < PARALLAX].sum())
+    order = np.argsort(parallax)
+    middle = float(parallax[order][np.searchsorted(np.cumsum(pixels[order]), 0.5)])
+    out = []
+    if borrowed >= SHARE:
+        out.append(
+            f"{borrowed:.0%} of the image has no depth of its own (no usable flow, or no parallax):"
+            " what is shown there is a guess from its neighbours."
+        )
+    if little >= SHARE:
+        out.append(
+            f"{little:.0%} of the image has a parallax below {PARALLAX:g} px (median {middle:.2g}"
+            " px): errors of the flow decide the depth there. Try frames further apart."
+        )
+    return out
+
+
+def _parts(shown: Shown) -> list[str]:
+    """Components whose scale follows from contact alone."""
+    parts = shown.components
+    if len(parts) == 1:
+        return []
+    pixels = shown.labels.size
+    moving = 1 - parts.background.pixels / pixels
+    return [
+        f"{len(parts) - 1} components beside the background ({moving:.1%} of the image) have"
+        " no scale from the images: theirs follows from what they stand on or touch."
+    ]

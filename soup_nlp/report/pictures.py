@@ -1,0 +1,229 @@
+"""The pictures of a result, each with its title in words and a legend with units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.report.colour import (
+    ERROR_LIMIT,
+    SIGMA_LIMIT,
+    Image,
+    colourise_depth,
+    colourise_error,
+    colourise_flow,
+    colourise_normals,
+    colourise_sigma,
+    component_colours,
+    depth_range,
+    draw_superpixels,
+    flow_limit,
+    wheel_key,
+)
+from soup_nlp.report.shown import Shown
+
+Float = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """Legend of numbers: colours from left to right, and texts at even steps below them.
+
+    Attributes:
+        colours: (1, M, 3) uint8.
+        texts: At even steps, the first at the left end.
+    """
+
+    colours: Image
+    texts: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Swatches:
+    """Legend of classes: (colour, text) of each."""
+
+    entries: tuple[tuple[tuple[int, int, int], str], ...]
+
+
+@dataclass(frozen=True)
+class Wheel:
+    """Legend of a flow: the wheel's picture (S, S, 3) and what its rim stands for."""
+
+    image: Image
+    text: str
+
+
+Legend = Bar | Swatches | Wheel
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of a result.
+
+    Attributes:
+        name: Stem of its file, and key of the page.
+        title: In words, with what unknown looks like.
+        image: (H, W, 3) uint8 RGB.
+        legend: What its colours stand for; None for photographs.
+    """
+
+    name: str
+    title: str
+    image: Image
+    legend: Legend | None = None
+
+
+def pictures(shown: Shown) -> dict[str, Picture]:
+    """All pictures of a result by name, in the order of the overview.
+
+    "image_ref", "image_next", "superpixels", "components", "flow", "flow_confidence",
+    "depth_ref", "depth_next", "depth_start", "depth_true", "error", "confidence" and "normals";
+    what is not known is left out.
+    """
+    found = [
+        *_images(shown),
+        *_parts(shown),
+        *_flow(shown),
+        *_depths(shown),
+        *_error(shown),
+        *_sigma(shown),
+        _normals(shown),
+    ]
+    return {picture.name: picture for picture in found}
+
+
+def _images(shown: Shown) -> list[Picture]:
+    named = (("ref", "reference frame", shown.image_ref), ("next", "next frame", shown.image_next))
+    return [Picture(f"image_{k}", title, image) for k, title, image in named if image is not None]
+
+
+def _parts(shown: Shown) -> list[Picture]:
+    """Superpixels and components."""
+    labels, component = shown.labels, shown.components.of_superpixel
+    back = shown.image_ref
+    if back is None:
+        back = np.full((*labels.shape, 3), 90, np.uint8)
+    number, count = len(component), len(shown.components)
+    colours = component_colours(count)
+    pixels = np.bincount(component[labels].ravel(), minlength=count) / labels.size
+    first = [
+        ((int(c[0]), int(c[1]), int(c[2])), f"{k}: {share:.1%}")
+        for k, (c, share) in enumerate(zip(colours, pixels, strict=True))
+    ][:6]
+    word = "one rigid component" if count == 1 else f"{count} rigid components, share of the image"
+    grey = back.astype(float).mean(axis=2, keepdims=True)
+    shaded = colours[component[labels]] * (0.6 + 0.4 * grey / 255)
+    return [
+        Picture("superpixels", f"{number} superpixels", draw_superpixels(back, labels)),
+        Picture("components", word, shaded.astype(np.uint8), Swatches(tuple(first))),
+    ]
+
+
+def _flow(shown: Shown) -> list[Picture]:
+    """Flow and its confidence."""
+    uv, confidence = shown.array("input/flow"), shown.array("input/confidence")
+    if uv is None or confidence is None:
+        return []
+    sure = np.clip(confidence, 0, 1).astype(float)
+    used = np.where((sure > 0)[..., None], uv.astype(float), np.nan)
+    limit = flow_limit(used)
+    title = "flow from the reference to the next frame; black = unusable"
+    rim = f"hue = direction, white = 0 px, rim = {limit:.3g} px, darker = longer"
+    grey = np.repeat((255 * sure).round().astype(np.uint8)[:, :, None], 3, axis=2)
+    ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    bar = Bar(ramp, ("0", "0.5", "1"))
+    share = f"{np.mean(sure > 0):.0%} of the pixels usable"
+    return [
+        Picture("flow", title, colourise_flow(used, limit), Wheel(wheel_key(), rim)),
+        Picture("flow_confidence", f"flow confidence; black = unusable ({share})", grey, bar),
+    ]
+
+
+def _depths(shown: Shown) -> list[Picture]:
+    """Depths of both frames, of the start and of the truth, on one colour range."""
+    s, truth = shown.scale, shown.array("truth/depth_ref")
+    maps = {k: shown.array(f"depth/{k}") for k in ("ref", "next", "start_ref")}
+    delivered = maps["ref"]
+    assert delivered is not None
+    near, far = depth_range(truth if truth is not None else delivered * s)
+    steps = 1 / np.linspace(1 / far, 1 / near, 5)
+    texts = tuple(f"{z:.3g} {shown.length}" if k in (0, 4) else f"{z:.3g}"
+                  for k, z in enumerate(steps))  # fmt: skip
+    levels = 1 / np.linspace(1 / far, 1 / near, 128)[None]
+    bar = Bar(colourise_depth(levels, near, far), texts)
+    titles = {
+        "ref": "depth of the reference frame" + _score(shown, "solution"),
+        "next": "depth of the next frame"
+        + _score(shown, "solution_next")
+        + "; grey = nothing lands there",
+        "start_ref": "depth of the start" + _score(shown, "start"),
+    }
+    names = {"ref": "depth_ref", "next": "depth_next", "start_ref": "depth_start"}
+    own = {k: _own_scale(shown, k) for k in maps}
+    out = [
+        Picture(names[k], titles[k], colourise_depth(z * own[k], near, far), bar)
+        for k, z in maps.items()
+        if z is not None
+    ]
+    if truth is not None:
+        title = "true depth; grey = no truth"
+        out.append(Picture("depth_true", title, colourise_depth(truth, near, far), bar))
+    return out
+
+
+def _own_scale(shown: Shown, which: str) -> float:
+    """Scale of a depth map to the truth: the start has its own, the next frame the solution's."""
+    name = "start" if which == "start_ref" else "solution"
+    found = shown.summary["metrics"].get(name, {}).get("scale")
+    return float(found) if found else 1.0
+
+
+def _score(shown: Shown, name: str) -> str:
+    m = shown.summary["metrics"].get(name)
+    return f", MRE {m['mre']:.3f}" if m and m["mre"] is not None else ""
+
+
+def relative_error(shown: Shown) -> Float | None:
+    """(H, W) |z_gt - s z| / z_gt of the reference frame, NaN where unknown; None without truth."""
+    truth, z = shown.array("truth/depth_ref"), shown.array("depth/ref")
+    if truth is None or z is None or "solution" not in shown.summary["metrics"]:
+        return None
+    known = (truth > 0) & (z > 0)
+    error = np.full(truth.shape, np.nan)
+    error[known] = np.abs(truth[known] - shown.scale * z[known]) / truth[known]
+    return error
+
+
+def _error(shown: Shown) -> list[Picture]:
+    error = relative_error(shown)
+    if error is None:
+        return []
+    colours = colourise_error(np.linspace(0, ERROR_LIMIT, 128)[None])
+    texts = tuple(f"{100 * x:.0f} %" for x in np.linspace(0, ERROR_LIMIT, 5))
+    bar = Bar(colours, (*texts[:-1], f"\u2265 {texts[-1]}"))
+    title = "depth error relative to the truth; grey = no truth"
+    return [Picture("error", title, colourise_error(error), bar)]
+
+
+def _sigma(shown: Shown) -> list[Picture]:
+    sigma = shown.array("depth/sigma_ref")
+    if sigma is None:
+        return []
+    colours = colourise_sigma(np.linspace(0, SIGMA_LIMIT, 128)[None])
+    texts = tuple(f"{100 * x:.0f} %" for x in np.linspace(0, SIGMA_LIMIT, 4))
+    bar = Bar(colours, (*texts[:-1], f"\u2265 {texts[-1]}"))
+    title = "expected depth error (1 sigma); dark = a guess"
+    return [Picture("confidence", title, colourise_sigma(sigma), bar)]
+
+
+def _normals(shown: Shown) -> Picture:
+    n = shown.soup("n")[shown.labels]
+    entries = {"faces the camera": (0, 0, -1), "right": (1, 0, 0), "left": (-1, 0, 0),
+               "up": (0, -1, 0), "down": (0, 1, 0)}  # fmt: skip
+    keys = []
+    for text, normal in entries.items():
+        r, g, b = (int(x) for x in colourise_normals(np.array(normal, float)[None, None])[0, 0])
+        keys.append(((r, g, b), text))
+    return Picture("normals", "surface normals", colourise_normals(n), Swatches(tuple(keys)))

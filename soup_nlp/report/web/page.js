@@ -1,0 +1,352 @@
+/* The page of a result: rebuilds both frames from superpixels, planes and motions. */
+"use strict";
+(async () => {
+const $ = (id) => document.getElementById(id);
+const data = JSON.parse($("data").textContent);
+const scene = data.scene;
+
+for (const image of document.querySelectorAll("figure > img"))
+  image.onclick = () => image.parentElement.classList.toggle("large");
+addEventListener("keydown", (event) => {
+  if (event.key === "Escape")
+    document.querySelectorAll("figure.large").forEach((f) => f.classList.remove("large"));
+});
+
+/* numbers that were deflated and written as base64 */
+async function unpack(text, Kind) {
+  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Kind(await new Response(stream).arrayBuffer());
+}
+
+const [labels, planes, motion, motionCamera, guess, seen, surface] = await Promise.all([
+  unpack(scene.labels, Uint16Array), unpack(scene.planes, Float32Array),
+  unpack(scene.motion, Float32Array), unpack(scene.motionCamera, Float32Array),
+  unpack(scene.guess, Uint8Array), unpack(scene.seen, Uint8Array), unpack(scene.surface, Uint8Array),
+]);
+const [w, h] = scene.grid;
+
+/* points of the reference frame; camera axes: x right, y down, z ahead */
+function points() {
+  const [[fx, skew, cx], [, fy, cy]] = scene.K;
+  const out = new Float32Array(3 * w * h);
+  for (let v = 0, p = 0; v < h; v++)
+    for (let u = 0; u < w; u++, p++) {
+      const y = (v * scene.step - cy) / fy, x = (u * scene.step - cx - skew * y) / fx;
+      const i = 3 * labels[p];
+      const inverse = planes[i] * x + planes[i + 1] * y + planes[i + 2];
+      const z = inverse > 0 ? 1 / inverse : NaN;
+      out.set([x * z, y * z, z], 3 * p);
+    }
+  return out;
+}
+
+/* corners of the triangles that are no curtains */
+function triangles() {
+  const out = new Uint32Array(6 * (w - 1) * (h - 1));
+  let count = 0, bit = 0;
+  const has = (k) => (surface[k >> 3] >> (k & 7)) & 1;
+  for (let v = 0; v < h - 1; v++)
+    for (let u = 0; u < w - 1; u++) {
+      const a = v * w + u, b = a + 1, c = a + w, d = c + 1;
+      if (has(bit++)) { out[count++] = a; out[count++] = c; out[count++] = b; }
+      if (has(bit++)) { out[count++] = b; out[count++] = c; out[count++] = d; }
+    }
+  return out.slice(0, count);
+}
+
+const VERTEX = `
+  in float label, seen;
+  uniform sampler2D motion;
+  uniform float time, pointSize;
+  uniform vec2 grid;
+  out vec2 place;
+  out float depth, guess, hidden;
+  vec3 turned(vec3 w, vec3 x) {
+    float angle = length(w);
+    if (angle < 1e-9) return x + cross(w, x);
+    vec3 k = w / angle;
+    return x * cos(angle) + cross(k, x) * sin(angle) + k * dot(k, x) * (1.0 - cos(angle));
+  }
+  vec3 moved(sampler2D table, vec3 x, float t) {
+    int i = int(label + 0.5);
+    vec4 turn = texelFetch(table, ivec2(0, i), 0);
+    vec3 pivot = texelFetch(table, ivec2(1, i), 0).xyz;
+    vec3 shift = texelFetch(table, ivec2(2, i), 0).xyz;
+    return turned(t * turn.xyz, x - pivot) + pivot + t * shift;
+  }
+  uniform sampler2D raw;
+  uniform mat3 cameraNext;
+  uniform vec2 sizeNext;
+  uniform bool fromNext;
+  void main() {
+    int p = gl_VertexID, w = int(grid.x);
+    vec3 x = position;
+    guess = texelFetch(motion, ivec2(0, int(label + 0.5)), 0).w;
+    depth = x.z;
+    hidden = 0.0;
+    place = (vec2(p % w, p / w) + 0.5) / grid;
+    if (fromNext) {
+      vec3 q = cameraNext * moved(raw, x, 1.0);
+      place = (q.xy / q.z + 0.5) / sizeNext;
+      hidden = 1.0 - seen;
+    }
+    vec3 at = moved(motion, x, time);
+    gl_Position = projectionMatrix * modelViewMatrix * vec4(at, 1.0);
+    gl_PointSize = pointSize;
+  }`;
+const FRAGMENT = `
+  precision highp float;
+  in vec2 place;
+  in float depth, guess, hidden;
+  uniform sampler2D colours;
+  uniform float far;
+  uniform bool guesses;
+  out vec4 colour;
+  void main() {
+    if (!(depth < far) || (!guesses && guess > 0.5)) discard;
+    vec2 inside = step(vec2(0.0), place) * step(place, vec2(1.0));
+    colour = inside.x * inside.y > 0.5 && hidden < 0.5 ? texture(colours, place) : vec4(0.35, 0.35, 0.38, 1.0);
+  }`;
+
+/* one row of three texels per superpixel: rotation and guess, pivot, shift */
+function motionTexture(values) {
+  const texels = new Float32Array(12 * scene.count);
+  for (let i = 0; i < scene.count; i++) {
+    for (let part = 0; part < 3; part++)
+      texels.set(values.subarray(9 * i + 3 * part, 9 * i + 3 * part + 3), 12 * i + 4 * part);
+    texels[12 * i + 3] = guess[i];
+  }
+  const out = new THREE.DataTexture(texels, 3, scene.count, THREE.RGBAFormat, THREE.FloatType);
+  out.needsUpdate = true;
+  return out;
+}
+
+let renderer;
+try {
+  renderer = new THREE.WebGLRenderer({ canvas: $("canvas"), antialias: true, preserveDrawingBuffer: true });
+} catch (error) {
+  $("message").textContent = "This browser shows no WebGL 2: the 3D view is left out, the pictures are below.";
+  return;
+}
+renderer.outputColorSpace = THREE.SRGBColorSpace;
+renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+renderer.setClearColor(0x20262e);
+
+/* all colours are written as they are: no light, no change of colour space */
+const texture = async (name) => {
+  const image = document.querySelector(`figure > img[data-name="${name}"]`);
+  await image.decode();
+  const out = new THREE.Texture(image);
+  out.flipY = false;
+  out.colorSpace = THREE.NoColorSpace;
+  const photo = name.startsWith("image");
+  out.minFilter = out.magFilter = photo ? THREE.LinearFilter : THREE.NearestFilter;
+  out.generateMipmaps = false;
+  out.needsUpdate = true;
+  return out;
+};
+const textures = {};
+const K = scene.KNext;
+const home = motionTexture(motion), raw = motionTexture(motionCamera);
+const uniforms = {
+  motion: { value: home }, raw: { value: raw }, time: { value: 0 },
+  grid: { value: new THREE.Vector2(w, h) }, pointSize: { value: 2 },
+  cameraNext: { value: new THREE.Matrix3().set(...K[0], ...K[1], ...K[2]) },
+  sizeNext: { value: new THREE.Vector2(...scene.sizeNext) }, fromNext: { value: false },
+  colours: { value: null }, far: { value: scene.far }, guesses: { value: true },
+};
+const material = new THREE.ShaderMaterial({
+  uniforms, vertexShader: VERTEX, fragmentShader: FRAGMENT, glslVersion: THREE.GLSL3,
+  side: THREE.DoubleSide,
+});
+const position = new THREE.BufferAttribute(points(), 3);
+const label = new THREE.BufferAttribute(Float32Array.from(labels), 1);
+const shown = new THREE.BufferAttribute(Float32Array.from(seen), 1);
+const geometry = (index) => {
+  const out = new THREE.BufferGeometry();
+  out.setAttribute("position", position);
+  out.setAttribute("label", label);
+  out.setAttribute("seen", shown);
+  if (index) out.setIndex(new THREE.BufferAttribute(index, 1));
+  return out;
+};
+const mesh = new THREE.Mesh(geometry(triangles()), material);
+const cloud = new THREE.Points(geometry(null), material);
+mesh.frustumCulled = cloud.frustumCulled = false;
+cloud.visible = false;
+
+/* y up and z towards the viewer, as viewers expect */
+const world = new THREE.Scene(), body = new THREE.Group();
+body.matrixAutoUpdate = false;
+body.matrix.makeScale(1, -1, -1);
+world.add(body);
+body.add(mesh, cloud);
+
+const flat = (rows) => new THREE.Matrix4().set(...rows.flat());
+let pose = flat(scene.camera);
+const [fx, fy, cx, cy] = [scene.K[0][0], scene.K[1][1], scene.K[0][2], scene.K[1][2]];
+
+function frustum(colour) {
+  const s = 0.09 * scene.middle, corner = (u, v) => [s * (u - cx) / fx, s * (v - cy) / fy, s];
+  const [width, height] = scene.size;
+  const c = [corner(0, 0), corner(width, 0), corner(width, height), corner(0, height)];
+  const top = [s * (width / 2 - cx) / fx, s * (-0.2 * height - cy) / fy, s], o = [0, 0, 0];
+  const lines = [o, c[0], o, c[1], o, c[2], o, c[3], c[0], c[1], c[1], c[2], c[2], c[3], c[3], c[0],
+    c[0], top, top, c[1]];
+  return line(lines, colour);
+}
+function line(corners, colour) {
+  const out = new THREE.LineSegments(new THREE.BufferGeometry(),
+    new THREE.LineBasicMaterial({ color: colour }));
+  out.geometry.setAttribute("position", new THREE.BufferAttribute(Float32Array.from(corners.flat()), 3));
+  out.frustumCulled = false;
+  return out;
+}
+const cameras = new THREE.Group();
+const cameraRef = frustum(0x6fb7ff), cameraNext = frustum(0xffa94d);
+cameraNext.matrixAutoUpdate = false;
+cameras.add(cameraRef, cameraNext);
+body.add(cameras);
+
+/* path of the pivot of every component that moves */
+const paths = new THREE.Group();
+function drawPaths(values) {
+  paths.clear();
+  const seen = new Set();
+  for (let i = 0; i < scene.count; i++) {
+    const pivot = [...values.subarray(9 * i + 3, 9 * i + 6)], key = pivot.join();
+    if (seen.has(key)) continue;
+    seen.add(key);
+    const shift = values.subarray(9 * i + 6, 9 * i + 9);
+    if (Math.hypot(...shift) < 0.01 * pivot[2]) continue;
+    const path = line([pivot, pivot.map((x, k) => x + shift[k])], 0xff5566);
+    path.material.depthTest = false;
+    path.renderOrder = 1;
+    paths.add(path);
+  }
+}
+body.add(paths);
+
+const eye = new THREE.PerspectiveCamera(50, 1, scene.middle / 200, Math.max(scene.deepest, scene.middle) * 4);
+const controls = new THREE.OrbitControls(eye, $("canvas"));
+controls.zoomToCursor = true;
+
+/* a point of the reference camera's frame, y up */
+const up = (x, y, z) => new THREE.Vector3(x, -y, -z);
+function fit(margin) {
+  const aspect = $("stage").clientWidth / $("stage").clientHeight;
+  const tall = Math.max(scene.size[1] / fy, scene.size[0] / fx / aspect) * margin;
+  eye.fov = 2 * Math.atan(tall / 2) * 180 / Math.PI;
+}
+const m = scene.middle;
+const VIEWS = {
+  aside: () => { fit(1.12); eye.position.copy(up(0.2 * m, -0.17 * m, -0.3 * m)); controls.target.copy(up(0, 0, m)); },
+  reference: () => { fit(1); eye.position.copy(up(0, 0, 0)); controls.target.copy(up(0, 0, m)); },
+  next: () => {
+    fit(1);
+    eye.position.copy(new THREE.Vector3(0, 0, 0).applyMatrix4(pose).applyMatrix4(body.matrix));
+    controls.target.copy(new THREE.Vector3(0, 0, m).applyMatrix4(pose).applyMatrix4(body.matrix));
+    setTime(1);
+  },
+  left: () => { fit(1.1); eye.position.copy(up(-0.75 * m, -0.15 * m, 0.15 * m)); controls.target.copy(up(0, 0, m)); },
+  right: () => { fit(1.1); eye.position.copy(up(0.75 * m, -0.15 * m, 0.15 * m)); controls.target.copy(up(0, 0, m)); },
+  top: () => { fit(1.3); eye.position.copy(up(0, -1.6 * m, 0.75 * m)); controls.target.copy(up(0, 0, 1.1 * m)); },
+};
+
+let wanted = false;
+function draw() {
+  if (wanted) return;
+  wanted = true;
+  requestAnimationFrame(() => { wanted = false; controls.update(); renderer.render(world, eye); });
+}
+controls.addEventListener("change", draw);
+
+function resize() {
+  const { clientWidth, clientHeight } = $("stage");
+  renderer.setSize(clientWidth, clientHeight, false);
+  eye.aspect = clientWidth / clientHeight;
+  eye.updateProjectionMatrix();
+  draw();
+}
+addEventListener("resize", resize);
+
+function setTime(value) {
+  $("time").value = value;
+  uniforms.time.value = Number(value);
+  draw();
+}
+async function setMode(name) {
+  textures[name] ??= await texture(name);
+  uniforms.colours.value = textures[name];
+  uniforms.fromNext.value = name === "image_next";
+  const mode = data.modes.find((one) => one.name === name);
+  $("mode-title").textContent = mode.title;
+  $("mode-legend").innerHTML = mode.legend;
+  for (const button of $("modes").children) button.classList.toggle("on", button.value === name);
+  draw();
+}
+function setView(name) { VIEWS[name](); eye.updateProjectionMatrix(); controls.update(); draw(); }
+function buttons(id, entries, act) {
+  for (const [value, word] of entries) {
+    const button = document.createElement("button");
+    Object.assign(button, { value, textContent: word, onclick: () => act(value) });
+    $(id).append(button);
+  }
+}
+buttons("modes", data.modes.map((mode) => [mode.name, mode.word]), setMode);
+buttons("views", Object.keys(VIEWS).map((name) => [name, name]), setView);
+$("time").oninput = () => setTime($("time").value);
+$("points").onchange = () => { cloud.visible = $("points").checked; mesh.visible = !cloud.visible; draw(); };
+$("guesses").onchange = () => { uniforms.guesses.value = $("guesses").checked; draw(); };
+$("cameras").onchange = () => { cameras.visible = $("cameras").checked; draw(); };
+$("paths").onchange = () => { paths.visible = $("paths").checked; draw(); };
+/* held: both cameras stand in one place, and everything moves as they see it */
+function hold(held) {
+  uniforms.motion.value = held ? raw : home;
+  pose = held ? new THREE.Matrix4() : flat(scene.camera);
+  cameraNext.matrix.copy(pose);
+  drawPaths(held ? motionCamera : motion);
+  draw();
+}
+$("still").onchange = () => hold($("still").checked);
+/* depths of the slider are even in their logarithm */
+const near = 0.5 * m, deepest = Math.max(scene.deepest * 1.001, 1.1 * near);
+function setFar(depth) {
+  uniforms.far.value = depth;
+  $("far").value = Math.log(depth / near) / Math.log(deepest / near);
+  $("far-text").textContent = `${depth.toPrecision(3)} ${scene.unit}`;
+  draw();
+}
+$("far").oninput = () => setFar(near * (deepest / near) ** $("far").value);
+
+let playing = 0;
+$("play").onclick = () => {
+  if (playing) { cancelAnimationFrame(playing); playing = 0; $("play").textContent = "\u25b6"; return; }
+  const began = performance.now() - 1000 * Number($("time").value);
+  const step = (now) => {
+    const t = ((now - began) / 1000) % 3;  /* there in a second, a rest, and back */
+    setTime(t < 1 ? t : t < 1.5 ? 1 : t < 2.5 ? 2.5 - t : 0);
+    playing = requestAnimationFrame(step);
+  };
+  $("play").textContent = "\u25a0";
+  playing = requestAnimationFrame(step);
+};
+
+/* report.html#mode=depth_ref&time=1&view=top opens that view */
+const asked = new URLSearchParams(location.hash.slice(1));
+const mode = asked.get("mode");
+setFar(scene.far);
+hold(false);
+resize();
+setView(asked.get("view") in VIEWS ? asked.get("view") : "aside");
+if (asked.has("time")) setTime(Math.min(Math.max(Number(asked.get("time")) || 0, 0), 1));
+else setTime(0);
+await setMode(data.modes.some((one) => one.name === mode) ? mode : data.modes[0].name);
+$("message").textContent = "";
+document.body.dataset.ready = "yes";
+window.soupView = { setMode, setTime, setView, setFar, modes: data.modes.map((one) => one.name), renderer };
+})().catch((error) => {
+  document.getElementById("message").textContent = `The 3D view failed: ${error.message}`;
+  throw error;
+});

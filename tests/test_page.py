@@ -1,0 +1,224 @@
+"""report.html: what it holds, and that it is made of any result folder."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import dump_problem, make_problem
+from soup_nlp.geometry.camera import pixel_grid, rays
+from soup_nlp.geometry.rotation import exp
+from soup_nlp.report import scene3d
+from soup_nlp.report.folder import summary, write_folder
+from soup_nlp.report.limits import limits
+from soup_nlp.report.page import MODES, page
+from soup_nlp.report.pictures import pictures
+from soup_nlp.report.scene3d import make_scene
+from soup_nlp.report.shown import of_run
+
+
+@pytest.fixture(scope="module")
+def shown(small_run):
+    return of_run(small_run, summary(small_run), "status  <fine> & dandy")
+
+
+@pytest.fixture(scope="module")
+def text(shown):
+    return page(shown, pictures(shown))
+
+
+def data_of(text):
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
+    return json.loads(found[1])
+
+
+def unpack(packed, kind, shape):
+    return np.frombuffer(zlib.decompress(base64.b64decode(packed)), kind).reshape(shape)
+
+
+@pytest.fixture(scope="module")
+def written(small_run, tmp_path_factory):
+    """A result folder."""
+    out = tmp_path_factory.mktemp("written")
+    write_folder(out, small_run, dump_problem(small_run.problem), "log\n")
+    return out
+
+
+@pytest.fixture
+def folder(written, tmp_path):
+    """A copy of it."""
+    return Path(shutil.copytree(written, tmp_path / "result"))
+
+
+def test_the_page_is_one_file_that_fetches_nothing(text):
+    addresses = set(re.findall(r'(?:src|href)="([^"]{0,20})', text))
+    assert addresses
+    assert all(address.startswith("data:") for address in addresses)
+    # the only address is a name of the drawing library, which nobody fetches
+    assert set(re.findall(r"https?://[^\s\"'`)]+", text)) == {"http://www.w3.org/1999/xhtml"}
+    assert not re.search(
+        r"\bimport\s*\(|\bfetch\(|XMLHttpRequest\(|url\(", text.split("</style>")[0]
+    )
+    assert "Three.js Authors" in text
+    assert text.count("<script") == text.count("</script>") == 3
+    assert len(text) < 2e6
+    assert "status  &lt;fine&gt; &amp; dandy" in text
+
+
+def test_the_page_has_every_part(text):
+    data = data_of(text)
+    names = [mode["name"] for mode in data["modes"]]
+    assert names == list(MODES)
+    for word in ("What limits this result", "Energy by stage", "Verdict", "Components"):
+        assert word in text
+    assert re.findall(r'data-name="(\w+)"', text)[:5] == [
+        "image_ref", "image_next", "superpixels", "components", "flow",
+    ]  # fmt: skip
+    assert re.search(r"rim = [\d.]+ px", text)
+
+
+def test_planes_and_motions_rebuild_both_frames(text, small_run):
+    """What the browser computes from the page is the reconstruction."""
+    s, run = data_of(text)["scene"], small_run
+    scale, n = run.metrics["solution"].scale, len(run.soup)
+    labels = unpack(s["labels"], "<u2", run.segmentation.labels.shape)
+    np.testing.assert_array_equal(labels, run.segmentation.labels)
+    planes = unpack(s["planes"], "<f4", (n, 3)).astype(float)
+    ray = rays(np.array(s["K"]), pixel_grid(*labels.shape))
+    points = ray / np.einsum("hwc,hwc->hw", planes[labels], ray)[..., None]
+    # single precision, about 1e-7, grows where a plane is seen at a small angle
+    np.testing.assert_allclose(points[..., 2], scale * run.reconstruction.depth_ref, rtol=1e-4)
+    for name, pose in (("motionCamera", np.eye(4)), ("motion", np.array(s["camera"]))):
+        w, pivot, shift = (
+            unpack(s[name], "<f4", (n, 9))
+            .astype(float)
+            .reshape(n, 3, 3)[labels]
+            .transpose(2, 0, 1, 3)
+        )
+        moved = np.einsum("hwij,hwj->hwi", exp(w), points - pivot) + pivot + shift
+        want = scale * run.reconstruction.points_next @ pose[:3, :3].T + pose[:3, 3]
+        far = np.linalg.norm(want, axis=-1, keepdims=True)
+        np.testing.assert_allclose(moved / far, want / far, atol=1e-4)
+
+
+def test_the_next_camera_is_where_the_background_says(text, small_run):
+    pose = np.array(data_of(text)["scene"]["camera"])
+    centre = small_run.metrics["solution"].scale * small_run.camera.centre
+    np.testing.assert_allclose(pose[:3, 3], centre, rtol=1e-9)
+
+
+def two_walls(gap, same=True):
+    """Surface of two halves of 6 x 8 pixels, the right one farther by a factor."""
+    labels = np.repeat([[0] * 4 + [1] * 4], 6, axis=0)
+    planes = np.array([[0, 0, 1.0], [0, 0, 1 / gap]])
+    ray = rays(np.diag([9.0, 9.0, 1.0]), pixel_grid(6, 8))
+    component = np.array([0, 0 if same else 1])
+    return scene3d._surface(planes, labels, component, ray, np.ones((6, 8), bool))
+
+
+def test_curtains_are_cut_and_nothing_else():
+    assert two_walls(1.01).all()
+    for cut in (two_walls(1.5), two_walls(1.0, same=False)):
+        assert not cut[:, 3].any()
+        assert cut[:, [0, 1, 2, 4, 5, 6]].all()
+    # a slanted plane is no curtain, however fast its depth grows
+    slanted = np.array([[0, -0.9, 1.0]])
+    ray = rays(np.array([[6.0, 0, 0], [0, 6, 0], [0, 0, 1]]), pixel_grid(6, 8))
+    labels, known = np.zeros((6, 8), int), np.ones((6, 8), bool)
+    assert scene3d._surface(slanted, labels, np.array([0]), ray, known).all()
+    known[2, 3] = False
+    cut = scene3d._surface(slanted, labels, np.array([0]), ray, known)
+    assert (~cut).sum() == 6
+
+
+def test_large_images_are_thinned(shown, monkeypatch):
+    monkeypatch.setattr(scene3d, "MOST_PIXELS", 256 * 128 / 8)
+    scene = make_scene(shown)
+    assert scene.step == 3
+    assert scene.labels.shape == (43, 86)
+    assert scene.surface.shape == (42, 85, 2)
+
+
+def test_a_far_sky_is_left_out_at_first(shown):
+    scene = make_scene(shown)
+    assert scene.middle < scene.far <= scene.deepest
+    z = np.concatenate([np.full(900, 2.0), np.full(100, 1e6)])
+    assert scene3d._far(z) == (8.0, 1e6)
+
+
+def test_a_folder_makes_the_same_page_again(folder, capsys):
+    written = (folder / "report.html").read_text()
+    assert main(["view", str(folder), "--renew", "--no-open"]) == 0
+    assert f"{folder}/report.html" in capsys.readouterr().out
+    again = (folder / "report.html").read_text()
+    # the log holds no verdict here
+    cut = re.compile(r"<h2>Verdict.*?</pre>", re.DOTALL)
+    assert cut.sub("", again) == cut.sub("", written)
+
+
+@pytest.mark.parametrize("input_there", [True, False])
+def test_a_folder_of_an_earlier_version(folder, input_there):
+    """It has no images and no unit; the images come from its input, where that is there."""
+    with h5py.File(folder / "result.h5", "a") as file:
+        del file["input/image_ref"], file["input/image_next"], file.attrs["truth_unit"]
+    (folder / "report.html").unlink()
+    if not input_there:
+        (folder / "config.yaml").write_text("input: {kind: folder, path: gone}\n")
+    assert main(["view", str(folder), "--no-open"]) == 0
+    text = (folder / "report.html").read_text()
+    assert ('data-name="image_ref"' in text) == input_there
+    assert "true depth" in text
+
+
+def test_the_page_can_be_left_out(small_run, folder):
+    problem = small_run.problem.replace(output={"page": False})
+    assert problem.digest() == small_run.problem.digest()
+    files = write_folder(folder, replace(small_run, problem=problem), dump_problem(problem), "")
+    assert "report.html" not in files
+    assert not (folder / "report.html").exists()
+    assert "overview.png" in files
+
+
+def test_view_of_no_result(tmp_path, capsys):
+    assert main(["view", str(tmp_path)]) == 2
+    assert "result file does not exist" in capsys.readouterr().err
+
+
+def test_limits_name_what_is_wrong(shown):
+    good = " ".join(limits(shown))
+    assert "did not converge" not in good
+    tree = {**shown.tree, "input": dict(shown.tree["input"]), "start": dict(shown.tree["start"])}
+    tree["input"]["confidence"] = np.zeros_like(tree["input"]["confidence"])
+    tree["start"]["parallax"] = np.full_like(tree["start"]["parallax"], 0.1)
+    tree["start"]["borrowed"] = np.ones_like(tree["start"]["borrowed"])
+    told = {**shown.summary, "status": "Time_Limit", "converged": False}
+    found = limits(replace(shown, tree=tree, summary=told))
+    assert found[0] == "The NLP did not converge (Time_Limit): try a larger solver.max_iter."
+    assert "usable at 0% of the pixels" in found[1]
+    assert found[2].startswith("100% of the image has no depth of its own")
+    assert "parallax below 1 px (median 0.1 px)" in found[3]
+
+
+def test_a_result_without_sigma_has_no_such_mode(shown):
+    depth = {k: v for k, v in shown.tree["depth"].items() if k != "sigma_ref"}
+    bare = replace(shown, tree={**shown.tree, "depth": depth})
+    found = pictures(bare)
+    assert "confidence" not in found
+    names = [mode["name"] for mode in data_of(page(bare, found))["modes"]]
+    assert names == [name for name in MODES if name != "confidence"]
+
+
+def test_problem_files_know_the_switch():
+    scene = {"kind": "scene", "scene": "room"}
+    assert make_problem({"input": scene}).output.page
+    assert not make_problem({"input": scene}, ["output.page=false"]).output.page
