@@ -12,14 +12,16 @@ import pytest
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.model import compile as compiling
+from soup_nlp.model import vectors
 from soup_nlp.model.assemble import Entries, Pattern
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.lanes import LANES, NoLanesError, compile_lanes, in_lanes
 from soup_nlp.model.layout import Chart
+from soup_nlp.model.mapped import Mapped
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP, assemble
-from soup_nlp.model.sums import Sums
+from soup_nlp.model.sums import Sums, interpreted
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.solve.hessian import LagrangianHessian
 from soup_nlp.solve.ipopt import Ipopt
@@ -165,8 +167,9 @@ def test_lengths_are_checked_before_machine_code_reads():
         sums.hessian("exact", np.zeros(6), np.zeros(1))
 
 
-@needs_compiler
-def test_every_operation_has_casadis_value():
+@pytest.fixture(scope="module")
+def every() -> ca.Function:
+    """Every operation that kernels may have, of one variable and one number of data."""
     a, b = ca.SX.sym("a"), ca.SX.sym("b")
     component = ca.vertcat(
         a + b - a * b / (2 + b),
@@ -180,7 +183,37 @@ def test_every_operation_has_casadis_value():
         ca.logic_not(a < b),
         1.5,
     )
-    f = ca.Function("every", [a, b, ca.SX(0, 1)], [component])
+    return ca.Function("every", [a, b, ca.SX(0, 1)], [component])
+
+
+@pytest.mark.parametrize("block", [3, 4, 8, 2048])
+def test_numpy_has_casadis_value_of_every_operation(every, block, monkeypatch):
+    monkeypatch.setattr(vectors, "BLOCK", block)
+    rng = np.random.default_rng(2)
+    x, data, count = rng.normal(size=8), rng.normal(size=(8, 1)), 8
+    # two elements share their places
+    place = (np.arange(count)[:, None] // 2) * 10 + np.arange(10)
+    table = Table(np.arange(count)[:, None], data, np.zeros((0, 0), np.int64))
+    out = np.ones(40)
+    vectors.Vectors(every, table, place).add(out, x, np.zeros(0), 1.0, None)
+    expected = np.array([np.asarray(every(*pair, [])).ravel() for pair in zip(x, data.ravel())])
+    np.testing.assert_allclose(out.reshape(4, 10), 1 + expected[::2] + expected[1::2], rtol=1e-14)
+
+
+def test_an_operation_without_a_twin_goes_to_casadi():
+    x, w = ca.SX.sym("x"), ca.SX.sym("w")
+    f = ca.Function("sine", [x, w, ca.SX(0, 1)], [w * ca.sin(x)])
+    table = Table(np.arange(3)[:, None], np.ones((3, 1)), np.zeros((0, 0), np.int64))
+    term = interpreted(f, table, np.zeros((3, 1), int))
+    assert isinstance(term, Mapped)
+    out = np.zeros(1)
+    term.add(out, np.array([0.1, 0.2, 0.3]), np.zeros(0), 1.0, None)
+    assert out[0] == pytest.approx(np.sin([0.1, 0.2, 0.3]).sum(), rel=1e-14)
+
+
+@needs_compiler
+def test_every_operation_has_casadis_value(every):
+    f = every
     library = compile_lanes([f])
     rng = np.random.default_rng(2)
     x, data = rng.normal(size=(LANES, 1)), rng.normal(size=(LANES, 1))

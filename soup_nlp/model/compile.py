@@ -65,7 +65,7 @@ def compile_functions(
     plain = {f.name(): f for f in functions}
     compiler = compiler or find_compiler()
     if compiler is None:
-        log.info("no C compiler found: kernels run in CasADi's virtual machine (slower)")
+        log.debug("no C compiler found: Ipopt's kernels run in CasADi's virtual machine")
         return plain
     generator = ca.CodeGenerator("kernels", {"with_header": False})
     for f in functions:
@@ -95,7 +95,9 @@ def shared_library(
     try:
         return _build(source, key, compiler)
     except (OSError, subprocess.SubprocessError) as error:
-        log.warning("compiling the kernels failed, using CasADi's virtual machine: %s", error)
+        log.warning(
+            "compiling the kernels failed, using numpy and CasADi's virtual machine: %s", error
+        )
         return None
 
 

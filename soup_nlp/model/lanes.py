@@ -84,7 +84,7 @@ _OPERATIONS: Mapping[int, str] = {
 
 
 class NoLanesError(Exception):
-    """A function cannot be vectorised; `mapped` replaces it."""
+    """A function cannot be vectorised; `vectors` or `mapped` replaces it."""
 
 
 def c_source(function: ca.Function) -> str:
@@ -132,7 +132,7 @@ def compile_lanes(functions: Sequence[ca.Function]) -> ctypes.CDLL:
     key = "\0".join(["lanes", _HEAD, _LOOP, *(f.serialize() for f in functions)])
     path = shared_library(key, lambda: "\n".join([_HEAD, *(c_source(f) for f in functions)]))
     if path is None:
-        raise NoLanesError("no working compiler")
+        raise NoLanesError("no working C compiler")
     try:
         return ctypes.CDLL(str(path))
     except OSError as error:

@@ -1,4 +1,7 @@
-"""Kernels in CasADi's virtual machine, summed over their table: what replaces `lanes`."""
+"""Kernels in CasADi's virtual machine, summed over their table.
+
+They replace `vectors` where a kernel has an operation that numpy has no twin of there.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """An NLP's sums as numpy arrays: value, gradient, constraints and Hessians of several kinds.
 
 Every kernel is summed over its table: by vectorised machine code (`lanes`) where a C compiler is
-found, else in CasADi's virtual machine. Ipopt and the exports take the functions of `assemble`; the
+found, else by numpy (`vectors`). Ipopt and the exports take the functions of `assemble`; the
 presolve, which evaluates a hundred times as often, takes these.
 """
 
@@ -22,6 +22,7 @@ from soup_nlp.model.kernel import Group, Table
 from soup_nlp.model.lanes import Lanes, NoLanesError, Summed, compile_lanes
 from soup_nlp.model.mapped import Mapped
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.vectors import Vectors
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -93,7 +94,7 @@ class Sums:
             every = [u.entries for u in unions]
             self.upper = Pattern.of((nlp.nx, nlp.nx), [*every, Entries(*(besides or _NOTHING))])
         jacobian_places = iter(self.jacobian.places)
-        self._terms: dict[str, list[Summed | Mapped]] = {}
+        self._terms: dict[str, list[Summed | Vectors | Mapped]] = {}
         self.vectorised = nlp.compiled
         for group, functions, union, upper in zip(nlp.groups, made, unions, self.upper.places):
             size = group.size
@@ -111,7 +112,7 @@ class Sums:
 
     def _summed(
         self, table: Table, functions: dict[str, ca.Function], place: dict[str, NDArray[np.integer]]
-    ) -> dict[str, Summed | Mapped]:
+    ) -> dict[str, Summed | Vectors | Mapped]:
         """Functions of one kernel over its table, by the fastest way there is.
 
         Args:
@@ -130,8 +131,12 @@ class Sums:
                 }
             except NoLanesError as error:
                 self.vectorised = False
-                log.debug("no machine code on vectors: %s", error)
-        return {key: Mapped(f, table, place[key]) for key, f in functions.items()}
+                log.info(
+                    "no machine code on vectors: %s; kernels run in numpy, and a solve takes about"
+                    " a quarter longer (a C compiler on the PATH, gcc or clang, is used)",
+                    error,
+                )
+        return {key: interpreted(f, table, place[key]) for key, f in functions.items()}
 
     def _size(self, key: str) -> int:
         nx, ng, _ = self._sizes
@@ -167,6 +172,16 @@ class Sums:
         """Nonzeros of the Hessian of `lam_f f + lam_g . g`, in the order of `upper`."""
         with self.seconds.of("hess_lag"):
             return self._sum(kind, x, lam_g, lam_f)
+
+
+def interpreted(
+    function: ca.Function, table: Table, place: NDArray[np.integer]
+) -> Vectors | Mapped:
+    """A function over a table without a compiler: in numpy, or else in CasADi."""
+    try:
+        return Vectors(function, table, place)
+    except NoLanesError:
+        return Mapped(function, table, place)
 
 
 def _vector(name: str, values: Float, size: int) -> Float:

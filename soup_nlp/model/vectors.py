@@ -1,0 +1,140 @@
+"""Kernels in numpy, summed over their table: what replaces `lanes` where there is no compiler.
+
+The kernel's instructions run one after the other on blocks of elements, so that an instruction
+costs one call of numpy a block. In CasADi's virtual machine, instruction by instruction and element
+by element, a kernel takes four times as long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.model.kernel import Table
+from soup_nlp.model.lanes import NoLanesError
+
+Float = NDArray[np.float64]
+
+BLOCK = 2048
+"""Elements of a block: more cost fewer calls, fewer fit into the cache."""
+
+
+def _if_else_zero(a: Float, b: Float, out: Float) -> None:
+    # not a product: what is left out may be infinite
+    out[...] = np.where(a != 0, b, 0.0)
+
+
+_ONE = np.array(1.0)
+_OPERATIONS: Mapping[int, Callable[..., Any]] = {
+    ca.OP_ASSIGN: np.positive,
+    ca.OP_ADD: np.add,
+    ca.OP_SUB: np.subtract,
+    ca.OP_MUL: np.multiply,
+    ca.OP_DIV: np.divide,
+    ca.OP_NEG: np.negative,
+    ca.OP_SQ: np.square,
+    ca.OP_TWICE: lambda a, out: np.add(a, a, out),
+    ca.OP_INV: lambda a, out: np.divide(_ONE, a, out),
+    ca.OP_SQRT: np.sqrt,
+    # an output as third argument is deprecated in these two
+    ca.OP_FMAX: lambda a, b, out: np.maximum(a, b, out=out),
+    ca.OP_FMIN: lambda a, b, out: np.minimum(a, b, out=out),
+    ca.OP_FABS: np.abs,
+    ca.OP_LT: np.less,
+    ca.OP_LE: np.less_equal,
+    ca.OP_NOT: lambda a, out: np.equal(a, 0.0, out),
+    ca.OP_IF_ELSE_ZERO: _if_else_zero,
+}
+
+
+class Vectors:
+    """One function of a kernel, summed over the kernel's table."""
+
+    def __init__(self, function: ca.Function, table: Table, place: NDArray[np.integer]) -> None:
+        """Translate the function.
+
+        Args:
+            function: (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,).
+            table: The kernel's table, E elements.
+            place: (E, k) where each entry is added.
+
+        Raises:
+            NoLanesError: It has an operation that is not among the ones the energy needs.
+        """
+        size = max(1, min(BLOCK, len(table)))
+        count = [function.nnz_in(i) if i < function.n_in() else 0 for i in range(5)]
+        self._x, self._data = np.empty((count[0], size)), np.empty((count[1], size))
+        self._theta, self._lam_f = np.empty(count[2]), np.empty(1)
+        self._lam_c, self._out = np.empty((count[4], size)), np.empty((function.nnz_out(0), size))
+        self._calls = self._translated(function, size)
+        starts = range(0, len(table), size)
+        # the last block is filled with its last element, whose entries are then left out
+        blocks = [np.minimum(np.arange(s, s + size), len(table) - 1) for s in starts]
+        self._full = len(table) - size * (len(blocks) - 1) if blocks else 0
+        # without constraints a table has no rows at all
+        rows = table.rows.reshape(len(table), table.rows.shape[1])
+        self._blocks = [
+            (
+                np.ascontiguousarray(table.index[b].T),
+                np.ascontiguousarray(table.data[b].T),
+                np.ascontiguousarray(rows[b].T),
+            )
+            for b in blocks
+        ]
+        # entries in the order in which blocks give them
+        self._place = [np.ascontiguousarray(place[s : s + size].T).ravel() for s in starts]
+
+    def _translated(self, f: ca.Function, size: int) -> list[tuple[Callable[..., Any], Any]]:
+        """Calls of numpy with their arguments: rows of the block's buffers and registers."""
+        inputs = self._x, self._data, self._theta[:, None], self._lam_f[:, None], self._lam_c
+        work = np.empty((f.sz_w(), size))
+        held: dict[int, Float] = {}
+        calls: list[tuple[Callable[..., Any], Any]] = []
+        for k in range(f.n_instructions()):
+            op, to, source = f.instruction_id(k), f.instruction_output(k), f.instruction_input(k)
+            if op == ca.OP_INPUT:
+                held[to[0]] = inputs[source[0]][source[1]]
+            elif op == ca.OP_CONST:
+                held[to[0]] = np.array([f.instruction_constant(k)])
+            elif op == ca.OP_OUTPUT:
+                calls.append((np.copyto, (self._out[to[1]], held[source[0]])))
+            elif op in _OPERATIONS:
+                given = [held[i] for i in source[: 1 if op in _UNARY else 2]]
+                held[to[0]] = work[to[0]]
+                calls.append((_OPERATIONS[op], (*given, work[to[0]])))
+            else:
+                raise NoLanesError(f"{f.name()}: operation {op}")
+        return calls
+
+    def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
+        """Add the elements' entries to `out`; arguments as of `lanes.Summed.add`."""
+        self._theta[:], self._lam_f[0] = theta[: len(self._theta)], lam_f
+        calls, last = self._calls, len(self._blocks) - 1
+        with np.errstate(all="ignore"):
+            for k, (index, data, rows) in enumerate(self._blocks):
+                np.take(x, index, out=self._x)
+                self._data[:] = data
+                if lam_g is not None:
+                    np.take(lam_g, rows, out=self._lam_c)
+                for call, given in calls:
+                    call(*given)
+                entries = self._out if k < last else self._out[:, : self._full]
+                out += np.bincount(self._place[k], entries.ravel(), len(out))
+
+
+_UNARY = frozenset(
+    (
+        ca.OP_ASSIGN,
+        ca.OP_NEG,
+        ca.OP_SQ,
+        ca.OP_TWICE,
+        ca.OP_INV,
+        ca.OP_SQRT,
+        ca.OP_FABS,
+        ca.OP_NOT,
+    )
+)
