@@ -10,6 +10,7 @@ import numpy as np
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_flow
 from soup_nlp.data.flow.robust import reweighted
+from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
@@ -27,6 +28,7 @@ from soup_nlp.model.reweighting import (
     in_noise,
     in_pixels,
 )
+from soup_nlp.pipeline.still_layer import see_through
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.propose import Start, propose
@@ -46,6 +48,8 @@ class Case:
         weights: Constants of the energy.
         soup: Where solvers start: the start, or the presolve's answer.
         options: Stages and limits of the problem.
+        seen: The pair as the photometric term sees it: without a layer that stands still before
+            the scene, where there is one.
     """
 
     problem: Problem
@@ -56,6 +60,7 @@ class Case:
     weights: Weights
     soup: Soup
     options: SolverOptions
+    seen: Pair
 
     def __len__(self) -> int:
         return len(self.segmentation)
@@ -102,6 +107,13 @@ def prepare(
     done("load")
     flow = pair.flow or problem.flow.load(pair, problem.path)
     pair = pair.with_flow(flow)
+    computed = is_named(flow.source) and not flow.source.startswith("truth")
+    seen = see_through(pair, problem.seed) if problem.flow.see_through and computed else None
+    if seen is not None and seen.flow is not None:
+        flow = seen.flow
+        pair = pair.with_flow(flow)
+        if log:
+            log("a layer stands still before the scene: flow searched for behind it")
     done("flow", pair)
     s = problem.segmentation
     labels = superpixels(problem, pair)
@@ -116,7 +128,7 @@ def prepare(
     done("start", start)
     data, weights = build_energy(problem, pair, seg, start)
     stages = solver_options(problem, start)
-    case = Case(problem, pair, seg, start, data, weights, start.soup, stages)
+    case = Case(problem, pair, seg, start, data, weights, start.soup, stages, seen or pair)
     if not presolve:
         return case
     # one iteration of the constrained NLP is the smallest number that a solve has

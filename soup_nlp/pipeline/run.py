@@ -248,7 +248,7 @@ def run(
         clock("nlp")
     refined = None
     if problem.refine.enabled:
-        photo = look(case.pair, case.segmentation.labels, solution.soup, problem.refine)
+        photo = look(case.seen, case.segmentation.labels, solution.soup, problem.refine)
         refined = refine_soup(
             solution.soup,
             case.data,

@@ -175,6 +175,9 @@ class FlowOptions(Section):
     reweight_px: Positive | None = None
     """Pixels that disagree with their superpixel's affine flow by more than about this count
     less; null for never."""
+    see_through: bool = True
+    """Where flow that was computed follows a layer that stands still before a moving scene (a
+    reflection in a windscreen), search for the scene's own along its epipolar lines."""
     dis: DisOptions = DisOptions()
     """Options of OpenCV's DIS flow and of its forward-backward check."""
 

@@ -1,0 +1,216 @@
+"""A layer that stands still before a moving scene: a reflection in a windscreen, dirt on it.
+
+Where the layer has more contrast than the scene the flow follows it, is zero, closes its round
+trip and is fully confident: the road goes to infinity. The scene's own motion shows once what both
+images have in common at the same place is taken out, and is searched for along the epipolar lines
+of the rigid motion that the rest of the flow has.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dctn, idctn
+
+from soup_nlp.data.census import census, census_at
+from soup_nlp.data.flow.consistency import FloatMap
+from soup_nlp.data.pair import Flow
+from soup_nlp.geometry.camera import rays
+
+Image = NDArray[np.uint8]
+Float = NDArray[np.float64]
+
+LEVELS = 64
+"""Depths that are tried of either kind of plane."""
+REACH = 0.25
+"""Largest displacement tried, in widths of the image, at unit distance from the epipole."""
+WINDOW = 31
+"""Side of the window over which costs are averaged, pixels."""
+TAU = 0.35
+"""A contradiction of census counts at most this much."""
+STRIDE = 4
+"""Every so many pixels are looked at."""
+STILL_PX = 0.5
+"""A displacement up to which a pixel stands still, pixels."""
+MOVED_PX = 2.0
+"""Displacement, pixels, from which one is another."""
+CLEARLY, SLIGHTLY = 0.02, -0.01
+"""By how much the flow found must cost less than the given one: where a still pixel is to count as
+contradicted, and, once enough are, everywhere."""
+ENOUGH = 0.002
+"""Share of the image that has to be contradicted."""
+CONTRARY = 0.25
+"""Cost above which the flow found agrees with nothing either."""
+
+
+def without_still_layer(ref: Image, nxt: Image) -> tuple[Image, Image]:
+    """Both images (H, W, 3), grey (H, W), without the gradients that they share at one place.
+
+    Of two derivatives of one sign the smaller is taken off both; images are made of what is left
+    (Poisson's equation with free borders, by cosine transforms). Where nothing stands still the
+    images lose a part of their contrast, alike in both.
+    """
+    ref, nxt = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (ref, nxt))
+    first, second = (_derivatives(image.astype(np.float32)) for image in (ref, nxt))
+    shared = [
+        np.where(a * b > 0, np.sign(a) * np.minimum(np.abs(a), np.abs(b)), 0)
+        for a, b in zip(first, second, strict=True)
+    ]
+    return tuple(  # type: ignore[return-value]
+        _integrated(own[0] - shared[0], own[1] - shared[1], float(image.mean()))
+        for own, image in ((first, ref), (second, nxt))
+    )
+
+
+def _derivatives(image: FloatMap) -> tuple[FloatMap, FloatMap]:
+    along, down = np.zeros_like(image), np.zeros_like(image)
+    along[:, :-1] = np.diff(image, axis=1)
+    down[:-1] = np.diff(image, axis=0)
+    return along, down
+
+
+def _integrated(along: FloatMap, down: FloatMap, mean: float) -> Image:
+    height, width = along.shape
+    divergence = along + down
+    divergence[:, 1:] -= along[:, :-1]
+    divergence[1:] -= down[:-1]
+    v, u = np.arange(height)[:, None], np.arange(width)
+    laplacian = 2 * (np.cos(np.pi * v / height) + np.cos(np.pi * u / width)) - 4
+    laplacian[0, 0] = 1.0
+    spectrum = dctn(divergence, norm="ortho") / laplacian
+    spectrum[0, 0] = 0.0
+    image = idctn(spectrum, norm="ortho") + mean
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+class EpipolarSearch:
+    """Costs of flows between two images, and the flow of least cost along epipolar lines.
+
+    Args:
+        ref: (H, W) grey reference image.
+        nxt: (H', W') grey next image.
+        stride: Every so many pixels of the reference image are looked at.
+    """
+
+    def __init__(self, ref: Image, nxt: Image, stride: int) -> None:
+        self.stride = stride
+        self.own = np.ascontiguousarray(census(ref)[:, ::stride, ::stride])
+        self.there = census(nxt)
+        height, width = ref.shape
+        self.v, self.u = np.mgrid[0:height:stride, 0:width:stride].astype(np.float32)
+
+    def cost(self, x: FloatMap, y: FloatMap) -> FloatMap:
+        """Mean difference of census over a window, of pixels of the grid and (x, y) of the next
+        image; `TAU` beyond its border."""
+        height, width = self.there.shape[1:3]
+        inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+        c = np.abs(census_at(self.there, x, y) - self.own).sum(axis=(0, 3)) / 16
+        c = np.where(inside, np.minimum(c, TAU), TAU).astype(np.float32)
+        side = max(1, WINDOW // self.stride)
+        return np.asarray(cv2.blur(c, (side, side)), np.float32)
+
+    def of_flow(self, uv: FloatMap) -> FloatMap:
+        """Cost of a flow (H, W, 2) on the grid."""
+        own = uv[:: self.stride, :: self.stride]
+        return self.cost(self.u + own[..., 0], self.v + own[..., 1])
+
+    def along(self, R: Float, t: Float, K_ref: Float, K_next: Float) -> tuple[FloatMap, FloatMap]:
+        """Flow of least cost among planes swept over depth under a rigid motion, and its cost.
+
+        Planes are parallel to the image, and level, as the ground of an upright image.
+
+        Args:
+            R: (3, 3) rotation.
+            t: (3,) unit translation.
+            K_ref: (3, 3) intrinsics of the reference frame.
+            K_next: (3, 3) intrinsics of the next frame.
+        """
+        ray = rays(K_ref, np.stack([self.u, self.v], axis=-1).astype(float))
+        turned = (ray @ R.T).astype(np.float32)
+        best = np.full(self.u.shape, np.inf, np.float32)
+        flow = np.zeros((*self.u.shape, 2), np.float32)
+        most = REACH * self.there.shape[2] / K_next[0, 0]
+        level = np.maximum(ray[..., 1], 0.0) / max(float(ray[..., 1].max()), 1e-6)
+        for shape in (np.ones_like(level), level):
+            for share in (np.arange(LEVELS) + 0.5) / LEVELS:
+                point = turned + (most * share * shape[..., None] * t).astype(np.float32)
+                ahead = np.maximum(point[..., 2], 0.05)
+                x = (point[..., 0] / ahead * K_next[0, 0] + K_next[0, 2]).astype(np.float32)
+                y = (point[..., 1] / ahead * K_next[1, 1] + K_next[1, 2]).astype(np.float32)
+                c = self.cost(x, y)
+                better = c < best
+                best[better] = c[better]
+                flow[better] = np.stack([x - self.u, y - self.v], axis=-1)[better]
+        return flow, best
+
+
+def still(flow: Flow) -> NDArray[np.bool_]:
+    """(H, W) pixels that stand still for certain."""
+    near: NDArray[np.bool_] = np.linalg.norm(flow.uv, axis=2) < STILL_PX
+    return near & (flow.confidence > 0.5)
+
+
+def corrected(
+    ref: Image, nxt: Image, flow: Flow, R: Float, t: Float, K_ref: Float, K_next: Float
+) -> Flow | None:
+    """A flow that follows the scene where the given one follows a layer that stands still.
+
+    Args:
+        ref: (H, W) grey reference image without the layer (`without_still_layer`).
+        nxt: (H', W') grey next image without it.
+        flow: Flow of the images as they are.
+        R: (3, 3) rotation of the motion that what is not still has.
+        t: (3,) its unit translation.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        K_next: (3, 3) intrinsics of the next frame.
+
+    Returns:
+        The flow with what was found; its confidence there falls with the distance, pixels, from
+        the epipolar line. None where hardly any still pixel is contradicted.
+    """
+    search = EpipolarSearch(ref, nxt, STRIDE)
+    found, cost = search.along(R, t, K_ref, K_next)
+    gain = search.of_flow(flow.uv) - cost
+    moved = np.linalg.norm(found - flow.uv[::STRIDE, ::STRIDE], axis=2)
+    contradicted = still(flow)[::STRIDE, ::STRIDE] & (gain > CLEARLY) & (moved > MOVED_PX)
+    if contradicted.mean() < ENOUGH:
+        return None
+
+    def full(coarse: FloatMap) -> FloatMap:
+        height, width = ref.shape
+        size = coarse.shape[1] * STRIDE, coarse.shape[0] * STRIDE
+        return np.asarray(cv2.resize(coarse, size)[:height, :width], np.float32)
+
+    gain = cv2.blur(gain, (9, 9))
+    wrong = (full(gain) > SLIGHTLY) & (full(moved) > MOVED_PX)
+    guess = np.where(wrong[..., None], full(found), flow.uv).astype(np.float32)
+    uv = _nearby(ref, nxt, guess)
+    off = _distance_from_line(uv, R, t, K_ref, K_next)
+    sure = (np.linalg.norm(uv - guess, axis=2) < 3) & (full(cost) < CONTRARY)
+    # what had no confidence mostly leaves the image: the search has found something else
+    sure &= flow.confidence > 0.3
+    confidence = np.where(wrong, np.exp(-(off**2)) * sure, flow.confidence)
+    uv = np.where(wrong[..., None], uv, flow.uv)
+    return Flow(uv, confidence.astype(np.float32), flow.source)
+
+
+def _nearby(ref: Image, nxt: Image, guess: FloatMap) -> FloatMap:
+    """The flow (H, W, 2) by DIS that starts at a guess, on the two finest scales."""
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis.setFinestScale(0)
+    dis.setCoarsestScale(1)
+    dis.setVariationalRefinementIterations(10)
+    return np.asarray(dis.calc(ref, nxt, guess.copy()), np.float32)
+
+
+def _distance_from_line(
+    uv: FloatMap, R: Float, t: Float, K_ref: Float, K_next: Float
+) -> NDArray[np.float64]:
+    """(H, W) pixels between where a flow ends and the epipolar line of its pixel."""
+    height, width = uv.shape[:2]
+    v, u = np.mgrid[0:height, 0:width].astype(float)
+    line = np.cross(t, rays(K_ref, np.stack([u, v], axis=-1)) @ R.T)
+    end = rays(K_next, np.stack([u + uv[..., 0], v + uv[..., 1]], axis=-1))
+    across = np.maximum(np.linalg.norm(line[..., :2], axis=2), 1e-12)
+    return np.asarray(K_next[0, 0] * np.abs(np.sum(line * end, axis=2)) / across)

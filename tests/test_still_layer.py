@@ -1,0 +1,92 @@
+"""A layer that stands still before a moving scene: the scene's flow is found behind it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_flow import texture
+
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.flow.layers import without_still_layer
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.still_layer import see_through
+
+WIDTH, HEIGHT = 512, 218
+BEHIND = np.s_[130:205, 150:400]
+"""Part of the image, mostly road, that the layer covers."""
+
+
+def with_flow(pair: Pair, still: bool, source: str = "dis") -> Pair:
+    """The true flow as if it had been computed, zero at full confidence behind the layer."""
+    assert pair.truth is not None
+    assert pair.truth.flow is not None
+    uv = np.nan_to_num(pair.truth.flow).astype(np.float32)
+    sure = np.isfinite(pair.truth.flow).all(axis=2).astype(np.float32)
+    if still:
+        uv[BEHIND], sure[BEHIND] = 0.0, 1.0
+    return pair.with_flow(Flow(uv, sure, source))
+
+
+def covered(image: np.ndarray) -> np.ndarray:
+    """The image with a reflection of more contrast than the road."""
+    out = image.astype(float)
+    layer = texture(HEIGHT, WIDTH, seed=5)[..., None]
+    out[BEHIND] = 0.5 * out[BEHIND] + 0.5 * layer[BEHIND]
+    return np.rint(out).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def street() -> Pair:
+    return render_scene("street", 0, WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def reflecting(street: Pair) -> Pair:
+    images = covered(street.image_ref), covered(street.image_next)
+    return replace(street, image_ref=images[0], image_next=images[1])
+
+
+def test_what_stands_still_leaves_the_images():
+    layer, other = (np.dstack([texture(60, 80, seed)] * 3) for seed in (0, 1))
+    for image in without_still_layer(layer, layer):
+        assert image.std() == 0
+    for image, given in zip(without_still_layer(layer, other), (layer, other)):
+        # a random derivative shares its sign with another half of the time
+        assert 0.5 * given.std() < image.std() < given.std()
+
+
+def test_the_road_moves_behind_a_reflection(reflecting: Pair):
+    given = with_flow(reflecting, still=True)
+    seen = see_through(given)
+    assert seen is not None
+    assert seen.flow is not None
+    assert seen.flow.source == "dis"
+    true = reflecting.truth.flow[BEHIND]
+    error = np.linalg.norm(seen.flow.uv[BEHIND] - true, axis=2)
+    moved = np.linalg.norm(true, axis=2) > 4
+    sure = seen.flow.confidence[BEHIND] > 0.3
+    assert np.mean(moved) > 0.5
+    # before, all of them were wrong by more than 4 pixels at full confidence
+    assert np.mean(error[moved & sure] < 2.0) > 0.8
+    assert np.mean(sure[moved]) > 0.25
+    # what moves is left alone where the next frame shows it
+    above = np.s_[20:90, 100:400]
+    assert np.mean((seen.flow.uv == given.flow.uv)[above]) > 0.95
+
+
+def test_images_without_a_layer_are_left_alone(street: Pair):
+    assert see_through(with_flow(street, still=False)) is None
+
+
+def test_true_flow_is_believed(reflecting: Pair):
+    """The correction is for flow that was computed, and can be turned off."""
+    small = {"input": {"kind": "memory", "hash": "0"}, "segmentation": {"superpixels": 60}}
+    for source, flow in (("truth", {}), ("dis", {"see_through": False})):
+        given = with_flow(reflecting, still=True, source=source)
+        case = prepare(make_problem({**small, "flow": flow}), pair=given)
+        assert case.seen is case.pair
+        assert (case.pair.flow.uv[BEHIND] == 0).all()
