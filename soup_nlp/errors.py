@@ -2,6 +2,30 @@
 
 from __future__ import annotations
 
+import reprlib
+
+LONGEST = 1000
+"""Characters of a text from outside that a message repeats."""
+
+
+def printable(value: object, longest: int = LONGEST) -> str:
+    """A text from outside on one line: control characters escaped, the end cut off.
+
+    A terminal obeys control characters, and some that order right to left, whoever wrote them.
+
+    Args:
+        value: Anything; its str() is taken.
+        longest: Characters that are kept.
+    """
+    try:
+        text = str(value)
+    except (ValueError, RecursionError) as error:
+        # an integer of more digits than Python prints, a list in itself
+        text = f"{type(value).__name__} ({error})"
+    head = " ".join(text[: longest + 1].splitlines())
+    safe = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in head)
+    return safe if len(safe) <= longest else f"{safe[:longest]} ... ({len(text)} characters)"
+
 
 class SoupError(Exception):
     """Base of every error that soup_nlp raises on purpose (exit code 2 on the command line).
@@ -28,7 +52,7 @@ class SoupError(Exception):
         self.found = found
         self.expected = expected
         self.hint = hint
-        parts = [what]
+        parts = [printable(what)]
         for label, value in (
             ("where", where),
             ("found", found),
@@ -36,7 +60,7 @@ class SoupError(Exception):
             ("try", hint),
         ):
             if value is not None:
-                parts.append(f"  {label}: {value}")
+                parts.append(f"  {label}: {printable(value)}")
         super().__init__("\n".join(parts))
 
 
@@ -62,3 +86,30 @@ class ExportError(SoupError):
 
 class StoppedError(SoupError):
     """A run was told to stop before it had a start, so that there is nothing to keep."""
+
+
+def expect(value: object, kinds: type | tuple[type, ...], what: str, make: str) -> None:
+    """Raise DataError unless an argument is of a kind that the function takes.
+
+    Args:
+        value: The argument.
+        kinds: As of isinstance().
+        what: Name of the argument and what it is.
+        make: How to make one.
+    """
+    if not isinstance(value, kinds):
+        names = kinds if isinstance(kinds, tuple) else (kinds,)
+        raise DataError(
+            f"{what} is of another kind",
+            found=f"{type(value).__name__} {printable(repr_of(value), 60)}",
+            expected=" or ".join(k.__name__ for k in names),
+            hint=make,
+        )
+
+
+def repr_of(value: object) -> str:
+    """repr() of anything, short and without exceptions."""
+    try:
+        return reprlib.repr(value)
+    except Exception as error:  # of a class of the user's own
+        return f"({type(error).__name__})"

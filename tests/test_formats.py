@@ -157,7 +157,7 @@ def test_read_flow_npy_and_suffixes(tmp_path: Path) -> None:
     np.save(tmp_path / "b.npy", np.array(["x"]))
     with raises("does not hold numbers"):
         fmt.read_flow(tmp_path / "b.npy")
-    with raises(r"not a readable \.npy"):
+    with raises("flow file is truncated"):
         fmt.read_flow(put(tmp_path / "c.npy", (tmp_path / "a.npy").read_bytes()[:-9]))
     np.save(tmp_path / "d.npy", np.zeros((3, 4)))
     with raises("wrong shape"):

@@ -28,9 +28,9 @@ ALLOWED = {
     # metrics, baselines, confidence, and the referee that recomputes stored results
     "evaluate": {"errors", "storage", "data", "geometry", "model", "start", "solve"},
     # the whole problem file
-    "config": {"errors", "schema", "data", "model", "start", "solve", "refine"},
-    "pipeline": {"errors", "config", "data", "geometry", "model", "start", "solve", "refine"}
-    | {"evaluate"},
+    "config": {"errors", "schema", "storage", "data", "model", "start", "solve", "refine"},
+    "pipeline": {"errors", "storage", "config", "data", "geometry", "model", "start", "solve"}
+    | {"refine", "evaluate"},
     "report": {"errors", "storage", "data", "geometry", "solve", "refine", "evaluate", "pipeline"},
     # files for and from other solvers
     "export": {"errors", "storage", "config", "geometry", "model", "solve", "evaluate"}
@@ -56,7 +56,7 @@ LIBRARIES = {
     "h5py": {"storage", "data"},
     "typer": {"cli"},
     "rich": {"cli", "report"},
-    "yaml": {"config", "data", "report", "cli"},
+    "yaml": {"storage", "config", "data", "report", "cli"},
     "cv2": {"data", "start", "report"},
     "skimage": {"data", "geometry"},
     "trimesh": {"report"},

@@ -102,7 +102,7 @@ def test_wrong_files_are_refused(tmp_path, old, new, said):
 
 
 def test_missing_and_truncated_files_are_refused(tmp_path):
-    with pytest.raises(ExportError, match="cannot be read"):
+    with pytest.raises(ExportError, match="is missing"):
         read_sol(tmp_path / "none.sol", ORDER, ROWS)
     (tmp_path / "a.sol").write_text(TEXT[: TEXT.index("20")])
     with pytest.raises(ExportError, match="ends early"):

@@ -11,7 +11,8 @@ import pytest
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.atomic import atomic_path
-from soup_nlp.storage.store import Array, plain, read_attrs, read_h5, require, write_h5, write_json
+from soup_nlp.storage.h5_files import read_attrs, read_h5
+from soup_nlp.storage.store import Array, plain, require, write_h5, write_json
 from soup_nlp.storage.versions import versions
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.storage.files import is_file, parse_json, read_bytes
 from soup_nlp.storage.store import plain
 from soup_nlp.storage.versions import code_version
 
@@ -68,13 +69,17 @@ def attempt(work: Callable[[], Row]) -> Row:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Rows of a JSON-lines file in order; a line that a crash cut off is left out."""
-    if not path.is_file():
+    """Rows of a JSON-lines file in order; a line that a crash cut off is left out.
+
+    Raises:
+        DataError: the file cannot be read, or is something else.
+    """
+    if not os.path.lexists(path) or (is_file(path) and not path.stat().st_size):
         return []
     out = []
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in read_bytes(path, "file of rows").decode("utf-8", errors="replace").split("\n"):
         try:
-            row = json.loads(line)
+            row = parse_json(line)
         except ValueError:
             continue
         if isinstance(row, dict):

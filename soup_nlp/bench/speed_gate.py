@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from soup_nlp.bench.rows import failed
 from soup_nlp.errors import DataError
+from soup_nlp.storage.files import read_json
 
 Row = Mapping[str, Any]
 
@@ -88,11 +88,11 @@ def read_baseline(path: Path) -> list[Run]:
         DataError: the file is missing or no baseline.
     """
     try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
+        tree = read_json(path, "baseline")
         if tree["version"] != VERSION:
             raise ValueError(f"version {tree['version']}")
         return [Run(dict(run["settings"]), dict(run["values"])) for run in tree["runs"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise DataError(
             "not a baseline of bench speed",
             where=path,

@@ -1,4 +1,6 @@
-"""The command line: exit code 0 good, 1 not converged or a claim fails, 2 bad input, 130 Ctrl-C."""
+"""The command line: exit code 0 good, 1 not converged or a claim fails, 2 bad input, 70 a bug,
+130 Ctrl-C.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,14 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from soup_nlp.errors import SoupError, StoppedError
+from soup_nlp.cli.boundary import (
+    BROKEN_PIPE,
+    drop_output,
+    guarded,
+    prepare_streams,
+    report_bug,
+)
+from soup_nlp.errors import SoupError, StoppedError, printable
 from soup_nlp.storage.versions import __version__
 
 ABORTED = 130
@@ -91,9 +100,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments; default sys.argv.
 
     Returns:
-        0 good, 1 not converged (interrupted too) or a claim fails, 2 bad input, 130 interrupted
-        before there was anything to keep, or twice: no result is written.
+        0 good, 1 not converged (interrupted too) or a claim fails, 2 bad input, 70 a bug, 130
+        interrupted before there was anything to keep, or twice: no result is written.
     """
+    prepare_streams()
+    try:
+        code = _run(argv)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        drop_output()
+        return BROKEN_PIPE
+    return code
+
+
+def _run(argv: Sequence[str] | None) -> int:
     try:
         code = app(args=list(argv) if argv is not None else None, standalone_mode=False)
         # the command line library makes this code of a KeyboardInterrupt
@@ -111,9 +131,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         # usage errors of the command line library carry their own message
         if hasattr(error, "format_message"):
-            print(f"error: {error.format_message()}", file=sys.stderr)
+            print(f"error: {printable(error.format_message())}", file=sys.stderr)
             return 2
-        raise
+        if isinstance(error, BrokenPipeError):
+            raise
+        return report_bug(error)
 
 
 def _aborted() -> int:
@@ -137,7 +159,8 @@ def _load(name: str, home: str) -> Any:
     """The command of a function such as "solve:solve"."""
     module, _, function = home.partition(":")
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    alone.command(name=name)(getattr(import_module(f"soup_nlp.cli.{module}"), function))
+    own = getattr(import_module(f"soup_nlp.cli.{module}"), function)
+    alone.command(name=name)(guarded(own))
     return typer.main.get_command(alone)
 
 

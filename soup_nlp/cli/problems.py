@@ -11,10 +11,11 @@ import typer
 
 from soup_nlp.cli.options import Formulations, Out, Presolve, Problem, Quiet, Set, Superpixels
 from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
-from soup_nlp.errors import ConfigError
+from soup_nlp.errors import ConfigError, DataError, printable
 from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_formulation
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.folder import prepare_folder
+from soup_nlp.storage.files import MOST_YAML, is_folder, read_text
 
 
 def show(problem: Problem, overrides: Set = None) -> None:
@@ -29,14 +30,23 @@ def list_(
     ] = None,
 ) -> None:
     """Print the problems that come with the package, or of a folder."""
-    if folder is not None and not folder.is_dir():
+    if folder is not None and not is_folder(folder):
         raise ConfigError("no such folder", where=folder, hint="soup-nlp list without a folder")
     files = {str(p): p for p in sorted(folder.glob("*.yaml"))} if folder else shipped_problems()
     for name, path in files.items():
-        first = path.read_text(encoding="utf-8").partition("\n")[0]
-        print(f"{name:<14} {first.removeprefix('#').strip() if first[:1] == '#' else ''}")
+        print(f"{printable(name):<14} {_first_line(path)}")
     if folder is None:
         print("\nsoup-nlp solve NAME; templates take --set input.root=FOLDER")
+
+
+def _first_line(path: Path) -> str:
+    """What a problem file says of itself in its first line."""
+    try:
+        text = read_text(path, "problem file", most=MOST_YAML)
+    except DataError as error:
+        return f"({error.what})"
+    first = text.partition("\n")[0]
+    return printable(first.removeprefix("#").strip(), 200) if first[:1] == "#" else ""
 
 
 def export(

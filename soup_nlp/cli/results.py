@@ -17,7 +17,8 @@ from soup_nlp.export.residuals import residual_table, table_text
 from soup_nlp.report.check import LIMITS, check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.verdict import accuracy, protocol
-from soup_nlp.storage.store import read_h5
+from soup_nlp.storage.files import is_folder
+from soup_nlp.storage.h5_files import read_h5
 
 
 def check(
@@ -28,7 +29,7 @@ def check(
     ] = None,
 ) -> None:
     """Recompute energy, constraints and metrics of a result, or the constraints of a .sol."""
-    if folder.is_dir() or folder.suffix != ".sol":
+    if is_folder(folder) or folder.suffix != ".sol":
         report = check_folder(folder)
         tree = read_h5(folder / "result.h5")
         c = float(tree["weights"]["min_facing"])

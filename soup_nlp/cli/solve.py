@@ -12,7 +12,7 @@ import typer
 
 from soup_nlp.cli.options import PROBLEM, Set
 from soup_nlp.cli.progress import SolveLog
-from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
+from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError
@@ -21,6 +21,7 @@ from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.verdict import missed, verdict
 from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.files import as_path, is_file
 
 
 def solve(
@@ -117,7 +118,7 @@ def _from_file(
         if flow:
             # a path on the command line starts here, one in a problem file from the file
             place = key != "source" or is_path(flow)
-            source = str(Path(flow).expanduser().resolve()) if place else flow
+            source = str(as_path(flow, "flow", home=True).absolute()) if place else flow
             overrides = [f"flow.{key}={json.dumps(source)}", *overrides]
     return load_problem(problem, overrides)
 
@@ -143,7 +144,7 @@ def _from_options(
         source["fov"] = float(fov)
     if depth:
         source["depth"] = depth
-    raw: dict[str, Any] = {"name": Path(ref).stem, "input": source, "base": str(Path.cwd())}
+    raw: dict[str, Any] = {"name": title(Path(ref).stem), "input": source, "base": str(Path.cwd())}
     raw["flow"] = {key: flow for key, flow in flows.items() if flow}
     return make_problem(raw, overrides, where="command line")
 
@@ -197,7 +198,7 @@ def _camera(text: str, option: str) -> list[float] | str:
         values = [float(x) for x in text.split(",")]
     except ValueError:
         values = []
-    if not values and Path(text).expanduser().is_file():
+    if not values and is_file(as_path(text, "camera file", home=True)):
         return text
     if len(values) != 4:
         raise ConfigError(

@@ -5,49 +5,55 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import Input
 from soup_nlp.data.pair import Pair
-from soup_nlp.errors import ConfigError
+from soup_nlp.errors import ConfigError, printable
 from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.schema.explain import Place, explain, nearest
-from soup_nlp.schema.section import Count, NonNegative, Positive, Section, Whole
+from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
+from soup_nlp.schema.section import NonNegative, Positive, Samples, Section, Seed
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.start.start_options import StartOptions
+from soup_nlp.storage.files import as_path, check_length, check_node, is_file, read_text
+
+LONGEST_NAME = 100
+"""Characters of a problem's name."""
 
 
 class SegmentationOptions(Section):
     """Superpixels and graphs."""
 
-    superpixels: Whole = 1000
+    superpixels: Annotated[int, Field(ge=1, le=MAX_SUPERPIXELS)] = 1000
     """Wanted number; the answer may differ by a few per cent."""
     method: Literal["slic", "grid"] = "slic"
     """slic, or grid (the paper's worst case)."""
     compactness: Positive = 10.0
     """SLIC's balance of colour and distance."""
-    smoothing_px: NonNegative = 0.0
+    smoothing_px: Annotated[float, Field(ge=0, le=100)] = 0.0
     """Gaussian pre-smoothing of SLIC, pixels."""
     follow_flow_px: Positive | None = 1.0
     """A pixel on a border goes to the neighbour whose affine flow is nearer to its own by more
     than this, pixels; null leaves the borders to the image alone."""
-    neighbours: Whole = 15
+    neighbours: Annotated[int, Field(ge=1, le=MAX_NEIGHBOURS)] = 15
     """K of the K-NN graph, less than the number of superpixels."""
     beta: NonNegative = 0.02
     """Fall-off of w1, w2 with distance, 1/pixel."""
     beta_colour: NonNegative = 1.0
     """Fall-off of w4 with colour difference, colours in [0, 1]."""
-    boundary_samples: Whole | Literal["all"] = 3
+    boundary_samples: Samples | Literal["all"] = 3
     """Points per shared boundary, or all."""
 
 
@@ -69,14 +75,28 @@ class OutputOptions(Section):
     """Write report.html, the page with the 3D view."""
 
 
+def title(text: object) -> str:
+    """A text as the name of a problem: what cannot be in one becomes an underscore."""
+    kept = (c if c.isprintable() and c not in "/\\" else "_" for c in printable(text))
+    return "".join(kept)[:LONGEST_NAME] or "problem"
+
+
+def _is_title(text: str) -> str:
+    if title(text) != text:
+        raise ValueError(
+            f"1 to {LONGEST_NAME} printable characters without / and \\: it names files"
+        )
+    return text
+
+
 class Problem(Section):
     """One problem file."""
 
-    name: str = "problem"
+    name: Annotated[str, AfterValidator(_is_title)] = "problem"
     """For titles."""
     input: Input
     """What to solve, by its kind."""
-    seed: Count = 0
+    seed: Seed = 0
     """Of every random draw."""
     segmentation: SegmentationOptions = SegmentationOptions()
     """Superpixels and graphs."""
@@ -101,7 +121,9 @@ class Problem(Section):
 
     def path(self, name: str) -> Path:
         """A path of this problem, relative ones from its file's folder."""
-        return (Path(self.base) / Path(name).expanduser()).resolve()
+        base, own = as_path(self.base, "folder of the problem"), as_path(name, "input", home=True)
+        # realpath, unlike resolve, bears a link to itself
+        return Path(os.path.realpath(base / own))
 
     def digest(self) -> str:
         """Hash of everything that decides the result: not of the name, the place and the files."""
@@ -147,16 +169,8 @@ def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
         ConfigError: the file is missing or not YAML, a key is unknown or given twice, a value is
             of the wrong type or out of range.
     """
-    path, base = _find(Path(path))
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            "problem file cannot be read",
-            where=path,
-            found=getattr(error, "strerror", None) or error,
-            hint="soup-nlp list shows the problems that come with the package",
-        ) from error
+    path, base = _find(as_path(path, "problem file", error=ConfigError))
+    text = read_text(path, "problem file", error=ConfigError)
     raw, lines = _parse(text, str(path))
     if not isinstance(raw, dict):
         raise ConfigError(
@@ -165,7 +179,7 @@ def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
             found=type(raw).__name__,
             expected="keys such as input: {kind: motorcycle}",
         )
-    raw.setdefault("name", path.stem)
+    raw.setdefault("name", title(path.stem))
     raw.setdefault("base", str(base))
     return make_problem(raw, overrides, where=str(path), lines=lines)
 
@@ -176,15 +190,15 @@ def _find(path: Path) -> tuple[Path, Path]:
     Raises:
         ConfigError: it is a bare name that no problem of the package has.
     """
-    if path.is_file() or path.suffix or len(path.parts) != 1:
-        return path, path.resolve().parent
+    if is_file(path) or path.suffix or len(path.parts) != 1:
+        return path, Path(os.path.realpath(path)).parent
     shipped = shipped_problems()
     if path.name not in shipped:
         raise ConfigError(
             "neither a problem file nor a problem that comes with the package",
             where=path,
             expected=", ".join(shipped),
-            hint=nearest(path.name, [*shipped]) or "soup-nlp list says what each is",
+            hint=nearest(path.name[:60], [*shipped]) or "soup-nlp list says what each is",
         )
     return shipped[path.name], Path.cwd()
 
@@ -266,15 +280,21 @@ _Loader.add_constructor(
 
 def _parse(text: str, source: str) -> tuple[Any, dict[Place, str]]:
     """The content of a YAML text, and the line of every key."""
-    loader = _Loader(text)
     lines: dict[Place, str] = {}
+    try:
+        check_length(text)
+        loader = _Loader(text)
+    except (yaml.YAMLError, ValueError) as error:
+        # the loader looks for characters that YAML does not have
+        raise ConfigError("text is not YAML", where=source, found=error) from error
     try:
         node = loader.get_single_node()
         if node is None:
             return None, lines
+        check_node(node)
         _locate(node, (), lines, source)
         return loader.construct_document(node), lines
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         raise ConfigError(
             "text is not YAML",

@@ -23,7 +23,8 @@ from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError
 from soup_nlp.geometry.camera import intrinsics
-from soup_nlp.schema.section import Count, Finite, Positive, Section, Whole
+from soup_nlp.schema.limits import MAX_SIDE
+from soup_nlp.schema.section import Finite, Index, Positive, Section, Seed, Whole
 
 Resolve = Callable[[str], Path]
 """Full path of a name in the problem file."""
@@ -131,11 +132,11 @@ class SceneInput(PairInput):
     """Kind of input."""
     scene: Literal["street", "room", "sheet", "orbit", "still"]
     """Which scene."""
-    seed: Count = 0
+    seed: Seed = 0
     """Changes layout, textures and motions."""
-    width: Annotated[int, Field(ge=64)] = 1024
+    width: Annotated[int, Field(ge=64, le=MAX_SIDE)] = 1024
     """Columns, pixels."""
-    height: Annotated[int, Field(ge=48)] = 436
+    height: Annotated[int, Field(ge=48, le=MAX_SIDE)] = 436
     """Rows, pixels."""
 
     def load(self, path: Resolve) -> Pair:
@@ -152,7 +153,7 @@ class SintelInput(PairInput):
     """Folder that holds training/."""
     scene: str
     """Such as alley_1."""
-    frame: Count
+    frame: Index
     """Number of the reference frame."""
     render: Literal["clean", "final", "albedo"] = "clean"
     """Rendering pass."""
@@ -190,7 +191,7 @@ class VkittiInput(PairInput):
     """Root folder of the dataset."""
     scene: str
     """Such as "0001" (1) or Scene01 (2)."""
-    frame: Count
+    frame: Index
     """Number of the reference frame."""
     variation: str = "clone"
     """Weather or camera variation."""
@@ -210,7 +211,7 @@ class TumInput(PairInput):
     """Kind of input."""
     path: str
     """Folder of the sequence."""
-    frame: Count = 0
+    frame: Index = 0
     """Index of the reference image in rgb.txt."""
     step: Whole = 1
     """Distance of the next image."""

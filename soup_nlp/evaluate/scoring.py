@@ -19,7 +19,9 @@ from soup_nlp.evaluate.metrics import (
     sample_at_points,
     true_pixels,
 )
-from soup_nlp.storage.store import read_h5, require
+from soup_nlp.storage.files import as_path
+from soup_nlp.storage.h5_files import read_h5
+from soup_nlp.storage.store import require
 
 Float = NDArray[np.float64]
 
@@ -93,9 +95,9 @@ def evaluate(
             pixel.
     """
     check_cap(cap)
-    tree = read_h5(Path(folder) / "result.h5")
+    tree = read_h5(as_path(folder, "result folder") / "result.h5")
     depths = {k: require(tree, f"depth/{v}") for k, v in DEPTHS.items() if v in tree["depth"]}
-    gt = read_depth(Path(depth), depth_scale)
+    gt = read_depth(depth, depth_scale)
     expected = require(tree, "depth/ref").shape
     if gt.shape != expected:
         raise DataError(

@@ -26,6 +26,7 @@ from soup_nlp.pipeline import Case, Run, make_run, prepare
 from soup_nlp.solve.ipopt import Stage
 from soup_nlp.solve.kkt import residuals
 from soup_nlp.solve.stages import Solution
+from soup_nlp.storage.files import as_path, read_text
 from soup_nlp.storage.store import write_json
 
 Float = NDArray[np.float64]
@@ -70,7 +71,7 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
         ExportError: a file is missing or does not belong to the other.
         SoupError: the problem's input cannot be used.
     """
-    folder = Path(folder)
+    folder = as_path(folder, "exported folder", error=ExportError)
     manifest = read_manifest(folder)
     case = prepare(load_problem(folder / "problem.yaml"))
     form = case.formulation(
@@ -129,9 +130,9 @@ def _orders(folder: Path, nlp: NLP, layout: MatrixLayout) -> tuple[Any, Any]:
         path = (folder / STUB).with_suffix(suffix)
         place = {name: k for k, name in enumerate(names)}
         try:
-            lines = path.read_text(encoding="utf-8").split()[: len(names)]
+            lines = read_text(path, "file of names", error=ExportError).split()[: len(names)]
             order = np.array([place[name] for name in lines], np.int64)
-        except (OSError, ValueError, KeyError) as error:
+        except KeyError as error:
             raise ExportError("names of the file cannot be used", where=path, found=error) from None
         if len(np.unique(order)) != len(names):
             raise ExportError(

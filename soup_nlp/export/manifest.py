@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError, create_model
 
-from soup_nlp.errors import ExportError
+from soup_nlp.errors import DataError, ExportError
 from soup_nlp.model.layout import GAUGES
+from soup_nlp.storage.files import read_json
 
 STUB = "soup"
 MANIFEST = "manifest.json"
@@ -52,15 +52,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     Raises:
         ExportError: it is missing, or an entry that is needed is missing or wrong.
     """
-    try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ExportError(
-            "manifest.json cannot be read",
-            where=folder,
-            found=error,
-            hint="soup-nlp export PROBLEM.yaml -o DIR makes one",
-        ) from error
+    manifest = read_json(folder / MANIFEST, MANIFEST, error=ExportError)
     try:
         known = _Manifest.model_validate(manifest).model_dump()
     except ValidationError as error:
@@ -90,9 +82,9 @@ def remove_stale(folder: Path, written: Sequence[str]) -> None:
     Files that no export writes are never touched, whatever the manifest says.
     """
     try:
-        listed = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["files"]
+        listed = read_json(folder / MANIFEST, MANIFEST)["files"]
         names = {str(name) for name in listed}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (DataError, KeyError, TypeError):
         return
     for name in (names & OWN).difference(written):
         (folder / name).unlink(missing_ok=True)

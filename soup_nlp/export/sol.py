@@ -9,9 +9,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.errors import ExportError
+from soup_nlp.errors import ExportError, printable
 from soup_nlp.export.opcodes import number
 from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.files import as_path, read_bytes
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -19,6 +20,8 @@ N = TypeVar("N", int, float)
 
 OPTIONS = "Options"
 """Line that ends the message."""
+MOST_BYTES = 256 << 20
+"""Size of the largest .sol: millions of variables."""
 CLASSES = ("solved", "uncertain", "infeasible", "unbounded", "limit", "failure")
 
 
@@ -54,12 +57,10 @@ class _Lines:
 
     def __init__(self, path: Path) -> None:
         self.path, self.at = path, 0
-        try:
-            self.lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        except OSError as error:
-            raise ExportError(
-                "solution file cannot be read", where=path, found=error.strerror
-            ) from error
+        content = read_bytes(path, "solution file", error=ExportError, most=MOST_BYTES)
+        self.lines = content.decode("utf-8", errors="replace").split("\n")
+        if not self.lines[-1]:
+            self.lines.pop()
 
     def next(self, expected: str) -> str:
         if self.at >= len(self.lines):
@@ -103,10 +104,11 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
         ExportError: the file is missing, not a .sol in text format, holds no point, or is for a
             problem of another size.
     """
-    lines = _Lines(Path(path))
+    lines = _Lines(as_path(path, "solution file", error=ExportError))
     message = []
     while (line := lines.next(OPTIONS)) != OPTIONS:
-        message.append(line)
+        # of a program that may be anybody's
+        message.append(printable(line))
     said = [line for line in message if line]
     (count,) = lines.numbers(1, "number of options", int)
     # two more options announce a tolerance

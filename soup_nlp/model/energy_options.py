@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from soup_nlp.schema.section import NonNegative, Positive, Section, Share, Truncation, Whole
+from soup_nlp.schema.section import NonNegative, Positive, Samples, Section, Share, Truncation
 
 
 class Weights(Section):
@@ -105,7 +105,7 @@ class EnergyOptions(Section):
     side."""
     rotation_px: Positive | None = None
     """Pixels per radian of rotation difference; null for the focal length."""
-    pixel_samples: Whole | Literal["all"] = 16
+    pixel_samples: Samples | Literal["all"] = 16
     """Pixels per superpixel in E_proj, or all."""
     weights: Weights = Weights()
     """Factors of the terms and their truncations."""

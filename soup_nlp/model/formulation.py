@@ -9,6 +9,7 @@ from pydantic import Field
 from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Gauge
 from soup_nlp.model.norms import NormForm, TruncationForm
+from soup_nlp.schema.limits import MOST
 from soup_nlp.schema.section import NonNegative, Section, Share
 
 
@@ -31,7 +32,7 @@ class FormulationOptions(Section):
     """Added to the Gauss-Newton Hessian's diagonal."""
     min_facing: Annotated[float, Field(ge=0, le=0.5)] = 1e-3
     """Visibility: lower bound c of -n . r."""
-    depth_ratio: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 5.0
+    depth_ratio: Annotated[float, Field(ge=1, le=MOST)] = 5.0
     """Depth at a rim pixel is at most this many times the anchor's."""
     compiled: bool = True
     """Compile kernels where a C compiler is found."""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.config.problem import Problem, dump_problem, make_problem
+from soup_nlp.config.problem import Problem, dump_problem, make_problem, title
 from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import StoppedError
@@ -365,5 +365,5 @@ def solve_pair(pair: Pair, **options: Any) -> Run:
         DataError: the pair cannot be used.
     """
     source = {"kind": "memory", "hash": pair_hash(pair)}
-    raw = {"name": pair.name, "input": source, **options}
+    raw = {"name": title(pair.name), "input": source, **options}
     return run(make_problem(raw, where="solve_pair"), pair=pair)

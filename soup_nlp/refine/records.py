@@ -9,6 +9,7 @@ from typing import Annotated
 from pydantic import Field
 
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.schema.limits import MAX_PARTICLES, MOST
 from soup_nlp.schema.section import (
     Count,
     Finite,
@@ -29,11 +30,11 @@ class RefineOptions(Section):
     """Refine the start: the NLP is skipped."""
     rounds: Count = 4
     """Most rounds of particles."""
-    particles: Annotated[int, Field(ge=2)] = 50
+    particles: Annotated[int, Field(ge=2, le=MAX_PARTICLES)] = 50
     """Labels of every superpixel, the current belief among them."""
     keep: Annotated[float, Field(ge=0, le=0.9)] = 0.25
     """Share of the particles that stays for the next round."""
-    depth_reach: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 2.0
+    depth_reach: Annotated[float, Field(ge=1, le=MOST)] = 2.0
     """A new depth is at most this many times the upper quartile of the neighbours' depths, and
     at least their lower quartile over this squared."""
     trws_iterations: Whole = 15

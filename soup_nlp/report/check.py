@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate import recompute
 from soup_nlp.evaluate.scoring import DEPTHS
-from soup_nlp.storage.store import read_attrs, read_h5, require
+from soup_nlp.storage.files import as_path, parse_yaml, read_json, read_text
+from soup_nlp.storage.h5_files import read_attrs, read_h5
+from soup_nlp.storage.store import require
 
 Entries: TypeAlias = Mapping[str, Any]
 TERMS = ("arap", "proj", "cont", "orient", "prior")
@@ -90,13 +90,8 @@ def check_folder(folder: str | Path) -> CheckReport:
     Raises:
         DataError: a file, a claim or an array is missing or not what it should be.
     """
-    folder = Path(folder)
-    try:
-        claims = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(
-            "summary.json cannot be read", where=folder, found=error, hint="run solve first"
-        ) from error
+    folder = as_path(folder, "result folder")
+    claims = read_json(folder / "summary.json", "summary.json")
     path = folder / "result.h5"
     tree, attrs = read_h5(path), read_attrs(path)
     try:
@@ -110,8 +105,8 @@ def check_folder(folder: str | Path) -> CheckReport:
 
 
 def _rows(folder: Path, claims: Entries, tree: Entries, attrs: Entries) -> Iterator[Claim]:
-    yield from _labels(claims, attrs, (folder / "config.yaml").read_text(encoding="utf-8"))
-    settings = yaml.safe_load(str(attrs["config"]))
+    yield from _labels(claims, attrs, read_text(folder / "config.yaml", "config.yaml"))
+    settings = parse_yaml(str(attrs["config"]))
     weights = {k: float(v) for k, v in tree["weights"].items()}
     yield from _weights(tree, settings["energy"], weights)
     for name, gap in recompute.data_errors(tree, settings).items():

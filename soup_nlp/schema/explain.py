@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import difflib
 import re
+import reprlib
 from collections.abc import Mapping
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from soup_nlp.errors import ConfigError
+from soup_nlp.errors import ConfigError, printable
 
 Place = tuple[str, ...]
 """Keys that lead to a value, from the top."""
+_SHORT = reprlib.Repr()
+"""Prints values of any size on a short line."""
+_SHORT.maxstring = _SHORT.maxother = 80
 
 
 def explain(
@@ -57,14 +61,15 @@ def explain(
     if kind in ("missing", "union_tag_not_found"):
         hint = None if kind == "missing" else "every input has a kind; soup-nlp list names examples"
         return ConfigError("missing key" + more, where=where, expected=key, hint=hint)
-    hint = nearest(str(value), [word for item in found for word in _words(item)])
+    hint = nearest(printable(value, 60), [word for item in found for word in _words(item)])
+    ranges = _range(model, tree, place)
     if kind == "string_type" and isinstance(value, int | float):
         hint = f'write it in quotes: "{value}" (YAML drops leading zeros)'
     return ConfigError(
         "value does not fit" + more,
         where=where,
-        found=repr(value),
-        expected=", or ".join(dict.fromkeys(_expected(item) for item in found)),
+        found=_SHORT.repr(value),
+        expected=", or ".join(dict.fromkeys(_expected(item, ranges) for item in found)),
         hint=hint,
     )
 
@@ -94,11 +99,20 @@ def _sections(model: type[BaseModel], tree: Mapping[str, Any]) -> dict[Place, li
         below = tree.get(key)
         below = below if isinstance(below, Mapping) else {}
         if info.discriminator:
-            tags = {m: m.model_fields["kind"].annotation.__args__ for m in section.__args__}
-            section = next((m for m in tags if below.get("kind") in tags[m]), None)
+            section = next((m for m in section.__args__ if below.get("kind") in _tags(m)), None)
         if isinstance(section, type) and issubclass(section, BaseModel):
             out |= {(key, *place): names for place, names in _sections(section, below).items()}
     return out
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
+
+
+def _tags(model: type[BaseModel]) -> tuple[str, ...]:
+    """Kinds of input that a section is."""
+    kinds: Any = model.model_fields["kind"].annotation
+    return tuple(kinds.__args__)
 
 
 def nearest(word: str, allowed: list[str]) -> str | None:
@@ -114,7 +128,33 @@ def _words(item: Mapping[str, Any]) -> list[str]:
     return re.findall(r"'([^']*)'", str(context.get("expected_tags", text)))
 
 
-def _expected(item: Mapping[str, Any]) -> str:
+def _range(model: type[BaseModel], tree: Any, place: Place) -> str:
+    """Smallest and largest number that the field at a place allows; "" where it has no such."""
+    for key in place[:-1]:
+        below: Any = model.model_fields[key].annotation if key in model.model_fields else None
+        tree = tree.get(key) if isinstance(tree, Mapping) else None
+        kinds = [k for k in (below, *getattr(below, "__args__", ())) if isinstance(k, type)]
+        known = [k for k in kinds if issubclass(k, BaseModel)]
+        if len(known) > 1 and isinstance(tree, Mapping):
+            known = [k for k in known if tree.get("kind") in _tags(k)]
+        if not known:
+            return ""
+        model = known[0]
+    info = model.model_fields.get(place[-1]) if place else None
+    if info is None:
+        return ""
+    bounds: dict[str, Any] = {}
+    choices = getattr(info.annotation, "__args__", ())
+    for item in (*info.metadata, *(x for c in choices for x in getattr(c, "__metadata__", ()))):
+        # a field's own bounds, or those of the types that it names
+        for part in (item, *getattr(item, "metadata", ())):
+            found = ((name, getattr(part, name, None)) for name in ("ge", "gt", "le", "lt"))
+            bounds |= {name: value for name, value in found if value is not None}
+    low, high = (bounds.get(a, bounds.get(b)) for a, b in (("ge", "gt"), ("le", "lt")))
+    return f"{_number(low)} to {_number(high)}" if low is not None and high is not None else ""
+
+
+def _expected(item: Mapping[str, Any], ranges: str = "") -> str:
     """What was allowed, without pydantic's `Input should be`."""
     if words := _words(item):
         return ("one of " if len(words) > 1 else "") + ", ".join(words)
@@ -124,4 +164,6 @@ def _expected(item: Mapping[str, Any]) -> str:
         return f"a list of {item['ctx']['min_length']} or more"
     if item["type"] == "too_long":
         return f"a list of {item['ctx']['max_length']} or fewer"
-    return str(item["msg"]).removeprefix("Input should be ").removeprefix("Value error, ")
+    text = str(item["msg"]).removeprefix("Input should be ").removeprefix("Value error, ")
+    bounded = item["type"].startswith(("greater_than", "less_than")) and ranges
+    return f"{text} ({ranges})" if bounded else text

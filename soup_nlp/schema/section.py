@@ -8,16 +8,20 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from soup_nlp.schema.explain import explain
+from soup_nlp.schema.limits import LEAST, MAX_ROUNDS, MAX_SAMPLES, MAX_SEED, MOST
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Tolerance = Annotated[float, Field(ge=1e-12, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
+Positive = Annotated[float, Field(ge=LEAST, le=MOST, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=MOST, allow_inf_nan=False)]
+Tolerance = Annotated[float, Field(ge=1e-12, le=MOST, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
-Truncation = Annotated[float, Field(gt=0)]
+Truncation = Annotated[float, Field(ge=LEAST)]
 """A truncation may be infinite: the untruncated norm."""
-Count = Annotated[int, Field(ge=0)]
-Whole = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=0, le=MAX_ROUNDS)]
+Whole = Annotated[int, Field(ge=1, le=MAX_ROUNDS)]
+Index = Annotated[int, Field(ge=0, le=MAX_SEED)]
+Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
+Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
 
 
 class Section(BaseModel):

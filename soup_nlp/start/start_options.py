@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from soup_nlp.schema.section import Count, NonNegative, Section, Whole
+from soup_nlp.schema.section import Count, NonNegative, Samples, Section, Seed, Whole
 
 
 class StartOptions(Section):
     """How the initialisation is made."""
 
-    samples: Whole = 40
+    samples: Samples = 40
     """Pixels per superpixel."""
     dominant: Whole = 5
     """Dominant motions looked for."""
@@ -39,5 +39,5 @@ class StartOptions(Section):
 class SeededStart(StartOptions):
     """The same with the seed, which a problem has once for all its stages."""
 
-    seed: Count = 0
+    seed: Seed = 0
     """Of sampling and RANSAC."""

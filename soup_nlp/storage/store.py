@@ -1,4 +1,7 @@
-"""Results on disk: HDF5 with units on every array, and JSON that any reader accepts."""
+"""Results on disk: HDF5 with units on every array, and JSON that any reader accepts.
+
+`storage.h5_files` reads what is written here.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,6 @@ import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from os import PathLike as _PathLike
-from pathlib import Path
 from typing import Any, TypeAlias, Union
 
 import h5py
@@ -44,8 +46,6 @@ class Array:
 
 
 Tree: TypeAlias = Mapping[str, Union[Array, "Tree"]]
-ReadTree: TypeAlias = dict[str, Any]
-"""Nested dict of numpy arrays, as `read_h5` returns it."""
 
 
 def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
@@ -90,57 +90,6 @@ def _write_group(group: h5py.Group, tree: Tree) -> None:
         dataset = group.create_dataset(name, data=data, **options)
         for key in ("units", "description", "shape_letters"):
             dataset.attrs[key] = getattr(item, key)
-
-
-def read_h5(path: PathLike) -> ReadTree:
-    """All arrays of a result file, as nested dicts of numpy arrays (text as str or object arrays).
-
-    Raises:
-        DataError: the file is missing or is not HDF5.
-    """
-
-    def walk(group: h5py.Group) -> ReadTree:
-        out: ReadTree = {}
-        for key, item in group.items():
-            if isinstance(item, h5py.Group):
-                out[key] = walk(item)
-            elif h5py.check_string_dtype(item.dtype) is not None:
-                out[key] = np.asarray(item.asstr()[()])
-            else:
-                out[key] = np.asarray(item[()])
-        return out
-
-    with _open(path) as file:
-        return walk(file)
-
-
-def read_attrs(path: PathLike) -> dict[str, Any]:
-    """Root attributes of a result file.
-
-    `versions` is returned as a dict, other JSON texts as they were stored.
-
-    Raises:
-        DataError: the file is missing or is not HDF5.
-    """
-    with _open(path) as file:
-        out = dict(file.attrs)
-    if isinstance(out.get("versions"), str):
-        out["versions"] = json.loads(out["versions"])
-    return {k: v.item() if isinstance(v, np.generic) else v for k, v in out.items()}
-
-
-def _open(path: PathLike) -> h5py.File:
-    if not Path(path).is_file():
-        raise DataError("result file does not exist", where=path)
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        raise DataError(
-            "file is not a readable HDF5 file",
-            where=path,
-            found=error,
-            expected="a result file written by soup_nlp",
-        ) from error
 
 
 def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.data.datasets.layout import make_pair, need, need_folder, read_if, training_folder
 from soup_nlp.data.formats.camera_files import read_kitti_projections, read_vkitti2_intrinsics
-from soup_nlp.data.formats.images import PathLike, decode
+from soup_nlp.data.formats.images import decode
 from soup_nlp.data.formats.map_files import (
     KITTI_DISPARITY,
     read_depth_png16,
@@ -21,6 +21,7 @@ from soup_nlp.data.formats.map_files import (
 from soup_nlp.data.pair import Float, Pair, Truth, check_size
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics, pixel_grid, rays
+from soup_nlp.storage.files import PathLike
 
 
 class _Kitti(NamedTuple):

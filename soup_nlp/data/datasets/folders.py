@@ -17,11 +17,13 @@ from skimage.measure import label
 from soup_nlp.data.datasets.layout import MARK, is_result, make_pair, need, need_folder, read_if
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_intrinsics
-from soup_nlp.data.formats.images import PathLike, read_bytes, read_mask, read_text
+from soup_nlp.data.formats.images import read_mask
 from soup_nlp.data.formats.map_files import read_depth, read_depth_png16, read_flow
+from soup_nlp.data.formats.npy_files import read_npz
 from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.storage.files import PathLike, is_file, read_text
 
 LAYOUT = (
     "frame_0.png and frame_1.png (or image_ref.png and image_next.png), K.txt; optional "
@@ -49,7 +51,7 @@ def _find(folder: Path, stems: tuple[str, ...], suffixes: tuple[str, ...]) -> Pa
     """The first file of the folder with one of the names, in the order given."""
     for stem in stems:
         for suffix in suffixes:
-            if (folder / f"{stem}{suffix}").is_file():
+            if is_file(folder / f"{stem}{suffix}"):
                 return folder / f"{stem}{suffix}"
     return None
 
@@ -85,7 +87,7 @@ def load_folder(
     """
     folder = need_folder(folder, LAYOUT)
     if is_result(folder):
-        marked = (folder / MARK).is_file()
+        marked = is_file(folder / MARK)
         raise DataError(
             "input folder holds a result, whose depth and flow would pass for truth",
             where=folder,
@@ -123,12 +125,7 @@ def _moving_components(path: PathLike) -> NDArray[np.int32]:
 
 def _read_points(path: Path, unit: str) -> Float:
     """(M, 3) sparse truth (u, v, z) from points.npz."""
-    read_bytes(path, "points file")
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            arrays = {name: content[name] for name in content.files}
-    except Exception as error:  # zipfile, NumPy and zlib each raise their own
-        raise DataError("points file is no .npz", where=path, found=str(error)) from error
+    arrays = read_npz(path, "points file")
     uv, xyz = arrays.get("uv_0", np.empty(0)), arrays.get("xyz_mm_0", np.empty(0))
     if uv.ndim != 2 or uv.shape[1] != 2 or xyz.shape != (len(uv), 3):
         raise DataError(
@@ -165,7 +162,7 @@ def load_tum(folder: PathLike, frame: int = 0, step: int = 1) -> Pair:
         DataError: the layout is unknown, a file is missing or the frame does not exist.
     """
     folder = need_folder(folder, TUM_LAYOUT)
-    if _find(folder, ("frame_0", "image_ref"), _IMAGES) and not (folder / "rgb.txt").is_file():
+    if _find(folder, ("frame_0", "image_ref"), _IMAGES) and not is_file(folder / "rgb.txt"):
         return load_folder(folder, depth_scale=TUM_SCALE)
     images = _tum_list(need(folder / "rgb.txt", TUM_LAYOUT))
     depths = read_if(_tum_list, folder / "depth.txt") or []

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from soup_nlp.data.formats.images import PathLike, read_image
+from soup_nlp.data.formats.images import read_image
 from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.errors import DataError
+from soup_nlp.storage.files import PathLike, as_path, is_file, is_folder, read_json
 
 T = TypeVar("T")
 
@@ -24,11 +24,11 @@ def need(path: PathLike, layout: str) -> Path:
     Raises:
         DataError: the file is missing; the message names the first folder that is missing too.
     """
-    path = Path(path)
-    if path.is_file():
+    path = as_path(path)
+    if is_file(path):
         return path
     folder = path.parent
-    while not folder.is_dir() and folder != folder.parent:
+    while not is_folder(folder) and folder != folder.parent:
         folder = folder.parent
     raise DataError(
         "file of the dataset is missing",
@@ -45,12 +45,12 @@ def need_folder(path: PathLike, layout: str) -> Path:
     Raises:
         DataError: it is not.
     """
-    path = Path(path)
-    if not path.is_dir():
+    path = as_path(path, "dataset folder")
+    if not is_folder(path):
         raise DataError(
             "dataset folder is missing",
             where=path,
-            found="a file" if path.is_file() else "nothing",
+            found="a file" if is_file(path) else "nothing",
             expected=f"a folder with {layout}",
         )
     return path
@@ -63,12 +63,12 @@ def training_folder(root: PathLike, layout: str) -> Path:
         DataError: the root is not a folder.
     """
     root = need_folder(root, layout)
-    return root / "training" if (root / "training").is_dir() else root
+    return root / "training" if is_folder(root / "training") else root
 
 
 def read_if(reader: Callable[..., T], path: Path | None, *options: object) -> T | None:
     """What the reader makes of an optional file; None where there is no such file."""
-    return reader(path, *options) if path is not None and path.is_file() else None
+    return reader(path, *options) if path is not None and is_file(path) else None
 
 
 def make_pair(
@@ -101,10 +101,10 @@ MARK = ".soup_nlp"
 
 def is_result(folder: Path) -> bool:
     """Whether a folder is for results: it has the mark, or a summary that names its problem."""
-    if (folder / MARK).is_file():
+    if is_file(folder / MARK):
         return True
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        summary = read_json(folder / "summary.json", "summary.json")
+    except DataError:
         return False
     return isinstance(summary, dict) and "problem_hash" in summary

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from soup_nlp.data.datasets.layout import make_pair, need, read_if, training_folder
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_cam
-from soup_nlp.data.formats.images import DataWarning, PathLike, read_mask
+from soup_nlp.data.formats.images import DataWarning, read_mask
 from soup_nlp.data.formats.map_files import read_dpt, read_flo
 from soup_nlp.data.pair import Float, Pair, Truth, check_size
 from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.storage.files import PathLike, is_file
 
 LAYOUT = (
     "training/{clean,final,albedo}/SCENE/frame_NNNN.png; optional "
@@ -83,7 +84,7 @@ def _flow_truth(base: Path, name: str) -> tuple[Float | None, NDArray[np.bool_] 
 
 def _cameras(paths: list[Path], scene: str) -> list[Float]:
     """Intrinsics of the frames; `DEFAULT_CAMERA`, with a warning, where a file is missing."""
-    absent = [path for path in paths if not path.is_file()]
+    absent = [path for path in paths if not is_file(path)]
     if absent and scene != DEFAULT_SCENE:
         warnings.warn(
             f"no camera file {absent[0]}: the focal length of {DEFAULT_SCENE} is taken,"

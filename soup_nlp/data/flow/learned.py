@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from soup_nlp.data.flow.consistency import FloatMap, checked_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
+from soup_nlp.storage.files import is_file
 
 Image = NDArray[np.uint8]
 
@@ -60,7 +61,7 @@ def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
             "a network needs two RGB images of one size",
             found=f"{image_ref.shape} and {image_next.shape}",
         )
-    if source not in MODELS and not Path(source).is_file():
+    if source not in MODELS and not is_file(source):
         raise DataError("file of a network is missing", where=source)
     network = onnx_network(Path(source)) if source.endswith(".onnx") else raft_network(source)
     forward = _run(network, image_ref, image_next, source)

@@ -19,11 +19,11 @@ from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.dis_options import DisOptions
 from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.flow.rlof import rlof_flow
-from soup_nlp.data.formats.images import PathLike
 from soup_nlp.data.formats.map_files import read_confidence, read_flow
 from soup_nlp.data.pair import Flow, Pair, check_size
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.schema.section import Positive, Section, Share
+from soup_nlp.storage.files import PathLike, is_file
 
 Image = NDArray[np.uint8]
 FlowSource = Callable[[Image, Image], Flow]
@@ -270,7 +270,7 @@ def resolve_flow(pair: Pair, source: str) -> Flow:
     plugins = flow_sources()
     if source in plugins:
         return _run_plugin(plugins[source], pair)
-    if not Path(source).suffix and not Path(source).exists():
+    if not Path(source).suffix and not is_file(source):
         names = [*METHODS, f"{NOISE}SIGMA", *sorted(plugins)]
         raise DataError(
             "unknown flow source",

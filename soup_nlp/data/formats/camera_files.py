@@ -10,10 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.formats.images import PathLike, check_body, read_bytes, read_text
+from soup_nlp.data.formats.images import check_body
 from soup_nlp.data.formats.map_files import check_magic
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.storage.files import PathLike, read_bytes, read_text
 
 Float = NDArray[np.float64]
 

@@ -6,18 +6,18 @@ Every reader raises `DataError` for a file that is missing, empty, truncated or 
 from __future__ import annotations
 
 import contextlib
-import os
+import io
 import warnings
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from soup_nlp.errors import DataError
-
-PathLike = str | os.PathLike[str]
+from soup_nlp.schema.limits import MAX_PIXELS, check_image_size
+from soup_nlp.storage.files import PathLike, read_bytes
 
 DARK = 65535 // 3
 """A 16-bit image whose largest value is below this may hold fewer bits."""
@@ -25,51 +25,6 @@ DARK = 65535 // 3
 
 class DataWarning(UserWarning):
     """An input can be used, but may not be what it seems."""
-
-
-def read_bytes(path: PathLike, what: str) -> bytes:
-    """The content of a file.
-
-    Args:
-        path: The file.
-        what: Name of the content for the message, e.g. "flow file".
-
-    Raises:
-        DataError: the file is missing, a folder, empty, or not readable.
-    """
-    path = Path(path)
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise DataError(
-            f"{what} is missing", where=path, expected="an existing file", hint=_neighbours(path)
-        ) from None
-    except OSError as error:
-        raise DataError(
-            f"{what} cannot be read", where=path, found=error.strerror, expected="a readable file"
-        ) from error
-    if not content:
-        raise DataError(f"{what} is empty", where=path, found="0 bytes")
-    return content
-
-
-def _neighbours(path: Path) -> str:
-    """A hint that names what the folder of a missing file holds."""
-    if not path.parent.is_dir():
-        return f"the folder {path.parent} does not exist; check the path"
-    names = sorted(p.name for p in path.parent.iterdir())
-    shown = ", ".join(names[:6]) + (" ..." if len(names) > 6 else "")
-    return f"check the name; the folder holds: {shown or 'nothing'}"
-
-
-def read_text(path: PathLike, what: str) -> str:
-    """The content of a UTF-8 text file."""
-    try:
-        return read_bytes(path, what).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise DataError(
-            f"{what} is not text", where=path, found="binary content", expected="UTF-8 text"
-        ) from None
 
 
 def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
@@ -98,6 +53,7 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
             found=f"a {'PNG' if png else 'JPEG'} without its end marker",
             hint="copy or download the file again",
         )
+    _check_header(content, path, what)
     image = None
     with contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -110,6 +66,28 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
             hint="the file may be damaged; try to open it in an image viewer",
         )
     return np.asarray(image)
+
+
+def _check_header(content: bytes, path: PathLike, what: str) -> None:
+    """Raise DataError where an image's header claims a size beyond the limits.
+
+    The pixels are not decoded: those of one colour take next to no place in the file.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with Image.open(io.BytesIO(content)) as header:
+                width, height = header.size
+        except Image.DecompressionBombError as error:
+            raise DataError(
+                f"{what} has an impossible size",
+                where=path,
+                found=error,
+                expected=f"at most {MAX_PIXELS} pixels",
+            ) from None
+        except Exception:  # what Pillow does not know OpenCV may
+            return
+    check_image_size(width, height, what, path)
 
 
 def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]:

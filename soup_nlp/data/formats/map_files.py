@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.formats.images import PathLike, check_body, decode, decode_png16, read_bytes
+from soup_nlp.data.formats.images import check_body, decode, decode_png16
+from soup_nlp.data.formats.npy_files import read_npy
 from soup_nlp.errors import DataError
+from soup_nlp.schema.limits import check_image_size
+from soup_nlp.storage.files import PathLike, as_path, read_bytes
 
 Float = NDArray[np.float64]
 Reader = Callable[[PathLike], Float]
-
-MAX_SIDE = 100_000
-"""Largest width or height that a header may claim, pixels; more is taken for a damaged file."""
 
 MAGIC = b"PIEH"
 """First four bytes of .flo, .dpt and .cam files; as a little-endian float32 they read 202021.25."""
@@ -62,14 +62,7 @@ def _raster(
     Raises:
         DataError: no image has this size (H, W, ...), or the file is shorter or longer.
     """
-    if not all(0 < side <= MAX_SIDE for side in size):
-        raise DataError(
-            "file header claims an impossible size",
-            where=path,
-            found=f"{size[1]} x {size[0]} (width x height)",
-            expected=f"1 to {MAX_SIDE} on each side",
-            hint="the file is damaged or of another format",
-        )
+    check_image_size(size[1], size[0], what, path)
     check_body(len(content) - start, 4 * int(np.prod(size)), path, what)
     values = np.frombuffer(content, f"{order}f4", offset=start).reshape(size)
     return values.astype(np.float32)
@@ -84,27 +77,8 @@ def _read_pieh(path: PathLike, channels: tuple[int, ...], what: str) -> NDArray[
     return _raster(content, 12, (height, width, *channels), "<", path, what)
 
 
-def _read_npy(path: PathLike, what: str) -> NDArray[Any]:
-    """One array of real numbers from a plain .npy file (no pickles)."""
-    read_bytes(path, what)
-    try:
-        array = np.load(Path(path), allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(
-            f"{what} is not a readable .npy file", where=path, found=str(error)
-        ) from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        raise DataError(
-            f"{what} does not hold numbers",
-            where=path,
-            found=getattr(array, "dtype", type(array).__name__),
-            expected="one array of real numbers",
-        )
-    return array
-
-
 def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> Float:
-    suffix = Path(path).suffix.lower()
+    suffix = as_path(path, f"{what} file").suffix.lower()
     if suffix not in readers:
         raise DataError(
             f"{what} file has an unknown suffix",
@@ -129,6 +103,7 @@ def _known_flow(flow: NDArray[Any], path: PathLike) -> Float:
             found=flow.shape,
             expected="(H, W, 2) or (2, H, W)",
         )
+    check_image_size(flow.shape[1], flow.shape[0], "flow", path)
     with np.errstate(over="ignore"):
         out = np.array(flow, dtype=np.float32)
     out[~(np.abs(out) <= UNKNOWN_FLOW).all(axis=2)] = np.nan
@@ -188,7 +163,7 @@ def read_flow(path: PathLike) -> Float:
     readers: dict[str, Reader] = {
         ".flo": read_flo,
         ".png": read_kitti_flow,
-        ".npy": lambda p: _known_flow(_read_npy(p, "flow file"), p),
+        ".npy": lambda p: _known_flow(read_npy(p, "flow file"), p),
     }
     return _by_suffix(path, readers, "flow")
 
@@ -228,6 +203,7 @@ def _known_depth(depth: NDArray[Any], path: PathLike) -> Float:
         raise DataError(
             "depth has the wrong shape", where=path, found=depth.shape, expected="(H, W)"
         )
+    check_image_size(depth.shape[1], depth.shape[0], "depth", path)
     out = np.array(depth, dtype=np.float64)
     out[~(np.isfinite(out) & (out > 0))] = np.nan
     return out
@@ -318,7 +294,7 @@ def read_depth(path: PathLike, png_scale: float = 1000.0) -> Float:
     """
     readers: dict[str, Reader] = {
         ".dpt": read_dpt,
-        ".npy": lambda p: _known_depth(_read_npy(p, "depth file"), p),
+        ".npy": lambda p: _known_depth(read_npy(p, "depth file"), p),
         ".pfm": read_pfm,
         ".png": partial(read_depth_png16, scale=png_scale),
     }

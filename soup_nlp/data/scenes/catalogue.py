@@ -16,6 +16,7 @@ from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
 from soup_nlp.data.scenes.shapes import Box, Float, Plane, Shape, Sheet, Sphere
 from soup_nlp.data.scenes.texture import Colour, Panels, Texture
 from soup_nlp.geometry import camera, rotation
+from soup_nlp.schema.limits import check_image_size
 
 Random = np.random.Generator
 
@@ -33,6 +34,7 @@ def render_scene(name: str, seed: int = 0, width: int = 1024, height: int = 436)
         A `Pair` with full `Truth` in metres and no flow. Component 0 is the static background.
         Motions are `next_from_ref` with the camera's motion included; NaN for the bending sheet.
     """
+    check_image_size(width, height, "scene", name)
     layout, focal = _LAYOUTS[name]
     # tall images keep the field of view of a 4:3 image, or the ground would pass the camera
     f = focal * max(width, 4 / 3 * height)

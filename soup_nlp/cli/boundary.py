@@ -1,0 +1,88 @@
+"""The edge of every command: what nobody foresaw becomes the report of a bug, in a file."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from typing import ParamSpec
+
+import typer
+
+from soup_nlp.errors import DataError, SoupError, printable
+from soup_nlp.storage.versions import versions
+
+BUG = 70
+"""Exit code of a bug of the program (EX_SOFTWARE of sysexits.h)."""
+BROKEN_PIPE = 141
+"""Exit code where the reader of the output has gone, as shells have it."""
+
+P = ParamSpec("P")
+
+
+def guarded(command: Callable[P, None]) -> Callable[P, None]:
+    """A command that ends in a SoupError, an exit code, or the report of a bug."""
+
+    @functools.wraps(command)
+    def run(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            command(*args, **kwargs)
+        except (SoupError, typer.Exit, typer.Abort, BrokenPipeError):
+            raise
+        except Exception as error:
+            if _out_of_memory(error):
+                raise DataError(
+                    "the machine has not enough memory for this",
+                    found=error,
+                    hint="smaller images, or fewer superpixels, neighbours or particles",
+                ) from error
+            # usage errors of the command line library carry their own message
+            if hasattr(error, "format_message"):
+                raise
+            raise typer.Exit(report_bug(error)) from error
+
+    return run
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """Whether Python, NumPy, OpenCV or native code found no memory."""
+    return isinstance(error, MemoryError) or any(
+        word in str(error) for word in ("bad_alloc", "Insufficient memory")
+    )
+
+
+def report_bug(error: BaseException) -> int:
+    """Write a traceback to a file and ask for it; returns the exit code."""
+    lines = traceback.format_exception(error)
+    facts = [f"command: {sys.argv!r}", *(f"{k}: {v}" for k, v in versions().items()), ""]
+    text = "\n".join(facts) + "".join(lines)
+    place = "no file could be written"
+    with suppress(OSError):
+        handle, place = tempfile.mkstemp(prefix="soup_nlp_bug_", suffix=".txt")
+        with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
+            file.write(text)
+    said = printable(f"{type(error).__name__}: {error}", 200)
+    print(
+        f"error: this is a bug of soup-nlp, please report it with the file below\n"
+        f"  found: {said}\n  where: {place}",
+        file=sys.stderr,
+    )
+    return BUG
+
+
+def prepare_streams() -> None:
+    """Let characters that a terminal or file cannot show be printed as escapes."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            with suppress(OSError, ValueError):
+                stream.reconfigure(errors="backslashreplace")
+
+
+def drop_output() -> None:
+    """Send what is left of the output nowhere: its reader has gone."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,50 @@
+"""Ranges at the doors: what is beyond them is of no use and takes memory or time without end."""
+
+from __future__ import annotations
+
+from soup_nlp.errors import DataError
+
+MAX_SIDE = 20_000
+"""Largest width or height of an image, flow or depth, pixels."""
+MAX_PIXELS = 64_000_000
+"""Most pixels of one; a picture of 8K has half of them."""
+MAX_ASPECT = 32
+"""Largest ratio of its sides; a panorama has 10."""
+MAX_SUPERPIXELS = 20_000
+MAX_NEIGHBOURS = 100
+MAX_PARTICLES = 1_000
+MAX_SAMPLES = 10_000
+"""Pixels or boundary points of one superpixel."""
+MAX_ROUNDS = 10_000
+"""Rounds and iterations of any loop."""
+MAX_SEED = 2**31 - 1
+"""OpenCV's generator takes 32 bits with a sign."""
+LEAST, MOST = 1e-9, 1e9
+"""Magnitude of real numbers: products and squares of them stay far from overflow."""
+
+
+def check_image_size(width: int, height: int, what: str, where: object) -> None:
+    """Raise DataError unless an image of this size is within the limits.
+
+    Args:
+        width: Columns, pixels.
+        height: Rows, pixels.
+        what: Name of the image for the message.
+        where: Its file or array.
+    """
+    found = f"{width} x {height} (width x height)"
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
+        raise DataError(
+            f"{what} has an impossible size",
+            where=where,
+            found=found,
+            expected=f"1 to {MAX_SIDE} on each side, at most {MAX_PIXELS} pixels",
+            hint="scale the images and their intrinsics down; or the file is damaged",
+        )
+    if max(width, height) > MAX_ASPECT * min(width, height):
+        raise DataError(
+            f"{what} is too long for its width",
+            where=where,
+            found=found,
+            expected=f"sides of a ratio from 1 to {MAX_ASPECT}",
+        )

@@ -1,0 +1,268 @@
+"""The door of files: what is no regular file, too large or too deep is an error, not a hang."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from soup_nlp.errors import DataError, SoupError, printable
+
+PathLike = str | os.PathLike[str]
+
+MOST_BYTES = 2 << 30
+"""Size of the largest file of images or numbers."""
+MOST_TEXT = 64 << 20
+"""Size of the largest text, bytes."""
+MOST_YAML = 1 << 20
+"""Size of the largest YAML text, characters: problem files have some thousand."""
+MOST_NODES = 100_000
+"""Values of a YAML text, its aliases written out."""
+DEEPEST = 64
+"""Levels of brackets in JSON and YAML."""
+KINDS = {
+    stat.S_ISDIR: "a folder",
+    stat.S_ISFIFO: "a named pipe",
+    stat.S_ISSOCK: "a socket",
+    stat.S_ISCHR: "a device",
+    stat.S_ISBLK: "a device",
+}
+
+
+def as_path(
+    name: object, what: str = "file", *, error: type[SoupError] = DataError, home: bool = False
+) -> Path:
+    """A name as a path.
+
+    Args:
+        name: Text or path.
+        what: Name of the file for the message.
+        error: Kind of error.
+        home: Whether `~` is the home folder.
+
+    Raises:
+        SoupError: it is neither, holds a NUL, or names the home of an unknown user.
+    """
+    if not isinstance(name, str | os.PathLike) or isinstance(os.fspath(name), bytes):
+        raise error(
+            f"{what} is not named by a path",
+            found=f"{type(name).__name__} {printable(name, 60)}",
+            expected="text or a pathlib.Path",
+        )
+    if "\0" in os.fspath(name):
+        raise error(f"name of {what} holds a NUL character", where=name)
+    path = Path(name)
+    if not home:
+        return path
+    try:
+        return path.expanduser()
+    except RuntimeError as problem:
+        raise error(f"home folder of {what} is not known", where=name, found=problem) from None
+
+
+def is_file(path: PathLike) -> bool:
+    """Whether there is a regular file; False where the name cannot be one."""
+    try:
+        return stat.S_ISREG(os.stat(path).st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def is_folder(path: PathLike) -> bool:
+    """Whether there is a folder; False where the name cannot be one."""
+    try:
+        return stat.S_ISDIR(os.stat(path).st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def read_bytes(
+    path: PathLike, what: str, *, error: type[SoupError] = DataError, most: int = MOST_BYTES
+) -> bytes:
+    """The content of a regular file.
+
+    Pipes and devices are not waited for, and a file is not read before its size is known.
+
+    Args:
+        path: The file.
+        what: Name of the content for the message, e.g. "flow file".
+        error: Kind of error.
+        most: Bytes that it may have.
+
+    Raises:
+        SoupError: the file is missing, not a regular one, empty, too large, or not readable.
+    """
+    path = as_path(path, what, error=error)
+    try:
+        # an open pipe without a writer would wait for one
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    except FileNotFoundError:
+        raise error(
+            f"{what} is missing", where=path, expected="an existing file", hint=_neighbours(path)
+        ) from None
+    except OSError as problem:
+        raise error(
+            f"{what} cannot be read", where=path, found=_kind(path) or problem.strerror,
+            expected="a readable file",
+        ) from problem  # fmt: skip
+    try:
+        state = os.fstat(handle)
+        if not stat.S_ISREG(state.st_mode):
+            raise error(
+                f"{what} cannot be read", where=path, found=_kind(path), expected="a readable file"
+            )
+        if state.st_size > most:
+            raise error(
+                f"{what} is too large",
+                where=path,
+                found=f"{state.st_size} bytes",
+                expected=f"at most {most} bytes",
+            )
+        with open(handle, "rb", closefd=False) as file:
+            content = file.read(most + 1)
+    except OSError as problem:
+        raise error(f"{what} cannot be read", where=path, found=problem.strerror) from problem
+    finally:
+        os.close(handle)
+    if not content:
+        raise error(f"{what} is empty", where=path, found="0 bytes")
+    return content
+
+
+def _kind(path: Path) -> str | None:
+    """What is there instead of a regular file."""
+    try:
+        mode = os.stat(path).st_mode
+    except OSError:
+        return None
+    return next((word for test, word in KINDS.items() if test(mode)), None)
+
+
+def _neighbours(path: Path) -> str:
+    """A hint that names what the folder of a missing file holds."""
+    if path.is_symlink():
+        return "it is a symbolic link whose target is missing"
+    try:
+        names = sorted(os.listdir(path.parent))
+    except OSError:
+        return f"the folder {path.parent} does not exist; check the path"
+    shown = ", ".join(names[:6]) + (" ..." if len(names) > 6 else "")
+    return f"check the name; the folder holds: {shown or 'nothing'}"
+
+
+def read_text(
+    path: PathLike, what: str, *, error: type[SoupError] = DataError, most: int = MOST_TEXT
+) -> str:
+    """The content of a UTF-8 text file, see `read_bytes`."""
+    try:
+        return read_bytes(path, what, error=error, most=most).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise error(
+            f"{what} is not text", where=path, found="binary content", expected="UTF-8 text"
+        ) from None
+
+
+# --- JSON and YAML --------------------------------------------------------------------------------
+
+
+def parse_json(text: str) -> Any:
+    """The value of a JSON text: control characters of its strings escaped, numbers that fit.
+
+    Raises:
+        ValueError: it is not JSON, nested too deep, or a number is no float64.
+    """
+    try:
+        return _plain(json.loads(text, parse_constant=_constant, parse_int=_whole), 0)
+    except RecursionError:
+        raise ValueError(f"brackets are nested more than {DEEPEST} deep") from None
+
+
+def read_json(path: PathLike, what: str, *, error: type[SoupError] = DataError) -> Any:
+    """The value of a JSON file, see `parse_json`.
+
+    Raises:
+        SoupError: the file cannot be read, or is not such JSON.
+    """
+    try:
+        return parse_json(read_text(path, what, error=error))
+    except ValueError as problem:
+        raise error(f"{what} is not JSON", where=path, found=problem) from None
+
+
+def _constant(word: str) -> float:
+    raise ValueError(f"{word} is no number of JSON")
+
+
+def _whole(text: str) -> int:
+    if len(text) > 19:
+        raise ValueError(f"number of {len(text)} digits")
+    return int(text)
+
+
+def _plain(value: Any, level: int) -> Any:
+    """The value with clean strings.
+
+    Raises:
+        ValueError: it is nested too deep.
+    """
+    if level > DEEPEST:
+        raise ValueError(f"brackets are nested more than {DEEPEST} deep")
+    if isinstance(value, str):
+        return "\n".join(printable(line) for line in value.split("\n"))
+    if isinstance(value, Mapping):
+        return {printable(key): _plain(item, level + 1) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item, level + 1) for item in value]
+    return value
+
+
+def check_node(node: yaml.Node) -> None:
+    """Raise ValueError for a YAML document that is nested too deep, or grows by its aliases."""
+    sizes: dict[int, int] = {}
+
+    def size(node: yaml.Node, level: int) -> int:
+        """Values of a node, its aliases written out."""
+        if level > DEEPEST:
+            raise ValueError(f"brackets are nested more than {DEEPEST} deep")
+        if not isinstance(node, yaml.CollectionNode):
+            return 1
+        if id(node) not in sizes:
+            pairs = node.value if isinstance(node, yaml.MappingNode) else [node.value]
+            sizes[id(node)] = 1 + sum(size(item, level + 1) for pair in pairs for item in pair)
+        if sizes[id(node)] > MOST_NODES:
+            raise ValueError(f"more than {MOST_NODES} values")
+        return sizes[id(node)]
+
+    size(node, 0)
+
+
+def parse_yaml(text: str) -> Any:
+    """The value of a YAML text.
+
+    Raises:
+        ValueError: it is not YAML, too long, too deep, or grows by aliases.
+    """
+    check_length(text)
+    try:
+        loader = yaml.SafeLoader(text)
+        try:
+            node = loader.get_single_node()
+            if node is None:
+                return None
+            check_node(node)
+            return loader.construct_document(node)
+        finally:
+            loader.dispose()
+    except (yaml.YAMLError, RecursionError, TypeError) as problem:
+        raise ValueError(printable(problem)) from None
+
+
+def check_length(text: str) -> None:
+    """Raise ValueError for a YAML text that is too long."""
+    if len(text) > MOST_YAML:
+        raise ValueError(f"{len(text)} characters, at most {MOST_YAML} are read")

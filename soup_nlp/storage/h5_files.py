@@ -1,0 +1,120 @@
+"""HDF5 files read: links are not followed, sizes are looked at before memory is taken."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TypeAlias
+
+import h5py
+import numpy as np
+
+from soup_nlp.errors import DataError
+from soup_nlp.storage.files import PathLike, as_path, is_file, parse_json
+from soup_nlp.storage.memory import require_memory
+
+ReadTree: TypeAlias = dict[str, Any]
+"""Nested dict of numpy arrays, as `read_h5` returns it."""
+
+DEEPEST = 16
+"""Levels of groups."""
+BROKEN = (OSError, RuntimeError, KeyError, TypeError, ValueError, AttributeError)
+"""What h5py raises on files that are damaged."""
+
+
+def read_h5(path: PathLike) -> ReadTree:
+    """All arrays of a result file, as nested dicts of numpy arrays (text as str or object arrays).
+
+    Raises:
+        DataError: the file is missing or is not HDF5, is damaged, holds a link or a type that no
+            result has, or more than fits into memory.
+    """
+    with _opened(path) as file:
+        items = list(_items(file, "", {h5py.h5o.get_info(file["/"].id).addr}, path))
+        size = sum(i.size * i.dtype.itemsize for _, i in items if isinstance(i, h5py.Dataset))
+        require_memory(size, "the arrays of the result", path, "the file may be damaged")
+        out: ReadTree = {}
+        for name, item in items:
+            *groups, last = name.split("/")
+            place = out
+            for group in groups:
+                place = place.setdefault(group, {})
+            if isinstance(item, h5py.Group):
+                place[last] = {}
+            elif h5py.check_string_dtype(item.dtype):
+                place[last] = np.asarray(item.asstr()[()])
+            else:
+                place[last] = np.asarray(item[()])
+        return out
+
+
+def _items(
+    group: h5py.Group, place: str, seen: set[Any], path: PathLike
+) -> Iterator[tuple[str, h5py.Group | h5py.Dataset]]:
+    """Names, groups and datasets below a group; hard links are the only ones.
+
+    Raises:
+        DataError: there is a link of another kind, or what is neither group nor array.
+    """
+
+    def wrong(name: str, found: object, expected: str) -> DataError:
+        return DataError(
+            "result holds what no result has", where=f"{path}, {name}", found=found,
+            expected=expected,
+        )  # fmt: skip
+
+    if place.count("/") > DEEPEST:
+        raise wrong(place, "groups within groups", f"at most {DEEPEST} levels")
+    for key in group:
+        name = f"{place}{key}"
+        link = group.get(key, getlink=True)
+        if not isinstance(link, h5py.HardLink):
+            raise wrong(name, type(link).__name__, "an array or a group, no link")
+        item = group[key]
+        address = h5py.h5o.get_info(item.id).addr
+        if address in seen:
+            raise wrong(name, "an object under two names", "a tree")
+        seen.add(address)
+        if isinstance(item, h5py.Group):
+            yield name, item
+            yield from _items(item, f"{name}/", seen, path)
+        elif not isinstance(item, h5py.Dataset):
+            raise wrong(name, type(item).__name__, "an array or a group")
+        elif item.shape is None or item.external or item.is_virtual:
+            raise wrong(name, "an array without values of its own", "numbers or text")
+        elif item.dtype.kind not in "fiub" and not h5py.check_string_dtype(item.dtype):
+            raise wrong(name, f"type {item.dtype}", "numbers or text")
+        else:
+            yield name, item
+
+
+def read_attrs(path: PathLike) -> dict[str, Any]:
+    """Root attributes of a result file.
+
+    `versions` is returned as a dict, other JSON texts as they were stored.
+
+    Raises:
+        DataError: the file is missing or is not HDF5, or is damaged.
+    """
+    with _opened(path) as file:
+        out = dict(file.attrs)
+        if isinstance(out.get("versions"), str):
+            out["versions"] = parse_json(out["versions"])
+    return {k: v.item() if isinstance(v, np.generic) else v for k, v in out.items()}
+
+
+@contextmanager
+def _opened(path: PathLike) -> Iterator[h5py.File]:
+    """The file; what goes wrong while it is read is an error of the file."""
+    if not is_file(as_path(path, "result file")):
+        raise DataError("result file does not exist", where=path)
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except BROKEN as error:
+        raise DataError(
+            "file is not a readable HDF5 file",
+            where=path,
+            found=error,
+            expected="a result file written by soup_nlp",
+        ) from error

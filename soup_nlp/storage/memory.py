@@ -1,0 +1,51 @@
+"""Memory of the machine, asked before it is taken."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+
+from soup_nlp.errors import DataError
+
+_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+"""What a container may take, where there is one."""
+
+
+def usable_memory() -> int:
+    """Bytes that this process may still take without swapping."""
+    free = [int(psutil.virtual_memory().available)]
+    for name in _LIMITS:
+        with suppress(OSError, ValueError):
+            free.append(int(Path(name).read_text()) - int(psutil.Process().memory_info().rss))
+    return max(0, min(free))
+
+
+def require_memory(size: float, what: str, where: object = None, hint: str | None = None) -> None:
+    """Raise DataError where the machine has no such amount of memory.
+
+    Args:
+        size: Bytes that are about to be taken.
+        what: What takes them, for the message.
+        where: File or setting concerned.
+        hint: What to lower.
+    """
+    usable = usable_memory()
+    if size > usable:
+        raise DataError(
+            f"{what} would take more memory than this machine has",
+            where=where,
+            found=f"about {_text(size)}",
+            expected=f"at most {_text(usable)}, which are free",
+            hint=hint,
+        )
+
+
+def _text(size: float) -> str:
+    """Bytes in a unit that leaves few digits."""
+    for unit in ("kB", "MB", "GB", "TB"):
+        size /= 1000
+        if size < 1000:
+            return f"{size:.3g} {unit}"
+    return f"{size:.3g} TB"
