@@ -28,6 +28,7 @@ from soup_nlp.model.reweighting import (
     in_noise,
     in_pixels,
 )
+from soup_nlp.pipeline.memory import check_fits
 from soup_nlp.pipeline.still_layer import see_through
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
@@ -104,6 +105,7 @@ def prepare(
             on_stage(stage)
 
     pair = pair or problem.load_pair()
+    check_fits(problem, pair)
     done("load")
     flow = pair.flow or problem.flow.load(pair, problem.path)
     pair = pair.with_flow(flow)
