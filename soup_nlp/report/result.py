@@ -17,7 +17,8 @@ from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.surface import at_jumps, hidden, joined
-from soup_nlp.storage.store import read_attrs, read_h5, require
+from soup_nlp.storage.h5_files import read_attrs, read_h5
+from soup_nlp.storage.store import require
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline.run import Run

@@ -175,7 +175,7 @@ def read_confidence(path: PathLike) -> NDArray[np.float32]:
         (H, W) float32 in [0, 1].
     """
     if Path(path).suffix == ".npy":
-        found = _read_npy(path, "confidence file")
+        found = read_npy(path, "confidence file")
     else:
         found = decode(path, "confidence map")
         if found.dtype in (np.uint8, np.uint16):
