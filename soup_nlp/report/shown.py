@@ -18,7 +18,8 @@ from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.report.tree import result_tree
-from soup_nlp.storage.store import Array, ReadTree, Tree, plain, read_attrs, read_h5
+from soup_nlp.storage.h5_files import ReadTree, read_attrs, read_h5
+from soup_nlp.storage.store import Array, Tree, plain
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline.run import Run
