@@ -31,7 +31,8 @@ ALLOWED = {
     "config": {"errors", "schema", "storage", "data", "model", "start", "solve", "refine"},
     "pipeline": {"errors", "storage", "config", "data", "geometry", "model", "start", "solve"}
     | {"refine", "evaluate"},
-    "report": {"errors", "storage", "data", "geometry", "solve", "refine", "evaluate", "pipeline"},
+    "report": {"errors", "storage", "data", "geometry", "start", "solve", "refine", "evaluate"}
+    | {"pipeline"},
     # files for and from other solvers
     "export": {"errors", "storage", "config", "geometry", "model", "solve", "evaluate"}
     | {"pipeline"},

@@ -169,7 +169,7 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
     main = next(iter(metrics), "")
     return {
         "status": result.solution.status,
-        "good": result.good,
+        "good": result.solved,
         "superpixels": len(result.segmentation),
         "size": list(result.pair.size),
         "stages": dict(result.seconds),

@@ -100,7 +100,7 @@ def measure_energy(item: Item, overrides: tuple[str, ...] = (), variant: str = "
         metrics[name] = {"mre": m.mre, "median_relative": m.median_relative}
     return {
         "status": result.solution.status,
-        "good": result.good,
+        "good": result.solved,
         "mixed": float((true.purity < 0.95).mean()),
         "energy": {name: energy(soup) for name, soup in soups.items()},
         "metrics": {convention: metrics},

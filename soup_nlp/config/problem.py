@@ -24,7 +24,7 @@ from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.schema.explain import Place, explain, nearest
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
-from soup_nlp.schema.section import NonNegative, Positive, Samples, Section, Seed
+from soup_nlp.schema.section import NonNegative, Positive, Samples, Section, Seed, Share
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.start.start_options import StartOptions
 from soup_nlp.storage.files import as_path, check_length, check_node, is_file, read_text
@@ -73,6 +73,8 @@ class OutputOptions(Section):
 
     page: bool = True
     """Write report.html, the page with the 3D view."""
+    min_confidence: Share = 0.5
+    """Least confidence, 1 - sigma / 0.5, of the points in clouds and meshes; 0 keeps guesses."""
 
 
 def title(text: object) -> str:

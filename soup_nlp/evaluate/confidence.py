@@ -19,6 +19,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import TangentLayout
+from soup_nlp.model.reweighting import LEAST_NOISE, MOST_NOISE
 from soup_nlp.solve.selected_inverse import BlockCholesky
 from soup_nlp.solve.tangent_problem import TangentProblem
 from soup_nlp.start.propose import Start
@@ -150,10 +151,12 @@ SIGMA_PRIOR = 0.5
 """Standard deviation of log depth where the pair says nothing: scenes vary by about that much."""
 PRIOR_SHARE = 0.01
 """Factor of E_prior in the information: it holds depth where nothing else does, knowing little."""
-FACTOR, POWER_NOISE, POWER_SPREAD = 0.3, 0.0, 1.0
-"""Calibration: sigma = FACTOR noise^POWER_NOISE spread^POWER_SPREAD."""
-GUESS = 0.25
-"""A pixel whose sigma is larger is a guess."""
+FACTOR, POWER = 15.0, 1.25
+"""sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
+MIN_CONFIDENCE = 0.5
+"""A pixel whose confidence, 1 - sigma / `SIGMA_PRIOR`, is less is a guess."""
+MOST_SIGMA = (1 - MIN_CONFIDENCE) * SIGMA_PRIOR
+"""The sigma of that confidence."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +167,8 @@ class Confidence:
         sigma: (H, W) calibrated standard deviation of log depth, the global scale left out.
         spread: (H, W) standard deviation of log depth as the marginals have it.
         marginals: Of the planes and of the components' scales.
-        noise: Median re-projection error of the start, pixels, that the calibration starts from.
+        noise: Of the flow, pixels: median re-projection error of the start, within the limits
+            that E_prior has.
     """
 
     sigma: Float
@@ -175,7 +179,7 @@ class Confidence:
     @property
     def guessed(self) -> float:
         """Share of the pixels whose depth is a guess."""
-        return float(np.mean(self.sigma > GUESS))
+        return float(np.mean(self.sigma > MOST_SIGMA))
 
     @property
     def component_sigma(self) -> Float:
@@ -188,10 +192,9 @@ def calibrated(spread: Float, noise: float) -> Float:
 
     Args:
         spread: What the marginals say.
-        noise: Median re-projection error of the start, pixels.
+        noise: Of the flow, pixels.
     """
-    sigma = FACTOR * noise**POWER_NOISE * spread**POWER_SPREAD
-    return np.asarray(np.minimum(sigma, SIGMA_PRIOR))
+    return np.asarray(np.minimum(FACTOR * (noise * spread) ** POWER, SIGMA_PRIOR))
 
 
 def confidence(
@@ -219,5 +222,5 @@ def confidence(
     sizes = np.bincount(labels.ravel(), minlength=len(soup))
     own = marginals(info, sizes, start.component)
     spread = spread_in_image(info, own.plane, labels, K_ref)
-    noise = float(np.median(start.error))
+    noise = float(np.clip(np.median(start.error), LEAST_NOISE, MOST_NOISE))
     return Confidence(calibrated(spread, noise), spread, own, noise)

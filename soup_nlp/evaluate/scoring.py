@@ -29,12 +29,17 @@ DEPTHS = {"solution": "ref", "nlp": "nlp_ref", "start": "start_ref", "rigid": "r
 """Depth maps of the reference frame that a result stores, by the name of their metrics."""
 
 
+SURE = {"solution_90": 0.9, "solution_70": 0.7}
+"""Shares of the pixels with a true depth, the most certain ones, that are scored apart."""
+
+
 def score_depths(
     truth: Truth | None,
     depths: Mapping[str, Float],
     scale: Scale = "median",
     cap: float | None = None,
     depth_next: Float | None = None,
+    sigma: Float | None = None,
 ) -> dict[str, DepthMetrics]:
     """Metrics of named depth maps, and of a constant depth, against dense or sparse truth.
 
@@ -44,30 +49,49 @@ def score_depths(
         scale: Rule of the one global scale of each depth map.
         cap: Truth beyond this depth is left out.
         depth_next: (H', W') z of the next frame.
+        sigma: (H, W) uncertainty of the depth "solution".
 
     Returns:
-        By the same names, "constant", and "solution_next" for the next frame; what has no true
-        pixel is absent.
+        By the same names, "constant", "solution_next" for the next frame, and those of `SURE` for
+        the pixels where sigma is least; what has no true pixel is absent.
     """
     out: dict[str, DepthMetrics] = {}
     if truth is None:
         return out
     for name, depth in depths.items():
-        if truth.depth_ref is not None:
-            estimate, gt = depth, truth.depth_ref
-        elif truth.points is not None:
-            estimate, gt = sample_at_points(depth, truth.points)
-        else:
+        if truth.depth_ref is None and truth.points is None:
             break
+        estimate, gt = _at_truth(truth, depth)
         if not true_pixels(gt, cap).any():
             break
         out[name] = depth_metrics(estimate, gt, scale=scale, cap=cap)
         if "constant" not in out:
             out["constant"] = depth_metrics(np.ones(gt.shape), gt, scale=scale, cap=cap)
+    if sigma is not None and "solution" in out:
+        for name, share in SURE.items():
+            estimate, gt = _at_truth(truth, depths["solution"])
+            unsure = _at_truth(truth, sigma)[0]
+            kept = np.where(most_certain(gt, unsure, share), gt, np.nan)
+            out[name] = depth_metrics(estimate, kept, scale=scale, cap=cap)
     gt_next = truth.depth_next
     if depth_next is not None and gt_next is not None and true_pixels(gt_next, cap).any():
         out["solution_next"] = depth_metrics(depth_next, gt_next, scale=scale, cap=cap)
     return out
+
+
+def _at_truth(truth: Truth, image: Float) -> tuple[Float, Float]:
+    """Values of an image (H, W) where truth is known, and the true depth there."""
+    if truth.depth_ref is not None:
+        return image, truth.depth_ref
+    assert truth.points is not None
+    return sample_at_points(image, truth.points)
+
+
+def most_certain(gt: Float, sigma: Float, share: float) -> NDArray[np.bool_]:
+    """The share of the true pixels where sigma is least."""
+    true = true_pixels(gt, None) & np.isfinite(sigma)
+    limit = np.quantile(sigma[true], share) if true.any() else 0.0
+    return np.asarray(true & (sigma <= limit))
 
 
 def evaluate(

@@ -176,6 +176,11 @@ class Run:
 
     @property
     def good(self) -> bool:
+        """Whether the solve ended well and at most half of the image is a guess."""
+        return self.solved and self.confidence.guessed <= 0.5
+
+    @property
+    def solved(self) -> bool:
         """Whether the NLP converged (or was skipped) and nobody interrupted the refinement."""
         solved = self.solution.converged or self.solution.status == "Skipped"
         return solved and (self.refined is None or self.refined.status != "interrupted")
@@ -312,7 +317,9 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         start_reconstruction=before,
         reconstruction=after,
         rigid=rigid,
-        metrics=score_depths(pair.truth, depths, expected.scale, expected.cap, after.depth_next),
+        metrics=score_depths(
+            pair.truth, depths, expected.scale, expected.cap, after.depth_next, after.sigma_ref
+        ),
         seconds={},
         confidence=sure,
         refined=refined,

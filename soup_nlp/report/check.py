@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate import recompute
-from soup_nlp.evaluate.scoring import DEPTHS
+from soup_nlp.evaluate.scoring import DEPTHS, SURE
 from soup_nlp.storage.files import as_path, parse_yaml, read_json, read_text
 from soup_nlp.storage.h5_files import read_attrs, read_h5
 from soup_nlp.storage.store import require
@@ -328,9 +328,15 @@ def _compared(tree: Entries, name: str) -> tuple[recompute.Float, recompute.Floa
     """Estimate and truth of a row of metrics."""
     if name == "solution_next":
         return require(tree, "depth/next"), require(tree, "truth/depth_next")
-    z = require(tree, f"depth/{'ref' if name == 'constant' else DEPTHS[name]}")
+    sure = SURE.get(name)
+    stored = "ref" if name == "constant" or sure else DEPTHS[name]
+    z, unsure = require(tree, f"depth/{stored}"), require(tree, "depth/sigma_ref")
     if "depth_ref" in tree["truth"]:
         gt = require(tree, "truth/depth_ref")
     else:
+        unsure, _ = recompute.at_points(unsure, require(tree, "truth/points"))
         z, gt = recompute.at_points(z, require(tree, "truth/points"))
+    if sure:
+        true = np.isfinite(gt) & (gt > 0) & np.isfinite(unsure)
+        gt = np.where(unsure <= np.quantile(unsure[true], sure), gt, np.nan)
     return (np.ones_like(gt) if name == "constant" else z), gt

@@ -13,6 +13,7 @@ from soup_nlp.data.datasets.layout import MARK, is_result
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import skill
+from soup_nlp.report.certainty import certainty
 from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture
 from soup_nlp.report.formats import write_formats
 from soup_nlp.report.page import page
@@ -226,6 +227,7 @@ def summary(run: Run) -> dict[str, Any]:
             "borrowed": int(run.start.borrowed.sum()),
             "median_error_px": float(np.median(run.start.error)),
         },
+        "certainty": certainty(run),
         "flow": str(run.pair.flow),
         "versions": versions(),
         "seed": run.problem.seed,

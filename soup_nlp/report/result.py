@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ import yaml
 from numpy.typing import NDArray
 
 from soup_nlp.errors import DataError
+from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, SIGMA_PRIOR
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
@@ -46,6 +47,7 @@ class Result:
         flow_confidence: (H, W) of the flow that was solved with, 0 to 1.
         metre: Lengths of the truth in a unit of the reconstruction, where a truth is known.
         metre_unit: Name of the truth's unit.
+        min_confidence: Least confidence of the points in clouds and meshes.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Result:
     flow_confidence: NDArray[np.floating]
     metre: float | None = None
     metre_unit: str = "m"
+    min_confidence: float = MIN_CONFIDENCE
 
     def __str__(self) -> str:
         h, w = self.images[0].shape[:2]
@@ -88,7 +91,14 @@ class Result:
     @property
     def sigma(self) -> Float | None:
         """(H, W) standard deviation of log depth of the reference frame, where it is known."""
-        return getattr(self.reconstruction, "sigma_ref", None)
+        return self.reconstruction.sigma_ref
+
+    @property
+    def confidence(self) -> Float:
+        """(H, W) 1 where depth is certain, 0 where nothing is known of it; 1 without sigma."""
+        if self.sigma is None:
+            return np.ones(self.flow_confidence.shape)
+        return np.asarray(1.0 - self.sigma / SIGMA_PRIOR)
 
     @cached_property
     def surface(self) -> tuple[Mask, Mask]:
@@ -97,8 +107,9 @@ class Result:
 
     @cached_property
     def sure(self) -> Mask:
-        """(H, W) pixels of clouds: seen in both frames and not at a jump of the depth."""
-        return ~hidden(self.reconstruction) & ~at_jumps(*self.surface)
+        """(H, W) pixels of clouds: seen in both frames, no guess and not at a jump of the depth."""
+        known = self.confidence >= self.min_confidence
+        return known & ~hidden(self.reconstruction) & ~at_jumps(*self.surface)
 
 
 def result_of(run: Run) -> Result:
@@ -114,6 +125,7 @@ def result_of(run: Run) -> Result:
         flow_confidence=pair.flow.confidence,
         metre=None if m is None else m.scale,
         metre_unit="m" if pair.truth is None else pair.truth.unit,
+        min_confidence=run.problem.output.min_confidence,
     )
 
 
@@ -147,12 +159,12 @@ def _result(tree: Mapping[str, Any], attrs: Mapping[str, Any]) -> Result:
     seg = Segmentation(**{**empty, **{k: v for k, v in parts.items() if k in empty}})
     start = tree["start"]
     own = soup, seg, start["component"], K[0], K[1], start["borrowed"].astype(bool)
-    size = images[1].shape[0], images[1].shape[1]
+    rec = reconstruct(soup, seg.labels, K[0], K[1], (images[1].shape[0], images[1].shape[1]))
     return Result(
         name=str(attrs["name"]),
         images=(images[0], images[1]),
         K=(K[0], K[1]),
-        reconstruction=reconstruct(soup, seg.labels, K[0], K[1], size),
+        reconstruction=replace(rec, sigma_ref=tree["depth"].get("sigma_ref")),
         components=find_components(*own),
         flow_confidence=tree["input"]["confidence"],
         metre=attrs.get("scale_to_truth"),

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from soup_nlp.evaluate.metrics import DepthMetrics, skill
+from soup_nlp.evaluate.scoring import SURE
+from soup_nlp.report.certainty import certainty, certainty_lines
 from soup_nlp.report.shown import PAGE
 
 if TYPE_CHECKING:
@@ -26,7 +28,12 @@ WORDS = {
     " kept",
     "Restoration_Failed": "not converged: feasibility could not be restored, best iterate kept",
 }
-TITLES = {"nlp": "NLP alone", "rigid": "one rigid motion", "constant": "constant depth"}
+TITLES = {
+    **{name: f"surest {share:.0%}" for name, share in SURE.items()},
+    "nlp": "NLP alone",
+    "rigid": "one rigid motion",
+    "constant": "constant depth",
+}
 DELIVERED = {
     "constrained NLP": "its answer, retracted to the constraints",
     "presolve": "the presolve's answer, whose exact energy is lower",
@@ -34,9 +41,6 @@ DELIVERED = {
 }
 OF_ANSWER = ("nlp_infeasibility", "dual_infeasibility", "complementarity")
 """Residuals of Ipopt's own answer; the others are those of the delivered soup."""
-
-GUESSED = 0.5
-"""Share of superpixels without a depth of their own above which the summary warns."""
 
 PAD = " " * 12
 
@@ -88,11 +92,8 @@ def facts(run: Run, limit: float | None = None) -> str:
     answer = "  ".join(f"{k} {s.residuals[k]:.1e}" for k in OF_ANSWER if k in s.residuals)
     if answer:
         lines.append(f"{PAD}Ipopt's answer: {answer}")
-    borrowed = float(run.start.borrowed.mean())
-    if borrowed >= GUESSED and not run.start.bending:
-        lines.append(
-            f"depth       {borrowed:.0%} of the superpixels have no parallax: theirs is a guess"
-        )
+    first, *rest = certainty_lines(certainty(run))
+    lines += [f"certainty   {first}", *(PAD + line for line in rest)]
     if run.metrics:
         lines += [f"accuracy    {protocol(run.metrics)}"]
         lines += [PAD + line for line in accuracy(run.metrics)]
@@ -145,7 +146,7 @@ def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
         row = f"{'next frame':<17}{m.mre:>8.4f}{m.median_relative:>9.4f}{'':>8}{m.coverage:>10.1%}"
         return [*lines, row]
     worst = metrics["constant"].mre
-    for name in ("solution", "nlp", "start", "rigid", "constant"):
+    for name in ("solution", *SURE, "nlp", "start", "rigid", "constant"):
         if name in metrics:
             m = metrics[name]
             lines.append(

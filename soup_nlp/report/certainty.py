@@ -1,0 +1,79 @@
+"""How much of the image is determined, by what, and what is a guess."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.evaluate.confidence import MOST_SIGMA
+from soup_nlp.geometry.surface import hidden
+from soup_nlp.start.components import TIES
+
+if TYPE_CHECKING:
+    from soup_nlp.pipeline.run import Run
+
+LITTLE = 1.0
+"""Parallax in pixels below which an error of the flow is most of it."""
+WORDS = {
+    "flow": "by flow and parallax",
+    "contact": "with the scale of a contact",
+    "outline": "with the scale of an outline",
+    "unseen": "no usable flow",
+    "still": "hardly any parallax",
+    "weak": "little information",
+}
+
+
+def certainty(run: Run) -> dict[str, float]:
+    """Shares of the image, in summary.json and the verdict.
+
+    Returns:
+        "determined": where sigma of log depth is at most `MOST_SIGMA`; the sum of "flow" (in the
+        largest component), "contact" and "outline" (in others, by what gives them their scale).
+        "guess": the rest; the sum of "unseen" (no usable flow, or hidden in the next frame),
+        "still" (parallax below a pixel) and "weak". "median_sigma": of what is determined.
+    """
+    sigma = run.confidence.sigma
+    labels, start = run.segmentation.labels, run.start
+    sure = sigma <= MOST_SIGMA
+    tie = start.tie[labels]
+    assert run.pair.flow is not None
+    unseen = (run.pair.flow.confidence <= 0) | hidden(run.reconstruction)
+    still = (start.parallax < LITTLE)[labels]
+
+    def share(mask: NDArray[np.bool_]) -> float:
+        return float(mask.mean())
+
+    return {
+        "determined": share(sure),
+        "flow": share(sure & (tie == TIES.index("reference"))),
+        "contact": share(sure & (tie == TIES.index("contact below"))),
+        "outline": share(sure & (tie > TIES.index("contact below"))),
+        "guess": share(~sure),
+        "unseen": share(~sure & unseen),
+        "still": share(~sure & ~unseen & still),
+        "weak": share(~sure & ~unseen & ~still),
+        "median_sigma": float(np.median(sigma[sure])) if sure.any() else float("nan"),
+    }
+
+
+def certainty_lines(found: dict[str, float]) -> list[str]:
+    """The shares as sentences: one of what is determined, one of what is a guess."""
+
+    def parts(names: tuple[str, ...]) -> str:
+        return ", ".join(f"{found[k]:.0%} {WORDS[k]}" for k in names if found[k] >= 0.005)
+
+    lines = []
+    if found["determined"] >= 0.005:
+        lines.append(
+            f"{found['determined']:.0%} of the image is determined, half of it to"
+            f" {found['median_sigma']:.1%} (1 sigma): {parts(('flow', 'contact', 'outline'))}"
+        )
+    if found["guess"] >= 0.005:
+        lines.append(
+            f"{found['guess']:.0%} is a guess (sigma above {MOST_SIGMA:.0%}):"
+            f" {parts(('unseen', 'still', 'weak'))}"
+        )
+    return lines
