@@ -36,6 +36,9 @@ ALLOWED = {
     # files for and from other solvers
     "export": {"errors", "storage", "config", "geometry", "model", "solve", "evaluate"}
     | {"pipeline"},
+    # a named, versioned problem set of such files
+    "family": {"errors", "storage", "config", "data", "geometry", "model", "start", "solve"}
+    | {"pipeline", "export"},
 }
 """Rooms in their order, and what each may import."""
 ALLOWED["bench"] = {"errors", *ALLOWED} - {"schema"}
@@ -48,16 +51,17 @@ DOORS = {
     ("start", "model"): {"model.energy_data"},
     ("solve", "data"): {"data.pair"},
     ("refine", "data"): {"data.pair", "data.census"},
+    ("family", "data"): {"data.pair"},
 }
 """Where one room may enter another only through some of its modules."""
 
 LIBRARIES = {
-    "casadi": {"model", "solve", "export", "bench"},
+    "casadi": {"model", "solve", "export", "family", "bench"},
     "matplotlib": {"report", "bench"},
     "h5py": {"storage", "data"},
     "typer": {"cli"},
     "rich": {"cli", "report"},
-    "yaml": {"storage", "config", "data", "report", "cli"},
+    "yaml": {"storage", "config", "data", "report", "family", "cli"},
     "cv2": {"data", "start", "report"},
     "skimage": {"data", "geometry"},
     "trimesh": {"report"},

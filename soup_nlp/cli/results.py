@@ -14,6 +14,7 @@ from soup_nlp.evaluate.metrics import Scale
 from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
 from soup_nlp.export.residuals import residual_table, table_text
+from soup_nlp.family.results import check_sol
 from soup_nlp.report.check import LIMITS, check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.verdict import accuracy, protocol
@@ -36,6 +37,11 @@ def check(
         print(table_text(residual_table(tree["solution"], tree["energy"]["rim_ray"], c, LIMITS)))
         print(f"\n{report}")
         good, claim = report.ok, "claim"
+    elif folder.stem.startswith("SOUP-") and export_ is None:
+        verdict = check_sol(folder)
+        print(table_text(verdict.kinds))
+        print(verdict)
+        good, claim = all(k.ok for k in verdict.kinds), "constraint"
     else:
         imported = import_sol(export_ or folder.parent, folder, renew=False)
         rows = sol_table(imported)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import lsmr
+from scipy.sparse.linalg import splu
 
 from soup_nlp.model.nlp import NLP, to_scipy
 from soup_nlp.solve.kkt import optimality
@@ -20,6 +20,8 @@ ENERGY_SLACK = 1e-3
 """A solution's exact energy may be this share above the proposal's because of the smoothing."""
 ACTIVE = 1e-5
 """A row this close to a bound (relative to 1 + |bound|) counts as active."""
+DAMPING = 1e-12
+"""Of least-squares multipliers, relative to the mean square of a row's gradient."""
 
 
 @dataclass(frozen=True)
@@ -163,11 +165,24 @@ def least_squares_multipliers(nlp: NLP, x: Float) -> Float:
             break
         A = sparse.csr_matrix(J[rows][:, inside].T)
         lam[:] = 0.0
-        lam[rows] = lsmr(A, -grad[inside], atol=1e-12, btol=1e-12, maxiter=20 * len(rows))[0]
+        lam[rows] = _least_squares(A, -grad[inside])
         wrong = (lam < 0) & ~at_lower | (lam > 0) & ~at_upper
         lam[wrong] = 0.0
         rows = rows[~wrong[rows]]
     return lam
+
+
+def _least_squares(A: sparse.csr_matrix, b: Float) -> Float:
+    """x that makes |A x - b| least, by the augmented system [I A; A' -delta]; A may lack rank."""
+    k, n = A.shape
+    delta = DAMPING * sparse.linalg.norm(A) ** 2 / n
+    blocks = [[sparse.identity(k), A], [A.T, -delta * sparse.identity(n)]]
+    solve = splu(sparse.csc_matrix(sparse.block_array(blocks))).solve
+    x = np.zeros(n)
+    # every repetition takes a factor off what the damping left
+    for _ in range(3):
+        x += solve(np.concatenate([b - A @ x, np.zeros(n)]))[k:]
+    return x
 
 
 def _gradient(nlp: NLP, x: Float) -> Float:

@@ -1,0 +1,54 @@
+"""Command family: the SOUP problem set as a folder of .nl files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from soup_nlp.cli.options import numbers
+from soup_nlp.errors import DataError
+from soup_nlp.family.instances import SCENES, SIZES, STANDARD, STARTS, select
+from soup_nlp.family.write import write_family
+from soup_nlp.report.folder import prepare_folder
+
+QUICK = "100,250"
+"""Sizes that a minute makes."""
+
+
+def _list(known: tuple[object, ...]) -> str:
+    return ",".join(map(str, known))
+
+
+def family(
+    out: Annotated[
+        Path, typer.Argument(help="Folder of the set; new, empty or of an earlier one.")
+    ],
+    sizes: Annotated[str, typer.Option(help=f"Superpixels, of {_list(SIZES)}.")] = QUICK,
+    scenes: Annotated[str, typer.Option(help="Rendered scenes.")] = _list(SCENES),
+    formulation: Annotated[
+        list[str] | None,
+        typer.Option("--formulation", help="gauge/norm/truncation; may be repeated."),
+    ] = None,
+    starts: Annotated[
+        str, typer.Option(help="easy (presolved), hard (proposal), cold (constant depth).")
+    ] = _list(STARTS),
+) -> None:
+    """Write the SOUP problem set: .nl files, best known points, index, README, licence."""
+    wanted = numbers(sizes, "--sizes")
+    parts = (
+        [word.strip() for word in text.split(",") if word.strip()] for text in (scenes, starts)
+    )
+    names, begins = parts
+    chosen = select(wanted, names, formulation or [STANDARD], begins)
+    if out.is_dir() and any(out.iterdir()) and not (out / "index.json").is_file():
+        raise DataError(
+            "folder holds other files", where=out, expected="a new or empty folder, or a set"
+        )
+    entries = write_family(prepare_folder(out), chosen)
+    print(f"{len(entries)} instances; index.json, index.csv, README.md, LICENSE.txt in {out}/")
+    changed = [e["name"] for e in entries if e["published"] is False]
+    if changed:
+        print(f"{len(changed)} are not the published bytes: please report processor and versions")
+    raise typer.Exit(1 if changed else 0)

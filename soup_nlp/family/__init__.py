@@ -1,0 +1,1 @@
+"""The SOUP family: a named, versioned set of NLPs for people who write solvers."""

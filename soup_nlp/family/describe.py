@@ -1,0 +1,138 @@
+"""What problem sets say of an instance: sizes, classes, degree, rank of the Jacobian, LICQ."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from soup_nlp.export.nl import NLFile
+from soup_nlp.export.verify import ACTIVE
+from soup_nlp.model.nlp import NLP, to_scipy
+
+Float = NDArray[np.float64]
+
+CLASSES = {0: "constant", 1: "linear", 2: "quadratic", 3: "general"}
+LETTERS = {0: "C", 1: "L", 2: "Q", 3: "O"}
+"""CUTEst's letter of each class of an objective; rows have no C, a constant is linear."""
+RANK = 1e-8
+"""Singular values below this times the largest count as 0."""
+
+
+def degree(value: ca.SX, x: ca.SX) -> int:
+    """0 constant, 1 linear, 2 quadratic, 3 anything else, as an expression of x."""
+    if not any(ca.which_depends(value, x, 1, True)):
+        return 0
+    gradient = ca.jacobian(value, x)
+    entries = ca.vertcat(*gradient.nonzeros())
+    if not any(ca.which_depends(entries, x, 1, True)):
+        return 1
+    second = ca.vertcat(*ca.jacobian(entries, x).nonzeros())
+    return 2 if not any(ca.which_depends(second, x, 1, True)) else 3
+
+
+def classes(nlp: NLP) -> dict[str, Any]:
+    """Class of the objective; class, kind and number of the rows of every kind of constraint."""
+    objective, rows = 0, {}
+    for group in nlp.groups:
+        kernel = group.kernel
+        if kernel.objective is not None:
+            objective = max(objective, degree(kernel.objective, kernel.x))
+        if kernel.constraints is not None:
+            own = np.unique(group.table.rows)
+            equal = bool((nlp.lbg[own] == nlp.ubg[own]).all())
+            rows[kernel.name if group.kernel.objective is None else f"epigraph_{kernel.name}"] = {
+                "rows": len(own),
+                "class": CLASSES[degree(kernel.constraints, kernel.x)],
+                "kind": "equality" if equal else "inequality",
+            }
+    return {"objective_class": CLASSES[objective], "constraint_classes": rows}
+
+
+def classification(nlp: NLP, found: dict[str, Any]) -> str:
+    """CUTEst's string, such as OQR2-MN-1808-1809.
+
+    Objective, constraints, R for twice differentiable, 2 for second derivatives; M for a modelling
+    exercise; Y where slack variables of the formulation are variables; n and m.
+    """
+    place = {word: number for number, word in CLASSES.items()}
+    rows = max(place[c["class"]] for c in found["constraint_classes"].values())
+    internal = any(s.startswith(("s_", "z_")) for s in nlp.x_names()[-1:])
+    letters = LETTERS[place[found["objective_class"]]] + LETTERS[max(rows, 1)]
+    return f"{letters}R2-M{'Y' if internal else 'N'}-{nlp.nx}-{nlp.ng}"
+
+
+def rank(matrix: sparse.csr_matrix) -> int:
+    """Rank of a sparse matrix whose rows share few columns.
+
+    A row with a column of its own is independent of all others; what is left falls into blocks,
+    each of which has its singular values.
+    """
+    left = sparse.csr_matrix(matrix)
+    left.eliminate_zeros()
+    found = 0
+    while left.shape[0]:
+        count = np.bincount(left.indices, minlength=left.shape[1])
+        largest = np.abs(left).max() if left.nnz else 0.0
+        alone = (count == 1)[left.indices] & (np.abs(left.data) > RANK * largest)
+        owner = np.repeat(np.arange(left.shape[0]), np.diff(left.indptr))
+        gone = np.zeros(left.shape[0], bool)
+        gone[owner[alone]] = True
+        if not gone.any():
+            break
+        found += int(gone.sum())
+        left = left[~gone]
+    if not left.nnz:
+        return found
+    _, block = connected_components(left @ left.T, directed=False)
+    order = np.argsort(block, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(block[order])) + 1):
+        part = left[rows]
+        used = np.unique(part.indices)
+        if len(used):
+            values = np.linalg.svd(part[:, used].toarray(), compute_uv=False)
+            found += int(np.sum(values > RANK * values.max()))
+    return found
+
+
+def qualification(nlp: NLP, x: Float) -> dict[str, Any]:
+    """Rank of the Jacobian of all rows and of the active ones, and whether LICQ holds at a point.
+
+    Args:
+        nlp: The problem.
+        x: (nx,) a feasible point.
+    """
+    g, jacobian = nlp.jac_g(x, nlp.p)
+    J = sparse.csr_matrix(to_scipy(jacobian))
+    g = np.asarray(g).ravel()
+    active = np.zeros(nlp.ng, bool)
+    for bound in (nlp.lbg, nlp.ubg):
+        near = np.isfinite(bound)
+        active[near] |= np.abs(g - bound)[near] <= ACTIVE * (1 + np.abs(bound[near]))
+    # a variable on its bound has no direction left
+    off = (x - nlp.lbx > ACTIVE) & (nlp.ubx - x > ACTIVE)
+    own = rank(J[active][:, off])
+    return {
+        "jacobian_rank": rank(J),
+        "active_rows": int(active.sum()),
+        "active_rank": own,
+        "variables_on_bounds": int(len(x) - off.sum()),
+        "licq": own == int(active.sum()),
+    }
+
+
+def sizes(nlp: NLP, file: NLFile) -> dict[str, Any]:
+    """Counts of variables, rows, nonzeros and nonlinear parts."""
+    finite = np.isfinite(nlp.lbx) | np.isfinite(nlp.ubx)
+    return {
+        **nlp.sizes(),
+        "bounded_variables": int(finite.sum()),
+        "gradient_nonzeros": file.gradient_nonzeros,
+        "nonlinear_rows": file.nonlinear_rows,
+        "nonlinear_variables": dict(zip(("rows", "objective", "both"), file.nonlinear)),
+        "defined_variables": sum(file.defined),
+    }

@@ -1,0 +1,244 @@
+"""Instances of the family: names, and the NLP that belongs to a name, equal on every processor.
+
+What searches or iterates (superpixels, start, presolve) was done once; its answers are records in
+the package (`frozen`). What is left is rendering and arithmetic, whose last bits depend on the
+processor: every number of the NLP is rounded to 20 significant bits, which takes those away.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.pair import Pair
+from soup_nlp.errors import ConfigError
+from soup_nlp.export.artefact import CHOICES, form_label, parse_formulation
+from soup_nlp.family.frozen import Frozen, load_frozen
+from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.nlp import NLP
+from soup_nlp.pipeline.case import Case, build_energy, solver_options
+from soup_nlp.start.propose import Start
+
+Float = NDArray[np.float64]
+
+VERSION = 1
+"""Of the family: the same version has the same bytes."""
+SCENES = ("orbit", "street", "room", "sheet")
+SIZES = (100, 250, 500, 1000, 2000)
+STARTS = ("easy", "hard", "cold")
+STANDARD = "unit-offset/smooth/smooth"
+"""Formulation of the family unless another is asked for."""
+BITS = 20
+"""Significant bits of every number of an instance."""
+FLOOR = -30
+"""Numbers are multiples of 2 to this power at least: differences near 0 have no good last bits."""
+SHIFT = 0.381966011250105
+"""Where the rounding changes over, in units of its step: not at a half, where exact data lie."""
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One instance.
+
+    Attributes:
+        scene: Of SCENES.
+        formulation: gauge/norm/truncation.
+        size: Superpixels that were asked for, of SIZES; the NLP has a few more or less.
+        start: easy (presolved), hard (the proposal) or cold (constant depth, true flow).
+    """
+
+    scene: str
+    formulation: str
+    size: int
+    start: str
+
+    @property
+    def name(self) -> str:
+        """`SOUP-<scene>-<formulation>-N<size>-<start>`."""
+        return f"{self.problem}-{self.start}"
+
+    @property
+    def problem(self) -> str:
+        """The name without the start: what the starts share."""
+        return f"SOUP-{self.scene}-{self.formulation.replace('/', '-')}-N{self.size}"
+
+
+def parse_name(name: str) -> Instance:
+    """The instance of a name; without its start, that of the first.
+
+    Raises:
+        ConfigError: it is none of the family.
+    """
+    found = re.fullmatch(r"SOUP-([a-z]+)-([a-z-]+)-N(\d+)(?:-([a-z]+))?", name)
+    for form in formulations() if found else ():
+        assert found is not None
+        if found[2] == form.replace("/", "-"):
+            one = Instance(found[1], form, int(found[3]), found[4] or STARTS[0])
+            if one.scene in SCENES and one.size in SIZES and one.start in STARTS:
+                return one
+    raise ConfigError(
+        "no instance of the family",
+        found=name,
+        expected=f"SOUP-SCENE-GAUGE-NORM-TRUNCATION-NSIZE-START, such as {example().name}",
+    )
+
+
+def example() -> Instance:
+    """The smallest instance, for messages."""
+    return Instance("street", STANDARD, 100, "easy")
+
+
+def formulations() -> list[str]:
+    """Every formulation, as gauge/norm/truncation."""
+    return ["/".join(words) for words in product(*CHOICES.values())]
+
+
+def select(
+    sizes: Sequence[int],
+    scenes: Sequence[str],
+    forms: Sequence[str],
+    starts: Sequence[str] = STARTS,
+) -> list[Instance]:
+    """Instances of sizes, scenes, formulations and starts.
+
+    Raises:
+        ConfigError: one of them is not of the family.
+    """
+    known = {"--sizes": (sizes, SIZES), "--scenes": (scenes, SCENES), "--starts": (starts, STARTS)}
+    for where, (asked, there) in known.items():
+        wrong = [str(a) for a in asked if a not in there]
+        if wrong or not len(asked):
+            raise ConfigError(
+                "not of the family",
+                where=where,
+                found=", ".join(wrong) or "nothing",
+                expected=", ".join(map(str, there)),
+            )
+    labels = [_whole(form) for form in forms]
+    unique = dict.fromkeys(scenes), dict.fromkeys(labels), dict.fromkeys(sizes)
+    return [Instance(*own, start) for own in product(*unique) for start in dict.fromkeys(starts)]
+
+
+def _whole(form: str) -> str:
+    """A formulation with the parts that were left out."""
+    own = dict(zip(("gauge", "norm", "truncation"), STANDARD.split("/")))
+    return "/".join((own | parse_formulation(form)).values())
+
+
+def build_case(scene: str, size: int) -> Case:
+    """The problem of a scene and size; its soup is the proposal.
+
+    Raises:
+        DataError: the package has no record of it.
+    """
+    return case_of(load_frozen(scene, size))
+
+
+def case_of(record: Frozen, pair: Pair | None = None) -> Case:
+    """The problem of a record: its pair is rendered, its graphs and weights are computed.
+
+    Args:
+        record: Of a scene and size.
+        pair: The scene's pair, where it is rendered already.
+    """
+    problem = record.problem
+    pair = pair or problem.load_pair()
+    pair = pair.with_flow(problem.flow.load(pair, problem.path))
+    s = problem.segmentation
+    samples = None if s.boundary_samples == "all" else s.boundary_samples
+    own = s.neighbours, s.beta, s.beta_colour, samples
+    seg = build_segmentation(record.labels, pair.image_ref, *own)
+    n = len(seg)
+    nothing = np.zeros(n)
+    start = Start(
+        soup=record.start,
+        error=record.error,
+        parallax=nothing,
+        borrowed=nothing.astype(bool),
+        motion=nothing.astype(np.int64),
+        component=record.component,
+        motions=[],
+        surface=record.surface,
+        bending=record.bending,
+    )
+    data, weights = build_energy(problem, pair, seg, start)
+    options = solver_options(problem, start)
+    return Case(problem, pair, seg, start, rounded_data(data), weights, start.soup, options)
+
+
+def rounded_data(data: EnergyData) -> EnergyData:
+    """The same numbers, each rounded: what the NLP makes of them is plain arithmetic."""
+    own = {f.name: getattr(data, f.name) for f in fields(data)}
+    reals: dict[str, Any] = {
+        k: rounded(v) for k, v in own.items() if np.asarray(v).dtype == np.float64
+    }
+    return replace(data, **{**reals, "rotation_scale": float(reals["rotation_scale"])})
+
+
+def build_instance(
+    case: Case, record: Frozen, formulation: str, start: str
+) -> tuple[NLP, MatrixLayout, Formulation]:
+    """The NLP of a formulation at a start, its layout and its formulation.
+
+    Args:
+        case: From `case_of`.
+        record: The same record.
+        formulation: gauge/norm/truncation.
+        start: Of STARTS; "best" is the best known point, not rounded.
+    """
+    form = case.formulation(**parse_formulation(formulation), hessian="exact", compiled=False)
+    assert form_label(form) == formulation
+    soups = {"easy": record.best, "hard": record.start, "best": record.best}
+    soup = constant_depth(case.data) if start == "cold" else soups[start]
+    nlp, layout = replace(case, soup=soup).nlp(form)
+    x0 = nlp.x0 if start == "best" else rounded(nlp.x0)
+    if start == "best":
+        # switches start inside their bounds, and are at one of them where they are best
+        switch = np.array([s.startswith("z_") for s in nlp.x_names()])
+        x0 = np.where(switch, np.round(x0), x0)
+    nlp = replace(nlp, x0=np.clip(x0, nlp.lbx, nlp.ubx))
+    return nlp, layout, form
+
+
+def rounded(values: Float) -> Float:
+    """Numbers to BITS significant bits, so that last bits which a processor decides are gone.
+
+    The step is a power of 2, hence exact. Two values that differ by d = 1e-15 relative come out
+    different with a probability of about 2 ** BITS * d, one in a thousand million.
+    """
+    values = np.asarray(values, float)
+    exponent = np.frexp(np.where(np.isfinite(values), values, 0.0))[1]
+    step = np.ldexp(1.0, np.maximum(exponent - BITS, FLOOR))
+    # whole numbers stay: the shift is less than a step
+    exact = np.floor(values / step + (1 - SHIFT)) * step
+    return np.where(np.isfinite(values), exact, values)
+
+
+def constant_depth(data: EnergyData) -> Soup:
+    """Planes that face the camera at one depth, moved as their mean flow says, without rotation."""
+    n = len(data)
+    target = np.add.reduce(data.pixel_target, axis=1) / data.pixel_target.shape[1]
+    source = np.add.reduce(data.pixel_ray, axis=1) / data.pixel_ray.shape[1]
+    K = data.K_next
+    focal, centre = np.array([K[0, 0], K[1, 1]]), np.array([K[0, 2], K[1, 2]])
+    shift = np.zeros((n, 3))
+    shift[:, :2] = (target - centre) / focal - source[:, :2]
+    ones = np.ones(n)
+    normal = np.tile([0.0, 0.0, -1.0], (n, 1))
+    return Soup(ones, normal, ones, np.tile(np.eye(3), (n, 1, 1)), shift)
+
+
+def problems(chosen: Sequence[Instance]) -> Iterator[tuple[str, int, list[Instance]]]:
+    """Scene, size and the instances of both: what one render serves."""
+    for scene, size in dict.fromkeys((i.scene, i.size) for i in chosen):
+        yield scene, size, [i for i in chosen if (i.scene, i.size) == (scene, size)]

@@ -1,0 +1,128 @@
+"""Results of solvers on the family in a form that belongs to no solver, and their verification."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import ExportError
+from soup_nlp.export.program import orders, take_apart
+from soup_nlp.export.residuals import Kind, kind
+from soup_nlp.export.sol import Sol, read_sol
+from soup_nlp.export.verify import Limits, Residuals, examine, violations
+from soup_nlp.family.frozen import load_frozen
+from soup_nlp.family.instances import VERSION, build_instance, case_of, parse_name
+from soup_nlp.storage.store import write_json
+
+Float = NDArray[np.float64]
+
+FEASIBLE = 1e-6
+"""Largest violation that a verified point may have."""
+TOLERANCE = 1e-4
+"""Dual infeasibility and complementarity that `compare` asks for; ten times that is verified."""
+FIELDS = ("solver", "name", "n", "m", "status", "objective", "iterations", "time")
+"""What a result must have; everything else is welcome."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A solver's point on an instance, recomputed.
+
+    Attributes:
+        sol: The solver's file.
+        objective: Of its point.
+        best: Best known objective.
+        residuals: Unscaled KKT residuals.
+        kinds: Violations of bounds and rows.
+        n: Variables.
+        m: Rows.
+    """
+
+    sol: Sol
+    objective: float
+    best: float
+    residuals: Residuals
+    kinds: list[Kind]
+    n: int
+    m: int
+
+    @property
+    def verified(self) -> bool:
+        """A point on the constraints with small KKT residuals."""
+        r = self.residuals
+        return r.primal <= FEASIBLE and r.within(Limits(tol=TOLERANCE))
+
+    def __str__(self) -> str:
+        r, gap = self.residuals, (self.objective - self.best) / abs(self.best)
+        said = self.sol.message.splitlines()[0] if self.sol.message else "no message"
+        word = "verified" if self.verified else "not verified"
+        return "\n".join(
+            [
+                f"solver      {said} ({self.sol.status}, code {self.sol.code}): {word}",
+                f"objective   {self.objective:.9g}, best known {self.best:.9g}, gap {gap:+.2e}",
+                f"residuals   primal {r.primal:.1e}  dual {r.dual:.1e}  complementarity"
+                f" {r.complementarity:.1e}  (unscaled; multipliers: {r.multipliers})",
+            ]
+        )
+
+
+def check_sol(path: Path) -> Verdict:
+    """Read `<name>.sol`, the answer to the instance of that name, and recompute what it claims.
+
+    The instance is built again; nothing of the .nl file beside it is used.
+
+    Raises:
+        ConfigError: the name is none of the family.
+        ExportError: the file cannot be read.
+    """
+    instance = parse_name(path.stem)
+    record = load_frozen(instance.scene, instance.size)
+    case = case_of(record)
+    nlp = build_instance(case, record, instance.formulation, instance.start)[0]
+    best = build_instance(case, record, instance.formulation, "best")[0].x0
+    program = take_apart(nlp.groups, nlp.nx, nlp.ng, nlp.p[: len(nlp.theta)])
+    sol = read_sol(path, *orders(program))
+    with np.errstate(all="ignore"):
+        return Verdict(
+            sol,
+            float(nlp.oracle(sol.x, nlp.p)[0]),
+            float(nlp.oracle(best, nlp.p)[0]),
+            examine(nlp, sol.x, sol.lam_g).residuals,
+            [kind(k, v, FEASIBLE, False) for k, v in violations(nlp, sol.x).items()],
+            nlp.nx,
+            nlp.ng,
+        )
+
+
+def write_results(path: Path, rows: list[dict[str, Any]], note: dict[str, Any]) -> None:
+    """Write results, whole or not at all.
+
+    Args:
+        path: The JSON file.
+        rows: Each with FIELDS.
+        note: Machine, limits and what else is equal for all rows.
+    """
+    write_json(path, {"set": "SOUP", "version": VERSION, **note, "results": rows})
+
+
+def read_results(path: Path) -> list[dict[str, Any]]:
+    """Results of a file.
+
+    Raises:
+        ExportError: it cannot be read, or a row lacks a field.
+    """
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))["results"]
+        missing = [f"row {k}: {f}" for k, row in enumerate(rows) for f in FIELDS if f not in row]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ExportError("results cannot be read", where=path, found=error) from error
+    if missing:
+        raise ExportError(
+            "results lack a field", where=path, found=missing[0], expected=", ".join(FIELDS)
+        )
+    return list(rows)

@@ -1,0 +1,172 @@
+"""The family as a folder: .nl files with names, best known points, index, README, licence."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from soup_nlp import __version__
+from soup_nlp.data.pair import Pair
+from soup_nlp.export.names import readable_names
+from soup_nlp.export.nl import NLFile, write_nl
+from soup_nlp.export.sol import write_sol
+from soup_nlp.export.verify import examine
+from soup_nlp.family.describe import classes, classification, qualification, sizes
+from soup_nlp.family.frozen import Frozen, load_frozen
+from soup_nlp.family.instances import VERSION, Instance, build_instance, case_of, problems
+from soup_nlp.family.pages import LICENCE, readme
+from soup_nlp.model.nlp import NLP
+from soup_nlp.pipeline.case import Case
+from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.store import write_json
+
+Entry = dict[str, Any]
+
+DIGITS = 9
+"""Of numbers in the index: more would depend on the processor."""
+
+
+def published() -> dict[str, Any]:
+    """What was measured on this version: checksums, and who reached the best known points."""
+    path = files("soup_nlp.family") / "records" / "published.json"
+    return dict(json.loads(path.read_text(encoding="utf-8")))
+
+
+def write_family(
+    folder: Path, chosen: Sequence[Instance], say: Callable[[str], None] = print
+) -> list[Entry]:
+    """Write instances with their index into an existing folder.
+
+    Args:
+        folder: Where everything goes.
+        chosen: See `instances.select`.
+        say: Called with a line per instance.
+
+    Returns:
+        The index's entries. "published" says whether the bytes are those of the published
+        version, None where that has no such instance.
+
+    Raises:
+        DataError: the package has no record of a size, or the folder cannot be written.
+    """
+    known, entries = published(), []
+
+    @cache
+    def rendered(scene: str) -> Pair:
+        return load_frozen(scene, chosen[0].size).problem.load_pair()
+
+    for scene, size, own in problems(chosen):
+        record = load_frozen(scene, size)
+        case = case_of(record, rendered(scene))
+        for form in dict.fromkeys(i.formulation for i in own):
+            starts = [i for i in own if i.formulation == form]
+            shared: Entry = {}
+            for instance in starts:
+                nlp, layout, _ = build_instance(case, record, form, instance.start)
+                names = readable_names(nlp, layout)
+                file = write_nl(folder / f"{instance.name}.nl", nlp, names=names)
+                shared = shared or _solved(folder, case, record, instance, file, known)
+                entries.append(_entry(instance, nlp, file, shared, known))
+                say(_line(entries[-1]))
+    index = {"set": "SOUP", "version": VERSION, "generator": f"soup_nlp {__version__}"}
+    write_json(folder / "index.json", {**index, "instances": entries})
+    write_text(folder / "index.csv", as_csv(entries))
+    write_text(folder / "README.md", readme(entries))
+    write_text(folder / "LICENSE.txt", LICENCE)
+    return entries
+
+
+def _line(entry: Mapping[str, Any]) -> str:
+    """An instance in a line."""
+    changed = "  NOT the published bytes" if entry["published"] is False else ""
+    return (
+        f"{entry['file']:<52} n {entry['variables']:>6}  m {entry['constraints']:>6}"
+        f"  {entry['bytes'] / 1e6:5.1f} MB{changed}"
+    )
+
+
+def _solved(
+    folder: Path,
+    case: Case,
+    record: Frozen,
+    instance: Instance,
+    file: NLFile,
+    known: Mapping[str, Any],
+) -> Entry:
+    """Best known point of a problem, written as .sol, and what holds for all of its starts."""
+    nlp = build_instance(case, record, instance.formulation, "best")[0]
+    x = nlp.x0
+    message = f"SOUP {VERSION}: best known point of {instance.problem}"
+    order = file.variables, file.rows
+    write_sol(folder / f"{instance.problem}.sol", x, None, *order, message)
+    found = classes(nlp)
+    r = examine(nlp, x, None).residuals
+    return {
+        "superpixels": len(case),
+        **sizes(nlp, file),
+        **found,
+        "classification": classification(nlp, found),
+        **qualification(nlp, x),
+        "best_known": {
+            "objective": _short(nlp.oracle(x, nlp.p)[0]),
+            "sol": f"{instance.problem}.sol",
+            **{k: _short(getattr(r, k), 2) for k in ("primal", "dual", "complementarity")},
+            "found_by": None,
+            "reached_by": [],
+            "tried_by": [],
+            "date": None,
+            **known["solved"].get(instance.problem, {}),
+        },
+    }
+
+
+def _entry(
+    instance: Instance, nlp: NLP, file: NLFile, shared: Entry, known: Mapping[str, Any]
+) -> Entry:
+    """The index's entry of an instance that was written."""
+    sha = known["sha256"].get(instance.name)
+    return {
+        "name": instance.name,
+        "file": file.path.name,
+        "scene": instance.scene,
+        "formulation": instance.formulation,
+        "size": instance.size,
+        "start": instance.start,
+        **shared,
+        "objective_at_start": _short(nlp.oracle(nlp.x0, nlp.p)[0]),
+        "bytes": file.size,
+        "sha256": file.sha256,
+        "published": None if sha is None else sha == file.sha256,
+    }
+
+
+def _short(value: Any, digits: int = DIGITS) -> float:
+    """A number with so many digits as do not depend on the processor."""
+    return float(f"{float(value):.{digits}g}")
+
+
+def as_csv(entries: Sequence[Entry]) -> str:
+    """The entries as a table; nested ones have a dot in their column."""
+    rows = [_flat(e) for e in entries]
+    head = list(dict.fromkeys(k for row in rows for k in row))
+    out = io.StringIO()
+    writer = csv.DictWriter(out, head, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def _flat(entry: Mapping[str, Any], before: str = "") -> Entry:
+    out: Entry = {}
+    for key, value in entry.items():
+        if isinstance(value, Mapping):
+            out |= _flat(value, f"{before}{key}.")
+        else:
+            out[before + key] = " ".join(value) if isinstance(value, list) else value
+    return out

@@ -1,0 +1,295 @@
+"""The SOUP family: names, the same bytes on every processor, index, best points, answers."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy import sparse
+
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import make_problem
+from soup_nlp.errors import ConfigError, DataError, ExportError
+from soup_nlp.export.names import readable_names
+from soup_nlp.export.nl import write_nl
+from soup_nlp.family import results, write
+from soup_nlp.family.describe import degree, rank
+from soup_nlp.family.freeze import record_of
+from soup_nlp.family.frozen import (
+    Frozen,
+    decoded,
+    encoded,
+    load_frozen,
+    read_frozen,
+    save_frozen,
+)
+from soup_nlp.family.instances import (
+    BITS,
+    SCENES,
+    SIZES,
+    STANDARD,
+    Instance,
+    build_instance,
+    case_of,
+    parse_name,
+    rounded,
+    select,
+)
+from soup_nlp.family.results import check_sol, read_results, write_results
+from soup_nlp.family.write import published, write_family
+from soup_nlp.geometry import rotation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.pipeline.case import prepare
+
+LIFTED = "free/epigraph/lifted"
+
+
+@pytest.fixture(scope="module")
+def record() -> Frozen:
+    """Sixty superpixels of a small room with the true flow; its best point is the proposal."""
+    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
+    own = {"input": scene, "segmentation": {"superpixels": 60}, "flow": {"source": "truth"}}
+    return record_of(prepare(make_problem(own)))
+
+
+@pytest.fixture(scope="module")
+def folder(record, tmp_path_factory):
+    """The set of that record, under the names of a published size."""
+    out = tmp_path_factory.mktemp("set")
+    patch = pytest.MonkeyPatch()
+    for module in (write, results):
+        patch.setattr(module, "load_frozen", lambda scene, size: record)
+    chosen = select([100], ["room"], [STANDARD]) + select([100], ["room"], [LIFTED], ["hard"])
+    lines: list[str] = []
+    write_family(out, chosen, lines.append)
+    assert len(lines) == len(chosen) == 4
+    yield out
+    patch.undo()
+
+
+# --- names ---------------------------------------------------------------------------------------
+
+
+def test_a_name_says_which_instance_it_is():
+    one = Instance("street", "free/epigraph/lifted", 250, "cold")
+    assert one.name == "SOUP-street-free-epigraph-lifted-N250-cold"
+    assert parse_name(one.name) == one
+    assert parse_name(one.problem).start == "easy"
+    # the gauge has a dash of its own
+    standard = Instance("orbit", STANDARD, 1000, "hard")
+    assert parse_name(standard.name) == standard
+    for wrong in ("SOUP-moon-free-smooth-smooth-N100-easy", "SOUP-street-free-N100-easy", "x"):
+        with pytest.raises(ConfigError, match="SOUP-SCENE"):
+            parse_name(wrong)
+
+
+def test_what_is_not_of_the_family_is_refused():
+    for sizes, scenes, starts in (
+        ([101], ["room"], ["easy"]),
+        ([100], ["moon"], ["easy"]),
+        ([100], ["room"], ["warm"]),
+        ([100], [], ["easy"]),
+    ):
+        with pytest.raises(ConfigError, match="not of the family"):
+            select(sizes, scenes, [STANDARD], starts)
+    with pytest.raises(ConfigError, match="unknown gauge"):
+        select([100], ["room"], ["loose"])
+    # a formulation may be shortened, and what is asked for twice is one
+    assert len(select([100, 100], ["room"], ["unit-offset", STANDARD], ["easy"])) == 1
+
+
+# --- the same bytes ------------------------------------------------------------------------------
+
+
+def test_rounding_takes_last_bits_away():
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=4000) * 10.0 ** rng.integers(-4, 4, 4000)
+    out = rounded(values)
+    assert (rounded(values * (1 + 4e-16)) == out).all()
+    assert (rounded(out) == out).all()
+    assert (np.abs(out / values - 1)[np.abs(values) > 1e-2] < 2.0 ** (1 - BITS)).all()
+    # numbers that are short stay, from whichever side they come
+    exact = np.array([0.0, 1.0, -1.0, 0.5, 435.5, -0.375])
+    for nudge in (0.0, 1e-15, -1e-15):
+        assert (rounded(exact + nudge) == exact).all()
+    assert rounded(np.array([np.inf, -np.inf])).tolist() == [np.inf, -np.inf]
+
+
+def test_a_soup_survives_its_record(record, tmp_path):
+    rng = np.random.default_rng(1)
+    n = rng.normal(size=(5, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    turn = rotation.exp(rng.uniform(-1, 1, (5, 3)))
+    one = np.ones(5)
+    soup = Soup(rng.uniform(0.5, 2, 5), n, one, turn, rng.normal(size=(5, 3)))
+    again = decoded(encoded(soup))
+    np.testing.assert_allclose(again.R, soup.R, atol=1e-15)
+    np.testing.assert_allclose(again.n, soup.n, atol=1e-15)
+    np.testing.assert_allclose(again.distance, soup.distance, rtol=1e-15)
+    np.testing.assert_allclose(again.translation, soup.translation, atol=1e-15)
+    save_frozen(tmp_path / "a.npz", record)
+    save_frozen(tmp_path / "b.npz", read_frozen(tmp_path / "a.npz"))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    with pytest.raises(DataError, match="record of the family"):
+        read_frozen(tmp_path / "c.npz")
+
+
+PROGRAM = """
+import hashlib, sys
+from pathlib import Path
+from soup_nlp.export.nl import write_nl
+from soup_nlp.family.frozen import read_frozen
+from soup_nlp.family.instances import STARTS, build_instance, case_of
+record = read_frozen(Path(sys.argv[1]))
+case = case_of(record)
+for form in ("unit-offset/smooth/smooth", "unit-translation/epigraph/lifted"):
+    for start in (*STARTS, "best"):
+        nlp = build_instance(case, record, form, start)[0]
+        print(write_nl(sys.argv[2], nlp).sha256)
+"""
+
+
+def test_two_processors_make_the_same_bytes(record, tmp_path):
+    save_frozen(tmp_path / "record.npz", record)
+    kernels = {
+        "new": {"OPENBLAS_CORETYPE": "Haswell"},
+        # numpy's own loops without vector instructions beyond the baseline as well
+        "old": {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4"},
+    }
+    made = {}
+    for name, variables in kernels.items():
+        command = [sys.executable, "-W", "ignore", "-c", PROGRAM]
+        made[name] = subprocess.run(
+            [*command, tmp_path / "record.npz", tmp_path / "x.nl"],
+            env={**os.environ, "OMP_NUM_THREADS": "1", **variables},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.split()
+    # the record's best point is its proposal, so that easy and hard are one here
+    assert len(made["new"]) == 8
+    assert len(set(made["new"])) == 6
+    assert made["new"] == made["old"]
+
+
+def test_the_package_has_a_record_of_every_size():
+    known = published()
+    for scene in SCENES:
+        for size in SIZES:
+            record = load_frozen(scene, size)
+            assert len(record.minimum) == record.labels.max() + 1
+            assert f"SOUP-{scene}-unit-offset-smooth-smooth-N{size}-easy" in known["sha256"]
+
+
+@pytest.mark.slow
+def test_an_instance_has_the_published_bytes(tmp_path):
+    instance = Instance("orbit", STANDARD, 100, "hard")
+    record = load_frozen("orbit", 100)
+    nlp, layout, _ = build_instance(case_of(record), record, STANDARD, "hard")
+    file = write_nl(tmp_path / "x.nl", nlp, names=readable_names(nlp, layout))
+    assert file.sha256 == published()["sha256"][instance.name]
+
+
+# --- the folder ----------------------------------------------------------------------------------
+
+
+def test_the_index_says_what_problem_sets_say(folder):
+    index = json.loads((folder / "index.json").read_text())
+    assert (index["set"], index["version"]) == ("SOUP", 1)
+    entries = {e["name"]: e for e in index["instances"]}
+    easy = entries["SOUP-room-unit-offset-smooth-smooth-N100-easy"]
+    n = easy["superpixels"]
+    assert easy["variables"] == 16 * n
+    assert easy["constraints"] == 16 * n + 1
+    assert easy["classification"] == f"OQR2-MN-{16 * n}-{16 * n + 1}"
+    kinds = easy["constraint_classes"]
+    assert kinds["so3"] == {"rows": 6 * n, "class": "quadratic", "kind": "equality"}
+    assert kinds["visible"]["class"] == kinds["simplex"]["class"] == "linear"
+    # seven equalities a superpixel and the simplex, all independent
+    assert easy["licq"]
+    assert easy["active_rank"] == easy["active_rows"] >= 7 * n + 1
+    assert easy["published"] is False
+    lifted = entries["SOUP-room-free-epigraph-lifted-N100-hard"]
+    assert lifted["classification"].startswith("QOR2-MY")
+    # the three starts are one problem
+    starts = [entries[f"SOUP-room-unit-offset-smooth-smooth-N100-{s}"] for s in ("hard", "cold")]
+    assert starts[1]["objective_at_start"] > 2 * starts[0]["objective_at_start"]
+    assert starts[0]["best_known"] == easy["best_known"]
+    rows = list(csv.DictReader((folder / "index.csv").open(encoding="utf-8")))
+    assert [r["name"] for r in rows] == list(entries)
+    assert float(rows[0]["best_known.objective"]) == easy["best_known"]["objective"]
+    assert "CC BY 4.0" in (folder / "LICENSE.txt").read_text()
+    assert easy["sha256"][:16] in (folder / "README.md").read_text()
+
+
+def test_a_best_point_is_read_back_as_the_answer_that_it_is(folder):
+    # the proposal stands for the best point here: on the constraints, but no minimum
+    verdict = check_sol(folder / "SOUP-room-unit-offset-smooth-smooth-N100.sol")
+    assert verdict.objective == verdict.best
+    assert verdict.residuals.primal < 1e-14
+    assert verdict.residuals.dual > 1e-3
+    assert not verdict.verified
+    assert "gap +0.00e+00" in str(verdict)
+
+
+def test_an_answer_off_the_constraints_is_told(folder, tmp_path, capsys):
+    text = (folder / "SOUP-room-unit-offset-smooth-smooth-N100.sol").read_text().splitlines()
+    first = text.index("Options") + 9
+    text[first] = repr(float(text[first]) + 0.5)
+    path = tmp_path / "SOUP-room-unit-offset-smooth-smooth-N100-hard.sol"
+    path.write_text("\n".join(text) + "\n")
+    assert main(["check", str(path)]) == 1
+    assert "FAIL rows" in capsys.readouterr().out
+
+
+def test_other_files_are_not_overwritten(tmp_path, capsys):
+    (tmp_path / "mine.txt").write_text("mine")
+    assert main(["family", str(tmp_path), "--sizes", "100"]) == 2
+    assert "holds other files" in capsys.readouterr().err
+    assert main(["family", str(tmp_path / "new"), "--sizes", "99"]) == 2
+    assert not (tmp_path / "new").exists()
+
+
+# --- words and numbers of the index --------------------------------------------------------------
+
+
+def test_degree_of_an_expression():
+    x, p = ca.SX.sym("x", 3), ca.SX.sym("p")
+    for value, expected in (
+        (p**3, 0),
+        (p**2 * x[0] + 3, 1),
+        (x[0] * x[1] + p, 2),
+        (x[0] / x[1], 3),
+        (ca.sqrt(x[0] ** 2 + 1), 3),
+    ):
+        assert degree(value, x) == expected
+
+
+def test_rank_of_a_sparse_matrix():
+    rng = np.random.default_rng(2)
+    blocks = [rng.normal(size=(5, 4)), rng.normal(size=(3, 6)), np.outer([1, 2, 3.0], [1, 1.0])]
+    matrix = sparse.block_diag(blocks, format="csr").tolil()
+    # a row across all blocks, and one of zeros
+    matrix = sparse.vstack([matrix, np.ones((1, 12)), np.zeros((1, 12))]).tocsr()
+    assert rank(matrix) == np.linalg.matrix_rank(matrix.toarray()) == 9
+    assert rank(sparse.csr_matrix((3, 4))) == 0
+    assert rank(sparse.identity(4, format="csr")) == 4
+
+
+def test_results_are_solver_neutral(tmp_path):
+    row = {
+        "solver": "own 1.0", "name": "SOUP-x", "n": 2, "m": 1, "status": "optimal",
+        "objective": 1.0, "iterations": 3, "time": 0.5,
+    }  # fmt: skip
+    write_results(tmp_path / "r.json", [row], {"machine": "any"})
+    assert read_results(tmp_path / "r.json") == [row]
+    del row["time"]
+    write_results(tmp_path / "r.json", [row], {})
+    with pytest.raises(ExportError, match="lack a field"):
+        read_results(tmp_path / "r.json")
