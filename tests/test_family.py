@@ -82,7 +82,7 @@ def test_a_name_says_which_instance_it_is():
     assert parse_name(one.name) == one
     assert parse_name(one.problem).start == "easy"
     # the gauge has a dash of its own
-    standard = Instance("orbit", STANDARD, 1000, "hard")
+    standard = Instance("orbit", STANDARD, 250, "hard")
     assert parse_name(standard.name) == standard
     for wrong in ("SOUP-moon-free-smooth-smooth-N100-easy", "SOUP-street-free-N100-easy", "x"):
         with pytest.raises(ConfigError, match="SOUP-SCENE"):
@@ -214,9 +214,10 @@ def test_the_index_says_what_problem_sets_say(folder):
     # seven equalities a superpixel and the simplex, all independent
     assert easy["licq"]
     assert easy["active_rank"] == easy["active_rows"] >= 7 * n + 1
+    # another program under the same name
     assert easy["published"] is False
     lifted = entries["SOUP-room-free-epigraph-lifted-N100-hard"]
-    assert lifted["classification"].startswith("QOR2-MY")
+    assert lifted["classification"].startswith("OOR2-MY")
     # the three starts are one problem
     starts = [entries[f"SOUP-room-unit-offset-smooth-smooth-N100-{s}"] for s in ("hard", "cold")]
     assert starts[1]["objective_at_start"] > 2 * starts[0]["objective_at_start"]

@@ -192,7 +192,6 @@ app = _group(
     "Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.",
     COMMANDS,
 )
-<<<<<<< HEAD
 app.add_typer(_group("Measure over many runs; tables, plots and gates.", BENCH), name="bench")
 
 
@@ -204,34 +203,3 @@ def every(
     ] = False,
 ) -> None:
     """Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program."""
-=======
-bench = typer.Typer(no_args_is_help=True, help="Measure over many runs; tables, plots and gates.")
-COMMANDS: dict[typer.Typer, dict[str, Callable[..., None]]] = {
-    app: {
-        "solve": solve,
-        "check": check,
-        "evaluate": evaluate,
-        "show": show,
-        "list": list_,
-        "export": export,
-        "import": import_,
-        "family": family,
-        "compare": compare,
-    },
-    bench: {
-        "accuracy": accuracy,
-        "speed": speed,
-        "search": search,
-        "refine": bench_studies.refine,
-        "methods": bench_studies.methods,
-        "formulations": bench_studies.formulations,
-        "cut-off": bench_studies.cut_off,
-        "trws": bench_studies.trws,
-        "all": bench_all.command(main),
-    },
-}
-for group, commands in COMMANDS.items():
-    for name, function in commands.items():
-        group.command(name=name)(function)
-app.add_typer(bench, name="bench")
->>>>>>> a9d8b3a (Add the SOUP family: a named, versioned set of NLPs with the same bytes on every processor)

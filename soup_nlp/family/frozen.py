@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -96,7 +97,7 @@ def decoded(numbers: Float) -> Soup:
 
 def save_frozen(path: Path, record: Frozen) -> None:
     """Write a record, whole or not at all; the same record gives the same bytes."""
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "problem": np.frombuffer(record.text.encode(), np.uint8),
         # differences along rows are mostly 0
         "labels": np.diff(record.labels, axis=1, prepend=0).astype(np.int16),
