@@ -179,7 +179,8 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
     )
     data, weights = build_energy(problem, pair, seg, start)
     options = solver_options(problem, start)
-    return Case(problem, pair, seg, start, rounded_data(data), weights, start.soup, options)
+    data = rounded_data(data)
+    return Case(problem, pair, seg, start, data, weights, start.soup, options, seen=pair)
 
 
 def rounded_data(data: EnergyData) -> EnergyData:
