@@ -8,11 +8,19 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from soup_nlp.evaluate.confidence import information, marginals, spread_in_image
+from soup_nlp.evaluate.confidence import (
+    POWER,
+    SIGMA_PRIOR,
+    calibrated,
+    information,
+    marginals,
+    spread_in_image,
+)
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.solve import selected_inverse
 from soup_nlp.solve.selected_inverse import BlockCholesky, dissect
+from soup_nlp.solve.tangent_problem import TangentProblem
 
 FORM = Formulation(compiled=False)
 
@@ -132,3 +140,86 @@ def test_a_superpixel_without_flow_is_less_sure(small_room, info):
     without = information(small_room.soup, data, small_room.weights, FORM)
     before, after = (marginals(i, seg.sizes, one).plane[blind, 0, 0] for i in (info, without))
     assert after > 1.5 * before
+
+
+def test_calibration_is_capped_where_nothing_is_known():
+    assert calibrated(np.array([0.0, 1e9]), 0.1).tolist() == [0.0, SIGMA_PRIOR]
+    one, two = calibrated(np.array([0.01, 0.02]), 0.1)
+    assert two / one == pytest.approx(2**POWER)
+    assert calibrated(np.array([0.01]), 0.2)[0] == pytest.approx(two)
+
+
+@pytest.mark.slow
+def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room):
+    """Gaussian noise on the flow: log depths of 200 answers spread as the information predicts.
+
+    Without truncation and with a smoothing wider than all residuals the energy is nearly quadratic:
+    `w |r|^2 / (2 eps)` a norm. The gradient's covariance under noise of variance s^2 is then
+    s^2 times the information F of E_proj with weights w^2 / eps, and that of the answer
+    `S F S s^2` with the inverse S of the whole information.
+    """
+    draws, wide, noise = 200, 300.0, 0.05
+    data, n = small_room.data, len(small_room)
+    free = dict.fromkeys(("sigma_proj", "sigma_cont", "sigma_cont_ref", "sigma_arap"), np.inf)
+    weights = small_room.weights.replace(**free, sigma_orient=np.inf)
+    problem = TangentProblem(small_room.soup, data, weights, FORM, chart="inverse-depth")
+    problem.smoothing(wide)
+    nlp, mean = problem.nlp, np.zeros(9 * n)
+    mean[::9] = -small_room.segmentation.sizes / small_room.segmentation.sizes.sum()
+
+    def held(matrix: np.ndarray) -> np.ndarray:
+        """Inverse where the mean log depth is held."""
+        scale = 1 / np.sqrt(np.abs(matrix.diagonal()))
+        row = mean * scale / np.linalg.norm(mean * scale)
+        inner = matrix * np.outer(scale, scale)
+        kkt = np.block([[inner, row[:, None]], [row[None], np.zeros((1, 1))]])
+        return np.linalg.inv(kkt)[:-1, :-1] * np.outer(scale, scale)
+
+    def inverse(x: np.ndarray, kind: str) -> np.ndarray:
+        upper = problem.upper.copy()
+        upper.data = problem.hessian(x, np.zeros((n, problem.rims + 5)), kind)
+        dense = upper.toarray()
+        return held(dense + np.triu(dense, 1).T)
+
+    x = nlp.x0.copy()
+    for k in range(40):
+        step = inverse(x, "gauss-newton" if k < 30 else "exact") @ problem.gradient(x)
+        while problem.value(x - step) > problem.value(x) and np.abs(step).max() > 1e-9:
+            step = step / 2
+        x = x - step
+    newton = inverse(x, "exact")
+    assert np.abs(newton @ problem.gradient(x)).max() < 1e-9
+    parameters, targets = _with_targets(problem, wide)
+    rng = np.random.default_rng(0)
+    spread = np.empty((draws, n))
+    for k in range(draws):
+        p = parameters.copy()
+        p[targets] += rng.normal(0, noise, targets.shape)
+        y = x - newton @ np.asarray(nlp.grad_f(x, p)[1]).ravel()
+        y -= newton @ np.asarray(nlp.grad_f(y, p)[1]).ravel()
+        spread[k] = -np.log(y[::9] / x[::9])
+    at = problem.layout.unpack(x)
+    S = held(information(at, data, weights, FORM, wide).matrix.toarray())
+    own = dict.fromkeys(("arap", "cont", "orient", "prior"), 0.0)
+    flow = replace(data, pixel_weight=(weights.proj * data.pixel_weight) ** 2 / wide)
+    F = information(at, flow, weights.replace(**own, proj=1.0), FORM, wide).matrix.toarray()
+    predicted = noise * np.sqrt((S @ F @ S).diagonal()[::9])
+    ratio = spread.std(axis=0) / predicted
+    # 200 draws know a standard deviation to 5 %
+    assert abs(np.median(ratio) - 1) < 0.1
+    assert np.mean(np.abs(ratio - 1) < 0.2) > 0.9
+
+
+def _with_targets(problem: TangentProblem, smoothing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters of the NLP, and where the flow's targets stand in them: (E, 2)."""
+    nlp = problem.nlp
+    p = nlp.with_theta(eps=smoothing, eps_pixel=smoothing)
+    place = len(nlp.theta)
+    for group in nlp.groups:
+        rows, width = group.table.data.shape
+        if group.kernel.name == "t_proj":
+            # weight, truncation, ray (3), target (2)
+            at = place + width * np.arange(rows)[:, None] + [5, 6]
+            return p, at
+        place += rows * width
+    raise AssertionError("no re-projection")

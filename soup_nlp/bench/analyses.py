@@ -10,6 +10,7 @@ from types import MappingProxyType
 from soup_nlp.bench import analyses_report as reports
 from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
 from soup_nlp.bench.analyses_measures import VIEWS, measure_energy, measure_flow, measure_view
+from soup_nlp.bench.confidence import measure_confidence, plot_confidence, text_confidence
 from soup_nlp.bench.rows import MeasureRows, Row, measure_all
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import Listing
@@ -130,6 +131,14 @@ _ALL = (
         dict.fromkeys(VIEWS, ()),
         "view",
         function=measure_view,
+    ),
+    Analysis(
+        "confidence",
+        "how well sigma of log depth tells large errors from small ones, and its calibration",
+        {"": ()},
+        function=measure_confidence,
+        page=text_confidence,
+        plot=plot_confidence,
     ),
     Analysis(
         "energy",

@@ -17,7 +17,7 @@ from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.formulation import Formulation, FormulationOptions
 from soup_nlp.model.layout import TangentLayout
 from soup_nlp.model.reweighting import LEAST_NOISE, MOST_NOISE
 from soup_nlp.solve.selected_inverse import BlockCholesky
@@ -51,7 +51,11 @@ class Information:
 
 
 def information(
-    soup: Soup, data: EnergyData, weights: Weights, form: Formulation, smoothing: float = SMOOTHING
+    soup: Soup,
+    data: EnergyData,
+    weights: Weights,
+    form: FormulationOptions,
+    smoothing: float = SMOOTHING,
 ) -> Information:
     """The information of the energy at a soup.
 
@@ -62,7 +66,8 @@ def information(
         form: Visibility and whether kernels are compiled; constraints carry no information.
         smoothing: Width of all norms, pixels.
     """
-    problem = TangentProblem(soup, data, weights, form, exact=False, chart="inverse-depth")
+    whole = Formulation.make(dict(form))
+    problem = TangentProblem(soup, data, weights, whole, exact=False, chart="inverse-depth")
     problem.smoothing(smoothing)
     x = problem.nlp.x0
     slacks = np.zeros((problem.layout.count, problem.rims + 5))
@@ -151,7 +156,7 @@ SIGMA_PRIOR = 0.5
 """Standard deviation of log depth where the pair says nothing: scenes vary by about that much."""
 PRIOR_SHARE = 0.01
 """Factor of E_prior in the information: it holds depth where nothing else does, knowing little."""
-FACTOR, POWER = 15.0, 1.25
+FACTOR, POWER = 14.0, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
 MIN_CONFIDENCE = 0.5
 """A pixel whose confidence, 1 - sigma / `SIGMA_PRIOR`, is less is a guess."""
@@ -167,8 +172,7 @@ class Confidence:
         sigma: (H, W) calibrated standard deviation of log depth, the global scale left out.
         spread: (H, W) standard deviation of log depth as the marginals have it.
         marginals: Of the planes and of the components' scales.
-        noise: Of the flow, pixels: median re-projection error of the start, within the limits
-            that E_prior has.
+        noise: Of the flow, pixels, see `flow_noise`.
     """
 
     sigma: Float
@@ -187,6 +191,17 @@ class Confidence:
         return calibrated(np.sqrt(self.marginals.component), self.noise)
 
 
+def flow_noise(start: Start) -> float:
+    """Noise of the flow, pixels: the start's median re-projection error, within E_prior's limits.
+
+    Where surfaces bend every superpixel has a motion of its own, which fits the flow whatever its
+    errors are: the largest noise is assumed.
+    """
+    if start.bending:
+        return MOST_NOISE
+    return float(np.clip(np.median(start.error), LEAST_NOISE, MOST_NOISE))
+
+
 def calibrated(spread: Float, noise: float) -> Float:
     """Standard deviation of log depth that errors keep to, at most `SIGMA_PRIOR`.
 
@@ -201,7 +216,7 @@ def confidence(
     soup: Soup,
     data: EnergyData,
     weights: Weights,
-    form: Formulation,
+    form: FormulationOptions,
     labels: NDArray[np.int32],
     K_ref: Float,
     start: Start,
@@ -222,5 +237,5 @@ def confidence(
     sizes = np.bincount(labels.ravel(), minlength=len(soup))
     own = marginals(info, sizes, start.component)
     spread = spread_in_image(info, own.plane, labels, K_ref)
-    noise = float(np.clip(np.median(start.error), LEAST_NOISE, MOST_NOISE))
+    noise = flow_noise(start)
     return Confidence(calibrated(spread, noise), spread, own, noise)

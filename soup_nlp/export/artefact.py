@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import ConfigError
+from soup_nlp.evaluate.confidence import Information, information
 from soup_nlp.export.manifest import (
     FUNCTIONS,
     MANIFEST,
@@ -34,6 +36,10 @@ from soup_nlp.storage.versions import versions
 Float = NDArray[np.float64]
 
 FORMATS = ("nl", "casadi", "h5")
+INFORMATION = (
+    "triu Gauss-Newton information of E at the start in nine coordinates a superpixel: relative"
+    " inverse depth at the anchor, its slopes (2), rotation (3), shift of the anchor (3)"
+)
 CHOICES = {"gauge": GAUGES, "norm": NORMS, "truncation": TRUNCATIONS}
 """Values of each part of a formulation, in the order of its label."""
 
@@ -114,7 +120,8 @@ def export_case(
     # the functions are of no use without parameters, start and bounds
     if "h5" in formats or "casadi" in formats:
         attrs = {k: manifest[k] for k in ("name", "problem_hash", "formulation", "smoothing")}
-        _write_start_h5(folder / f"{STUB}.h5", nlp, names, attrs)
+        info = information(case.soup, case.data, case.weights, form)
+        _write_start_h5(folder / f"{STUB}.h5", nlp, names, attrs, info)
         files.append(f"{STUB}.h5")
     write_json(folder / MANIFEST, manifest)
     return manifest
@@ -156,15 +163,20 @@ def fingerprint(case: Case, nlp: NLP, layout: MatrixLayout) -> dict[str, float]:
 
 
 def _write_start_h5(
-    path: Path, nlp: NLP, names: tuple[list[str], list[str]], attrs: dict[str, object]
+    path: Path,
+    nlp: NLP,
+    names: tuple[list[str], list[str]],
+    attrs: dict[str, object],
+    info: Information,
 ) -> None:
-    """Write sizes, bounds, parameters, sparsities and values at the start.
+    """Write sizes, bounds, parameters, sparsities and values at the start, and the information.
 
     Args:
         path: The .h5 file.
         nlp: The NLP; its Hessian is written as it is, with lam_f = 1 and lam_g = 1.
         names: Of variables and constraints.
         attrs: Root attributes.
+        info: Gauss-Newton information at the start.
     """
     f, grad = nlp.grad_f(nlp.x0, nlp.p)
     g, jac = nlp.jac_g(nlp.x0, nlp.p)
@@ -173,8 +185,8 @@ def _write_start_h5(
     def vector(value: object, text: str, letter: str) -> Array:
         return Array(np.asarray(value, float).ravel(), "1", text, letter)
 
-    def matrix(value: object, text: str) -> dict[str, Array]:
-        m = to_scipy(value).tocoo()
+    def matrix(value: sparse.spmatrix, text: str) -> dict[str, Array]:
+        m = value.tocoo()
         return {
             "row": Array(m.row.astype(np.int64), "1", "row of every entry", "Z"),
             "column": Array(m.col.astype(np.int64), "1", "column of every entry", "Z"),
@@ -195,8 +207,8 @@ def _write_start_h5(
             "f": Array(np.float64(f), "1", "objective"),
             "g": vector(g, "constraints", "G"),
             "grad_f": vector(grad, "gradient of the objective", "X"),
-            "jac_g": matrix(jac, "Jacobian of g"),
-            "hess_lag": matrix(hess, f"triu Hessian, lam_f = lam_g = 1 ({nlp.hessian})"),
+            "jac_g": matrix(to_scipy(jac), "Jacobian of g"),
+            "hess_lag": matrix(to_scipy(hess), f"triu Hessian, lam_f = lam_g = 1 ({nlp.hessian})"),
         },
     }
     write_h5(path, tree, attrs)

@@ -296,7 +296,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     before, middle = dense(case.start.soup), dense(solution.soup)
     after = middle if refined is None else dense(refined.soup)
     between = middle if refined is not None and solution.stages else None
-    form = case.formulation()
+    form = case.problem.formulation
     own = refined.soup if refined else solution.soup
     sure = confidence(own, case.data, case.weights, form, labels, pair.K_ref, case.start)
     after = replace(after, sigma_ref=sure.sigma)

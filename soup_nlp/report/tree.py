@@ -110,7 +110,7 @@ _CONFIDENCE: Table = {
     ),
     "spread": ("1", "H,W", "standard deviation of log z by the marginals, not calibrated"),
     "component_sigma": ("1", "C", "standard deviation of a rigid component's log scale"),
-    "noise": ("px", "", "median re-projection error of the start, which the calibration uses"),
+    "noise": ("px", "", "noise of the flow that the calibration uses"),
 }
 _IPOPT = {
     "obj": "objective of the solver's form",

@@ -1,0 +1,256 @@
+"""The analysis of confidence: sparsification against single cues, and calibration by family."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.bench.rows import Row
+from soup_nlp.bench.suite_pairs import Item
+from soup_nlp.bench.tables import (
+    codes,
+    failures,
+    figure,
+    joined,
+    made,
+    mean,
+    save,
+    show,
+    table,
+    titles,
+)
+from soup_nlp.data.pair import Truth
+from soup_nlp.errors import DataError
+from soup_nlp.evaluate.confidence import (
+    FACTOR,
+    POWER,
+    SIGMA_PRIOR,
+    Information,
+    confidence,
+    information,
+    spread_in_image,
+)
+from soup_nlp.evaluate.metrics import sample_at_points, true_pixels
+from soup_nlp.evaluate.sparsification import coverage, sparsification
+from soup_nlp.pipeline.run import Run, run
+from soup_nlp.refine.costs import Particles
+from soup_nlp.refine.photometric import look
+
+Float = NDArray[np.float64]
+Chosen = Callable[[Float], Float]
+
+CUES = {
+    "sigma": "sigma as delivered",
+    "own": "the same information, but of each superpixel's own block alone",
+    "residual": "re-projection error of the start",
+    "flow": "1 - flow confidence",
+    "parallax": "(1 - flow confidence) / parallax",
+    "photo": "photometric disagreement of the solution (census)",
+}
+"""Uncertainties that are compared."""
+SAMPLE = 400
+"""Pixels of a pair that are kept for the calibration on other families."""
+WITHIN = 0.70
+"""Share of the pixels that FACTOR brings within one sigma."""
+LEAST_PARALLAX = 0.1
+"""Pixels of parallax below which the cue divides by this."""
+
+
+def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> Row:
+    """Sparsification of every cue and coverage of sigma on one pair.
+
+    Raises:
+        DataError: the pair has no true depth.
+    """
+    result = run(item.problem(overrides))
+    truth = result.pair.truth
+    if truth is None or (truth.depth_ref is None and truth.points is None):
+        raise DataError("pair has no true depth", where=item.key)
+    begin = time.process_time()
+    confidence(
+        result.soup,
+        result.data,
+        result.weights,
+        result.problem.formulation,
+        result.segmentation.labels,
+        result.pair.K_ref,
+        result.start,
+    )
+    seconds = time.process_time() - begin
+    z, gt = _where_true(truth, result.reconstruction.depth_ref)
+    true = true_pixels(gt, None) & np.isfinite(z)
+    scaled, gt = z[true] * float(np.median(gt[true] / z[true])), gt[true]
+
+    def chosen(image: Float) -> Float:
+        return _where_true(truth, image)[0][true]
+
+    relative, log = np.abs(scaled - gt) / gt, np.abs(np.log(scaled / gt))
+    cues = {name: chosen(image) for name, image in _cues(result).items()}
+    found = {name: sparsification(relative, cue) for name, cue in cues.items()}
+    sure = result.confidence
+    unit = chosen((sure.noise * sure.spread) ** POWER)
+    picked = np.linspace(0, len(log) - 1, min(SAMPLE, len(log))).astype(int)
+    own = found["sigma"]
+    return {
+        "status": result.solution.status,
+        "good": result.solved,
+        "metrics": {},
+        "confidence": {
+            "mre": float(relative.mean()),
+            **{name: result.metrics[name].mre for name in ("solution_90", "solution_70")},
+            "ause": {name: one.ause for name, one in found.items()},
+            "within": coverage(log, cues["sigma"]),
+            "guess": sure.guessed,
+            "noise": sure.noise,
+            "seconds": seconds,
+            "curve": [own.kept.tolist(), own.error.tolist(), own.oracle.tolist()],
+            "sample": np.stack([log[picked], unit[picked]]).round(6).tolist(),
+        },
+    }
+
+
+def _where_true(truth: Truth, image: Float) -> tuple[Float, Float]:
+    if truth.depth_ref is not None:
+        return image, truth.depth_ref
+    assert truth.points is not None
+    return sample_at_points(image, truth.points)
+
+
+def _cues(result: Run) -> dict[str, Float]:
+    """(H, W) uncertainties by name."""
+    labels, start, pair = result.segmentation.labels, result.start, result.pair
+    assert pair.flow is not None
+    doubt = 1.0 - pair.flow.confidence.astype(float)
+    out = {
+        "sigma": result.confidence.sigma,
+        "own": _own_block(result),
+        "residual": start.error[labels],
+        "flow": doubt,
+        "parallax": (0.02 + doubt) / np.maximum(start.parallax, LEAST_PARALLAX)[labels],
+    }
+    photo = look(pair, labels, result.soup, result.problem.refine)
+    if photo is not None:
+        out["photo"] = photo.costs(Particles.of(result.soup), photo.unit(result.soup))[:, 0][labels]
+    return out
+
+
+def _own_block(result: Run) -> Float:
+    """Conditional standard deviation: every superpixel while all others are held."""
+    info: Information = information(
+        result.soup, result.data, result.weights, result.problem.formulation
+    )
+    n = len(result.soup)
+    at = np.arange(9 * n).reshape(n, 9)
+    blocks = np.asarray(info.matrix[at.repeat(9), np.tile(at, 9).ravel()]).reshape(n, 9, 9)
+    plane = np.linalg.pinv(blocks, rcond=1e-12, hermitian=True)[:, :3, :3]
+    return spread_in_image(info, plane, result.segmentation.labels, result.pair.K_ref)
+
+
+def left_out(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
+    """By family: FACTOR as the others would choose it, and the coverage of 1, 2 sigma with it."""
+    samples: dict[str, list[Float]] = {}
+    for row in rows:
+        samples.setdefault(row["sequence"], []).append(np.array(row["confidence"]["sample"]))
+    out = {}
+    for family, own in samples.items():
+        others = [s for name, several in samples.items() if name != family for s in several]
+        if not others:
+            continue
+        # every pair counts alike
+        ratio = np.concatenate([np.quantile(e / u, np.linspace(0, 1, 101)) for e, u in others])
+        factor = float(np.quantile(ratio, WITHIN))
+        told = [coverage(e, np.minimum(factor * u, SIGMA_PRIOR)) for e, u in own]
+        one, two = (float(np.mean(k)) for k in zip(*told))
+        out[family] = factor, one, two
+    return out
+
+
+def text_confidence(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
+    """Tables by pair and by family."""
+    good = [r for r in rows if r.get("confidence")]
+    lines = [f"# Analysis: {name}", "", f"{text[0].upper()}{text[1:]}. {note}", "", made(rows), ""]
+    lines += [
+        "AUSE / MRE is the area between the sparsification curve and the oracle's, over the mean"
+        " relative error: 0 is perfect, 0.8 to 1 is chance. Within k: share of the pixels whose"
+        " log depth is within k sigma, one median scale a pair.",
+        "",
+    ]
+    used = [c for c in CUES if any(c in r["confidence"]["ause"] for r in good)]
+    head = ["pair", "flow", "MRE", "surest 90 %", "surest 70 %"]
+    head += [*(f"AUSE {c}" for c in used), "within 1", "within 2", "guess", "CPU s"]
+    lines += table(head, [_line(n, r, used) for n, r in zip(titles(good), good, strict=True)])
+    lines += ["", *(f"- {c}: {CUES[c]}" for c in used), "", "## By family", ""]
+    lines += [
+        f"FACTOR, shipped as {FACTOR:g}, is chosen for each family on all others, so that"
+        f" {WITHIN:.0%} of their pixels lie within one sigma; every pair counts alike.",
+        "",
+    ]
+    lines += table(*_families(good, used))
+    return joined([*lines, "", *failures(rows), codes(rows)])
+
+
+def _line(title: str, row: Row, used: Sequence[str]) -> list[str]:
+    c: Mapping[str, Any] = row["confidence"]
+    return [
+        title,
+        row["flow"],
+        *(show(c[k]) for k in ("mre", "solution_90", "solution_70")),
+        *(show(c["ause"].get(k), ".3f") for k in used),
+        *(show(k, ".2f") for k in c["within"]),
+        show(c["guess"], ".1%"),
+        show(c["seconds"], ".1f"),
+    ]
+
+
+def _families(good: Sequence[Row], used: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """Head and lines of the table by family; the last line is the mean of the families."""
+    told, lines, numbers = left_out(good), [], []
+    for family in dict.fromkeys(r["sequence"] for r in good):
+        own = [r["confidence"] for r in good if r["sequence"] == family]
+        area = [mean([c["ause"].get(k) for c in own]) for k in used]
+        within = [float(np.mean([c["within"][k] for c in own])) for k in (0, 1)]
+        factor, *left = told.get(family, (None, None, None))
+        numbers.append([*area, *within, *left])
+        lines.append(
+            [f"{family} ({len(own)})", *_shown(numbers[-1], len(used)), show(factor, ".1f")]
+        )
+    last = [mean(column) for column in zip(*numbers)]
+    lines.append([f"mean of {len(numbers)} families", *_shown(last, len(used)), ""])
+    head = ["family (pairs)", *(f"AUSE {c}" for c in used), "within 1", "within 2"]
+    return [*head, "left out: within 1", "left out: within 2", "FACTOR of the others"], lines
+
+
+def _shown(numbers: Sequence[Any], areas: int) -> list[str]:
+    return [show(v, ".3f" if k < areas else ".2f") for k, v in enumerate(numbers)]
+
+
+def plot_confidence(path: Path, rows: Sequence[Row]) -> None:
+    """Sparsification curves: sigma and the oracle, a panel a family."""
+    good = [r for r in rows if r.get("confidence")]
+    families = list(dict.fromkeys(r["sequence"] for r in good))
+    across = min(4, max(1, len(families)))
+    down = -(-len(families) // across)
+    out = figure(3.0 * across, 2.4 * down)
+    axes = out.subplots(down, across, squeeze=False)
+    for ax in axes.ravel()[len(families) :]:
+        ax.set_visible(False)
+    for ax, family in zip(axes.ravel(), families):
+        for row in (r for r in good if r["sequence"] == family):
+            kept, own, best = np.array(row["confidence"]["curve"])
+            whole = row["confidence"]["mre"]
+            ax.plot(100 * (1 - kept), own / whole, color="#4477aa", lw=1)
+            ax.plot(100 * (1 - kept), best / whole, color="#bbbbbb", lw=1)
+        ax.axhline(1.0, color="#cc6677", lw=0.8, ls="--")
+        ax.set(title=family, ylim=(0, 1.3), xlim=(0, 100))
+        ax.title.set_fontsize(9)
+    for ax in axes[-1]:
+        ax.set_xlabel("most uncertain % removed")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("MRE of the rest / MRE")
+    out.suptitle("Sparsification: sigma (blue), oracle (grey), chance (dashed)", fontsize=10)
+    save(out, path)

@@ -1,0 +1,108 @@
+"""Sparsification, coverage and their table, by hand-made examples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soup_nlp.bench.confidence import left_out, text_confidence
+from soup_nlp.errors import DataError
+from soup_nlp.evaluate.confidence import POWER
+from soup_nlp.evaluate.sparsification import LAST, STEPS, coverage, sparsification
+
+ERROR = np.linspace(0.0, 1.0, 1001)
+
+
+def test_the_errors_themselves_are_a_perfect_uncertainty():
+    found = sparsification(ERROR[::-1], 3 * ERROR[::-1])
+    assert found.ause == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(found.error, found.oracle)
+    assert found.kept[0] == 1.0
+    assert found.kept[-1] == LAST
+    assert len(found.kept) == STEPS
+
+
+def test_the_area_of_a_linear_error():
+    """The mean of what the oracle keeps is kept / 2; sorted the wrong way it is 1 - kept / 2."""
+    kept = np.linspace(1.0, LAST, STEPS)
+    worst = sparsification(ERROR, -ERROR)
+    np.testing.assert_allclose(worst.oracle, kept / 2, atol=2e-3)
+    np.testing.assert_allclose(worst.error, 1 - kept / 2, atol=2e-3)
+    assert worst.ause == pytest.approx(np.mean(1 - kept) / 0.5, abs=5e-3)
+
+
+def test_an_uncertainty_by_chance_keeps_the_mean():
+    rng = np.random.default_rng(0)
+    found = sparsification(rng.permutation(np.repeat(ERROR, 20)), rng.uniform(size=20020))
+    kept = np.linspace(1.0, LAST, STEPS)
+    assert found.ause == pytest.approx(np.mean(0.5 - kept / 2) / 0.5, abs=0.03)
+
+
+def test_no_error_has_no_area():
+    assert sparsification(np.zeros(5), np.arange(5.0)).ause == 0.0
+
+
+@pytest.mark.parametrize(
+    ("error", "uncertainty", "words"),
+    [
+        ([1.0, 2.0], [1.0], "do not fit"),
+        ([], [], "do not fit"),
+        ([-1.0], [1.0], "not negative"),
+        ([np.nan], [1.0], "finite"),
+        ([1.0], [np.nan], "not NaN"),
+    ],
+)
+def test_what_cannot_be_sorted_is_refused(error, uncertainty, words):
+    with pytest.raises(DataError, match=words):
+        sparsification(error, uncertainty)
+
+
+def test_coverage_counts_what_lies_within():
+    assert coverage([0.5, -1.5, 2.5, 1.0], [1.0, 1.0, 1.0, 1.0]) == [0.5, 0.75]
+
+
+def row(family: str, pair: str, scale: float) -> dict:
+    rng = np.random.default_rng(3)
+    unit = rng.uniform(0.5, 2.0, 2000) ** POWER
+    return {
+        "sequence": family,
+        "pair": pair,
+        "suite": "rendered",
+        "flow": "dis",
+        "variant": "",
+        "presets": ["paper"],
+        "confidence": {
+            "mre": 0.05,
+            "solution_90": 0.04,
+            "solution_70": 0.03,
+            "ause": {"sigma": 0.2, "flow": 0.5},
+            "within": [0.7, 0.9],
+            "guess": 0.1,
+            "noise": 0.1,
+            "seconds": 0.5,
+            "curve": [[1.0, 0.5], [0.05, 0.02], [0.05, 0.01]],
+            "sample": [
+                (scale * unit * np.abs(rng.normal(size=2000)) * 1e-3).tolist(),
+                unit.tolist(),
+            ],
+        },
+    }
+
+
+def test_the_factor_of_a_family_is_chosen_on_the_others():
+    """Errors of 1 and of 2 thousandths: each family is judged by the other's factor."""
+    told = left_out([row("one", "a", 1.0), row("two", "b", 2.0)])
+    # 70 % of a Gaussian lie within 1.04 standard deviations
+    assert told["one"][0] == pytest.approx(2.07e-3, rel=0.05)
+    assert told["two"][0] == pytest.approx(1.04e-3, rel=0.05)
+    assert told["one"][1] == pytest.approx(0.96, abs=0.02)
+    assert told["two"][1] == pytest.approx(0.40, abs=0.03)
+
+
+def test_the_page_has_pairs_and_families():
+    text = text_confidence(
+        "confidence", "what it asks", [row("one", "a", 1.0), row("two", "b", 2.0)]
+    )
+    assert "| a" in text
+    assert "| two (1) |" in text
+    assert "mean of 2 families" in text
