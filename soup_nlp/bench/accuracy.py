@@ -24,8 +24,9 @@ from soup_nlp.config.problem import Problem, dump_problem
 from soup_nlp.data.flow.sources import is_named, is_network
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import depth_metrics, sample_at_points, scene_flow_epe, skill
+from soup_nlp.evaluate.metrics import depth_metrics, scene_flow_epe, skill
 from soup_nlp.evaluate.protocols import Preset, preset
+from soup_nlp.evaluate.scoring import SURE, at_truth, most_certain
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.run import Run, run
 from soup_nlp.report.folder import prepare_folder, write_folder
@@ -164,7 +165,8 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
     sparse points, is left out.
     """
     maps = depth_maps(result)
-    tables = {name: _metrics(result.pair.truth, maps, preset(name)) for name in presets}
+    sigma = result.reconstruction.sigma_ref
+    tables = {name: _metrics(result.pair.truth, maps, preset(name), sigma) for name in presets}
     metrics = {name: table for name, table in tables.items() if table}
     main = next(iter(metrics), "")
     return {
@@ -210,18 +212,24 @@ def _applies(truth: Truth | None, convention: Preset) -> bool:
 
 
 def _metrics(
-    truth: Truth | None, maps: Mapping[str, Float], convention: Preset
+    truth: Truth | None,
+    maps: Mapping[str, Float],
+    convention: Preset,
+    sigma: Float | None = None,
 ) -> dict[str, dict[str, float]]:
     """Metrics of every method under one convention; {} where it does not apply."""
     if truth is None or "constant" not in maps or not _applies(truth, convention):
         return {}
+    scored = {method: at_truth(truth, depth) for method, depth in maps.items()}
+    if sigma is not None:
+        estimate, gt = scored["solution"]
+        unsure, _ = at_truth(truth, sigma)
+        for name, share in SURE.items():
+            kept = np.where(most_certain(gt, unsure, share), gt, np.nan)
+            if convention.counts(kept):
+                scored[name] = estimate, kept
     out: dict[str, dict[str, float]] = {}
-    for method, depth in maps.items():
-        if truth.depth_ref is not None:
-            estimate, gt = depth, truth.depth_ref
-        else:
-            assert truth.points is not None
-            estimate, gt = sample_at_points(depth, truth.points)
+    for method, (estimate, gt) in scored.items():
         m = convention.score(estimate, gt).as_dict()
         out[method] = {k: m[k] for k in KEPT}
     for m in out.values():

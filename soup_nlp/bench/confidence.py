@@ -24,7 +24,6 @@ from soup_nlp.bench.tables import (
     table,
     titles,
 )
-from soup_nlp.data.pair import Truth
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import (
     FACTOR,
@@ -35,7 +34,8 @@ from soup_nlp.evaluate.confidence import (
     information,
     spread_in_image,
 )
-from soup_nlp.evaluate.metrics import sample_at_points, true_pixels
+from soup_nlp.evaluate.metrics import true_pixels
+from soup_nlp.evaluate.scoring import at_truth
 from soup_nlp.evaluate.sparsification import coverage, sparsification
 from soup_nlp.pipeline.run import Run, run
 from soup_nlp.refine.costs import Particles
@@ -82,12 +82,12 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
         result.start,
     )
     seconds = time.process_time() - begin
-    z, gt = _where_true(truth, result.reconstruction.depth_ref)
+    z, gt = at_truth(truth, result.reconstruction.depth_ref)
     true = true_pixels(gt, None) & np.isfinite(z)
     scaled, gt = z[true] * float(np.median(gt[true] / z[true])), gt[true]
 
     def chosen(image: Float) -> Float:
-        return _where_true(truth, image)[0][true]
+        return at_truth(truth, image)[0][true]
 
     relative, log = np.abs(scaled - gt) / gt, np.abs(np.log(scaled / gt))
     cues = {name: chosen(image) for name, image in _cues(result).items()}
@@ -112,13 +112,6 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
             "sample": np.stack([log[picked], unit[picked]]).round(6).tolist(),
         },
     }
-
-
-def _where_true(truth: Truth, image: Float) -> tuple[Float, Float]:
-    if truth.depth_ref is not None:
-        return image, truth.depth_ref
-    assert truth.points is not None
-    return sample_at_points(image, truth.points)
 
 
 def _cues(result: Run) -> dict[str, Float]:

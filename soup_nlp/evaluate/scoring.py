@@ -61,7 +61,7 @@ def score_depths(
     for name, depth in depths.items():
         if truth.depth_ref is None and truth.points is None:
             break
-        estimate, gt = _at_truth(truth, depth)
+        estimate, gt = at_truth(truth, depth)
         if not true_pixels(gt, cap).any():
             break
         out[name] = depth_metrics(estimate, gt, scale=scale, cap=cap)
@@ -69,8 +69,8 @@ def score_depths(
             out["constant"] = depth_metrics(np.ones(gt.shape), gt, scale=scale, cap=cap)
     if sigma is not None and "solution" in out:
         for name, share in SURE.items():
-            estimate, gt = _at_truth(truth, depths["solution"])
-            unsure = _at_truth(truth, sigma)[0]
+            estimate, gt = at_truth(truth, depths["solution"])
+            unsure = at_truth(truth, sigma)[0]
             kept = np.where(most_certain(gt, unsure, share), gt, np.nan)
             out[name] = depth_metrics(estimate, kept, scale=scale, cap=cap)
     gt_next = truth.depth_next
@@ -79,7 +79,7 @@ def score_depths(
     return out
 
 
-def _at_truth(truth: Truth, image: Float) -> tuple[Float, Float]:
+def at_truth(truth: Truth, image: Float) -> tuple[Float, Float]:
     """Values of an image (H, W) where truth is known, and the true depth there."""
     if truth.depth_ref is not None:
         return image, truth.depth_ref
