@@ -70,7 +70,7 @@ _START: Table = {
         "1",
         "N",
         "what gives its component a scale: 0 largest, 1 contact below, 2 outline,"
-        " 3 cut off below, 4 nothing",
+        " 3 cut off below, 4 nothing, 5 ground",
     ),
     "bending_share": ("1", "", "share that moves unlike most of its surface"),
     "bending": ("1", "", "surfaces are taken to bend"),

@@ -102,9 +102,10 @@ BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 UNKNOWN = np.log(100.0)
 """Contact and pace that differ by more, in logarithms, say nothing: the camera is at rest."""
-TIES = ("reference", "contact below", "outline", "cut off below", "nothing")
+TIES = ("reference", "contact below", "outline", "cut off below", "nothing", "ground")
 """What gives a component its scale: it is the largest one, which has the scene's; it stands on what
-is below it; it touches what is around it; the lower border hides what it stands on; or nothing."""
+is below it; it touches what is around it; the lower border hides what it stands on; nothing; or
+the ground bounds it, where it would be below."""
 UNSUPPORTED = 1e-6
 """Added to the share of a component's support that is placed: without any, longer contacts
 first."""

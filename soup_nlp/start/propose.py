@@ -25,8 +25,15 @@ from soup_nlp.start.choice import (
     select,
     smooth_choice,
 )
-from soup_nlp.start.components import borrow, connected_labels, contact_scales, rigid_components
+from soup_nlp.start.components import (
+    TIES,
+    borrow,
+    connected_labels,
+    contact_scales,
+    rigid_components,
+)
 from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.ground import above_ground
 from soup_nlp.start.merge import gather
 from soup_nlp.start.plane_fit import Views
 from soup_nlp.start.start_options import SeededStart
@@ -146,7 +153,14 @@ def propose(
     soup = _soup(mu, slope, choice.R, t, views.anchor, views.radius)
     component = rigid_components(label, seg)
     scale, tie = contact_scales(soup, component, seg, K_ref, o.upright)
-    soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t).normalised()
+    soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t)
+    if o.upright and o.ground:
+        scene = component == np.argmax(np.bincount(component))
+        known = scene & ~weak & (views.weight.mean(axis=1) > 0.5)
+        area = np.bincount(seg.labels.ravel()).astype(float)
+        soup, lifted = above_ground(soup, views.anchor, area, known, component, o.seed)
+        tie = np.where(lifted, TIES.index("ground"), tie)
+    soup = soup.normalised()
     error = own.cost[:, 0]
     return Start(soup, error, parallax, weak, label, component, motions, surface, tie, share)
 

@@ -34,6 +34,9 @@ class StartOptions(Section):
     upright: bool = True
     """The image's columns run down: components stand on what is below them. Off, a component is
     scaled to touch whatever it touches first."""
+    ground: bool = True
+    """In an upright image nothing lies below a level plane that much of the scene lies on: what has
+    no depth of its own, and components, are lifted to it."""
 
 
 class SeededStart(StartOptions):

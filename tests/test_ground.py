@@ -1,0 +1,84 @@
+"""Nothing lies below the ground: what has no depth of its own is lifted to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.start.ground import above_ground, ground
+
+HIGH, FAR = 1.5, 30.0
+"""Height of the camera, and distance of a wall."""
+
+
+@pytest.fixture
+def scene() -> tuple[np.ndarray, np.ndarray]:
+    """Rays of a grid, and the depth of a road that ends at a wall."""
+    v, u = np.mgrid[-0.4:0.4:20j, -0.8:0.8:30j]
+    ray = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3)
+    Z = np.where(ray[:, 1] > HIGH / FAR, HIGH / np.maximum(ray[:, 1], 1e-6), FAR)
+    return ray, Z
+
+
+def facing(Z: np.ndarray) -> Soup:
+    """Planes parallel to the image at these depths, all with the same translation."""
+    n = np.tile([0.0, 0.0, -1.0], (len(Z), 1))
+    R = np.broadcast_to(np.eye(3), (len(Z), 3, 3))
+    return Soup(Z, n, np.ones(len(Z)), R, np.array([0.0, 0.0, -1.0]) / Z[:, None])
+
+
+def lift(ray, Z, known, component):
+    return above_ground(facing(Z), ray, np.ones(len(Z)), known, component, 0)
+
+
+def test_what_is_not_known_comes_up_to_the_road(scene):
+    ray, Z = scene
+    lost = (ray[:, 1] > 0.2) & (ray[:, 0] > 0.5)
+    assert 0.02 < lost.mean() < 0.2
+    given = np.where(lost, 40.0, Z)
+    soup, lifted = lift(ray, given, ~lost, np.zeros(len(Z), int))
+    np.testing.assert_allclose(soup.depth_at(ray), Z, rtol=1e-9)
+    # the scene keeps its motion
+    np.testing.assert_allclose(soup.translation, facing(given).translation, rtol=1e-12)
+    assert not lifted.any()
+
+
+def test_a_component_is_lifted_as_one(scene):
+    """Its shape stays, and so does what its flow says: translation and depth change alike."""
+    ray, Z = scene
+    car = (ray[:, 1] > 0.2) & (ray[:, 0] > 0.5)
+    given = np.where(car, 40.0 + ray[:, 0], Z)
+    soup, lifted = lift(ray, given, ~car, car.astype(int))
+    np.testing.assert_array_equal(lifted, car)
+    ratio = soup.depth_at(ray) / given
+    translation = soup.translation[:, 2] / facing(given).translation[:, 2]
+    np.testing.assert_allclose(ratio, translation, rtol=1e-9)
+    # one factor, but for what would still lie below
+    common = np.median(Z[car] / given[car])
+    assert np.isclose(ratio[car], common).mean() > 0.5
+    assert (soup.depth_at(ray)[car] < Z[car] / 0.8 * (1 + 1e-9)).all()
+
+
+@pytest.mark.parametrize("why", ["below", "steep", "nothing level"])
+def test_without_a_ground_nothing_moves(scene, why):
+    ray, Z = scene
+    known = np.ones(len(Z), bool)
+    if why == "below":
+        # a table: an eighth of what is well known is the floor beside it
+        Z = np.where((ray[:, 1] > 0.1) & (ray[:, 0] > 0.4), 2 * Z, Z)
+    elif why == "steep":
+        Z = 5 / (1 + 0.8 * ray[:, 1])
+    else:
+        Z = np.random.default_rng(0).uniform(3, 30, len(Z))
+    assert (ground(1 / Z, ray, np.ones(len(Z)), known, 0) == 0).all()
+
+
+def test_what_is_well_known_stays_below(scene):
+    """A ditch that is seen well is believed."""
+    ray, Z = scene
+    ditch = (ray[:, 1] > 0.3) & (np.abs(ray[:, 0]) < 0.1)
+    assert 0 < ditch.mean() < 0.05
+    given = np.where(ditch, 1.5 * Z, Z)
+    soup, _ = lift(ray, given, np.ones(len(Z), bool), np.zeros(len(Z), int))
+    np.testing.assert_allclose(soup.depth_at(ray), given, rtol=1e-12)
