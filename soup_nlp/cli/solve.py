@@ -54,6 +54,9 @@ def solve(
     depth: Annotated[str | None, typer.Option(help="True depth of the reference frame.")] = None,
     superpixels: Annotated[int | None, typer.Option(help="Wanted number N; default 1000.")] = None,
     neighbours: Annotated[int | None, typer.Option(help="K of the K-NN graph; default 15.")] = None,
+    max_size: Annotated[
+        float | None, typer.Option(help="Megapixels at which larger images are solved; 1.5.")
+    ] = None,
     no_refine: Annotated[
         bool, typer.Option("--no-refine", help="The NLP alone, as refine.enabled=false.")
     ] = False,
@@ -76,6 +79,7 @@ def solve(
     short = {
         "segmentation.superpixels": superpixels,
         "segmentation.neighbours": neighbours,
+        "max_size": max_size,
         "refine.enabled": "false" if no_refine else None,
         "refine.from_start": "true" if no_nlp else None,
     }

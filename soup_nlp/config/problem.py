@@ -98,6 +98,9 @@ class Problem(Section):
     """For titles."""
     input: Input
     """What to solve, by its kind."""
+    max_size: Positive | None = 1.5
+    """Largest reference image that is solved as it is, megapixels. A larger pair is solved at this
+    size, and its depth brought to the images' own size along their edges; null for no limit."""
     seed: Seed = 0
     """Of every random draw."""
     segmentation: SegmentationOptions = SegmentationOptions()

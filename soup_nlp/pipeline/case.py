@@ -11,7 +11,8 @@ from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_flow
 from soup_nlp.data.flow.robust import reweighted
 from soup_nlp.data.flow.sources import is_named
-from soup_nlp.data.pair import Pair
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.working_size import smaller_flow, working_size
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import Labels, segment
@@ -51,6 +52,7 @@ class Case:
         options: Stages and limits of the problem.
         seen: The pair as the photometric term sees it: without a layer that stands still before
             the scene, where there is one.
+        full: The pair at its own size, where it was larger than `max_size`; else None.
     """
 
     problem: Problem
@@ -62,6 +64,7 @@ class Case:
     soup: Soup
     options: SolverOptions
     seen: Pair
+    full: Pair | None = None
 
     def __len__(self) -> int:
         return len(self.segmentation)
@@ -104,10 +107,14 @@ def prepare(
         if on_stage:
             on_stage(stage)
 
-    pair = pair or problem.load_pair()
+    full = pair or problem.load_pair()
+    pair = working_size(full, problem.max_size)
     check_fits(problem, pair)
+    if pair is not full and log:
+        (h, w), (rows, columns) = full.size, pair.size
+        log(f"{w}x{h} is solved at {columns}x{rows} (max_size {problem.max_size:g} megapixels)")
     done("load")
-    flow = pair.flow or problem.flow.load(pair, problem.path)
+    flow = _flow(problem, full, pair)
     pair = pair.with_flow(flow)
     computed = is_named(flow.source) and not flow.source.startswith("truth")
     seen = see_through(pair, problem.seed) if problem.flow.see_through and computed else None
@@ -130,13 +137,23 @@ def prepare(
     done("start", start)
     data, weights = build_energy(problem, pair, seg, start)
     stages = solver_options(problem, start)
-    case = Case(problem, pair, seg, start, data, weights, start.soup, stages, seen or pair)
+    larger = None if pair.size == full.size else full
+    case = Case(problem, pair, seg, start, data, weights, start.soup, stages, seen or pair, larger)
     if not presolve:
         return case
     # one iteration of the constrained NLP is the smallest number that a solve has
     once = stages.replace(presolve=True, max_iter=1)
     answer = solve_soup(start.soup, data, weights, case.formulation(), once, say=log)
     return replace(case, soup=answer.soup)
+
+
+def _flow(problem: Problem, full: Pair, pair: Pair) -> Flow:
+    """The flow of a pair that was made smaller, or not; a file has the size of the images."""
+    if pair.flow is not None:
+        return pair.flow
+    if pair is full or not problem.flow.is_file():
+        return problem.flow.load(pair, problem.path)
+    return smaller_flow(problem.flow.load(full, problem.path), full, pair)
 
 
 def superpixels(problem: Problem, pair: Pair) -> Labels:

@@ -32,6 +32,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.pipeline.full_size import FullSize, full_size
 from soup_nlp.refine.mppbp import objective, refine_soup
 from soup_nlp.refine.photometric import look
 from soup_nlp.refine.records import Refined
@@ -65,6 +66,7 @@ class Run:
         confidence: How sure `reconstruction` is.
         refined: Result of the refinement of `solution`; None where it is off.
         nlp_reconstruction: Dense 3D of `solution`, where there is an NLP and it was refined.
+        full: Depth at the images' own size, where the pair was solved at a smaller one.
     """
 
     problem: Problem
@@ -82,6 +84,7 @@ class Run:
     confidence: Confidence
     refined: Refined | None = None
     nlp_reconstruction: Reconstruction | None = None
+    full: FullSize | None = None
 
     def __str__(self) -> str:
         h, w = self.pair.size
@@ -300,6 +303,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     own = refined.soup if refined else solution.soup
     sure = confidence(own, case.data, case.weights, form, labels, pair.K_ref, case.start)
     after = replace(after, sigma_ref=sure.sigma)
+    full = None if case.full is None else full_size(case.full, pair, after, expected)
     rigid = rigid_depth(pair) if pair.truth is not None else None
     depths = {"solution": after.depth_ref, "start": before.depth_ref}
     if between is not None:
@@ -324,6 +328,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         confidence=sure,
         refined=refined,
         nlp_reconstruction=between,
+        full=full,
     )
 
 

@@ -30,6 +30,9 @@ from soup_nlp.storage.versions import versions
 if TYPE_CHECKING:
     from soup_nlp.pipeline.run import Run
 
+FULL = {"ref_full": "depth_ref_full.png", "next_full": "depth_next_full.png"}
+"""Depth at the images' own size, where a pair was solved at a smaller one (`max_size`)."""
+
 FILES = (
     "config.yaml",
     "result.h5",
@@ -138,13 +141,14 @@ def _refuse_overwriting(folder: Path, inputs: Iterable[Path]) -> None:
                 "output folder is the input's folder",
                 "a folder of its own: depth and flow of a result would pass for truth",
             )
-        if place.parent == folder.resolve() and place.name in FILES:
+        if place.parent == folder.resolve() and place.name in (*FILES, *FULL.values()):
             raise refuse(
                 "an input would be overwritten by the result",
                 "a folder that holds none of the inputs under the name of a result's file",
                 place.name,
             )
-    found = [] if is_result(folder) else [name for name in FILES if (folder / name).exists()]
+    own = (*FILES, *FULL.values())
+    found = [] if is_result(folder) else [name for name in own if (folder / name).exists()]
     if found:
         raise refuse(
             "output folder holds files that would be overwritten and are of no earlier result",
@@ -187,7 +191,7 @@ def write_folder(
     else:
         (folder / PAGE).unlink(missing_ok=True)
     write_json(folder / "summary.json", {**told, "depth_png_scale": scales})
-    return [name for name in FILES if (folder / name).is_file()]
+    return [name for name in (*FILES, *FULL.values()) if (folder / name).is_file()]
 
 
 def summary(run: Run) -> dict[str, Any]:
@@ -222,6 +226,7 @@ def summary(run: Run) -> dict[str, Any]:
             "height": run.pair.size[0],
             **s.nlp,
         },
+        "full_size": _full_size(run),
         "start": {
             "motions": len(run.start.motions),
             "borrowed": int(run.start.borrowed.sum()),
@@ -232,6 +237,15 @@ def summary(run: Run) -> dict[str, Any]:
         "versions": versions(),
         "seed": run.problem.seed,
     }
+
+
+def _full_size(run: Run) -> dict[str, Any] | None:
+    """Size and score of the depth at the images' own size; None where that was solved."""
+    if run.full is None:
+        return None
+    height, width = run.full.depth_ref.shape
+    scores = run.full.metrics
+    return {"width": width, "height": height, "metrics": scores and scores.as_dict()}
 
 
 def _refinement(run: Run) -> dict[str, Any] | None:
@@ -256,6 +270,11 @@ def _pictures(folder: Path, run: Run, drawn: Mapping[str, Picture]) -> dict[str,
         name: write_clipped_depth_png16(folder / f"depth_{name}.png", depth)
         for name, depth in (("ref", rec.depth_ref), ("next", rec.depth_next))
     }
+    for name, file in FULL.items():
+        (folder / file).unlink(missing_ok=True)
+        if run.full is not None:
+            depth = getattr(run.full, f"depth_{name.removesuffix('_full')}")
+            scales[name] = write_clipped_depth_png16(folder / file, depth)
     for name, file in PICTURES.items():
         if name in drawn:
             write_picture(folder / file, drawn[name])

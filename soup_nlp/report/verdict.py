@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from soup_nlp.evaluate.metrics import DepthMetrics, skill
 from soup_nlp.evaluate.scoring import SURE
 from soup_nlp.report.certainty import certainty, certainty_lines
+from soup_nlp.report.depth_words import depth_words
 from soup_nlp.report.shown import PAGE
 
 if TYPE_CHECKING:
@@ -92,8 +93,10 @@ def facts(run: Run, limit: float | None = None) -> str:
     answer = "  ".join(f"{k} {s.residuals[k]:.1e}" for k in OF_ANSWER if k in s.residuals)
     if answer:
         lines.append(f"{PAD}Ipopt's answer: {answer}")
-    first, *rest = certainty_lines(certainty(run))
-    lines += [f"certainty   {first}", *(PAD + line for line in rest)]
+    shares = certainty(run)
+    said = {"depth": depth_words(run, shares), "certainty": certainty_lines(shares)}
+    for title, (first, *rest) in said.items():
+        lines += [f"{title:<12}{first}", *(PAD + line for line in rest)]
     if run.metrics:
         lines += [f"accuracy    {protocol(run.metrics)}"]
         lines += [PAD + line for line in accuracy(run.metrics)]

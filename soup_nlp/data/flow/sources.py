@@ -200,7 +200,7 @@ class FlowOptions(Section):
         return resolve_flow(pair, str(path(self.source)) if is_path(self.source) else self.source)
 
     def _load_with_confidence(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
-        if not is_path(self.source) or is_network(self.source):
+        if not self.is_file():
             raise ConfigError(
                 "a backward flow or a confidence goes with the file of a flow only",
                 where="flow.source",
@@ -213,6 +213,10 @@ class FlowOptions(Section):
         confidence = path(self.confidence) if self.confidence else None
         size = pair.image_next.shape[0], pair.image_next.shape[1]
         return with_confidence(flow, backward, confidence, size, self.dis)
+
+    def is_file(self) -> bool:
+        """Whether the source is the file of a flow."""
+        return is_path(self.source) and not is_network(self.source)
 
     def files(self) -> list[str]:
         """Names of the files that may be read; what is no file, such as "dis", is among them."""

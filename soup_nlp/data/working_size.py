@@ -1,0 +1,102 @@
+"""A pair at a smaller size: images, cameras, flow and truth together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.pair import Flow, Pair, Truth
+
+Float = NDArray[np.float64]
+Size = tuple[int, int]
+
+
+def working_size(pair: Pair, megapixels: float | None) -> Pair:
+    """The pair with a reference image of at most so many megapixels; itself where it is smaller.
+
+    Images and flow are averaged, the flow by its confidence; depths and labels of the truth are
+    those of the nearest pixel.
+
+    Args:
+        pair: Any pair.
+        megapixels: Largest size of the reference image; None for no limit.
+    """
+    height, width = pair.size
+    if megapixels is None or height * width <= megapixels * 1e6:
+        return pair
+    factor = np.sqrt(megapixels * 1e6 / (height * width))
+    ref, following = (_smaller(i.shape, factor) for i in (pair.image_ref, pair.image_next))
+    small = replace(
+        pair,
+        image_ref=_averaged(pair.image_ref, ref),
+        image_next=_averaged(pair.image_next, following),
+        K_ref=scaled_camera(pair.K_ref, pair.image_ref.shape, ref),
+        K_next=scaled_camera(pair.K_next, pair.image_next.shape, following),
+        flow=None,
+        truth=None if pair.truth is None else _truth(pair.truth, pair, ref, following),
+    )
+    return small if pair.flow is None else small.with_flow(smaller_flow(pair.flow, pair, small))
+
+
+def scaled_camera(K: Float, old: tuple[int, ...], new: Size) -> Float:
+    """(3, 3) intrinsics of an image (height, width, ...) that is resized to (height, width)."""
+    scale = np.array([new[1] / old[1], new[0] / old[0], 1.0])
+    out: Float = K * scale[:, None]
+    # pixel centres are at whole numbers
+    out[:2, 2] += 0.5 * scale[:2] - 0.5
+    return out
+
+
+def smaller_flow(flow: Flow, pair: Pair, small: Pair) -> Flow:
+    """The flow of a pair at the size of `small`, the same pair made smaller."""
+    size = small.size
+    confidence = _averaged(flow.confidence, size)
+    known = np.maximum(confidence, np.finfo(np.float32).tiny)
+    mean = _averaged(flow.uv * flow.confidence[..., None], size) / known[..., None]
+    uv = np.empty((*size, 2), np.float32)
+    at = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float32)[::-1]
+    for k in range(2):
+        own = pair.size[1 - k] / size[1 - k]
+        next_ = small.image_next.shape[1 - k] / pair.image_next.shape[1 - k]
+        # where the middle of a pixel goes, in pixels of the smaller next image
+        uv[..., k] = ((at[k] + 0.5) * own + mean[..., k]) * next_ - 0.5 - at[k]
+    uv[confidence == 0] = 0
+    return Flow(uv, np.clip(confidence, 0, 1), flow.source)
+
+
+def _smaller(shape: tuple[int, ...], factor: float) -> Size:
+    return max(1, round(shape[0] * factor)), max(1, round(shape[1] * factor))
+
+
+def _averaged(image: NDArray[Any], size: Size) -> NDArray[Any]:
+    return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA))
+
+
+def _nearest(values: NDArray[Any], size: Size) -> NDArray[Any]:
+    rows, columns = (
+        ((np.arange(n) + 0.5) * old / n).astype(int) for n, old in zip(size, values.shape)
+    )
+    return values[rows[:, None], columns]
+
+
+def _truth(truth: Truth, pair: Pair, ref: Size, following: Size) -> Truth:
+    """The truth at the sizes of the smaller images."""
+    (height, width) = pair.size
+    changed: dict[str, Any] = {}
+    for name in truth.known():
+        value = getattr(truth, name)
+        if name == "motions":
+            continue
+        if name == "points":
+            scale = np.array([ref[1] / width, ref[0] / height])
+            changed[name] = np.column_stack([(value[:, :2] + 0.5) * scale - 0.5, value[:, 2:]])
+        else:
+            changed[name] = _nearest(value, following if name == "depth_next" else ref)
+    if truth.flow is not None:
+        scale = np.array([following[1], following[0]]) / pair.image_next.shape[1::-1]
+        changed["flow"] = changed["flow"] * scale
+    return replace(truth, **changed)

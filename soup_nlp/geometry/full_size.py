@@ -1,0 +1,105 @@
+"""Depth at the full size of an image: superpixels grown along its edges, planes evaluated there."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.camera import rays
+
+Float = NDArray[np.float64]
+Labels = NDArray[np.int32]
+
+COLOUR = 0.1
+"""Standard deviation of colour differences, colours in [0, 1], of the weights of neighbours."""
+SPREAD = 0.7
+"""Standard deviation of distances, pixels of the small image."""
+ROWS = 128
+"""Rows that are computed at a time."""
+
+
+def grown_labels(labels: Labels, small: NDArray[np.uint8], image: NDArray[np.uint8]) -> Labels:
+    """Superpixels of a small image at the size of the large one, borders along its edges.
+
+    Joint bilateral upsampling (Kopf et al., 2007) of labels: near a border the 3 x 3 nearest pixels
+    of the small image vote, the more the nearer they are in place and colour.
+
+    Args:
+        labels: (h, w) superpixel of every pixel; -1 is a label too.
+        small: (h, w, 3) small image.
+        image: (H, W, 3) large image.
+
+    Returns:
+        (H, W) labels.
+    """
+    (h, w), (height, width) = labels.shape, image.shape[:2]
+    border = _borders(labels)
+    x = (np.arange(width) + 0.5) * (w / width) - 0.5
+    column = np.rint(x).astype(np.int64).clip(0, w - 1)
+    out = np.empty((height, width), np.int32)
+    for top in range(0, height, ROWS):
+        bottom = min(top + ROWS, height)
+        y = (np.arange(top, bottom) + 0.5) * (h / height) - 0.5
+        row = np.rint(y).astype(np.int64).clip(0, h - 1)
+        part = labels[row[:, None], column]
+        v, u = np.nonzero(border[row[:, None], column])
+        if len(v):
+            place = np.stack([y[v], x[u]])
+            part[v, u] = _voted(labels, small, image[top + v, u], place, row[v], column[u])
+        out[top:bottom] = part
+    return out
+
+
+def plane_depth(labels: Labels, normal: Float, offset: Float, K: Float) -> NDArray[np.float32]:
+    """(H, W) z of planes `normal . X + offset = 0`; NaN where a label is -1 or a plane turns away.
+
+    Args:
+        labels: (H, W) plane of every pixel.
+        normal: (N, 3), towards the camera.
+        offset: (N,).
+        K: (3, 3) intrinsics of the image.
+    """
+    height, width = labels.shape
+    out = np.empty((height, width), np.float32)
+    for top in range(0, height, ROWS):
+        own = labels[top : top + ROWS]
+        v, u = np.mgrid[top : top + len(own), 0:width]
+        facing = -np.einsum("hwc,hwc->hw", normal[own], rays(K, np.stack([u, v], axis=-1)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = offset[own] / facing
+        out[top : top + ROWS] = np.where((own >= 0) & (facing > 1e-6) & (z > 0), z, np.nan)
+    return out
+
+
+def _borders(labels: Labels) -> NDArray[np.bool_]:
+    """(h, w) whether another label is among the 3 x 3 pixels around a pixel."""
+    out = np.zeros(labels.shape, bool)
+    padded = np.pad(labels, 1, mode="edge")
+    height, width = labels.shape
+    for dv in range(3):
+        for du in range(3):
+            out |= padded[dv : dv + height, du : du + width] != labels
+    return out
+
+
+def _voted(
+    labels: Labels,
+    small: NDArray[np.uint8],
+    colour: NDArray[np.uint8],
+    place: Float,
+    row: NDArray[np.int64],
+    column: NDArray[np.int64],
+) -> Labels:
+    """(P,) label with the most votes for pixels of a colour (P, 3) at places (2, P) (y, x)."""
+    h, w = labels.shape
+    votes, weights = [], []
+    for dv in (-1, 0, 1):
+        for du in (-1, 0, 1):
+            r, c = (row + dv).clip(0, h - 1), (column + du).clip(0, w - 1)
+            far = (place[0] - r) ** 2 + (place[1] - c) ** 2
+            other = ((small[r, c].astype(np.float32) - colour) ** 2).sum(-1) / 255.0**2
+            weights.append(np.exp(-far / (2 * SPREAD**2) - other / (2 * COLOUR**2)))
+            votes.append(labels[r, c])
+    score = [sum(w * (one == of) for w, one in zip(weights, votes)) for of in votes]
+    best = np.argmax(score, axis=0)
+    return np.asarray(np.stack(votes)[best, np.arange(len(best))], np.int32)

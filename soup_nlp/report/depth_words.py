@@ -1,0 +1,50 @@
+"""What a run knows of depth without a truth: flow, parallax, components, what to try."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from soup_nlp.report.limits import SHARE, USABLE
+
+if TYPE_CHECKING:
+    from soup_nlp.pipeline.run import Run
+
+STILL = 0.3
+"""Share of the image without parallax from which other frames are recommended."""
+
+
+def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
+    """Lines of the verdict: usable flow, parallax, what moves, and what to try.
+
+    Args:
+        run: The run.
+        shares: Of the image, see `certainty.certainty`.
+    """
+    assert run.pair.flow is not None
+    usable = float((run.pair.flow.confidence > 0).mean())
+    lines = [f"flow usable at {usable:.0%} of the pixels"]
+    if run.start.bending:
+        lines.append("surfaces bend: their relief is weakly determined")
+    else:
+        pixels = np.sort(run.start.parallax[run.segmentation.labels].ravel())
+        lines[0] += f", median parallax {pixels[len(pixels) // 2]:.3g} px"
+    moving = [part.pixels / run.segmentation.labels.size for part in run.components.members[1:]]
+    large = [share for share in moving if share >= SHARE / 5]
+    if large:
+        sizes = ", ".join(f"{share:.0%}" for share in large)
+        lines.append(f"components beside the background: {len(large)} ({sizes} of the image)")
+    if run.full is not None:
+        (height, width), (h, w) = run.full.depth_ref.shape, run.pair.size
+        scored = "" if run.full.metrics is None else f": MRE {run.full.metrics.mre:.4f}"
+        lines.append(f"solved at {w}x{h}, brought to {width}x{height}{scored}")
+    hints = []
+    if usable < USABLE:
+        hints.append("a better flow (--flow), or frames closer in time")
+    if shares["still"] >= STILL:
+        hints.append("frames further apart: the camera has to move, not to turn alone")
+    if hints:
+        lines.append(f"try {'; '.join(hints)}")
+    return lines

@@ -1,0 +1,113 @@
+"""Large images: a pair made smaller stays the same scene, and depth comes back along edges."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.pair import Flow, Pair, Truth
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.data.working_size import scaled_camera, working_size
+from soup_nlp.geometry.camera import intrinsics, pixel_grid, project, rays
+from soup_nlp.geometry.full_size import grown_labels, plane_depth
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.run import run
+from soup_nlp.report.verdict import facts
+
+K = intrinsics(90.0, 80.0, 47.3, 30.1)
+
+
+def plane_pair(height=60, width=96) -> Pair:
+    """A plane seen by two cameras: flow and depth follow from it exactly."""
+    n, t = np.array([0.1, 0.2, -1.0]), np.array([0.3, -0.1, 0.2])
+    ray = rays(K, pixel_grid(height, width))
+    depth = 5.0 / -(ray @ n)
+    flow = project(K, depth[..., None] * ray + t) - pixel_grid(height, width)
+    confidence = np.ones((height, width), np.float32)
+    # unusable displacements must not be averaged into usable ones
+    flow[20:23, 20:23], confidence[20:23, 20:23] = 1e4, 0.0
+    image = np.full((height, width, 3), 128, np.uint8)
+    points = np.array([[10.0, 20.0, depth[20, 10]]])
+    truth = Truth(depth_ref=depth, flow=flow, points=points)
+    return Pair(image, image, K, K, Flow(flow.astype(np.float32), confidence), truth)
+
+
+def test_a_smaller_pair_sees_the_same_plane():
+    pair = plane_pair()
+    small = working_size(pair, 0.0026)
+    height, width = small.size
+    assert height * width <= 2600 * 1.02
+    assert small.flow is not None
+    n, t = np.array([0.1, 0.2, -1.0]), np.array([0.3, -0.1, 0.2])
+    ray = rays(small.K_ref, pixel_grid(height, width))
+    depth = 5.0 / -(ray @ n)
+    flow = project(small.K_next, depth[..., None] * ray + t) - pixel_grid(height, width)
+    # the average over a pixel differs from its centre by the second order of the flow
+    good = small.flow.confidence == 1
+    assert good.mean() > 0.95
+    np.testing.assert_allclose(small.flow.uv[good], flow[good], atol=0.02)
+    # the truth is that of the nearest pixel, half a pixel away at most
+    np.testing.assert_allclose(small.truth.depth_ref, depth, rtol=0.02)
+    at = small.truth.points[0]
+    assert 5.0 / -(rays(small.K_ref, at[:2]) @ n) == pytest.approx(at[2], rel=1e-12)
+
+
+def test_what_is_small_enough_is_not_touched():
+    pair = plane_pair()
+    assert working_size(pair, None) is pair
+    assert working_size(pair, 60 * 96 / 1e6) is pair
+
+
+def test_corners_of_a_resized_image_keep_their_rays():
+    other = scaled_camera(K, (60, 96), (20, 48))
+    corner, same = rays(K, [-0.5, -0.5]), rays(other, [-0.5, -0.5])
+    np.testing.assert_allclose(corner, same, rtol=1e-12)
+    np.testing.assert_allclose(rays(K, [95.5, 59.5]), rays(other, [47.5, 19.5]), rtol=1e-12)
+
+
+def test_labels_grow_to_the_edges_of_the_image():
+    height, width = 120, 160
+    v, u = np.mgrid[0:height, 0:width]
+    # a disc whose border is nowhere that of the small image
+    inside = np.hypot(u - 71.3, v - 63.7) < 37.2
+    image = np.where(inside[..., None], [200, 90, 40], [60, 120, 180]).astype(np.uint8)
+    size = (width // 4, height // 4)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    labels = cv2.resize(inside.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    grown = grown_labels(labels.astype(np.int32), small, image)
+    blocks = cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST)
+    assert (blocks != inside).sum() > 200
+    # what is left are pixels whose neighbours of the small image all lie on the other side
+    assert (grown != inside).sum() < 0.1 * (blocks != inside).sum()
+
+
+def test_planes_are_exact_at_every_pixel():
+    pair = plane_pair()
+    labels = np.zeros(pair.size, np.int32)
+    labels[:5] = -1
+    z = plane_depth(labels, np.array([[0.1, 0.2, -1.0]]), np.array([5.0]), K)
+    assert np.isnan(z[:5]).all()
+    np.testing.assert_allclose(z[5:], pair.truth.depth_ref[5:], rtol=1e-6)
+
+
+def test_a_large_pair_comes_back_at_its_size():
+    pair = render_scene("orbit", 0, 256, 128)
+    settings = {
+        "input": {"kind": "scene", "scene": "orbit", "width": 256, "height": 128},
+        "max_size": 0.012,
+        "flow": {"source": "truth"},
+        "segmentation": {"superpixels": 60, "neighbours": 6},
+        "refine": {"enabled": False},
+    }
+    done = run(make_problem(settings), pair=pair)
+    assert done.pair.size[0] * done.pair.size[1] <= 12_500
+    assert done.full.depth_ref.shape == (128, 256)
+    assert done.full.labels.shape == (128, 256)
+    known = np.isfinite(done.full.depth_next)
+    assert known.mean() > 0.9
+    # finer edges lose nothing
+    assert done.full.metrics.mre < 1.1 * done.metrics["solution"].mre
+    assert "brought to 256x128" in facts(done)
+    assert prepare(make_problem({**settings, "max_size": None})).full is None
