@@ -11,6 +11,7 @@ from hypothesis.extra.numpy import arrays
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate import recompute
 from soup_nlp.evaluate.metrics import (
+    component_overlaps,
     depth_metrics,
     sample_at_points,
     scene_flow_epe,
@@ -244,3 +245,13 @@ def test_presets_apply_cap_and_crop():
     with pytest.raises(DataError, match="unknown metric preset"):
         preset("papr")
     assert all(p.text and p.name in str(p) for p in PRESETS.values())
+
+
+def test_overlaps_of_components():
+    true = np.array([[0, 0, 0, 0], [0, 1, 1, -1], [2, 2, 2, 2]])
+    found = np.array([[0, 0, 0, 0], [3, 3, 3, 3], [0, 0, 2, 2]])
+    # component 1 has two pixels, of which 3 covers both; 3 has one more that is known
+    assert component_overlaps(found, true) == {0: (0, 4 / 7), 1: (3, 2 / 3), 2: (2, 0.5)}
+    assert component_overlaps(found, np.full((3, 4), -1)) == {}
+    with pytest.raises(DataError):
+        component_overlaps(found[:2], true)

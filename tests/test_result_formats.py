@@ -71,8 +71,7 @@ def test_ply_is_read_by_trimesh(tmp_path, result, frame):
 
 
 def test_ply_has_the_uncertainty_where_it_is_known(tmp_path, result):
-    rec = replace(result.reconstruction)
-    object.__setattr__(rec, "sigma_ref", np.full((60, 80), 0.25))
+    rec = replace(result.reconstruction, sigma_ref=np.full((60, 80), 0.25))
     write_formats(tmp_path, replace(result, reconstruction=rec), ["ply"])
     head = (tmp_path / "points_ref.ply").read_bytes().split(b"end_header")[0]
     assert b"property float sigma_log_depth" in head

@@ -275,3 +275,28 @@ def scene_flow_epe(
         "coverage": n / int(true.sum()),
         "n_pixels": n,
     }
+
+
+def component_overlaps(found: ArrayLike, true: ArrayLike) -> dict[int, tuple[int, float]]:
+    """The found component that covers each true one best, and their intersection over union.
+
+    Args:
+        found: (H, W) labels from 0.
+        true: (H, W) true labels from 0; negative where unknown, which counts nowhere.
+
+    Raises:
+        DataError: the shapes differ.
+    """
+    a, b = np.asarray(found), np.asarray(true)
+    if a.shape != b.shape:
+        raise DataError("maps of components differ in size", found=a.shape, expected=b.shape)
+    known = b >= 0
+    if not known.any():
+        return {}
+    a, b = a[known].astype(np.int64), b[known].astype(np.int64)
+    count = int(a.max()) + 1
+    both = np.bincount(b * count + a, minlength=count * (int(b.max()) + 1)).reshape(-1, count)
+    union = both.sum(axis=0) + both.sum(axis=1, keepdims=True) - both
+    share = both / np.maximum(union, 1)
+    there = np.flatnonzero(both.sum(axis=1))
+    return {int(k): (int(share[k].argmax()), float(share[k].max())) for k in there}

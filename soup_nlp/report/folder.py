@@ -12,7 +12,7 @@ import numpy as np
 from soup_nlp.data.datasets.layout import MARK, is_result
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import skill
+from soup_nlp.evaluate.metrics import component_overlaps, skill
 from soup_nlp.report.certainty import certainty
 from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture
 from soup_nlp.report.formats import write_formats
@@ -215,6 +215,7 @@ def summary(run: Run) -> dict[str, Any]:
             k: m.as_dict() | ({} if k == "solution_next" else {"skill": skill(m.mre, constant)})
             for k, m in run.metrics.items()
         },
+        "components": _components(run),
         "expected": run.problem.expected.model_dump(),
         "seconds": run.seconds,
         "iterations": {stage.name: stage.iterations for stage in s.stages},
@@ -246,6 +247,16 @@ def _full_size(run: Run) -> dict[str, Any] | None:
     height, width = run.full.depth_ref.shape
     scores = run.full.metrics
     return {"width": width, "height": height, "metrics": scores and scores.as_dict()}
+
+
+def _components(run: Run) -> dict[str, Any]:
+    """How many components there are, and how they overlap with the true ones."""
+    truth = run.pair.truth
+    out: dict[str, Any] = {"count": len(run.components)}
+    if truth is not None and truth.components is not None:
+        found = component_overlaps(run.components.of_pixel, truth.components)
+        out["truth"] = {str(k): {"component": c, "iou": iou} for k, (c, iou) in found.items()}
+    return out
 
 
 def _refinement(run: Run) -> dict[str, Any] | None:
