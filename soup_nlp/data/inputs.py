@@ -138,10 +138,12 @@ class SceneInput(PairInput):
     """Columns, pixels."""
     height: Annotated[int, Field(ge=48, le=MAX_SIDE)] = 436
     """Rows, pixels."""
+    frame: Count = 0
+    """First frame of the pair; camera and bodies go on as from frame 0 to frame 1."""
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        return render_scene(self.scene, self.seed, self.width, self.height)
+        return render_scene(self.scene, self.seed, self.width, self.height, self.frame)
 
 
 class SintelInput(PairInput):

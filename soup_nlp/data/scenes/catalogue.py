@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
+from soup_nlp.data.scenes.raycast import Body, Part, Scene, advanced, inverse, render
 from soup_nlp.data.scenes.shapes import Box, Float, Plane, Shape, Sheet, Sphere
 from soup_nlp.data.scenes.texture import Colour, Panels, Texture
 from soup_nlp.geometry import camera, rotation
@@ -21,7 +21,9 @@ from soup_nlp.schema.limits import check_image_size
 Random = np.random.Generator
 
 
-def render_scene(name: str, seed: int = 0, width: int = 1024, height: int = 436) -> Pair:
+def render_scene(
+    name: str, seed: int = 0, width: int = 1024, height: int = 436, frame: int = 0
+) -> Pair:
     """Render a named scene.
 
     Args:
@@ -29,6 +31,7 @@ def render_scene(name: str, seed: int = 0, width: int = 1024, height: int = 436)
         seed: Changes layout, textures and motions within sensible ranges; same seed, same bytes.
         width: Columns of both images, at least 64; the focal length grows with it.
         height: Rows of both images, at least 48.
+        frame: The pair's first frame: camera and bodies go on as from frame 0 to frame 1.
 
     Returns:
         A `Pair` with full `Truth` in metres and no flow. Component 0 is the static background.
@@ -41,7 +44,8 @@ def render_scene(name: str, seed: int = 0, width: int = 1024, height: int = 436)
     K = camera.intrinsics(f, f, (width - 1) / 2, (height - 1) / 2)
     rng = np.random.default_rng([seed, list(_LAYOUTS).index(name)])
     scene = layout(rng, width / (2 * f), height / (2 * f))
-    return render(scene, K, height, width, name=f"{name}-{seed}")
+    own = f"{name}-{seed}" + (f"-{frame}" if frame else "")
+    return render(advanced(scene, frame), K, height, width, name=own)
 
 
 # --- poses -----------------------------------------------------------------------------------

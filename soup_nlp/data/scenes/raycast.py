@@ -8,7 +8,7 @@ the pixel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.data.scenes.shapes import NEAR, Shape
 from soup_nlp.data.scenes.texture import Texture
+from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera
 
 Float = NDArray[np.float64]
@@ -145,6 +146,24 @@ class Scene:
             depth[near[closer]] = hit[closer]
             index[near[closer]] = p
         return depth, index
+
+
+def advanced(scene: Scene, steps: int) -> Scene:
+    """The scene some frames later: camera and bodies go on as from the first frame to the second.
+
+    Raises:
+        DataError: a shape bends; it does so from the first frame to the second only.
+    """
+    if steps and not all(part.shape.rigid for part in scene.parts):
+        raise DataError("a scene that bends has two frames", found=f"frame {steps}", expected="0")
+    go_on = scene.next_from_scene @ inverse(scene.ref_from_scene)
+    ref = np.linalg.matrix_power(go_on, steps) @ scene.ref_from_scene
+    bodies = []
+    for body in scene.bodies:
+        so_far = np.linalg.matrix_power(body.motion, steps)
+        parts = [replace(p, scene_from_part=so_far @ p.scene_from_part) for p in body.parts]
+        bodies.append(replace(body, parts=tuple(parts)))
+    return Scene(tuple(bodies), ref, go_on @ ref)
 
 
 def _may_hit(shape: Shape, camera_from_part: Float, K: Float, uv: Float) -> Int:

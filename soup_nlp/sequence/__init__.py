@@ -1,0 +1,1 @@
+"""Sequences: consecutive pairs solved and put on one scale."""

@@ -1,0 +1,149 @@
+"""A chain of solved pairs in one scale and one frame of reference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.sequence.pairs import SolvedPair
+from soup_nlp.sequence.scales import Link, link, solve_scales
+from soup_nlp.sequence.tracks import carried, follow, number
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Solved pairs of consecutive frames, the first camera's axes and the first pair's unit.
+
+    Attributes:
+        pairs: Pair k is of the frames k and k + 1.
+        scales: (K,) factor from each pair's unit to that of the first.
+        links: What the scales were made of, those of pairs over two frames too.
+        world_from_camera: Pose of every frame's camera, K + 1.
+        tracks: Number of the track of every component, by its label, of every pair.
+    """
+
+    pairs: tuple[SolvedPair, ...]
+    scales: Float
+    links: tuple[Link, ...]
+    world_from_camera: tuple[RigidMotion, ...]
+    tracks: tuple[dict[int, int], ...]
+
+    def __len__(self) -> int:
+        return len(self.pairs) + 1
+
+    def __str__(self) -> str:
+        low, high = self.scales.min(), self.scales.max()
+        flagged = sum(k.flagged for k in self.links)
+        return f"Chain({len(self)} frames, scales {low:.3g}..{high:.3g}, {flagged} flagged links)"
+
+    __repr__ = __str__
+
+    def depth(self, frame: int) -> Float:
+        """(H, W) z of a frame in the chain's unit; of the last frame as its pair's next one."""
+        if frame == len(self.pairs):
+            return self.scales[-1] * self.pairs[-1].result.depths[1]
+        return self.scales[frame] * self.pairs[frame].result.depths[0]
+
+    def points(self, frame: int) -> Float:
+        """(H, W, 3) points of a frame that has a pair, in the world."""
+        local = self.scales[frame] * self.pairs[frame].result.points[0]
+        return self.world_from_camera[frame](local)
+
+    def motion(self, pair: int, label: int) -> RigidMotion:
+        """What a component does in the world from a frame to the next; label 0 stands still."""
+        M, s = self.pairs[pair].result.components[label].motion, self.scales[pair]
+        before, after = self.world_from_camera[pair], self.world_from_camera[pair + 1]
+        return after @ RigidMotion(M.R, s * M.t) @ before.inverse
+
+    def path(self, track: int) -> dict[int, Float]:
+        """Centre (3,) of a track in the world, by frame."""
+        out: dict[int, Float] = {}
+        for k, own in enumerate(self.tracks):
+            for label, name in own.items():
+                if name == track:
+                    part = self.pairs[k].result.components[label]
+                    out[k] = self.world_from_camera[k](self.scales[k] * part.centre)
+                    out[k + 1] = self.motion(k, label)(out[k])
+        return out
+
+
+def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> Chain:
+    """Put consecutive pairs on one scale and follow camera and components.
+
+    Args:
+        pairs: Of the frames (0, 1), (1, 2), ...
+        over: Further pairs of the same frames, such as (0, 2), whose links are used too.
+
+    Raises:
+        DataError: the pairs are not consecutive, or share no pixel.
+    """
+    if [(p.first, p.second) for p in pairs] != [(k, k + 1) for k in range(len(pairs))]:
+        raise DataError("pairs of a chain are not consecutive", found=[p.first for p in pairs])
+    links = find_links([*pairs, *over])
+    scales = solve_scales(len(pairs) + len(over), links)[: len(pairs)]
+    poses = [RigidMotion(np.eye(3), np.zeros(3))]
+    for pair, s in zip(pairs, scales, strict=True):
+        camera = pair.result.components.camera
+        poses.append(poses[-1] @ RigidMotion(camera.R, s * camera.t).inverse)
+    matches = [
+        follow(
+            carried(a.result.components.of_pixel, a.result.reconstruction),
+            b.result.components.of_pixel,
+        )
+        for a, b in pairwise(pairs)
+    ]
+    tracks = number(matches, [len(p.result.components) for p in pairs])
+    return Chain(tuple(pairs), scales, tuple(links), tuple(poses), tuple(tracks))
+
+
+def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
+    """Links of all pairs that share a frame, over the static scene that both are sure of.
+
+    A pair without parallax has a depth that is a guess: its links are flagged, and the pairs on
+    both sides of it are linked across it, the depth of the one carried along by its flow.
+    """
+    out: list[Link] = []
+    for b, second in enumerate(pairs):
+        for a, first in enumerate(pairs[:b]):
+            for frame in {first.first, first.second} & {second.first, second.second}:
+                z1, keep1 = _view(first, frame)
+                z2, keep2 = _view(second, frame)
+                guess = first.still or second.still
+                found = link(a, b, z1, z2, keep1 & keep2, flagged=guess)
+                out += [found] if found else []
+    for pair in pairs:
+        before = [a for a, p in enumerate(pairs) if p.second == pair.first and not p.still]
+        after = [b for b, p in enumerate(pairs) if p.first == pair.second and not p.still]
+        if pair.still and before and after:
+            z, keep = _carry(pairs[before[0]], pair)
+            other, sure = _view(pairs[after[0]], pair.second)
+            found = link(before[0], after[0], z, other, keep & sure, bridge=True)
+            out += [found] if found else []
+    return out
+
+
+def _view(pair: SolvedPair, frame: int) -> tuple[Float, Mask]:
+    """(H, W) z of one of a pair's frames, and which pixels are of the static scene and sure."""
+    result = pair.result
+    keep = result.sure & (result.components.of_pixel == 0)
+    if frame == pair.first:
+        return result.depths[0], keep
+    return result.depths[1], carried(keep, result.reconstruction) > 0
+
+
+def _carry(before: SolvedPair, still: SolvedPair) -> tuple[Float, Mask]:
+    """The next frame's z of a pair, carried through a pair whose camera rests."""
+    z, keep = _view(before, before.second)
+    _, own = _view(still, still.first)
+    source = still.result.reconstruction.source_next
+    there = (source >= 0) & (keep & own).ravel()[source]
+    return np.where(there, z.ravel()[source], np.nan), there

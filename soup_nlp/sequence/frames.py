@@ -1,0 +1,153 @@
+"""Frames of a sequence: image files, a video, a rendered scene."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from soup_nlp.errors import DataError
+from soup_nlp.report.figures import write_png
+
+Raw = dict[str, Any]
+
+IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp", ".webp")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
+LAYOUT = "frame_*"
+"""Images of a folder that holds other ones too, such as depth."""
+
+
+class Frames(ABC):
+    """Frames in order."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of frames."""
+
+    @abstractmethod
+    def pair(self, first: int, second: int) -> Raw:
+        """Section `input` of the problem of two frames."""
+
+
+@dataclass(frozen=True)
+class FileFrames(Frames):
+    """Image files of one camera.
+
+    Attributes:
+        paths: Images in order.
+        camera: Keys `intrinsics` or `fov` of an input of files.
+        depths: True depth of every frame, for measuring only; empty where unknown.
+        depth_scale: Values per unit of length of a 16-bit .png depth.
+    """
+
+    paths: tuple[Path, ...]
+    camera: Raw
+    depths: tuple[Path, ...] = ()
+    depth_scale: float = 1000.0
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def pair(self, first: int, second: int) -> Raw:
+        """See `Frames`."""
+        ref, following = str(self.paths[first]), str(self.paths[second])
+        out = {"kind": "files", "ref": ref, "next": following, **self.camera}
+        if self.depths:
+            truth = {"depth": str(self.depths[first]), "depth_next": str(self.depths[second])}
+            out.update(truth, depth_scale=self.depth_scale)
+        return out
+
+
+@dataclass(frozen=True)
+class SceneFrames(Frames):
+    """Frames of a rendered scene, whose camera and bodies go on as they begin."""
+
+    scene: str
+    count: int
+    seed: int = 0
+    width: int = 1024
+    height: int = 436
+
+    def __len__(self) -> int:
+        return self.count
+
+    def pair(self, first: int, second: int) -> Raw:
+        """See `Frames`."""
+        if second != first + 1:
+            raise DataError(
+                "frames of a scene are solved one after the other", found=second - first
+            )
+        own = {"scene": self.scene, "seed": self.seed, "width": self.width, "height": self.height}
+        return {"kind": "scene", "frame": first, **own}
+
+
+def find_images(source: Path) -> list[Path]:
+    """Images of a folder or of a pattern such as `clip/*.jpg`, in the order of their numbers.
+
+    Of a folder with images named frame_* only these are taken.
+
+    Raises:
+        DataError: there are fewer than two.
+    """
+    if source.is_dir():
+        found = [p for p in source.glob(LAYOUT) if p.suffix.lower() in IMAGES]
+        found = found or [p for p in source.iterdir() if p.suffix.lower() in IMAGES]
+    else:
+        found = [p for p in source.parent.glob(source.name) if p.is_file()]
+    if len(found) < 2:
+        raise DataError(
+            "a sequence needs two images at least",
+            where=source,
+            found=len(found),
+            expected="a folder of images, a pattern in quotes, a video, or scene:NAME",
+        )
+    return sorted(found, key=_by_number)
+
+
+def find_depths(images: list[Path]) -> list[Path]:
+    """Files depth_* beside images frame_*, one for each; empty where one is missing."""
+    out = []
+    for path in images:
+        stem = path.stem.replace("frame_", "depth_")
+        own = [path.with_name(stem + suffix) for suffix in (".png", ".npy", ".pfm", ".dpt")]
+        there = [p for p in own if p.is_file() and p != path]
+        if not there:
+            return []
+        out.append(there[0])
+    return out
+
+
+def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = None) -> list[Path]:
+    """Write every `stride`-th frame of a video as PNG into a folder; their paths.
+
+    Raises:
+        DataError: the video cannot be read.
+    """
+    video = cv2.VideoCapture(str(path))
+    out: list[Path] = []
+    index = 0
+    folder.mkdir(parents=True, exist_ok=True)
+    while most is None or len(out) < most:
+        if not video.grab():
+            break
+        if index % stride == 0:
+            good, image = video.retrieve()
+            if not good:
+                break
+            out.append(folder / f"{len(out):04d}.png")
+            write_png(out[-1], cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+        index += 1
+    video.release()
+    if len(out) < 2:
+        raise DataError("video has fewer than two readable frames", where=path, found=len(out))
+    return out
+
+
+def _by_number(path: Path) -> list[Any]:
+    """Key of an order in which 10 comes after 9."""
+    words = re.split(r"(\d+)", path.name)
+    return [(1, int(word), "") if word.isdigit() else (0, 0, word) for word in words]

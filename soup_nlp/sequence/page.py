@@ -1,0 +1,168 @@
+"""A page of a chain: image and depth of every frame with a slider, paths from above, the table."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.report.colour import Image
+from soup_nlp.sequence.chain import Chain
+
+WIDTH = 720
+"""Most columns of a picture in the page."""
+QUALITY = 80
+"""Of the pictures, JPEG."""
+PLAN = 360
+"""Side of the plan view, pixels."""
+COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#17becf")
+
+
+def chain_page(
+    chain: Chain, told: Mapping[str, Any], images: Sequence[Image], depths: Sequence[Image]
+) -> str:
+    """The page as HTML that needs nothing else.
+
+    Args:
+        chain: The chain.
+        told: Contents of chain.json.
+        images: (H, W, 3) image of every frame.
+        depths: (H, W, 3) its depth in colour, one range for all.
+    """
+    frames = [[_jpeg(a), _jpeg(b)] for a, b in zip(images, depths)]
+    title = html.escape(str(told["name"]))
+    return _PAGE.format(
+        title=title,
+        last=len(chain) - 1,
+        frames=json.dumps(frames),
+        plan=_plan(chain),
+        table=_table(told),
+        unit=html.escape(str(told["unit"])),
+    )
+
+
+def _jpeg(image: Image) -> str:
+    """A picture as the address of its data."""
+    height, width = image.shape[:2]
+    if width > WIDTH:
+        size = (WIDTH, round(height * WIDTH / width))
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    rgb = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", rgb, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+
+
+def _plan(chain: Chain) -> str:
+    """Camera and tracks from above, x to the right and z upwards, as SVG."""
+    camera = np.array([m.t for m in chain.world_from_camera])
+    names = sorted({t for own in chain.tracks for t in own.values()} - {0})
+    paths = {t: np.array(list(chain.path(t).values())) for t in names}
+    # what is seen in one pair only is mostly no body
+    paths = {t: p for t, p in paths.items() if len(p) > 2}
+    points = np.concatenate([camera, *paths.values()])[:, [0, 2]]
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = float(max((high - low).max(), 1e-9))
+    middle = (low + high) / 2
+
+    def place(p: NDArray[np.float64]) -> str:
+        xy = ((p[:, [0, 2]] - middle) / size * 0.86 + 0.5) * PLAN
+        return " ".join(f"{x:.1f},{PLAN - y:.1f}" for x, y in xy)
+
+    def line(p: NDArray[np.float64], colour: str, text: str) -> str:
+        spots = place(p)
+        x, y = spots.split()[-1].split(",")
+        dots = "".join(
+            f'<circle cx="{s.split(",")[0]}" cy="{s.split(",")[1]}" r="3" fill="{colour}"/>'
+            for s in spots.split()
+        )
+        return (
+            f'<polyline points="{spots}" fill="none" stroke="{colour}" stroke-width="2"/>{dots}'
+            f'<text x="{x}" y="{y}" dx="6" dy="4" fill="{colour}">{text}</text>'
+        )
+
+    drawn = [line(camera, "#222", "camera")]
+    drawn += [line(p, COLOURS[t % len(COLOURS)], f"track {t}") for t, p in paths.items()]
+    return f'<svg width="{PLAN}" height="{PLAN}" viewBox="0 0 {PLAN} {PLAN}">{"".join(drawn)}</svg>'
+
+
+def _table(told: Mapping[str, Any]) -> str:
+    """Links, and scores where there is a truth, as a table of HTML."""
+    true = {tuple(k["pairs"]): k["true"] for k in (told["score"] or {}).get("links", ())}
+    rows = []
+    for k in told["links"]:
+        a, b = k["pairs"]
+        known = f"{true[a, b]:.3f}" if (a, b) in true else ""
+        note = "bridge" if k["bridge"] else "a guess" if k["flagged"] else ""
+        cells = (
+            f"{a}, {b}",
+            f"{k['ratio']:.3f}",
+            f"{k['spread']:.3f}",
+            known,
+            str(k["pixels"]),
+            note,
+        )
+        rows.append("".join(f"<td>{cell}</td>" for cell in cells))
+    heads = "pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", ""
+    head = "".join(f"<th>{h}</th>" for h in heads)
+    out = f"<table><tr>{head}</tr>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
+    if told["score"]:
+        s = told["score"]
+        out += (
+            f"<p>Mean relative error: {s['mre_own_scale']:.4f} with a scale for every frame,"
+            f" {s['mre_one_scale']:.4f} with one for the sequence ({s['cost']:+.1%}).</p>"
+        )
+    return out
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
+<style>
+body {{ font: 15px/1.4 system-ui, sans-serif; margin: 1.2em; color: #222; }}
+.row {{ display: flex; flex-wrap: wrap; gap: 1em; align-items: flex-start; }}
+figure {{ margin: 0; max-width: 720px; }} img {{ width: 100%; display: block; }}
+figcaption {{ color: #555; }} input[type=range] {{ width: 24em; max-width: 60vw; }}
+table {{ border-collapse: collapse; }} td, th {{ padding: .2em .7em; text-align: right; }}
+tr:nth-child(even) {{ background: #f3f3f3; }} svg {{ border: 1px solid #ddd; font-size: 12px; }}
+</style></head><body>
+<h1>{title}</h1>
+<p><button id="play">play</button> <input id="time" type="range" min="0" max="{last}" value="0">
+<span id="now">frame 0</span></p>
+<div class="row">
+<figure><img id="image" alt="image"><figcaption>image</figcaption></figure>
+<figure><img id="depth" alt="depth"><figcaption>
+depth, one scale and one colour range for all frames: red is near, blue is far, black is unknown</figcaption></figure>
+</div>
+<div class="row">
+<figure>{plan}<figcaption>
+from above: x to the right, z (ahead) upwards; a dot is a frame</figcaption>
+</figure>
+<div>{table}<p>Unit of length: {unit}.</p></div>
+</div>
+<script>
+const frames = {frames};
+const time = document.getElementById("time"), play = document.getElementById("play");
+let timer = null;
+function show() {{
+  const k = Number(time.value);
+  document.getElementById("image").src = frames[k][0];
+  document.getElementById("depth").src = frames[k][1];
+  document.getElementById("now").textContent = "frame " + k;
+}}
+time.addEventListener("input", show);
+play.addEventListener("click", () => {{
+  if (timer) {{ clearInterval(timer); timer = null; play.textContent = "play"; return; }}
+  play.textContent = "stop";
+  timer = setInterval(() => {{
+    time.value = (Number(time.value) + 1) % frames.length;
+    show();
+  }}, 250);
+}});
+show();
+</script></body></html>
+"""

@@ -1,0 +1,108 @@
+"""Solve the pairs of a sequence, each into a result folder; what is there already is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from soup_nlp.bench.rows import Job, Row, attempt, failed, measure_all
+from soup_nlp.config.problem import make_problem
+from soup_nlp.errors import SolverError
+from soup_nlp.pipeline.run import run
+from soup_nlp.report.result import Result, read_result
+from soup_nlp.sequence.frames import Frames, Raw
+from soup_nlp.storage.store import read_h5
+
+ROWS = "pairs.jsonl"
+"""Rows of the pairs of a sequence."""
+REST = 0.5
+"""Share of the background whose depth is a guess above which a pair has no parallax."""
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedPair:
+    """A pair of frames with its result.
+
+    Attributes:
+        first: Index of the reference frame.
+        second: Index of the next frame.
+        result: What was solved.
+        truth: Arrays of the truth by name, as in result.h5; empty where unknown.
+        parallax_px: Median displacement that the camera's translation causes, pixels.
+    """
+
+    first: int
+    second: int
+    result: Result
+    truth: dict[str, np.ndarray]
+    parallax_px: float
+
+    @property
+    def still(self) -> bool:
+        """Whether most of the background has no parallax, so that its depth is a guess."""
+        return self.result.components.background.borrowed > REST
+
+
+def solve_pairs(
+    frames: Frames,
+    which: Sequence[tuple[int, int]],
+    folder: Path,
+    overrides: Sequence[str] = (),
+    workers: int = 1,
+    say: Callable[[int, int, Row], None] | None = None,
+) -> list[SolvedPair]:
+    """Solve pairs of frames in parallel processes; those that are stored are only read.
+
+    Args:
+        frames: The sequence.
+        which: Indices of the frames of every pair.
+        folder: Gets `pairs/000_001/` ... and a row a pair in `pairs.jsonl`.
+        overrides: Of the problem, such as segmentation.superpixels=500.
+        workers: Processes.
+        say: Called with (done, total, row) after every solve.
+
+    Raises:
+        SolverError: a pair cannot be solved.
+    """
+    jobs, places = [], []
+    for first, second in which:
+        source = frames.pair(first, second)
+        place = folder / "pairs" / f"{first:03d}_{second:03d}"
+        name = {"key": place.name, "input": source, "overrides": list(overrides)}
+        work = partial(attempt, partial(_solve, source, tuple(overrides), place))
+        jobs.append(Job(name, work, stale=not (place / "result.h5").is_file()))
+        places.append(place)
+    rows = measure_all(jobs, folder / ROWS, workers, say=say)
+    wrong = [row for row in rows if failed(row)]
+    if wrong:
+        raise SolverError(
+            f"{len(wrong)} of {len(rows)} pairs cannot be solved",
+            where=wrong[0]["key"],
+            found=wrong[0]["error"],
+            hint="the others are kept: the same command goes on",
+        )
+    return [_read(*pair, place) for pair, place in zip(which, places, strict=True)]
+
+
+def _solve(source: Raw, overrides: tuple[str, ...], place: Path) -> Row:
+    """Solve a pair into its folder."""
+    raw = {"name": place.name, "input": source, "base": str(Path.cwd())}
+    done = run(make_problem(raw, overrides, where="sequence"))
+    done.save(place)
+    return {
+        "converged": done.solution.converged,
+        "components": len(done.components),
+        "mre": done.metrics["solution"].mre if "solution" in done.metrics else None,
+    }
+
+
+def _read(first: int, second: int, place: Path) -> SolvedPair:
+    result = read_result(place)
+    tree = read_h5(place / "result.h5")
+    own = result.components.of_superpixel == 0
+    parallax = float(np.median(tree["start"]["parallax"][own]))
+    return SolvedPair(first, second, result, dict(tree.get("truth", {})), parallax)

@@ -1,0 +1,110 @@
+"""One scale for all pairs of a sequence: links between pairs that share a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.errors import DataError
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FEWEST = 200
+"""Pixels that a link needs."""
+LEAST_SPREAD = 0.005
+"""Spread of a log ratio below which links do not gain weight."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """What a frame that two pairs share says of their scales.
+
+    Attributes:
+        first: Index of the pair.
+        second: Index of the other pair.
+        log_ratio: Logarithm of the second's scale over the first's, the median over pixels.
+        spread: Robust standard deviation of the same over pixels (1.4826 MAD).
+        pixels: Number of pixels.
+        bridge: Whether it was carried over a pair without parallax in between.
+        flagged: Whether it is a guess: a pair has no parallax, or few pixels are shared.
+    """
+
+    first: int
+    second: int
+    log_ratio: float
+    spread: float
+    pixels: int
+    bridge: bool = False
+    flagged: bool = False
+
+
+def link(
+    first: int,
+    second: int,
+    one: Float,
+    other: Float,
+    keep: Mask,
+    *,
+    bridge: bool = False,
+    flagged: bool = False,
+) -> Link | None:
+    """The link of two depth maps of one frame; None where they share no pixel.
+
+    Args:
+        first: Index of the pair that `one` is of.
+        second: Index of the pair that `other` is of.
+        one: (H, W) z, NaN where unknown.
+        other: (H, W) z of the same frame.
+        keep: (H, W) pixels that count.
+        bridge: See `Link`.
+        flagged: See `Link`.
+    """
+    with np.errstate(invalid="ignore"):
+        both = keep & (one > 0) & (other > 0)
+    if not both.any():
+        return None
+    ratio = np.log(one[both] / other[both])
+    middle = float(np.median(ratio))
+    spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
+    count = int(both.sum())
+    return Link(first, second, middle, spread, count, bridge, flagged or count < FEWEST)
+
+
+def solve_scales(count: int, links: Sequence[Link]) -> Float:
+    """(count,) scales of all pairs, the first's 1: a robust linear system of their logarithms.
+
+    Every link weighs by its spread; those that contradict the others lose weight (soft L1).
+
+    Raises:
+        DataError: a pair is linked to no other.
+    """
+    from scipy.optimize import least_squares
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    ends = np.array([(k.first, k.second) for k in links], np.int64).reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    parts, part = connected_components(graph, directed=False)
+    if parts > 1:
+        alone = int(np.argmax(part != part[0]))
+        raise DataError("a pair shares no pixel with the others", where=f"pair {alone}")
+    if count == 1:
+        return np.ones(1)
+    rows = np.zeros((len(links), count))
+    at = np.arange(len(links))
+    rows[at, ends[:, 1]] += 1
+    rows[at, ends[:, 0]] -= 1
+    value = np.array([k.log_ratio for k in links])
+    sigma = np.maximum([k.spread for k in links], LEAST_SPREAD)
+    # a guess holds only where nothing else does
+    sigma = np.where([k.flagged for k in links], 10 * np.maximum(sigma, 0.1), sigma)
+    A, b = rows[:, 1:] / sigma[:, None], value / sigma
+    first = np.linalg.lstsq(A, b, rcond=None)[0]
+    if len(links) > count - 1:
+        answer = least_squares(lambda x: A @ x - b, first, jac=lambda x: A, loss="soft_l1")
+        first = answer.x
+    return np.exp(np.concatenate([[0.0], first]))

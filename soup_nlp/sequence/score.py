@@ -1,0 +1,96 @@
+"""A chain against the truth: one scale for all beside one per pair, and the camera's path."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.evaluate.metrics import depth_metrics, true_pixels
+from soup_nlp.sequence.chain import Chain
+
+Float = NDArray[np.float64]
+
+
+def true_depth(chain: Chain, frame: int) -> Float | None:
+    """(H, W) true z of a frame, None where unknown."""
+    if frame == len(chain.pairs):
+        return chain.pairs[-1].truth.get("depth_next")
+    return chain.pairs[frame].truth.get("depth_ref")
+
+
+def score(chain: Chain) -> dict[str, Any] | None:
+    """Errors of depth and path; None without a truth.
+
+    "frames" has the MRE of every frame by a median scale of its own, and by one for the sequence;
+    "links" the true ratio of scales beside the estimated one; "path" the error of the camera's
+    positions after the best similarity, over the length of the true path, where that is known.
+    """
+    found = [(k, true_depth(chain, k)) for k in range(len(chain))]
+    known = {k: z for k, z in found if z is not None and true_pixels(z, None).any()}
+    if not known:
+        return None
+    depths = {k: chain.depth(k) for k in known}
+    ratio = []
+    for k, z in depths.items():
+        good = true_pixels(known[k], None) & (z > 0)
+        ratio.append(known[k][good] / z[good])
+    one = float(np.median(np.concatenate(ratio)))
+    frames = []
+    for k, z in depths.items():
+        own = depth_metrics(z, known[k])
+        shared = depth_metrics(one * z, known[k], scale="none")
+        row = {"frame": k, "mre_own_scale": own.mre, "mre_one_scale": shared.mre}
+        frames.append({**row, "own_scale": own.scale, "coverage": own.coverage})
+    means = {key: float(np.mean([f[key] for f in frames])) for key in _KEYS}
+    links = []
+    for k, (a, b) in enumerate(pairwise(chain.pairs)):
+        if k in known and k + 1 in known:
+            true = [
+                depth_metrics(p.result.depths[0], known[i]).scale for i, p in ((k, a), (k + 1, b))
+            ]
+            said = chain.scales[k + 1] / chain.scales[k]
+            links.append({"pairs": [k, k + 1], "estimated": said, "true": true[1] / true[0]})
+    return {
+        "scale": one,
+        "frames": frames,
+        **means,
+        "cost": means[_KEYS[1]] / means[_KEYS[0]] - 1,
+        "links": links,
+        "path": path_error(chain),
+    }
+
+
+_KEYS = ("mre_own_scale", "mre_one_scale")
+
+
+def path_error(chain: Chain) -> dict[str, float] | None:
+    """Error of the camera's positions after a similarity; None where the true path is unknown."""
+    motions = [p.truth.get("motions") for p in chain.pairs]
+    if any(m is None or not np.isfinite(m[0]).all() for m in motions):
+        return None
+    pose, true = np.eye(4), [np.zeros(3)]
+    for m in motions:
+        assert m is not None
+        # component 0 of a truth is the static scene
+        pose = pose @ np.linalg.inv(m[0])
+        true.append(pose[:3, 3])
+    there = np.array(true)
+    length = float(np.linalg.norm(np.diff(there, axis=0), axis=1).sum())
+    if length == 0 or len(there) < 3:
+        return None
+    error = there - aligned(np.array([m.t for m in chain.world_from_camera]), there)
+    rmse = float(np.sqrt((error**2).sum(axis=1).mean()))
+    return {"rmse": rmse, "length": length, "share": rmse / length}
+
+
+def aligned(points: Float, target: Float) -> Float:
+    """Points (M, 3) after the similarity of least squares to target (M, 3) (Umeyama, 1991)."""
+    a, b = points - points.mean(axis=0), target - target.mean(axis=0)
+    U, S, Vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    size = (a**2).sum()
+    scale = float((S * sign).sum() / size) if size > 0 else 1.0
+    return scale * a @ (U * sign @ Vt).T + target.mean(axis=0)

@@ -1,0 +1,70 @@
+"""Components followed through the frames of a sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.geometry.soup import Reconstruction
+
+Labels = NDArray[np.integer]
+
+SAME = 0.3
+"""Intersection over union from which two components are one."""
+
+
+def carried(of_pixel: Labels, rec: Reconstruction) -> Labels:
+    """(H', W') labels of the reference frame where they are seen in the next one, -1 elsewhere."""
+    source = rec.source_next
+    return np.where(source >= 0, of_pixel.ravel()[source], -1)
+
+
+def follow(before: Labels, after: Labels) -> dict[int, int]:
+    """Which component of a pair each one of the pair before is, by overlap in the frame they share.
+
+    Args:
+        before: (H, W) labels, carried to the frame; -1 where unknown, 0 is the background.
+        after: (H, W) labels of the other pair.
+
+    Returns:
+        Label after by label before; each at most once, the largest overlap first.
+    """
+    known = before >= 0
+    old, new = before[known].astype(np.int64), after[known].astype(np.int64)
+    count = int(after.max()) + 1
+    both = np.bincount(old * count + new, minlength=(int(before.max()) + 1) * count)
+    both = both.reshape(-1, count)
+    union = both.sum(axis=0) + both.sum(axis=1, keepdims=True) - both
+    share = both / np.maximum(union, 1)
+    # the background is not followed
+    share[0], share[:, 0] = 0, 0
+    out: dict[int, int] = {}
+    while share.max(initial=0.0) >= SAME:
+        i, k = (int(x) for x in np.unravel_index(int(share.argmax()), share.shape))
+        out[i] = k
+        share[i], share[:, k] = 0, 0
+    return out
+
+
+def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dict[int, int]]:
+    """Number of the track of every component of every pair; 0 is the background.
+
+    Args:
+        matches: What `follow` found between each pair and the next one.
+        counts: Components of every pair, the background counted.
+    """
+    out: list[dict[int, int]] = []
+    fresh = 1
+    for k, count in enumerate(counts):
+        own = {0: 0}
+        back = {new: old for old, new in matches[k - 1].items()} if k else {}
+        for label in range(1, count):
+            if label in back:
+                own[label] = out[k - 1][back[label]]
+            else:
+                own[label] = fresh
+                fresh += 1
+        out.append(own)
+    return out

@@ -1,0 +1,155 @@
+"""Files of a chain: depth and clouds in one scale, trajectories, a table, a page and a video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.report.colour import Image, colourise_depth, depth_range
+from soup_nlp.report.pointcloud import AXES, write_ply
+from soup_nlp.sequence.chain import Chain
+from soup_nlp.sequence.page import chain_page
+from soup_nlp.sequence.score import score
+from soup_nlp.storage.atomic import atomic_path, write_text
+from soup_nlp.storage.store import write_json
+
+Float = NDArray[np.float64]
+
+POINTS = 100_000
+"""Most points of a frame's cloud."""
+RATE = 5.0
+"""Frames a second of the video."""
+UNIT = "the first pair's soup unit (free scale: its planes are at mean distance 1)"
+
+
+def write_chain(folder: Path, chain: Chain, name: str) -> list[str]:
+    """Write every file of a chain into an existing folder.
+
+    Args:
+        folder: The folder, which has the pairs already.
+        chain: The chain.
+        name: For titles.
+
+    Returns:
+        Names of the files and folders.
+    """
+    (folder / "depth").mkdir(exist_ok=True)
+    (folder / "points").mkdir(exist_ok=True)
+    depths = [chain.depth(k) for k in range(len(chain))]
+    scale = _png_scale(depths)
+    for k, z in enumerate(depths):
+        write_depth(folder / "depth" / f"{k:04d}.png", z, scale)
+    for k in range(len(chain.pairs)):
+        _cloud(folder / "points" / f"{k:04d}.ply", chain, k, name)
+    told = {**summary(chain), "name": name, "depth_png_scale": scale, "score": score(chain)}
+    write_json(folder / "chain.json", told)
+    write_text(folder / "trajectory.tum", trajectory(chain))
+    pictures = coloured(depths)
+    write_video(folder / "depth.mp4", [np.vstack(p) for p in zip(images(chain), pictures)])
+    write_text(folder / "chain.html", chain_page(chain, told, images(chain), pictures))
+    files = ["depth", "points", "chain.json", "trajectory.tum", "depth.mp4", "chain.html"]
+    return [*files, "pairs"]
+
+
+def summary(chain: Chain) -> dict[str, Any]:
+    """Scales, links, poses and tracks as plain values."""
+    tracks = sorted({t for own in chain.tracks for t in own.values()} - {0})
+    return {
+        "frames": len(chain),
+        "unit": UNIT,
+        "world": f"the first frame's camera: {AXES}",
+        "scales": [
+            {"pair": [p.first, p.second], "scale": s, "parallax_px": p.parallax_px}
+            for p, s in zip(chain.pairs, chain.scales)
+        ],
+        "links": [
+            {
+                "pairs": [k.first, k.second],
+                "ratio": float(np.exp(k.log_ratio)),
+                "spread": k.spread,
+                "pixels": k.pixels,
+                "bridge": k.bridge,
+                "flagged": k.flagged,
+            }
+            for k in chain.links
+        ],
+        "world_from_camera": [m.matrix for m in chain.world_from_camera],
+        "tracks": [{"track": t, "path": chain.path(t), "pixels": pixels(chain, t)} for t in tracks],
+    }
+
+
+def pixels(chain: Chain, track: int) -> dict[int, int]:
+    """Pixels of a track by frame."""
+    return {
+        k: chain.pairs[k].result.components[label].pixels
+        for k, own in enumerate(chain.tracks)
+        for label, name in own.items()
+        if name == track
+    }
+
+
+def trajectory(chain: Chain) -> str:
+    """Poses of the camera in the format of the TUM benchmark, world_from_camera."""
+    lines = [f"# timestamp tx ty tz qx qy qz qw; timestamp: frame number; unit: {UNIT}"]
+    for k, pose in enumerate(chain.world_from_camera):
+        lines.append(f"{k} " + " ".join(f"{x:.9g}" for x in (*pose.t, *pose.quaternion)))
+    return "\n".join(lines) + "\n"
+
+
+def images(chain: Chain) -> list[Image]:
+    """(H, W, 3) images of all frames."""
+    return [*(p.result.images[0] for p in chain.pairs), chain.pairs[-1].result.images[1]]
+
+
+def coloured(depths: list[Float]) -> list[Image]:
+    """Depth of all frames in colours of one range."""
+    near, far = depth_range(np.concatenate([z.ravel()[::7] for z in depths]))
+    return [colourise_depth(z, near, far) for z in depths]
+
+
+def write_depth(path: Path, depth: Float, scale: float) -> None:
+    """Write a depth map as 16-bit PNG: value = round(depth * scale), 0 where unknown."""
+    from soup_nlp.report.figures import write_clipped_depth_png16
+
+    write_clipped_depth_png16(path, depth, scale)
+
+
+def write_video(path: Path, pictures: list[Image]) -> None:
+    """Write pictures of one size as MPEG-4."""
+    height, width = pictures[0].shape[:2]
+    # coders want even sides
+    size = width - width % 2, height - height % 2
+    with atomic_path(path) as temporary:
+        coder = cv2.VideoWriter.fourcc(*"mp4v")
+        video = cv2.VideoWriter(str(temporary), coder, RATE, size)
+        for picture in pictures:
+            video.write(cv2.cvtColor(picture[: size[1], : size[0]], cv2.COLOR_RGB2BGR))
+        video.release()
+
+
+def _png_scale(depths: list[Float]) -> float:
+    """One number of values per unit for all depth maps, a power of two."""
+    far = float(np.nanpercentile(np.concatenate([z.ravel() for z in depths]), 99.9))
+    return float(2.0 ** np.floor(np.log2(65535.0) - np.log2(far)))
+
+
+def _cloud(path: Path, chain: Chain, frame: int, name: str) -> None:
+    """Write a frame's points in the world, every few pixels."""
+    result = chain.pairs[frame].result
+    step = max(1, int(np.ceil(np.sqrt(result.sure.sum() / POINTS))))
+    keep = np.zeros_like(result.sure)
+    keep[::step, ::step] = result.sure[::step, ::step]
+    tracks = np.array([chain.tracks[frame][k] for k in range(len(result.components))])
+    normals = result.normals[0][keep] @ chain.world_from_camera[frame].R.T
+    comments = [
+        f"{name}: frame {frame}",
+        f"frame: the first frame's camera, {AXES}",
+        f"unit: {UNIT}",
+        "track: what moves by itself, 0 is the static scene",
+    ]
+    scalars = {"track": tracks[result.components.of_pixel[keep]]}
+    write_ply(path, chain.points(frame)[keep], result.images[0][keep], normals, scalars, comments)
