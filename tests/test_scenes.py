@@ -13,7 +13,7 @@ from soup_nlp.data.scenes.catalogue import SCENES, render_scene
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
 from soup_nlp.data.scenes.shapes import Box, Plane, Sheet, Sphere
 from soup_nlp.data.scenes.texture import Texture, fractal_noise, pulse_coverage, value_noise
-from soup_nlp.errors import ConfigError
+from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry import camera, rotation
 
 ALL = list(SCENES)
@@ -322,3 +322,15 @@ def test_the_camera_scales_with_the_width():
 def test_a_scene_that_cannot_be_rendered_is_refused(key, value):
     with pytest.raises(ConfigError, match=key):
         SceneInput.make({"kind": "scene", "scene": "room", key: value})
+
+
+def test_a_scene_goes_on_where_its_first_pair_ends():
+    first, second = (render_scene("street", 0, 96, 64, frame=k) for k in (0, 1))
+    np.testing.assert_allclose(first.truth.depth_next, second.truth.depth_ref, rtol=1e-9)
+    # the same motion again
+    np.testing.assert_allclose(first.truth.motions[0], second.truth.motions[0], atol=1e-12)
+    # shading is that of the pair's first frame
+    gap = np.abs(first.image_next.astype(float) - second.image_ref)
+    assert gap.mean() < 1
+    with pytest.raises(DataError, match="bends"):
+        render_scene("sheet", 0, 96, 64, frame=1)

@@ -33,6 +33,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "results:check",
         "Recompute energy, constraints and metrics of a result, or the constraints of a .sol.",
     ),
+    "chain": (
+        "chain:chain",
+        "Solve the consecutive pairs of a sequence and put them on one scale.",
+    ),
     "convert": (
         "convert:convert",
         "Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions.",

@@ -138,7 +138,7 @@ class SceneInput(PairInput):
     """Columns, pixels."""
     height: Annotated[int, Field(ge=48, le=MAX_SIDE)] = 436
     """Rows, pixels."""
-    frame: Count = 0
+    frame: Index = 0
     """First frame of the pair; camera and bodies go on as from frame 0 to frame 1."""
 
     def load(self, path: Resolve) -> Pair:

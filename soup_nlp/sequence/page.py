@@ -125,7 +125,8 @@ _PAGE = """<!doctype html>
 <style>
 body {{ font: 15px/1.4 system-ui, sans-serif; margin: 1.2em; color: #222; }}
 .row {{ display: flex; flex-wrap: wrap; gap: 1em; align-items: flex-start; }}
-figure {{ margin: 0; max-width: 720px; }} img {{ width: 100%; display: block; }}
+figure {{ margin: 0; }} .pictures figure {{ flex: 1 1 380px; max-width: 720px; }}
+img {{ width: 100%; display: block; }} .row + .row {{ margin-top: 1em; }}
 figcaption {{ color: #555; }} input[type=range] {{ width: 24em; max-width: 60vw; }}
 table {{ border-collapse: collapse; }} td, th {{ padding: .2em .7em; text-align: right; }}
 tr:nth-child(even) {{ background: #f3f3f3; }} svg {{ border: 1px solid #ddd; font-size: 12px; }}
@@ -133,14 +134,16 @@ tr:nth-child(even) {{ background: #f3f3f3; }} svg {{ border: 1px solid #ddd; fon
 <h1>{title}</h1>
 <p><button id="play">play</button> <input id="time" type="range" min="0" max="{last}" value="0">
 <span id="now">frame 0</span></p>
-<div class="row">
+<div class="row pictures">
 <figure><img id="image" alt="image"><figcaption>image</figcaption></figure>
 <figure><img id="depth" alt="depth"><figcaption>
-depth, one scale and one colour range for all frames: red is near, blue is far, black is unknown</figcaption></figure>
+depth, one scale and one colour range for all frames: red is near, blue is far, black is
+unknown</figcaption></figure>
 </div>
 <div class="row">
 <figure>{plan}<figcaption>
-from above: x to the right, z (ahead) upwards; a dot is a frame</figcaption>
+from above: x to the right, z (ahead) upwards; a dot is a frame. What moves by itself has<br>
+a scale of its own in every pair: its path is as good as its depth.</figcaption>
 </figure>
 <div>{table}<p>Unit of length: {unit}.</p></div>
 </div>

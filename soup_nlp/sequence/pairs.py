@@ -15,7 +15,7 @@ from soup_nlp.errors import SolverError
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.result import Result, read_result
 from soup_nlp.sequence.frames import Frames, Raw
-from soup_nlp.storage.store import read_h5
+from soup_nlp.storage.h5_files import read_h5
 
 ROWS = "pairs.jsonl"
 """Rows of the pairs of a sequence."""

@@ -77,7 +77,7 @@ def link(
 def solve_scales(count: int, links: Sequence[Link]) -> Float:
     """(count,) scales of all pairs, the first's 1: a robust linear system of their logarithms.
 
-    Every link weighs by its spread; those that contradict the others lose weight (soft L1).
+    Every link weighs by its spread; those that contradict the others lose weight (Cauchy).
 
     Raises:
         DataError: a pair is linked to no other.
@@ -105,6 +105,6 @@ def solve_scales(count: int, links: Sequence[Link]) -> Float:
     A, b = rows[:, 1:] / sigma[:, None], value / sigma
     first = np.linalg.lstsq(A, b, rcond=None)[0]
     if len(links) > count - 1:
-        answer = least_squares(lambda x: A @ x - b, first, jac=lambda x: A, loss="soft_l1")
+        answer = least_squares(lambda x: A @ x - b, first, jac=lambda x: A, loss="cauchy")
         first = answer.x
     return np.exp(np.concatenate([[0.0], first]))

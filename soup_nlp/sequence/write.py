@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.report.colour import Image, colourise_depth, depth_range
+from soup_nlp.report.figures import write_clipped_depth_png16
 from soup_nlp.report.pointcloud import AXES, write_ply
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.page import chain_page
@@ -42,7 +43,7 @@ def write_chain(folder: Path, chain: Chain, name: str) -> list[str]:
     depths = [chain.depth(k) for k in range(len(chain))]
     scale = _png_scale(depths)
     for k, z in enumerate(depths):
-        write_depth(folder / "depth" / f"{k:04d}.png", z, scale)
+        write_clipped_depth_png16(folder / "depth" / f"{k:04d}.png", z, scale)
     for k in range(len(chain.pairs)):
         _cloud(folder / "points" / f"{k:04d}.ply", chain, k, name)
     told = {**summary(chain), "name": name, "depth_png_scale": scale, "score": score(chain)}
@@ -109,13 +110,6 @@ def coloured(depths: list[Float]) -> list[Image]:
     """Depth of all frames in colours of one range."""
     near, far = depth_range(np.concatenate([z.ravel()[::7] for z in depths]))
     return [colourise_depth(z, near, far) for z in depths]
-
-
-def write_depth(path: Path, depth: Float, scale: float) -> None:
-    """Write a depth map as 16-bit PNG: value = round(depth * scale), 0 where unknown."""
-    from soup_nlp.report.figures import write_clipped_depth_png16
-
-    write_clipped_depth_png16(path, depth, scale)
 
 
 def write_video(path: Path, pictures: list[Image]) -> None:

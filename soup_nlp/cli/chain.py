@@ -1,0 +1,142 @@
+"""Command chain: a sequence of frames on one scale."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from soup_nlp.cli import options
+from soup_nlp.cli.options import Progress
+from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.sequence.chain import make_chain
+from soup_nlp.sequence.frames import (
+    VIDEOS,
+    FileFrames,
+    Frames,
+    SceneFrames,
+    find_depths,
+    find_images,
+    video_frames,
+)
+from soup_nlp.sequence.pairs import ROWS, solve_pairs
+from soup_nlp.sequence.report import table
+from soup_nlp.sequence.write import write_chain
+
+SCENE = "scene:"
+"""Before the name of a rendered scene."""
+
+
+def chain(
+    source: Annotated[
+        list[str],
+        typer.Argument(help="Folder, images, 'pattern/*.jpg', video, or scene:NAME."),
+    ],
+    out: options.Out = Path("out/chain"),
+    intrinsics: Annotated[
+        str | None,
+        typer.Option(help="fx,fy,cx,cy in pixels, or a file; default K.txt beside the images."),
+    ] = None,
+    fov: Annotated[
+        float | None, typer.Option(help="Horizontal field of view, degrees, instead.")
+    ] = None,
+    stride: Annotated[int, typer.Option(help="Take every so many frames.", min=1)] = 1,
+    frames: Annotated[
+        int | None, typer.Option(help="Most frames; of a scene 10 unless named.", min=2)
+    ] = None,
+    two_frame: Annotated[
+        bool, typer.Option("--two-frame", help="Solve frames k and k + 2 too, for more links.")
+    ] = False,
+    depth_scale: Annotated[
+        float, typer.Option(help="Values per unit of length of true depth_*.png (KITTI 256).")
+    ] = 1000.0,
+    overrides: options.Set = None,
+    workers: options.Workers = 1,
+    quiet: options.Quiet = False,
+) -> None:
+    """Solve the consecutive pairs of a sequence and put them on one scale."""
+    _check_folder(out)
+    sequence = _frames(source, out, intrinsics, fov, stride, frames, depth_scale)
+    count = len(sequence)
+    which = [(k, k + 1) for k in range(count - 1)]
+    over = [(k, k + 2) for k in range(count - 2)] if two_frame else []
+    changes = ["output.page=false", *(overrides or [])]
+    pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet))
+    done = make_chain(pairs[: len(which)], pairs[len(which) :])
+    name = source[0] if len(source) == 1 else f"{source[0]} ..."
+    files = write_chain(out, done, name)
+    print(table(done))
+    print(f"files       {out}/: " + ", ".join(files))
+
+
+def _check_folder(out: Path) -> None:
+    """Raise DataError where the output folder holds what no chain has written."""
+    if out.is_dir() and any(out.iterdir()) and not (out / ROWS).is_file():
+        raise DataError(
+            "output folder holds files of its own",
+            where=out,
+            expected="a new or empty folder, or that of an earlier chain",
+            hint="choose another --out",
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    (out / ROWS).touch()
+
+
+def _frames(
+    source: list[str],
+    out: Path,
+    intrinsics: str | None,
+    fov: float | None,
+    stride: int,
+    most: int | None,
+    depth_scale: float,
+) -> Frames:
+    """The frames that the command line names."""
+    first = source[0]
+    if first.startswith(SCENE):
+        own = first.removeprefix(SCENE)
+        if len(source) > 1 or stride > 1 or intrinsics or fov:
+            raise ConfigError("a rendered scene has its own camera and steps", found=source)
+        return SceneFrames(own, most or 10)
+    path = Path(first).expanduser()
+    depths: list[Path] = []
+    if len(source) > 1:
+        images = [Path(name) for name in source][::stride][:most]
+    elif path.suffix.lower() in VIDEOS:
+        images = video_frames(path, out / "frames", stride, most)
+    else:
+        images = find_images(path)[::stride][:most]
+        depths = find_depths(images)
+    images = [p.resolve() for p in images]
+    return FileFrames(
+        tuple(images),
+        _camera(images[0].parent, intrinsics, fov),
+        tuple(p.resolve() for p in depths),
+        depth_scale,
+    )
+
+
+def _camera(folder: Path, intrinsics: str | None, fov: float | None) -> dict[str, Any]:
+    """Keys of an input of files."""
+    if intrinsics and fov:
+        raise ConfigError("two cameras are named", found="--intrinsics and --fov", expected="one")
+    if fov:
+        return {"fov": fov}
+    if intrinsics is None:
+        own = folder / "K.txt"
+        return {"intrinsics": str(own)} if own.is_file() else {}
+    if Path(intrinsics).is_file():
+        return {"intrinsics": str(Path(intrinsics).resolve())}
+    try:
+        numbers = [float(word) for word in intrinsics.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 4:
+        raise ConfigError(
+            "intrinsics are neither a file nor four numbers",
+            where="--intrinsics",
+            found=intrinsics,
+            expected="fx,fy,cx,cy in pixels, or a file of 4 or 9 numbers",
+        )
+    return {"intrinsics": numbers}

@@ -1,0 +1,227 @@
+"""Pairs of a sequence on one scale."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from helpers_result import CAMERA, small_result
+
+from soup_nlp.cli.main import main
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.rotation import exp
+from soup_nlp.report.figures import write_png
+from soup_nlp.sequence.chain import make_chain
+from soup_nlp.sequence.frames import (
+    FileFrames,
+    SceneFrames,
+    find_depths,
+    find_images,
+    video_frames,
+)
+from soup_nlp.sequence.pairs import SolvedPair
+from soup_nlp.sequence.scales import Link, link, solve_scales
+from soup_nlp.sequence.score import aligned
+from soup_nlp.sequence.tracks import carried, follow, number
+
+IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+
+
+def test_the_link_of_two_maps_is_the_median_of_their_ratio():
+    rng = np.random.default_rng(0)
+    one = rng.uniform(1, 5, (30, 40))
+    other = one / 1.3 * np.exp(rng.normal(0, 0.02, one.shape))
+    # a fifth is far off, some is unknown
+    other[:6] *= 3
+    other[6:8] = np.nan
+    found = link(2, 3, one, other, np.ones(one.shape, bool))
+    assert (found.first, found.second, found.pixels) == (2, 3, 28 * 40)
+    # the median of noise of 0.02, moved by the fifth on one side: less than one of its deviations
+    assert found.log_ratio == pytest.approx(np.log(1.3), abs=0.02)
+    assert 0.02 < found.spread < 0.04
+    assert not found.flagged
+    assert link(0, 1, one, other, np.zeros(one.shape, bool)) is None
+    few = np.zeros(one.shape, bool)
+    few[10, :20] = True
+    assert link(0, 1, one, other, few).flagged
+
+
+def test_scales_follow_their_links():
+    true = np.array([1.0, 1.2, 0.7, 0.9])
+
+    def between(a, b, error=0.0, **marks):
+        return Link(a, b, float(np.log(true[b] / true[a]) + error), 0.02, 5000, **marks)
+
+    chain = [between(0, 1), between(1, 2), between(2, 3)]
+    np.testing.assert_allclose(solve_scales(4, chain), true, rtol=1e-9)
+    assert solve_scales(1, []) == [1.0]
+    # one of several that contradict each other gives way, a guess even more
+    more = [*chain, between(0, 2), between(1, 3), between(0, 3, error=0.5)]
+    np.testing.assert_allclose(solve_scales(4, more), true, rtol=0.02)
+    guess = [*chain[:2], between(2, 3, error=0.5, flagged=True), between(1, 3, bridge=True)]
+    np.testing.assert_allclose(solve_scales(4, guess), true, rtol=0.01)
+    with pytest.raises(DataError, match="pair 3"):
+        solve_scales(4, chain[:2])
+
+
+def test_components_are_followed_by_overlap():
+    before = np.zeros((10, 20), int)
+    before[2:6, 2:8], before[2:6, 12:16] = 1, 2
+    before[0] = -1
+    after = np.zeros((10, 20), int)
+    after[3:7, 2:8], after[7:9, 10:19] = 2, 1
+    assert follow(before, after) == {1: 2}
+    assert follow(before, np.zeros((10, 20), int)) == {}
+    tracks = number([{1: 2}, {2: 1}], [3, 3, 2])
+    assert tracks == [{0: 0, 1: 1, 2: 2}, {0: 0, 1: 3, 2: 1}, {0: 0, 1: 1}]
+
+
+def scaled(result, factor):
+    """The same result in another unit: its lengths times a factor."""
+    rec = result.reconstruction
+    changes = {k: factor * getattr(rec, k) for k in ("depth_ref", "depth_next")}
+    changes |= {k: factor * getattr(rec, k) for k in ("points_ref", "points_next")}
+    parts = tuple(
+        replace(c, motion=replace(c.motion, t=factor * c.motion.t), centre=factor * c.centre)
+        for c in result.components
+    )
+    components = replace(result.components, members=parts)
+    return replace(result, reconstruction=replace(rec, **changes), components=components)
+
+
+def toy_pairs():
+    """Two pairs of frames 0, 1, 2; the wall comes nearer by CAMERA, and units differ by 2."""
+    first = small_result()
+    # seen from frame 1 the scene is the next frame of the first pair
+    depth = first.reconstruction.depth_next
+    second = scaled(first, 0.5)
+    rec = replace(second.reconstruction, depth_ref=0.5 * depth)
+    second = replace(second, reconstruction=rec)
+    return [SolvedPair(k, k + 1, r, {}, 5.0) for k, r in enumerate((first, second))]
+
+
+def test_a_chain_has_one_scale_and_one_frame_of_reference():
+    chain = make_chain(toy_pairs())
+    np.testing.assert_allclose(chain.scales, [1, 2], rtol=1e-9)
+    np.testing.assert_allclose(chain.depth(1), 2 * chain.pairs[1].result.depths[0])
+    np.testing.assert_allclose(
+        chain.world_from_camera[1].matrix, np.linalg.inv(CAMERA.matrix), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        chain.world_from_camera[2].matrix, np.linalg.inv(CAMERA.matrix @ CAMERA.matrix), atol=1e-9
+    )
+    # the static scene stands still in the world
+    np.testing.assert_allclose(chain.motion(1, 0).matrix, np.eye(4), atol=1e-9)
+    with pytest.raises(DataError, match="consecutive"):
+        make_chain(toy_pairs()[1:])
+
+
+def test_a_pair_without_parallax_is_bridged():
+    first, second = toy_pairs()
+    # in between nothing moves, and its depth is nonsense
+    still = small_result()
+    rest = tuple(replace(c, borrowed=1.0) for c in still.components)
+    identity = np.arange(60 * 80).reshape(60, 80)
+    rec = replace(
+        still.reconstruction,
+        depth_ref=np.full((60, 80), 7.0),
+        depth_next=np.full((60, 80), 7.0),
+        source_next=identity,
+    )
+    middle = replace(still, reconstruction=rec, components=replace(still.components, members=rest))
+    pairs = [first, SolvedPair(1, 2, middle, {}, 0.0), replace(second, first=2, second=3)]
+    chain = make_chain(pairs)
+    assert [k.flagged for k in chain.links] == [True, True, False]
+    assert chain.links[-1].bridge
+    assert chain.scales[2] == pytest.approx(2, rel=0.01)
+
+
+def test_labels_are_carried_to_the_next_frame():
+    result = small_result()
+    there = carried(result.components.of_pixel, result.reconstruction)
+    seen = result.reconstruction.source_next >= 0
+    assert (there[~seen] == -1).all()
+    assert set(np.unique(there[seen])) == {0, 1}
+
+
+def test_similarities_are_found_exactly():
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(6, 3))
+    target = 2.5 * points @ exp([0.3, -0.2, 0.5]).T + [1, 2, 3]
+    np.testing.assert_allclose(aligned(points, target), target, atol=1e-12)
+    assert not np.allclose(aligned(points * [1, 1, -1], target), target)
+
+
+def test_frames_of_a_folder_a_pattern_and_a_video(tmp_path):
+    for k in (10, 9, 100):
+        write_png(tmp_path / f"frame_{k}.png", IMAGE)
+        np.save(tmp_path / f"depth_{k}.npy", np.ones((48, 64)))
+    write_png(tmp_path / "other.png", IMAGE)
+    images = find_images(tmp_path)
+    assert [p.name for p in images] == ["frame_9.png", "frame_10.png", "frame_100.png"]
+    assert find_images(tmp_path / "frame_1*.png") == images[1:]
+    depths = find_depths(images)
+    assert [p.name for p in depths] == ["depth_9.npy", "depth_10.npy", "depth_100.npy"]
+    (tmp_path / "depth_9.npy").unlink()
+    assert find_depths(images) == []
+    own = FileFrames(tuple(images), {"fov": 60}, tuple(depths), 256.0).pair(0, 2)
+    assert own["next"] == str(images[2])
+    assert own["depth_next"] == str(depths[2])
+    with pytest.raises(DataError, match="two images"):
+        find_images(tmp_path / "*.jpg")
+    video = cv2.VideoWriter(
+        str(tmp_path / "a.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48)
+    )
+    for k in range(5):
+        video.write(np.full((48, 64, 3), 50 * k, np.uint8))
+    video.release()
+    found = video_frames(tmp_path / "a.avi", tmp_path / "frames", stride=2)
+    levels = [cv2.imread(str(p)).mean() for p in found]
+    np.testing.assert_allclose(levels, [0, 100, 200], atol=3)
+    (tmp_path / "b.mp4").write_bytes(b"no video")
+    with pytest.raises(DataError, match="video"):
+        video_frames(tmp_path / "b.mp4", tmp_path / "frames2")
+
+
+def test_frames_of_a_scene_follow_each_other():
+    assert SceneFrames("street", 4).pair(2, 3)["frame"] == 2
+    with pytest.raises(DataError):
+        SceneFrames("street", 4).pair(0, 2)
+
+
+@pytest.mark.slow
+def test_a_rendered_sequence_has_one_scale(tmp_path, capsys):
+    small = "input.width=192,input.height=128,segmentation.superpixels=60,flow.source=truth"
+    settings = [x for item in small.split(",") for x in ("--set", item)]
+    call = ["chain", "scene:street", "--frames", "3", "--out", str(tmp_path / "out"), "-q"]
+    call += [*settings, "--set", "refine.enabled=false", "--set", "segmentation.neighbours=8"]
+    assert main(call) == 0
+    printed = capsys.readouterr().out
+    told = json.loads((tmp_path / "out" / "chain.json").read_text())
+    (one,) = told["links"]
+    # the static scene has exact flow; planes of 400 pixels cost a few per cent
+    assert one["ratio"] == pytest.approx(told["score"]["links"][0]["true"], rel=0.02)
+    assert told["score"]["cost"] < 0.02
+    assert told["score"]["path"]["share"] < 0.01
+    assert "with one for the sequence" in printed
+    page = (tmp_path / "out" / "chain.html").read_text()
+    assert "src=" not in page.replace(".src = ", "")
+    assert "http" not in page.replace("http-equiv", "")
+    video = cv2.VideoCapture(str(tmp_path / "out" / "depth.mp4"))
+    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 3
+    video.release()
+    assert len(np.loadtxt(tmp_path / "out" / "trajectory.tum")) == 3
+    # what is solved is not solved again
+    rows = (tmp_path / "out" / "pairs.jsonl").read_text()
+    assert main(call) == 0
+    assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
+
+
+def test_folders_of_the_user_are_left_alone(tmp_path, capsys):
+    (tmp_path / "chain.json").write_text("mine")
+    assert main(["chain", "scene:street", "--out", str(tmp_path)]) == 2
+    assert "files of its own" in capsys.readouterr().err
+    assert (tmp_path / "chain.json").read_text() == "mine"
