@@ -18,7 +18,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import Input
 from soup_nlp.data.pair import Pair
-from soup_nlp.errors import ConfigError, printable
+from soup_nlp.errors import ConfigError, expect, printable
 from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.refine.records import RefineOptions
@@ -225,6 +225,9 @@ def make_problem(
     Raises:
         ConfigError: as `load_problem`.
     """
+    expect(raw, Mapping, "problem", "a dict of sections: {'input': {'kind': 'motorcycle'}}")
+    for item in overrides:
+        expect(item, str, "override", "text such as 'solver.max_iter=200'")
     tree = copy.deepcopy(dict(raw))
     overridden = {_override(tree, item): f"--set {item}" for item in overrides}
     lines = {**(lines or {}), **overridden}

@@ -14,6 +14,7 @@ from soup_nlp.data.formats.images import read_image
 from soup_nlp.data.formats.map_files import read_flow
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.schema.limits import check_image_size
 
 Float = NDArray[np.float64]
 
@@ -59,6 +60,7 @@ def image_of(given: ImageLike, where: str) -> NDArray[np.uint8]:
         )
     if image.size == 0:
         raise DataError("image has no pixels", where=where, found=image.shape)
+    check_image_size(image.shape[1], image.shape[0], "image", where)
     image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[:, :, :3]
     return np.ascontiguousarray(image)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.data.accept import CameraLike, FlowLike, ImageLike, camera_of, flow_of, image_of
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, printable, repr_of
 
 Float = NDArray[np.float64]
 
@@ -108,6 +108,20 @@ class Flow:
     __repr__ = __str__
 
 
+_SHAPES = {
+    "depth_ref": "(H, W)",
+    "depth_next": "(H, W)",
+    "flow": "(H, W, 2)",
+    "occluded": "(H, W)",
+    "components": "(H, W)",
+    "motions": "(B, 4, 4)",
+    "points": "(M, 3)",
+    "scene_flow": "(H, W, 3)",
+}
+_KINDS = dict.fromkeys(_SHAPES, "fiu") | {"occluded": "b", "components": "iu"}
+"""Shape and kind of number of every part of a truth."""
+
+
 @dataclass(frozen=True)
 class Truth:
     """What is known of the scene, for measuring only; any part may be None.
@@ -133,6 +147,23 @@ class Truth:
     points: Float | None = None
     scene_flow: Float | None = None
     unit: str = "m"
+
+    def __post_init__(self) -> None:
+        for name, kinds in _KINDS.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            made = np.asarray(value) if isinstance(value, np.ndarray | list | tuple) else None
+            if made is None or made.dtype.kind not in kinds or made.ndim < 2:
+                raise DataError(
+                    "part of the truth is no array of its kind",
+                    where=f"truth.{name}",
+                    found=f"{type(value).__name__} {printable(repr_of(value), 60)}",
+                    expected=f"{_SHAPES[name]} array of "
+                    + ("True and False" if kinds == "b" else "numbers"),
+                    hint="soup_nlp.Truth(depth_ref=array); files are read by a problem's input",
+                )
+            object.__setattr__(self, name, made)
 
     def known(self) -> list[str]:
         """Names of the parts that are not None."""

@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, repr_of
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -142,11 +142,17 @@ def check_cap(cap: float | None) -> None:
     Raises:
         DataError: it is not; NaN is not.
     """
-    if cap is not None and not cap > 0:
+    if cap is None:
+        return
+    try:
+        positive = float(cap) > 0
+    except (TypeError, ValueError, OverflowError):
+        positive = False
+    if not positive:
         raise DataError(
             "depth cap must be positive",
             where="cap",
-            found=cap,
+            found=repr_of(cap),
             expected="a depth in the unit of the truth, such as 70",
         )
 

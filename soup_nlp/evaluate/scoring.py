@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Truth
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, repr_of
 from soup_nlp.evaluate.metrics import (
     DepthMetrics,
     Scale,
@@ -119,6 +120,10 @@ def evaluate(
             pixel.
     """
     check_cap(cap)
+    if not (isinstance(scale, str) and scale in get_args(Scale)):
+        raise DataError(
+            "unknown scale rule", found=repr_of(scale), expected=", ".join(get_args(Scale))
+        )
     tree = read_h5(as_path(folder, "result folder") / "result.h5")
     depths = {k: require(tree, f"depth/{v}") for k, v in DEPTHS.items() if v in tree["depth"]}
     gt = read_depth(depth, depth_scale)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from soup_nlp.config.problem import Problem, dump_problem, make_problem, title
 from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.pair import Pair
-from soup_nlp.errors import StoppedError
+from soup_nlp.errors import StoppedError, expect
 from soup_nlp.evaluate.baselines import rigid_depth
 from soup_nlp.evaluate.confidence import Confidence, confidence
 from soup_nlp.evaluate.metrics import DepthMetrics
@@ -42,6 +42,9 @@ from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.propose import Start
 
 Float = NDArray[np.float64]
+
+PAIR = "soup_nlp.Pair(image_ref, image_next, K_ref)"
+"""How a pair is made, for messages."""
 
 
 @dataclass(frozen=True)
@@ -242,6 +245,9 @@ def run(
         StoppedError: `stop` was set before there was a start.
         SoupError: the input cannot be used.
     """
+    expect(problem, Problem, "problem", "soup_nlp.load_problem(FILE), or make_problem({...})")
+    if pair is not None:
+        expect(pair, Pair, "pair", PAIR)
     clock = _Clock(stop, on_stage)
     case = prepare(problem, pair=pair, log=log, on_stage=clock)
 
@@ -376,6 +382,7 @@ def solve_pair(pair: Pair, **options: Any) -> Run:
         ConfigError: an option is wrong.
         DataError: the pair cannot be used.
     """
+    expect(pair, Pair, "pair", PAIR)
     source = {"kind": "memory", "hash": pair_hash(pair)}
     raw = {"name": title(pair.name), "input": source, **options}
     return run(make_problem(raw, where="solve_pair"), pair=pair)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -13,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Pair
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, printable
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.report.tree import result_tree
+from soup_nlp.storage.files import is_file, read_json, read_text
 from soup_nlp.storage.h5_files import ReadTree, read_attrs, read_h5
 from soup_nlp.storage.store import Array, Tree, plain
 
@@ -124,9 +124,9 @@ def of_folder(folder: Path, pair: Pair | None = None) -> Shown:
     """
     tree = read_h5(folder / "result.h5")
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        summary = read_json(folder / "summary.json", "summary.json")
         name, metrics = summary["name"], summary["metrics"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (KeyError, TypeError) as error:
         raise DataError(
             "summary.json cannot be read", where=folder, found=error, hint="run solve first"
         ) from error
@@ -150,9 +150,9 @@ def _values(tree: Tree) -> ReadTree:
 
 def _ending(log: Path) -> str:
     """The verdict at the end of a log; "" where there is none."""
-    if not log.is_file():
+    if not is_file(log):
         return ""
-    lines = log.read_text(encoding="utf-8").splitlines()
+    lines = [printable(line) for line in read_text(log, "log.txt").splitlines()]
     starts = [k for k, line in enumerate(lines) if line.startswith(("status  ", "solver  "))]
     own = lines[starts[-1] :] if starts else []
     return "\n".join(line for line in own if not line.startswith(("files  ", "look  ", "next  ")))
