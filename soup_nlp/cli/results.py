@@ -15,9 +15,10 @@ from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
 from soup_nlp.export.residuals import residual_table, table_text
 from soup_nlp.family.results import check_sol
-from soup_nlp.report.check import LIMITS, check_folder
+from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.verdict import accuracy, protocol
+from soup_nlp.solve.kkt import LIMITS
 from soup_nlp.storage.files import is_folder
 from soup_nlp.storage.h5_files import read_h5
 

@@ -235,7 +235,14 @@ def confidence(
     weak = weights.replace(prior=PRIOR_SHARE * weights.prior)
     info = information(soup, data, weak, form)
     sizes = np.bincount(labels.ravel(), minlength=len(soup))
-    own = marginals(info, sizes, start.component)
-    spread = spread_in_image(info, own.plane, labels, K_ref)
     noise = flow_noise(start)
+    try:
+        own = marginals(info, sizes, start.component)
+    except ArithmeticError:
+        # an energy without some of its terms leaves directions free: nothing is sure
+        free = np.full((len(soup), 3, 3), np.inf)
+        nothing = Marginals(free, np.full(int(start.component.max()) + 1, np.inf))
+        spread = np.full(labels.shape, np.inf)
+        return Confidence(spread, spread, nothing, noise)
+    spread = spread_in_image(info, own.plane, labels, K_ref)
     return Confidence(calibrated(spread, noise), spread, own, noise)

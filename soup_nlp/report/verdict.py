@@ -21,6 +21,7 @@ WORDS = {
     "Solved_To_Acceptable_Level": "converged to Ipopt's acceptable level",
     "Maximum_Iterations_Exceeded": "not converged: iteration limit, best iterate kept",
     "Time_Limit": "not converged: time limit, best iterate kept",
+    "Constraints_Violated": "not converged: the answer breaks its constraints",
     "Skipped": "refined from the start, no NLP",
     "Interrupted": "interrupted, best iterate kept",
     "Infeasible_Problem_Detected": "not converged: no feasible point nearby, best iterate kept",

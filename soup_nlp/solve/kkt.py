@@ -13,6 +13,27 @@ from soup_nlp.solve.ipopt import Stage
 Float = NDArray[np.float64]
 
 
+LIMITS = {
+    "so3": 1e-8,
+    "normal": 1e-8,
+    "simplex": 1e-10,
+    "positive": 0.0,
+    "det": 1e-8,
+    # Ipopt keeps inequalities to its own tolerance
+    "visible": 1e-6,
+}
+"""Largest violation that a delivered soup may have, by kind of constraint."""
+UNMET = "Constraints_Violated"
+"""Status of a solve whose answer does not satisfy its constraints, whatever the solver says."""
+
+
+def feasible(soup: Soup, rim_ray: Float, min_facing: float) -> bool:
+    """Whether a soup satisfies its constraints within LIMITS; arguments as below."""
+    found = constraint_residuals(soup, rim_ray, min_facing)
+    # false for NaN too
+    return all(found[name] <= limit for name, limit in LIMITS.items())
+
+
 def constraint_residuals(soup: Soup, rim_ray: Float, min_facing: float) -> dict[str, float]:
     """Largest violation of every kind of constraint, from the arrays alone.
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.model.compile import compiler_seconds
@@ -22,7 +23,7 @@ from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.ipopt import Ipopt, Listener, Stage, Watch
-from soup_nlp.solve.kkt import residuals
+from soup_nlp.solve.kkt import UNMET, feasible, residuals
 from soup_nlp.solve.phase import Phase
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.tangent_problem import TangentProblem
@@ -161,12 +162,20 @@ def solve_soup(
     watch.say(str(stage))
     found = {"constrained NLP": layout.unpack(stage.x), "presolve": presolved, "start": start}
     ends = {k: s.normalised(data.share).retracted() for k, s in found.items() if s is not None}
-    delivered = min(ends, key=lambda k: energy(ends[k]))
-    final = ends[delivered]
+    held = {k: s for k, s in ends.items() if feasible(s, data.rim_ray, form.min_facing)}
+    if not held:
+        # nothing that breaks its constraints is delivered
+        rays = data.visibility_ray(form.depth_ratio)
+        tilted = tilt_to_camera(start, data.anchor_ray, rays, form.min_facing)
+        held = {"start": tilted.normalised(data.share).retracted()}
+    delivered = min(held, key=lambda k: energy(held[k]))
+    final = held[delivered]
+    # the solver's word is not taken for it
+    broken = stage.converged and "constrained NLP" not in held
     return Solution(
         soup=final,
-        status=stage.status,
-        converged=stage.converged,
+        status=UNMET if broken else stage.status,
+        converged=stage.converged and not broken,
         stages=tuple(stages),
         energy_start=oracle.energy(start, data, weights),
         energy=oracle.energy(final, data, weights),
