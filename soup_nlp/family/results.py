@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import Limits, Residuals, examine, violations
 from soup_nlp.family.frozen import load_frozen
 from soup_nlp.family.instances import VERSION, build_instance, case_of, parse_name
+from soup_nlp.storage.files import read_json
 from soup_nlp.storage.store import write_json
 
 Float = NDArray[np.float64]
@@ -117,7 +117,7 @@ def read_results(path: Path) -> list[dict[str, Any]]:
         ExportError: it cannot be read, or a row lacks a field.
     """
     try:
-        rows = json.loads(path.read_text(encoding="utf-8"))["results"]
+        rows = read_json(path, "results file", error=ExportError)["results"]
         missing = [f"row {k}: {f}" for k, row in enumerate(rows) for f in FIELDS if f not in row]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ExportError("results cannot be read", where=path, found=error) from error
