@@ -27,9 +27,9 @@ from soup_nlp.bench.tables import (
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import (
     FACTOR,
-    POWER,
     SIGMA_PRIOR,
     Information,
+    calibrated,
     confidence,
     information,
     spread_in_image,
@@ -48,6 +48,7 @@ CUES = {
     "sigma": "sigma as delivered",
     "own": "the same information, but of each superpixel's own block alone",
     "residual": "re-projection error of the start",
+    "misfit": "distance of the flow from the one that the solution induces",
     "flow": "1 - flow confidence",
     "parallax": "(1 - flow confidence) / parallax",
     "photo": "photometric disagreement of the solution (census)",
@@ -72,17 +73,12 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
     if truth is None or (truth.depth_ref is None and truth.points is None):
         raise DataError("pair has no true depth", where=item.key)
     begin = time.process_time()
-    confidence(
-        result.soup,
-        result.data,
-        result.weights,
-        result.problem.formulation,
-        result.segmentation.labels,
-        result.pair.K_ref,
-        result.start,
-    )
+    assert result.pair.flow is not None
+    energy = result.data, result.weights, result.problem.formulation
+    rec = result.reconstruction
+    confidence(rec, result.pair.flow, result.pair.K_ref, result.start, *energy)
     seconds = time.process_time() - begin
-    z, gt = at_truth(truth, result.reconstruction.depth_ref)
+    z, gt = at_truth(truth, rec.depth_ref)
     true = true_pixels(gt, None) & np.isfinite(z)
     scaled, gt = z[true] * float(np.median(gt[true] / z[true])), gt[true]
 
@@ -93,7 +89,8 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
     cues = {name: chosen(image) for name, image in _cues(result).items()}
     found = {name: sparsification(relative, cue) for name, cue in cues.items()}
     sure = result.confidence
-    unit = chosen((sure.noise * sure.spread) ** POWER)
+    whole = calibrated(sure.spread, sure.noise, sure.misfit[rec.labels], limit=np.inf)
+    unit = chosen(whole) / FACTOR
     picked = np.linspace(0, len(log) - 1, min(SAMPLE, len(log))).astype(int)
     own = found["sigma"]
     return {
@@ -123,6 +120,7 @@ def _cues(result: Run) -> dict[str, Float]:
         "sigma": result.confidence.sigma,
         "own": _own_block(result),
         "residual": start.error[labels],
+        "misfit": result.confidence.misfit[labels],
         "flow": doubt,
         "parallax": (0.02 + doubt) / np.maximum(start.parallax, LEAST_PARALLAX)[labels],
     }

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.camera import pixel_grid, rays
-from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.soup import Reconstruction, Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation, FormulationOptions
@@ -156,8 +157,10 @@ SIGMA_PRIOR = 0.5
 """Standard deviation of log depth where the pair says nothing: scenes vary by about that much."""
 PRIOR_SHARE = 0.01
 """Factor of E_prior in the information: it holds depth where nothing else does, knowing little."""
-FACTOR, POWER = 14.0, 1.25
+FACTOR, POWER = 10.5, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
+MOST_MISFIT = 5.0
+"""Pixels beyond which a flow that the answer contradicts is as wrong as any."""
 MIN_CONFIDENCE = 0.5
 """A pixel whose confidence, 1 - sigma / `SIGMA_PRIOR`, is less is a guess."""
 MOST_SIGMA = (1 - MIN_CONFIDENCE) * SIGMA_PRIOR
@@ -173,12 +176,14 @@ class Confidence:
         spread: (H, W) standard deviation of log depth as the marginals have it.
         marginals: Of the planes and of the components' scales.
         noise: Of the flow, pixels, see `flow_noise`.
+        misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
     """
 
     sigma: Float
     spread: Float
     marginals: Marginals
     noise: float
+    misfit: Float
 
     @property
     def guessed(self) -> float:
@@ -202,47 +207,54 @@ def flow_noise(start: Start) -> float:
     return float(np.clip(np.median(start.error), LEAST_NOISE, MOST_NOISE))
 
 
-def calibrated(spread: Float, noise: float) -> Float:
-    """Standard deviation of log depth that errors keep to, at most `SIGMA_PRIOR`.
+def flow_misfit(rec: Reconstruction, flow: Flow) -> Float:
+    """(N,) mean distance of a flow from the one that a reconstruction induces, pixels."""
+    distance = np.linalg.norm(rec.flow - flow.uv, axis=-1)
+    limited = np.where(np.isfinite(distance), np.minimum(distance, MOST_MISFIT), MOST_MISFIT)
+    flat = rec.labels.ravel()
+    return np.asarray(np.bincount(flat, limited.ravel()) / np.bincount(flat))
+
+
+def calibrated(
+    spread: Float, noise: float, misfit: Float | float = 0.0, limit: float = SIGMA_PRIOR
+) -> Float:
+    """Standard deviation of log depth that errors keep to.
 
     Args:
         spread: What the marginals say.
         noise: Of the flow, pixels.
+        misfit: Of the same superpixel, pixels; where it is larger than the noise, their geometric
+            mean is the noise.
+        limit: Largest value.
     """
-    return np.asarray(np.minimum(FACTOR * (noise * spread) ** POWER, SIGMA_PRIOR))
+    local = np.sqrt(noise * np.maximum(noise, misfit))
+    return np.asarray(np.minimum(FACTOR * (local * spread) ** POWER, limit))
 
 
 def confidence(
-    soup: Soup,
+    rec: Reconstruction,
+    flow: Flow,
+    K_ref: Float,
+    start: Start,
     data: EnergyData,
     weights: Weights,
     form: FormulationOptions,
-    labels: NDArray[np.int32],
-    K_ref: Float,
-    start: Start,
 ) -> Confidence:
     """How sure the depth of an answer is.
 
     Args:
-        soup: The answer.
+        rec: The answer.
+        flow: Flow that it was solved with.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        start: Rigid components and the flow's noise.
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
         form: Visibility and whether kernels are compiled.
-        labels: (H, W) superpixel of every pixel.
-        K_ref: (3, 3) intrinsics of the reference frame.
-        start: Rigid components and the flow's noise.
     """
     weak = weights.replace(prior=PRIOR_SHARE * weights.prior)
-    info = information(soup, data, weak, form)
-    sizes = np.bincount(labels.ravel(), minlength=len(soup))
-    noise = flow_noise(start)
-    try:
-        own = marginals(info, sizes, start.component)
-    except ArithmeticError:
-        # an energy without some of its terms leaves directions free: nothing is sure
-        free = np.full((len(soup), 3, 3), np.inf)
-        nothing = Marginals(free, np.full(int(start.component.max()) + 1, np.inf))
-        spread = np.full(labels.shape, np.inf)
-        return Confidence(spread, spread, nothing, noise)
-    spread = spread_in_image(info, own.plane, labels, K_ref)
-    return Confidence(calibrated(spread, noise), spread, own, noise)
+    info = information(rec.soup, data, weak, form)
+    own = marginals(info, np.bincount(rec.labels.ravel()), start.component)
+    spread = spread_in_image(info, own.plane, rec.labels, K_ref)
+    noise, misfit = flow_noise(start), flow_misfit(rec, flow)
+    sigma = calibrated(spread, noise, misfit[rec.labels])
+    return Confidence(sigma, spread, own, noise, misfit)

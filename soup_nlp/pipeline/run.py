@@ -305,9 +305,9 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     before, middle = dense(case.start.soup), dense(solution.soup)
     after = middle if refined is None else dense(refined.soup)
     between = middle if refined is not None and solution.stages else None
-    form = case.problem.formulation
-    own = refined.soup if refined else solution.soup
-    sure = confidence(own, case.data, case.weights, form, labels, pair.K_ref, case.start)
+    assert pair.flow is not None
+    energy = case.data, case.weights, case.problem.formulation
+    sure = confidence(after, pair.flow, pair.K_ref, case.start, *energy)
     after = replace(after, sigma_ref=sure.sigma)
     full = None if case.full is None else full_size(case.full, pair, after, expected)
     rigid = rigid_depth(pair) if pair.truth is not None else None

@@ -110,6 +110,7 @@ _CONFIDENCE: Table = {
     ),
     "spread": ("1", "H,W", "standard deviation of log z by the marginals, not calibrated"),
     "component_sigma": ("1", "C", "standard deviation of a rigid component's log scale"),
+    "misfit": ("px", "N", "mean distance of the flow from the one that the answer induces"),
     "noise": ("px", "", "noise of the flow that the calibration uses"),
 }
 _IPOPT = {
@@ -173,6 +174,7 @@ def result_tree(run: Run) -> Tree:
         "plane": run.confidence.marginals.plane,
         "spread": run.confidence.spread,
         "component_sigma": run.confidence.component_sigma,
+        "misfit": run.confidence.misfit,
         "noise": np.float64(run.confidence.noise),
     }
     flow = {"flow": pair.flow.uv, "confidence": pair.flow.confidence}
