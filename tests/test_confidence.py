@@ -8,16 +8,22 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.pair import Flow
 from soup_nlp.evaluate.confidence import (
+    MOST_SIGMA,
     POWER,
     SIGMA_PRIOR,
     calibrated,
+    confidence,
+    flow_misfit,
     information,
     marginals,
     spread_in_image,
 )
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve import selected_inverse
 from soup_nlp.solve.selected_inverse import BlockCholesky, dissect
 from soup_nlp.solve.tangent_problem import TangentProblem
@@ -223,3 +229,45 @@ def _with_targets(problem: TangentProblem, smoothing: float) -> tuple[np.ndarray
             return p, at
         place += rows * width
     raise AssertionError("no re-projection")
+
+
+def sure_of(case, data=None, weights=None):
+    K = case.pair.K_ref, case.pair.K_next
+    rec = reconstruct(case.soup, case.segmentation.labels, *K)
+    energy = data or case.data, weights or case.weights, FORM
+    return confidence(rec, case.pair.flow, K[0], case.start, *energy)
+
+
+def test_a_superpixel_that_nothing_holds_has_the_sigma_of_the_prior(small_room):
+    blind = 25
+    weight = small_room.data.pixel_weight.copy()
+    weight[blind] = 0.0
+    data = replace(small_room.data, pixel_weight=weight)
+    free = small_room.weights.replace(arap=1e-9, cont=1e-9, orient=1e-9)
+    sigma = sure_of(small_room, data, free).sigma
+    assert (sigma[small_room.segmentation.labels == blind] == SIGMA_PRIOR).all()
+    assert sure_of(small_room).sigma[small_room.segmentation.labels == blind].mean() < SIGMA_PRIOR
+
+
+def test_the_background_of_a_camera_at_rest_is_a_guess(small_room):
+    scene = {"kind": "scene", "scene": "still", "width": 256, "height": 128}
+    still = prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+    moves = still.pair.truth.components > 0
+    at_rest = sure_of(still).sigma > MOST_SIGMA
+    assert at_rest[~moves].mean() > 0.8
+    assert sure_of(small_room).guessed < 0.2
+
+
+def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
+    K = small_room.pair.K_ref, small_room.pair.K_next
+    rec = reconstruct(small_room.soup, small_room.segmentation.labels, *K)
+    own = small_room.segmentation.labels == 25
+    flow = small_room.pair.flow
+    assert flow_misfit(rec, Flow(rec.flow.astype(np.float32), flow.confidence)).max() < 1e-4
+    moved = np.where(own[..., None], rec.flow + np.array([2.0, 0.0]), rec.flow).astype(np.float32)
+    found = flow_misfit(rec, Flow(moved, flow.confidence))
+    assert found[25] == pytest.approx(2.0, abs=1e-4)
+    assert np.delete(found, 25).max() < 1e-4
+    quiet, loud = calibrated(np.array([0.01]), 0.1, 0.05), calibrated(np.array([0.01]), 0.1, 0.4)
+    # the geometric mean of noise and misfit is twice the noise
+    assert loud / quiet == pytest.approx(2**POWER)
