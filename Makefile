@@ -42,7 +42,7 @@ docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict --quiet
 
 results: $(VENV)/.optional
-	$(BIN)/soup-nlp bench all --out results $(if $(DATA),--data $(DATA))
+	$(BIN)/soup-nlp bench all --out results --overwrite $(if $(DATA),--data $(DATA))
 
 clean:
 	rm -rf $(VENV) out site

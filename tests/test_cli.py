@@ -280,7 +280,7 @@ def test_bad_input_is_refused_with_code_2(images, tmp_path, capsys, changes, par
 
 def test_bad_input_leaves_its_log(images, tmp_path):
     assert solve_files(images, tmp_path, flow="cut.flo") == 2
-    assert "failed" in (tmp_path / "log.txt").read_text()
+    assert "failed" in (tmp_path / "failed.log").read_text()
 
 
 def test_an_unwritable_output_is_refused(images, tmp_path, capsys):

@@ -19,6 +19,7 @@ from soup_nlp.pipeline import case as cases
 from soup_nlp.pipeline.run import run
 from soup_nlp.report import folder as folders
 from soup_nlp.solve.interrupt import interruptible
+from soup_nlp.storage.mark import MARK
 
 pytestmark = pytest.mark.slow
 
@@ -33,9 +34,9 @@ def solve(out: Path) -> int:
     return cli.main(["solve", ORBIT, "--out", str(out), "-q", *SMALL])
 
 
-def ctrl_c(times: int = 1) -> None:
+def ctrl_c(times: int = 1, number: int = signal.SIGINT) -> None:
     for _ in range(times):
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +56,8 @@ def test_before_a_start_it_ends_after_the_stage(owner, stage, tmp_path, monkeypa
     assert "interrupt received" in error
     assert "before there was a start" in error
     assert not (tmp_path / "out" / "summary.json").exists()
-    assert "interrupted" in (tmp_path / "out" / "log.txt").read_text()
+    assert sorted(os.listdir(tmp_path / "out")) == [MARK, folders.FAILED]
+    assert "interrupted" in (tmp_path / "out" / folders.FAILED).read_text()
 
 
 def test_a_second_one_aborts_and_says_so(tmp_path, monkeypatch, capfd):
@@ -85,6 +87,26 @@ def test_once_there_is_a_start_the_best_iterate_is_written(at, tmp_path, monkeyp
     assert all((tmp_path / name).is_file() for name in folders.FILES)
 
 
+@pytest.mark.parametrize("times", [1, 2])
+def test_sigterm_ends_like_ctrl_c(times, tmp_path, monkeypatch, capfd):
+    assert solve(tmp_path) == 0
+    before = (tmp_path / "result.h5").read_bytes()
+    sent = iter([lambda: ctrl_c(times, signal.SIGTERM)])
+    own = solve_module.SolveLog.iteration
+    monkeypatch.setattr(
+        solve_module.SolveLog,
+        "iteration",
+        lambda *args: (next(sent, lambda: None)(), own(*args)),
+    )
+    assert solve(tmp_path) == (1 if times == 1 else 130)
+    assert "interrupt received" in capfd.readouterr().err
+    status = json.loads((tmp_path / "summary.json").read_text())["status"]
+    assert (status == "Interrupted") == (times == 1)
+    assert ((tmp_path / "result.h5").read_bytes() == before) == (times == 2)
+    assert (tmp_path / folders.FAILED).is_file() == (times == 2)
+    assert cli.main(["check", str(tmp_path)]) == 0
+
+
 def test_a_second_one_in_the_solver_aborts_too(tmp_path, monkeypatch, capfd):
     def interrupted(self, progress):
         if progress.stage == "constrained NLP":
@@ -108,8 +130,8 @@ def test_files_that_are_being_written_are_written(tmp_path, monkeypatch, capfd):
 
     monkeypatch.setattr(folders, "write_h5", interrupted)
     assert solve(tmp_path) == 0
-    # the summary says that the rest is there, so the old one goes first
-    assert seen == [False]
+    # the earlier result stays until the new one is whole
+    assert seen == [True]
     assert all((tmp_path / name).is_file() for name in folders.FILES)
     assert "files are being written" in capfd.readouterr().err
 

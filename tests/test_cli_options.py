@@ -88,9 +88,10 @@ def test_a_result_folder_takes_the_next_result_and_is_no_input(tmp_path, capsys)
     assert main([*args, "--out", str(out)]) in (0, 1)
     assert main([*args, "--out", str(out)]) in (0, 1)
     assert main(["solve", str(out / "config.yaml"), "--out", str(out), "-q"]) in (0, 1)
-    # one that was made before there was a mark
+    # without the mark nothing says who made the files
     (out / MARK).unlink()
-    assert main([*args, "--out", str(out)]) in (0, 1)
+    assert main([*args, "--out", str(out)]) == 2
+    assert main([*args, "--out", str(out), "--overwrite"]) in (0, 1)
     for path in (tmp_path / "pair").iterdir():
         (out / path.name).write_bytes(path.read_bytes())
     marked = tmp_path / "stopped while it was written"

@@ -17,6 +17,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.errors import ExportError
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.sol import write_sol
+from soup_nlp.storage.mark import MARK
 
 pytestmark = pytest.mark.slow
 
@@ -43,10 +44,12 @@ def test_a_second_export_removes_the_files_of_the_first(tmp_path):
     (tmp_path / "mine.txt").write_text("not of the export")
     manifest["files"] += ["mine.txt", "../outside"]
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    assert write(tmp_path, "--superpixels", "12", "-q") == 0
+    # it was changed, so it is the user's now
+    assert write(tmp_path, "--superpixels", "12", "-q") == 2
+    assert write(tmp_path, "--superpixels", "12", "-q", "--overwrite") == 0
     names = {p.name for p in tmp_path.iterdir()}
     own = {"soup.nl", "soup.col", "soup.row", "problem.yaml", "manifest.json"}
-    assert names == own | {"mine.casadi", "mine.txt"}
+    assert names == own | {"mine.casadi", "mine.txt", MARK}
 
 
 def test_sizes_that_give_the_same_number_have_folders_of_their_own(tmp_path, capsys):
@@ -59,6 +62,14 @@ def test_sizes_that_give_the_same_number_have_folders_of_their_own(tmp_path, cap
     words = [w for f in ("free", "free/smooth/smooth") for w in ("--formulation", f)]
     assert write(tmp_path / "f", "--superpixels", "9", *words) == 0
     assert len(capsys.readouterr().out.splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["problem.yaml", "manifest.json"])
+def test_files_of_the_user_are_not_overwritten(name, tmp_path, capsys):
+    (tmp_path / name).write_text("precious")
+    assert write(tmp_path, "--superpixels", "9") == 2
+    assert f"found: {name}" in capsys.readouterr().err
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["precious"]
 
 
 @pytest.mark.parametrize("count", ["0", "-3"])

@@ -30,6 +30,7 @@ from soup_nlp.evaluate.scoring import SURE, at_truth, most_certain
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.run import Run, run
 from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.storage.folders import scratch
 
 Float = NDArray[np.float64]
 Measure = Callable[[Item, tuple[str, ...], str], Row]
@@ -135,11 +136,14 @@ def measure_pair(
     # do not solve a pair that cannot be scored
     if not any(_applies(pair.truth, preset(name)) for name in item.presets):
         raise _no_truth(item)
-    log = None if folder is None else str(prepare_folder(folder) / "ipopt.log")
-    result = run(problem, pair=pair, ipopt_log=log)
-    result = replace(result, seconds={**result.seconds, "load": loaded})
-    if folder is not None:
-        write_folder(folder, result, dump_problem(problem), "")
+    with scratch() as temporary:
+        log = temporary / "ipopt.log"
+        if folder is not None:
+            prepare_folder(folder)
+        result = run(problem, pair=pair, ipopt_log=None if folder is None else str(log))
+        result = replace(result, seconds={**result.seconds, "load": loaded})
+        if folder is not None:
+            write_folder(folder, result, dump_problem(problem), "", ipopt_log=log)
     found = scores(result, item.presets)
     if not found["metrics"]:
         raise _no_truth(item)

@@ -15,8 +15,8 @@ from soup_nlp.bench.rows import MeasureRows, Row, measure_all
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import Listing
 from soup_nlp.errors import ConfigError
-from soup_nlp.report.folder import prepare_folder
 from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.folders import claim, staged
 
 Overrides = tuple[str, ...]
 
@@ -162,6 +162,7 @@ def run_analysis(
     *,
     values: Sequence[str] | None = None,
     presets: Sequence[str] = (),
+    overwrite: bool = False,
 ) -> Path:
     """Measure every variant on every pair and write OUT/NAME.md, .png and .jsonl.
 
@@ -173,6 +174,7 @@ def run_analysis(
         measure_rows: Measures the jobs; `measure_all` with its options.
         values: Only these variants; of a numeric analysis other values as well.
         presets: Metric conventions instead of the suites' own, the main one first.
+        overwrite: Overwrite files that the program did not make.
 
     Returns:
         The table's file.
@@ -186,7 +188,7 @@ def run_analysis(
     for own in analysis.variants.values():
         # a wrong value ends here, not as a failed row a pair
         items[0].problem((*overrides, *own))
-    prepare_folder(out)
+    claim(out, (f"{name}.md", f"{name}.png"), overwrite)
     jobs = [
         pair_job(item, (*overrides, *own), variant, measure=analysis.function)
         for item in items
@@ -194,13 +196,14 @@ def run_analysis(
     ]
     rows = measure_rows(jobs, out / f"{name}.jsonl")
     note = f"Overrides of every pair: {', '.join(f'`{o}`' for o in overrides) or 'none'}."
-    page, picture = out / f"{name}.md", out / f"{name}.png"
-    write_text(page, analysis.page(name, analysis.text, rows, note))
-    if analysis.plot is not None:
-        analysis.plot(picture, rows)
-    else:
-        reports.plot_variants(picture, analysis.axis, analysis.text, rows, analysis.numeric)
-    return page
+    with staged(out) as new:
+        write_text(new / f"{name}.md", analysis.page(name, analysis.text, rows, note))
+        picture = new / f"{name}.png"
+        if analysis.plot is not None:
+            analysis.plot(picture, rows)
+        else:
+            reports.plot_variants(picture, analysis.axis, analysis.text, rows, analysis.numeric)
+    return out / f"{name}.md"
 
 
 def _items(analysis: Analysis, listings: Sequence[Listing], presets: Sequence[str]) -> list[Item]:

@@ -20,6 +20,7 @@ from unittest import mock
 
 from soup_nlp.bench.rows import Row, attempt, failure
 from soup_nlp.errors import SolverError, SoupError
+from soup_nlp.storage.system import end_with_parent
 from soup_nlp.storage.versions import code_version, versions
 
 GRACE = 5.0
@@ -79,11 +80,14 @@ def isolated(
     context: Any = multiprocessing.get_context(method)
     process = context.Process(target=_child, args=(work, target, memory))
     process.start()
-    process.join(seconds + GRACE)
-    late = process.is_alive()
-    if late:
-        process.kill()
-        process.join()
+    late = True
+    try:
+        process.join(seconds + GRACE)
+        late = process.is_alive()
+    finally:
+        if late:
+            process.kill()
+            process.join()
     spent = time.perf_counter() - begin
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
@@ -111,6 +115,7 @@ def alone(work: Callable[[], Row], folder: Path, seconds: float = 7200.0) -> Row
 
 
 def _child(work: Callable[[], Any], target: Path, memory: int | None) -> None:
+    end_with_parent()
     # what the work prints belongs beside its files
     with target.with_name("output.log").open("wb") as log:
         os.dup2(log.fileno(), 1)
@@ -120,6 +125,7 @@ def _child(work: Callable[[], Any], target: Path, memory: int | None) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     # a Ctrl-C belongs to the parent, which ends this process
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         answer = ("returned", work())
     except MemoryError:

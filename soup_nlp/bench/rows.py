@@ -13,6 +13,7 @@ from typing import Any
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.storage.files import is_file, parse_json, read_bytes
 from soup_nlp.storage.store import plain
+from soup_nlp.storage.system import end_with_parent
 from soup_nlp.storage.versions import code_version
 
 Row = dict[str, Any]
@@ -182,7 +183,9 @@ def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]
         again = [name for name in names if name in left]
         if not again:
             continue
-        pool = ProcessPoolExecutor(max_workers=min(workers, len(again)), env=ONE_THREAD)
+        pool = ProcessPoolExecutor(
+            max_workers=min(workers, len(again)), env=ONE_THREAD, initializer=end_with_parent
+        )
         try:
             futures = {pool.submit(left[name].work): name for name in again}
             for future in as_completed(futures):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import resource
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +22,7 @@ from soup_nlp.pipeline import Case, make_run, prepare
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
+from soup_nlp.storage.folders import scratch
 
 Float = NDArray[np.float64]
 
@@ -131,8 +131,8 @@ def measure(**settings: Any) -> Row:
     with clocks.stage("evaluation"):
         run = make_run(case, solution)
     run = replace(run, seconds=dict(clocks.wall))
-    with clocks.stage("output"), tempfile.TemporaryDirectory() as folder:
-        write_folder(prepare_folder(folder), run, dump_problem(problem), "")
+    with clocks.stage("output"), scratch() as folder:
+        write_folder(prepare_folder(folder / "result"), run, dump_problem(problem), "")
     return {
         "sizes": {
             "superpixels": len(case),

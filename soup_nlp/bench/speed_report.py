@@ -17,6 +17,7 @@ from soup_nlp.bench.speed import measure
 from soup_nlp.bench.studies import Study
 from soup_nlp.bench.tables import columns, failures, figure, joined, save, show, table
 from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.folders import staged
 
 Row = Mapping[str, Any]
 Cell = Callable[[Row], str]
@@ -190,6 +191,11 @@ def conclusion(records: Sequence[Row]) -> str:
 class SpeedStudy(Study):
     """`bench speed`: a study whose page has several tables and plots."""
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the files that are written of all rows."""
+        return (f"{self.name}.md", "growth.png", "phases.png", "energy.png")
+
     def write(self, out: Path, rows: Sequence[dict[str, Any]]) -> None:
         """Table and plots of the runs that are there."""
         good = [r for r in rows if not failed(r)]
@@ -203,11 +209,12 @@ class SpeedStudy(Study):
         lines += [*columns(self.cells, good), "", self.note, *failures(list(rows))]
         for title, body in sections.items():
             lines += ["", f"## {title}", "", *body] if body else []
-        write_text(out / f"{self.name}.md", joined(lines))
-        if good:
-            plot_growth(out / "growth.png", good)
-            plot_phases(out / "phases.png", good)
-            plot_energy(out / "energy.png", good)
+        with staged(out) as new:
+            write_text(new / f"{self.name}.md", joined(lines))
+            if good:
+                plot_growth(new / "growth.png", good)
+                plot_phases(new / "phases.png", good)
+                plot_energy(new / "energy.png", good)
 
 
 SPEED = SpeedStudy(

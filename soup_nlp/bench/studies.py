@@ -7,7 +7,6 @@ are its own, and is stored, so that a study that was stopped goes on where it wa
 from __future__ import annotations
 
 import platform
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -20,6 +19,7 @@ from soup_nlp.bench.processes import alone
 from soup_nlp.bench.rows import Job, Row, Say, failed, measure_all
 from soup_nlp.bench.tables import columns, failures, joined
 from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.folders import claim, scratch, staged
 
 Settings = Mapping[str, Any]
 Cells = Mapping[str, Callable[[Row], str]]
@@ -43,13 +43,19 @@ class Study:
     cells: Cells
     summary: Callable[[Sequence[Row]], list[str]] | None = None
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the files that are written of all rows."""
+        return (f"{self.name}.md",)
+
     def write(self, out: Path, rows: Sequence[Row]) -> None:
         """Write the page of the rows that are there; those that failed are listed at its end."""
         good = [r for r in rows if not failed(r)]
         note = self.note.format(**rows[0]["settings"])
         lines = [f"{note} {date.today()}, {platform.machine()}.", "", *columns(self.cells, good)]
         lines += self.summary(good) if self.summary else []
-        write_text(out / f"{self.name}.md", joined([*lines, *failures(list(rows))]))
+        with staged(out) as new:
+            write_text(new / f"{self.name}.md", joined([*lines, *failures(list(rows))]))
 
 
 def grid(**values: Sequence[Any]) -> list[Settings]:
@@ -73,6 +79,7 @@ def run_study(
     settings: Sequence[Settings],
     say: Say | None = None,
     page: bool = True,
+    overwrite: bool = False,
 ) -> list[Row]:
     """Measure every setting; rows go to OUT/NAME.jsonl.
 
@@ -82,7 +89,9 @@ def run_study(
         settings: Keyword arguments of `study.measure`, plain JSON values.
         say: Called after every new row.
         page: Write OUT/NAME.md after every row.
+        overwrite: Overwrite files that the program did not make.
     """
+    claim(out, study.files if page else (), overwrite)
     jobs = []
     for own in settings:
         key = f"{study.name} {' '.join(str(v) for v in own.values() if v != [])}"
@@ -94,5 +103,5 @@ def run_study(
 
 def run_alone(study: Study, settings: Settings, seconds: float = 7200.0) -> Row:
     """The row of one setting, or why it failed."""
-    with tempfile.TemporaryDirectory() as folder:
-        return alone(partial(study.measure, **settings), Path(folder), seconds)
+    with scratch() as folder:
+        return alone(partial(study.measure, **settings), folder, seconds)

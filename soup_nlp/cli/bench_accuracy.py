@@ -24,6 +24,7 @@ from soup_nlp.cli.options import Progress, numbers
 from soup_nlp.errors import ConfigError
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.folders import claim, staged
 
 
 def mre_of(row: Row) -> str:
@@ -56,6 +57,7 @@ def accuracy(
     ] = None,
     name: Annotated[str, typer.Option(help="Name of the files of one suite.")] = "",
     any_code: options.AnyCode = False,
+    overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Depth against truth on a suite of pairs; interrupted runs can be continued."""
@@ -74,6 +76,8 @@ def accuracy(
     measure_rows = partial(measure_all, workers=workers, say=progress, any_code=any_code)
     listings = [list_suite(known, data, wanted) for known in suite or ["rendered"]]
     _check_names(analysis, folders, name, suite or [])
+    if not analysis:
+        claim(out, [f"{name or listing.suite.name}.md" for listing in listings], overwrite)
     if analysis:
         page = run_analysis(
             analysis,
@@ -83,6 +87,7 @@ def accuracy(
             measure_rows,
             values=None if values is None else split_values(analysis, values),
             presets=conventions or (),
+            overwrite=overwrite,
         )
         _tell(page)
     for listing in [] if analysis else listings:
@@ -101,7 +106,8 @@ def accuracy(
         note = f"Suite `{listing.suite.name}`: {listing.suite.text}."
         if changes:
             note += f" Overrides: {', '.join(f'`{o}`' for o in changes)}."
-        write_text(page, report(f"Accuracy on {page.stem}", rows, note))
+        with staged(out) as new:
+            write_text(new / page.name, report(f"Accuracy on {page.stem}", rows, note))
         _tell(page)
     raise typer.Exit(1 if progress.failed else 0)
 
@@ -157,6 +163,7 @@ def search(
     only: options.Only = None,
     workers: options.Workers = 1,
     any_code: options.AnyCode = False,
+    overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Search for better defaults and check them on pairs and families that did not choose."""
@@ -171,6 +178,7 @@ def search(
             f" {len(validation)} validate",
             file=sys.stderr,
         )
+    claim(out, ["search.md"], overwrite)
     progress = Progress(quiet, mre_of)
     found = tuning.search(
         space,
@@ -189,6 +197,7 @@ def search(
     words += [f"--flow {f}" for f in flow or []] + [f"--only '{o}'" for o in only or []]
     words += [f"--set '{o}'" for o in overrides or []] + [f"--param '{p}'" for p in params or []]
     page = out / "search.md"
-    write_text(page, text_search(found, f"soup-nlp bench search {' '.join(words)}"))
+    with staged(out) as new:
+        write_text(new / page.name, text_search(found, f"soup-nlp bench search {' '.join(words)}"))
     _tell(page)
     raise typer.Exit(1 if progress.failed else 0)

@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.cli.options import Data
+from soup_nlp.cli.options import Data, Overwrite
+from soup_nlp.storage.folders import claim, staged
 
 TERSE = "--set segmentation.superpixels=500"
 THREE = "--suite rendered --only street --only room --only orbit"
@@ -51,6 +52,7 @@ COMMANDS = (
 def everything(
     data: Data = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder.")] = Path("out/bench"),
+    overwrite: Overwrite = False,
     dry: Annotated[bool, typer.Option(help="Print the commands only.")] = False,
 ) -> None:
     """Make every table and picture of results/ in a folder; a run that was stopped goes on."""
@@ -64,6 +66,7 @@ def everything(
             if "--suite" not in text:
                 continue
         words = [w.format(out=out, data=data) for w in shlex.split(text)]
+        words += ["--overwrite"] if overwrite else []
         print(f"soup-nlp {shlex.join(words)}", flush=True)
         if not dry:
             ended[shlex.join(words)] = main(words)
@@ -71,7 +74,8 @@ def everything(
         return
     overview = Path("out/motorcycle/overview.png")
     if overview.is_file():
-        shutil.copy(overview, out / "motorcycle.png")
+        with staged(claim(out, ["motorcycle.png"], overwrite)) as new:
+            shutil.copy(overview, new / "motorcycle.png")
     bad = [f"{words}: exit code {code}" for words, code in ended.items() if code]
     print("\n".join(bad) or "every command ended well")
     raise typer.Exit(1 if bad else 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -15,9 +16,8 @@ from soup_nlp.bench.speed import plan, problem_of
 from soup_nlp.bench.speed_gate import baseline, check, read_baseline
 from soup_nlp.bench.speed_report import SPEED
 from soup_nlp.bench.studies import Settings, run_study
-from soup_nlp.cli.options import Out, Progress, Quiet, Set, numbers, words
+from soup_nlp.cli.options import Out, Overwrite, Progress, Quiet, Set, numbers, words
 from soup_nlp.data.scenes.catalogue import SCENES
-from soup_nlp.report.folder import prepare_folder
 from soup_nlp.storage.atomic import write_text
 
 
@@ -41,6 +41,7 @@ def speed(
         Path | None, typer.Option(help="Write the measurement as a baseline.")
     ] = None,
     out: Out = Path("out/bench/speed"),
+    overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
@@ -57,8 +58,11 @@ def speed(
     for own in settings:
         # a wrong override stops here, not after an hour
         problem_of(**own)
-    folder = prepare_folder(out)
-    rows = run_study(SPEED, folder, settings, Progress(quiet, _result_of), page=not kept)
+    if write_baseline is not None and os.path.lexists(write_baseline) and not overwrite:
+        # refuses what is no baseline
+        read_baseline(write_baseline)
+    say = Progress(quiet, _result_of)
+    rows = run_study(SPEED, out, settings, say, page=not kept, overwrite=overwrite)
     if write_baseline is not None:
         write_text(write_baseline, json.dumps(baseline(rows, machine()), indent=1) + "\n")
     if kept:
@@ -68,7 +72,7 @@ def speed(
         print(f"{bad} of {len(findings)} values are worse" if bad else "the gate holds")
     else:
         bad = sum(map(failed, rows))
-        print(f"{len(rows)} runs, {bad} failed, in {folder / SPEED.name}.md")
+        print(f"{len(rows)} runs, {bad} failed, in {out / SPEED.name}.md")
     raise typer.Exit(1 if bad else 0)
 
 

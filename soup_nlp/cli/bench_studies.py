@@ -13,7 +13,7 @@ from soup_nlp.bench.rows import failed
 from soup_nlp.bench.speed import plan
 from soup_nlp.bench.studies import Settings, Study, grid, run_study
 from soup_nlp.bench.suite_pairs import RENDERED
-from soup_nlp.cli.options import Out, Progress, Quiet, Seeds, numbers, words
+from soup_nlp.cli.options import Out, Overwrite, Progress, Quiet, Seeds, numbers, words
 from soup_nlp.model.layout import GAUGES
 
 Size = Annotated[int, typer.Option(help="Superpixels wanted.")]
@@ -21,8 +21,10 @@ SCENES = [*RENDERED, "motorcycle"]
 SPEED = Path("out/bench/speed")
 
 
-def _run(study: Study, out: Path, settings: Sequence[Settings], quiet: bool) -> None:
-    rows = run_study(study, out, settings, Progress(quiet))
+def _run(
+    study: Study, out: Path, settings: Sequence[Settings], overwrite: bool, quiet: bool
+) -> None:
+    rows = run_study(study, out, settings, Progress(quiet), overwrite=overwrite)
     bad = sum(map(failed, rows))
     print(f"{len(rows)} rows, {bad} failed, in {out}/{study.name}.md")
     raise typer.Exit(1 if bad else 0)
@@ -32,11 +34,12 @@ def refine(
     scenes: Annotated[str, typer.Option("--scenes", "--only", help="Scenes.")] = ",".join(SCENES),
     superpixels: Size = 1000,
     out: Out = Path("out/bench/refine"),
+    overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """What NLP and refinement contribute: E and MRE of start, either alone and both."""
     settings = grid(scene=words(scenes, "--scenes", SCENES), superpixels=[superpixels])
-    _run(study_energy.REFINE, out, settings, quiet)
+    _run(study_energy.REFINE, out, settings, overwrite, quiet)
 
 
 def methods(
@@ -45,19 +48,21 @@ def methods(
     superpixels: Annotated[str, typer.Option(help="Superpixels N.")] = "1000",
     unrefined: Annotated[bool, typer.Option(help="Leave the refinement out.")] = False,
     out: Out = SPEED,
+    overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """How low every method ends on one energy, before and after refinement."""
     chosen = words(scenes, "--scenes", SCENES), numbers(superpixels, "--superpixels", 2)
     settings = plan(*chosen, [20], numbers(seeds, "--seeds"), refine=not unrefined)
     study = study_energy.METHODS_UNREFINED if unrefined else study_energy.METHODS_REFINED
-    _run(study, out, settings, quiet)
+    _run(study, out, settings, overwrite, quiet)
 
 
 def formulations(
     scene: Annotated[str, typer.Option(help="A rendered scene.")] = "street",
     superpixels: Size = 250,
     out: Out = SPEED,
+    overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Every gauge, norm and truncation of the constrained NLP: which converge."""
@@ -68,21 +73,22 @@ def formulations(
         truncation=("smooth", "lifted"),
         gauge=GAUGES,
     )
-    _run(study_energy.FORMULATIONS, out, settings, quiet)
+    _run(study_energy.FORMULATIONS, out, settings, overwrite, quiet)
 
 
 def cut_off(
     seeds: Seeds = "0,1,2,3,4,5,6,7",
     superpixels: Size = 500,
     out: Out = Path("out/bench/accuracy"),
+    overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Depth of components that the lower border cuts off, by contact alone and as shipped."""
     chosen = numbers(seeds, "--seeds")
     settings = grid(scene=("street", "room"), seed=chosen, superpixels=[superpixels])
-    _run(study_parts.CUT_OFF, out, settings, quiet)
+    _run(study_parts.CUT_OFF, out, settings, overwrite, quiet)
 
 
-def trws(out: Out = SPEED, quiet: Quiet = False) -> None:
+def trws(out: Out = SPEED, overwrite: Overwrite = False, quiet: Quiet = False) -> None:
     """Time and memory of TRW-S at the size of a refinement."""
-    _run(study_parts.TRWS, out, grid(dtype=("float64", "float32")), quiet)
+    _run(study_parts.TRWS, out, grid(dtype=("float64", "float32")), overwrite, quiet)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,14 +12,17 @@ from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
 from soup_nlp.bench.solvers.runner import make_tasks
-from soup_nlp.cli.options import Formulations, Out, Presolve, Set, Superpixels
+from soup_nlp.cli.options import Formulations, Out, Overwrite, Presolve, Set, Superpixels
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.verify import Limits
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.report.folder import prepare_folder
 from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.folders import claim, scratch, staged
+
+FILES = ("README.md", "profile.png", "curves.png")
+"""What is written of all rows, beside the rows themselves."""
 
 
 def compare(
@@ -37,6 +39,7 @@ def compare(
     presolve: Presolve = True,
     out: Out = Path("out/solvers"),
     overrides: Set = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Run real solvers on problems, verify their claims, write table and profiles."""
     if not (seconds > 0 and iterations > 0 and tol > 0 and memory > 0):
@@ -56,19 +59,20 @@ def compare(
     sizes = [[f"segmentation.superpixels={n}"] for n in superpixels or ()] or [[]]
     # a file that is wrong is found before hours of runs, not after
     chosen = [load_problem(path, [*(overrides or []), *own]) for path in problems for own in sizes]
-    folder = prepare_folder(out)
+    folder = claim(out, FILES, overwrite)
     rows: list[dict[str, Any]] = []
     try:
-        with tempfile.TemporaryDirectory() as scratch:
+        with scratch() as temporary:
             for problem in chosen:
                 tasks = list(make_tasks(prepare(problem, presolve), forms, limits, presolve))
-                rows += run_all(tasks, names, limits, folder / "runs.jsonl", Path(scratch), print)
+                rows += run_all(tasks, names, limits, folder / "runs.jsonl", temporary, print)
     finally:
         # an input that cannot be used does not take the others' page away
         if rows:
-            write_text(folder / "README.md", page(rows))
-            draw_profiles(folder / "profile.png", rows)
-            draw_curves(folder / "curves.png", rows)
+            with staged(folder) as new:
+                write_text(new / "README.md", page(rows))
+                draw_profiles(new / "profile.png", rows)
+                draw_curves(new / "curves.png", rows)
     print("\n".join(conclusion(rows)))
-    print(f"files       {folder}/: README.md, profile.png, curves.png, runs.jsonl")
+    print(f"files       {out}/: {', '.join(FILES)}, runs.jsonl")
     raise typer.Exit(0 if any(r["verified"] for r in rows) else 1)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from soup_nlp.cli.options import Overwrite
 from soup_nlp.report.formats import FORMATS
 from soup_nlp.report.save import convert as convert_folder
 
@@ -19,9 +20,10 @@ def convert(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Output folder; default the result's own.")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions."""
     names = [name.strip() for name in to.split(",") if name.strip()]
     target = folder if out is None else out
-    for name in convert_folder(folder, names, out):
+    for name in convert_folder(folder, names, out, overwrite):
         print(target / name)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from soup_nlp.cli.options import Out, Quiet
+from soup_nlp.cli.options import Out, Overwrite, Quiet
 from soup_nlp.cli.progress import SolveLog
 from soup_nlp.cli.solve import solve_problem
 from soup_nlp.config.problem import load_problem
@@ -18,14 +18,14 @@ PAIRS = {
 """Problems of the demo, and what to see in each."""
 
 
-def demo(out: Out = Path("out/demo"), quiet: Quiet = False) -> None:
+def demo(out: Out = Path("out/demo"), overwrite: Overwrite = False, quiet: Quiet = False) -> None:
     """Solve a real pair and a rendered street in which cars move."""
     codes = []
     for name, text in PAIRS.items():
         print(f"\n{name}: {text}", flush=True)
         problem = load_problem(name)
-        log = SolveLog(quiet, problem=problem)
-        codes.append(solve_problem(problem, out / name, log, problem.expected.mre_at_most))
+        log, limit = SolveLog(quiet, problem=problem), problem.expected.mre_at_most
+        codes.append(solve_problem(problem, out / name, log, limit, overwrite=overwrite))
     pictures = " and ".join(str(out / name / "overview.png") for name in PAIRS)
     print(f"\nlook at    {pictures}")
     raise typer.Exit(max(codes))

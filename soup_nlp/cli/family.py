@@ -7,14 +7,17 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.cli.options import numbers
+from soup_nlp.cli.options import Overwrite, numbers
 from soup_nlp.errors import DataError
 from soup_nlp.family.instances import SCENES, SIZES, STANDARD, STARTS, select
 from soup_nlp.family.write import write_family
-from soup_nlp.report.folder import prepare_folder
+from soup_nlp.storage.folders import claim, staged
 
 QUICK = "100,250"
 """Sizes that a minute makes."""
+
+TABLES = ("index.json", "index.csv", "README.md", "LICENSE.txt")
+"""Files of a set beside its instances."""
 
 
 def _list(known: tuple[object, ...]) -> str:
@@ -34,6 +37,7 @@ def family(
     starts: Annotated[
         str, typer.Option(help="easy (presolved), hard (proposal), cold (constant depth).")
     ] = _list(STARTS),
+    overwrite: Overwrite = False,
 ) -> None:
     """Write the SOUP problem set: .nl files, best known points, index, README, licence."""
     wanted = numbers(sizes, "--sizes")
@@ -46,7 +50,9 @@ def family(
         raise DataError(
             "folder holds other files", where=out, expected="a new or empty folder, or a set"
         )
-    entries = write_family(prepare_folder(out), chosen)
+    claim(out, TABLES, overwrite)
+    with staged(out, whole=True, overwrite=overwrite) as new:
+        entries = write_family(new, chosen)
     print(f"{len(entries)} instances; index.json, index.csv, README.md, LICENSE.txt in {out}/")
     changed = [e["name"] for e in entries if e["published"] is False]
     if changed:

@@ -20,6 +20,7 @@ from soup_nlp.cli.boundary import (
     report_bug,
 )
 from soup_nlp.errors import SoupError, StoppedError, printable
+from soup_nlp.storage.system import sigterm_as_ctrl_c
 from soup_nlp.storage.versions import __version__
 
 ABORTED = 130
@@ -113,7 +114,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     prepare_streams()
     try:
-        code = _run(argv)
+        with sigterm_as_ctrl_c():
+            code = _run(argv)
         sys.stdout.flush()
     except BrokenPipeError:
         drop_output()
@@ -122,6 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
+    """Run the command line; the exit code."""
     try:
         code = app(args=list(argv) if argv is not None else None, standalone_mode=False)
         # the command line library makes this code of a KeyboardInterrupt

@@ -17,6 +17,9 @@ from soup_nlp.errors import ConfigError
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Output folder.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Overwrite files that this program did not make.")
+]
 PROBLEM = "Problem file, or a name that `soup-nlp list` shows."
 Problem = Annotated[Path, typer.Argument(help=PROBLEM)]
 Presolve = Annotated[

@@ -9,13 +9,23 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.cli.options import Formulations, Out, Presolve, Problem, Quiet, Set, Superpixels
+from soup_nlp.cli.options import (
+    Formulations,
+    Out,
+    Overwrite,
+    Presolve,
+    Problem,
+    Quiet,
+    Set,
+    Superpixels,
+)
 from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
 from soup_nlp.errors import ConfigError, DataError, printable
 from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_formulation
+from soup_nlp.export.manifest import OWN
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.report.folder import prepare_folder
 from soup_nlp.storage.files import MOST_YAML, is_folder, read_text
+from soup_nlp.storage.folders import claim
 
 
 def show(problem: Problem, overrides: Set = None) -> None:
@@ -60,6 +70,7 @@ def export(
     ] = None,
     presolve: Presolve = True,
     overrides: Set = None,
+    overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Write the NLP for other solvers; several sizes or formulations make a folder each."""
@@ -72,6 +83,9 @@ def export(
         own = [] if size is None else [f"segmentation.superpixels={size}"]
         own += [f"formulation.{k}={v}" for k, v in form.items()]
         chosen = load_problem(problem, [*(overrides or []), *own])
+        if not several:
+            # before the work, not after it
+            claim(out, OWN, overwrite)
         if form is forms[0]:
             case = prepare(chosen, presolve)
         # the same soup in another formulation
@@ -83,8 +97,8 @@ def export(
         if name in written:
             continue
         written.add(name)
-        folder = prepare_folder(out / name if several else out)
-        manifest = export_case(here, style, folder, format_ or ["nl"], presolve)
+        folder = out / name if several else out
+        manifest = export_case(here, style, folder, format_ or ["nl"], presolve, overwrite)
         s = manifest["sizes"]
         if not quiet:
             print(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, cast, get_args
+from typing import Annotated, Any, cast, get_args
 
 import numpy as np
 import typer
 
-from soup_nlp.config.problem import dump_problem
-from soup_nlp.errors import ConfigError, ExportError
+from soup_nlp.cli.options import Overwrite
+from soup_nlp.config.problem import dump_problem, load_problem
+from soup_nlp.errors import ConfigError, ExportError, SoupError
 from soup_nlp.evaluate.metrics import Scale
 from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
@@ -32,7 +33,7 @@ def check(
 ) -> None:
     """Recompute energy, constraints and metrics of a result, or the constraints of a .sol."""
     if is_folder(folder) or folder.suffix != ".sol":
-        report = check_folder(folder)
+        report = check_folder(folder, _images(folder))
         tree = read_h5(folder / "result.h5")
         c = float(tree["weights"]["min_facing"])
         print(table_text(residual_table(tree["solution"], tree["energy"]["rim_ray"], c, LIMITS)))
@@ -51,6 +52,15 @@ def check(
         good, claim = all(r.ok for r in rows), "constraint"
     print(f"every {claim} holds" if good else f"a {claim} does not hold")
     raise typer.Exit(0 if good else 1)
+
+
+def _images(folder: Path) -> tuple[Any, Any] | None:
+    """The two images that a result was made of; None where they are not at hand."""
+    try:
+        pair = load_problem(folder / "config.yaml").load_pair()
+    except SoupError:
+        return None
+    return pair.image_ref, pair.image_next
 
 
 def evaluate(
@@ -79,6 +89,7 @@ def import_(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Result folder; default DIR/result.")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Make a result folder of a foreign solver's answer: depth maps, points, residuals."""
     imported = import_sol(folder, sol)
@@ -91,7 +102,7 @@ def import_(
             found=message.splitlines()[0] if message else None,
             hint=f"soup-nlp check {sol} says what is wrong with it",
         )
-    target = prepare_folder(out or folder / "result", run.problem.input_paths())
+    target = prepare_folder(out or folder / "result", run.problem.input_paths(), overwrite)
     text = foreign_verdict(imported)
     write_folder(target, run, dump_problem(run.problem), f"{message}\n{text}\n", text)
     print(text)

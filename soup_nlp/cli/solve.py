@@ -5,23 +5,24 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from soup_nlp.cli.options import PROBLEM, Set
+from soup_nlp.cli.options import PROBLEM, Overwrite, Set
 from soup_nlp.cli.progress import SolveLog
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
-from soup_nlp.errors import ConfigError
+from soup_nlp.errors import ConfigError, SoupError
 from soup_nlp.pipeline.run import run as run_problem
-from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.verdict import missed, verdict
 from soup_nlp.solve.interrupt import interruptible
-from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.files import as_path, is_file
+from soup_nlp.storage.folders import scratch
 
 
 def solve(
@@ -66,6 +67,7 @@ def solve(
     json_: Annotated[
         bool, typer.Option("--json", help="Print summary.json instead of the verdict.")
     ] = False,
+    overwrite: Overwrite = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Every phase.")] = False,
 ) -> None:
@@ -100,8 +102,8 @@ def solve(
         chosen = _from_file(problem, pair, flows, overrides)
     # a problem file's expectation is of the file without overrides
     limit = None if overrides else chosen.expected.mre_at_most
-    log = SolveLog(quiet, verbose, chosen)
-    raise typer.Exit(solve_problem(chosen, out or Path("out") / chosen.name, log, limit, json_))
+    log, folder = SolveLog(quiet, verbose, chosen), out or Path("out") / chosen.name
+    raise typer.Exit(solve_problem(chosen, folder, log, limit, json_, overwrite))
 
 
 def _from_file(
@@ -159,15 +161,17 @@ def solve_problem(
     log: SolveLog,
     mre_at_most: float | None,
     as_json: bool = False,
+    overwrite: bool = False,
 ) -> int:
     """Solve a problem, write its folder and print the verdict, or summary.json.
 
     Returns:
         0 for a good result that meets the expectation, else 1.
     """
-    folder = prepare_folder(out, chosen.input_paths())
+    folder = prepare_folder(out, chosen.input_paths(), overwrite)
     interrupt = interruptible(log.interrupted)
-    with interrupt as stop, warnings.catch_warnings(), log:
+    with interrupt as stop, warnings.catch_warnings(), log, scratch() as temporary:
+        ipopt_log = temporary / "ipopt.log"
         warnings.simplefilter("always", DataWarning)
         warnings.showwarning = log.warn
         try:
@@ -177,21 +181,26 @@ def solve_problem(
                 stop=stop,
                 log=log.say,
                 on_stage=log.stage,
-                ipopt_log=str(folder / "ipopt.log"),
+                ipopt_log=str(ipopt_log),
             )
             if interrupt.aborted:
                 raise KeyboardInterrupt
         except BaseException as error:
             log.lines.append(f"failed: {str(error) or type(error).__name__}")
-            write_text(folder / "log.txt", "\n".join(log.lines) + "\n")
+            with suppress(SoupError):
+                write_failure(folder, "\n".join(log.lines) + "\n", ipopt_log)
             raise
         # an interruption must not leave half of the files; writing takes seconds only
         interrupt.deferred = True
-        files = write_folder(folder, run, dump_problem(chosen), "\n".join(log.lines) + "\n")
-        log.stage("files")
-        text = verdict(run, folder, files, mre_at_most)
-        write_text(folder / "log.txt", "\n".join([*log.lines, text]) + "\n")
-    print((folder / "summary.json").read_text(encoding="utf-8") if as_json else text)
+
+        def told(files: list[str]) -> str:
+            log.stage("files")
+            log.lines.append(verdict(run, folder, files, mre_at_most))
+            return "\n".join(log.lines) + "\n"
+
+        write_folder(folder, run, dump_problem(chosen), told, ipopt_log=ipopt_log)
+    summary = folder / "summary.json"
+    print(summary.read_text(encoding="utf-8") if as_json else log.lines[-1])
     good = run.good and (mre_at_most is None or not missed(run))
     return 0 if good else 1
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -17,10 +18,10 @@ from soup_nlp.export.manifest import (
     FUNCTIONS,
     MANIFEST,
     NORMS,
+    OWN,
     STUB,
     TRUNCATIONS,
     kept_best,
-    remove_stale,
 )
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.nl import NLFile, write_nl
@@ -29,7 +30,8 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import GAUGES, MatrixLayout
 from soup_nlp.model.nlp import NLP, to_scipy
 from soup_nlp.pipeline import Case
-from soup_nlp.storage.atomic import atomic_path, write_text
+from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.store import Array, Tree, write_h5, write_json
 from soup_nlp.storage.versions import versions
 
@@ -74,10 +76,11 @@ def export_case(
     folder: Path,
     formats: Sequence[str] = ("nl",),
     presolved: bool = False,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Write soup.nl with names, problem.yaml and manifest.json into an existing folder.
+    """Write soup.nl with names, problem.yaml and manifest.json into a folder.
 
-    Files of an earlier export there that this one does not write are removed.
+    An earlier export there stays whole until this one is, and is then removed.
 
     Args:
         case: Problem with its start.
@@ -85,12 +88,14 @@ def export_case(
         folder: Where the files go.
         formats: Of FORMATS; nl is always written, and soup.h5 with casadi as well.
         presolved: The case starts at the presolve's answer (for the manifest).
+        overwrite: Overwrite files that the program did not make.
 
     Returns:
         The manifest.
 
     Raises:
         ConfigError: unknown format.
+        DataError: the folder cannot be written, or holds a file of the user of the same name.
         ExportError: the NLP cannot be written.
     """
     for word in formats:
@@ -100,29 +105,43 @@ def export_case(
             )
     form = form.replace(hessian="exact", compiled=False)
     nlp, layout = case.nlp(form)
+    target = claim(folder, OWN, overwrite)
+    with staged(target, whole=True) as new:
+        return _write_files(new, target, case, form, (nlp, layout), formats, presolved)
+
+
+def _write_files(
+    folder: Path,
+    earlier: Path,
+    case: Case,
+    form: Formulation,
+    program: tuple[NLP, MatrixLayout],
+    formats: Sequence[str],
+    presolved: bool,
+) -> dict[str, Any]:
+    """Write an export into an empty folder; the best answer known is that of an earlier one."""
+    nlp, layout = program
     names = readable_names(nlp, layout)
     file = write_nl(folder / f"{STUB}.nl", nlp, names=names)
-    files = [f"{STUB}.nl", f"{STUB}.col", f"{STUB}.row"]
-    best = kept_best(folder, file.sha256)
-    remove_stale(folder, files)
     if "casadi" in formats:
         for function in FUNCTIONS:
-            with atomic_path(folder / f"{function}.casadi") as temporary:
-                getattr(nlp, function).save(str(temporary))
-            files.append(f"{function}.casadi")
+            # CasADi's own writer does not notice a full disk
+            text = ca.StringSerializer()
+            text.pack(getattr(nlp, function))
+            write_text(folder / f"{function}.casadi", text.encode())
     write_text(folder / "problem.yaml", dump_problem(case.problem))
     manifest = {
         **_description(case, form, nlp, layout, file),
         "start": "presolve" if presolved else "proposal",
-        "best_known": best,
-        "files": files,
+        "best_known": kept_best(earlier, file.sha256),
     }
     # the functions are of no use without parameters, start and bounds
     if "h5" in formats or "casadi" in formats:
         attrs = {k: manifest[k] for k in ("name", "problem_hash", "formulation", "smoothing")}
         info = information(case.soup, case.data, case.weights, form)
         _write_start_h5(folder / f"{STUB}.h5", nlp, names, attrs, info)
-        files.append(f"{STUB}.h5")
+    files = {path.name for path in folder.iterdir()} - {"problem.yaml"}
+    manifest["files"] = sorted(files, key=OWN.index)
     write_json(folder / MANIFEST, manifest)
     return manifest
 

@@ -27,6 +27,7 @@ from soup_nlp.solve.ipopt import Stage
 from soup_nlp.solve.kkt import residuals
 from soup_nlp.solve.stages import Solution
 from soup_nlp.storage.files import as_path, read_text
+from soup_nlp.storage.folders import claim, recover, staged
 from soup_nlp.storage.store import write_json
 
 Float = NDArray[np.float64]
@@ -72,6 +73,7 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
         SoupError: the problem's input cannot be used.
     """
     folder = as_path(folder, "exported folder", error=ExportError)
+    recover(folder)
     manifest = read_manifest(folder)
     case = prepare(load_problem(folder / "problem.yaml"))
     form = case.formulation(
@@ -92,7 +94,9 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
             "exact_energy": energy,
             "found_by": message,
         }
-        write_json(folder / MANIFEST, manifest)
+        # it was read as a manifest, and only this entry changes
+        with staged(claim(folder, [MANIFEST], overwrite=True)) as new:
+            write_json(new / MANIFEST, manifest)
     return Imported(run, answer, manifest, violations(nlp, answer.x))
 
 

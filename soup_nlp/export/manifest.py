@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError, create_model
 
-from soup_nlp.errors import DataError, ExportError
+from soup_nlp.errors import ExportError
 from soup_nlp.model.layout import GAUGES
 from soup_nlp.storage.files import read_json
 
@@ -18,8 +17,13 @@ NORMS = ("smooth", "epigraph")
 TRUNCATIONS = ("smooth", "lifted")
 FUNCTIONS = ("oracle", "grad_f", "jac_g", "hess_lag")
 """Functions of the NLP that the format casadi has."""
-OWN = {f"{STUB}{s}" for s in (".nl", ".col", ".row", ".h5")} | {f"{f}.casadi" for f in FUNCTIONS}
-"""Every file beside problem.yaml and the manifest that an export may write."""
+OWN = (
+    *(f"{STUB}{suffix}" for suffix in (".nl", ".col", ".row", ".h5")),
+    *(f"{function}.casadi" for function in FUNCTIONS),
+    "problem.yaml",
+    MANIFEST,
+)
+"""Every file that an export may write."""
 
 
 def _record(name: str, **kinds: Any) -> type[BaseModel]:
@@ -74,17 +78,3 @@ def kept_best(folder: Path, sha256: str) -> dict[str, Any] | None:
         return None
     best: dict[str, Any] | None = old["best_known"]
     return best if old["nl"]["sha256"] == sha256 else None
-
-
-def remove_stale(folder: Path, written: Sequence[str]) -> None:
-    """Remove what the manifest of an earlier export lists and this one does not write.
-
-    Files that no export writes are never touched, whatever the manifest says.
-    """
-    try:
-        listed = read_json(folder / MANIFEST, MANIFEST)["files"]
-        names = {str(name) for name in listed}
-    except (DataError, KeyError, TypeError):
-        return
-    for name in (names & OWN).difference(written):
-        (folder / name).unlink(missing_ok=True)

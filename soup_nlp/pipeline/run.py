@@ -128,12 +128,15 @@ class Run:
         next camera as the reference frame sees it."""
         return self.components.camera
 
-    def save(self, folder: str | Path, formats: Sequence[str] = ()) -> list[str]:
+    def save(
+        self, folder: str | Path, formats: Sequence[str] = (), overwrite: bool = False
+    ) -> list[str]:
         """Write a result folder, as `soup-nlp solve` does.
 
         Args:
             folder: A new or empty folder, or that of an earlier result.
             formats: Files for other programs beside: "glb", "colmap", "npy", "pfm", "rrd" ...
+            overwrite: Overwrite files that the program did not make.
 
         Returns:
             Names of the files.
@@ -144,7 +147,7 @@ class Run:
         """
         # the report room imports this one
         write = import_module("soup_nlp.report.save").save
-        return list(write(self, folder, dump_problem(self.problem), formats))
+        return list(write(self, folder, dump_problem(self.problem), formats, overwrite))
 
     @property
     def delivered(self) -> str:

@@ -11,58 +11,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate import recompute
+from soup_nlp.evaluate import recompute, recompute_files
 from soup_nlp.evaluate.scoring import DEPTHS, SURE
+from soup_nlp.report.check_arrays import require_layout
+from soup_nlp.report.check_files import file_claims
+from soup_nlp.report.claim import ABSOLUTE, HASHED, RECOMPUTED, RELATIVE, Claim, number, same
 from soup_nlp.solve.kkt import LIMITS
 from soup_nlp.storage.files import as_path, parse_yaml, read_json, read_text
+from soup_nlp.storage.folders import recover
 from soup_nlp.storage.h5_files import read_attrs, read_h5
 from soup_nlp.storage.store import require
 
 Entries: TypeAlias = Mapping[str, Any]
+Images: TypeAlias = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 TERMS = ("arap", "proj", "cont", "orient", "prior")
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-RELATIVE = 1e-9
-ABSOLUTE = 1e-12
 ROUNDINGS = 16
 """Error of a pixel coordinate after projection into both frames, in units of machine precision."""
-NOT_CHECKED = "dual infeasibility and complementarity need the model's derivatives: not rechecked"
-
-
-@dataclass(frozen=True)
-class Claim:
-    """One claim of a result folder.
-
-    Attributes:
-        name: Subject of the claim.
-        claimed: Value in summary.json.
-        found: Value recomputed from the arrays.
-        limit: Largest allowed found value (constraints) or difference (numbers, relative).
-        ok: Whether the claim holds.
-        worst: Superpixel with the largest residual, -1 where there is none.
-        note: Explanation.
-    """
-
-    name: str
-    claimed: float
-    found: float
-    limit: float
-    ok: bool
-    worst: int = -1
-    note: str = ""
-
-    def __str__(self) -> str:
-        where = f"  superpixel {self.worst}" if self.worst >= 0 else ""
-        return (
-            f"{'ok  ' if self.ok else 'FAIL'} {self.name:<28} {self.claimed:>13.6g}"
-            f" {self.found:>13.6g} {self.limit:>9.1e}{where}{'  ' if self.note else ''}{self.note}"
-        )
+LEFT = (
+    "dual infeasibility and complementarity, which need the model's derivatives",
+    "times, versions, the wording of logs, colours of pictures and points (as written only)",
+    "images, flow, labels, truth and multipliers are taken as they are stored",
+)
+"""What nothing recomputes."""
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """All rows of a check."""
+    """All rows of a check, and what was left unchecked."""
 
     rows: tuple[Claim, ...]
+    left: tuple[str, ...] = LEFT
 
     @property
     def ok(self) -> bool:
@@ -70,33 +49,60 @@ class CheckReport:
         return all(r.ok for r in self.rows)
 
     def __str__(self) -> str:
-        head = f"     {'claim':<28} {'claimed':>13} {'recomputed':>13} {'limit':>9}"
-        return "\n".join([head, *map(str, self.rows), f"     {NOT_CHECKED}"])
+        head = f"     {'claim':<34} {'claimed':>13} {'found':>13} {'limit':>9}  how"
+        counts = {how: sum(r.how == how for r in self.rows) for how in (RECOMPUTED, HASHED)}
+        lines = [
+            f"     {counts[RECOMPUTED]} claims are recomputed from the arrays",
+            f"     {counts[HASHED]} are compared with the SHA-256 or the copy in result.h5",
+            *(f"     left: {text}" for text in self.left),
+        ]
+        return "\n".join([head, *map(str, self.rows), *lines])
 
 
-def check_folder(folder: str | Path) -> CheckReport:
-    """Recompute energy, constraints, depth and metrics of a result folder.
+def check_folder(folder: str | Path, images: Images | None = None) -> CheckReport:
+    """Recompute energy, constraints, depth, metrics and files of a result folder.
+
+    Args:
+        folder: Result folder.
+        images: The two images, (H, W, 3) or (H, W) uint8; without them E_photo of the refinement
+            is left as it is claimed.
 
     Raises:
         DataError: a file, a claim or an array is missing or not what it should be.
     """
     folder = as_path(folder, "result folder")
+    recover(folder)
     claims = read_json(folder / "summary.json", "summary.json")
     path = folder / "result.h5"
     tree, attrs = read_h5(path), read_attrs(path)
+    config = read_text(folder / "config.yaml", "config.yaml")
     try:
-        return CheckReport(tuple(_rows(folder, claims, tree, attrs)))
+        settings = parse_yaml(str(attrs["config"]))
+        require_layout(tree)
+        rows = tuple(_rows(folder, claims, tree, attrs, settings, config, images))
     except KeyError as error:
         raise DataError("result lacks a claim or an array", where=folder, found=error) from error
-    except (ValueError, IndexError, TypeError, AttributeError, np.linalg.LinAlgError) as error:
+    except (ValueError, IndexError, TypeError, AttributeError, ArithmeticError) as error:
         raise DataError(
             "claims and arrays of a result do not fit together", where=folder, found=error
         ) from error
+    except (np.linalg.LinAlgError, MemoryError) as error:
+        raise DataError("arrays of a result cannot be used", where=folder, found=error) from error
+    photo = "photo" in ((claims.get("refinement") or {}).get("end") or {})
+    unseen = ("E_photo of the refinement: the images of config.yaml are not at hand",)
+    return CheckReport(rows, LEFT + (unseen if photo and images is None else ()))
 
 
-def _rows(folder: Path, claims: Entries, tree: Entries, attrs: Entries) -> Iterator[Claim]:
-    yield from _labels(claims, attrs, read_text(folder / "config.yaml", "config.yaml"))
-    settings = parse_yaml(str(attrs["config"]))
+def _rows(
+    folder: Path,
+    claims: Entries,
+    tree: Entries,
+    attrs: Entries,
+    settings: Entries,
+    config: str,
+    images: Images | None,
+) -> Iterator[Claim]:
+    yield from _labels(claims, attrs, config)
     weights = {k: float(v) for k, v in tree["weights"].items()}
     yield from _weights(tree, settings["energy"], weights)
     for name, gap in recompute.data_errors(tree, settings).items():
@@ -107,16 +113,17 @@ def _rows(folder: Path, claims: Entries, tree: Entries, attrs: Entries) -> Itera
         for term, value in found.items():
             # a term may be the rounding error of the sum that it belongs to
             claimed = claims["energy"][which][term]
-            yield _same(f"energy {which} {term}", claimed, value, of=found["total"], absolute=slack)
+            yield same(f"energy {which} {term}", claimed, value, of=found["total"], absolute=slack)
     if claims["converged"]:
         before, after = (float(claims["energy"][k]["total"]) for k in ("start", "nlp"))
         ok = after <= before * (1 + RELATIVE) + slack
         yield Claim("energy falls", before, after, before, ok)
     yield from _rounds(claims, slack)
-    yield from _refined(claims, tree, settings, weights, slack)
+    yield from _refined(claims, tree, settings, weights, slack, images)
     yield from _constraints(claims, tree, weights)
     yield from _depths(tree)
     yield from _metrics(tree, claims["metrics"])
+    yield from file_claims(folder, claims, tree)
 
 
 def _weights(tree: Entries, form: Entries, weights: Mapping[str, float]) -> Iterator[Claim]:
@@ -127,7 +134,7 @@ def _weights(tree: Entries, form: Entries, weights: Mapping[str, float]) -> Iter
         # given for 1,000 superpixels
         own["orient"] *= len(tree["start"]["component"]) / 1000
     for key in TERMS:
-        yield _same(f"weight {key}", own[key], weights[key])
+        yield same(f"weight {key}", own[key], weights[key])
 
 
 def _rounding(tree: Entries, weights: Mapping[str, float]) -> float:
@@ -157,7 +164,7 @@ def _rounds(claims: Entries, slack: float) -> Iterator[Claim]:
     under = max(float(r["bound"]) - float(r["mrf_energy"]) for r in rounds)
     yield Claim("no choice below its bound", 0.0, under, 0.0, under <= within)
     if not refinement["polish_gain"]:
-        yield _same("last round is delivered", totals[-2], totals[-1], absolute=slack)
+        yield same("last round is delivered", totals[-2], totals[-1], absolute=slack)
 
 
 def _refined(
@@ -166,37 +173,30 @@ def _refined(
     settings: Entries,
     weights: Mapping[str, float],
     slack: float,
+    images: Images | None,
 ) -> Iterator[Claim]:
-    """Objective that the refinement ended with; the share of the images is taken as claimed."""
+    """Objective that the refinement began and ended with; E_photo needs the images."""
     refinement = claims.get("refinement")
     if not refinement:
         return
-    end, own = refinement["end"], dict(weights)
-    if "photo" in end:
+    own = dict(weights)
+    if "photo" in refinement["end"]:
         own["proj"] *= float(settings["refine"]["photo_proj"])
         sigma = float(settings["refine"]["photo_sigma_proj"])
         own["sigma_proj"] = min(own["sigma_proj"], sigma)
-    found = recompute.energy(_state(tree, "solution"), tree["energy"], own)
-    found["total"] += _number(end.get("photo", 0.0))
-    for term, value in found.items():
-        yield _same(f"refined {term}", end[term], value, of=found["total"], absolute=slack)
-
-
-def _number(value: Any) -> float:
-    """A claim as a number; JSON has null where it is not finite."""
-    return float("nan") if value is None else float(value)
-
-
-def _same(
-    name: str, claimed: Any, found: float, of: float = 0.0, absolute: float = ABSOLUTE
-) -> Claim:
-    """A claim that must equal `found` up to rounding of it, of the sum `of`, or `absolute`."""
-    value = _number(claimed)
-    gap = abs(value - found)
-    ok = gap <= RELATIVE * max(abs(found), abs(of)) + absolute or (
-        np.isnan(value) and np.isnan(found)
-    )
-    return Claim(name, value, found, RELATIVE, bool(ok))
+    for word, which, key in (("unrefined", "nlp", "begin"), ("refined", "solution", "end")):
+        claimed, state = refinement[key], _state(tree, which)
+        found = recompute.energy(state, tree["energy"], own)
+        found["total"] += number(claimed.get("photo", 0.0))
+        for term, value in found.items():
+            of = found["total"]
+            yield same(f"{word} {term}", claimed[term], value, of=of, absolute=slack)
+        if "photo" in claimed and images is not None:
+            factor = float(settings["refine"]["photo"])
+            seen = recompute_files.photo(state, tree, factor, *images)
+            value = number(claimed["photo"])
+            ok = abs(value - seen.energy) <= seen.within
+            yield Claim(f"{word} photo", value, seen.energy, seen.within / seen.energy, ok)
 
 
 def _labels(claims: Entries, attrs: Entries, config: str) -> Iterator[Claim]:
@@ -241,7 +241,7 @@ def _constraints(claims: Entries, tree: Entries, weights: Mapping[str, float]) -
         """Constraints of one soup, and the claims about them."""
         found = recompute.constraints(_state(tree, which), rim, facing)
         for name, limit in limits.items():
-            value, claimed = float(found[name].max()), _number(claims[key][name])
+            value, claimed = float(found[name].max()), number(claims[key][name])
             ok = value <= limit and abs(value - claimed) <= 1e-3 * value + ABSOLUTE
             worst = int(found[name].argmax()) if name != "simplex" and value > 0 else -1
             yield Claim(f"{which} {name}", claimed, value, limit, bool(ok), worst)
@@ -308,8 +308,8 @@ def _metrics(tree: Entries, claims: Entries) -> Iterator[Claim]:
             constant = found.get("mre", constant)
         if "skill" in claim and constant > 0:
             found["skill"] = 1 - found.get("mre", np.nan) / constant
-        yield _same(f"mre {name}", claim["mre"], found.get("mre", np.nan))
-        others = [_same(key, claim[key], value) for key, value in found.items() if key != "mre"]
+        yield same(f"mre {name}", claim["mre"], found.get("mre", np.nan))
+        others = [same(key, claim[key], value) for key, value in found.items() if key != "mre"]
         bad = [row for row in others if not row.ok]
         note = ", ".join(f"{r.name} is {r.found:.6g}, not {r.claimed:.6g}" for r in bad)
         count = float(len(others))

@@ -1,15 +1,15 @@
-"""The result folder; every file is written whole or not at all."""
+"""The result folder; it is written whole or not at all."""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterable, Mapping
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from soup_nlp.data.datasets.layout import MARK, is_result
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import component_overlaps, skill
@@ -18,12 +18,14 @@ from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_p
 from soup_nlp.report.formats import write_formats
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import Picture, pictures
+from soup_nlp.report.record import RECORD, extended, record_of
 from soup_nlp.report.result import result_of
 from soup_nlp.report.shown import PAGE, of_folder, of_run
 from soup_nlp.report.tree import attributes, result_tree
 from soup_nlp.report.verdict import facts
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.store import write_h5, write_json
 from soup_nlp.storage.versions import versions
 
@@ -78,6 +80,9 @@ PICTURES = {
 }
 """Files of the pictures that are written alone, by name."""
 
+FAILED = "failed.log"
+"""Log of a solve that ended without a result; the next result removes it."""
+
 _ROUND = (
     "energy",
     "mrf_energy",
@@ -95,40 +100,27 @@ _ROUND = (
 """Entries of a round of the refinement in summary.json."""
 
 
-def prepare_folder(folder: str | Path, inputs: Iterable[Path] | None = None) -> Path:
-    """Make the output folder and check that it can be written.
+def prepare_folder(
+    folder: str | Path, inputs: Iterable[Path] | None = None, overwrite: bool = False
+) -> Path:
+    """Make the folder of a result and check that it can be written.
 
     Args:
         folder: The folder.
-        inputs: Files and folders of the problem that is solved into it, see `input_paths`; neither
-            these nor files that no solve has written are overwritten. None checks neither.
+        inputs: Files and folders of the problem that is solved into it, see `input_paths`; these
+            are never overwritten.
+        overwrite: Overwrite files that the program did not make.
 
     Raises:
         DataError: it cannot be written, or holds what is not to be overwritten.
     """
-    folder = Path(folder)
     if inputs is not None:
-        _refuse_overwriting(folder, inputs)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-        if inputs is not None:
-            (folder / MARK).touch()
-        # Ipopt appends to its log, stage by stage
-        (folder / "ipopt.log").unlink(missing_ok=True)
-    except OSError as error:
-        raise DataError(
-            "output folder cannot be written",
-            where=folder,
-            found=error.strerror,
-            hint="choose another --out",
-        ) from error
-    return folder
+        _keep_inputs(Path(folder), inputs)
+    return claim(folder, (*FILES, *FULL.values(), FAILED), overwrite)
 
 
-def _refuse_overwriting(folder: Path, inputs: Iterable[Path]) -> None:
-    """Raise DataError where a result would overwrite, or lie among, its inputs or foreign files."""
+def _keep_inputs(folder: Path, inputs: Iterable[Path]) -> None:
+    """Raise DataError where a result would overwrite, or lie among, its inputs."""
 
     def refuse(what: str, expected: str, found: str | None = None) -> DataError:
         return DataError(
@@ -147,29 +139,27 @@ def _refuse_overwriting(folder: Path, inputs: Iterable[Path]) -> None:
                 "a folder that holds none of the inputs under the name of a result's file",
                 place.name,
             )
-    own = (*FILES, *FULL.values())
-    found = [] if is_result(folder) else [name for name in own if (folder / name).exists()]
-    if found:
-        raise refuse(
-            "output folder holds files that would be overwritten and are of no earlier result",
-            "a new or empty folder, or that of an earlier result",
-            ", ".join(found),
-        )
 
 
 def write_folder(
-    folder: Path, run: Run, config: str, log: str, verdict: str | None = None
+    folder: Path,
+    run: Run,
+    config: str,
+    log: str | Callable[[list[str]], str],
+    verdict: str | None = None,
+    ipopt_log: Path | None = None,
+    formats: Sequence[str] = (),
 ) -> list[str]:
-    """Write every file of a run, summary.json last: where it exists, the others are complete.
-
-    The summary.json of an earlier result is removed first.
+    """Write every file of a run; an earlier result stays whole until the new one is.
 
     Args:
         folder: Prepared folder.
         run: The run.
         config: Merged problem as YAML.
-        log: Lines of the log.
+        log: Text of the log, or what makes it of the names of the other files.
         verdict: What the page shows as printed; None for `facts`.
+        ipopt_log: Ipopt's own log.
+        formats: Files for other programs beside, see `formats.FORMATS`.
 
     Returns:
         Names of the files.
@@ -177,21 +167,40 @@ def write_folder(
     Raises:
         DataError: a file cannot be written.
     """
-    (folder / "summary.json").unlink(missing_ok=True)
+    with staged(folder, whole=True) as new:
+        if ipopt_log is not None and ipopt_log.is_file():
+            shutil.copy(ipopt_log, new / "ipopt.log")
+        _write_files(new, run, config, verdict, formats)
+        names = {path.name for path in new.iterdir()} | {"log.txt", "result.h5"}
+        files = [name for name in FILES if name in names] + sorted(names.difference(FILES))
+        write_text(new / "log.txt", log if isinstance(log, str) else log(files))
+        # the last one: it holds the hashes of the others
+        tree = {**result_tree(run), RECORD: record_of(new)}
+        write_h5(new / "result.h5", tree, attributes(run, config))
+    return files
+
+
+def write_failure(folder: Path, log: str, ipopt_log: Path) -> None:
+    """Write the log of a solve that failed, followed by Ipopt's; an earlier result stays."""
+    with suppress(OSError):
+        log += ipopt_log.read_text(encoding="utf-8", errors="replace")
+    with staged(folder) as new:
+        write_text(new / FAILED, log)
+
+
+def _write_files(
+    folder: Path, run: Run, config: str, verdict: str | None, formats: Sequence[str]
+) -> None:
+    """Every file of a run but its logs and result.h5."""
     write_text(folder / "config.yaml", config)
-    write_text(folder / "log.txt", log)
-    write_h5(folder / "result.h5", result_tree(run), attributes(run, config))
     told = summary(run)
     shown = of_run(run, told, facts(run) if verdict is None else verdict)
     drawn = pictures(shown)
     scales = _pictures(folder, run, drawn)
-    write_formats(folder, result_of(run), ("motions", "ply"))
+    write_formats(folder, result_of(run), ("motions", "ply", *formats))
     if run.problem.output.page:
         write_text(folder / PAGE, page(shown, drawn))
-    else:
-        (folder / PAGE).unlink(missing_ok=True)
     write_json(folder / "summary.json", {**told, "depth_png_scale": scales})
-    return [name for name in (*FILES, *FULL.values()) if (folder / name).is_file()]
 
 
 def summary(run: Run) -> dict[str, Any]:
@@ -289,8 +298,6 @@ def _pictures(folder: Path, run: Run, drawn: Mapping[str, Picture]) -> dict[str,
     for name, file in PICTURES.items():
         if name in drawn:
             write_picture(folder / file, drawn[name])
-        else:
-            (folder / file).unlink(missing_ok=True)
     overview(folder / "overview.png", drawn, run.problem.name)
     return scales
 
@@ -315,5 +322,6 @@ def renew_page(folder: Path, pair: Pair | None = None) -> Path:
         raise DataError(
             "result lacks what a page shows", where=folder, found=repr(error), hint="solve it again"
         ) from error
-    write_text(folder / PAGE, text)
+    with extended(folder, overwrite=True) as new:
+        write_text(new / PAGE, text)
     return folder / PAGE

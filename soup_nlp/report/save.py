@@ -6,17 +6,23 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from soup_nlp.data.datasets.layout import is_result
-from soup_nlp.errors import DataError
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.formats import check_formats, write_formats
-from soup_nlp.report.result import read_result, result_of
+from soup_nlp.report.record import extended
+from soup_nlp.report.result import read_result
+from soup_nlp.storage.folders import staged
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline.run import Run
 
 
-def save(run: Run, folder: str | Path, config: str, formats: Sequence[str] = ()) -> list[str]:
+def save(
+    run: Run,
+    folder: str | Path,
+    config: str,
+    formats: Sequence[str] = (),
+    overwrite: bool = False,
+) -> list[str]:
     """Write the result folder of a run.
 
     Args:
@@ -24,6 +30,7 @@ def save(run: Run, folder: str | Path, config: str, formats: Sequence[str] = ())
         folder: A new or empty folder, or that of an earlier result.
         config: Merged problem as YAML.
         formats: Files for other programs beside, see `formats.FORMATS`.
+        overwrite: Overwrite files that the program did not make.
 
     Returns:
         Names of the files.
@@ -34,21 +41,21 @@ def save(run: Run, folder: str | Path, config: str, formats: Sequence[str] = ())
     """
     names = check_formats(formats) if formats else []
     in_memory = run.problem.input.kind == "memory"
-    target = prepare_folder(folder, [] if in_memory else run.problem.input_paths())
-    files = write_folder(target, run, config, f"{run}\n")
-    if names:
-        files += write_formats(target, result_of(run), names)
-    return list(dict.fromkeys(files))
+    inputs = [] if in_memory else run.problem.input_paths()
+    target = prepare_folder(folder, inputs, overwrite)
+    return write_folder(target, run, config, f"{run}\n", formats=names)
 
 
-def convert(folder: Path, formats: Sequence[str], out: Path | None = None) -> list[str]:
+def convert(
+    folder: Path, formats: Sequence[str], out: Path | None = None, overwrite: bool = False
+) -> list[str]:
     """Write a result folder in other formats.
 
     Args:
         folder: Result folder of `solve`, `import` or `Run.save`.
         formats: See `formats.FORMATS`.
-        out: Where to; None for the result folder itself. Else a new or empty folder, or one of an
-            earlier conversion.
+        out: Where to; None for the result folder itself.
+        overwrite: Overwrite files that the program did not make.
 
     Returns:
         Names of the files and folders.
@@ -59,12 +66,6 @@ def convert(folder: Path, formats: Sequence[str], out: Path | None = None) -> li
     """
     names = check_formats(formats)
     result = read_result(folder)
-    target = folder if out is None else out
-    if out is not None and out.is_dir() and any(out.iterdir()) and not is_result(out):
-        raise DataError(
-            "output folder holds files of its own",
-            where=out,
-            expected="a new or empty folder, or one of an earlier conversion",
-            hint="choose another --out",
-        )
-    return write_formats(prepare_folder(target, [] if out is not None else None), result, names)
+    where = extended(folder, overwrite) if out is None else staged(out, overwrite=overwrite)
+    with where as new:
+        return write_formats(new, result, names)

@@ -157,6 +157,20 @@ _TRUTH: Table = {
 }  # fmt: skip
 
 
+LAYOUT: Mapping[str, Table] = {
+    "input": _INPUT,
+    "segmentation": _SEGMENTATION,
+    "energy": _ENERGY,
+    "start": {**_SOUP, **_START},
+    "solution": _SOUP,
+    "nlp": _SOUP,
+    "answer": _SOUP,
+    "depth": _DEPTH,
+    "truth": _TRUTH,
+}
+"""Tables of the groups whose axes are named."""
+
+
 def result_tree(run: Run) -> Tree:
     """Every array of a run, as `store.write_h5` takes it."""
     pair, rec, nlp = run.pair, run.reconstruction, run.nlp_reconstruction

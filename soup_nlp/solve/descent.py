@@ -20,6 +20,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -220,7 +221,8 @@ class Descent:
         if self.watch.listener:
             self.watch.listener(Progress(phase.name, iteration, row[0], 0.0, now))
         if self.watch.log_file:
-            with open(self.watch.log_file, "a") as log:
+            # a full disk takes the log, not the solve
+            with suppress(OSError), open(self.watch.log_file, "a") as log:
                 if not iteration:
                     log.write(f"\n{phase.name}: {phase.hessian} Hessian, {self.library}\n")
                     log.write("iter    objective    inf_du   compl  damping\n")

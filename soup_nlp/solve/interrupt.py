@@ -1,4 +1,4 @@
-"""Ctrl-C as an event: a solve ends at its next iteration and keeps the best iterate."""
+"""Ctrl-C and SIGTERM as an event: a solve ends at its next iteration and keeps the best iterate."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from typing import Any
 class interruptible:  # noqa: N801
     """Context in which Ctrl-C sets an event instead of raising (main thread only).
 
-    The second Ctrl-C raises KeyboardInterrupt, except while `deferred` is set, as during the
-    writing of files. CasADi swallows one that is raised in its callbacks; `aborted` records it.
+    SIGTERM does the same. The second signal raises KeyboardInterrupt, except while `deferred` is
+    set, as during the writing of files. CasADi swallows one that is raised in its callbacks;
+    `aborted` records it.
 
     Args:
         say: Told what a Ctrl-C does; it is called in a signal handler.
@@ -23,11 +24,12 @@ class interruptible:  # noqa: N801
         self.event = threading.Event()
         self.deferred = self.aborted = False
         self._say = say or (lambda line: None)
-        self._old: Any = None
+        self._old: dict[int, Any] = {}
 
     def __enter__(self) -> threading.Event:
         if threading.current_thread() is threading.main_thread():
-            self._old = signal.signal(signal.SIGINT, self._set)
+            numbers = signal.SIGINT, signal.SIGTERM
+            self._old = {number: signal.signal(number, self._set) for number in numbers}
         return self.event
 
     def _set(self, number: int, frame: FrameType | None) -> None:
@@ -44,5 +46,5 @@ class interruptible:  # noqa: N801
         self.event.set()
 
     def __exit__(self, *exc: object) -> None:
-        if self._old is not None:
-            signal.signal(signal.SIGINT, self._old)
+        for number, handler in self._old.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

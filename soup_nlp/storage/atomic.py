@@ -30,8 +30,8 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         The temporary path.
 
     Raises:
-        DataError: the folder is missing or cannot be written, `path` is a folder, or the block
-            left no file at the temporary path.
+        DataError: the folder is missing or cannot be written, `path` is a folder, the disk is
+            full, or the block left no file at the temporary path.
     """
     target = Path(path)
     if target.is_dir():
@@ -49,7 +49,7 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         ) from error
     except OSError as error:
         raise DataError(
-            "cannot write in the folder of an output file", where=target, found=error
+            "cannot write in the folder of an output file", where=target, found=error.strerror
         ) from error
     os.close(handle)
     temporary = Path(name)
@@ -61,9 +61,13 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
             )
         temporary.chmod(_mode(target))
         os.replace(temporary, target)
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
+        if isinstance(error, OSError):
+            raise DataError(
+                "file cannot be written", where=target, found=error.strerror or error
+            ) from error
         raise
 
 

@@ -98,9 +98,11 @@ def read_attrs(path: PathLike) -> dict[str, Any]:
     """
     with _opened(path) as file:
         out = dict(file.attrs)
+        out = {k: v.item() if isinstance(v, np.generic) else v for k, v in out.items()}
+        out = {k: v.decode() if isinstance(v, bytes) else v for k, v in out.items()}
         if isinstance(out.get("versions"), str):
             out["versions"] = parse_json(out["versions"])
-    return {k: v.item() if isinstance(v, np.generic) else v for k, v in out.items()}
+    return out
 
 
 @contextmanager

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, is_dataclass
+from io import BytesIO
 from os import PathLike as _PathLike
 from typing import Any, TypeAlias, Union
 
@@ -18,11 +20,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.atomic import PathLike, atomic_path, write_text
+from soup_nlp.storage.atomic import PathLike, write_bytes, write_text
+from soup_nlp.storage.files import read_bytes
 from soup_nlp.storage.versions import versions
 
 SCHEMA = 1
 """Version of the layout of result files; grows when a reader would have to change."""
+
+FORMAT = ("v110", "v110")
+"""Versions of HDF5's format that are written: the oldest with checksums everywhere."""
 
 COMPRESS_ABOVE = 64 * 1024
 """Arrays of more bytes than this are compressed (gzip level 1 after a byte shuffle)."""
@@ -64,16 +70,41 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
         DataError: an array cannot be stored, or the file cannot be written.
     """
     own = {"schema": SCHEMA, "versions": json.dumps(versions()), "machine": platform.platform()}
-    with atomic_path(path) as temporary:
-        try:
-            with h5py.File(temporary, "w", track_order=True) as file:
-                for key, value in (dict(attrs) | own).items():
-                    if value is not None:
-                        simple = isinstance(value, str | bool | int | float | np.generic)
-                        file.attrs[key] = value if simple else json.dumps(plain(value))
-                _write_group(file, tree)
-        except (OSError, TypeError, ValueError, RuntimeError) as error:
-            raise DataError("cannot write the HDF5 file", where=path, found=error) from error
+    try:
+        # in memory: on a full disk HDF5 ends the process
+        with h5py.File(
+            os.path.basename(path),
+            "w",
+            driver="core",
+            backing_store=False,
+            track_order=True,
+            libver=FORMAT,
+        ) as file:
+            for key, value in (dict(attrs) | own).items():
+                if value is not None:
+                    _write_attribute(file, key, value)
+            _write_group(file, tree)
+            file.flush()
+            image = file.id.get_file_image()
+    except (OSError, TypeError, ValueError, RuntimeError) as error:
+        raise DataError("cannot write the HDF5 file", where=path, found=error) from error
+    write_bytes(path, image)
+
+
+def replace_group(source: PathLike, target: PathLike, name: str, tree: Tree) -> None:
+    """Write a copy of a result file with other arrays in one of its groups.
+
+    Raises:
+        DataError: the file cannot be read or written.
+    """
+    image = BytesIO(read_bytes(source, "result file"))
+    try:
+        with h5py.File(image, "r+", libver=FORMAT) as file:
+            del file[name]
+            _write_group(file, {name: tree})
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise DataError("result file cannot be changed", where=source, found=error) from error
+    write_bytes(target, image.getvalue())
 
 
 def _write_group(group: h5py.Group, tree: Tree) -> None:
@@ -83,13 +114,37 @@ def _write_group(group: h5py.Group, tree: Tree) -> None:
             continue
         data = np.asarray(item.value)
         if data.dtype.kind == "U":
-            data = data.astype(h5py.string_dtype())
-        options: dict[str, Any] = {}
-        if data.nbytes > COMPRESS_ABOVE and data.ndim > 0:
-            options = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-        dataset = group.create_dataset(name, data=data, **options)
+            data = np.char.encode(data, "utf-8")
+            data = data.astype(h5py.string_dtype(length=max(1, data.dtype.itemsize)))
+        _write_array(group, name, data)
         for key in ("units", "description", "shape_letters"):
-            dataset.attrs[key] = getattr(item, key)
+            group[name].attrs[key] = getattr(item, key)
+
+
+def _write_attribute(file: h5py.File, key: str, value: object) -> None:
+    if isinstance(value, bool | int | float | np.generic):
+        file.attrs[key] = value
+        return
+    text = (value if isinstance(value, str) else json.dumps(plain(value))).encode()
+    # of fixed length: HDF5 has no checksum for others
+    file.attrs.create(key, text, dtype=h5py.string_dtype(length=max(1, len(text))))
+
+
+def _write_array(group: h5py.Group, name: str, data: NDArray[Any]) -> None:
+    """Write an array under a checksum: HDF5 then notices bytes that were changed."""
+    if data.ndim and data.size:
+        options: dict[str, Any] = {"fletcher32": True, "chunks": True}
+        if data.nbytes > COMPRESS_ABOVE:
+            options |= {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+        group.create_dataset(name, data=data, **options)
+        return
+    # what is no chunk is kept in the header, which has a checksum of its own
+    kind = h5py.h5t.py_create(data.dtype, logical=True)
+    layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    layout.set_layout(h5py.h5d.COMPACT)
+    space = h5py.h5s.create_simple(data.shape) if data.ndim else h5py.h5s.create(h5py.h5s.SCALAR)
+    made = h5py.h5d.create(group.id, name.encode(), kind, space, layout)
+    made.write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(data))
 
 
 def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:

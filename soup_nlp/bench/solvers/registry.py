@@ -21,6 +21,7 @@ from soup_nlp.errors import SolverError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import read_sol
 from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.storage.system import end_with_parent
 
 
 def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
@@ -39,6 +40,7 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
                 stderr=subprocess.STDOUT,
                 timeout=max(1.0, task.limits.seconds - (time.perf_counter() - begin)),
                 check=False,
+                preexec_fn=end_with_parent,
             ).returncode
         except subprocess.TimeoutExpired:
             return Answer(None, None, "Time_Limit", False, -1, time.perf_counter() - begin)

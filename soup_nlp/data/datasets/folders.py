@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import label
 
-from soup_nlp.data.datasets.layout import MARK, is_result, make_pair, need, need_folder, read_if
+from soup_nlp.data.datasets.layout import is_result, make_pair, need, need_folder, read_if
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_intrinsics
 from soup_nlp.data.formats.images import read_mask
@@ -24,6 +24,7 @@ from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.storage.files import PathLike, is_file, read_text
+from soup_nlp.storage.mark import MARK
 
 LAYOUT = (
     "frame_0.png and frame_1.png (or image_ref.png and image_next.png), K.txt; optional "

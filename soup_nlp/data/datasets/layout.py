@@ -10,6 +10,7 @@ from soup_nlp.data.formats.images import read_image
 from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import PathLike, as_path, is_file, is_folder, read_json
+from soup_nlp.storage.mark import MARK
 
 T = TypeVar("T")
 
@@ -93,10 +94,6 @@ def make_pair(
     ref, following = (read_image(path, white) for path in images)
     K_ref, K_next = cameras
     return Pair(ref, following, K_ref, K_next, truth=truth if truth.known() else None, name=name)
-
-
-MARK = ".soup_nlp"
-"""Empty file by which a folder is known as one for results, from before its first file on."""
 
 
 def is_result(folder: Path) -> bool:

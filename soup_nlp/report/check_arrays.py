@@ -1,0 +1,75 @@
+"""The arrays of a result fit together: shapes, kinds and indices, before anything is computed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from soup_nlp.errors import DataError
+from soup_nlp.report.tree import LAYOUT, Table
+
+INDICES = {
+    "segmentation/labels": "N",
+    "segmentation/knn": "N",
+    "energy/edges": "N",
+    "energy/pairs": "N",
+}
+"""Arrays of indices, and the letter of the axis that they point into."""
+SHARED = ("N", "E", "P", "H", "W")
+"""Letters that stand for one size in all arrays: superpixels, edges, pairs, image."""
+FREE = ("depth/next", "truth/depth_next")
+"""Maps of the next frame, whose size may be another."""
+
+
+def require_layout(tree: Mapping[str, Any]) -> None:
+    """Check every array that is there against its axes.
+
+    Raises:
+        DataError: an array has another shape, no numbers, or indices out of range.
+    """
+    sizes: dict[str, int] = {}
+    for group, table in LAYOUT.items():
+        values = tree.get(group, {})
+        if not isinstance(values, Mapping):
+            raise _wrong(group, "an array", "a group")
+        _require_shapes(group, table, values, sizes)
+    for place, letter in INDICES.items():
+        group, name = place.split("/")
+        found = tree.get(group, {}).get(name)
+        if found is None:
+            continue
+        top = sizes.get(letter, 0)
+        if found.dtype.kind not in "iu" or (
+            found.size and not 0 <= found.min() <= found.max() < top
+        ):
+            raise _wrong(place, "other values", f"whole numbers from 0 to {top - 1}")
+
+
+def _require_shapes(
+    group: str, table: Table, values: Mapping[str, Any], sizes: dict[str, int]
+) -> None:
+    """Shapes are those of the table; a shared letter stands for one size in all arrays."""
+    for name, (_, letters, _) in table.items():
+        place, value = f"{group}/{name}", values.get(name)
+        if value is None:
+            continue
+        if isinstance(value, Mapping) or value.dtype.kind not in "biuf":
+            raise _wrong(place, "a group or text", "numbers")
+        axes = letters.split(",") if letters else []
+        if len(axes) != value.ndim:
+            raise _wrong(place, value.shape, f"axes ({letters})")
+        for axis, size in zip(axes, value.shape, strict=True):
+            expected = int(axis) if axis.isdigit() else size
+            if axis in SHARED and place not in FREE:
+                expected = sizes.setdefault(axis, size)
+            if size != expected:
+                raise _wrong(place, value.shape, f"({letters}) with {axis} = {expected}")
+
+
+def _wrong(place: str, found: object, expected: str) -> DataError:
+    return DataError(
+        "array of a result does not fit the others",
+        where=f"result.h5, {place}",
+        found=found,
+        expected=expected,
+    )

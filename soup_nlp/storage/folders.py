@@ -1,0 +1,286 @@
+"""Output folders: a command's files appear all at once, and no file of the user is overwritten.
+
+A command first claims the names that it will write (`claim`). Later it writes its files into a new
+folder beside the target, which takes the target's place in one step (`staged`). What the
+program made, and what is the user's, is in `storage.mark`.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
+
+from soup_nlp.errors import DataError
+from soup_nlp.storage.atomic import PathLike
+from soup_nlp.storage.mark import MARK, adopt, digest_of, files_in, is_foreign, made, write_mark
+from soup_nlp.storage.system import deferred_signals, exchange
+
+_STAGE = ".soup_nlp-"
+"""In the names of temporary folders."""
+_COMMIT = f"{_STAGE}commit"
+"""Complete new files inside their folder, that are being moved to their places."""
+
+
+def claim(folder: PathLike, names: Iterable[str], overwrite: bool = False) -> Path:
+    """Make an output folder, and check that these files may be written into it.
+
+    What an ended process left behind is finished or removed.
+
+    Args:
+        folder: The output folder.
+        names: Files that will be written.
+        overwrite: Take existing files of these names as the program's own.
+
+    Returns:
+        The folder.
+
+    Raises:
+        DataError: it cannot be written, or holds a file of the user under one of the names.
+    """
+    try:
+        target = Path(folder).resolve()
+        with deferred_signals():
+            target.mkdir(parents=True, exist_ok=True)
+            recover(target)
+            _sweep(_left_behind(target))
+            stage, lock = _new_stage(target)
+            _drop(stage, lock)
+            if made(target) is None:
+                # an early version did not list its files
+                adopt(target, [n for n in names if (target / n).is_file()])
+        foreign = [name for name in names if is_foreign(target, name)]
+    except (OSError, RuntimeError, ValueError) as error:
+        raise _unwritable(folder, error) from error
+    if foreign and not overwrite:
+        raise _clash(folder, foreign)
+    if foreign:
+        adopt(target, foreign)
+    return Path(folder)
+
+
+@contextmanager
+def staged(folder: PathLike, whole: bool = False, overwrite: bool = False) -> Iterator[Path]:
+    """An empty folder whose files are moved into `folder` together when the block ends well.
+
+    On any exception `folder` stays as it was. Where it holds nothing but the program's own files
+    and the file system can exchange two folders, the new files replace the old ones in one step;
+    else one after the other, and `recover` finishes what a killed process has begun.
+
+    Args:
+        folder: The output folder.
+        whole: The new files are a whole result: own files of an earlier one are removed.
+        overwrite: Overwrite files that the program did not make.
+
+    Yields:
+        The temporary folder, beside or in the output folder.
+
+    Raises:
+        DataError: a file cannot be written, or one of the user has a name of a new file.
+    """
+    try:
+        target = Path(folder).resolve()
+        with deferred_signals():
+            target.mkdir(parents=True, exist_ok=True)
+            recover(target)
+            stage, lock = _new_stage(target)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise _unwritable(folder, error) from error
+    try:
+        yield stage
+        with deferred_signals():
+            _commit(stage, target, whole, overwrite)
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+    finally:
+        _drop(stage, lock)
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """A folder for temporary files, which is removed at the end, or by the next one if killed.
+
+    Raises:
+        DataError: it cannot be made.
+    """
+    root = Path(tempfile.gettempdir())
+    prefix = f"soup_nlp-{os.getuid()}-"
+    try:
+        with deferred_signals():
+            _sweep(root.glob(f"{prefix}*"))
+            folder = Path(tempfile.mkdtemp(prefix=prefix, dir=root))
+            lock = _lock(folder)
+    except OSError as error:
+        raise DataError(
+            "no temporary folder can be made", where=root, found=error.strerror, hint="set TMPDIR"
+        ) from error
+    try:
+        yield folder
+    finally:
+        _drop(folder, lock)
+
+
+def recover(folder: Path) -> None:
+    """Finish the move of new files into a folder that a killed process has begun."""
+    commit = folder / _COMMIT
+    if not commit.is_dir() or commit.is_symlink():
+        return
+    lock = os.open(commit, os.O_RDONLY)
+    try:
+        # another process may be at it
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if commit.is_dir():
+            _move_in(commit, folder)
+    finally:
+        os.close(lock)
+
+
+def _below(folder: Path, top: str) -> list[str]:
+    """Names of a file, or of all files below a folder, as seen from its parent."""
+    path = folder / top
+    if path.is_symlink() or not path.is_dir():
+        return [top]
+    return [f"{top}/{name}" for name in files_in(path)]
+
+
+def _clash(folder: PathLike, names: Iterable[str]) -> DataError:
+    return DataError(
+        "output folder holds files that would be overwritten and that this program did not"
+        " make, or that were changed since",
+        where=folder,
+        found=", ".join(names),
+        expected="a new or empty folder, or that of an earlier result",
+        hint="choose another --out, or --overwrite",
+    )
+
+
+def _unwritable(folder: PathLike, error: Exception) -> DataError:
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+    return DataError(
+        "output folder cannot be written",
+        where=folder,
+        found=reason,
+        hint="choose another --out, or make room where the disk is full",
+    )
+
+
+def _new_stage(target: Path) -> tuple[Path, int]:
+    """A new temporary folder beside the target, or in it where it cannot be exchanged."""
+    name = f".{target.name[:64]}{_STAGE}"
+    places = [(target.parent, name), (target, _STAGE)]
+    if os.path.ismount(target) or _inside(target):
+        del places[0]
+    for parent, prefix in places:
+        try:
+            stage = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
+        except OSError:
+            if parent == target:
+                raise
+            continue
+        shutil.copymode(target, stage)
+        lock = _lock(stage)
+        return stage, lock
+    raise AssertionError("unreachable")
+
+
+def _inside(target: Path) -> bool:
+    """Whether this process works in the folder: a shell there must not lose it."""
+    with suppress(OSError):
+        return Path.cwd().is_relative_to(target)
+    return True
+
+
+def _lock(folder: Path) -> int:
+    """Hold a folder, so that no other process takes it for left behind."""
+    handle = os.open(folder, os.O_RDONLY)
+    with suppress(OSError):
+        # some network file systems have no locks
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return handle
+
+
+def _drop(stage: Path, lock: int) -> None:
+    """Remove a temporary folder."""
+    with deferred_signals():
+        shutil.rmtree(stage, ignore_errors=True)
+        os.close(lock)
+
+
+def _left_behind(target: Path) -> list[Path]:
+    """Temporary folders of a target, of other processes that run or have ended."""
+    own = f".{target.name[:64]}{_STAGE}"
+    beside = [p for p in target.parent.iterdir() if p.name.startswith(own)]
+    return beside + [p for p in target.iterdir() if p.name.startswith(_STAGE) and p.name != _COMMIT]
+
+
+def _sweep(paths: Iterable[Path]) -> None:
+    """Remove temporary folders whose process has ended: nobody holds them."""
+    for path in paths:
+        with suppress(OSError):
+            handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(path, ignore_errors=True)
+            finally:
+                os.close(handle)
+
+
+def _commit(stage: Path, target: Path, whole: bool, overwrite: bool) -> None:
+    """Give the files of a temporary folder their places."""
+    new = {name: digest_of(stage / name) for name in files_in(stage)}
+    clash = [name for name in new if is_foreign(target, name)]
+    if clash and not overwrite:
+        raise _clash(target, clash)
+    if clash:
+        adopt(target, clash)
+    listed = made(target) or {}
+    tops = {PurePosixPath(name).parts[0] for name in [*new, *listed]}
+    there = {path.name for path in target.iterdir()} - {MARK, stage.name}
+    here = {name for top in there & tops for name in _below(target, top)}
+    old = {k: v for k, v in listed.items() if k in here and not is_foreign(target, k)}
+    write_mark(stage, new if whole else old | new)
+    for name in here & new.keys():
+        shutil.copymode(target / name, stage / name)
+    _sync(stage)
+    # only the program's own files: nothing else moves with the folder
+    alone = there <= tops and here <= (old | new if whole else new).keys()
+    if alone and stage.parent == target.parent and exchange(stage, target):
+        return
+    commit = target / _COMMIT
+    try:
+        os.rename(stage, commit)
+    except OSError:
+        # another file system is mounted at the target
+        near = Path(tempfile.mkdtemp(prefix=_STAGE, dir=target))
+        shutil.copytree(stage, near, dirs_exist_ok=True)
+        _sync(near)
+        os.rename(near, commit)
+    _move_in(commit, target)
+
+
+def _move_in(commit: Path, target: Path) -> None:
+    """Move complete new files to their places, remove own old ones; may be done again."""
+    new, old = made(commit), made(target)
+    for name in (old or {}).keys() - (new or {}).keys():
+        if os.path.lexists(target / name) and not is_foreign(target, name):
+            (target / name).unlink()
+            with suppress(OSError):
+                # empty ones only
+                os.removedirs((target / name).parent)
+    for name in files_in(commit):
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(commit / name, target / name)
+    if (commit / MARK).exists():
+        os.replace(commit / MARK, target / MARK)
+    shutil.rmtree(commit)
+
+
+def _sync(folder: Path) -> None:
+    """Wait until the files of a folder are on disk; some systems tell only now that it is full."""
+    for name in [*files_in(folder), MARK]:
+        with (folder / name).open("rb") as file:
+            os.fsync(file.fileno())

@@ -1,0 +1,82 @@
+"""Which files of a folder the program made: the hidden file MARK lists them with their SHA-256.
+
+A file that is not listed, or that was changed since, belongs to the user.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+
+from soup_nlp.errors import DataError
+from soup_nlp.storage.atomic import write_text
+
+MARK = ".soup_nlp"
+"""Hidden file of a folder with results: JSON, SHA-256 by name of every file that was made."""
+
+
+def made(folder: Path) -> dict[str, str] | None:
+    """SHA-256 by name of the files that the program made in a folder.
+
+    None where the mark is empty, as early versions left it: they did not list their files.
+    """
+    path = folder / MARK
+    try:
+        if path.is_symlink() or not path.is_file():
+            return {}
+        text = path.read_text(encoding="utf-8")
+        if not text:
+            return None
+        listed = json.loads(text)["files"]
+        # nothing outside the folder is the program's own, whatever a mark says
+        inside = [n for n in listed if not PurePosixPath(n).is_absolute() and ".." not in n]
+        return {str(name): str(listed[name]) for name in inside}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return {}
+
+
+def files_in(folder: Path) -> list[str]:
+    """Names of all files in a folder and in those below it, without the mark."""
+    paths = [path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()]
+    return sorted(p.relative_to(folder).as_posix() for p in paths if p != folder / MARK)
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def is_foreign(folder: Path, name: str) -> bool:
+    """Whether a folder holds something under this name that the program did not make."""
+    path = folder / name
+    above = [folder / parent for parent in PurePosixPath(name).parents][:-1]
+    if any(os.path.lexists(p) and (p.is_symlink() or not p.is_dir()) for p in above):
+        return True
+    if not os.path.lexists(path):
+        return False
+    if path.is_symlink() or not path.is_file():
+        return True
+    listed = made(folder)
+    return listed is not None and listed.get(name) != digest_of(path)
+
+
+def adopt(folder: Path, names: Iterable[str]) -> None:
+    """Enter files of the user into the mark, so that they may be overwritten."""
+    there = {name: folder / name for name in names}
+    for name, path in there.items():
+        if path.is_dir() and not path.is_symlink():
+            raise DataError("cannot write a file over a folder", where=folder / name)
+        if path.is_symlink():
+            # the link goes, what it leads to stays
+            path.unlink()
+    digests = {name: digest_of(path) for name, path in there.items() if path.is_file()}
+    write_mark(folder, (made(folder) or {}) | digests)
+
+
+def write_mark(folder: Path, files: dict[str, str]) -> None:
+    """Write the list of a folder's own files, SHA-256 by name."""
+    write_text(folder / MARK, json.dumps({"files": dict(sorted(files.items()))}, indent=1) + "\n")

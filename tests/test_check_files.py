@@ -1,0 +1,181 @@
+"""The check notices every changed file and entry, and refuses damaged ones without a crash."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from soup_nlp.config.problem import dump_problem
+from soup_nlp.data.pair import Pair
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.errors import DataError
+from soup_nlp.pipeline.run import solve_pair
+from soup_nlp.report.check import CheckReport, check_folder
+from soup_nlp.report.claim import HASHED
+from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.report.record import RECORD, record_of
+from soup_nlp.storage import store
+from soup_nlp.storage.mark import MARK
+
+
+@pytest.fixture(scope="module")
+def pair() -> Pair:
+    return render_scene("street", 0, 128, 96)
+
+
+@pytest.fixture(scope="module")
+def solved(pair, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("solved") / "out"
+    run = solve_pair(
+        pair,
+        segmentation={"superpixels": 25, "neighbours": 4},
+        flow={"source": "truth"},
+        solver={"presolve_eps": [0.3, 0.03]},
+        refine={"rounds": 1, "particles": 8},
+    )
+    write_folder(prepare_folder(out), run, dump_problem(run.problem), "a log\n", formats=["npy"])
+    return out
+
+
+@pytest.fixture
+def folder(solved, tmp_path) -> Path:
+    shutil.copytree(solved, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def images(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
+    return pair.image_ref, pair.image_next
+
+
+def bad(report: CheckReport) -> list[str]:
+    return [row.name for row in report.rows if not row.ok]
+
+
+def test_every_claim_of_a_result_holds(solved, pair):
+    report = check_folder(solved, images(pair))
+    assert bad(report) == []
+    assert not any("E_photo" in text for text in report.left)
+    photos = [row for row in report.rows if row.name.endswith("refined photo")]
+    assert len(photos) == 2
+    for row in photos:
+        # an allowance as large as E_photo would notice nothing
+        assert row.limit < 0.05
+        assert row.found == pytest.approx(row.claimed, rel=0.01)
+    assert any("E_photo" in text for text in check_folder(solved).left)
+
+
+def test_every_file_is_covered(solved):
+    said = {row.name.removesuffix(" as written") for row in check_folder(solved).rows}
+    others = {"result.h5", "summary.json", "config.yaml", MARK}
+    assert {p.name for p in solved.iterdir()} - others <= said
+    assert record_of(solved)["files"].value.size == len(list(solved.iterdir())) - 2
+
+
+@pytest.mark.parametrize("change", ["flipped", "missing", "longer"])
+def test_a_changed_file_is_noticed(change, folder):
+    others = {"result.h5", "summary.json", "config.yaml", MARK}
+    names = {p.name for p in folder.iterdir()} - others
+    for name in names:
+        data = bytearray((folder / name).read_bytes())
+        if change == "missing":
+            (folder / name).unlink()
+            continue
+        if change == "longer":
+            data += b"x"
+        else:
+            data[len(data) // 2] ^= 1
+        (folder / name).write_bytes(data)
+    assert {f"{name} as written" for name in names} <= set(bad(check_folder(folder)))
+
+
+def repaired(folder: Path) -> list[str]:
+    """Failing claims after the record was made again: what is recomputed, not compared."""
+    with h5py.File(folder / "result.h5", "a") as file:
+        del file[RECORD]
+        store._write_group(file, {RECORD: record_of(folder)})
+    return bad(check_folder(folder))
+
+
+def test_a_forged_depth_map_is_recomputed(folder):
+    path = str(folder / "depth_next.png")
+    values = cv2.imread(path, cv2.IMREAD_UNCHANGED)
+    values[10, 20] += 1
+    cv2.imwrite(path, values)
+    assert repaired(folder) == ["depth_next.png pixels"]
+    cv2.imwrite(path, values[:, :-1])
+    assert repaired(folder) == ["depth_next.png pixels"]
+
+
+@pytest.mark.parametrize("name", ["points_ref.ply", "points_next.ply"])
+def test_a_forged_cloud_is_recomputed(name, folder):
+    data = bytearray((folder / name).read_bytes())
+    head = data.index(b"end_header\n") + 11
+    z = np.frombuffer(data, "<f4", 1, head + 8)
+    data[head + 8 : head + 12] = (z * np.float32(1.00001)).tobytes()
+    (folder / name).write_bytes(data)
+    assert f"{name} points" in repaired(folder)
+
+
+Change = Callable[[dict], object]
+CHANGES: dict[str, tuple[Change, str]] = {
+    "scale": (lambda s: s["depth_png_scale"].update(ref=1.0), "depth_png_scale ref"),
+    "size": (lambda s: s["sizes"].update(superpixels=7), "size superpixels"),
+    "variables": (lambda s: s["sizes"].update(variables=7), "size variables"),
+    "iterations": (lambda s: s["iterations"].update({"constrained NLP": 77}), "iterations"),
+    "borrowed": (lambda s: s["start"].update(borrowed=99), "start borrowed"),
+    "photo": (lambda s: s["refinement"]["end"].update(photo=1.0), "refined photo"),
+}
+
+
+@pytest.mark.parametrize("key", CHANGES)
+def test_a_forged_entry_is_recomputed(key, folder, pair):
+    change, name = CHANGES[key]
+    claims = json.loads((folder / "summary.json").read_text())
+    change(claims)
+    (folder / "summary.json").write_text(json.dumps(claims))
+    if key == "photo":
+        assert name in bad(check_folder(folder, images(pair)))
+    assert any(row.startswith(name) or key == "photo" for row in repaired(folder))
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["versions numpy", "seconds nlp", "start motions", "sizes equalities", "refinement status",
+     "flow", "name", "expected", "metrics", "metrics start", "metrics solution mre", "refinement",
+     "sizes hessian_nonzeros", "depth_png_scale next"],
+)  # fmt: skip
+@pytest.mark.parametrize("how", ["changed", "removed"])
+def test_entries_are_as_written(how, place, folder):
+    *above, last = place.split()
+    claims = json.loads((folder / "summary.json").read_text())
+    here = claims
+    for key in above:
+        here = here[key]
+    if how == "removed":
+        del here[last]
+    elif isinstance(here[last], dict):
+        here[last]["more"] = 1
+    else:
+        here[last] = 1 if isinstance(here[last], str) else "other"
+    (folder / "summary.json").write_text(json.dumps(claims))
+    try:
+        report = check_folder(folder)
+    except DataError:
+        # a claim that is needed is not there
+        assert how == "removed" or place in (
+            "metrics",
+            "metrics start",
+            "refinement status",
+            "metrics solution mre",
+            "depth_png_scale next",
+        )
+        return
+    assert not report.ok
+    assert any(row.how == HASHED and not row.ok for row in report.rows)

@@ -1,0 +1,172 @@
+"""Result files that are damaged or strange: an error of the file, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from soup_nlp.cli.main import main
+from soup_nlp.errors import DataError
+from soup_nlp.storage.files import read_json
+from soup_nlp.storage.h5_files import read_attrs, read_h5
+from soup_nlp.storage.store import Array, write_h5
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory) -> bytes:
+    path = tmp_path_factory.mktemp("h5") / "r.h5"
+    rng = np.random.default_rng(0)
+    tree = {
+        "a": {"x": Array(rng.random((20, 3)), "1", "", "N,3"), "s": Array(2.5, "1", "")},
+        "big": Array(rng.random((60, 200)), "1", ""),
+        "text": Array(["ab", "cdé"], "1", ""),
+        "none": Array(np.zeros((0, 3)), "1", ""),
+        "many": {str(k): Array(rng.random(k + 1), "1", "") for k in range(12)},
+    }
+    write_h5(path, tree, {"name": "x", "config": "a: 1\n" * 300, "seed": 3})
+    return path.read_bytes()
+
+
+def same(a, b) -> bool:
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    return bool(np.array_equal(a, b))
+
+
+def test_flipped_bits_are_noticed(image, tmp_path):
+    """Everything that is read is under a checksum: an error, or the numbers that were written."""
+    path, rng = tmp_path / "r.h5", np.random.default_rng(1)
+    path.write_bytes(image)
+    tree, attrs, noticed = read_h5(path), read_attrs(path), 0
+    for at in rng.integers(0, len(image), 250):
+        data = bytearray(image)
+        data[at] ^= 1 << int(rng.integers(8))
+        path.write_bytes(data)
+        try:
+            assert same(read_h5(path), tree)
+            assert read_attrs(path) == attrs
+        except DataError:
+            noticed += 1
+    # what is not read is free space between the parts
+    assert noticed > 200
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.999])
+def test_a_file_that_was_cut_off_is_noticed(share, image, tmp_path):
+    (tmp_path / "r.h5").write_bytes(image[: int(share * len(image))])
+    with pytest.raises(DataError, match="HDF5"):
+        read_h5(tmp_path / "r.h5")
+
+
+def cycle(file: h5py.File) -> None:
+    file["a/loop"] = file["a"]
+
+
+def parent(file: h5py.File) -> None:
+    file["a/root"] = file["/"]
+
+
+def dangling(file: h5py.File) -> None:
+    file["a/x"] = h5py.SoftLink("/nowhere")
+
+
+def outside(file: h5py.File) -> None:
+    file["a/x"] = h5py.ExternalLink("/etc/hostname", "/")
+
+
+def named(file: h5py.File) -> None:
+    file["a/x"] = np.dtype("f8")
+
+
+def huge(file: h5py.File) -> None:
+    file["a"].create_dataset("x", (1 << 30, 1 << 14), "f8", chunks=(1 << 10, 1 << 10))
+
+
+def raw(file: h5py.File) -> None:
+    file["a"].create_dataset("x", (4,), "f8", external=[("/etc/hostname", 0, 32)])
+
+
+def virtual(file: h5py.File) -> None:
+    layout = h5py.VirtualLayout((4,), "f8")
+    layout[:] = h5py.VirtualSource("elsewhere.h5", "x", (4,))
+    file["a"].create_virtual_dataset("x", layout)
+
+
+def compound(file: h5py.File) -> None:
+    file["a/x"] = np.zeros(2, [("p", "f8"), ("q", "i4")])
+
+
+def pointers(file: h5py.File) -> None:
+    file["a/x"] = np.array([file["a"].ref], h5py.ref_dtype)
+
+
+def empty(file: h5py.File) -> None:
+    file["a/x"] = h5py.Empty("f8")
+
+
+STRANGE = [cycle, parent, dangling, outside, named, huge, raw, virtual, compound, pointers, empty]
+
+
+@pytest.mark.parametrize("change", STRANGE, ids=lambda f: f.__name__)
+def test_what_no_result_holds_is_refused(change: Callable[[h5py.File], None], tmp_path):
+    with h5py.File(tmp_path / "r.h5", "w") as file:
+        file.create_group("a")
+        change(file)
+    with pytest.raises(DataError, match=r"no result has"):
+        read_h5(tmp_path / "r.h5")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[1]", "3", '{"a": 1' + "0" * 5000 + "}", "[" * 100_000, "\x00", '{"a": nan}']
+)
+def test_json_that_is_none_is_an_error_of_the_file(text, tmp_path):
+    path = tmp_path / "summary.json"
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"summary\.json"):
+        read_json(path, "summary.json")
+    path.write_bytes(b"\xff\xfe{}")
+    with pytest.raises(DataError, match="not text"):
+        read_json(path, "summary.json")
+
+
+def small(folder: Path, config: str, **attrs: object) -> None:
+    """A folder that has the files of a result."""
+    write_h5(folder / "result.h5", {"weights": {"arap": Array(1.0, "1", "")}}, {"config": config})
+    with h5py.File(folder / "result.h5", "a") as file:
+        file.attrs.update(attrs)
+    (folder / "config.yaml").write_text(config)
+    labels = ("status", "converged", "delivered", "problem_hash", "seed")
+    (folder / "summary.json").write_text(json.dumps(dict.fromkeys(labels, "x") | {"energy": {}}))
+
+
+@pytest.mark.parametrize(
+    "config", ["{", "a: [1", "", "3", "a: &a [*a]", "a: " + "[" * 1200, "- !!python/object:os.x 1"]
+)
+def test_settings_that_are_none_are_an_error_of_the_file(config, tmp_path, capsys):
+    small(tmp_path, config or " ")
+    assert main(["check", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "result.h5", "summary.json"])
+@pytest.mark.parametrize("kind", ["missing", "folder", "dangling link"])
+def test_files_that_are_not_there(kind, name, tmp_path, capsys):
+    small(tmp_path, "a: 1")
+    (tmp_path / name).unlink()
+    if kind == "folder":
+        (tmp_path / name).mkdir()
+    elif kind == "dangling link":
+        (tmp_path / name).symlink_to("nowhere")
+    assert main(["check", str(tmp_path)]) == 2
+    assert name in capsys.readouterr().err
+
+
+def test_versions_that_are_no_json(tmp_path):
+    small(tmp_path, "a: 1", versions="{")
+    with pytest.raises(DataError, match="HDF5"):
+        read_attrs(tmp_path / "result.h5")

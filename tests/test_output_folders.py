@@ -1,0 +1,341 @@
+"""Output folders: whole or not at all, and never over a file of the user."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from soup_nlp.errors import DataError
+from soup_nlp.storage import folders
+from soup_nlp.storage.folders import claim, recover, scratch, staged
+from soup_nlp.storage.mark import MARK, digest_of, files_in, made
+from soup_nlp.storage.system import deferred_signals, exchange
+
+
+def write(folder: Path, whole: bool = True, **files: str) -> None:
+    with staged(folder, whole) as new:
+        for name, text in files.items():
+            (new / name).write_text(text)
+
+
+def content(folder: Path) -> dict[str, str]:
+    return {p.name: p.read_text() for p in folder.iterdir() if p.name != MARK}
+
+
+@pytest.fixture(params=["exchanged", "moved"])
+def way(request, monkeypatch) -> str:
+    """Both ways in which new files take their places."""
+    if request.param == "moved":
+        monkeypatch.setattr(folders, "exchange", lambda a, b: False)
+    return str(request.param)
+
+
+def test_a_new_result_replaces_the_old_one_whole(tmp_path, way):
+    target = tmp_path / "out"
+    write(target, a="1", b="1")
+    write(target, a="2", c="2")
+    assert content(target) == {"a": "2", "c": "2"}
+    assert made(target).keys() == {"a", "c"}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_files_of_the_user_stay(tmp_path, way):
+    target = tmp_path / "out"
+    write(target, a="1", b="1")
+    (target / "mine").write_text("m")
+    (target / "sub").mkdir()
+    (target / "sub" / "x").write_text("s")
+    (target / "b").write_text("changed by the user")
+    write(target, a="2")
+    assert (target / "sub" / "x").read_text() == "s"
+    (target / "sub" / "x").unlink()
+    (target / "sub").rmdir()
+    assert content(target) == {"a": "2", "b": "changed by the user", "mine": "m"}
+
+
+def test_pages_of_several_commands_share_a_folder(tmp_path, way):
+    for name in ("x", "y", "x"):
+        write(tmp_path, False, **{f"{name}.md": name})
+    assert content(tmp_path) == {"x.md": "x", "y.md": "y"}
+    assert made(tmp_path).keys() == {"x.md", "y.md"}
+
+
+def test_a_failure_leaves_the_old_result(tmp_path, way):
+    target = tmp_path / "out"
+    write(target, a="1")
+
+    def fail(error: BaseException) -> None:
+        with staged(target, True) as new:
+            (new / "a").write_text("2")
+            raise error
+
+    for error in (RuntimeError("x"), KeyboardInterrupt("x"), DataError("x")):
+        with pytest.raises(type(error), match="x"):
+            fail(error)
+    with pytest.raises(DataError, match="cannot be written"):
+        fail(OSError(28, "No space left on device"))
+    assert content(target) == {"a": "1"}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def foreign(folder: Path, kind: str) -> Path:
+    path = folder / "a"
+    if kind == "file":
+        path.write_text("precious")
+    elif kind == "changed":
+        write(folder, a="1")
+        path.write_text("precious")
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        (folder.parent / "elsewhere").write_text("precious")
+        path.symlink_to(folder.parent / "elsewhere" if kind == "link" else "nowhere")
+    return path
+
+
+@pytest.mark.parametrize("kind", ["file", "changed", "folder", "link", "dangling link"])
+def test_what_was_not_made_here_is_refused(kind, tmp_path):
+    target = tmp_path / "out"
+    target.mkdir()
+    path = foreign(target, kind)
+    before = os.lstat(path)
+    with pytest.raises(DataError, match=r"(?s)would be overwritten.*found: a\n.*--overwrite"):
+        claim(target, ["a", "b"])
+    with pytest.raises(DataError, match="would be overwritten"):
+        write(target, a="2")
+    assert os.lstat(path) == before
+    claim(target, ["b"])
+    if kind == "folder":
+        with pytest.raises(DataError, match="over a folder"):
+            claim(target, ["a"], overwrite=True)
+        return
+    claim(target, ["a"], overwrite=True)
+    write(target, a="2")
+    assert content(target) == {"a": "2"}
+    assert not path.is_symlink()
+    if kind == "link":
+        assert (tmp_path / "elsewhere").read_text() == "precious"
+
+
+def test_a_symbolic_mark_is_not_followed(tmp_path):
+    target, victim = tmp_path / "out", tmp_path / "victim"
+    target.mkdir()
+    victim.write_text("{}")
+    (target / MARK).symlink_to(victim)
+    claim(target, ["a"])
+    write(target, a="1")
+    assert victim.read_text() == "{}"
+    assert not (target / MARK).is_symlink()
+    assert made(target).keys() == {"a"}
+    (target / MARK).unlink()
+    (target / MARK).symlink_to("nowhere")
+    write(target, False, b="1")
+    assert sorted(os.listdir(tmp_path)) == ["out", "victim"]
+
+
+def test_folders_in_a_result_are_replaced_file_by_file(tmp_path, way):
+    target = tmp_path / "out"
+
+    def colmap(text: str, *names: str) -> None:
+        with staged(target, True) as new:
+            for name in names:
+                (new / name).parent.mkdir(parents=True, exist_ok=True)
+                (new / name).write_text(text)
+
+    colmap("1", "c/x", "c/d/y", "a")
+    colmap("2", "c/x", "b")
+    assert files_in(target) == ["b", "c/x"]
+    (target / "c" / "mine").write_text("m")
+    colmap("3", "a")
+    assert files_in(target) == ["a", "c/mine"]
+    # a link on the way leads out of the folder
+    (tmp_path / "elsewhere").mkdir()
+    (target / "d").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(DataError, match="d/x"):
+        colmap("4", "d/x")
+    assert os.listdir(tmp_path / "elsewhere") == []
+
+
+def test_a_mark_owns_nothing_outside_its_folder(tmp_path):
+    (tmp_path / "victim").write_text("1")
+    write(tmp_path / "out", a="1")
+    listed = json.loads((tmp_path / "out" / MARK).read_text())
+    for name in ("../victim", str(tmp_path / "victim")):
+        listed["files"][name] = digest_of(tmp_path / "victim")
+    (tmp_path / "out" / MARK).write_text(json.dumps(listed))
+    write(tmp_path / "out", b="2")
+    assert (tmp_path / "victim").read_text() == "1"
+    assert content(tmp_path / "out") == {"b": "2"}
+
+
+@pytest.mark.parametrize("text", ["x", "[]", '{"files": 3}', '{"files": {"a": {}}}', "\x00"])
+def test_a_broken_mark_owns_nothing(text, tmp_path):
+    (tmp_path / MARK).write_text(text)
+    (tmp_path / "a").write_text("precious")
+    with pytest.raises(DataError, match="overwritten"):
+        claim(tmp_path, ["a"])
+
+
+def test_an_empty_mark_is_of_an_early_version(tmp_path):
+    (tmp_path / MARK).touch()
+    for name in ("a", "notes"):
+        (tmp_path / name).write_text("1")
+    claim(tmp_path, ["a"])
+    write(tmp_path, a="2")
+    assert content(tmp_path) == {"a": "2", "notes": "1"}
+
+
+def test_a_link_to_a_folder_is_followed(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    for text in "12":
+        claim(tmp_path / "link", ["a"])
+        write(tmp_path / "link", a=text)
+    assert content(tmp_path / "real") == {"a": "2"}
+    assert (tmp_path / "link").is_symlink()
+
+
+def test_the_working_folder_keeps_its_identity(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = tmp_path.stat().st_ino
+    for text in "12":
+        write(Path(), a=text)
+    assert content(tmp_path) == {"a": "2"}
+    assert tmp_path.stat().st_ino == before
+
+
+def test_permissions_are_those_of_the_old_files(tmp_path):
+    target = tmp_path / "out"
+    target.mkdir(0o750)
+    write(target, a="1")
+    (target / "a").chmod(0o604)
+    write(target, a="2")
+    assert stat.S_IMODE((target / "a").stat().st_mode) == 0o604
+    assert stat.S_IMODE(target.stat().st_mode) == 0o750
+
+
+KILLED = """
+import os, signal, sys
+from soup_nlp.storage import folders
+from soup_nlp.storage.folders import staged
+if sys.argv[2] == "moved":
+    folders.exchange = lambda a, b: False
+own, left = os.replace, [int(sys.argv[3])]
+def replace(*args):
+    if not left[0]:
+        os.kill(os.getpid(), signal.SIGKILL)
+    left[0] -= 1
+    own(*args)
+os.replace = replace
+with staged(sys.argv[1], True) as new:
+    for name in "acd":
+        (new / name).write_text("2")
+    if sys.argv[2] == "early":
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def killed(target: Path, *args: str) -> None:
+    ended = subprocess.run([sys.executable, "-c", textwrap.dedent(KILLED), str(target), *args])
+    assert ended.returncode == -signal.SIGKILL
+
+
+def test_what_a_kill_leaves_is_removed_by_the_next_run(tmp_path):
+    target = tmp_path / "out"
+    write(target, a="1", b="1")
+    killed(target, "early", "9")
+    assert content(target) == {"a": "1", "b": "1"}
+    assert len(os.listdir(tmp_path)) == 2
+    # a folder that is in use is not removed
+    with staged(target) as new:
+        claim(target, ["a"])
+        assert new.is_dir()
+    assert os.listdir(tmp_path) == ["out"]
+    assert content(target) == {"a": "1", "b": "1"}
+
+
+@pytest.mark.parametrize("moves", [1, 2, 3])
+def test_a_move_that_was_killed_is_finished(moves, tmp_path):
+    target = tmp_path / "out"
+    write(target, a="1", b="1")
+    # the mark of the new files is the first that is replaced
+    killed(target, "moved", str(moves))
+    recover(target)
+    assert content(target) == {"a": "2", "c": "2", "d": "2"}
+    assert made(target).keys() == {"a", "c", "d"}
+    write(target, a="3")
+    assert content(target) == {"a": "3"}
+
+
+def test_folders_are_exchanged_in_one_step(tmp_path):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).touch()
+    if not exchange(tmp_path / "a", tmp_path / "b"):
+        pytest.skip("this file system cannot exchange folders")
+    assert os.listdir(tmp_path / "a") == ["b"]
+    assert not exchange(tmp_path / "a", tmp_path / "none")
+
+
+def test_scratch_folders_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    left = tmp_path / f"soup_nlp-{os.getuid()}-killed"
+    left.mkdir()
+    (left / "x").touch()
+    with scratch() as first, scratch() as second:
+        assert first != second
+        assert not left.exists()
+        assert first.is_dir()
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_waits(number):
+    seen = []
+    old = signal.signal(number, lambda *_: seen.append(True))
+    try:
+        with deferred_signals():
+            signal.raise_signal(number)
+            signal.raise_signal(number)
+            assert not seen
+        assert seen == [True]
+    finally:
+        signal.signal(number, old)
+
+
+LIMITED = """
+import resource, sys
+from soup_nlp.errors import DataError
+from soup_nlp.storage.folders import staged
+from soup_nlp.storage.store import Array, write_h5, write_json
+import numpy as np
+resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
+try:
+    with staged(sys.argv[1], True) as new:
+        write_json(new / "small.json", {})
+        write_h5(new / "r.h5", {"x": Array(np.random.default_rng(0).random(20_000), "1", "")}, {})
+except DataError as error:
+    print(error)
+    sys.exit(2)
+"""
+
+
+def test_a_file_that_cannot_be_written_ends_in_an_error(tmp_path):
+    target = tmp_path / "out"
+    write(target, a="1")
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(target)], capture_output=True, text=True
+    )
+    assert done.returncode == 2, done.stderr
+    assert "cannot be written" in done.stdout
+    assert content(target) == {"a": "1"}
+    assert os.listdir(tmp_path) == ["out"]
+    assert json.loads((target / MARK).read_text())["files"].keys() == {"a"}
