@@ -68,7 +68,7 @@ def pair_job(
 
 def settings_hash(problem: Problem) -> str:
     """Hash of everything but the input: the same settings on every pair and in every place."""
-    return _hash(problem, {"name", "base", "input", "expected"})
+    return _hash(problem, {"name", "base", "preset", "input", "expected"})
 
 
 def input_hash(problem: Problem) -> str:

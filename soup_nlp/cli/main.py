@@ -43,7 +43,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions.",
     ),
     "evaluate": ("results:evaluate", "Score a result against a truth file."),
-    "show": ("problems:show", "Print the merged problem and its hash."),
+    "show": (
+        "problems:show",
+        "Print the merged problem and its hash; without a problem, the options of a preset.",
+    ),
     "list": ("problems:list_", "Print the problems that come with the package, or of a folder."),
     "export": (
         "problems:export",
@@ -76,6 +79,10 @@ BENCH: Mapping[str, tuple[str, str]] = {
     "search": (
         "bench_accuracy:search",
         "Search for better defaults and check them on pairs and families that did not choose.",
+    ),
+    "paper": (
+        "bench_paper:paper",
+        "The paper's tables and figures by `preset: paper` and the defaults; can be continued.",
     ),
     "refine": (
         "bench_studies:refine",

@@ -12,9 +12,14 @@ import typer
 from soup_nlp.bench.rows import Row, failed
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.bench.tables import reason
+from soup_nlp.config.presets import PRESETS
 from soup_nlp.errors import ConfigError
 
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
+PresetName = Annotated[
+    str | None,
+    typer.Option("--preset", help=f"Options below the problem's own: {', '.join(PRESETS)}."),
+]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Output folder.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Overwrite = Annotated[
@@ -46,6 +51,11 @@ Width = Annotated[int, typer.Option(help="Columns of rendered scenes.", min=64)]
 Seeds = Annotated[str, typer.Option(help="Seeds of rendered scenes, such as 0,1,2.")]
 Workers = Annotated[int, typer.Option(help="Processes of this machine (extra: bench).", min=1)]
 AnyCode = Annotated[bool, typer.Option(help="Also take stored rows of other code versions.")]
+
+
+def preset_first(preset: str | None, overrides: list[str] | None) -> list[str]:
+    """Overrides with the one that names a preset first, so that `--set preset=null` may undo it."""
+    return [*([] if preset is None else [f"preset={preset}"]), *(overrides or [])]
 
 
 def numbers(text: str, option: str, least: int = 0) -> list[int]:

@@ -10,15 +10,19 @@ from typing import Annotated
 import typer
 
 from soup_nlp.cli.options import (
+    PROBLEM,
     Formulations,
     Out,
     Overwrite,
+    PresetName,
     Presolve,
     Problem,
     Quiet,
     Set,
     Superpixels,
+    preset_first,
 )
+from soup_nlp.config.presets import PRESETS, dump_preset
 from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
 from soup_nlp.errors import ConfigError, DataError, printable
 from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_formulation
@@ -28,9 +32,23 @@ from soup_nlp.storage.files import MOST_YAML, is_folder, read_text
 from soup_nlp.storage.folders import claim
 
 
-def show(problem: Problem, overrides: Set = None) -> None:
-    """Print the merged problem and its hash."""
-    chosen = load_problem(problem, overrides or [])
+def show(
+    problem: Annotated[Path | None, typer.Argument(help=PROBLEM)] = None,
+    overrides: Set = None,
+    preset: PresetName = None,
+) -> None:
+    """Print the merged problem and its hash; without a problem, the options of a preset."""
+    if problem is None:
+        if preset is None or preset not in PRESETS or overrides:
+            raise ConfigError(
+                "nothing to show",
+                where="--preset" if preset else None,
+                found=preset,
+                expected=f"a problem, or --preset {' or '.join(PRESETS)} alone",
+            )
+        print(dump_preset(preset), end="")
+        return
+    chosen = load_problem(problem, preset_first(preset, overrides))
     print(f"{dump_problem(chosen)}# hash {chosen.digest()}")
 
 

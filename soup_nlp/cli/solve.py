@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from soup_nlp.cli.options import PROBLEM, Overwrite, Set
+from soup_nlp.cli.options import PROBLEM, Overwrite, PresetName, Set, preset_first
 from soup_nlp.cli.progress import SolveLog
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
@@ -31,6 +31,7 @@ def solve(
         Path | None, typer.Option("--out", "-o", help="Output folder; default out/NAME.")
     ] = None,
     overrides: Set = None,
+    preset: PresetName = None,
     ref: Annotated[str | None, typer.Option(help="Reference image.")] = None,
     next_: Annotated[str | None, typer.Option("--next", help="Next image.")] = None,
     intrinsics: Annotated[
@@ -86,7 +87,7 @@ def solve(
         "refine.from_start": "true" if no_nlp else None,
     }
     given = [f"{key}={value}" for key, value in short.items() if value is not None]
-    overrides = [*(overrides or []), *given]
+    overrides = [*preset_first(preset, overrides), *given]
     pair = {
         "--ref": ref,
         "--next": next_,

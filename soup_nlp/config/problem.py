@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, Field, ValidationError
 
+from soup_nlp.config.presets import with_preset
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import Input
 from soup_nlp.data.pair import Pair
@@ -96,6 +97,9 @@ class Problem(Section):
 
     name: Annotated[str, AfterValidator(_is_title)] = "problem"
     """For titles."""
+    preset: Literal["paper"] | None = None
+    """Options below the keys of this file: paper, the method as printed (`soup-nlp show --preset
+    paper`); null for the defaults."""
     input: Input
     """What to solve, by its kind."""
     max_size: Positive | None = 1.5
@@ -131,8 +135,8 @@ class Problem(Section):
         return Path(os.path.realpath(base / own))
 
     def digest(self) -> str:
-        """Hash of everything that decides the result: not of the name, the place and the files."""
-        tree = self.model_dump(mode="json", exclude={"name", "base", "output"})
+        """Hash of everything that decides the result: not of the names, the place and the files."""
+        tree = self.model_dump(mode="json", exclude={"name", "base", "preset", "output"})
         return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
 
     def load_pair(self) -> Pair:
@@ -216,6 +220,8 @@ def make_problem(
 ) -> Problem:
     """Check a mapping of sections and its overrides; see `load_problem`.
 
+    What `preset` names lies below both.
+
     Args:
         raw: Sections by name.
         overrides: `a.b=value` with the value in YAML.
@@ -231,6 +237,7 @@ def make_problem(
     tree = copy.deepcopy(dict(raw))
     overridden = {_override(tree, item): f"--set {item}" for item in overrides}
     lines = {**(lines or {}), **overridden}
+    tree = with_preset(tree)
     try:
         return Problem.model_validate(tree)
     except ValidationError as error:

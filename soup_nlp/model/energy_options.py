@@ -93,6 +93,10 @@ class EnergyOptions(Section):
 
     units: Literal["pixel", "paper"] = "pixel"
     """pixel (every term in pixels, free of scale) or paper (one length unit)."""
+    length: Literal["depth", "translation", "scales"] = "depth"
+    """Unit of length with units: paper. depth: the mean plane distance is 1. translation: the
+    translations add up to 1, at the lengths that the start gives them. scales: the plane distances
+    add up to 1."""
     arap_at_anchors: bool = False
     """Motion difference at the anchors instead of the camera's origin."""
     arap_across: Share = 0.03

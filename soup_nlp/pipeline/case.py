@@ -26,6 +26,7 @@ from soup_nlp.model.reweighting import (
     across_components,
     across_discontinuities,
     at_occlusions,
+    in_length,
     in_noise,
     in_pixels,
 )
@@ -201,6 +202,8 @@ def build_energy(
         data = across_discontinuities(data, start.surface, **held)
     if e.units == "pixel":
         data = in_pixels(data, start.soup, seg, form.rotation_px)
+    else:
+        data = in_length(data, start.soup, e.length)
     weights: Weights = form.weights
     if bends:
         # on the same relief 1 - cos between neighbours falls as 1 / N

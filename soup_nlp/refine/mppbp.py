@@ -110,7 +110,7 @@ def refine_soup(
         weights = photo.beside(weights)
     pair_costs = PairCosts(data, weights)
     proposer = Proposer(data, neighbours(pair_costs.edges, data.anchor_ray), seed)
-    shares = dict(SHARES)
+    shares = {k: v for k, v in SHARES.items() if o.proposals == "all" or k in WALKS}
     kept: Particles | None = None
     if photo is not None and o.sweep:
         kept = swept(best, *proposer.commonest(best, 2), data, photo, o.sweep)
@@ -328,7 +328,7 @@ def _learn(
     rate = {k: done.accepted[k] / max(1, done.proposed[k]) for k in shares}
     mean = sum(rate.values()) / len(rate)
     if mean > 0:
-        whole = sum(SHARES.values()) / len(SHARES)
+        whole = sum(SHARES[k] for k in shares) / len(shares)
         for k in shares:
             # half of what is usual stays for every kind: what fails now may help later
             wanted = 0.5 * SHARES[k] + 0.5 * whole * min(rate[k] / mean, 3.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -32,6 +32,8 @@ class RefineOptions(Section):
     """Most rounds of particles."""
     particles: Annotated[int, Field(ge=2, le=MAX_PARTICLES)] = 50
     """Labels of every superpixel, the current belief among them."""
+    proposals: Literal["all", "walks"] = "all"
+    """all, or walks: steps around the current belief alone, as in the paper."""
     keep: Annotated[float, Field(ge=0, le=0.9)] = 0.25
     """Share of the particles that stays for the next round."""
     depth_reach: Annotated[float, Field(ge=1, le=MOST)] = 2.0

@@ -60,6 +60,14 @@ def estimate(
         threshold: Inlier distance, pixels.
         seed: Of RANSAC.
     """
+    motion = essential_motion(r, q, focal, threshold, seed)
+    return None if motion is None else refine(motion, r, q, weight, focal, threshold)
+
+
+def essential_motion(
+    r: Float, q: Float, focal: float, threshold: float, seed: int = 0
+) -> Motion | None:
+    """Motion by essential matrix and cheirality as RANSAC finds it, or None; see `estimate`."""
     if len(r) < 8:
         return None
     cv2.setRNGSeed(seed)
@@ -77,8 +85,7 @@ def estimate(
     stack = np.ascontiguousarray(E[: 3 * (len(E) // 3)]).reshape(-1, 3, 3)
     cost = [np.mean(np.minimum(np.abs(sampson(e, r, q, focal)), 3.0)) for e in stack]
     best = np.ascontiguousarray(stack[int(np.argmin(cost))])
-    motion = _decompose(best, r, q)
-    return None if motion is None else refine(motion, r, q, weight, focal, threshold)
+    return _decompose(best, r, q)
 
 
 def _decompose(E: Float, r: Float, q: Float) -> Motion | None:
@@ -172,4 +179,26 @@ def repeated(
             break
         out.append(motion)
         left &= ~inlier
+    return out
+
+
+def motion_of_points(
+    points: Float, target: Float, K_next: Float, threshold: float = 1.0
+) -> Float | None:
+    """(4, 4) rigid motion next_from_ref of known points, by robust PnP; None where none fits.
+
+    Args:
+        points: (M, 3) in the reference frame.
+        target: (M, 2) where the next frame sees them, pixels.
+        K_next: (3, 3) its intrinsics.
+        threshold: Inlier distance, pixels.
+    """
+    cv2.setRNGSeed(0)
+    good, turn, shift, _ = cv2.solvePnPRansac(
+        points, target, K_next, None, reprojectionError=threshold, iterationsCount=200
+    )
+    if not good:
+        return None
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
     return out

@@ -34,6 +34,7 @@ from soup_nlp.start.components import (
 )
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import above_ground
+from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import gather
 from soup_nlp.start.plane_fit import Views
 from soup_nlp.start.start_options import SeededStart
@@ -103,6 +104,8 @@ def propose(
     """
     o = options or SeededStart()
     views, poor = look(seg, flow, K_ref, K_next, o)
+    if o.method == "homography":
+        return _of_homographies(views, seg, o)
     motions = dominant(views, o)
     fit = views.fit(motions)
     cost = fit.penalised()
@@ -163,6 +166,18 @@ def propose(
     soup = soup.normalised()
     error = own.cost[:, 0]
     return Start(soup, error, parallax, weak, label, component, motions, surface, tie, share)
+
+
+def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
+    """The paper's start: nothing is known of components, so all superpixels are one."""
+    soup, borrowed = unorganised(views, seg, o)
+    soup = soup.normalised()
+    gap = soup.moved(soup.points(views.ray))
+    gap = (gap[..., :2] / gap[..., 2:] - views.target[..., :2]) * np.asarray(views.focal)
+    total = np.maximum(views.weight.sum(axis=1), 1e-9)
+    error = np.sum(views.weight * np.linalg.norm(gap, axis=2), axis=1) / total
+    parallax, whole = _parallax(soup, views), np.zeros(len(seg), np.int64)
+    return Start(soup, error, parallax, borrowed, whole - 1, whole, [], whole, whole)
 
 
 def look(

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from soup_nlp.schema.section import Count, NonNegative, Samples, Section, Seed, Whole
 
 
 class StartOptions(Section):
     """How the initialisation is made."""
 
+    method: Literal["shared", "homography"] = "shared"
+    """shared (motions of the whole image, one of them for every superpixel) or homography (the
+    paper's: epipolar geometry and homography of every superpixel, all scales alike)."""
+    motion_neighbours: Count = 15
+    """With homography: nearest neighbours whose flow helps to find the motion of a superpixel, as
+    the paper has it for small ones; with 0 its own homography is decomposed."""
     samples: Samples = 40
     """Pixels per superpixel."""
     dominant: Whole = 5
     """Dominant motions looked for."""
     threshold_px: NonNegative = 1.0
-    """Inlier distance of a dominant motion."""
+    """Inlier distance of a motion, pixels."""
     smoothness: NonNegative = 0.5
     """Pixels that a border between motions must gain, where the flow does not jump."""
     min_parallax_px: NonNegative = 0.25

@@ -1,0 +1,139 @@
+"""The departures of the defaults from the paper, each with the options that undo it.
+
+A departure is a group of options in which the defaults and `preset: paper` differ. "Off alone" are
+the defaults with the paper's values of the group; "on alone" is the preset with the defaults'.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from soup_nlp.config.presets import PRESETS, leaves
+from soup_nlp.config.problem import make_problem
+
+PAPER = ("preset=paper",)
+
+
+@dataclass(frozen=True)
+class Departure:
+    """A group of options.
+
+    Attributes:
+        name: Of its row.
+        keys: Options, dotted.
+        with_off: Further options that "off alone" needs.
+        with_on: Further options that "on alone" needs; None where it has no meaning on the preset.
+        needs: What these further options are, for the table; or why there are none.
+    """
+
+    name: str
+    keys: tuple[str, ...]
+    with_off: Mapping[str, Any] = field(default_factory=dict)
+    with_on: Mapping[str, Any] | None = field(default_factory=dict)
+    needs: str = ""
+
+    def off_alone(self) -> tuple[str, ...]:
+        """Overrides of the defaults."""
+        printed = dict(leaves(PRESETS["paper"]))
+        return _overrides({**{k: printed[k] for k in self.keys}, **self.with_off})
+
+    def on_alone(self) -> tuple[str, ...] | None:
+        """Overrides of the preset, which they name; None where there are none."""
+        if self.with_on is None:
+            return None
+        ours = {**{k: default(k) for k in self.keys}, **self.with_on}
+        return (*PAPER, *_overrides(ours))
+
+
+def default(key: str) -> Any:
+    """The default of an option."""
+    value: Any = make_problem({"input": {"kind": "motorcycle"}})
+    for name in key.split("."):
+        value = getattr(value, name)
+    return value
+
+
+def _overrides(values: Mapping[str, Any]) -> tuple[str, ...]:
+    return tuple(
+        f"{key}={'.inf' if value == float('inf') else json.dumps(value)}"
+        for key, value in values.items()
+    )
+
+
+_WEIGHTS = tuple(f"energy.weights.{w}" for w in ("arap", "proj", "cont", "orient", "sigma_cont"))
+_SMOOTHING = ("solver.presolve_eps", "solver.eps")
+_PIXELS = {key: default(key) for key in ("energy.units", "energy.rotation_px", *_WEIGHTS)}
+_MORE = {"energy.pixel_samples": 64, "segmentation.boundary_samples": "all"}
+_SHARED = {"start.method": "shared"}
+
+DEPARTURES = (
+    Departure(
+        "start: shared motions, scales by contact",
+        ("start.method", "start.samples", "start.threshold_px"),
+    ),
+    Departure(
+        "pixel units, their weights and smoothing",
+        ("energy.units", "energy.length", *_WEIGHTS, *_SMOOTHING),
+        # half a pixel of motion is next to nothing in the paper's units
+        with_off={"energy.weights.sigma_arap": float("inf")},
+        needs="off: E_arap not truncated, since its truncation is in pixels",
+    ),
+    Departure(
+        "E_arap truncated with a leak",
+        ("energy.weights.sigma_arap", "energy.weights.leak_arap"),
+        with_on={"energy.weights.sigma_arap": 1e-3},
+        needs="on: at 0.001 in the paper's units",
+    ),
+    Departure(
+        "E_arap and E_prior weak across components",
+        ("energy.arap_across",),
+        with_on=_SHARED,
+        needs="on: with the start that finds components",
+    ),
+    Departure(
+        "E_cont weak at occlusions",
+        ("energy.cont_occluded",),
+        with_on=_SHARED,
+        needs="on: with the start that finds components",
+    ),
+    Departure(
+        "another energy where surfaces bend",
+        ("start.bending",),
+        with_on={
+            **_SHARED,
+            **_PIXELS,
+            "solver.presolve_eps": [0.1, 0.03, 0.01],
+            "solver.eps": 0.01,
+        },
+        needs="on: with the start that finds them, and pixel units",
+    ),
+    Departure("prior on relief", ("energy.weights.prior",)),
+    Departure("borders that follow the flow", ("segmentation.follow_flow_px",)),
+    Departure("confidence of the flow", ("flow.dis.tau", "flow.dis.limit")),
+    Departure(
+        "samples of pixels and boundaries",
+        (),
+        with_off=_MORE,
+        with_on=_MORE,
+        needs="off in both: 64 pixels a superpixel, whole boundaries",
+    ),
+    Departure("gauge: d constant", ("formulation.gauge",)),
+    Departure("visibility", ("formulation.min_facing", "formulation.depth_ratio")),
+    Departure(
+        "presolve before Ipopt",
+        (),
+        with_off={"solver.presolve": False},
+        with_on={"solver.presolve": False},
+        needs="off in both; the preset has it, since it is a way to the minimum of the same energy",
+    ),
+    Departure(
+        "proposals beyond walks, depths within reach",
+        ("refine.proposals", "refine.depth_reach"),
+    ),
+    Departure("rounds end early", ("refine.rounds", "refine.stagnation")),
+    Departure("images in the refinement", ("refine.photo", "refine.sweep")),
+)
+"""Every departure that has a switch; `tests/test_bench_paper.py` holds them complete."""

@@ -1,0 +1,212 @@
+"""Figures of `bench paper`, one PNG each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.bench.paper_measures import read_maps
+from soup_nlp.bench.paper_scale import SCALES
+from soup_nlp.bench.rows import Row
+from soup_nlp.bench.tables import figure, save
+
+Number = float | None
+Lines = Mapping[str, Mapping[str, Mapping[str, Number]]]
+"""Values by method, pair and variant."""
+
+COLOURS = {
+    "preset: paper": "#cc6677",
+    "defaults": "#4477aa",
+    "constant depth": "#bbbbbb",
+    "published": "#222222",
+}
+SCALE_STYLES = {
+    "arap": ("E_arap, printed", "#cc6677"),
+    "cont": ("E_cont, printed", "#228833"),
+    "arap px": ("E_arap, pixels", "#ddaa33"),
+    "paper": ("E, preset: paper", "#222222"),
+    "defaults": ("E, defaults", "#4477aa"),
+}
+PANELS = 12
+"""Most panels of the figure of scales."""
+
+
+def plot_lines(path: Path, lines: Lines, axis: str, measure: str, text: str) -> None:
+    """A panel a method, a line a pair, over the variants."""
+    picture = figure(9, 3.6)
+    axes = picture.subplots(1, len(lines), sharey=True, squeeze=False)[0]
+    values: list[float] = []
+    for ax, (method, pairs) in zip(axes, lines.items(), strict=True):
+        for pair, own in pairs.items():
+            y = np.array([np.nan if v is None else v for v in own.values()])
+            values += [v for v in y if np.isfinite(v)]
+            ax.plot(np.arange(len(own)), y, "o-", lw=1.2, ms=4, label=pair)
+        names = list(next(iter(pairs.values()), {}))
+        slanted = len("".join(names)) > 36
+        ax.set_xticks(np.arange(len(names)), names, rotation=20 if slanted else 0, size=8)
+        ax.set(title=method, xlabel=axis)
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel(measure)
+    _scaled(axes, values)
+    axes[-1].legend(fontsize=7)
+    picture.suptitle(text, fontsize=10)
+    save(picture, path)
+
+
+def _scaled(axes: Sequence[object], values: Sequence[float]) -> None:
+    """A logarithmic axis where values differ much, else one from 0."""
+    for ax in axes:
+        if values and min(values) > 0 and max(values) > 20 * min(values):
+            ax.set_yscale("log")  # type: ignore[attr-defined]
+        else:
+            ax.set_ylim(bottom=0)  # type: ignore[attr-defined]
+
+
+def plot_comparison(path: Path, bars: Mapping[str, Mapping[str, Number]], text: str) -> None:
+    """Groups of bars: MRE by method for every dataset."""
+    names = list(dict.fromkeys(m for own in bars.values() for m in own))
+    picture = figure(max(6.0, 1.3 * len(bars) + 2), 3.8)
+    ax = picture.add_subplot()
+    width = 0.8 / max(1, len(names))
+    values = []
+    for k, name in enumerate(names):
+        y = [own.get(name) for own in bars.values()]
+        x = np.arange(len(bars)) + (k - (len(names) - 1) / 2) * width
+        height = [np.nan if v is None else v for v in y]
+        values += [v for v in y if v is not None]
+        ax.bar(x, height, width, label=name, color=COLOURS.get(name))
+    _scaled([ax], values)
+    ax.set_xticks(np.arange(len(bars)), list(bars), rotation=15, size=8)
+    ax.set(ylabel="MRE, one median scale, no cap")
+    ax.legend(fontsize=7)
+    ax.set_title(text, fontsize=10)
+    save(picture, path)
+
+
+def plot_curves(path: Path, curves: Mapping[str, Mapping[str, Row]]) -> None:
+    """Energies over iterations and rounds: a line of panels a pair, solver and rounds by method."""
+    pairs = list(curves)
+    methods = list(dict.fromkeys(m for own in curves.values() for m in own))
+    picture = figure(2.4 * 2 * len(methods), 2.1 * max(1, len(pairs)) + 0.5)
+    axes = picture.subplots(max(1, len(pairs)), 2 * len(methods), squeeze=False)
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for k, pair in enumerate(pairs):
+        for m, (method, row) in enumerate(curves[pair].items()):
+            left, right = axes[k, 2 * m], axes[k, 2 * m + 1]
+            _stages(left, row)
+            rounds = row["rounds"]
+            right.set_axis_on()
+            right.plot(np.arange(len(rounds)), rounds, "o-", color=COLOURS.get(method), ms=4)
+            left.set_title(f"{pair}\n{method}: solver", fontsize=7)
+            right.set_title("refinement, exact", fontsize=7)
+            for ax, label in ((left, "iteration"), (right, "round")):
+                ax.tick_params(labelsize=6)
+                ax.set_xlabel(label, fontsize=7)
+                ax.grid(alpha=0.3)
+    save(picture, path)
+
+
+def _stages(ax: object, row: Row) -> None:
+    """The smoothed energy of every stage, one after the other; the start far above is cut off."""
+    begin, ends = 0, []
+    ax.set_axis_on()  # type: ignore[attr-defined]
+    for stage in row["stages"]:
+        y = np.asarray(stage["objective"], np.float64)
+        x = begin + np.arange(len(y))
+        ax.semilogy(x, np.maximum(y, 1e-12), "-", lw=1.3)  # type: ignore[attr-defined]
+        begin += len(y)
+        ends.append(y)
+    ax.set_ylabel("E, smoothed", fontsize=7)  # type: ignore[attr-defined]
+
+
+def plot_bars(path: Path, table: Mapping[str, Mapping[str, Number]], text: str, label: str) -> None:
+    """Horizontal bars: one group a name, a colour a method; logarithmic about 1."""
+    names = list(table)
+    groups = list(dict.fromkeys(g for own in table.values() for g in own))
+    picture = figure(8, 0.36 * len(names) + 1.2)
+    ax = picture.add_subplot()
+    height = 0.8 / max(1, len(groups))
+    for k, group in enumerate(groups):
+        y = np.arange(len(names)) + (k - (len(groups) - 1) / 2) * height
+        x = [table[n].get(group) for n in names]
+        ax.barh(y, [np.nan if v is None else v - 1 for v in x], height, left=1, label=group)
+    ax.set_xscale("log")
+    ax.axvline(1.0, color="k", lw=0.8)
+    ax.set_yticks(np.arange(len(names)), names, size=7)
+    ax.invert_yaxis()
+    ax.set_xlabel(label, fontsize=8)
+    ax.grid(alpha=0.3, axis="x")
+    ax.legend(fontsize=7)
+    ax.set_title(text, fontsize=10)
+    save(picture, path)
+
+
+def plot_scale(path: Path, bodies: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
+    """Energies over the scale of one body, from 0 (lowest) to 1 (highest); the truth is 1."""
+    shown = dict(list(bodies.items())[:PANELS])
+    columns = 4
+    lines = max(1, -(-len(shown) // columns))
+    picture = figure(2.6 * columns, 2.3 * lines + 0.6)
+    axes = picture.subplots(lines, columns, squeeze=False)
+    for ax in axes.flat[len(shown) :]:
+        ax.set_axis_off()
+    for ax, (name, curves) in zip(axes.flat, shown.items(), strict=False):
+        for kind, (label, colour) in SCALE_STYLES.items():
+            y = np.asarray(curves[kind])
+            y = (y - y.min()) / max(float(np.ptp(y)), 1e-12)
+            ax.semilogx(SCALES, y, color=colour, lw=1.2, label=label)
+            ax.plot(SCALES[np.argmin(y)], 0, "v", color=colour, ms=5)
+        ax.axvline(1.0, color="k", lw=0.8, ls=":")
+        ax.set_xticks([0.25, 0.5, 1, 2, 4], ["1/4", "1/2", "1", "2", "4"])
+        ax.minorticks_off()
+        ax.set_title(name, fontsize=7)
+        ax.tick_params(labelsize=6)
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    picture.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=7)
+    picture.suptitle("Energy over the scale of one moving body about the truth", fontsize=10)
+    save(picture, path)
+
+
+def plot_maps(path: Path, files: Mapping[str, tuple[Path, Path]]) -> None:
+    """Image, truth, unorganised soup, preset and defaults: one line a pair."""
+    found = {name: (read_maps(a), read_maps(b)) for name, (a, b) in files.items()}
+    found = {name: maps for name, maps in found.items() if all(maps)}
+    heads = ("image", "truth", "paper's start", "preset: paper", "defaults")
+    picture = figure(2.0 * len(heads), 1.15 * max(1, len(found)) + 0.4)
+    axes = picture.subplots(max(1, len(found)), len(heads), squeeze=False)
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for k, (name, (paper, ours)) in enumerate(found.items()):
+        truth = paper.get("truth")
+        depths = [truth, paper["start"], paper["solution"], ours["solution"]]
+        known = np.asarray(truth if truth is not None else ours["solution"], np.float64)
+        low, high = _limits(known)
+        axes[k, 0].imshow(paper["image"])
+        axes[k, 0].set_title(name, fontsize=6, loc="left")
+        for ax, head, depth in zip(axes[k, 1:], heads[1:], depths, strict=True):
+            if k == 0:
+                ax.set_title(head, fontsize=8)
+            if depth is None:
+                ax.text(0.5, 0.5, "sparse", ha="center", size=7, transform=ax.transAxes)
+                continue
+            z = np.asarray(depth, np.float64)
+            ax.imshow(np.log(_scaled_to(z, known)), cmap="viridis", vmin=low, vmax=high)
+    save(picture, path)
+
+
+def _limits(z: NDArray[np.float64]) -> tuple[float, float]:
+    good = z[np.isfinite(z) & (z > 0)]
+    low, high = np.percentile(good, [2, 98]) if good.size else (1.0, 2.0)
+    return float(np.log(low)), float(np.log(max(high, 1.01 * low)))
+
+
+def _scaled_to(z: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np.float64]:
+    """z times the median of known / z; NaN where it is not positive."""
+    z = np.where(z > 0, z, np.nan)
+    ratio = known / z
+    ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
+    return z * (np.median(ratio) if ratio.size else 1.0)

@@ -1,0 +1,311 @@
+"""What `bench paper` solves: pairs of the paper's datasets, and the rows of its sections."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+
+from soup_nlp.bench.accuracy import head
+from soup_nlp.bench.analyses import ANALYSES, NOISE_PX
+from soup_nlp.bench.departures import DEPARTURES, PAPER
+from soup_nlp.bench.paper_measures import has_truth, measure
+from soup_nlp.bench.paper_scale import measure_scale
+from soup_nlp.bench.rows import Job, attempt
+from soup_nlp.bench.suite_pairs import Item, Options, spread
+from soup_nlp.bench.suites import SUITES, list_suite
+from soup_nlp.errors import DataError
+
+Overrides = tuple[str, ...]
+
+SCALE_SUPERPIXELS = 500
+"""Superpixels where the scale of one body is varied: nothing is solved there."""
+
+METHODS: Mapping[str, Overrides] = MappingProxyType({"preset: paper": PAPER, "defaults": ()})
+"""Overrides by the name of a method."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset of the paper.
+
+    Attributes:
+        name: As in `bench.published`.
+        title: For tables.
+        suites: Where its pairs are; the first suite that has any is taken.
+        cap: Convention with a depth cap, if one is in use.
+        sequences: Families of the suite `shared` that are pairs of this dataset.
+    """
+
+    name: str
+    title: str
+    suites: tuple[str, ...]
+    cap: str = ""
+    sequences: tuple[str, ...] = ()
+
+
+DATASETS = (
+    Dataset("sintel", "MPI Sintel", ("sintel",), "sintel70", ("sintel",)),
+    Dataset("vkitti", "Virtual KITTI", ("vkitti",), "eigen80"),
+    Dataset("kitti", "KITTI", ("kitti2012", "kitti2015"), "eigen80", ("kitti2012", "kitti2015")),
+    Dataset("kinect_paper", "kinect_paper", ("kinect_paper",), "", ("kinect_paper",)),
+    Dataset("kinect_tshirt", "kinect_tshirt", ("kinect_tshirt",)),
+)
+WITHOUT_TRUTH = {
+    "Back sequence": "no true depth is published with it, nor its intrinsics (Garg et al., CVPR"
+    " 2013); the paper shows pictures only",
+    "YouTube-Objects": "no true depth (Prest et al., CVPR 2012); the paper shows pictures only",
+    "KITTI odometry 00-09": "the published KITTI rows are of this set with LiDAR truth,"
+    " https://www.cvlibs.net/datasets/kitti/eval_odometry.php; the rows here are of the stereo and"
+    " flow sets",
+    "ULDEMV": "the paper draws its errors on KITTI and prints no number",
+}
+"""What the paper has and no row can be made of, and why."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How large the benchmark is.
+
+    Attributes:
+        superpixels: Of the comparison of datasets.
+        analysis: Of all other sections.
+        limit: Pairs a dataset, spread evenly; None for all.
+        numbers: Numbers of superpixels that are compared.
+        neighbours: K that are compared.
+        width: Columns of rendered scenes.
+        seeds: Seeds of rendered scenes for the scales of bodies.
+        families: Pairs of the analyses: names of rendered scenes, of datasets, or motorcycle.
+        overrides: Of every problem.
+    """
+
+    superpixels: int = 1000
+    analysis: int = 500
+    limit: int | None = None
+    numbers: tuple[int, ...] = (100, 250, 500, 1000, 2000)
+    neighbours: tuple[int, ...] = (4, 8, 15, 20)
+    width: int = 1024
+    seeds: tuple[int, ...] = (0, 1, 2)
+    families: tuple[str, ...] = ("street", "room", "motorcycle", "kitti", "kinect_paper")
+    overrides: Overrides = ()
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One row to be measured: a pair under overrides."""
+
+    item: Item
+    overrides: Overrides
+
+    @property
+    def key(self) -> tuple[str, Overrides]:
+        """Tells it from all others."""
+        return self.item.key, self.overrides
+
+    def job(self, folder: Path, pictures: bool = False) -> Job:
+        """Its job; pictures go to FOLDER/maps."""
+        name = head(self.item, self.overrides, ", ".join(self.overrides))
+        maps = self.maps(folder) if pictures else None
+        work = partial(measure, self.item, self.overrides, maps=maps)
+        return Job(name, partial(attempt, work), maps is not None and not maps.is_file())
+
+    def maps(self, folder: Path) -> Path:
+        """The file of its small depth maps."""
+        kind = "paper" if self.overrides[:1] == PAPER else "defaults"
+        return folder / "maps" / f"{self.item.key.replace('/', '-').replace(' ', '_')}-{kind}.npz"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Pairs by dataset, and what is measured of them.
+
+    Attributes:
+        sizes: See Sizes.
+        datasets: Pairs with truth by dataset; empty where none is there.
+        analyses: Pairs of the analyses.
+        scenes: Rendered scenes and pairs with moving masks, for the scales of bodies.
+    """
+
+    sizes: Sizes
+    datasets: Mapping[str, tuple[Item, ...]]
+    analyses: tuple[Item, ...]
+    scenes: tuple[Item, ...]
+
+    def cell(self, item: Item, method: str, *overrides: str, superpixels: int = 0) -> Cell:
+        """A pair by a method of METHODS, changed."""
+        n = superpixels or self.sizes.analysis
+        own = f"segmentation.superpixels={n}", *self.sizes.overrides
+        return Cell(item, (*METHODS[method], *own, *overrides))
+
+    def compared(self) -> list[Cell]:
+        """Every pair of every dataset, then the pairs of the analyses, by both methods."""
+        items = [i for group in self.datasets.values() for i in group]
+        known = {i.key for i in items}
+        items += [i for i in self.analyses if i.key not in known]
+        n = self.sizes.superpixels
+        return [self.cell(i, m, superpixels=n) for i in items for m in METHODS]
+
+    def variants(self, section: str, item: Item, method: str) -> dict[str, Cell]:
+        """The cells of a section of one change at a time, by the name of the change."""
+        s = self.sizes
+        if section == "superpixels":
+            return {str(n): self.cell(item, method, superpixels=n) for n in s.numbers}
+        if section == "flow" and not item.flow.startswith("truth"):
+            sources = ["truth", *(f"truth+noise:{px}" for px in NOISE_PX), "dis"]
+            return {
+                flow: Cell(replace(item, flow=flow), self.cell(item, method).overrides)
+                for flow in sources
+            }
+        changes = _changes(section, method, s)
+        return {name: self.cell(item, method, *own) for name, own in changes.items()}
+
+    def items(self, section: str) -> tuple[Item, ...]:
+        """Pairs of a section: of those with a true flow one each where the flow is varied."""
+        if section != "flow":
+            return self.analyses
+        return tuple(i for i in self.analyses if i.suite == "rendered")
+
+    def departures(self, item: Item) -> dict[str, tuple[Cell, Cell | None]]:
+        """Cells "off alone" and "on alone" by departure."""
+        n = f"segmentation.superpixels={self.sizes.analysis}"
+        out: dict[str, tuple[Cell, Cell | None]] = {}
+        for d in DEPARTURES:
+            on = d.on_alone()
+            own = n, *self.sizes.overrides
+            off = Cell(item, (*own, *d.off_alone()))
+            out[d.name] = off, None if on is None else Cell(item, (*PAPER, *own, *on[len(PAPER) :]))
+        return out
+
+    def jobs(self, folder: Path) -> list[Job]:
+        """All solves, each once, those of one pair together."""
+        compared = self.compared()
+        cells = {c.key: c for c in compared}
+        pictures = set(cells)
+        for section in SECTIONS:
+            for item in self.items(section):
+                for method in METHODS:
+                    for cell in self.variants(section, item, method).values():
+                        cells.setdefault(cell.key, cell)
+        for item in self.analyses:
+            for pair in self.departures(item).values():
+                cells.update({c.key: c for c in pair if c is not None and c.key not in cells})
+        place: dict[str, int] = {}
+        for key, _ in cells:
+            place.setdefault(key, len(place))
+        ordered = sorted(cells.values(), key=lambda c: place[c.item.key])
+        return [c.job(folder, c.key in pictures) for c in ordered]
+
+    def scale_jobs(self) -> list[Job]:
+        """Energies over the scale of moving bodies; nothing is solved."""
+        own = (f"segmentation.superpixels={SCALE_SUPERPIXELS}",)
+        return [
+            Job(
+                head(i, own, "scale of one body"),
+                partial(attempt, partial(measure_scale, i, own)),
+            )
+            for i in self.scenes
+        ]
+
+
+SECTIONS: Mapping[str, str] = MappingProxyType(
+    {
+        "terms": "terms of the energy",
+        "superpixels": "number of superpixels",
+        "neighbours": "K of the K-NN graph",
+        "pattern": "superpixels",
+        "flow": "flow",
+        "stages": "stages",
+    }
+)
+"""Sections of one change at a time, with the label of their axis."""
+
+
+def _changes(section: str, method: str, s: Sizes) -> dict[str, Overrides]:
+    """Overrides by the name of a change."""
+    if section == "terms":
+        known = dict(ANALYSES["ablation"].variants)
+        if method != "defaults":
+            # the paper has no prior
+            del known["+ prior"]
+            known["+ orient"] = ()
+        return known
+    if section == "neighbours":
+        return {str(k): (f"segmentation.neighbours={k}",) for k in s.neighbours}
+    if section == "pattern":
+        return {m: (f"segmentation.method={m}",) for m in ("slic", "grid")}
+    return {
+        "NLP": ("refine.enabled=false",),
+        "refinement": ("refine.from_start=true",),
+        "both": (),
+    }
+
+
+def make_plan(data: Path | None, sizes: Sizes) -> Plan:
+    """The pairs that are there."""
+    found = {d.name: _pairs(d, data, sizes) for d in DATASETS}
+    wanted = []
+    for family in sizes.families:
+        if family in found:
+            wanted += [*found[family][:1]]
+        elif family == "motorcycle":
+            wanted.append(
+                Item("shared", family, family, "dis", {"kind": family}, ("paper", "best"))
+            )
+        else:
+            o = Options(("dis",), sizes.width, (0,), None, (family,))
+            wanted += list_suite("rendered", None, o).items
+    scenes = list(list_suite("rendered", None, _scenes(sizes)).items)
+    scenes += _masked(data)
+    return Plan(sizes, found, tuple(wanted), tuple(scenes))
+
+
+def _scenes(sizes: Sizes) -> Options:
+    return Options(("truth",), sizes.width, sizes.seeds, None, ("street", "room"))
+
+
+def _masked(data: Path | None) -> list[Item]:
+    """Real pairs with a mask of what moves, a true depth and a true flow."""
+    out = []
+    for name in ("kitti2015", "shared"):
+        try:
+            listed = list_suite(name, data, Options(("truth",))).items
+        except DataError:
+            continue
+        out += [i for i in listed if i.sequence == "kitti2015"]
+    return list({str(dict(i.input)): i for i in out}.values())
+
+
+def _pairs(dataset: Dataset, data: Path | None, sizes: Sizes) -> tuple[Item, ...]:
+    """Pairs of a dataset that have a truth: of its suites, or else of the suite `shared`."""
+    listed: list[Item] = []
+    for name in dataset.suites:
+        listed += [i for i in _listed(name, data) if has_truth(i)]
+    if not listed:
+        listed = [i for i in _listed("shared", data) if i.sequence in dataset.sequences]
+        listed = [i for i in listed if has_truth(i)]
+    if sizes.limit is not None:
+        listed = [listed[k] for k in spread(len(listed), sizes.limit)] if listed else []
+    presets = ("paper", "best", *([dataset.cap] if dataset.cap else []))
+    return tuple(i.scored_by(presets) for i in listed)
+
+
+def _listed(name: str, data: Path | None) -> Iterable[Item]:
+    if data is None:
+        return ()
+    try:
+        return list_suite(name, data, Options(("dis",))).items
+    except DataError:
+        return ()
+
+
+def source_of(dataset: Dataset) -> str:
+    """Where the data of a dataset come from, and how to lay them out."""
+    suite = SUITES[dataset.suites[0]]
+    return f"not in the folder; from {suite.source}, laid out as {suite.layout}"
+
+
+def title(item: Item) -> str:
+    """Name of a pair for tables."""
+    return item.name if item.suite in ("rendered", "shared") else f"{item.suite} {item.name}"

@@ -1,0 +1,123 @@
+"""Named sets of options below a problem's own keys. `preset: paper` is the method as printed.
+
+The paper prints the factor 1 of E_arap, K of 15 to 20, 1,000 to 2,000 superpixels, 50 particles
+and 5 to 10 rounds. alpha1 to alpha3, beta, sigma and n were "tuned differently for different
+datasets" and are not printed: the values here are one set for all, see docs/formulation.md.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import yaml
+
+Tree = dict[str, Any]
+
+_INF = float("inf")
+
+PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "paper": {
+            "segmentation": {
+                "superpixels": 1000,
+                "method": "slic",
+                "follow_flow_px": None,
+                "neighbours": 15,
+            },
+            # all flow vectors alike
+            "flow": {"reweight_px": None, "dis": {"tau": 1e6, "limit": 1e4}},
+            "start": {
+                "method": "homography",
+                "samples": 100,
+                "threshold_px": 0.5,
+                "bending": 1.0,
+            },
+            "energy": {
+                "units": "paper",
+                "length": "translation",
+                "arap_at_anchors": False,
+                "arap_across": 1.0,
+                "cont_occluded": 1.0,
+                "rotation_px": None,
+                "weights": {
+                    "arap": 1.0,
+                    "proj": 0.1,
+                    "cont": 0.02,
+                    "orient": 1e-3,
+                    "prior": 0.0,
+                    "sigma_cont": 0.02,
+                    "sigma_cont_ref": _INF,
+                    "sigma_orient": 0.5,
+                    "sigma_arap": _INF,
+                    "leak_arap": 0.0,
+                    "sigma_proj": _INF,
+                },
+            },
+            # widths are of lengths and radians too, of which 0.01 would smooth all
+            "solver": {"presolve_eps": [0.03, 0.003, 0.001, 1e-4], "eps": 1e-4},
+            "formulation": {"gauge": "unit-translation", "min_facing": 0.0, "depth_ratio": 1e6},
+            "refine": {
+                "enabled": True,
+                "from_start": False,
+                "rounds": 5,
+                "particles": 50,
+                "proposals": "walks",
+                "depth_reach": 1e6,
+                "stagnation": 0.0,
+                "photo": 0.0,
+                "sweep": 0,
+            },
+        }
+    }
+)
+"""Options by name."""
+
+
+def with_preset(tree: Mapping[str, Any]) -> Tree:
+    """The tree of a problem over the options of the preset that it names; itself without one.
+
+    An unknown name is left to the check of the problem.
+    """
+    name = tree.get("preset")
+    if not isinstance(name, str) or name not in PRESETS:
+        return dict(tree)
+    return _over(PRESETS[name], tree)
+
+
+def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> Tree:
+    """Both trees; where a key is in both, `above` has its value, section by section."""
+    out: Tree = copy.deepcopy(dict(below))
+    for key, value in above.items():
+        old = out.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            out[key] = _over(old, value)
+        else:
+            out[key] = value
+    return out
+
+
+def leaves(tree: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted key and value of every option."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from leaves(value, f"{place}{key}.")
+        else:
+            yield f"{place}{key}", value
+
+
+def overrides_of(name: str) -> tuple[str, ...]:
+    """The options of a preset as `a.b=value`, as `--set` takes them."""
+    return tuple(f"{key}={_text(value)}" for key, value in leaves(PRESETS[name]))
+
+
+def dump_preset(name: str) -> str:
+    """The options of a preset as YAML."""
+    return yaml.safe_dump(PRESETS[name], sort_keys=False)
+
+
+def _text(value: Any) -> str:
+    return ".inf" if value == _INF else json.dumps(value)

@@ -1,0 +1,167 @@
+"""The paper's initialisation: epipolar geometry and homography of every superpixel (Sec. 4.4.1).
+
+The motion (R, t) of a superpixel comes from the flow of itself and of its nearest neighbours, by
+essential matrix and cheirality; its plane then follows from `q ~ (R - t n^T / d) r`, which is
+linear in n / d. Without neighbours the homography of the superpixel alone is decomposed: up to
+four (R, t, n) explain it, cheirality leaves those under which the superpixel lies before both
+cameras, mostly two, and that one is taken whose epipolar geometry explains the flow of the
+neighbours better.
+
+A superpixel for which this fails takes the answer of the nearest one for which it does not. All
+translations have unit length and all scales are alike: the unorganised soup.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.plane import normal_and_distance
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.start.epipolar import Motion, essential_motion, sampson
+from soup_nlp.start.plane_fit import Views
+from soup_nlp.start.start_options import SeededStart
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+LEAST_PIXELS = 8
+"""Fewest correspondences of a homography."""
+MOST_PIXELS = 400
+"""A motion is fitted to at most this many correspondences."""
+JUDGES = 6
+"""Neighbours whose flow decides between two decompositions."""
+LEAST_MOTION = 1e-6
+"""Smallest |t| / d of a decomposition that has a direction and a depth."""
+CLIP = 5.0
+"""Sampson distances count at most this many pixels."""
+
+
+class Matches(NamedTuple):
+    """Correspondences (M, 3) rays, (M, 3) rays of their flow targets, (M,) weights above 0."""
+
+    ray: Float
+    target: Float
+    weight: Float
+
+
+class Patch(NamedTuple):
+    """What is known of a superpixel: its motion, and m = -n / d with |t| = 1 as the length unit."""
+
+    motion: Motion
+    m: Float
+
+
+def unorganised(views: Views, seg: Segmentation, o: SeededStart) -> tuple[Soup, Bools]:
+    """The soup of single superpixels, all scales alike, and who borrowed.
+
+    Args:
+        views: Rays and targets of every superpixel.
+        seg: Superpixels and graphs.
+        o: Neighbours of a motion, inlier distance, seed.
+
+    Returns:
+        The soup, not normalised, and (N,) True where another's answer was taken.
+    """
+    found = [_patch(views, seg, i, o) for i in range(len(seg))]
+    fails = np.array([p is None for p in found])
+    source = np.arange(len(seg))
+    if fails.any() and not fails.all():
+        good = np.flatnonzero(~fails)
+        source[fails] = good[cKDTree(seg.anchors[good]).query(seg.anchors[fails])[1]]
+    sideways = Patch(Motion(np.eye(3), np.array([1.0, 0.0, 0.0])), np.array([0.0, 0.0, 1.0]))
+    own = [found[s] or sideways for s in source]
+    n, D = normal_and_distance(np.stack([p.m for p in own]))
+    R, t = (np.stack([getattr(p.motion, name) for p in own]) for name in ("R", "t"))
+    return Soup(np.ones(len(seg)), n, D, R, t), fails
+
+
+def _patch(views: Views, seg: Segmentation, i: int, o: SeededStart) -> Patch | None:
+    """Motion and plane of a superpixel; None where its flow does not give them."""
+    own = matches(views, np.array([i]))
+    if len(own.ray) < LEAST_PIXELS:
+        return None
+    focal = views.focal[0]
+    if not o.motion_neighbours:
+        H = fit_homography(own)
+        choices = [] if H is None else in_front(H, own.ray)
+        if len(choices) < 2:
+            return choices[0] if choices else None
+        around = matches(views, seg.knn[i, :JUDGES])
+        return choices[int(np.argmin([epipolar_error(c.motion, around, focal) for c in choices]))]
+    around = matches(views, np.append(i, seg.knn[i, : o.motion_neighbours]))
+    motion = essential_motion(around.ray, around.target, focal, o.threshold_px, o.seed)
+    if motion is None:
+        return None
+    m = plane_of(motion, own)
+    return Patch(motion, m) if (own.ray @ m > 0).all() else None
+
+
+def matches(views: Views, members: Int) -> Matches:
+    """Correspondences of some superpixels (M,), evenly thinned out where they are many."""
+    ray, target, weight = (
+        v[members].reshape(-1, *v.shape[2:]) for v in (views.ray, views.target, views.weight)
+    )
+    use = np.flatnonzero(weight > 0)
+    use = use[:: max(1, len(use) // MOST_PIXELS)]
+    return Matches(*(np.ascontiguousarray(v[use]) for v in (ray, target, weight)))
+
+
+def plane_of(motion: Motion, own: Matches) -> Float:
+    """m (3,) of least squares in `q ~ R r + t (m . r)`, errors across the ray of the target."""
+    y, q, t = own.ray @ motion.R.T, own.target, motion.t
+    root = np.sqrt(own.weight)[:, None]
+    a = (y[:, :2] - q[:, :2] * y[:, 2:]) * root
+    b = (t[:2] - q[:, :2] * t[2]) * root
+    A = b[:, :, None] * own.ray[:, None, :]
+    return np.asarray(np.linalg.lstsq(A.reshape(-1, 3), -a.ravel(), rcond=None)[0])
+
+
+def fit_homography(own: Matches) -> Float | None:
+    """Least-squares homography (3, 3) of rays, signed so that they stay ahead; None for none."""
+    if len(own.ray) < LEAST_PIXELS:
+        return None
+    a, b = (np.ascontiguousarray(v[:, :2]) for v in (own.ray, own.target))
+    try:
+        H, _ = cv2.findHomography(a, b, 0)
+    except cv2.error:
+        return None
+    if H is None or not np.isfinite(H).all():
+        return None
+    ahead = own.ray @ H[2]
+    if not (ahead > 0).all() and not (ahead < 0).all():
+        return None
+    return np.asarray(H if ahead[0] > 0 else -H, np.float64)
+
+
+def in_front(H: Float, ray: Float) -> list[Patch]:
+    """The decompositions of H under which every ray (M, 3) meets the plane before both cameras.
+
+    With `1 / Z(r) = m . r > 0` in the reference frame, the depth in the next one is `Z (H r)_z`,
+    positive by the sign of H.
+    """
+    try:
+        _, Rs, ts, ns = cv2.decomposeHomographyMat(H, np.eye(3))
+    except cv2.error:
+        return []
+    found = []
+    for R, t, n in zip(Rs, ts, ns, strict=True):
+        length = float(np.linalg.norm(t))
+        # each comes as (t, n) and as (-t, -n), of which one faces the camera
+        if np.linalg.det(R) > 0 and length > LEAST_MOTION and (ray @ n > 0).all():
+            found.append(Patch(Motion(R, t.ravel() / length), length * n.ravel()))
+    return found
+
+
+def epipolar_error(motion: Motion, around: Matches, focal: float) -> float:
+    """Mean clipped Sampson distance of correspondences to a motion, pixels."""
+    if not len(around.ray):
+        return 0.0
+    error = sampson(motion.essential(), around.ray, around.target, focal)
+    return float(np.average(np.minimum(np.abs(error), CLIP), weights=around.weight))

@@ -1,0 +1,191 @@
+"""The preset that is the method as printed: its options, its start, its unit, its proposals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+
+from soup_nlp.cli.main import main
+from soup_nlp.config.presets import PRESETS, leaves, overrides_of
+from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
+from soup_nlp.errors import ConfigError
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model import oracle
+from soup_nlp.model.energy_data import build_energy_data
+from soup_nlp.model.reweighting import in_length
+from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.refine.mppbp import refine_soup
+from soup_nlp.start.homographies import Matches, fit_homography, in_front, plane_of
+
+PAPER = {
+    # Sec. 4.4.1: "1,000-2,000 superpixels" by SLIC
+    "segmentation.superpixels": 1000,
+    "segmentation.method": "slic",
+    "segmentation.follow_flow_px": None,
+    # "a K in the range of 15-20"
+    "segmentation.neighbours": 15,
+    "start.method": "homography",
+    # Eq. 1 to 7: factor 1 of E_arap, alike everywhere; rho and rho_n alone truncate; four terms
+    "energy.units": "paper",
+    "energy.length": "translation",
+    "energy.arap_at_anchors": False,
+    "energy.arap_across": 1.0,
+    "energy.cont_occluded": 1.0,
+    "energy.weights.arap": 1.0,
+    "energy.weights.prior": 0.0,
+    "energy.weights.sigma_arap": np.inf,
+    "energy.weights.sigma_proj": np.inf,
+    "energy.weights.sigma_cont_ref": np.inf,
+    # t-hat: translations of unit length
+    "formulation.gauge": "unit-translation",
+    "formulation.min_facing": 0.0,
+    # "50 particles ... around the already known beliefs", "5-10 iterations"
+    "refine.particles": 50,
+    "refine.rounds": 5,
+    "refine.stagnation": 0.0,
+    "refine.proposals": "walks",
+    "refine.photo": 0.0,
+    "refine.sweep": 0,
+}
+STREET = {"kind": "scene", "scene": "street", "width": 256, "height": 112}
+SMALL = {"input": STREET, "segmentation": {"superpixels": 60, "neighbours": 8}}
+
+
+def value(problem: Problem, key: str):
+    out = problem
+    for name in key.split("."):
+        out = getattr(out, name)
+    return out
+
+
+def paper(*overrides: str, **more) -> Problem:
+    return make_problem({**SMALL, "preset": "paper", **more}, overrides)
+
+
+def test_the_preset_is_what_the_paper_prints():
+    problem = make_problem({"input": STREET, "preset": "paper"})
+    assert {key: value(problem, key) for key in PAPER} == PAPER
+    assert 5 <= problem.refine.rounds <= 10
+    assert np.isfinite(problem.energy.weights.sigma_cont)
+
+
+def test_every_option_of_the_preset_is_in_the_problem():
+    problem = make_problem({"input": STREET, "preset": "paper"})
+    for key, wanted in leaves(PRESETS["paper"]):
+        found = value(problem, key)
+        assert (list(found) if isinstance(found, tuple) else found) == wanted, key
+    assert problem == make_problem({"input": STREET, "preset": "paper"}, overrides_of("paper"))
+
+
+def test_keys_of_the_file_and_overrides_lie_above_the_preset(tmp_path):
+    path = tmp_path / "p.yaml"
+    path.write_text("preset: paper\ninput: {kind: motorcycle}\nenergy: {weights: {proj: 3.0}}\n")
+    problem = load_problem(path, ["refine.rounds=7", "energy.units=pixel"])
+    weights = problem.energy.weights
+    assert (weights.proj, weights.arap, weights.prior) == (3.0, 1.0, 0.0)
+    assert (problem.refine.rounds, problem.refine.particles) == (7, 50)
+    assert (problem.energy.units, problem.start.method) == ("pixel", "homography")
+    assert load_problem(path, ["preset=null"]).refine == Problem(input=problem.input).refine
+
+
+def test_a_dumped_preset_is_the_same_problem(tmp_path):
+    problem = paper()
+    (tmp_path / "again.yaml").write_text(dump_problem(problem))
+    assert load_problem(tmp_path / "again.yaml") == problem
+    bare = dump_problem(problem).replace("preset: paper", "preset: null")
+    (tmp_path / "bare.yaml").write_text(bare)
+    assert load_problem(tmp_path / "bare.yaml").digest() == problem.digest()
+
+
+def test_an_unknown_preset_is_an_error_that_names_the_known_ones():
+    with pytest.raises(ConfigError, match="preset") as caught:
+        make_problem({"input": STREET, "preset": "papr"})
+    assert "paper" in str(caught.value)
+
+
+def test_the_command_line_shows_a_preset_and_puts_it_below_overrides(capsys):
+    assert main(["show", "--preset", "paper"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out) == PRESETS["paper"]
+    assert main(["show", "street", "--preset", "paper", "--set", "refine.rounds=9"]) == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    assert (shown["refine"]["rounds"], shown["refine"]["particles"]) == (9, 50)
+    assert main(["show"]) == 2
+    assert main(["show", "--preset", "papr"]) == 2
+    assert "nothing to show" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    """Sixty superpixels of a street with its true flow, as printed."""
+    return prepare(paper(flow={"source": "truth"}))
+
+
+def test_the_start_is_one_of_single_superpixels(case):
+    """With a true flow it is right where the scene is static: all translations are the camera's."""
+    soup, truth = case.start.soup, case.pair.truth
+    length = np.linalg.norm(soup.translation, axis=1)
+    assert np.allclose(length, length[0], rtol=1e-12)
+    assert not case.start.component.any()
+    u, v = case.segmentation.anchors.round().astype(int).T
+    static = truth.components[v, u] == 0
+
+    def error(neighbours: int) -> float:
+        problem = paper(f"start.motion_neighbours={neighbours}", flow={"source": "truth"})
+        z = prepare(problem, pair=case.pair).start.soup.depth_at(case.data.anchor_ray)
+        ratio = (z / truth.depth_ref[v, u])[static]
+        return float(np.median(np.abs(ratio / np.median(ratio) - 1)))
+
+    # superpixels on one plane have an exact homography; the neighbours' flow is of other components
+    assert error(0) < 0.02
+    assert error(8) < 0.3
+
+
+def test_a_homography_has_its_own_motion_among_its_decompositions():
+    """The true one of an exact homography is found, and the plane follows from the motion."""
+    angle = 0.05
+    R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    t, m = np.array([0.6, 0.0, 0.8]), np.array([0.02, -0.05, 0.11])
+    grid = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 5), np.linspace(0, 0.2, 5)), axis=-1)
+    ray = np.column_stack([grid.reshape(-1, 2), np.ones(25)])
+    target = ray @ R.T + (ray @ m)[:, None] * t
+    own = Matches(ray, target / target[:, 2:], np.ones(25))
+    H = fit_homography(own)
+    found = in_front(H, ray)
+    assert 1 <= len(found) <= 2
+    off = [np.abs(p.motion.R - R).max() + np.abs(p.motion.t - t).max() for p in found]
+    best = found[int(np.argmin(off))]
+    # OpenCV fits in single precision
+    assert min(off) < 1e-3
+    assert np.allclose(best.m, m, atol=1e-3)
+    assert np.allclose(plane_of(best.motion, own), m, atol=1e-3)
+    assert fit_homography(Matches(ray[:5], target[:5], np.ones(5))) is None
+
+
+@pytest.mark.parametrize("length", ["depth", "translation", "scales"])
+def test_the_unit_of_length_is_the_sum_that_it_names(case, length):
+    """E_cont without truncation is a length: in its unit times the unit it is always the same."""
+    start, weights = case.start.soup, case.weights.replace(sigma_cont=np.inf)
+    bare = build_energy_data(case.segmentation, case.pair.flow, case.pair.K_ref, case.pair.K_next)
+    unit = {
+        "depth": start.distance.mean(),
+        "translation": np.linalg.norm(start.translation, axis=1).sum(),
+        "scales": start.distance.sum(),
+    }[length]
+    data = in_length(bare, start, length)
+    expected = oracle.continuity(start, bare, weights).sum() * start.distance.mean()
+    larger = Soup(2 * start.lam, start.n, start.d, start.R, start.t)
+    for soup in (start, larger):
+        found = oracle.continuity(soup, data, weights).sum() * unit
+        assert found == pytest.approx(expected, rel=1e-9)
+
+
+def test_walks_are_the_only_proposals_of_the_paper(case):
+    options = case.problem.refine.replace(rounds=2, particles=8)
+    done = refine_soup(
+        case.start.soup, case.data, case.weights, options, min_facing=0.0, depth_ratio=1e6
+    )
+    for number in done.rounds:
+        kinds = {kind for kind, count in number.proposed.items() if count}
+        assert kinds <= {"current", "kept"} | {k for k in kinds if k.startswith("walk_")}
+    assert done.energy["total"] <= done.energy_begin["total"]
