@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
+import cv2
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
@@ -230,6 +231,22 @@ def test_a_flow_source_is_an_entry_point(tmp_path, monkeypatch, small_room):
     flow = resolve_flow(small_room.pair, "mine")
     assert flow.source == "mine"
     assert (flow.uv == 3.0).all()
+
+
+def test_a_network_is_any_onnx_file(tmp_path, monkeypatch):
+    pytest.importorskip("onnx", reason="no onnx")
+    pytest.importorskip("onnxruntime", reason="no onnxruntime")
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs/networks.md").read_text(encoding="utf-8")
+    exec(re.findall(r"```python\n(.*?)```", page, re.DOTALL)[0], {})
+    rng = np.random.default_rng(0)
+    wide = cv2.GaussianBlur(rng.integers(0, 255, (80, 101, 3), dtype=np.uint8), (0, 0), 3)
+    pair = Pair(wide[:, 1:], wide[:, :-1], *[intrinsics(90, 90, 50, 40)] * 2)
+    flow = resolve_flow(pair, "lk.onnx")
+    inside = flow.uv[20:-20, 20:-20]
+    # linear in the displacement to first order only
+    np.testing.assert_allclose(np.median(inside, axis=(0, 1)), [1, 0], atol=0.1)
+    assert np.median(flow.confidence) > 0.9
 
 
 def test_a_solver_is_any_program_that_reads_nl(tmp_path, monkeypatch):
