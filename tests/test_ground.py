@@ -1,12 +1,14 @@
-"""Nothing lies below the ground: what has no depth of its own is lifted to it."""
+"""Nothing lies below the ground, and nothing floats above it."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from soup_nlp.geometry.camera import rays
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.ground import above_ground, ground
+from soup_nlp.start.ground import above_ground, floating, ground
 
 HIGH, FAR = 1.5, 30.0
 """Height of the camera, and distance of a wall."""
@@ -29,7 +31,9 @@ def facing(Z: np.ndarray) -> Soup:
 
 
 def lift(ray, Z, known, component):
-    return above_ground(facing(Z), ray, np.ones(len(Z)), known, component, 0)
+    known = known & (component == 0)
+    floor = ground(1 / Z, ray, np.ones(len(Z)), known, 0)
+    return above_ground(facing(Z), ray, np.ones(len(Z)), known, component, floor)
 
 
 def test_what_is_not_known_comes_up_to_the_road(scene):
@@ -82,3 +86,40 @@ def test_what_is_well_known_stays_below(scene):
     given = np.where(ditch, 1.5 * Z, Z)
     soup, _ = lift(ray, given, np.ones(len(Z), bool), np.zeros(len(Z), int))
     np.testing.assert_allclose(soup.depth_at(ray), given, rtol=1e-12)
+
+
+def street(car: float) -> tuple[Segmentation, np.ndarray, np.ndarray, np.ndarray]:
+    """Segmentation, rays, boundary rays and depth of a road with a car `car` times as far as it
+    stands."""
+    side, rows, columns = 8, 20, 30
+    labels = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    labels = labels.repeat(side, axis=0).repeat(side, axis=1)
+    height, width = labels.shape
+    K = np.array([[150.0, 0, width / 2], [0, 150.0, height / 2], [0, 0, 1]])
+    image = np.full((height, width, 3), 128, np.uint8)
+    seg = build_segmentation(labels, image, 8, 0.02, 1.0, 3)
+    ray = rays(K, seg.anchors)
+    Z = np.where(ray[:, 1] > HIGH / FAR, HIGH / np.maximum(ray[:, 1], 1e-6), FAR)
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    body = (row >= 9) & (row <= 13) & (column >= 10) & (column <= 14)
+    foot = HIGH / ((14 * side - height / 2) / 150)
+    Z = np.where(body, car * foot, Z)
+    return seg, ray, rays(K, seg.boundary.mean(axis=1)), Z
+
+
+@pytest.mark.parametrize("car", [0.5, 1.0])
+def test_what_floats_is_found_with_its_distance(car):
+    seg, ray, middle, Z = street(car)
+    body = np.isclose(Z, Z[13 * 30 + 12])
+    floor = ground(1 / Z, ray, np.ones(len(Z)), ~body, 0)
+    assert floor.any()
+    found = floating(facing(Z), seg, ray, middle, floor, np.zeros(len(Z), int))
+    if car == 1.0:
+        # it stands where it is, and so does the wall
+        assert found == []
+        return
+    assert len(found) == 1
+    region, farther = found[0]
+    np.testing.assert_array_equal(region, body)
+    # within what the boundary's sampled rows leave open
+    assert farther == pytest.approx(1 / car, rel=0.1)

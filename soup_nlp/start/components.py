@@ -202,12 +202,12 @@ def contact_scales(
         value = ratio + log_scale[b]
         if contact[ground].sum() >= 0.1 * contact[mine].sum():
             log_scale[c] = min(
-                _quantile(value[ground], weight[ground], GROUND),
-                _quantile(value[mine], contact[mine], MOST),
+                quantile(value[ground], weight[ground], GROUND),
+                quantile(value[mine], contact[mine], MOST),
             )
             tie[c] = TIES.index("contact below")
         else:
-            log_scale[c] = _quantile(value[mine], contact[mine], OUTLINE)
+            log_scale[c] = quantile(value[mine], contact[mine], OUTLINE)
             tie[c] = TIES.index("outline")
         placed[c] = True
     if upright:
@@ -293,5 +293,6 @@ def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -
     return depth
 
 
-def _quantile(value: Float, weight: Float, share: float) -> float:
+def quantile(value: Float, weight: Float, share: float) -> float:
+    """The value that a share of the weight lies below."""
     return float(np.quantile(value, share, weights=weight, method="inverted_cdf"))

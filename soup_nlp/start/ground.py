@@ -1,9 +1,12 @@
-"""Nothing that is seen lies below the ground.
+"""Nothing that is seen lies below the ground, and nothing floats above it.
 
 A thing without usable flow (it leaves the image, it is dark, it moves too fast) takes its depth
 from whatever is beside it, and a component that touches nothing known from its outline: both may
 end far below the road. In an upright image a level plane that much of the scene lies on, and next
 to nothing below, bounds the depth of all that is seen below the horizon.
+
+What moves along the epipolar lines, as an oncoming car, is explained by the camera's motion at a
+wrong depth, too near. It then floats: its lower border is seen against the ground, far behind it.
 """
 
 from __future__ import annotations
@@ -11,7 +14,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.start.components import BELOW as DOWN
+from soup_nlp.start.components import GROUND, connected_labels, quantile
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -23,6 +29,17 @@ ON, BELOW = 0.05, 0.2
 lies below."""
 LEAST_ON, MOST_BELOW = 0.1, 0.05
 """Shares of what is well known that lie on the ground at least, and below it at most."""
+STANDS = 1.35
+"""Inverse depth over that of the ground from which on a superpixel stands above it: superpixels on
+an outline hold some of both sides."""
+WHOLE = 1.15
+"""Ratio of depths on a boundary up to which both sides hang together."""
+FLOATS, GAP = 1.25, 1.1
+"""By how much the ground, and what is seen below the region, are farther than its lower border."""
+FEWEST, MOST_AREA = 3, 0.15
+"""Superpixels of a region that floats, and its share of the image."""
+IN_FRONT = 0.6
+"""Share of its outline, and of what lies below it, that has to be behind it and ground."""
 TRIALS = 500
 """Planes through three superpixels that are tried."""
 
@@ -72,7 +89,12 @@ def ground(mu: Float, ray: Float, weight: Float, known: NDArray[np.bool_], seed:
 
 
 def above_ground(
-    soup: Soup, ray: Float, weight: Float, known: NDArray[np.bool_], component: Int, seed: int
+    soup: Soup,
+    ray: Float,
+    weight: Float,
+    known: NDArray[np.bool_],
+    component: Int,
+    floor: Float,
 ) -> tuple[Soup, NDArray[np.bool_]]:
     """The soup with what is not known well, or moves by itself, lifted to the ground.
 
@@ -85,13 +107,12 @@ def above_ground(
         weight: (N,) area of every superpixel.
         known: (N,) which depths are known well, of the largest component.
         component: (N,) group that moves as one.
-        seed: Of the search for the ground.
+        floor: (N,) inverse depth of the ground (`ground`).
 
     Returns:
         The soup, and (N,) which belong to a component that was lifted as a whole.
     """
     mu = 1 / soup.depth_at(ray)
-    floor = ground(mu, ray, weight, known, seed)
     scene = component == np.argmax(np.bincount(component))
     lam, t = soup.lam.copy(), soup.t.copy()
     lifted = np.zeros(len(mu), bool)
@@ -110,3 +131,62 @@ def above_ground(
     lam[left] *= factor
     t[left & scene] /= factor[scene[left], None]
     return Soup(lam, soup.n, soup.d, soup.R, t), lifted
+
+
+def floating(
+    soup: Soup, seg: Segmentation, ray: Float, boundary_ray: Float, floor: Float, component: Int
+) -> list[tuple[NDArray[np.bool_], float]]:
+    """Regions that float above the ground: (N,) superpixels of each, and how much farther it is.
+
+    A region stands above the ground, hangs together in depth, and is in front of most that is
+    around it. It floats where the ground is seen along its lower border, clearly farther.
+
+    Args:
+        soup: Start, its components scaled.
+        seg: Superpixels and graphs.
+        ray: (N, 3) rays of the anchors.
+        boundary_ray: (P, 3) rays of the middles of shared boundaries.
+        floor: (N,) inverse depth of the ground (`ground`).
+        component: (N,) group that moves as one.
+    """
+    if not floor.any():
+        return []
+    mu = 1 / soup.depth_at(ray)
+    i, k = seg.pairs.T
+    depth = soup.depth_across(seg.pairs, boundary_ray)
+    plane = np.linalg.lstsq(ray[floor > 0], floor[floor > 0])[0]
+    far = 1 / np.maximum(boundary_ray @ plane, 1e-9)
+    stands = (floor == 0) | (mu > STANDS * floor)
+    near_ground = ~stands & (mu > (1 - BELOW) * floor)
+    link = stands[i] & stands[k] & (component[i] == component[k])
+    link &= np.abs(np.log(depth[0] / depth[1])) < np.log(WHOLE)
+    region = np.where(stands, connected_labels(link, seg), -1)
+    # every pair in both directions: own side, other side, gap to it and to the ground
+    own, other = np.concatenate([seg.pairs, seg.pairs[:, ::-1]]).T
+    gap = np.log(np.concatenate([depth[1] / depth[0], depth[0] / depth[1]]))
+    rise = np.log(np.concatenate([far / depth[0], far / depth[1]]))
+    length = np.tile(seg.boundary_length, 2).astype(float)
+    row = np.tile(seg.boundary[..., 1].mean(axis=1), 2)
+    way = seg.anchors[other] - seg.anchors[own]
+    down = way[:, 1] / np.linalg.norm(way, axis=1) > DOWN
+    area = np.bincount(seg.labels.ravel())
+    out = []
+    for c in np.unique(region[stands]):
+        mine = region == c
+        if mine.sum() < FEWEST or area[mine].sum() > MOST_AREA * area.sum():
+            continue
+        edge = mine[own] & ~mine[other]
+        low = edge & down
+        weight = length * np.maximum(row - seg.anchors[mine, 1].min(), 1.0) ** 2
+        on = low & near_ground[other]
+        if not on.any() or weight[on].sum() < IN_FRONT * weight[low].sum():
+            continue
+        behind = length[edge & (gap > np.log(WHOLE))].sum() > IN_FRONT * length[edge].sum()
+        above = quantile(rise[on], weight[on], GROUND)
+        if (
+            behind
+            and above > np.log(FLOATS)
+            and quantile(gap[on], weight[on], GROUND) > np.log(GAP)
+        ):
+            out.append((mine, float(np.exp(above))))
+    return out

@@ -33,7 +33,7 @@ from soup_nlp.start.components import (
     rigid_components,
 )
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.ground import above_ground
+from soup_nlp.start.ground import above_ground, floating, ground
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import gather
 from soup_nlp.start.plane_fit import Views
@@ -158,11 +158,8 @@ def propose(
     scale, tie = contact_scales(soup, component, seg, K_ref, o.upright)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t)
     if o.upright and o.ground:
-        scene = component == np.argmax(np.bincount(component))
-        known = scene & ~weak & (views.weight.mean(axis=1) > 0.5)
-        area = np.bincount(seg.labels.ravel()).astype(float)
-        soup, lifted = above_ground(soup, views.anchor, area, known, component, o.seed)
-        tie = np.where(lifted, TIES.index("ground"), tie)
+        known = ~weak & (views.weight.mean(axis=1) > 0.5)
+        soup, component, tie = _on_ground(soup, views.anchor, seg, K_ref, known, component, tie, o)
     soup = soup.normalised()
     error = own.cost[:, 0]
     return Start(soup, error, parallax, weak, label, component, motions, surface, tie, share)
@@ -178,6 +175,34 @@ def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
     error = np.sum(views.weight * np.linalg.norm(gap, axis=2), axis=1) / total
     parallax, whole = _parallax(soup, views), np.zeros(len(seg), np.int64)
     return Start(soup, error, parallax, borrowed, whole - 1, whole, [], whole, whole)
+
+
+def _on_ground(
+    soup: Soup,
+    anchor: Float,
+    seg: Segmentation,
+    K_ref: Float,
+    known: NDArray[np.bool_],
+    component: Int,
+    tie: Int,
+    o: SeededStart,
+) -> tuple[Soup, Int, Int]:
+    """Soup, components and ties with nothing below the ground and nothing that floats."""
+    known = known & (component == np.argmax(np.bincount(component)))
+    area = np.bincount(seg.labels.ravel()).astype(float)
+    floor = ground(1 / soup.depth_at(anchor), anchor, area, known, o.seed)
+    soup, lifted = above_ground(soup, anchor, area, known, component, floor)
+    tie = np.where(lifted, TIES.index("ground"), tie)
+    middle = rays(K_ref, seg.boundary.mean(axis=1))
+    lam, component = soup.lam.copy(), component.copy()
+    for region, farther in floating(soup, seg, anchor, middle, floor, component):
+        # it moves by itself, as its flow says at any depth
+        lam[region] *= farther
+        component[region] = component.max() + 1
+        tie[region] = TIES.index("contact below")
+    # components are numbered without gaps
+    component = np.unique(component, return_inverse=True)[1].ravel()
+    return Soup(lam, soup.n, soup.d, soup.R, soup.t), component, tie
 
 
 def look(

@@ -44,7 +44,7 @@ class StartOptions(Section):
     scaled to touch whatever it touches first."""
     ground: bool = True
     """In an upright image nothing lies below a level plane that much of the scene lies on: what has
-    no depth of its own, and components, are lifted to it."""
+    no depth of its own, and components, are lifted to it; what floats above it comes down."""
 
 
 class SeededStart(StartOptions):
