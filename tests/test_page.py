@@ -117,28 +117,25 @@ def test_the_next_camera_is_where_the_background_says(text, small_run):
     np.testing.assert_allclose(pose[:3, 3], centre, rtol=1e-9)
 
 
-def two_walls(gap, same=True):
-    """Surface of two halves of 6 x 8 pixels, the right one farther by a factor."""
-    labels = np.repeat([[0] * 4 + [1] * 4], 6, axis=0)
-    planes = np.array([[0, 0, 1.0], [0, 0, 1 / gap]])
-    ray = rays(np.diag([9.0, 9.0, 1.0]), pixel_grid(6, 8))
-    component = np.array([0, 0 if same else 1])
-    return scene3d._surface(planes, labels, component, ray, np.ones((6, 8), bool))
+def test_curtains_are_cut(shown, small_run):
+    """Cells whose corners all lie in one superpixel stay; those across components go."""
+    scene, labels = make_scene(shown), small_run.segmentation.labels
+    part = small_run.components.of_pixel
 
+    def alike(values):
+        first = values[:-1, :-1]
+        others = (values[1:, :-1], values[:-1, 1:], values[1:, 1:])
+        return np.all([first == other for other in others], axis=0)
 
-def test_curtains_are_cut_and_nothing_else():
-    assert two_walls(1.01).all()
-    for cut in (two_walls(1.5), two_walls(1.0, same=False)):
-        assert not cut[:, 3].any()
-        assert cut[:, [0, 1, 2, 4, 5, 6]].all()
-    # a slanted plane is no curtain, however fast its depth grows
-    slanted = np.array([[0, -0.9, 1.0]])
-    ray = rays(np.array([[6.0, 0, 0], [0, 6, 0], [0, 0, 1]]), pixel_grid(6, 8))
-    labels, known = np.zeros((6, 8), int), np.ones((6, 8), bool)
-    assert scene3d._surface(slanted, labels, np.array([0]), ray, known).all()
-    known[2, 3] = False
-    cut = scene3d._surface(slanted, labels, np.array([0]), ray, known)
-    assert (~cut).sum() == 6
+    assert scene.surface.shape == (labels.shape[0] - 1, labels.shape[1] - 1)
+    known = np.isfinite(small_run.reconstruction.depth_ref)
+    whole = alike(known) & known[:-1, :-1]
+    assert scene.surface[alike(labels) & whole].all()
+    assert not scene.surface[~whole].any()
+    assert len(small_run.components) > 1
+    assert not scene.surface[~alike(part)].any()
+    # and the surface goes on where planes meet
+    assert scene.surface[~alike(labels) & alike(part)].mean() > 0.5
 
 
 def test_large_images_are_thinned(shown, monkeypatch):
@@ -146,7 +143,8 @@ def test_large_images_are_thinned(shown, monkeypatch):
     scene = make_scene(shown)
     assert scene.step == 3
     assert scene.labels.shape == (43, 86)
-    assert scene.surface.shape == (42, 85, 2)
+    assert scene.surface.shape == (42, 85)
+    assert 0.5 < scene.surface.mean() < 1
 
 
 def test_a_far_sky_is_left_out_at_first(shown):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError, printable
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.report.tree import result_tree
 from soup_nlp.storage.files import is_file, read_json, read_text
 from soup_nlp.storage.h5_files import ReadTree, read_attrs, read_h5
@@ -37,6 +36,8 @@ class Shown:
     Attributes:
         name: Of the problem.
         tree: Arrays as in result.h5.
+        reconstruction: Dense 3D of both frames, in the result's unit of length.
+        components: What moves as one, and how, in the same unit.
         summary: Contents of summary.json.
         image_ref: (H, W, 3) uint8 RGB; None where it is not known any more.
         image_next: (H', W', 3) likewise.
@@ -46,6 +47,8 @@ class Shown:
 
     name: str
     tree: ReadTree = field(repr=False)
+    reconstruction: Reconstruction
+    components: Components
     summary: Mapping[str, Any] = field(repr=False)
     image_ref: Image | None = field(repr=False)
     image_next: Image | None = field(repr=False)
@@ -56,17 +59,6 @@ class Shown:
     def labels(self) -> NDArray[np.integer]:
         """(H, W) superpixel of every pixel."""
         return np.asarray(self.tree["segmentation"]["labels"])
-
-    @cached_property
-    def components(self) -> Components:
-        """The rigid components of the delivered soup, in the result's unit of length."""
-        t = self.tree
-        kept = {f.name: t["segmentation"].get(f.name) for f in fields(Segmentation)}
-        kept.update({k: t["energy"][k] for k in ("edges", "edge_weight", "pairs")})
-        soup = Soup(*(self.soup(k) for k in ("lam", "n", "d", "R", "t")))
-        K_ref, K_next = (np.asarray(t["input"][f"K_{k}"], float) for k in ("ref", "next"))
-        own = soup, Segmentation(**kept), t["start"]["component"], K_ref, K_next
-        return find_components(*own, np.asarray(t["start"]["borrowed"], bool))
 
     @property
     def bending(self) -> bool:
@@ -108,8 +100,17 @@ def of_run(run: Run, summary: Mapping[str, Any], verdict: str) -> Shown:
     """
     truth, pair = run.pair.truth, run.pair
     unit = truth.unit if truth is not None and "solution" in run.metrics else ""
-    tree, known = _values(result_tree(run)), plain(summary)
-    return Shown(run.problem.name, tree, known, pair.image_ref, pair.image_next, unit, verdict)
+    return Shown(
+        name=run.problem.name,
+        tree=_values(result_tree(run)),
+        reconstruction=run.reconstruction,
+        components=run.components,
+        summary=plain(summary),
+        image_ref=pair.image_ref,
+        image_next=pair.image_next,
+        unit=unit,
+        verdict=verdict,
+    )
 
 
 def of_folder(folder: Path, pair: Pair | None = None) -> Shown:
@@ -136,8 +137,34 @@ def of_folder(folder: Path, pair: Pair | None = None) -> Shown:
         images = {"ref": pair.image_ref, "next": pair.image_next}
         unit = pair.truth.unit if pair.truth is not None else unit
     unit = unit if "solution" in metrics else ""
-    text = _ending(folder / "log.txt")
-    return Shown(name, tree, summary, images["ref"], images["next"], unit, text)
+    try:
+        rec, parts = _rebuilt(tree)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise DataError("result does not hold together", where=folder, found=error) from error
+    return Shown(
+        name=name,
+        tree=tree,
+        reconstruction=rec,
+        components=parts,
+        summary=summary,
+        image_ref=images["ref"],
+        image_next=images["next"],
+        unit=unit,
+        verdict=_ending(folder / "log.txt"),
+    )
+
+
+def _rebuilt(tree: ReadTree) -> tuple[Reconstruction, Components]:
+    """Reconstruction and components of the delivered soup."""
+    soup = Soup(*(tree["solution"][k] for k in ("lam", "n", "d", "R", "t")))
+    K_ref, K_next = (tree["input"][f"K_{k}"] for k in ("ref", "next"))
+    # what rigid components need of it
+    kept = {f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)}
+    seg, start = Segmentation(**kept), tree["start"]
+    height, width = tree["depth"]["next"].shape
+    rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
+    borrowed = start["borrowed"].astype(bool)
+    return rec, find_components(soup, seg, start["component"], K_ref, K_next, borrowed)
 
 
 def _values(tree: Tree) -> ReadTree:

@@ -41,24 +41,28 @@ function points() {
   return out;
 }
 
-/* corners of the triangles that are no curtains */
-function triangles() {
-  const out = new Uint32Array(6 * (w - 1) * (h - 1));
+/* two triangles of every four pixels that are no curtain; of a curtain its four pixels alone */
+function pieces() {
+  const out = new Uint32Array(6 * (w - 1) * (h - 1)), edge = new Uint8Array(w * h);
   let count = 0, bit = 0;
   const has = (k) => (surface[k >> 3] >> (k & 7)) & 1;
   for (let v = 0; v < h - 1; v++)
     for (let u = 0; u < w - 1; u++) {
       const a = v * w + u, b = a + 1, c = a + w, d = c + 1;
-      if (has(bit++)) { out[count++] = a; out[count++] = c; out[count++] = b; }
-      if (has(bit++)) { out[count++] = b; out[count++] = c; out[count++] = d; }
+      if (!has(bit++)) {
+        edge[a] = edge[b] = edge[c] = edge[d] = 1;
+        continue;
+      }
+      for (const corner of [a, c, b, b, c, d]) out[count++] = corner;
     }
-  return out.slice(0, count);
+  const rim = Uint32Array.from(edge.keys()).filter((p) => edge[p]);
+  return [out.slice(0, count), rim];
 }
 
 const VERTEX = `
   in float label, seen;
   uniform sampler2D motion;
-  uniform float time, pointSize;
+  uniform float time, pixel, focal;
   uniform vec2 grid;
   out vec2 place;
   out float depth, guess, hidden;
@@ -92,8 +96,10 @@ const VERTEX = `
       hidden = 1.0 - seen;
     }
     vec3 at = moved(motion, x, time);
-    gl_Position = projectionMatrix * modelViewMatrix * vec4(at, 1.0);
-    gl_PointSize = pointSize;
+    vec4 seenAt = modelViewMatrix * vec4(at, 1.0);
+    gl_Position = projectionMatrix * seenAt;
+    /* a point is as large as its pixel */
+    gl_PointSize = clamp(depth * pixel * focal / max(-seenAt.z, 1e-6 * depth), 1.0, 24.0);
   }`;
 const FRAGMENT = `
   precision highp float;
@@ -151,7 +157,8 @@ const K = scene.KNext;
 const home = motionTexture(motion), raw = motionTexture(motionCamera);
 const uniforms = {
   motion: { value: home }, raw: { value: raw }, time: { value: 0 },
-  grid: { value: new THREE.Vector2(w, h) }, pointSize: { value: 2 },
+  grid: { value: new THREE.Vector2(w, h) }, pixel: { value: scene.step / scene.K[0][0] },
+  focal: { value: 1 },
   cameraNext: { value: new THREE.Matrix3().set(...K[0], ...K[1], ...K[2]) },
   sizeNext: { value: new THREE.Vector2(...scene.sizeNext) }, fromNext: { value: false },
   colours: { value: null }, far: { value: scene.far }, guesses: { value: true },
@@ -171,9 +178,12 @@ const geometry = (index) => {
   if (index) out.setIndex(new THREE.BufferAttribute(index, 1));
   return out;
 };
-const mesh = new THREE.Mesh(geometry(triangles()), material);
+const [corners, rim] = pieces();
+const mesh = new THREE.Mesh(geometry(corners), material);
+/* the surface ends at the centres of its pixels: points cover the other half */
+const fringe = new THREE.Points(geometry(rim), material);
 const cloud = new THREE.Points(geometry(null), material);
-mesh.frustumCulled = cloud.frustumCulled = false;
+mesh.frustumCulled = fringe.frustumCulled = cloud.frustumCulled = false;
 cloud.visible = false;
 
 /* y up and z towards the viewer, as viewers expect */
@@ -181,7 +191,7 @@ const world = new THREE.Scene(), body = new THREE.Group();
 body.matrixAutoUpdate = false;
 body.matrix.makeScale(1, -1, -1);
 world.add(body);
-body.add(mesh, cloud);
+body.add(mesh, fringe, cloud);
 
 const flat = (rows) => new THREE.Matrix4().set(...rows.flat());
 let pose = flat(scene.camera);
@@ -258,7 +268,12 @@ let wanted = false;
 function draw() {
   if (wanted) return;
   wanted = true;
-  requestAnimationFrame(() => { wanted = false; controls.update(); renderer.render(world, eye); });
+  requestAnimationFrame(() => {
+    wanted = false;
+    controls.update();
+    uniforms.focal.value = $("canvas").height / 2 / Math.tan(eye.fov / 2 * Math.PI / 180);
+    renderer.render(world, eye);
+  });
 }
 controls.addEventListener("change", draw);
 
@@ -297,7 +312,7 @@ function buttons(id, entries, act) {
 buttons("modes", data.modes.map((mode) => [mode.name, mode.word]), setMode);
 buttons("views", Object.keys(VIEWS).map((name) => [name, name]), setView);
 $("time").oninput = () => setTime($("time").value);
-$("points").onchange = () => { cloud.visible = $("points").checked; mesh.visible = !cloud.visible; draw(); };
+$("points").onchange = () => { cloud.visible = $("points").checked; mesh.visible = fringe.visible = !cloud.visible; draw(); };
 $("guesses").onchange = () => { uniforms.guesses.value = $("guesses").checked; draw(); };
 $("cameras").onchange = () => { cameras.visible = $("cameras").checked; draw(); };
 $("paths").onchange = () => { paths.visible = $("paths").checked; draw(); };
@@ -345,7 +360,7 @@ else setTime(0);
 await setMode(data.modes.some((one) => one.name === mode) ? mode : data.modes[0].name);
 $("message").textContent = "";
 document.body.dataset.ready = "yes";
-window.soupView = { setMode, setTime, setView, setFar, modes: data.modes.map((one) => one.name), renderer };
+window.soupView = { setMode, setTime, setView, setFar, eye, modes: data.modes.map((one) => one.name) };
 })().catch((error) => {
   document.getElementById("message").textContent = `The 3D view failed: ${error.message}`;
   throw error;

@@ -1,0 +1,142 @@
+"""report.html in a real browser: it loads, draws, moves and recolours."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from helpers_chromium import Chromium, file_address, find_chromium
+
+from soup_nlp.report.folder import summary
+from soup_nlp.report.page import MODES, page
+from soup_nlp.report.pictures import pictures
+from soup_nlp.report.shown import of_run
+
+CHROMIUM = find_chromium()
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the PATH (Debian: chromium)"),
+]
+BACKGROUND = (0x20, 0x26, 0x2E)
+
+
+@pytest.fixture(scope="module")
+def browser(small_run, tmp_path_factory):
+    shown = of_run(small_run, summary(small_run), "verdict")
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    path.write_text(page(shown, pictures(shown)), encoding="utf-8")
+    assert CHROMIUM is not None
+    chromium = Chromium(CHROMIUM, 1000, 800)
+    chromium.open(file_address(path))
+    yield chromium
+    chromium.close()
+
+
+def canvas(browser):
+    """What the 3D view shows, without what lies over it, as floats."""
+    browser.value("document.querySelector('.hint').style.visibility = 'hidden'")
+    box = browser.value(
+        "(() => { const r = document.getElementById('canvas').getBoundingClientRect();"
+        " return [r.left, r.top, r.width, r.height].map(Math.round); })()"
+    )
+    x, y, width, height = box
+    return browser.screenshot()[y : y + height, x : x + width].astype(float)
+
+
+def drawn(image):
+    """Share of the pixels that are not background."""
+    return float((np.abs(image - BACKGROUND).max(axis=2) > 8).mean())
+
+
+def apart(a, b):
+    """Share of the pixels that differ."""
+    return float((np.abs(a - b).max(axis=2) > 8).mean())
+
+
+def test_it_loads_without_an_error_and_fetches_nothing(browser):
+    assert browser.value("document.body.dataset.ready") == "yes"
+    assert browser.value("document.getElementById('message').textContent") == ""
+    assert drawn(canvas(browser)) > 0.2
+    assert [r for r in browser.requests if not r.startswith("file:")] == []
+    assert len(browser.requests) == 1
+    assert browser.log == []
+
+
+def test_a_console_error_would_be_seen(browser):
+    browser.value("console.error('planted')")
+    browser.value("setTimeout(() => { throw new Error('thrown'); })")
+    browser.value("new Promise(done => setTimeout(done, 20))")
+    assert "planted" in browser.log[0]
+    assert "thrown" in browser.log[1]
+    browser.log.clear()
+
+
+def test_the_view_of_the_reference_camera_is_the_reference_image(browser, small_run):
+    browser.value("soupView.setMode('image_ref'); soupView.setTime(0); soupView.setFar(1e9)")
+    browser.value("soupView.setView('reference')")
+    browser.value("document.getElementById('cameras').click()")
+    browser.value("document.getElementById('paths').click()")
+    found = canvas(browser)
+    height, width = found.shape[:2]
+    K, image = small_run.pair.K_ref, small_run.pair.image_ref
+    # the view's focal length in pixels of the canvas; it looks along the axis of the camera
+    focal = height / 2 / np.tan(np.radians(browser.value("soupView.eye.fov")) / 2)
+    M = np.array([
+        [focal / K[0, 0], 0, width / 2 - 0.5 - focal * K[0, 2] / K[0, 0]],
+        [0, focal / K[1, 1], height / 2 - 0.5 - focal * K[1, 2] / K[1, 1]],
+    ])  # fmt: skip
+    want = cv2.warpAffine(image, M, (width, height)).astype(float)
+    inside = cv2.warpAffine(np.ones(image.shape[:2]), M, (width, height)) > 0.999
+    whole = inside & (np.abs(found - BACKGROUND).max(axis=2) > 8)
+    # no holes, not even where the surface is cut
+    assert whole.sum() > 0.98 * inside.sum()
+    gap = np.abs(found - want).max(axis=2)[whole]
+    # JPEG at quality 90 and two ways of interpolating
+    assert np.median(gap) < 6
+    assert (gap > 40).mean() < 0.03
+
+
+def test_time_moves_the_scene(browser):
+    browser.value("soupView.setMode('image_ref'); soupView.setView('aside')")
+    images = []
+    for time in (0, 0.5, 1, 0):
+        browser.value(f"soupView.setTime({time})")
+        images.append(canvas(browser))
+    start, middle, end, again = images
+    assert apart(start, end) > 0.01
+    assert apart(start, middle) > 0.003
+    assert apart(middle, end) > 0.003
+    np.testing.assert_array_equal(start, again)
+    # the background rests
+    assert apart(start, end) < 0.5
+
+
+def test_every_mode_has_its_own_colours_and_legend(browser):
+    assert browser.value("soupView.modes") == list(MODES)
+    images = {}
+    for name in MODES:
+        browser.value(f"soupView.setMode('{name}')")
+        images[name] = canvas(browser)
+        assert drawn(images[name]) > 0.2, name
+        pressed = browser.value("document.querySelector('#modes .on').value")
+        assert pressed == name
+        legend = browser.value("document.getElementById('mode-legend').innerHTML")
+        assert bool(legend) == (name not in ("image_ref", "superpixels"))
+    names = list(images)
+    for k, a in enumerate(names):
+        for b in names[k + 1 :]:
+            assert apart(images[a], images[b]) > 0.01, (a, b)
+
+
+def test_switches(browser):
+    browser.value("soupView.setMode('image_ref'); soupView.setTime(1)")
+    before = canvas(browser)
+    for name in ("points", "cameras", "still"):
+        browser.value(f"document.getElementById('{name}').click()")
+        after = canvas(browser)
+        assert apart(before, after) > 0.001, name
+        browser.value(f"document.getElementById('{name}').click()")
+        np.testing.assert_array_equal(canvas(browser), before)
+    browser.value("soupView.setFar(0.01)")
+    assert drawn(canvas(browser)) < 0.01
+    assert browser.log == []
