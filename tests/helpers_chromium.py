@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import select
 import shutil
 import subprocess
 import tempfile
@@ -22,6 +23,9 @@ FLAGS = (
     "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
     "--remote-debugging-pipe", "--force-device-scale-factor=1",
 )  # fmt: skip
+
+SILENCE = 120
+"""Seconds after which a browser that does not answer is taken to be stuck."""
 
 
 def find_chromium() -> str | None:
@@ -116,17 +120,20 @@ class Chromium:
 
     def close(self) -> None:
         """End the browser."""
-        self.write.close()
+        self.process.terminate()
         try:
             self.process.wait(10)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
+        self.write.close()
         self.read.close()
         self.folder.cleanup()
 
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self.buffer:
+            if not select.select([self.read], [], [], SILENCE)[0]:
+                raise TimeoutError(f"the browser says nothing for {SILENCE} s: {self.log}")
             piece = self.read.read(1 << 16)
             if not piece:
                 raise RuntimeError("the browser has ended")

@@ -99,7 +99,7 @@ const VERTEX = `
     vec4 seenAt = modelViewMatrix * vec4(at, 1.0);
     gl_Position = projectionMatrix * seenAt;
     /* a point is as large as its pixel */
-    gl_PointSize = clamp(depth * pixel * focal / max(-seenAt.z, 1e-6 * depth), 1.0, 24.0);
+    gl_PointSize = clamp(depth * pixel * focal / max(-seenAt.z, 1e-6 * depth), 1.0, 8.0);
   }`;
 const FRAGMENT = `
   precision highp float;
