@@ -1,0 +1,215 @@
+"""Kill commands at random times and look at what is left: `python tests/kill_table.py --kills 60`.
+
+Every command first runs undisturbed. Then it runs again and again and gets a signal: half of the
+times at any moment, half of the times while its files are being written. Afterwards the folder
+must hold the old result or the new one, whole, and one more run must leave no temporary files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import load_problem
+from soup_nlp.export.names import readable_names
+from soup_nlp.export.sol import write_sol
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.storage.folders import recover
+from soup_nlp.storage.mark import digest_of, made
+
+TINY = [
+    "input.width=64", "input.height=48", "flow.source=truth", "segmentation.superpixels=12",
+    "segmentation.neighbours=4", "refine.rounds=1", "refine.particles=6", "output.page=false",
+]  # fmt: skip
+SIGNALS: Mapping[str, Sequence[int]] = {
+    "SIGKILL": [signal.SIGKILL],
+    "SIGTERM": [signal.SIGTERM],
+    "SIGINT": [signal.SIGINT],
+    "2 SIGINT": [signal.SIGINT, signal.SIGINT],
+}
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command line and the folder that it writes."""
+
+    name: str
+    words: list[str]
+    folder: Path
+
+
+def commands(root: Path, names: Sequence[str]) -> list[Command]:
+    """The commands of the table."""
+    overrides = [word for text in TINY for word in ("--set", text)]
+    export = ["export", "orbit", "-q", *overrides]
+    out = {name: root / name for name in ("solve", "export", "import", "compare", "bench")}
+    words = {
+        "solve": ["solve", "orbit", "-q", *overrides, "--out", str(out["solve"])],
+        "export": [*export, "--out", str(out["export"])],
+        "import": ["import", str(root / "exported"), str(root / "a.sol"), "-o", str(out["import"])],
+        "compare": f"compare orbit --solvers ipopt --seconds 20 -o {out['compare']}".split()
+        + overrides,
+        "bench": "bench accuracy --suite rendered --only orbit --only room --flow truth --width 64"
+        f" --workers 2 -q -o {out['bench']}".split()
+        + overrides[4:],
+    }
+    if "import" in names:
+        run([*export, "--no-presolve", "--out", str(root / "exported")])
+        problem = load_problem(root / "exported" / "problem.yaml")
+        case = prepare(problem)
+        nlp, layout = case.nlp(case.formulation(hessian="exact", compiled=False))
+        orders = []
+        for suffix, own in zip((".col", ".row"), readable_names(nlp, layout)):
+            place = {name: k for k, name in enumerate(own)}
+            lines = (root / "exported" / "soup").with_suffix(suffix).read_text().split()
+            orders.append([place[line] for line in lines[: len(own)]])
+        import numpy as np
+
+        write_sol(root / "a.sol", nlp.x0, None, *map(np.array, orders))
+    return [Command(name, words[name], out[name]) for name in names]
+
+
+def start(words: Sequence[str]) -> int:
+    """Run a command in a process and session of its own."""
+    sys.stdout.flush()
+    pid = os.fork()
+    if pid:
+        return pid
+    os.setsid()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with open(os.devnull, "w") as nothing:
+        os.dup2(nothing.fileno(), 1)
+        os.dup2(nothing.fileno(), 2)
+    code = 99
+    with contextlib.suppress(BaseException):
+        code = main(list(words))
+    os._exit(code)
+
+
+def run(words: Sequence[str]) -> tuple[int, float]:
+    """Exit code and seconds of an undisturbed run."""
+    begin = time.perf_counter()
+    _, status = os.waitpid(start(words), 0)
+    return os.waitstatus_to_exitcode(status), time.perf_counter() - begin
+
+
+def busy(folder: Path) -> bool:
+    """Whether files are being written for a folder."""
+    places = [folder.parent, folder] if folder.is_dir() else [folder.parent]
+    return any(".soup_nlp-" in name for place in places for name in os.listdir(place))
+
+
+def disturbed(command: Command, numbers: Sequence[int], delay: float, writing: bool) -> str:
+    """Run a command and send signals after a delay, which begins with the writing if asked."""
+    with contextlib.suppress(OSError):
+        # rows that are stored are not measured again
+        for path in command.folder.glob("*.jsonl"):
+            path.unlink()
+    left = busy(command.folder)
+    pid = start(command.words)
+    begin = time.perf_counter()
+    ended = False
+    while writing and not ended and (left or not busy(command.folder)):
+        left = left and busy(command.folder)
+        ended = os.waitpid(pid, os.WNOHANG)[0] != 0
+        time.sleep(0.0005)
+        if time.perf_counter() - begin > 300:
+            break
+    time.sleep(delay)
+    for number in numbers:
+        with contextlib.suppress(ProcessLookupError):
+            if not ended:
+                os.kill(pid, number)
+        time.sleep(0.02)
+    if ended:
+        return "ended before"
+    _, status = os.waitpid(pid, 0)
+    code = os.waitstatus_to_exitcode(status)
+    return signal.Signals(-code).name if code < 0 else f"exit {code}"
+
+
+def broken(folder: Path) -> list[str]:
+    """Files of a folder's list that are missing or are not the listed ones."""
+    if not folder.is_dir():
+        return []
+    recover(folder)
+    listed = made(folder) or {}
+    wrong = [
+        n for n, d in listed.items() if not (folder / n).is_file() or digest_of(folder / n) != d
+    ]
+    others = {p.name for p in folder.iterdir() if not p.name.startswith(".soup_nlp")}
+    rows = {name for name in others if name.endswith(".jsonl")}
+    return wrong + sorted(others - listed.keys() - rows)
+
+
+def orphans(session: int) -> int:
+    """Processes of a session that are still there."""
+    count = 0
+    for place in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            fields = place.read_text().rpartition(")")[2].split()
+            count += int(fields[3]) == session and fields[0] != "Z"
+    return count
+
+
+def table(kills: int, names: Sequence[str], seed: int = 0) -> list[dict[str, object]]:
+    """One row per kill, and one per command for the run after all of its kills."""
+    rng, rows = random.Random(seed), []
+    with tempfile.TemporaryDirectory() as place:
+        root = Path(place)
+        (root / "tmp").mkdir()
+        os.environ["TMPDIR"] = tempfile.tempdir = str(root / "tmp")
+        every = commands(root, names)
+        try:
+            for command in every:
+                _, seconds = run(command.words)
+                share = kills // len(every) + (command is every[0]) * (kills % len(every))
+                for k in range(share):
+                    word = list(SIGNALS)[k % len(SIGNALS)]
+                    writing = k % 8 >= 4
+                    delay = rng.uniform(0, 0.15 if writing else seconds)
+                    how = disturbed(command, SIGNALS[word], delay, writing)
+                    time.sleep(0.3)
+                    when = f"writing + {delay:.3f} s" if writing else f"{delay:.2f} s"
+                    row = {"command": command.name, "signal": word, "when": when, "ended": how}
+                    rows.append(row | {"broken": broken(command.folder)})
+                    print(json.dumps(rows[-1]), flush=True)
+                code, _ = run(command.words)
+                names_left = [n for p in (root, command.folder) for n in os.listdir(p)]
+                names_left = [n for n in names_left if ".soup_nlp-" in n] + os.listdir(root / "tmp")
+                row = {
+                    "command": command.name,
+                    "signal": "none",
+                    "when": "",
+                    "ended": f"exit {code}",
+                }
+                rows.append(row | {"broken": broken(command.folder), "left": names_left})
+                print(json.dumps(rows[-1]), flush=True)
+        finally:
+            tempfile.tempdir = None
+            del os.environ["TMPDIR"]
+    return rows
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=60)
+    parser.add_argument("--only", default="solve,export,import,compare,bench")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    found = table(options.kills, options.only.split(","), options.seed)
+    bad = [row for row in found if row["broken"] or row.get("left")]
+    done = sum(row["signal"] != "none" for row in found)
+    print(f"{done} kills, {len(bad)} folders that are not whole or hold temporary files")
+    sys.exit(bool(bad))

@@ -1,0 +1,78 @@
+"""A full disk: an error, no crash, no temporary file, and the earlier result stays whole."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from soup_nlp.errors import DataError
+from soup_nlp.storage.folders import staged
+from soup_nlp.storage.mark import digest_of, made
+from soup_nlp.storage.store import Array, write_h5, write_json
+
+
+@pytest.fixture
+def small_disk(tmp_path) -> Iterator[Path]:
+    """A file system of 1 MB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(place)]
+    try:
+        done = subprocess.run(words, capture_output=True, check=False)
+    except OSError:
+        pytest.skip("there is no command mount")
+    if done.returncode:
+        pytest.skip("file systems cannot be mounted here")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", str(place)], check=True)
+
+
+def write(folder: Path, size: int) -> None:
+    """A result with an array of so many bytes that do not compress."""
+    with staged(folder, whole=True) as new:
+        write_json(new / "summary.json", {"size": size})
+        values = np.random.default_rng(0).integers(0, 255, size, np.uint8)
+        write_h5(new / "result.h5", {"x": Array(values, "1", "")}, {})
+
+
+def whole(folder: Path) -> bool:
+    listed = made(folder)
+    return bool(listed) and all(digest_of(folder / n) == d for n, d in listed.items())
+
+
+@pytest.mark.parametrize("below", ["", "out"])
+def test_an_earlier_result_outlives_a_full_disk(below, small_disk):
+    """At the root of the file system, where folders cannot be exchanged, and below it."""
+    target = small_disk / below
+    for size, fits in ((300_000, True), (900_000, False), (400_000, True), (5_000_000, False)):
+        before = (target / "summary.json").read_bytes() if target.is_dir() and made(target) else b""
+        if fits:
+            write(target, size)
+        else:
+            with pytest.raises(DataError, match="cannot be written"):
+                write(target, size)
+            assert (target / "summary.json").read_bytes() == before
+        assert whole(target)
+        assert set(os.listdir(target)) == {".soup_nlp", "summary.json", "result.h5"}
+        assert len(os.listdir(small_disk)) == (1 if below else 3)
+
+
+def test_a_disk_without_any_room(small_disk):
+    write(small_disk / "out", 300_000)
+    with pytest.raises(OSError, match="space"), (small_disk / "ballast").open("wb") as file:
+        file.write(bytes(2_000_000))
+    for _ in range(2):
+        with pytest.raises(DataError, match="cannot be written"):
+            write(small_disk / "out", 100_000)
+    assert whole(small_disk / "out")
+    (small_disk / "ballast").unlink()
+    write(small_disk / "out", 100_000)
+    assert whole(small_disk / "out")
+    assert os.listdir(small_disk) == ["out"]
