@@ -110,33 +110,36 @@ def busy(folder: Path) -> bool:
     return any(".soup_nlp-" in name for place in places for name in os.listdir(place))
 
 
-def disturbed(command: Command, numbers: Sequence[int], delay: float, writing: bool) -> str:
-    """Run a command and send signals after a delay, which begins with the writing if asked."""
-    with contextlib.suppress(OSError):
+def disturbed(
+    command: Command, numbers: Sequence[int], delay: float, writing: bool
+) -> tuple[str, float]:
+    """Run a command and send signals after a delay, which begins with the writing if asked.
+
+    Returns:
+        How it ended, "before" where that was before the first signal; the seconds that it ran.
+    """
+    for path in command.folder.glob("*.jsonl"):
         # rows that are stored are not measured again
-        for path in command.folder.glob("*.jsonl"):
-            path.unlink()
-    left = busy(command.folder)
+        path.unlink()
+    stale = busy(command.folder)
     pid = start(command.words)
     begin = time.perf_counter()
-    ended = False
-    while writing and not ended and (left or not busy(command.folder)):
-        left = left and busy(command.folder)
-        ended = os.waitpid(pid, os.WNOHANG)[0] != 0
+    waiting, until = writing, begin + delay
+    while waiting or time.perf_counter() < until:
         time.sleep(0.0005)
-        if time.perf_counter() - begin > 300:
-            break
-    time.sleep(delay)
+        now = busy(command.folder)
+        stale = stale and now
+        if waiting and now and not stale:
+            waiting, until = False, time.perf_counter() + delay
+        if os.waitpid(pid, os.WNOHANG)[0]:
+            return "before", time.perf_counter() - begin
     for number in numbers:
-        with contextlib.suppress(ProcessLookupError):
-            if not ended:
-                os.kill(pid, number)
+        os.kill(pid, number)
         time.sleep(0.02)
-    if ended:
-        return "ended before"
     _, status = os.waitpid(pid, 0)
     code = os.waitstatus_to_exitcode(status)
-    return signal.Signals(-code).name if code < 0 else f"exit {code}"
+    spent = time.perf_counter() - begin
+    return signal.Signals(-code).name if code < 0 else f"exit {code}", spent
 
 
 def broken(folder: Path) -> list[str]:
@@ -151,16 +154,6 @@ def broken(folder: Path) -> list[str]:
     others = {p.name for p in folder.iterdir() if not p.name.startswith(".soup_nlp")}
     rows = {name for name in others if name.endswith(".jsonl")}
     return wrong + sorted(others - listed.keys() - rows)
-
-
-def orphans(session: int) -> int:
-    """Processes of a session that are still there."""
-    count = 0
-    for place in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError, ValueError, IndexError):
-            fields = place.read_text().rpartition(")")[2].split()
-            count += int(fields[3]) == session and fields[0] != "Z"
-    return count
 
 
 def table(kills: int, names: Sequence[str], seed: int = 0) -> list[dict[str, object]]:
@@ -178,8 +171,11 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> list[dict[str, obj
                 for k in range(share):
                     word = list(SIGNALS)[k % len(SIGNALS)]
                     writing = k % 8 >= 4
-                    delay = rng.uniform(0, 0.15 if writing else seconds)
-                    how = disturbed(command, SIGNALS[word], delay, writing)
+                    how = "before"
+                    while how == "before":
+                        delay = rng.uniform(0, 0.1 if writing else seconds)
+                        how, spent = disturbed(command, SIGNALS[word], delay, writing)
+                        seconds = spent if how == "before" and not writing else seconds
                     time.sleep(0.3)
                     when = f"writing + {delay:.3f} s" if writing else f"{delay:.2f} s"
                     row = {"command": command.name, "signal": word, "when": when, "ended": how}
