@@ -10,6 +10,7 @@ from soup_nlp.cli.options import Out, Overwrite, Quiet
 from soup_nlp.cli.progress import SolveLog
 from soup_nlp.cli.solve import solve_problem
 from soup_nlp.config.problem import load_problem
+from soup_nlp.report.shown import PAGE
 
 PAIRS = {
     "motorcycle": "a real pair, rigid: here one rigid motion for the whole image is as good",
@@ -26,6 +27,6 @@ def demo(out: Out = Path("out/demo"), overwrite: Overwrite = False, quiet: Quiet
         problem = load_problem(name)
         log, limit = SolveLog(quiet, problem=problem), problem.expected.mre_at_most
         codes.append(solve_problem(problem, out / name, log, limit, overwrite=overwrite))
-    pictures = " and ".join(str(out / name / "overview.png") for name in PAIRS)
-    print(f"\nlook at    {pictures}")
+    pages = " and ".join(str(out / name / PAGE) for name in PAIRS)
+    print(f"\nopen        {pages} in a browser")
     raise typer.Exit(max(codes))
