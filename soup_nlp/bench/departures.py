@@ -72,7 +72,7 @@ _SHARED = {"start.method": "shared"}
 DEPARTURES = (
     Departure(
         "start: shared motions, scales by contact",
-        ("start.method", "start.samples", "start.threshold_px"),
+        ("start.method", "start.samples", "start.threshold_px", "start.ground"),
     ),
     Departure(
         "pixel units, their weights and smoothing",
@@ -113,6 +113,8 @@ DEPARTURES = (
     Departure("prior on relief", ("energy.weights.prior",)),
     Departure("borders that follow the flow", ("segmentation.follow_flow_px",)),
     Departure("confidence of the flow", ("flow.dis.tau", "flow.dis.limit")),
+    Departure("flow seen through reflections", ("flow.see_through",)),
+    Departure("large images at a working size", ("max_size",)),
     Departure(
         "samples of pixels and boundaries",
         (),

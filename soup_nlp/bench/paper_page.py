@@ -11,6 +11,7 @@ import numpy as np
 from soup_nlp.bench import paper_figures as figures
 from soup_nlp.bench.departures import DEPARTURES
 from soup_nlp.bench.paper_plan import (
+    ALL,
     DATASETS,
     METHODS,
     SECTIONS,
@@ -70,15 +71,16 @@ def write_page(out: Path, results: Results, command: str) -> Path:
         results: Rows that are there.
         command: How the page is made.
     """
+    chosen = results.plan.sizes.sections
     sections = [
         _head(results, command),
         _comparison(out, results),
         _pictures(out, results),
-        *(_section(out, results, name) for name in SECTIONS),
+        *(_section(out, results, name) for name in SECTIONS if name in chosen),
         _convergence(out, results),
         _time(results),
-        _departures(out, results),
-        _scale(out, results),
+        _departures(out, results) if "departures" in chosen else [],
+        _scale(out, results) if "scale" in chosen else [],
         _missing(results),
         failures([*results.rows, *results.scales]),
     ]
@@ -380,6 +382,8 @@ def _scale(out: Path, r: Results) -> list[str]:
 def _missing(r: Results) -> list[str]:
     entries = [[d.title, source_of(d)] for d in DATASETS if not r.plan.datasets[d.name]]
     entries += [[name, text] for name, text in WITHOUT_TRUTH.items()]
+    left = [name for name in ALL if name not in r.plan.sizes.sections]
+    entries += [[f"section {name}", "left out of this run (`--sections`)"] for name in left]
     return ["## What is not here", "", *table(["data", "why, and where from"], entries), ""]
 
 

@@ -65,6 +65,21 @@ WITHOUT_TRUTH = {
 """What the paper has and no row can be made of, and why."""
 
 
+SECTIONS: Mapping[str, str] = MappingProxyType(
+    {
+        "terms": "terms of the energy",
+        "superpixels": "number of superpixels",
+        "neighbours": "K of the K-NN graph",
+        "pattern": "superpixels",
+        "flow": "flow",
+        "stages": "stages",
+    }
+)
+"""Sections of one change at a time, with the label of their axis."""
+ALL = (*SECTIONS, "departures", "scale")
+"""Sections that can be left out."""
+
+
 @dataclass(frozen=True)
 class Sizes:
     """How large the benchmark is.
@@ -79,6 +94,7 @@ class Sizes:
         seeds: Seeds of rendered scenes for the scales of bodies.
         families: Pairs of the analyses: names of rendered scenes, of datasets, or motorcycle.
         overrides: Of every problem.
+        sections: What is measured beside the comparison, of ALL.
     """
 
     superpixels: int = 1000
@@ -90,6 +106,7 @@ class Sizes:
     seeds: tuple[int, ...] = (0, 1, 2)
     families: tuple[str, ...] = ("street", "room", "motorcycle", "kitti", "kinect_paper")
     overrides: Overrides = ()
+    sections: tuple[str, ...] = ALL
 
 
 @dataclass(frozen=True)
@@ -183,12 +200,13 @@ class Plan:
         compared = self.compared()
         cells = {c.key: c for c in compared}
         pictures = set(cells)
-        for section in SECTIONS:
+        wanted = self.sizes.sections
+        for section in [name for name in SECTIONS if name in wanted]:
             for item in self.items(section):
                 for method in METHODS:
                     for cell in self.variants(section, item, method).values():
                         cells.setdefault(cell.key, cell)
-        for item in self.analyses:
+        for item in self.analyses if "departures" in wanted else ():
             for pair in self.departures(item).values():
                 cells.update({c.key: c for c in pair if c is not None and c.key not in cells})
         place: dict[str, int] = {}
@@ -200,6 +218,8 @@ class Plan:
     def scale_jobs(self) -> list[Job]:
         """Energies over the scale of moving bodies; nothing is solved."""
         own = (f"segmentation.superpixels={SCALE_SUPERPIXELS}",)
+        if "scale" not in self.sizes.sections:
+            return []
         return [
             Job(
                 head(i, own, "scale of one body"),
@@ -207,19 +227,6 @@ class Plan:
             )
             for i in self.scenes
         ]
-
-
-SECTIONS: Mapping[str, str] = MappingProxyType(
-    {
-        "terms": "terms of the energy",
-        "superpixels": "number of superpixels",
-        "neighbours": "K of the K-NN graph",
-        "pattern": "superpixels",
-        "flow": "flow",
-        "stages": "stages",
-    }
-)
-"""Sections of one change at a time, with the label of their axis."""
 
 
 def _changes(section: str, method: str, s: Sizes) -> dict[str, Overrides]:

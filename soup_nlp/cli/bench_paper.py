@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from soup_nlp.bench.paper_page import Results, complete, write_page
-from soup_nlp.bench.paper_plan import DATASETS, Sizes, make_plan
+from soup_nlp.bench.paper_plan import ALL, DATASETS, Sizes, make_plan
 from soup_nlp.bench.rows import measure_all
 from soup_nlp.bench.suite_pairs import RENDERED
 from soup_nlp.cli import options
@@ -40,6 +40,10 @@ def paper(
     ),
     width: options.Width = 1024,
     seeds: options.Seeds = "0,1,2",
+    sections: Annotated[
+        str,
+        typer.Option("--sections", help=f"Of {', '.join(ALL)}; the comparison is always there."),
+    ] = ",".join(ALL),
     overrides: options.Set = None,
     workers: options.Workers = 1,
     any_code: options.AnyCode = False,
@@ -56,9 +60,11 @@ def paper(
         seeds=tuple(numbers(seeds, "--seeds")),
         families=tuple(words(families, "--families", FAMILIES)),
         overrides=tuple(overrides or ()),
+        sections=tuple(words(sections, "--sections", list(ALL))),
     )
     said = [f"--superpixels {superpixels} --analysis {analysis} --families {families}"]
     said += [f"--numbers {sizes} --neighbours {neighbours} --width {width} --seeds {seeds}"]
+    said += [f"--sections {sections}"] * (sections != ",".join(ALL))
     said += [f"--limit {limit}"] * (limit is not None) + ["--data DIR"] * (data is not None)
     said += [f"--set {shlex.quote(o)}" for o in chosen.overrides]
     prepare_folder(out)

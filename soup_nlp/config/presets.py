@@ -22,6 +22,7 @@ _INF = float("inf")
 PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "paper": {
+            "max_size": None,
             "segmentation": {
                 "superpixels": 1000,
                 "method": "slic",
@@ -29,12 +30,13 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "neighbours": 15,
             },
             # all flow vectors alike
-            "flow": {"reweight_px": None, "dis": {"tau": 1e6, "limit": 1e4}},
+            "flow": {"see_through": False, "reweight_px": None, "dis": {"tau": 1e6, "limit": 1e4}},
             "start": {
                 "method": "homography",
                 "samples": 100,
                 "threshold_px": 0.5,
                 "bending": 1.0,
+                "ground": False,
             },
             "energy": {
                 "units": "paper",
