@@ -336,6 +336,7 @@ def test_a_file_that_cannot_be_written_ends_in_an_error(tmp_path):
     )
     assert done.returncode == 2, done.stderr
     assert "cannot be written" in done.stdout
+    assert f"where: {target / 'r.h5'}\n" in done.stdout
     assert content(target) == {"a": "1"}
     assert os.listdir(tmp_path) == ["out"]
     assert json.loads((target / MARK).read_text())["files"].keys() == {"a"}

@@ -94,6 +94,12 @@ def staged(folder: PathLike, whole: bool = False, overwrite: bool = False) -> It
         yield stage
         with deferred_signals():
             _commit(stage, target, whole, overwrite)
+    except DataError as error:
+        # name the place that the user knows
+        if not isinstance(error.where, Path) or not error.where.is_relative_to(stage):
+            raise
+        place = target / error.where.relative_to(stage)
+        raise DataError(error.what, where=place, found=error.found, hint=error.hint) from error
     except OSError as error:
         raise _unwritable(folder, error) from error
     finally:
