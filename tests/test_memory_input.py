@@ -103,6 +103,13 @@ def test_a_run_saves_itself_and_is_converted(run, tmp_path, capsys):
     assert (out / "colmap" / "sparse" / "0" / "points3D.txt").is_file()
 
 
+def test_a_run_plots_itself(run, tmp_path):
+    figure = run.plot()
+    assert len(figure.axes) >= 9
+    figure.savefig(tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 20_000
+
+
 def test_what_cannot_be_converted_is_refused(run, tmp_path, capsys):
     out, foreign = tmp_path / "out", tmp_path / "foreign"
     run.save(out)

@@ -149,6 +149,10 @@ class Run:
         write = import_module("soup_nlp.report.save").save
         return list(write(self, folder, dump_problem(self.problem), formats, overwrite))
 
+    def plot(self) -> Any:
+        """The overview as a `matplotlib.figure.Figure`: notebooks show it, `.savefig` writes it."""
+        return import_module("soup_nlp.report.save").plot(self)
+
     @property
     def delivered(self) -> str:
         """Origin of `solution.soup`: "constrained NLP", or "presolve" or "start" where these have

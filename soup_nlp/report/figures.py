@@ -36,10 +36,7 @@ def overview_strip(
     columns: int = 3,
     panel_width: float = 4.2,
 ) -> None:
-    """Write a PNG of titled pictures with their legends in a grid, under a title.
-
-    Panels keep their aspect; a row is as high as its highest panel. No global state of matplotlib
-    is touched, so it may run in any thread.
+    """Write `strip_figure` as PNG.
 
     Args:
         path: PNG file to write; its folder must exist.
@@ -50,6 +47,26 @@ def overview_strip(
 
     Raises:
         DataError: the folder cannot be written.
+    """
+    figure = strip_figure(panels, title, columns, panel_width)
+    with atomic_path(path) as temporary:
+        # half the time of the default level, and files a tenth larger
+        figure.savefig(temporary, format="png", dpi=_DPI, pil_kwargs={"compress_level": 3})
+
+
+def strip_figure(
+    panels: Sequence[Picture], title: str, columns: int = 3, panel_width: float = 4.2
+) -> Figure:
+    """Titled pictures with their legends in a grid, under a title.
+
+    Panels keep their aspect; a row is as high as its highest panel. No global state of matplotlib
+    is touched, so it may run in any thread.
+
+    Args:
+        panels: In reading order.
+        title: Above the panels; "" for none.
+        columns: Largest number of panels in a row.
+        panel_width: Width of a panel, inches at 100 dpi.
     """
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
@@ -70,9 +87,7 @@ def overview_strip(
         for k, panel in enumerate(row):
             _draw_panel(figure, panel, _GAP + k * (panel_width + _GAP), top, panel_width)
         top -= row_height + _CAPTION + _GAP
-    with atomic_path(path) as temporary:
-        # half the time of the default level, and files a tenth larger
-        figure.savefig(temporary, format="png", dpi=_DPI, pil_kwargs={"compress_level": 3})
+    return figure
 
 
 def write_picture(path: PathLike, picture: Picture) -> None:
@@ -176,11 +191,16 @@ def overview(path: PathLike, found: Mapping[str, Picture], title: str) -> None:
     Raises:
         DataError: the folder cannot be written.
     """
+    overview_strip(path, without_gaps(found), title)
+
+
+def without_gaps(found: Mapping[str, Picture]) -> list[Picture]:
+    """The pictures of an overview: without the spare ones that would leave a row open."""
     panels = dict(found)
     for name in _SPARE:
         if len(panels) % 3:
             panels.pop(name, None)
-    overview_strip(path, [*panels.values()], title)
+    return [*panels.values()]
 
 
 def write_png(path: PathLike, rgb: Image) -> None:

@@ -6,10 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from soup_nlp.report.folder import prepare_folder, write_folder
+from matplotlib.figure import Figure
+
+from soup_nlp.report.figures import strip_figure, without_gaps
+from soup_nlp.report.folder import prepare_folder, summary, write_folder
 from soup_nlp.report.formats import check_formats, write_formats
+from soup_nlp.report.pictures import pictures
 from soup_nlp.report.record import extended
 from soup_nlp.report.result import read_result
+from soup_nlp.report.shown import of_run
 from soup_nlp.storage.folders import staged
 
 if TYPE_CHECKING:
@@ -44,6 +49,12 @@ def save(
     inputs = [] if in_memory else run.problem.input_paths()
     target = prepare_folder(folder, inputs, overwrite)
     return write_folder(target, run, config, f"{run}\n", formats=names)
+
+
+def plot(run: Run) -> Figure:
+    """The overview of a run as a figure of matplotlib, which a notebook shows."""
+    drawn = pictures(of_run(run, summary(run), ""))
+    return strip_figure(without_gaps(drawn), run.problem.name)
 
 
 def convert(
