@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from helpers_chromium import Chromium, find_chromium
 from helpers_result import CAMERA, small_result
 
 from soup_nlp.cli.main import main
@@ -26,6 +27,7 @@ from soup_nlp.sequence.pairs import SolvedPair
 from soup_nlp.sequence.scales import Link, link, solve_scales
 from soup_nlp.sequence.score import aligned
 from soup_nlp.sequence.tracks import carried, follow, number
+from soup_nlp.sequence.write import write_chain
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
 
@@ -117,6 +119,50 @@ def test_a_chain_has_one_scale_and_one_frame_of_reference():
     np.testing.assert_allclose(chain.motion(1, 0).matrix, np.eye(4), atol=1e-9)
     with pytest.raises(DataError, match="consecutive"):
         make_chain(toy_pairs()[1:])
+
+
+def test_a_chain_is_written(tmp_path):
+    chain = make_chain(toy_pairs())
+    files = write_chain(tmp_path, chain, "toy & co")
+    assert all((tmp_path / name).exists() for name in files if name != "pairs")
+    told = json.loads((tmp_path / "chain.json").read_text())
+    assert told["score"] is None
+    np.testing.assert_allclose([s["scale"] for s in told["scales"]], [1, 2], rtol=1e-9)
+    for k in range(3):
+        path = str(tmp_path / "depth" / f"{k:04d}.png")
+        found = cv2.imread(path, cv2.IMREAD_UNCHANGED) / told["depth_png_scale"]
+        known = np.isfinite(chain.depth(k))
+        np.testing.assert_allclose(
+            found[known], chain.depth(k)[known], atol=0.51 / told["depth_png_scale"]
+        )
+    # the board is one track, whose points are in the cloud
+    assert [t["track"] for t in told["tracks"]] == [1]
+    assert [*told["tracks"][0]["path"]] == ["0", "1", "2"]
+    head = (tmp_path / "points" / "0001.ply").read_bytes().split(b"end_header")[0]
+    assert b"property float track" in head
+    poses = np.loadtxt(tmp_path / "trajectory.tum")
+    np.testing.assert_allclose(poses[1, 1:4], CAMERA.centre, atol=1e-8)
+
+
+def test_the_page_of_a_chain_opens(tmp_path):
+    chromium = find_chromium()
+    if chromium is None:
+        pytest.skip("no Chromium is installed")
+    write_chain(tmp_path, make_chain(toy_pairs()), "toy & co")
+    browser = Chromium(chromium, 1000, 700)
+    try:
+        browser.open((tmp_path / "chain.html").as_uri())
+        assert browser.value("document.querySelector('h1').textContent") == "toy & co"
+        first = browser.screenshot()
+        browser.value("time.value = 2; time.dispatchEvent(new Event('input'))")
+        browser.wait("document.getElementById('depth').naturalWidth == 80")
+        second = browser.screenshot()
+        assert browser.value("document.getElementById('now').textContent") == "frame 2"
+        assert (first != second).mean() > 0.01
+        assert browser.log == []
+        assert [r for r in browser.requests if not r.startswith("file:")] == []
+    finally:
+        browser.close()
 
 
 def test_a_pair_without_parallax_is_bridged():

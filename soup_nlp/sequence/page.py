@@ -167,5 +167,6 @@ play.addEventListener("click", () => {{
   }}, 250);
 }});
 show();
+document.body.dataset.ready = "yes";
 </script></body></html>
 """
