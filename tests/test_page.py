@@ -22,7 +22,7 @@ from soup_nlp.report import scene3d
 from soup_nlp.report.folder import summary, write_folder
 from soup_nlp.report.limits import limits
 from soup_nlp.report.page import MODES, page
-from soup_nlp.report.pictures import pictures
+from soup_nlp.report.pictures import _enlarged, pictures
 from soup_nlp.report.scene3d import make_scene
 from soup_nlp.report.shown import of_run
 
@@ -220,3 +220,15 @@ def test_problem_files_know_the_switch():
     scene = {"kind": "scene", "scene": "room"}
     assert make_problem({"input": scene}).output.page
     assert not make_problem({"input": scene}, ["output.page=false"]).output.page
+
+
+def test_sparse_truth_is_drawn_larger():
+    """Points of a laser on a tenth of the pixels; a dense map stays as it is."""
+    sparse = np.full((9, 9), np.nan)
+    sparse[4, 4] = 2.0
+    grown = _enlarged(sparse)
+    assert (grown[3:6, 3:6] == 2).all()
+    assert np.isfinite(grown).sum() == 9
+    dense = np.ones((9, 9))
+    dense[0, 0] = np.nan
+    np.testing.assert_array_equal(_enlarged(dense), dense)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from soup_nlp.report.colour import (
     ERROR_LIMIT,
@@ -25,6 +26,9 @@ from soup_nlp.report.colour import (
 from soup_nlp.report.shown import Shown
 
 Float = NDArray[np.floating]
+
+DENSE = 0.5
+"""Share of known pixels below which each is drawn larger: points of a laser are hardly seen."""
 
 
 @dataclass(frozen=True)
@@ -169,8 +173,18 @@ def _depths(shown: Shown) -> list[Picture]:
     ]
     if truth is not None:
         title = "true depth; grey = no truth"
-        out.append(Picture("depth_true", title, colourise_depth(truth, near, far), bar))
+        true = colourise_depth(_enlarged(np.where(truth > 0, truth, np.nan)), near, far)
+        out.append(Picture("depth_true", title, true, bar))
     return out
+
+
+def _enlarged(values: Float) -> Float:
+    """Sparse numbers (H, W), NaN where unknown, with every known pixel drawn three pixels wide."""
+    known = np.isfinite(values)
+    if known.mean() > DENSE or not known.any():
+        return values
+    distance, nearest = distance_transform_edt(~known, return_indices=True)
+    return np.where(distance < 1.5, values[tuple(nearest)], np.nan)
 
 
 def _own_scale(shown: Shown, which: str) -> float:
@@ -204,7 +218,7 @@ def _error(shown: Shown) -> list[Picture]:
     texts = tuple(f"{100 * x:.0f} %" for x in np.linspace(0, ERROR_LIMIT, 5))
     bar = Bar(colours, (*texts[:-1], f"\u2265 {texts[-1]}"))
     title = "depth error relative to the truth; grey = no truth"
-    return [Picture("error", title, colourise_error(error), bar)]
+    return [Picture("error", title, colourise_error(_enlarged(error)), bar)]
 
 
 def _sigma(shown: Shown) -> list[Picture]:
