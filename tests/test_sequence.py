@@ -124,7 +124,7 @@ def test_a_chain_has_one_scale_and_one_frame_of_reference():
 def test_a_chain_is_written(tmp_path):
     chain = make_chain(toy_pairs())
     files = write_chain(tmp_path, chain, "toy & co")
-    assert all((tmp_path / name).exists() for name in files if name != "pairs")
+    assert all((tmp_path / name).exists() for name in files)
     told = json.loads((tmp_path / "chain.json").read_text())
     assert told["score"] is None
     np.testing.assert_allclose([s["scale"] for s in told["scales"]], [1, 2], rtol=1e-9)
@@ -264,6 +264,10 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys):
     rows = (tmp_path / "out" / "pairs.jsonl").read_text()
     assert main(call) == 0
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
+    # a file of the user is not overwritten
+    (tmp_path / "out" / "chain.json").write_text("mine")
+    assert main(call) == 2
+    assert (tmp_path / "out" / "chain.json").read_text() == "mine"
 
 
 def test_folders_of_the_user_are_left_alone(tmp_path, capsys):

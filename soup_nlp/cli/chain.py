@@ -23,6 +23,7 @@ from soup_nlp.sequence.frames import (
 from soup_nlp.sequence.pairs import ROWS, solve_pairs
 from soup_nlp.sequence.report import table
 from soup_nlp.sequence.write import write_chain
+from soup_nlp.storage.folders import staged
 
 SCENE = "scene:"
 """Before the name of a rendered scene."""
@@ -65,7 +66,8 @@ def chain(
     pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet))
     done = make_chain(pairs[: len(which)], pairs[len(which) :])
     name = source[0] if len(source) == 1 else f"{source[0]} ..."
-    files = write_chain(out, done, name)
+    with staged(out) as new:
+        files = [*write_chain(new, done, name), "pairs"]
     print(table(done))
     print(f"files       {out}/: " + ", ".join(files))
 

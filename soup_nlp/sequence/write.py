@@ -31,7 +31,7 @@ def write_chain(folder: Path, chain: Chain, name: str) -> list[str]:
     """Write every file of a chain into an existing folder.
 
     Args:
-        folder: The folder, which has the pairs already.
+        folder: The folder.
         chain: The chain.
         name: For titles.
 
@@ -52,8 +52,7 @@ def write_chain(folder: Path, chain: Chain, name: str) -> list[str]:
     pictures = coloured(depths)
     write_video(folder / "depth.mp4", [np.vstack(p) for p in zip(images(chain), pictures)])
     write_text(folder / "chain.html", chain_page(chain, told, images(chain), pictures))
-    files = ["depth", "points", "chain.json", "trajectory.tum", "depth.mp4", "chain.html"]
-    return [*files, "pairs"]
+    return ["depth", "points", "chain.json", "trajectory.tum", "depth.mp4", "chain.html"]
 
 
 def summary(chain: Chain) -> dict[str, Any]:
