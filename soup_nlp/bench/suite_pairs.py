@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.datasets.sintel import DEFAULT_SCENE
+from soup_nlp.storage.files import is_folder
 
 RENDERED = ("street", "room", "sheet", "orbit", "still")
 KITTI_PRESETS = ("kitti", "eigen80", "best")
@@ -153,7 +154,7 @@ def shared(root: Path, o: Options) -> Iterator[Entry]:
 
 def sintel(root: Path, o: Options) -> Iterator[Entry]:
     """Pairs of the five sequences."""
-    base = root / "training" if (root / "training").is_dir() else root
+    base = root / "training" if is_folder(root / "training") else root
     for scene, frames in SINTEL_FRAMES.items():
         # the paper says 120 pairs of these five, not which: 24 each, evenly spaced
         for frame in spread(frames - 1, 24, 1):
@@ -168,7 +169,7 @@ def sintel(root: Path, o: Options) -> Iterator[Entry]:
 
 def kitti(kind: str, camera: str, count: int, root: Path, o: Options) -> Iterator[Entry]:
     """Training pairs of KITTI 2012 or 2015."""
-    base = root / "training" if (root / "training").is_dir() else root
+    base = root / "training" if is_folder(root / "training") else root
     for index in (f"{k:06d}" for k in range(count)):
         needs = tuple(base / camera / f"{index}_{frame}.png" for frame in (10, 11))
         yield Entry(kind, index, {"kind": kind, "root": str(root), "index": index}, needs)
@@ -176,7 +177,7 @@ def kitti(kind: str, camera: str, count: int, root: Path, o: Options) -> Iterato
 
 def vkitti(root: Path, o: Options) -> Iterator[Entry]:
     """Morning pairs of the four worlds, in version 1 or 2."""
-    second = (root / "Scene01").is_dir() or (root / "Scene02").is_dir()
+    second = is_folder(root / "Scene01") or is_folder(root / "Scene02")
     parts = sorted(root.glob("vkitti_*_rgb")) or [root / "vkitti_1.3.1_rgb"]
     raw = {"kind": "vkitti2" if second else "vkitti1", "root": str(root), "variation": "morning"}
     for world, frames in VKITTI_FRAMES.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -11,6 +12,7 @@ from types import MappingProxyType
 from soup_nlp.bench import suite_pairs as pairs
 from soup_nlp.bench.suite_pairs import KITTI_PRESETS, RENDERED, Entry, Item, Options, spread
 from soup_nlp.errors import DataError
+from soup_nlp.storage.files import as_path, is_file, is_folder
 
 _KINECT_LAYOUT = (
     "pair_NNN/ with frame_0.png, frame_1.png, K.txt and points.npz (uv_0 in pixels, xyz_mm_0) or"
@@ -170,25 +172,25 @@ def list_suite(name: str, data: Path | None = None, options: Options | None = No
     if name not in SUITES:
         raise DataError("unknown suite", found=repr(name), expected=", ".join(SUITES))
     suite, o = SUITES[name], options or Options()
-    root = (data or Path()).expanduser().resolve()
+    root = Path(os.path.realpath(as_path(data or Path(), "data folder", home=True)))
     listed: list[Item] = []
     for folder in suite.folders:
-        listed = list(suite.items((root / folder).resolve(), o))
-        here = [i for i in listed if all(f.is_file() for f in i.needs)]
+        listed = list(suite.items(Path(os.path.realpath(root / folder)), o))
+        here = [i for i in listed if all(is_file(f) for f in i.needs)]
         if any(i.needs for i in here) or (here and not suite.layout):
             names = _names(here)
             kept = names if o.limit is None else [names[k] for k in spread(len(names), o.limit)]
             items = tuple(i for i in here if i.name in kept)
             missing = len(_names(listed)) - len(names)
             return Listing(suite, items, len(names) - len(kept), missing)
-    if o.only and not listed and (not suite.layout or root.is_dir()):
+    if o.only and not listed and (not suite.layout or is_folder(root)):
         raise DataError(
             "no pair of the suite has such a name", where=f"suite {name}", found=", ".join(o.only)
         )
     raise DataError(
         f"suite {name} ({suite.text}) has no pair in the folder",
         where=data or "--data was not given",
-        found="no folder" if not root.is_dir() else "none of its images",
+        found="no folder" if not is_folder(root) else "none of its images",
         expected=suite.layout,
         hint=f"get it from {suite.source}, lay it out so, and give its root as --data",
     )

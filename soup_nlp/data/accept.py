@@ -75,7 +75,7 @@ def camera_of(given: CameraLike, where: str) -> Float:
         return read_intrinsics(Path(given))
     try:
         four = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return check_intrinsics(given, where)
     return check_intrinsics(intrinsics(*four) if four.shape == (4,) else given, where)
 

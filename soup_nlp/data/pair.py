@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.data.accept import CameraLike, FlowLike, ImageLike, camera_of, flow_of, image_of
-from soup_nlp.errors import DataError, printable, repr_of
+from soup_nlp.errors import DataError, expect, printable, repr_of
 
 Float = NDArray[np.float64]
 
@@ -153,8 +153,15 @@ class Truth:
             value = getattr(self, name)
             if value is None:
                 continue
-            made = np.asarray(value) if isinstance(value, np.ndarray | list | tuple) else None
-            if made is None or made.dtype.kind not in kinds or made.ndim < 2:
+            try:
+                made = np.asarray(value)
+            except (TypeError, ValueError, OverflowError):
+                made = np.empty(0, object)
+            axes = _SHAPES[name].strip("()").split(", ")
+            fits = len(made.shape) == len(axes) and all(
+                str(size) == axis for size, axis in zip(made.shape, axes) if axis.isdigit()
+            )
+            if made.dtype.kind not in kinds or not fits:
                 raise DataError(
                     "part of the truth is no array of its kind",
                     where=f"truth.{name}",
@@ -219,6 +226,7 @@ class Pair:
         ) -> None: ...
 
     def __post_init__(self) -> None:
+        expect(self.name, str, "name of the pair", "text")
         for what in ("image_ref", "image_next"):
             object.__setattr__(self, what, image_of(getattr(self, what), what))
         if self.K_next is None:

@@ -125,7 +125,9 @@ def evaluate(
             "unknown scale rule", found=repr_of(scale), expected=", ".join(get_args(Scale))
         )
     tree = read_h5(as_path(folder, "result folder") / "result.h5")
-    depths = {k: require(tree, f"depth/{v}") for k, v in DEPTHS.items() if v in tree["depth"]}
+    depths = {
+        k: require(tree, f"depth/{v}") for k, v in DEPTHS.items() if v in tree.get("depth", {})
+    }
     gt = read_depth(depth, depth_scale)
     expected = require(tree, "depth/ref").shape
     if gt.shape != expected:

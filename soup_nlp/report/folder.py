@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -25,6 +26,7 @@ from soup_nlp.report.tree import attributes, result_tree
 from soup_nlp.report.verdict import facts
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.store import write_h5, write_json
 from soup_nlp.storage.versions import versions
@@ -114,8 +116,9 @@ def prepare_folder(
     Raises:
         DataError: it cannot be written, or holds what is not to be overwritten.
     """
+    folder = as_path(folder, "output folder")
     if inputs is not None:
-        _keep_inputs(Path(folder), inputs)
+        _keep_inputs(folder, inputs)
     return claim(folder, (*FILES, *FULL.values(), FAILED), overwrite)
 
 
@@ -127,13 +130,15 @@ def _keep_inputs(folder: Path, inputs: Iterable[Path]) -> None:
             what, where=folder, found=found, expected=expected, hint="choose another --out"
         )
 
+    # realpath, unlike resolve, bears a link to itself
+    here = Path(os.path.realpath(folder))
     for place in inputs:
-        if place == folder.resolve():
+        if place == here:
             raise refuse(
                 "output folder is the input's folder",
                 "a folder of its own: depth and flow of a result would pass for truth",
             )
-        if place.parent == folder.resolve() and place.name in (*FILES, *FULL.values()):
+        if place.parent == here and place.name in (*FILES, *FULL.values()):
             raise refuse(
                 "an input would be overwritten by the result",
                 "a folder that holds none of the inputs under the name of a result's file",

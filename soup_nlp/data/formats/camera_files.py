@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.data.formats.images import check_body
 from soup_nlp.data.formats.map_files import check_magic
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.storage.files import PathLike, read_bytes, read_text
 
@@ -43,9 +43,12 @@ def check_intrinsics(given: object, where: object) -> Float:
     """
     try:
         K = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DataError(
-            "intrinsics are no matrix of numbers", where=where, found=repr(given), expected="(3, 3)"
+            "intrinsics are no matrix of numbers",
+            where=where,
+            found=printable(repr_of(given), 80),
+            expected="(3, 3)",
         ) from error
     if K.shape != (3, 3):
         raise DataError("intrinsics must be 3x3", where=where, found=K.shape, expected="(3, 3)")

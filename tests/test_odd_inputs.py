@@ -1,0 +1,44 @@
+"""Bad and odd inputs: every one ends in an error that helps, or in a result that holds.
+
+`python tests/count_odd.py` counts them by class, each in a process of its own with little memory;
+it has the cases that solve as well.
+"""
+
+from __future__ import annotations
+
+import pytest
+from helpers_odd_cases import CASES
+from helpers_odd_run import Case, fault
+from helpers_odd_world import World
+
+
+def table_of(case: Case) -> str:
+    """The table that a case comes from: its class and the first words of its name."""
+    return f"{case.group} {' '.join(case.name.split()[:2])}"
+
+
+TABLES: dict[str, list[Case]] = {}
+for _case in CASES:
+    if not _case.solves:
+        TABLES.setdefault(table_of(_case), []).append(_case)
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory) -> World:
+    return World(tmp_path_factory.mktemp("odd"))
+
+
+def test_the_collection_is_large_and_its_names_are_unique():
+    assert sum(map(len, TABLES.values())) > 400
+    assert len({case.name for case in CASES}) == len(CASES)
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_odd_inputs_are_answered(table, world, tmp_path):
+    found = {}
+    for number, case in enumerate(TABLES[table]):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        if problem := fault(case, world, folder):
+            found[case.name] = problem
+    assert not found
