@@ -92,7 +92,7 @@ WRITE: dict[str, Words] = {
         x,
     ],
 }
-NO_FOLDER = ("pipe", "zero", "null", "socket", "nul", "long", "deep", "loop", "garbage", "dangling")
+NO_FOLDER = ("pipe", "zero", "null", "socket", "nul", "long", "deep", "loop", "garbage")
 """Kinds that no output folder can be made at."""
 
 FOLDERS = ("check", "check --export", "evaluate", "import DIR", "list", "bench accuracy --data")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import os
 import sys
@@ -21,6 +22,16 @@ BUG = 70
 BROKEN_PIPE = 141
 """Exit code where the reader of the output has gone, as shells have it."""
 
+SYSTEM = {
+    getattr(errno, name)
+    for name in (
+        *("ENAMETOOLONG", "ELOOP", "ENOTDIR", "EISDIR", "EACCES", "EPERM", "EROFS"),
+        *("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EMFILE"),
+    )
+    if hasattr(errno, name)
+}
+"""What the machine refuses, and no program can do anything about."""
+
 P = ParamSpec("P")
 
 
@@ -39,6 +50,10 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
                     "the machine has not enough memory for this",
                     found=error,
                     hint="smaller images, or fewer superpixels, neighbours or particles",
+                ) from error
+            if isinstance(error, OSError) and error.errno in SYSTEM:
+                raise DataError(
+                    "the system refuses a file", where=error.filename, found=error.strerror
                 ) from error
             # usage errors of the command line library carry their own message
             if hasattr(error, "format_message"):

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.atomic import PathLike
+from soup_nlp.storage.files import is_folder
 from soup_nlp.storage.mark import MARK, adopt, digest_of, files_in, is_foreign, made, write_mark
 from soup_nlp.storage.system import deferred_signals, exchange
 
@@ -133,7 +134,7 @@ def scratch() -> Iterator[Path]:
 def recover(folder: Path) -> None:
     """Finish the move of new files into a folder that a killed process has begun."""
     commit = folder / _COMMIT
-    if not commit.is_dir() or commit.is_symlink():
+    if not is_folder(commit) or commit.is_symlink():
         return
     lock = os.open(commit, os.O_RDONLY)
     try:
