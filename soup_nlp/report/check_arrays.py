@@ -17,7 +17,7 @@ INDICES = {
 """Arrays of indices, and the letter of the axis that they point into."""
 SHARED = ("N", "E", "P", "H", "W")
 """Letters that stand for one size in all arrays: superpixels, edges, pairs, image."""
-FREE = ("depth/next", "truth/depth_next")
+FREE = ("depth/next", "depth/sigma_next", "input/image_next", "truth/depth_next")
 """Maps of the next frame, whose size may be another."""
 
 
