@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from soup_nlp.bench.processes import machine
+from soup_nlp.bench.solvers.family_runs import (
+    draw_family,
+    family_page,
+    family_tasks,
+    is_family,
+    neutral,
+    summary,
+)
 from soup_nlp.bench.solvers.page import conclusion, page
 from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
 from soup_nlp.bench.solvers.registry import available, find_solver
@@ -17,16 +27,22 @@ from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.verify import Limits
+from soup_nlp.family.results import write_results
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import claim, scratch, staged
+from soup_nlp.storage.store import write_json
 
 FILES = ("README.md", "profile.png", "curves.png")
 """What is written of all rows, beside the rows themselves."""
+OF_FAMILY = ("profiles.png", "results.json", "reached.json")
+"""What is written besides where instances of the family were solved."""
 
 
 def compare(
-    problems: Annotated[list[Path], typer.Argument(help="Problem files.")],
+    problems: Annotated[
+        list[Path], typer.Argument(help="Problem files, or a folder of `soup-nlp family`.")
+    ],
     solvers: Annotated[
         str, typer.Option(help="Comma-separated, or all; a program that reads .nl may be named.")
     ] = "all",
@@ -58,21 +74,41 @@ def compare(
     limits = Limits(seconds, iterations, tol, int(memory * 2**30))
     sizes = [[f"segmentation.superpixels={n}"] for n in superpixels or ()] or [[]]
     # a file that is wrong is found before hours of runs, not after
-    chosen = [load_problem(path, [*(overrides or []), *own]) for path in problems for own in sizes]
-    folder = claim(out, FILES, overwrite)
+    sets = [path for path in problems if is_family(path)]
+    files = [path for path in problems if path not in sets]
+    chosen = [load_problem(path, [*(overrides or []), *own]) for path in files for own in sizes]
+    written = (*FILES, *(OF_FAMILY if sets else ()))
+    folder = claim(out, written, overwrite)
     rows: list[dict[str, Any]] = []
+    of_family: list[dict[str, Any]] = []
+    runs = folder / "runs.jsonl"
     try:
         with scratch() as temporary:
+            for path in sets:
+                for tasks in family_tasks(path, limits):
+                    of_family += run_all(tasks, names, limits, runs, temporary, print)
             for problem in chosen:
                 tasks = list(make_tasks(prepare(problem, presolve), forms, limits, presolve))
-                rows += run_all(tasks, names, limits, folder / "runs.jsonl", temporary, print)
+                rows += run_all(tasks, names, limits, runs, temporary, print)
     finally:
         # an input that cannot be used does not take the others' page away
+        rows += of_family
         if rows:
             with staged(folder) as new:
-                write_text(new / "README.md", page(rows))
+                text = family_page(of_family) if of_family else page(rows)
+                write_text(new / "README.md", text)
                 draw_profiles(new / "profile.png", rows)
                 draw_curves(new / "curves.png", rows)
+                if of_family:
+                    _write_family(new, of_family, limits)
     print("\n".join(conclusion(rows)))
-    print(f"files       {out}/: {', '.join(FILES)}, runs.jsonl")
+    print(f"files       {out}/: {', '.join(written)}, runs.jsonl")
     raise typer.Exit(0 if any(r["verified"] for r in rows) else 1)
+
+
+def _write_family(folder: Path, rows: list[dict[str, Any]], limits: Limits) -> None:
+    """What OF_FAMILY names."""
+    draw_family(folder / "profiles.png", rows)
+    note = {"limits": asdict(limits), "machine": machine()}
+    write_results(folder / "results.json", [neutral(r) for r in rows], note)
+    write_json(folder / "reached.json", summary(rows))

@@ -193,7 +193,7 @@ def rounded_data(data: EnergyData) -> EnergyData:
 
 
 def build_instance(
-    case: Case, record: Frozen, formulation: str, start: str
+    case: Case, record: Frozen, formulation: str, start: str, hessian: str = "exact"
 ) -> tuple[NLP, MatrixLayout, Formulation]:
     """The NLP of a formulation at a start, its layout and its formulation.
 
@@ -202,8 +202,9 @@ def build_instance(
         record: The same record.
         formulation: gauge/norm/truncation.
         start: Of STARTS; "best" is the best known point, not rounded.
+        hessian: Kind of the Hessian.
     """
-    form = case.formulation(**parse_formulation(formulation), hessian="exact", compiled=False)
+    form = case.formulation(**parse_formulation(formulation), hessian=hessian, compiled=False)
     assert form_label(form) == formulation
     soups = {"easy": record.best, "hard": record.start, "best": record.best}
     soup = constant_depth(case.data) if start == "cold" else soups[start]

@@ -41,7 +41,8 @@ def cost_table(rows: Sequence[Row], measure: str) -> tuple[list[Problem], list[s
 
     Args:
         rows: Runs.
-        measure: "time" (seconds) or "energy" (exact energy).
+        measure: "time" (wall seconds), "cpu" (CPU seconds), "energy" (exact energy) or
+            "objective".
     """
     problems = sorted({problem_key(r) for r in rows})
     solvers = sorted({str(r["solver"]) for r in rows})
@@ -49,8 +50,14 @@ def cost_table(rows: Sequence[Row], measure: str) -> tuple[list[Problem], list[s
     for row in rows:
         if row["verified"]:
             place = problems.index(problem_key(row)), solvers.index(str(row["solver"]))
-            cost[place] = max(row["seconds"], SHORTEST) if measure == "time" else row["energy"]
+            cost[place] = _cost(row, measure)
     return problems, solvers, cost
+
+
+def _cost(row: Row, measure: str) -> float:
+    if measure in ("time", "cpu"):
+        return max(float(row["seconds" if measure == "time" else "cpu_seconds"]), SHORTEST)
+    return float(row[measure])
 
 
 def profile(cost: Float) -> tuple[Float, Float]:
@@ -72,23 +79,49 @@ def profile(cost: Float) -> tuple[Float, Float]:
 def draw_profiles(path: Path, rows: Sequence[Row]) -> None:
     """Picture of both profiles: time, and final exact energy."""
     picture = figure(9, 3.6)
-    labels = {"time": "time / best time", "energy": "relative gap of the exact energy to the best"}
-    for axes, measure in zip(picture.subplots(1, 2), labels):
+    for axes, measure in zip(picture.subplots(1, 2), ("time", "energy")):
         problems, solvers, cost = cost_table(rows, measure)
-        steps, share = profile(cost)
-        x = steps if measure == "time" else steps - 1
-        last = x[-1] * 2 if x[-1] > 0 else 1e-3
-        for j, solver in enumerate(solvers):
-            if np.isfinite(cost[:, j]).any():
-                axes.step([*x, last], [*share[:, j], share[-1, j]], where="post", label=solver)
-        if measure == "time":
-            axes.set_xscale("log")
-        else:
-            axes.set_xscale("symlog", linthresh=1e-6)
-        axes.set(xlabel=labels[measure], ylabel=f"share of {len(problems)} problems")
-        axes.set_ylim(-0.02, 1.05)
-        _finish(axes, 7)
+        draw_profile(axes, measure, len(problems), solvers, *profile(cost))
     save(picture, path)
+
+
+LABELS = {
+    "time": "time / best time",
+    "cpu": "CPU time / best CPU time",
+    "energy": "relative gap of the exact energy to the best",
+    "objective": "relative gap of the objective to the best",
+}
+
+
+def draw_profile(
+    axes: Axes, measure: str, count: int, solvers: Sequence[str], steps: Float, share: Float
+) -> None:
+    """A profile in a panel.
+
+    Args:
+        axes: The panel.
+        measure: As of `cost_table`.
+        count: Problems.
+        solvers: Names.
+        steps: (k,) ratios of `profile`.
+        share: (k, solvers) shares of `profile`.
+    """
+    timed = measure in ("time", "cpu")
+    x = steps if timed else steps - 1
+    last = x[-1] * 2 if x[-1] > 0 else 1e-3
+    styles = ("-", "--", ":", "-.")
+    for j, solver in enumerate(solvers):
+        if share[-1, j] > 0:
+            line = [*share[:, j], share[-1, j]]
+            # ten colours, then again with dashes
+            axes.step([*x, last], line, where="post", label=solver, ls=styles[j // 10 % 4])
+    if timed:
+        axes.set_xscale("log")
+    else:
+        axes.set_xscale("symlog", linthresh=1e-6)
+    axes.set(xlabel=LABELS[measure], ylabel=f"share of {count} problems")
+    axes.set_ylim(-0.02, 1.05)
+    _finish(axes, 7)
 
 
 def draw_curves(path: Path, rows: Sequence[Row]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shlex
 import shutil
 import subprocess
 import sys
@@ -21,6 +22,8 @@ from soup_nlp.errors import SolverError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import read_sol
 from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.system import end_with_parent
 
 
@@ -115,6 +118,21 @@ def reference(task: Task) -> Answer:
     return Answer(x, None, record.status, False, record.iterations, record.seconds, record.history)
 
 
+def package(task: Task) -> Answer:
+    """This package's own way: presolve, then Ipopt on the constrained NLP."""
+    begin = time.perf_counter()
+    m = task.limits
+    options = SolverOptions(
+        eps=task.form.eps, tol=m.tol, max_iter=m.iterations, max_seconds=0.9 * m.seconds
+    )
+    own = task.soup, task.data, task.weights, task.form
+    answer = solve_soup(*own, options)
+    stage = answer.stages[-1]
+    iterations = sum(s.iterations for s in answer.stages)
+    seconds = time.perf_counter() - begin
+    return Answer(stage.x, stage.lam_g, stage.status, stage.converged, iterations, seconds)
+
+
 def available() -> dict[str, Solver]:
     """Every solver that can run here, by name."""
     out: dict[str, Solver] = {
@@ -125,6 +143,7 @@ def available() -> dict[str, Solver]:
         out["pounce"] = partial(pounce, command)
         out["pounce-tuned"] = partial(pounce, command, near=True)
     out["lm"] = reference
+    out["soup-nlp"] = package
     if importlib.util.find_spec("pyscipopt"):
         out["scip"] = scip
     return out
@@ -139,7 +158,9 @@ def find_solver(name: str) -> Solver:
     known = available()
     if name in known:
         return known[name]
-    command = None if name in PLUGINS or name == "scip" else _find(name)
+    # options may follow the program's name
+    program, *options = shlex.split(name) or [""]
+    command = None if name in PLUGINS or name == "scip" else _find(program)
     if command is None:
         raise SolverError(
             "solver is not here",
@@ -147,4 +168,4 @@ def find_solver(name: str) -> Solver:
             found=name,
             expected=", ".join(known) + ", or a program that reads .nl",
         )
-    return partial(executable, command)
+    return partial(executable, command, options=options)

@@ -22,12 +22,15 @@ from soup_nlp.export.artefact import form_label
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.case import Case
 from soup_nlp.storage.versions import versions
 
 Float = NDArray[np.float64]
 Label = Mapping[str, Any]
 Maker = Callable[[Path], Task]
+Programs = tuple[NLP, NLP, MatrixLayout, Formulation]
 
 CURVE_POINTS = 40
 """Iterates of a trace whose exact energy is taken."""
@@ -61,14 +64,31 @@ def make_tasks(
 
 
 def _maker(case: Case, form: Formulation, limits: Limits) -> Maker:
-    @cache
-    def built() -> Task:
+    def programs() -> Programs:
         nlp, layout = case.nlp(form)
         second, _ = case.nlp(form.replace(hessian="gauss-newton+constraints"))
+        return nlp, second, layout, form
+
+    return task_maker(case, programs, limits)
+
+
+def task_maker(case: Case, programs: Callable[[], Programs], limits: Limits) -> Maker:
+    """Maker of the task of a case.
+
+    Args:
+        case: Data and weights.
+        programs: Makes the NLP with the exact Hessian, with the Gauss-Newton one, their layout and
+            their formulation; the start is theirs.
+        limits: For every solver.
+    """
+
+    @cache
+    def built() -> Task:
+        nlp, second, layout, form = programs()
         # assemble now, so that no solver's time includes it
-        programs = nlp.assembled(), second.assembled()
-        c = case
-        return Task(*programs, layout, c.soup, c.data, c.weights, form, limits, Path())
+        both = nlp.assembled(), second.assembled()
+        soup = layout.unpack(nlp.x0).retracted()
+        return Task(*both, layout, soup, case.data, case.weights, form, limits, Path())
 
     return lambda folder: replace(built(), folder=folder)
 
@@ -88,6 +108,8 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
     ended = isolated(lambda: work(task), task.folder, limits.seconds, limits.memory)
     row: Row = {
         **label,
+        "n": task.nlp.nx,
+        "m": task.nlp.ng,
         "how": ended.how,
         "status": str(ended.value or ended.how),
         "claimed": False,
@@ -144,6 +166,9 @@ def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
     if answer.x is None:
         return row
     row["energy"] = _energy(task, answer.x)
+    with np.errstate(all="ignore"):
+        value = float(task.nlp.oracle(answer.x, task.nlp.p)[0])
+    row["objective"] = value if np.isfinite(value) else None
     if not np.isfinite(answer.x).all():
         return row
     residuals = examine(task.nlp, answer.x, answer.lam_g).residuals

@@ -1,0 +1,161 @@
+"""The SOUP family in the comparison: its instances as tasks, profiles, results."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from soup_nlp.bench.solvers.page import Row, page
+from soup_nlp.bench.solvers.profiles import cost_table, draw_profile, profile
+from soup_nlp.bench.solvers.runner import Label, Maker, Programs, task_maker
+from soup_nlp.bench.tables import figure, save, show, table
+from soup_nlp.errors import DataError
+from soup_nlp.export.verify import Limits
+from soup_nlp.family.frozen import Frozen, load_frozen
+from soup_nlp.family.instances import Instance, build_instance, case_of, parse_name, problems
+from soup_nlp.pipeline.case import Case
+
+INDEX = "index.json"
+REACHED = 1e-4
+"""A verified point whose objective is this near to the best known one, relative, has reached it."""
+
+
+def is_family(path: Path) -> bool:
+    """Whether a folder is one that `soup-nlp family` wrote."""
+    return (path / INDEX).is_file()
+
+
+def family_tasks(folder: Path, limits: Limits) -> Iterator[list[tuple[Label, Maker]]]:
+    """Label and maker of the task of every instance of a folder, scene and size at a time.
+
+    Raises:
+        DataError: the index cannot be read.
+    """
+    try:
+        entries = json.loads((folder / INDEX).read_text(encoding="utf-8"))["instances"]
+        best = {e["name"]: float(e["best_known"]["objective"]) for e in entries}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError("index of the family cannot be read", where=folder, found=error) from error
+    for scene, size, own in problems([parse_name(name) for name in best]):
+        record = load_frozen(scene, size)
+        case = case_of(record)
+        digest = hashlib.sha256(record.text.encode()).hexdigest()[:12]
+        tasks: list[tuple[Label, Maker]] = []
+        for instance in own:
+            label = {
+                "problem": f"{scene} {instance.start}",
+                "problem_hash": digest,
+                "superpixels": size,
+                "formulation": instance.formulation,
+                "start": instance.start,
+                "name": instance.name,
+                "best_known": best[instance.name],
+                "energy_limit": float("inf"),
+            }
+            tasks.append(
+                (label, task_maker(case, partial(_programs, case, record, instance), limits))
+            )
+        yield tasks
+
+
+def _programs(case: Case, record: Frozen, instance: Instance) -> Programs:
+    """The NLP of an instance with both Hessians, its layout and formulation."""
+    own = case, record, instance.formulation, instance.start
+    nlp, layout, form = build_instance(*own)
+    second, _, _ = build_instance(*own, hessian="gauss-newton+constraints")
+    return nlp, second, layout, form
+
+
+def neutral(row: Row) -> dict[str, Any]:
+    """A row in the form of `family.results`."""
+    version = row["versions"].get("casadi" if row["solver"] in CASADI else "soup_nlp", "unknown")
+    return {
+        "solver": row["solver"],
+        "version": version,
+        "name": row["name"],
+        "n": row["n"],
+        "m": row["m"],
+        "status": row["status"],
+        "objective": row.get("objective"),
+        "iterations": row["iterations"],
+        "time": row["cpu_seconds"],
+        "wall_time": row["seconds"],
+        "claimed": row["claimed"],
+        "verified": row["verified"],
+        "reached": reached(row),
+        **{k: row.get(k) for k in ("primal", "dual", "complementarity")},
+    }
+
+
+CASADI = ("ipopt", "sqpmethod", "uno", "alpaqa", "sleqp", "bonmin", "fatrop")
+
+
+def reached(row: Row) -> bool:
+    """Whether a run ended, verified, at the best known objective."""
+    found = row.get("objective")
+    best = float(row["best_known"])
+    return bool(row["verified"] and found is not None and found <= best + REACHED * abs(best))
+
+
+def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Rows by start and size, "easy, N = 100" and so on."""
+    out: dict[str, list[Row]] = {}
+    for row in rows:
+        out.setdefault(f"{row['start']}, N = {row['superpixels']}", []).append(row)
+    return out
+
+
+def family_page(rows: Sequence[Row]) -> str:
+    """The page of a comparison over the family: by start and size first, then as any other."""
+    lines = [
+        "## By start and size",
+        "",
+        "Verified runs of all, in brackets those at the best known objective (within"
+        f" {REACHED:g}); median CPU seconds of the verified ones.",
+        "",
+    ]
+    solvers = sorted({str(r["solver"]) for r in rows})
+    parts = groups(rows)
+    cells = [[s, *(_cell([r for r in own if r["solver"] == s]) for own in parts.values())]
+             for s in solvers]  # fmt: skip
+    lines += table(["solver", *parts], cells)
+    lines += ["", "![profiles by start and size](profiles.png)", ""]
+    before, mark, after = page(rows).partition("## By solver")
+    return before + "\n".join(lines) + "\n" + mark + after
+
+
+def _cell(rows: Sequence[Row]) -> str:
+    if not rows:
+        return "-"
+    good = [r for r in rows if r["verified"]]
+    times = sorted(float(r["cpu_seconds"]) for r in good)
+    time = f", {show(times[len(times) // 2], '.1f')} s" if times else ""
+    return f"{len(good)} of {len(rows)} ({sum(map(reached, rows))}){time}"
+
+
+def draw_family(path: Path, rows: Sequence[Row]) -> None:
+    """Picture of the profiles of CPU time and of the objective, a line a start and size."""
+    parts = groups(rows)
+    picture = figure(9, 3.1 * len(parts))
+    panels = picture.subplots(len(parts), 2, squeeze=False)
+    for (title, own), line in zip(parts.items(), panels):
+        for axes, measure in zip(line, ("cpu", "objective")):
+            found, solvers, cost = cost_table(own, measure)
+            draw_profile(axes, measure, len(found), solvers, *profile(cost))
+            axes.set_title(title, fontsize=9)
+    save(picture, path)
+
+
+def summary(rows: Sequence[Row]) -> Mapping[str, Any]:
+    """Who tried and who reached the best known point of every problem (name without start)."""
+    out: dict[str, dict[str, list[str]]] = {}
+    for row in rows:
+        own = out.setdefault(row["name"].rpartition("-")[0], {"tried_by": [], "reached_by": []})
+        for key, there in (("tried_by", True), ("reached_by", reached(row))):
+            if there and row["solver"] not in own[key]:
+                own[key].append(row["solver"])
+    return out
