@@ -30,7 +30,8 @@ STUB = "SOUP-room-unit-offset-smooth-smooth-N100"
 def row(solver: str, start: str, objective: float, verified: bool = True, cpu: float = 1.0) -> dict:
     return {
         "problem": f"room {start}", "superpixels": 100, "formulation": "f", "solver": solver,
-        "seconds": 9.0, "energy": objective, "objective": objective, "verified": verified,
+        "seconds": 1.0, "wall_seconds": 9.0, "energy": objective, "verified": verified,
+        "objective": objective,
         "claimed": True, "energy_start": 9.0, "curve": [], "iterations": 3, "cpu_seconds": cpu,
         "peak_bytes": 1 << 20, "status": "optimal", "machine": "m", "versions": {"casadi": "3"},
         "code": "1", "problem_hash": "0", "start": start, "limits": asdict(Limits()),

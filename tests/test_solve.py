@@ -194,13 +194,37 @@ def test_the_claimed_multipliers_balance_the_gradient(room):
 def test_without_presolve_the_exact_hessian_converges(room):
     # wide smoothing: with 0.03 px the way from a cold start is so long that rounding decides it
     options = OPTIONS.replace(
-        eps=0.3, presolve=False, max_iter=300, ipopt={"constr_viol_tol": 1e-9}
+        eps=0.3,
+        presolve=False,
+        continuation=False,
+        max_iter=300,
+        ipopt={"constr_viol_tol": 1e-9},
     )
     solution = room.solve(options, form(hessian="exact"))
     assert [s.name for s in solution.stages] == ["constrained NLP"]
     assert solution.converged, solution.status
     assert_constraints(solution, room.data)
     assert solution.energy["total"] < solution.energy_start["total"]
+
+
+def test_ipopt_alone_narrows_the_smoothing(room):
+    options = OPTIONS.replace(eps=0.3, presolve=False, presolve_eps=(1.0, 0.3), max_iter=200)
+    solution = room.solve(options, form(hessian="exact"))
+    names = ["continuation 1", "continuation 0.3", "constrained NLP"]
+    assert [s.name for s in solution.stages] == names
+    first, second, _ = solution.stages
+    assert first.status == second.status == "Stagnated"
+    assert all(s.history["obj"][-1] < s.history["obj"][0] for s in (first, second))
+    assert solution.converged, solution.status
+    assert_constraints(solution, room.data)
+    assert solution.found_by == "Ipopt"
+    assert list(solution.ends) == ["start", "constrained NLP"]
+    assert solution.ends["constrained NLP"] < solution.ends["start"]
+    alone = room.solve(options.replace(continuation=False), form(hessian="exact"))
+    assert alone.stages[-1].name == "constrained NLP"
+    assert len(alone.stages) == 1
+    # the same minimum or one beside it
+    assert solution.energy["total"] < 1.02 * alone.energy["total"]
 
 
 def test_the_lifted_truncation_converges(room):

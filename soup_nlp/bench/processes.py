@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import pickle
@@ -54,6 +55,7 @@ def isolated(
     memory: int | None = None,
     *,
     fresh: bool = False,
+    cpu_seconds: float | None = None,
 ) -> Ended:
     """Call a function in a process of its own; a crash is an answer as well.
 
@@ -64,6 +66,7 @@ def isolated(
         memory: Bytes that a forked process may have more than this one has now; None for no limit.
         fresh: Start a new interpreter, so that the peak memory is that of the work alone; the work
             must pickle. Else the process is forked and sees everything of this one.
+        cpu_seconds: CPU time limit of it and of each of its children; None for none.
 
     Raises:
         SolverError: the system cannot fork.
@@ -78,7 +81,7 @@ def isolated(
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begin = time.perf_counter()
     context: Any = multiprocessing.get_context(method)
-    process = context.Process(target=_child, args=(work, target, memory))
+    process = context.Process(target=_child, args=(work, target, memory, cpu_seconds))
     process.start()
     late = True
     try:
@@ -97,6 +100,7 @@ def isolated(
         how, value, peak = pickle.loads(target.read_bytes())
     except (OSError, EOFError, pickle.UnpicklingError):
         word = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        late = late or word in ("SIGXCPU", "SIGKILL" if cpu >= (cpu_seconds or cpu + 1) else "")
         how, value, peak = "killed: time" if late else f"crashed: {word}", None, 0
     return Ended(how, value, spent, cpu, peak)
 
@@ -114,7 +118,9 @@ def alone(work: Callable[[], Row], folder: Path, seconds: float = 7200.0) -> Row
     return failure(f"no answer after {seconds:g} s" if late else f"{ended.how} {ended.value}")
 
 
-def _child(work: Callable[[], Any], target: Path, memory: int | None) -> None:
+def _child(
+    work: Callable[[], Any], target: Path, memory: int | None, cpu_seconds: float | None
+) -> None:
     end_with_parent()
     # what the work prints belongs beside its files
     with target.with_name("output.log").open("wb") as log:
@@ -123,6 +129,9 @@ def _child(work: Callable[[], Any], target: Path, memory: int | None) -> None:
     if memory is not None:
         limit = _virtual_bytes() + memory
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    if cpu_seconds is not None:
+        most = math.ceil(1.2 * cpu_seconds) + 1
+        resource.setrlimit(resource.RLIMIT_CPU, (most, most + 1))
     # a Ctrl-C belongs to the parent, which ends this process
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -48,7 +48,7 @@ def compare(
     ] = "all",
     formulation: Formulations = None,
     superpixels: Superpixels = None,
-    seconds: Annotated[float, typer.Option(help="Time limit of a run.")] = 60.0,
+    seconds: Annotated[float, typer.Option(help="CPU time limit of a run.")] = 60.0,
     iterations: Annotated[int, typer.Option(help="Iteration limit of a run.")] = 300,
     tol: Annotated[float, typer.Option(help="Dual infeasibility; constraints get 1/100.")] = 1e-4,
     memory: Annotated[float, typer.Option(help="Memory limit of a run, GiB.")] = 4.0,

@@ -29,7 +29,7 @@ class Limits:
     """Limits that are equal for every solver.
 
     Attributes:
-        seconds: Wall time, set-up included.
+        seconds: CPU time, set-up included.
         iterations: Of the solver's outer loop.
         tol: Dual infeasibility and complementarity; constraints get 1e-2 of it.
         memory: Bytes beyond what the problem itself takes.

@@ -47,6 +47,18 @@ OF_ANSWER = ("nlp_infeasibility", "dual_infeasibility", "complementarity")
 PAD = " " * 12
 
 
+def _found(run: Run) -> str:
+    """Who found the minimum, and the exact energy where each stage ended."""
+    s = run.solution
+    ends = dict(s.ends) | ({} if run.refined is None else {"refinement": run.energy["total"]})
+    who = {
+        "presolve": "minimum found by the presolve, confirmed by Ipopt",
+        "Ipopt": "minimum found by Ipopt",
+        "nobody": "no minimum reached",
+    }[s.found_by]
+    return who + (": E " + ", ".join(f"{k} {e:.5g}" for k, e in ends.items()) if ends else "")
+
+
 def verdict(run: Run, folder: Path, files: Sequence[str], limit: float | None = None) -> str:
     """The facts of a run, its files and the next command.
 
@@ -80,6 +92,7 @@ def facts(run: Run, limit: float | None = None) -> str:
         every = sum(stage.iterations for stage in s.stages)
         counted = f"constrained NLP {s.stages[-1].iterations} iterations of {every}"
         lines.append(f"{PAD}{counted}; {'refined' if run.refined else 'delivered'}: {made}")
+        lines.append(PAD + _found(run))
     if run.refined is not None:
         lines += [PAD + line for line in refinement(run.refined)]
     names = list(s.energy)

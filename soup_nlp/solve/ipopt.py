@@ -37,6 +37,8 @@ CALLS: Mapping[str, str] = {
     "hess_lag": "nlp_hess_l",
 }
 """What CasADi calls the functions in its statistics."""
+STILL = 2
+"""Small changes of f in a row that are a stagnation."""
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -136,8 +138,10 @@ class _Iterations(IterationCallback):
         listener: Listener | None,
         deadline: float,
         stop: threading.Event,
+        stagnation: float = 0.0,
     ) -> None:
         super().__init__()
+        self.stagnation, self.last_f, self.still = stagnation, np.inf, 0
         self.nlp, self.stage, self.listener = nlp, stage, listener
         self.deadline, self.stop = deadline, stop
         self.begin = time.perf_counter()
@@ -170,6 +174,11 @@ class _Iterations(IterationCallback):
         if self.listener:
             self.listener(Progress(self.stage, self.count, f, infeasible, now - self.begin))
         self.count += 1
+        if self.stagnation:
+            self.still = self.still + 1 if abs(self.last_f - f) <= self.stagnation * abs(f) else 0
+            self.last_f = f
+        if self.still >= STILL:
+            self.reason = "Stagnated"
         if self.stop.is_set():
             self.reason = "Interrupted"
         elif now > self.deadline:
@@ -233,6 +242,7 @@ class Ipopt:
         max_iter: int = 100,
         tol: float = 1e-4,
         seconds: float = np.inf,
+        stagnation: float = 0.0,
         stage: str = "solve",
         listener: Listener | None = None,
         stop: threading.Event | None = None,
@@ -248,6 +258,8 @@ class Ipopt:
             max_iter: Iteration limit.
             tol: Ipopt's tol and dual_inf_tol.
             seconds: Time limit; the best iterate is kept.
+            stagnation: Relative change of f that ends the solve when it was smaller twice in a
+                row; 0 for none.
             stage: Name for progress.
             listener: Called at every iteration.
             stop: Event that ends the solve at the next iteration.
@@ -256,7 +268,7 @@ class Ipopt:
         nlp = self.nlp
         begin = time.perf_counter()
         stop = stop or threading.Event()
-        watch = _Iterations(nlp, stage, listener, begin + seconds, stop)
+        watch = _Iterations(nlp, stage, listener, begin + seconds, stop, stagnation)
         solver = self._solver(watch, max_iter, tol, log_file)
         given = {"p": nlp.p if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
         bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}

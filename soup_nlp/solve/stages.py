@@ -21,6 +21,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Chart
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
+from soup_nlp.solve.continuation import KEEP, MAJORANT, narrow
 from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.ipopt import Ipopt, Listener, Stage, Watch
 from soup_nlp.solve.kkt import UNMET, feasible, residuals
@@ -61,6 +62,7 @@ class Solution:
         cpu_seconds: CPU time of this process in the same.
         delivered: What `soup` is: "constrained NLP", "presolve" or "start".
         far: Whether the presolve ended far from a minimum, so that Ipopt had few iterations.
+        ends: Exact energy where the "start", the "presolve" and the "constrained NLP" ended.
     """
 
     soup: Soup
@@ -77,6 +79,16 @@ class Solution:
     cpu_seconds: Mapping[str, float] = field(default_factory=dict)
     delivered: str = "constrained NLP"
     far: bool = False
+    ends: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def found_by(self) -> str:
+        """Who found the minimum: "presolve", "Ipopt", or "nobody" where none was reached."""
+        if not self.converged:
+            return "nobody"
+        # Ipopt only confirms a point that it does not move
+        descent = any(s.name.startswith("presolve") for s in self.stages)
+        return "presolve" if descent and not self.stages[-1].iterations else "Ipopt"
 
     def __str__(self) -> str:
         return (
@@ -136,20 +148,30 @@ def solve_soup(
     nlp, layout = build_matrix_nlp(soup, data, weights, form.replace(eps=o.eps, eps_pixel=o.eps))
     watch.say(str(nlp))
     warm: dict[str, Any] = {}
+    limit, x0 = o.max_iter, nlp.x0
+    if not o.presolve and o.continuation and o.max_iter:
+        majorant = form.replace(eps=o.eps, eps_pixel=o.eps, hessian=MAJORANT)
+        second, _ = build_matrix_nlp(soup, data, weights, majorant)
+        stages += narrow(second, o, watch, laps.begin + 0.7 * o.max_seconds)
+        # the last stage does the polish's work as well
+        limit, x0 = o.max_iter + o.polish_iterations, stages[-1].x
+        warm = {"lam_x0": stages[-1].lam_x, "lam_g0": stages[-1].lam_g}
+        laps.end("continuation")
     # the lifted truncation has another solution than the presolve's
     if form.truncation == "smooth" and soup is presolved and o.polish_iterations and near:
         assert rim is not None
         warm = warm_start(nlp, data, soup, rim)
-    solver = Ipopt(nlp, {**(WARM if warm else {}), **o.ipopt})
+    kept = (WARM if o.presolve else KEEP) if warm else {}
+    solver = Ipopt(nlp, {**kept, **o.ipopt})
     laps.end("build")
     if far:
         watch.say(
             f"far from a minimum: Ipopt has {o.far_iterations} iterations (solver.far_iterations)"
         )
     stage = solver(
-        x0=nlp.x0,
+        x0=x0,
         **warm,
-        max_iter=min(o.max_iter, o.far_iterations) if far else o.max_iter,
+        max_iter=min(limit, o.far_iterations) if far else limit,
         tol=o.tol,
         seconds=max(1.0, deadline - time.perf_counter()),
         stage="constrained NLP",
@@ -187,6 +209,7 @@ def solve_soup(
         cpu_seconds=laps.cpu,
         delivered=delivered,
         far=far,
+        ends={k: energy(ends[k]) for k in ("start", "presolve", "constrained NLP") if k in ends},
     )
 
 

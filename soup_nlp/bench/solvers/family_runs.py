@@ -83,7 +83,7 @@ def neutral(row: Row) -> dict[str, Any]:
         "objective": row.get("objective"),
         "iterations": row["iterations"],
         "time": row["cpu_seconds"],
-        "wall_time": row["seconds"],
+        "wall_time": row["wall_seconds"],
         "claimed": row["claimed"],
         "verified": row["verified"],
         "reached": reached(row),

@@ -15,7 +15,7 @@ Row = Mapping[str, Any]
 FEASIBLE = 1e-5
 """Largest violation of a point whose energy counts."""
 LIMITS = (
-    "Times are wall times of one run each, set-up included, on the machine named.",
+    "Times are CPU times of one run each, set-up included, on the machine named; so is the limit.",
     "The presolve's answer is almost optimal: energies hardly move, and the comparison is of how "
     "quickly a solver proves it. From the proposal it is harder.",
     "Local solvers end in local minima: an energy says where this start led, not what is best.",
@@ -123,7 +123,6 @@ CELLS: dict[str, Callable[[Row], str]] = {
     "compl.": lambda r: show(r.get("complementarity"), ".0e"),
     "iterations": lambda r: str(r["iterations"]) if r["iterations"] >= 0 else "-",
     "seconds": lambda r: show(r.get("seconds"), ".2f"),
-    "CPU s": lambda r: show(r.get("cpu_seconds"), ".2f"),
     "MB": lambda r: str(r["peak_bytes"] >> 20) if r["peak_bytes"] else "-",
     "status": lambda r: _status(r),
 }

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from soup_nlp.bench.solvers.task import Answer, Task, Trace
+from soup_nlp.bench.solvers.task import Answer, Task, Trace, clock
 from soup_nlp.export.verify import Limits
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.callback import IterationCallback
@@ -120,7 +119,7 @@ class _Watch(IterationCallback):
 
     def eval(self, arg: list[ca.DM]) -> list[int]:
         self.trace.add(np.asarray(arg[0]))
-        self.late = time.perf_counter() - self.trace.begin > self.seconds
+        self.late = clock() - self.trace.begin > self.seconds
         return [int(self.late)]
 
 
@@ -163,7 +162,7 @@ def plugin(name: str, task: Task) -> Answer:
         "Time_Limit" if watch.late else status,
         claimed and not watch.late,
         int(stats.get("iter_count", -1)),
-        time.perf_counter() - trace.begin,
+        clock() - trace.begin,
     )
 
 

@@ -7,7 +7,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 
 from soup_nlp.bench.reference_solver import EPS, levenberg_marquardt
 from soup_nlp.bench.solvers.plugins import NEAR, PLUGINS, TOLERANCES, plugin
-from soup_nlp.bench.solvers.task import Answer, Solver, Task, Trace
+from soup_nlp.bench.solvers.task import WALL, Answer, Solver, Task, Trace, clock
 from soup_nlp.errors import SolverError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import read_sol
@@ -29,7 +28,7 @@ from soup_nlp.storage.system import end_with_parent
 
 def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
     """Solve with a program of the AMPL convention, `solver stub -AMPL key=value ...`."""
-    begin = time.perf_counter()
+    begin = clock()
     file = write_nl(task.folder / "soup.nl", task.nlp)
     path = task.folder / "soup.sol"
     # the folder may hold the answer to another problem
@@ -41,16 +40,16 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
                 cwd=task.folder,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                timeout=max(1.0, task.limits.seconds - (time.perf_counter() - begin)),
+                timeout=WALL * max(1.0, task.limits.seconds - (clock() - begin)),
                 check=False,
                 preexec_fn=end_with_parent,
             ).returncode
         except subprocess.TimeoutExpired:
-            return Answer(None, None, "Time_Limit", False, -1, time.perf_counter() - begin)
+            return Answer(None, None, "Time_Limit", False, -1, clock() - begin)
     if not path.is_file():
         raise SolverError("solver wrote no .sol", where=Path(command).name, found=f"exit {code}")
     sol = read_sol(path, file.variables, file.rows)
-    seconds = time.perf_counter() - begin
+    seconds = clock() - begin
     Trace(task.folder / "trace", task.nlp.nx, begin).add(sol.x)
     status = sol.message.splitlines()[-1] if sol.message else sol.status
     return Answer(sol.x, sol.lam_g, status, sol.solved, -1, seconds)
@@ -67,7 +66,7 @@ def pounce(command: str, task: Task, near: bool = False) -> Answer:
     """POUNCE, which knows Ipopt's options; with those of a start near the end, if asked."""
     m = task.limits
     options = {option: getattr(m, name) for option, name in TOLERANCES.items()}
-    options |= {"acceptable_iter": 0, "max_wall_time": 0.9 * m.seconds, "print_level": 0}
+    options |= {"acceptable_iter": 0, "max_cpu_time": 0.9 * m.seconds, "print_level": 0}
     options |= NEAR if near else {}
     return executable(command, task, [f"{k}={v}" for k, v in options.items()])
 
@@ -76,14 +75,14 @@ def scip(task: Task) -> Answer:
     """SCIP, a global solver, on the .nl file: for small problems."""
     import pyscipopt
 
-    begin = time.perf_counter()
+    begin = clock()
     write_nl(task.folder / "soup.nl", task.nlp)
     names = (task.folder / "soup.col").read_text().split()
     place = {name: k for k, name in enumerate(task.nlp.x_names())}
     model = pyscipopt.Model()
     model.hideOutput()
     model.readProblem(str(task.folder / "soup.nl"))
-    model.setParam("limits/time", max(1.0, task.limits.seconds - (time.perf_counter() - begin)))
+    model.setParam("limits/time", max(1.0, task.limits.seconds - (clock() - begin)))
     model.setParam("numerics/feastol", max(task.limits.feasibility, 1e-9))
     found = {v.name: v for v in model.getVars()}
     start = model.createPartialSol()
@@ -93,13 +92,13 @@ def scip(task: Task) -> Answer:
     model.optimize()
     status, best = str(model.getStatus()), model.getBestSol()
     if best is None or not model.getNSols():
-        seconds = time.perf_counter() - begin
+        seconds = clock() - begin
         return Answer(None, None, f"{status}, no point", False, -1, seconds)
     x = np.empty(task.nlp.nx)
     for name in names:
         x[place[name]] = best[found[name]]
     nodes = int(model.getNTotalNodes())
-    return Answer(x, None, status, status == "optimal", nodes, time.perf_counter() - begin)
+    return Answer(x, None, status, status == "optimal", nodes, clock() - begin)
 
 
 def reference(task: Task) -> Answer:
@@ -111,7 +110,7 @@ def reference(task: Task) -> Answer:
     last = task.form.eps
     eps = [*(e for e in EPS if e > last), last]
     own = task.soup, task.data, task.weights, task.form
-    record = levenberg_marquardt(*own, eps=eps, seconds=0.8 * task.limits.seconds)
+    record = levenberg_marquardt(*own, eps=eps, seconds=0.8 * WALL * task.limits.seconds)
     # slack variables and switches at their best for this soup
     x = build_matrix_nlp(record.soup, task.data, task.weights, task.form)[0].x0.copy()
     x[: task.layout.size] = task.layout.pack(record.soup)
@@ -120,16 +119,16 @@ def reference(task: Task) -> Answer:
 
 def package(task: Task) -> Answer:
     """This package's own way: presolve, then Ipopt on the constrained NLP."""
-    begin = time.perf_counter()
+    begin = clock()
     m = task.limits
     options = SolverOptions(
-        eps=task.form.eps, tol=m.tol, max_iter=m.iterations, max_seconds=0.9 * m.seconds
+        eps=task.form.eps, tol=m.tol, max_iter=m.iterations, max_seconds=0.9 * WALL * m.seconds
     )
     own = task.soup, task.data, task.weights, task.form
     answer = solve_soup(*own, options)
     stage = answer.stages[-1]
     iterations = sum(s.iterations for s in answer.stages)
-    seconds = time.perf_counter() - begin
+    seconds = clock() - begin
     return Answer(stage.x, stage.lam_g, stage.status, stage.converged, iterations, seconds)
 
 

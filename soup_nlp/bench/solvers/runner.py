@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from soup_nlp.bench.processes import isolated, processor
 from soup_nlp.bench.rows import Job, Row, measure_all
 from soup_nlp.bench.solvers.registry import find_solver
-from soup_nlp.bench.solvers.task import Answer, Task, Trace
+from soup_nlp.bench.solvers.task import WALL, Answer, Task, Trace
 from soup_nlp.bench.tables import show
 from soup_nlp.export.artefact import form_label
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
@@ -105,7 +105,13 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
     trace = Trace(task.folder / "trace", task.nlp.nx)
     trace.path.unlink(missing_ok=True)
     limits = task.limits
-    ended = isolated(lambda: work(task), task.folder, limits.seconds, limits.memory)
+    ended = isolated(
+        lambda: work(task),
+        task.folder,
+        WALL * limits.seconds,
+        limits.memory,
+        cpu_seconds=limits.seconds,
+    )
     row: Row = {
         **label,
         "n": task.nlp.nx,
@@ -115,7 +121,8 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
         "claimed": False,
         "verified": False,
         "iterations": -1,
-        "seconds": ended.seconds,
+        "seconds": ended.cpu_seconds,
+        "wall_seconds": ended.seconds,
         "cpu_seconds": ended.cpu_seconds,
         "peak_bytes": ended.peak_bytes,
         "energy_start": oracle.energy(task.soup, task.data, task.weights)["total"],
