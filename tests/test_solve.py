@@ -208,12 +208,14 @@ def test_without_presolve_the_exact_hessian_converges(room):
 
 
 def test_ipopt_alone_narrows_the_smoothing(room):
-    options = OPTIONS.replace(eps=0.3, presolve=False, presolve_eps=(1.0, 0.3), max_iter=200)
+    options = OPTIONS.replace(
+        eps=0.3, presolve=False, presolve_eps=(1.0, 0.3), stagnation=3e-3, max_iter=200
+    )
     solution = room.solve(options, form(hessian="exact"))
     names = ["continuation 1", "continuation 0.3", "constrained NLP"]
     assert [s.name for s in solution.stages] == names
     first, second, _ = solution.stages
-    assert first.status == second.status == "Stagnated"
+    assert first.status == "Stagnated"
     assert all(s.history["obj"][-1] < s.history["obj"][0] for s in (first, second))
     assert solution.converged, solution.status
     assert_constraints(solution, room.data)
