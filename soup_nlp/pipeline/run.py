@@ -43,6 +43,10 @@ from soup_nlp.start.propose import Start
 
 Float = NDArray[np.float64]
 
+EXACT, EXACT_PARALLAX = 0.015, 1.0
+"""Flow is exact below this median re-projection error of the start, with more parallax than this,
+both in pixels; E_photo, which knows pixels to a tenth, would only disturb it."""
+
 PAIR = "soup_nlp.Pair(image_ref, image_next, K_ref)"
 """How a pair is made, for messages."""
 
@@ -269,7 +273,9 @@ def run(
         clock("nlp")
     refined = None
     if problem.refine.enabled:
-        photo = look(case.seen, case.segmentation.labels, solution.soup, problem.refine)
+        photo = None
+        if not flow_is_exact(case.start):
+            photo = look(case.seen, case.segmentation.labels, solution.soup, problem.refine)
         refined = refine_soup(
             solution.soup,
             case.data,
@@ -293,6 +299,15 @@ def run(
     clock("evaluation")
     parts = {f"nlp_{k}": v for k, v in solution.seconds.items()}
     return replace(done, seconds={**clock.seconds, **parts})
+
+
+def flow_is_exact(start: Start) -> bool:
+    """Whether rigid motions explain the flow better than images could tell: it is a true flow.
+
+    A scene without parallax does not count: flow that stands still is explained by anything.
+    """
+    moves = float(np.median(start.parallax)) > EXACT_PARALLAX
+    return moves and float(np.median(start.error)) < EXACT
 
 
 def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> Run:
