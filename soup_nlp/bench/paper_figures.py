@@ -104,7 +104,7 @@ def plot_curves(path: Path, curves: Mapping[str, Mapping[str, Row]]) -> None:
             left.set_title(f"{pair}\n{method}: solver", fontsize=7)
             right.set_title("refinement, exact", fontsize=7)
             for ax, label in ((left, "iteration"), (right, "round")):
-                ax.tick_params(labelsize=6)
+                ax.tick_params(which="both", labelsize=6)
                 ax.set_xlabel(label, fontsize=7)
                 ax.grid(alpha=0.3)
     save(picture, path)

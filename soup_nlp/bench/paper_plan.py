@@ -310,7 +310,7 @@ def _listed(name: str, data: Path | None) -> Iterable[Item]:
 def source_of(dataset: Dataset) -> str:
     """Where the data of a dataset come from, and how to lay them out."""
     suite = SUITES[dataset.suites[0]]
-    return f"not in the folder; from {suite.source}, laid out as {suite.layout}"
+    return f"no pair was given; from {suite.source}, laid out as {suite.layout}"
 
 
 def title(item: Item) -> str:

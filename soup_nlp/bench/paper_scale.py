@@ -32,7 +32,7 @@ Float = NDArray[np.float64]
 
 SCALES = np.geomspace(0.25, 4.0, 49)
 """Factors of the true scale; the middle one is 1."""
-LEAST = 6
+LEAST = 4
 """Fewest superpixels of a component that is looked at."""
 LEAST_POINTS = 30
 """Fewest true points of a component whose motion is estimated."""
