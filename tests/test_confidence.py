@@ -271,3 +271,10 @@ def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
     quiet, loud = calibrated(np.array([0.01]), 0.1, 0.05), calibrated(np.array([0.01]), 0.1, 0.4)
     # the geometric mean of noise and misfit is twice the noise
     assert loud / quiet == pytest.approx(2**POWER)
+
+
+def test_an_energy_that_sees_no_plane_leaves_everything_a_guess(small_room):
+    alone = dict.fromkeys(("proj", "cont", "orient", "prior"), 0.0)
+    sigma = sure_of(small_room, weights=small_room.weights.replace(**alone)).sigma
+    assert np.isfinite(sigma).all()
+    assert np.median(sigma) == SIGMA_PRIOR

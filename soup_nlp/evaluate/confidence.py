@@ -103,10 +103,13 @@ def marginals(info: Information, sizes: Int, component: Int) -> Marginals:
         ArithmeticError: the information is no positive semidefinite matrix.
     """
     n, g = len(sizes), info.growth
+    diagonal = info.matrix.diagonal()
+    # what no term sees gets next to no information, so that nothing is known of it
+    least = 1e-12 * float(diagonal.max()) or 1.0
+    weight = np.where(diagonal > least, 0.0, least)
     # any weight on the global scale makes the matrix definite; what it is cancels below
-    weight = np.zeros(9 * n)
     largest = 9 * int(np.argmax(sizes))
-    weight[largest] = info.matrix[largest, largest]
+    weight[largest] += max(diagonal[largest], least)
     solver = BlockCholesky(info.matrix + sparse.diags(weight), info.layout.anchor[:, :2])
     mean = _mean_log_depth(info, sizes, np.zeros(n, np.int64))[:, 0]
     mean /= mean @ g
