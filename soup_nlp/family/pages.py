@@ -52,6 +52,11 @@ Any solver that reads AMPL's `.nl` takes the files; nothing else is needed:
     pounce SOUP-street-unit-offset-smooth-smooth-N100-hard -AMPL      # ipopt, knitro, uno_ampl ...
     soup-nlp check SOUP-street-unit-offset-smooth-smooth-N100-hard.sol
 
+An `easy` start is a solution; an interior-point method stays there only with a small barrier:
+
+    pounce SOUP-street-unit-offset-smooth-smooth-N100-easy -AMPL mu_init=1e-5 bound_push=1e-6 \\
+        bound_frac=1e-6 nlp_scaling_method=none
+
 `.col` and `.row` name variables and rows. The `.sol` that the solver writes has to keep the name of
 its instance; `check` builds the instance again and recomputes objective and KKT residuals. To send
 results, write a JSON object with a list `results` of objects with at least `solver`, `name`, `n`,
