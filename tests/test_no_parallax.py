@@ -79,4 +79,5 @@ def test_the_verdict_warns_where_depth_is_a_guess(scene, said, tmp_path):
         "refine": {"enabled": False},
     }
     done = run(make_problem(raw))
-    assert ("a guess" in verdict(done, tmp_path, [])) == said
+    assert done.good != said
+    assert not said or "is a guess" in verdict(done, tmp_path, [])

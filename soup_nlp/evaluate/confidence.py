@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from soup_nlp.data.pair import Flow
+from soup_nlp.errors import ModelError
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.soup import Reconstruction, Soup
 from soup_nlp.model.energy_data import EnergyData
@@ -255,9 +256,17 @@ def confidence(
         form: Visibility and whether kernels are compiled.
     """
     weak = weights.replace(prior=PRIOR_SHARE * weights.prior)
-    info = information(rec.soup, data, weak, form)
-    own = marginals(info, np.bincount(rec.labels.ravel()), start.component)
-    spread = spread_in_image(info, own.plane, rec.labels, K_ref)
+    try:
+        info = information(rec.soup, data, weak, form)
+        own = marginals(info, np.bincount(rec.labels.ravel()), start.component)
+        spread = spread_in_image(info, own.plane, rec.labels, K_ref)
+    except (ModelError, ArithmeticError):
+        # numbers that no answer has, as a foreign solver may return: nothing is known
+        own = Marginals(
+            np.full((len(rec.soup), 3, 3), np.inf),
+            np.full(int(start.component.max()) + 1, np.inf),
+        )
+        spread = np.full(rec.labels.shape, np.inf)
     noise, misfit = flow_noise(start), flow_misfit(rec, flow)
     sigma = calibrated(spread, noise, misfit[rec.labels])
     return Confidence(sigma, spread, own, noise, misfit)

@@ -159,9 +159,12 @@ def find_solver(name: str) -> Solver:
     known = available()
     if name in known:
         return known[name]
-    # options may follow the program's name
-    program, *options = shlex.split(name) or [""]
-    command = None if name in PLUGINS or name == "scip" else _find(program)
+    options: list[str] = []
+    command = None if name in PLUGINS or name == "scip" else _find(name)
+    if command is None and name not in PLUGINS and name != "scip":
+        # options may follow the program's name
+        program, *options = shlex.split(name) or [""]
+        command = _find(program)
     if command is None:
         raise SolverError(
             "solver is not here",
