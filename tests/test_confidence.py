@@ -18,6 +18,7 @@ from soup_nlp.evaluate.confidence import (
     confidence,
     flow_misfit,
     information,
+    learned,
     marginals,
     spread_in_image,
 )
@@ -278,3 +279,9 @@ def test_an_energy_that_sees_no_plane_leaves_everything_a_guess(small_room):
     sigma = sure_of(small_room, weights=small_room.weights.replace(**alone)).sigma
     assert np.isfinite(sigma).all()
     assert np.median(sigma) == SIGMA_PRIOR
+
+
+def test_what_the_flow_adds_to_the_terms_on_shape():
+    """Information 4 with the flow, 3 without: the flow's is 1."""
+    assert learned(np.array([1 / 4]), np.array([1 / 3]))[0] == pytest.approx(1.0)
+    assert learned(np.array([2.0]), np.array([2.0]))[0] > 1e3

@@ -345,7 +345,7 @@ def test_without_a_working_compiler_kernels_run_in_the_virtual_machine(
     cc, own_cache, monkeypatch, caplog
 ):
     monkeypatch.setenv("CC", cc)
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.DEBUG):
         functions = list(squares().first_order().values())
         made = compiling.compile_functions(functions)
     assert set(made) == {f.name() for f in functions}

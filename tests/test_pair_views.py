@@ -140,7 +140,7 @@ def test_frames_of_two_widths_have_two_mirrors():
 def test_margins_that_leave_nothing_are_rejected(pair):
     with pytest.raises(DataError, match="margins do not fit"):
         cropped(pair, 100, 0, 28)
-    assert cropped(pair, 100, 0, 27).size == (96, 1)
+    assert cropped(pair, 100, 0, 18).size == (96, 10)
     with pytest.raises(DataError, match=r"margins do not fit(.|\n)*\(0, 0, -3, 0\)"):
         cropped(pair, 0, 0, -3)
 

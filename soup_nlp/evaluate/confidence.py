@@ -7,7 +7,7 @@ a neighbour is as unsure, not the conditional ones of a superpixel whose neighbo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,9 +159,13 @@ def spread_in_image(
 
 SIGMA_PRIOR = 0.5
 """Standard deviation of log depth where the pair says nothing: scenes vary by about that much."""
-PRIOR_SHARE = 0.01
+PRIOR_SHARE = 0.001
 """Factor of E_prior in the information: it holds depth where nothing else does, knowing little."""
-FACTOR, POWER = 10.5, 1.25
+FLOW_SHARE = 0.01
+"""Factor of E_proj in the information without the flow; without any, motions would be free."""
+LEAST_LEARNED = 1e-4
+"""Least share of the information that is counted as the flow's."""
+FACTOR, POWER = 8.8, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
 MOST_MISFIT = 5.0
 """Pixels beyond which a flow that the answer contradicts is as wrong as any."""
@@ -177,7 +181,7 @@ class Confidence:
 
     Attributes:
         sigma: (H, W) calibrated standard deviation of log depth, the global scale left out.
-        spread: (H, W) standard deviation of log depth as the marginals have it.
+        spread: (H, W) standard deviation of log depth by what the flow adds to the terms on shape.
         marginals: Of the planes and of the components' scales.
         noise: Of the flow, pixels, see `flow_noise`.
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
@@ -235,6 +239,31 @@ def calibrated(
     return np.asarray(np.minimum(FACTOR * (local * spread) ** POWER, limit))
 
 
+def learned(variance: Float, without: Float) -> Float:
+    """Variance by what the flow adds to the terms on shape alone.
+
+    Information adds up: `1 / v - 1 / v0` is that of the flow, with the variance v of everything and
+    v0 without the flow. Where both are equal, nothing was learned.
+    """
+    # one component alone has the mean that is held: neither varies
+    share = np.divide(variance, without, out=np.zeros_like(variance), where=without > 0)
+    return np.asarray(variance / np.clip(1 - share, LEAST_LEARNED, 1.0))
+
+
+def _spread(
+    rec: Reconstruction,
+    data: EnergyData,
+    weights: Weights,
+    form: FormulationOptions,
+    component: Int,
+    K_ref: Float,
+) -> tuple[Marginals, Float]:
+    """Marginals, and (H, W) standard deviation of log depth by them."""
+    info = information(rec.soup, data, weights, form)
+    own = marginals(info, np.bincount(rec.labels.ravel()), component)
+    return own, spread_in_image(info, own.plane, rec.labels, K_ref)
+
+
 def confidence(
     rec: Reconstruction,
     flow: Flow,
@@ -256,10 +285,13 @@ def confidence(
         form: Visibility and whether kernels are compiled.
     """
     weak = weights.replace(prior=PRIOR_SHARE * weights.prior)
+    blind = weak.replace(proj=FLOW_SHARE * weights.proj)
     try:
-        info = information(rec.soup, data, weak, form)
-        own = marginals(info, np.bincount(rec.labels.ravel()), start.component)
-        spread = spread_in_image(info, own.plane, rec.labels, K_ref)
+        (own, seen), (without, guessed) = (
+            _spread(rec, data, w, form, start.component, K_ref) for w in (weak, blind)
+        )
+        spread = np.sqrt(learned(seen**2, guessed**2))
+        own = replace(own, component=learned(own.component, without.component))
     except (ModelError, ArithmeticError):
         # numbers that no answer has, as a foreign solver may return: nothing is known
         own = Marginals(
