@@ -150,10 +150,15 @@ def test_a_superpixel_without_flow_is_less_sure(small_room, info):
 
 
 def test_calibration_is_capped_where_nothing_is_known():
-    assert calibrated(np.array([0.0, 1e9]), 0.1).tolist() == [0.0, SIGMA_PRIOR]
-    one, two = calibrated(np.array([0.01, 0.02]), 0.1)
-    assert two / one == pytest.approx(2**POWER)
-    assert calibrated(np.array([0.01]), 0.2)[0] == pytest.approx(two)
+    none, most, endless = calibrated(np.array([0.0, 1e9, np.inf]), 0.1)
+    assert none == 0.0
+    assert most == endless == pytest.approx(SIGMA_PRIOR)
+    one, two = calibrated(np.array([0.001, 0.002]), 0.1)
+    assert two / one == pytest.approx(2**POWER, rel=1e-4)
+    assert calibrated(np.array([0.001]), 0.2)[0] == pytest.approx(two)
+    # the prior's information is added to the pair's
+    alone = calibrated(np.array([0.5]), 0.1, prior=np.inf)[0]
+    assert calibrated(np.array([0.5]), 0.1)[0] ** -2 == pytest.approx(alone**-2 + SIGMA_PRIOR**-2)
 
 
 @pytest.mark.slow
@@ -246,8 +251,9 @@ def test_a_superpixel_that_nothing_holds_has_the_sigma_of_the_prior(small_room):
     data = replace(small_room.data, pixel_weight=weight)
     free = small_room.weights.replace(arap=1e-9, cont=1e-9, orient=1e-9)
     sigma = sure_of(small_room, data, free).sigma
-    assert (sigma[small_room.segmentation.labels == blind] == SIGMA_PRIOR).all()
-    assert sure_of(small_room).sigma[small_room.segmentation.labels == blind].mean() < SIGMA_PRIOR
+    own = small_room.segmentation.labels == blind
+    np.testing.assert_allclose(sigma[own], SIGMA_PRIOR, rtol=0.02)
+    assert sure_of(small_room).sigma[own].mean() < 0.9 * SIGMA_PRIOR
 
 
 def test_the_background_of_a_camera_at_rest_is_a_guess(small_room):
@@ -269,16 +275,16 @@ def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
     found = flow_misfit(rec, Flow(moved, flow.confidence))
     assert found[25] == pytest.approx(2.0, abs=1e-4)
     assert np.delete(found, 25).max() < 1e-4
-    quiet, loud = calibrated(np.array([0.01]), 0.1, 0.05), calibrated(np.array([0.01]), 0.1, 0.4)
+    quiet, loud = (calibrated(np.array([0.001]), 0.1, m) for m in (0.05, 0.4))
     # the geometric mean of noise and misfit is twice the noise
-    assert loud / quiet == pytest.approx(2**POWER)
+    assert loud / quiet == pytest.approx(2**POWER, rel=1e-3)
 
 
 def test_an_energy_that_sees_no_plane_leaves_everything_a_guess(small_room):
     alone = dict.fromkeys(("proj", "cont", "orient", "prior"), 0.0)
     sigma = sure_of(small_room, weights=small_room.weights.replace(**alone)).sigma
     assert np.isfinite(sigma).all()
-    assert np.median(sigma) == SIGMA_PRIOR
+    assert np.median(sigma) == pytest.approx(SIGMA_PRIOR, rel=0.02)
 
 
 def test_what_the_flow_adds_to_the_terms_on_shape():

@@ -89,7 +89,7 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
     cues = {name: chosen(image) for name, image in _cues(result).items()}
     found = {name: sparsification(relative, cue) for name, cue in cues.items()}
     sure = result.confidence
-    whole = calibrated(sure.spread, sure.noise, sure.misfit[rec.labels], limit=np.inf)
+    whole = calibrated(sure.spread, sure.noise, sure.misfit[rec.labels], prior=np.inf)
     unit = chosen(whole) / FACTOR
     picked = np.linspace(0, len(log) - 1, min(SAMPLE, len(log))).astype(int)
     own = found["sigma"]
@@ -155,7 +155,7 @@ def left_out(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
         # every pair counts alike
         ratio = np.concatenate([np.quantile(e / u, np.linspace(0, 1, 101)) for e, u in others])
         factor = float(np.quantile(ratio, WITHIN))
-        told = [coverage(e, np.minimum(factor * u, SIGMA_PRIOR)) for e, u in own]
+        told = [coverage(e, factor * u / np.hypot(1, factor * u / SIGMA_PRIOR)) for e, u in own]
         one, two = (float(np.mean(k)) for k in zip(*told))
         out[family] = factor, one, two
     return out

@@ -165,10 +165,12 @@ FLOW_SHARE = 0.01
 """Factor of E_proj in the information without the flow; without any, motions would be free."""
 LEAST_LEARNED = 1e-4
 """Least share of the information that is counted as the flow's."""
-FACTOR, POWER = 8.8, 1.25
+FACTOR, POWER = 8.5, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
 MOST_MISFIT = 5.0
 """Pixels beyond which a flow that the answer contradicts is as wrong as any."""
+LARGEST = 1e6
+"""Of what is calibrated: anything above is as little."""
 MIN_CONFIDENCE = 0.5
 """A pixel whose confidence, 1 - sigma / `SIGMA_PRIOR`, is less is a guess."""
 MOST_SIGMA = (1 - MIN_CONFIDENCE) * SIGMA_PRIOR
@@ -224,7 +226,7 @@ def flow_misfit(rec: Reconstruction, flow: Flow) -> Float:
 
 
 def calibrated(
-    spread: Float, noise: float, misfit: Float | float = 0.0, limit: float = SIGMA_PRIOR
+    spread: Float, noise: float, misfit: Float | float = 0.0, prior: float = SIGMA_PRIOR
 ) -> Float:
     """Standard deviation of log depth that errors keep to.
 
@@ -233,10 +235,11 @@ def calibrated(
         noise: Of the flow, pixels.
         misfit: Of the same superpixel, pixels; where it is larger than the noise, their geometric
             mean is the noise.
-        limit: Largest value.
+        prior: Standard deviation before looking; its information is added.
     """
     local = np.sqrt(noise * np.maximum(noise, misfit))
-    return np.asarray(np.minimum(FACTOR * (local * spread) ** POWER, limit))
+    sigma = np.minimum(FACTOR * (local * spread) ** POWER, LARGEST)
+    return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
 
 def learned(variance: Float, without: Float) -> Float:
