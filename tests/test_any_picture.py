@@ -19,6 +19,8 @@ from soup_nlp.data.formats.map_files import read_flow
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
 
+pytestmark = pytest.mark.slow
+
 SIZE = (160, 120)
 
 

@@ -24,6 +24,8 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.inputs import SceneInput
 from soup_nlp.errors import DataError
 
+pytestmark = pytest.mark.slow
+
 TINY = ("segmentation.superpixels=40", "segmentation.neighbours=6")
 QUICK = (*TINY, "solver.polish_iterations=0", "solver.max_iter=1", "refine.rounds=1")
 

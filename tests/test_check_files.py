@@ -24,6 +24,8 @@ from soup_nlp.report.record import RECORD, record_of
 from soup_nlp.storage import store
 from soup_nlp.storage.mark import MARK
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def pair() -> Pair:

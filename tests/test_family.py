@@ -47,6 +47,8 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.pipeline.case import prepare
 
+pytestmark = pytest.mark.slow
+
 LIFTED = "free/epigraph/lifted"
 
 

@@ -16,6 +16,8 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.verdict import facts
 
+pytestmark = pytest.mark.slow
+
 K = intrinsics(90.0, 80.0, 47.3, 30.1)
 
 

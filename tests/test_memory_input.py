@@ -19,6 +19,8 @@ from soup_nlp.pipeline.run import Run, solve_pair
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 
+pytestmark = pytest.mark.slow
+
 SMALL = {
     "segmentation": {"superpixels": 30, "neighbours": 5},
     "flow": {"source": "truth"},

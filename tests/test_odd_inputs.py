@@ -11,6 +11,8 @@ from helpers_odd_cases import CASES
 from helpers_odd_run import Case, fault
 from helpers_odd_world import World
 
+pytestmark = pytest.mark.slow
+
 
 def table_of(case: Case) -> str:
     """The table that a case comes from: its class and the first words of its name."""

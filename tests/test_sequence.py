@@ -29,6 +29,8 @@ from soup_nlp.sequence.score import aligned
 from soup_nlp.sequence.tracks import carried, follow, number
 from soup_nlp.sequence.write import write_chain
 
+pytestmark = pytest.mark.slow
+
 IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
 
 
