@@ -227,9 +227,9 @@ def test_files_that_are_no_baseline(tmp_path):
     path = tmp_path / "b.json"
     for text in ("{}", "[]", "no json", '{"version": 99, "runs": []}'):
         path.write_text(text)
-        with pytest.raises(DataError, match="baseline"):
+        with pytest.raises(DataError, match="not a baseline"):
             speed_gate.read_baseline(path)
-    with pytest.raises(DataError, match="baseline"):
+    with pytest.raises(DataError, match="not a baseline"):
         speed_gate.read_baseline(tmp_path / "missing.json")
     with pytest.raises(DataError, match="failed"):
         speed_gate.baseline([{"key": "x", "error": "broke"}], {})
@@ -254,8 +254,8 @@ def test_the_reference_solver_ends_at_the_solvers_smoothing():
     "words",
     [
         ["--scenes", "stret"],
-        ["--superpixels", "many"],
-        ["--superpixels", "1"],
+        ["--sizes", "many"],
+        ["--sizes", "1"],
         ["--seeds", "-1"],
         ["--neighbours", ""],
         ["--set", "solver.tolerance=1"],

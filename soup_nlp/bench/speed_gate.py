@@ -92,7 +92,7 @@ def read_baseline(path: Path) -> list[Run]:
         if tree["version"] != VERSION:
             raise ValueError(f"version {tree['version']}")
         return [Run(dict(run["settings"]), dict(run["values"])) for run in tree["runs"]]
-    except (ValueError, KeyError, TypeError) as error:
+    except (DataError, ValueError, KeyError, TypeError) as error:
         raise DataError(
             "not a baseline of bench speed",
             where=path,

@@ -7,6 +7,7 @@ a neighbour is as unsure, not the conditional ones of a superpixel whose neighbo
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +29,8 @@ from soup_nlp.start.propose import Start
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+
+log = logging.getLogger(__name__)
 
 SMOOTHING = 0.03
 """Width in pixels within which a norm is taken for its square: no flow is more exact."""
@@ -165,6 +168,8 @@ FLOW_SHARE = 0.01
 """Factor of E_proj in the information without the flow; without any, motions would be free."""
 LEAST_LEARNED = 1e-4
 """Least share of the information that is counted as the flow's."""
+MOST_BORROWED = 0.5
+"""Share of superpixels without a depth of their own from which the camera is at rest."""
 FACTOR, POWER = 8.5, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
 MOST_MISFIT = 5.0
@@ -215,6 +220,15 @@ def flow_noise(start: Start) -> float:
     if start.bending:
         return MOST_NOISE
     return float(np.clip(np.median(start.error), LEAST_NOISE, MOST_NOISE))
+
+
+def without_parallax(start: Start) -> NDArray[np.bool_]:
+    """(N,) superpixels that the start gave the depth of others, where these are most of the image.
+
+    The camera is at rest then. A few of them take their depth from a surface that is known.
+    """
+    most = not start.bending and float(start.borrowed.mean()) >= MOST_BORROWED
+    return np.asarray(start.borrowed & most)
 
 
 def flow_misfit(rec: Reconstruction, flow: Flow) -> Float:
@@ -294,9 +308,11 @@ def confidence(
             _spread(rec, data, w, form, start.component, K_ref) for w in (weak, blind)
         )
         spread = np.sqrt(learned(seen**2, guessed**2))
+        spread[without_parallax(start)[rec.labels]] = np.inf
         own = replace(own, component=learned(own.component, without.component))
-    except (ModelError, ArithmeticError):
+    except (ModelError, ArithmeticError) as error:
         # numbers that no answer has, as a foreign solver may return: nothing is known
+        log.warning("no uncertainty can be computed, all depth counts as a guess: %s", error)
         own = Marginals(
             np.full((len(rec.soup), 3, 3), np.inf),
             np.full(int(start.component.max()) + 1, np.inf),
