@@ -254,8 +254,8 @@ def test_the_reference_solver_ends_at_the_solvers_smoothing():
     "words",
     [
         ["--scenes", "stret"],
-        ["--sizes", "many"],
-        ["--sizes", "1"],
+        ["--superpixels", "many"],
+        ["--superpixels", "1"],
         ["--seeds", "-1"],
         ["--neighbours", ""],
         ["--set", "solver.tolerance=1"],
