@@ -70,6 +70,47 @@ def test_a_field_of_view_is_taken_without_a_word(tmp_path):
         estimated_intrinsics(path, 180.0)
 
 
+def stored_turned(path, image, orientation):
+    """A file that viewers show as `image` because its EXIF orientation turns it back."""
+    back = {1: None, 2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}[orientation]
+    stored = Image.fromarray(image)
+    stored = stored if back is None else stored.transpose(Image.Transpose(back))
+    exif = stored.getexif()
+    exif[ExifTags.Base.Orientation] = orientation
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 43
+    stored.save(path, exif=exif)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_photo_is_turned_as_its_exif_says(orientation, suffix, tmp_path):
+    image = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
+    for name in "ab":
+        stored_turned(tmp_path / f"{name}.{suffix}", image, orientation)
+    source = {"kind": "files", "ref": f"a.{suffix}", "next": f"b.{suffix}"}
+    pair = make_problem({"input": {**source, "fov": 90}, "base": str(tmp_path)}).load_pair()
+    assert (pair.image_ref == image).all()
+    assert (pair.image_next == image).all()
+    # 90 degrees over the 160 columns that are shown, principal point in the middle of them
+    np.testing.assert_allclose(pair.K_ref, [[80, 0, 79.5], [0, 80, 59.5], [0, 0, 1]])
+    # axes of a given camera are unclear
+    given = {"input": {**source, "intrinsics": [200, 200, 79.5, 59.5]}, "base": str(tmp_path)}
+    if orientation == 1:
+        assert (make_problem(given).load_pair().image_ref == image).all()
+    else:
+        with pytest.raises(DataError, match="stored turned"):
+            make_problem(given).load_pair()
+
+
+def test_the_focal_length_of_a_turned_photo_is_that_of_what_is_shown(tmp_path):
+    image = np.zeros((160, 120, 3), np.uint8)
+    stored_turned(tmp_path / "a.jpg", image, 6)
+    with pytest.warns(DataWarning, match="EXIF"):
+        K = estimated_intrinsics(tmp_path / "a.jpg")
+    f = 43 / np.hypot(36, 24) * 200
+    np.testing.assert_allclose(K, [[f, 0, 59.5], [0, f, 79.5], [0, 0, 1]])
+
+
 @pytest.fixture(scope="module")
 def orbit(tmp_path_factory):
     """A rendered pair as files, its flow in both directions, half of it marked unusable."""

@@ -57,7 +57,7 @@ class FilesInput(PairInput):
     """[fx, fy, cx, cy] of the reference frame in pixels, or a file of 4 or 9 numbers; null for
     `fov`, or else EXIF's focal length, or else 1.2 times the larger side."""
     fov: Positive | None = None
-    """Horizontal field of view of both frames in degrees, where `intrinsics` is null."""
+    """Horizontal field of view of both frames as shown, degrees, where `intrinsics` is null."""
     intrinsics_next: Camera | str | None = None
     """The same of the next frame; null for the same camera."""
     depth: str | None = None
@@ -87,7 +87,9 @@ class FilesInput(PairInput):
         else:
             K = camera(self.intrinsics)
         K_next = K if self.intrinsics_next is None else camera(self.intrinsics_next)
-        return make_pair(images, [K, K_next], truth, "files", self.white)
+        # what is given for a camera may be of the stored or of the turned picture
+        turn = self.intrinsics is None and self.intrinsics_next is None
+        return make_pair(images, [K, K_next], truth, "files", self.white, turn=turn)
 
     def files(self) -> list[str]:
         """See `PairInput`."""

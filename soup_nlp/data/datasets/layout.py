@@ -78,6 +78,8 @@ def make_pair(
     truth: Truth,
     name: str,
     white: int | None = None,
+    *,
+    turn: bool = False,
 ) -> Pair:
     """The pair of two image files; its truth is None where none of it is known.
 
@@ -87,11 +89,12 @@ def make_pair(
         truth: What its files hold.
         name: Name of the pair.
         white: Value of a 16-bit image that is white, see `read_image`.
+        turn: Turn images as their EXIF orientation says, see `read_image`.
 
     Raises:
         DataError: an image is damaged, or the truth does not fit it.
     """
-    ref, following = (read_image(path, white) for path in images)
+    ref, following = (read_image(path, white, turn=turn) for path in images)
     K_ref, K_next = cameras
     return Pair(ref, following, K_ref, K_next, truth=truth if truth.known() else None, name=name)
 

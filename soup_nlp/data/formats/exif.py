@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import warnings
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from soup_nlp.data.formats.images import DataWarning, PathLike, decode
+from soup_nlp.data.formats.images import SHOWN, DataWarning, PathLike, decode
 from soup_nlp.errors import ConfigError
 from soup_nlp.geometry.camera import intrinsics
 
@@ -29,7 +28,7 @@ def estimated_intrinsics(path: PathLike, fov: float | None = None) -> Float:
     """Intrinsics with square pixels and the principal point in the middle of the image.
 
     Args:
-        path: The image.
+        path: The image; its axes are those in which it is shown, turned by its EXIF orientation.
         fov: Horizontal field of view, degrees; None for EXIF's focal length, or else `GUESS` times
             the larger side.
 
@@ -42,7 +41,7 @@ def estimated_intrinsics(path: PathLike, fov: float | None = None) -> Float:
     Warns:
         DataWarning: the focal length is not given: where it comes from.
     """
-    width, height = image_size(path)
+    height, width = decode(path, "image", SHOWN).shape[:2]
     if fov is not None:
         if not 0 < fov < 180:
             raise ConfigError(
@@ -65,15 +64,6 @@ def estimated_intrinsics(path: PathLike, fov: float | None = None) -> Float:
             )
         warnings.warn(text, DataWarning, stacklevel=2)
     return intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2)
-
-
-def image_size(path: PathLike) -> tuple[int, int]:
-    """(width, height) of an image file as it is stored."""
-    # what Pillow cannot read, OpenCV may
-    with contextlib.suppress(OSError), Image.open(path) as image:
-        return image.size
-    height, width = decode(path, "image").shape[:2]
-    return width, height
 
 
 def exif_focal(path: PathLike) -> float | None:

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from soup_nlp.errors import DataError
 from soup_nlp.schema.limits import MAX_PIXELS, check_image_size
@@ -21,6 +21,9 @@ from soup_nlp.storage.files import PathLike, read_bytes
 
 DARK = 65535 // 3
 """A 16-bit image whose largest value is below this may hold fewer bits."""
+
+SHOWN = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+"""Flags with which OpenCV turns a picture as its EXIF orientation says."""
 
 
 class DataWarning(UserWarning):
@@ -40,8 +43,11 @@ def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
         )
 
 
-def decode(path: PathLike, what: str) -> NDArray[Any]:
-    """Decode an image file without changing its depth or channels (OpenCV order: BGR, BGRA)."""
+def decode(path: PathLike, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
+    """Decode an image file, unless `flags` say otherwise without changing its depth or channels.
+
+    OpenCV's order: BGR, BGRA.
+    """
     content = read_bytes(path, what)
     png = content.startswith(b"\x89PNG\r\n\x1a\n") and b"IEND" not in content
     last_scan, end = content.rfind(b"\xff\xda"), content.rfind(b"\xff\xd9")
@@ -56,7 +62,7 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
     _check_header(content, path, what)
     image = None
     with contextlib.suppress(cv2.error):
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if image is None:
         raise DataError(
             f"{what} cannot be decoded",
@@ -105,25 +111,53 @@ def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]
     return image
 
 
-def read_image(path: PathLike, white: int | None = None) -> NDArray[np.uint8]:
+def exif_orientation(path: PathLike) -> int:
+    """EXIF's orientation of an image file, 1 to 8; 1 (as stored) where it says nothing."""
+    try:
+        with Image.open(io.BytesIO(read_bytes(path, "image"))) as image:
+            found = image.getexif().get(ExifTags.Base.Orientation, 1)
+    except DataError:
+        raise
+    except Exception:  # what Pillow does not know OpenCV may
+        return 1
+    return found if found in range(1, 9) else 1
+
+
+def read_image(
+    path: PathLike, white: int | None = None, *, turn: bool = False
+) -> NDArray[np.uint8]:
     """Read a picture as 8-bit RGB.
 
     8 and 16 bit, grey, RGB and RGBA are accepted. Grey is repeated in the three channels, alpha is
-    dropped (not blended), an EXIF orientation is not applied because it would move pixels against
-    the camera. 16-bit values v become round(255 v / white), clipped to 255.
+    dropped (not blended). 16-bit values v become round(255 v / white), clipped to 255. A picture
+    that its EXIF orientation turns is refused unless `turn`: its camera may be that of either.
 
     Args:
         path: Image file (PNG, JPEG, TIFF, PPM ...).
         white: Value of a 16-bit image that becomes 255: 65535 when None; 4095 for 12-bit
             pictures stored in 16 bits, which would come out nearly black otherwise.
+        turn: Turn it as its EXIF orientation says, as viewers do.
 
     Returns:
         (H, W, 3) uint8 RGB image, indexed [v, u].
 
+    Raises:
+        DataError: the file is damaged, of another kind, or turned by EXIF without `turn`.
+
     Warns:
         DataWarning: no `white` is given and a 16-bit image is dark throughout.
     """
-    image = decode(path, "image")
+    orientation = exif_orientation(path)
+    if orientation != 1 and not turn:
+        raise DataError(
+            "image is stored turned, and its camera is given",
+            where=path,
+            found=f"EXIF orientation {orientation}",
+            expected="pixels stored upright: the camera's axes are unclear otherwise",
+            hint="save it upright (Pillow: ImageOps.exif_transpose), or leave the intrinsics out:"
+            " soup-nlp then turns it",
+        )
+    image = decode(path, "image", cv2.IMREAD_UNCHANGED if orientation == 1 else SHOWN)
     if image.ndim == 2:
         image = image[:, :, None]
     channels = image.shape[2]
