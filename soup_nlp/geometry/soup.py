@@ -209,23 +209,24 @@ def nearest_on_top(target: Float, z: Float, size: tuple[int, int]) -> Int:
     """
     height, width = size
     ok = np.flatnonzero((np.isfinite(target).all(-1) & (z > 0)).ravel())
-    at, depth = target.reshape(-1, 2)[ok], z.ravel()[ok]
-    far_first = np.argsort(-depth, kind="stable")
+    far_first = ok[np.argsort(-z.ravel()[ok], kind="stable")]
+    at = target.reshape(-1, 2)[far_first]
 
-    def last(corners: Float) -> Int:
-        """Index of the nearest pixel that lands on every pixel; corners (C, P, 2)."""
-        out = np.full(height * width, -1)
-        u, v = corners[:, far_first].astype(np.int64).transpose(2, 1, 0)
-        inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        which = np.broadcast_to(ok[far_first, None], u.shape)
-        # where an index is repeated the last value stays: that of the nearest pixel
-        out[(v * width + u)[inside]] = which[inside]
-        return out
+    def cells(corners: Float) -> tuple[Int, Int]:
+        """Pixels of the next frame on which corners (P, 2) lie, and which of them do."""
+        u, v = corners.astype(np.int64).T
+        inside = np.flatnonzero((u >= 0) & (v >= 0) & (u < width) & (v < height))
+        return (v * width + u)[inside], inside
 
-    out = last(np.floor(at + 0.5)[None])
+    out = np.full(height * width, -1)
+    # where an index is repeated the last value stays: that of the nearest pixel
+    cell, which = cells(np.floor(at + 0.5))
+    out[cell] = far_first[which]
     # cracks of a stretched surface alone take what covers them: taken everywhere, a footprint of
     # 2 x 2 pixels makes silhouettes grow and slanted surfaces nearer
-    footprint = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
-    crack = out < 0
-    out[crack] = last(np.floor(at) + footprint[:, None])[crack]
+    crack, low = out < 0, np.floor(at)
+    found = [cells(low + corner) for corner in ([0, 0], [0, 1], [1, 0], [1, 1])]
+    cell, which = (np.concatenate(x) for x in zip(*((c[crack[c]], w[crack[c]]) for c, w in found)))
+    order = np.argsort(which, kind="stable")
+    out[cell[order]] = far_first[which[order]]
     return out.reshape(height, width)
