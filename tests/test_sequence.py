@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,10 +13,12 @@ import pytest
 from helpers_chromium import Chromium, find_chromium
 from helpers_result import CAMERA, small_result
 
+from soup_nlp.bench.rows import Job, measure_all, read_rows
 from soup_nlp.cli.main import main
-from soup_nlp.errors import DataError
+from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.figures import write_png
+from soup_nlp.sequence import pairs, study
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import (
     FileFrames,
@@ -23,11 +27,12 @@ from soup_nlp.sequence.frames import (
     find_images,
     video_frames,
 )
+from soup_nlp.sequence.key_frames import key_frames, parallax
 from soup_nlp.sequence.pairs import SolvedPair
 from soup_nlp.sequence.scales import Link, link, solve_scales
 from soup_nlp.sequence.score import aligned
 from soup_nlp.sequence.tracks import carried, follow, number
-from soup_nlp.sequence.write import write_chain
+from soup_nlp.sequence.write import chain_files, write_chain
 
 pytestmark = pytest.mark.slow
 
@@ -125,9 +130,11 @@ def test_a_chain_has_one_scale_and_one_frame_of_reference():
 
 def test_a_chain_is_written(tmp_path):
     chain = make_chain(toy_pairs())
-    files = write_chain(tmp_path, chain, "toy & co")
-    assert all((tmp_path / name).exists() for name in files)
+    write_chain(tmp_path, chain, "toy & co", ["a.png", "b.png", "</script>"])
+    files = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    assert files == set(chain_files(3))
     told = json.loads((tmp_path / "chain.json").read_text())
+    assert told["sources"] == ["a.png", "b.png", "</script>"]
     assert told["score"] is None
     np.testing.assert_allclose([s["scale"] for s in told["scales"]], [1, 2], rtol=1e-9)
     for k in range(3):
@@ -150,7 +157,7 @@ def test_the_page_of_a_chain_opens(tmp_path):
     chromium = find_chromium()
     if chromium is None:
         pytest.skip("no Chromium is installed")
-    write_chain(tmp_path, make_chain(toy_pairs()), "toy & co")
+    write_chain(tmp_path, make_chain(toy_pairs()), "toy & co", ["a.png", "b.png", "<b>c.png"])
     browser = Chromium(chromium, 1000, 700)
     try:
         browser.open((tmp_path / "chain.html").as_uri())
@@ -159,7 +166,7 @@ def test_the_page_of_a_chain_opens(tmp_path):
         browser.value("time.value = 2; time.dispatchEvent(new Event('input'))")
         browser.wait("document.getElementById('depth').naturalWidth == 80")
         second = browser.screenshot()
-        assert browser.value("document.getElementById('now').textContent") == "frame 2"
+        assert browser.value("document.getElementById('now').textContent") == "frame 2: <b>c.png"
         assert (first != second).mean() > 0.01
         assert browser.log == []
         assert [r for r in browser.requests if not r.startswith("file:")] == []
@@ -180,8 +187,8 @@ def test_a_pair_without_parallax_is_bridged():
         source_next=identity,
     )
     middle = replace(still, reconstruction=rec, components=replace(still.components, members=rest))
-    pairs = [first, SolvedPair(1, 2, middle, {}, 0.0), replace(second, first=2, second=3)]
-    chain = make_chain(pairs)
+    still_between = [first, SolvedPair(1, 2, middle, {}, 0.0), replace(second, first=2, second=3)]
+    chain = make_chain(still_between)
     assert [k.flagged for k in chain.links] == [True, True, False]
     assert chain.links[-1].bridge
     assert chain.scales[2] == pytest.approx(2, rel=0.01)
@@ -240,12 +247,15 @@ def test_frames_of_a_scene_follow_each_other():
         SceneFrames("street", 4).pair(0, 2)
 
 
-@pytest.mark.slow
-def test_a_rendered_sequence_has_one_scale(tmp_path, capsys):
-    small = "input.width=192,input.height=128,segmentation.superpixels=60,flow.source=truth"
-    settings = [x for item in small.split(",") for x in ("--set", item)]
+SMALL = [
+    *("input.width=192", "input.height=128", "segmentation.superpixels=60", "flow.source=truth"),
+    *("refine.enabled=false", "segmentation.neighbours=8"),
+]
+
+
+def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     call = ["chain", "scene:street", "--frames", "3", "--out", str(tmp_path / "out"), "-q"]
-    call += [*settings, "--set", "refine.enabled=false", "--set", "segmentation.neighbours=8"]
+    call += [x for item in SMALL for x in ("--set", item)]
     assert main(call) == 0
     printed = capsys.readouterr().out
     told = json.loads((tmp_path / "out" / "chain.json").read_text())
@@ -266,14 +276,97 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys):
     rows = (tmp_path / "out" / "pairs.jsonl").read_text()
     assert main(call) == 0
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
+    # the table of chains has the same numbers
+    monkeypatch.setattr(study, "scratch", lambda: nullcontext(tmp_path / "out"))
+    row = study.measure_chain("street", 3, None, SMALL)
+    assert row["cost"] == told["score"]["cost"]
+    assert row["path"] == told["score"]["path"]["share"]
+    assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
+    settings = {"sequence": "street", "frames": 3, "data": None, "overrides": SMALL}
+    study.CHAIN.write(tmp_path, [{**row, "settings": settings, "cpu_seconds": 1.0}])
+    assert "| street | 3 |" in (tmp_path / "chain.md").read_text()
     # a file of the user is not overwritten
     (tmp_path / "out" / "chain.json").write_text("mine")
     assert main(call) == 2
     assert (tmp_path / "out" / "chain.json").read_text() == "mine"
+    assert main([*call, "--overwrite"]) == 0
 
 
-def test_folders_of_the_user_are_left_alone(tmp_path, capsys):
+def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch):
+    seen = []
+
+    def solve(raw, overrides, place):
+        seen.append(overrides)
+        place.mkdir(parents=True, exist_ok=True)
+        (place / "result.h5").touch()
+        return {}
+
+    monkeypatch.setattr(pairs, "_solve", solve)
+    monkeypatch.setattr(pairs, "_read", lambda first, second, place: (first, second))
+    for own in (["a"], ["a"], ["b"], ["a"]):
+        assert pairs.solve_pairs(SceneFrames("street", 3), [(0, 1)], tmp_path, own) == [(0, 1)]
+    assert seen == [("a",), ("b",), ("a",)]
+
+
+def test_files_of_the_user_are_left_alone(tmp_path, capsys):
     (tmp_path / "chain.json").write_text("mine")
     assert main(["chain", "scene:street", "--out", str(tmp_path)]) == 2
-    assert "files of its own" in capsys.readouterr().err
+    assert "would be overwritten" in capsys.readouterr().err
     assert (tmp_path / "chain.json").read_text() == "mine"
+
+
+def moved_images(folder, steps):
+    """Pictures of two textured layers before a camera that moves sideways; nearest depth 2."""
+    rng = np.random.default_rng(0)
+    far, near = (cv2.resize(rng.integers(0, 256, (40, 60), np.uint8), (600, 400)) for _ in range(2))
+    for k, x in enumerate(steps):
+        image = far[100:220, 100 + round(x) : 260 + round(x)].copy()
+        image[60:] = near[160:220, 100 + round(2 * x) : 260 + round(2 * x)]
+        write_png(folder / f"{k:02d}.png", np.repeat(image[..., None], 3, axis=2))
+    return find_images(folder)
+
+
+def test_frames_are_as_far_apart_as_their_parallax_asks(tmp_path):
+    K = np.array([[160, 0, 79.5], [0, 160, 59.5], [0, 0, 1.0]])
+    images = moved_images(tmp_path, [0, 0, 1, 2, 3, 40, 80, 80])
+    one, other = (cv2.imread(str(images[k]), cv2.IMREAD_GRAYSCALE) for k in (0, 4))
+    # layers move by 3 and 6 px; a rotation takes up what they have in common
+    assert 0.5 * 1.5 < 160 * parallax(one, other, K) <= 3
+    assert parallax(one, one, K) == pytest.approx(0, abs=1e-6)
+    assert parallax(one, np.zeros_like(one), K) is None
+    chosen = key_frames(images, K)
+    # 1 % is 1.6 px: frames 1 and 2 are too near; beyond frame 4 nothing is found again
+    assert chosen[0] == 0
+    assert chosen[1] in (3, 4)
+    assert chosen[-3:] == [5, 6, 7]
+    assert key_frames(images, K, most=2) == chosen[:2]
+    own = FileFrames(tuple(images), {"intrinsics": [160, 160, 79.5, 59.5]}).apart(most=2)
+    assert own.paths == tuple(images[k] for k in chosen[:2])
+
+
+@pytest.mark.parametrize("stride", ["0", "-1", "often"])
+def test_strides_are_checked(stride, tmp_path, capsys):
+    assert main(["chain", str(tmp_path), "--stride", stride]) == 2
+    assert "auto" in capsys.readouterr().err
+
+
+def answer(number):
+    if number == 3:
+        raise ValueError("three")
+    return {"number": number}
+
+
+def test_rows_come_from_dask(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra: dask)")
+    jobs = [Job({"key": str(k)}, partial(answer, k)) for k in range(4)]
+    with (
+        distributed.LocalCluster(
+            processes=False, n_workers=1, dashboard_address=None, protocol="inproc"
+        ) as cluster,
+    ):
+        rows = measure_all(jobs, tmp_path / "rows.jsonl", dask=cluster.scheduler_address)
+    assert [r.get("number") for r in rows] == [0, 1, 2, None]
+    assert "three" in rows[3]["error"]
+    assert len(read_rows(tmp_path / "rows.jsonl")) == 4
+    with pytest.raises(ConfigError, match="no Dask scheduler"):
+        measure_all(jobs, tmp_path / "rows.jsonl", dask="nonsense://nowhere")

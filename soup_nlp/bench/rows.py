@@ -116,6 +116,7 @@ def measure_all(
     say: Say | None = None,
     after: Callable[[list[Row]], None] | None = None,
     any_code: bool = False,
+    dask: str | None = None,
 ) -> list[Row]:
     """The row of every job, measured where the file does not hold it yet.
 
@@ -130,10 +131,11 @@ def measure_all(
         after: Called with all rows that are there so far, in the order of the jobs, after every
             new row and at the end.
         any_code: Also take rows of other code versions.
+        dask: Address of the scheduler that gets the work, "local" for one of `workers` processes.
 
     Raises:
         DataError: the file cannot be written.
-        ConfigError: joblib is needed and not installed.
+        ConfigError: joblib or Dask is needed and not installed, or the scheduler does not answer.
     """
     code = code_version()
     names = [_identity(job.name) for job in jobs]
@@ -148,7 +150,8 @@ def measure_all(
     def so_far() -> list[Row]:
         return [known[name] for name in names if name in known]
 
-    for name, result in _measured(todo, workers):
+    results = _measured(todo, workers) if dask is None else _on_dask(todo, dask, workers)
+    for name, result in results:
         known[name] = {**plain(todo[name].name), "code": code, **plain(result)}
         append_row(path, known[name])
         if say:
@@ -199,3 +202,32 @@ def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]
                 yield futures[future], result
         finally:
             pool.shutdown(wait=False, kill_workers=True)
+
+
+def _on_dask(todo: Mapping[str, Job], address: str, workers: int) -> Iterator[tuple[str, Row]]:
+    """Names and results of the jobs, as the workers of a Dask scheduler end them."""
+    if not todo:
+        return
+    try:
+        from distributed import Client, as_completed
+    except ImportError as error:
+        raise ConfigError(
+            "Dask is not installed", where="--dask", hint="pip install soup-nlp[dask]"
+        ) from error
+    options: dict[str, Any] = {"address": address}
+    if address == "local":
+        options = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None}
+    try:
+        client = Client(**options)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            "no Dask scheduler answers",
+            where="--dask",
+            found=f"{address}: {error}",
+            expected="an address such as tcp://host:8786, or local",
+        ) from error
+    with client:
+        futures = {client.submit(job.work, pure=False): name for name, job in todo.items()}
+        for future in as_completed(futures):
+            wrong = future.exception()
+            yield futures[future], future.result() if wrong is None else failure(repr(wrong))

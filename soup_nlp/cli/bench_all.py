@@ -36,6 +36,7 @@ COMMANDS = (
     " --seeds 1,2,3,4,5,6,10,11,12,13,14,15,16,17,18 --flow truth --flow dis"
     f" {NLP}",
     "bench cut-off -o {out}/accuracy",
+    "bench chain -o {out}/accuracy --data {data}",
     "bench paper -o {out}/paper --data {data} --limit 2 --superpixels 500 --analysis 250",
     "bench refine -o {out}/refine",
     "bench speed -o {out}/speed --superpixels 500,1000,2000 --neighbours 20",

@@ -1,4 +1,4 @@
-"""Commands bench refine, methods, formulations, cut-off and trws: studies of parts."""
+"""Commands bench refine, methods, formulations, cut-off, chain and trws: studies of parts."""
 
 from __future__ import annotations
 
@@ -13,8 +13,22 @@ from soup_nlp.bench.rows import failed
 from soup_nlp.bench.speed import plan
 from soup_nlp.bench.studies import Settings, Study, grid, run_study
 from soup_nlp.bench.suite_pairs import RENDERED
-from soup_nlp.cli.options import Out, Overwrite, Progress, Quiet, Seeds, numbers, words
+from soup_nlp.cli.options import (
+    Data,
+    Only,
+    Out,
+    Overwrite,
+    Progress,
+    Quiet,
+    Seeds,
+    Set,
+    numbers,
+    words,
+)
+from soup_nlp.errors import ConfigError
 from soup_nlp.model.layout import GAUGES
+from soup_nlp.sequence.study import CHAIN, TRACKING
+from soup_nlp.sequence.study import RENDERED as RENDERED_SEQUENCES
 
 Size = Annotated[int, typer.Option(help="Superpixels wanted.")]
 SCENES = [*RENDERED, "motorcycle"]
@@ -87,6 +101,25 @@ def cut_off(
     chosen = numbers(seeds, "--seeds")
     settings = grid(scene=("street", "room"), seed=chosen, superpixels=[superpixels])
     _run(study_parts.CUT_OFF, out, settings, overwrite, quiet)
+
+
+def chain(
+    data: Data = None,
+    only: Only = None,
+    frames: Annotated[int, typer.Option(help="Most frames of a sequence.", min=3)] = 10,
+    overrides: Set = None,
+    out: Out = Path("out/bench/accuracy"),
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """What one scale costs on rendered sequences, and on kitti_tracking in the --data folder."""
+    names = [*RENDERED_SEQUENCES, *([TRACKING] if data else [])]
+    chosen = [n for n in names if not only or any(word in n for word in only)]
+    if not chosen:
+        raise ConfigError("no sequence is left", where="--only", expected=", ".join(names))
+    folder = str(data.resolve()) if data else None
+    settings = grid(sequence=chosen, frames=[frames], data=[folder], overrides=[overrides or []])
+    _run(CHAIN, out, settings, overwrite, quiet)
 
 
 def trws(out: Out = SPEED, overwrite: Overwrite = False, quiet: Quiet = False) -> None:

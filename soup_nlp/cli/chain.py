@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +10,7 @@ import typer
 
 from soup_nlp.cli import options
 from soup_nlp.cli.options import Progress
-from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.errors import ConfigError
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import (
     VIDEOS,
@@ -20,13 +21,16 @@ from soup_nlp.sequence.frames import (
     find_images,
     video_frames,
 )
-from soup_nlp.sequence.pairs import ROWS, solve_pairs
+from soup_nlp.sequence.key_frames import LONGEST
+from soup_nlp.sequence.pairs import solve_pairs
 from soup_nlp.sequence.report import table
-from soup_nlp.sequence.write import write_chain
-from soup_nlp.storage.folders import staged
+from soup_nlp.sequence.write import SINGLE, chain_files, write_chain
+from soup_nlp.storage.folders import claim, staged
 
 SCENE = "scene:"
 """Before the name of a rendered scene."""
+AUTO = "auto"
+"""Stride that parallax decides."""
 
 
 def chain(
@@ -42,7 +46,9 @@ def chain(
     fov: Annotated[
         float | None, typer.Option(help="Horizontal field of view, degrees, instead.")
     ] = None,
-    stride: Annotated[int, typer.Option(help="Take every so many frames.", min=1)] = 1,
+    stride: Annotated[
+        str, typer.Option(help="Take every so many frames; auto: until there is parallax.")
+    ] = "1",
     frames: Annotated[
         int | None, typer.Option(help="Most frames; of a scene 10 unless named.", min=2)
     ] = None,
@@ -54,35 +60,43 @@ def chain(
     ] = 1000.0,
     overrides: options.Set = None,
     workers: options.Workers = 1,
+    dask: options.Dask = None,
+    overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Solve the consecutive pairs of a sequence and put them on one scale."""
-    _check_folder(out)
-    sequence = _frames(source, out, intrinsics, fov, stride, frames, depth_scale)
+    sequence = _frames(source, out, intrinsics, fov, _step(stride), frames, depth_scale)
     count = len(sequence)
+    claim(out, chain_files(count), overwrite)
+    sources = [sequence.source(k) for k in range(count)]
+    if stride == AUTO and not quiet:
+        names = ", ".join(Path(s).name for s in sources)
+        print(f"{count} frames far enough apart: {names}", file=sys.stderr)
     which = [(k, k + 1) for k in range(count - 1)]
     over = [(k, k + 2) for k in range(count - 2)] if two_frame else []
     changes = ["output.page=false", *(overrides or [])]
-    pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet))
+    pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet), dask)
     done = make_chain(pairs[: len(which)], pairs[len(which) :])
     name = source[0] if len(source) == 1 else f"{source[0]} ..."
-    with staged(out) as new:
-        files = [*write_chain(new, done, name), "pairs"]
+    with staged(out, whole=True, overwrite=overwrite) as new:
+        write_chain(new, done, name, sources)
     print(table(done))
-    print(f"files       {out}/: " + ", ".join(files))
+    print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "points/", "pairs/"]))
 
 
-def _check_folder(out: Path) -> None:
-    """Raise DataError where the output folder holds what no chain has written."""
-    if out.is_dir() and any(out.iterdir()) and not (out / ROWS).is_file():
-        raise DataError(
-            "output folder holds files of its own",
-            where=out,
-            expected="a new or empty folder, or that of an earlier chain",
-            hint="choose another --out",
+def _step(stride: str) -> int | None:
+    """Every how many frames one is taken; None where parallax decides.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    if stride == AUTO:
+        return None
+    if not stride.isdecimal() or int(stride) < 1:
+        raise ConfigError(
+            "unknown stride", where="--stride", found=stride, expected=f"a number from 1, or {AUTO}"
         )
-    out.mkdir(parents=True, exist_ok=True)
-    (out / ROWS).touch()
+    return int(stride)
 
 
 def _frames(
@@ -90,33 +104,37 @@ def _frames(
     out: Path,
     intrinsics: str | None,
     fov: float | None,
-    stride: int,
+    step: int | None,
     most: int | None,
     depth_scale: float,
 ) -> Frames:
-    """The frames that the command line names."""
+    """The frames that the command line names; `step` None takes those with enough parallax."""
     first = source[0]
     if first.startswith(SCENE):
         own = first.removeprefix(SCENE)
-        if len(source) > 1 or stride > 1 or intrinsics or fov:
+        if len(source) > 1 or step != 1 or intrinsics or fov:
             raise ConfigError("a rendered scene has its own camera and steps", found=source)
         return SceneFrames(own, most or 10)
     path = Path(first).expanduser()
     depths: list[Path] = []
+    # as many are chosen among all
+    end = most if step else None
     if len(source) > 1:
-        images = [Path(name) for name in source][::stride][:most]
+        images = [Path(name) for name in source][:: step or 1][:end]
     elif path.suffix.lower() in VIDEOS:
-        images = video_frames(path, out / "frames", stride, most)
+        read = None if most is None or step else most * LONGEST
+        images = video_frames(path, out / "frames", step or 1, end or read)
     else:
-        images = find_images(path)[::stride][:most]
+        images = find_images(path)[:: step or 1][:end]
         depths = find_depths(images)
     images = [p.resolve() for p in images]
-    return FileFrames(
+    found = FileFrames(
         tuple(images),
         _camera(images[0].parent, intrinsics, fov),
         tuple(p.resolve() for p in depths),
         depth_scale,
     )
+    return found if step else found.apart(most)
 
 
 def _camera(folder: Path, intrinsics: str | None, fov: float | None) -> dict[str, Any]:

@@ -100,6 +100,10 @@ BENCH: Mapping[str, tuple[str, str]] = {
         "bench_studies:cut_off",
         "Depth of components that the lower border cuts off, by contact alone and as shipped.",
     ),
+    "chain": (
+        "bench_studies:chain",
+        "What one scale costs on rendered sequences, and on kitti_tracking in the --data folder.",
+    ),
     "trws": ("bench_studies:trws", "Time and memory of TRW-S at the size of a refinement."),
     "all": (
         "bench_all:everything",

@@ -50,6 +50,10 @@ Only = Annotated[list[str] | None, typer.Option(help="Only pairs whose name hold
 Width = Annotated[int, typer.Option(help="Columns of rendered scenes.", min=64)]
 Seeds = Annotated[str, typer.Option(help="Seeds of rendered scenes, such as 0,1,2.")]
 Workers = Annotated[int, typer.Option(help="Processes of this machine (extra: bench).", min=1)]
+Dask = Annotated[
+    str | None,
+    typer.Option(help="Address of a Dask scheduler that shares the files, or local (extra: dask)."),
+]
 AnyCode = Annotated[bool, typer.Option(help="Also take stored rows of other code versions.")]
 
 

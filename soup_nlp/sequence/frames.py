@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import re
+import warnings
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import DataError
 from soup_nlp.report.figures import write_png
+from soup_nlp.sequence.key_frames import key_frames
+from soup_nlp.storage.folders import staged
 
 Raw = dict[str, Any]
 
@@ -31,6 +36,10 @@ class Frames(ABC):
     @abstractmethod
     def pair(self, first: int, second: int) -> Raw:
         """Section `input` of the problem of two frames."""
+
+    @abstractmethod
+    def source(self, frame: int) -> str:
+        """Where a frame comes from."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,20 @@ class FileFrames(Frames):
             out.update(truth, depth_scale=self.depth_scale)
         return out
 
+    def source(self, frame: int) -> str:
+        """See `Frames`."""
+        return str(self.paths[frame])
+
+    def apart(self, most: int | None = None) -> FileFrames:
+        """The frames that are far enough apart, see `key_frames`."""
+        with warnings.catch_warnings():
+            # every solve says where the focal length comes from
+            warnings.simplefilter("ignore", DataWarning)
+            first = make_problem({"input": self.pair(0, 1)}, where="sequence").load_pair()
+        keep = key_frames(self.paths, first.K_ref, most)
+        paths, depths = (tuple(x[k] for k in keep) if x else () for x in (self.paths, self.depths))
+        return replace(self, paths=paths, depths=depths)
+
 
 @dataclass(frozen=True)
 class SceneFrames(Frames):
@@ -83,6 +106,10 @@ class SceneFrames(Frames):
             )
         own = {"scene": self.scene, "seed": self.seed, "width": self.width, "height": self.height}
         return {"kind": "scene", "frame": first, **own}
+
+    def source(self, frame: int) -> str:
+        """See `Frames`."""
+        return f"{self.scene}-{self.seed}: frame {frame}"
 
 
 def find_images(source: Path) -> list[Path]:
@@ -122,29 +149,31 @@ def find_depths(images: list[Path]) -> list[Path]:
 
 
 def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = None) -> list[Path]:
-    """Write every `stride`-th frame of a video as PNG into a folder; their paths.
+    """Write every `stride`-th frame of a video as PNG into an output folder; their paths.
 
     Raises:
-        DataError: the video cannot be read.
+        DataError: the video cannot be read, or the folder holds other files of these names.
     """
     video = cv2.VideoCapture(str(path))
-    out: list[Path] = []
+    names: list[str] = []
     index = 0
-    folder.mkdir(parents=True, exist_ok=True)
-    while most is None or len(out) < most:
-        if not video.grab():
-            break
-        if index % stride == 0:
-            good, image = video.retrieve()
-            if not good:
+    with staged(folder, whole=True) as new:
+        while most is None or len(names) < most:
+            if not video.grab():
                 break
-            out.append(folder / f"{len(out):04d}.png")
-            write_png(out[-1], cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
-        index += 1
-    video.release()
-    if len(out) < 2:
-        raise DataError("video has fewer than two readable frames", where=path, found=len(out))
-    return out
+            if index % stride == 0:
+                good, image = video.retrieve()
+                if not good:
+                    break
+                names.append(f"{len(names):04d}.png")
+                write_png(new / names[-1], cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+            index += 1
+        video.release()
+        if len(names) < 2:
+            raise DataError(
+                "video has fewer than two readable frames", where=path, found=len(names)
+            )
+    return [folder / name for name in names]
 
 
 def _by_number(path: Path) -> list[Any]:

@@ -6,6 +6,7 @@ import base64
 import html
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -41,6 +42,7 @@ def chain_page(
         title=title,
         last=len(chain) - 1,
         frames=json.dumps(frames),
+        names=json.dumps([Path(x).name for x in told["sources"]]).replace("<", "\\u003c"),
         plan=_plan(chain),
         table=_table(told),
         unit=html.escape(str(told["unit"])),
@@ -149,13 +151,14 @@ a scale of its own in every pair: its path is as good as its depth.</figcaption>
 </div>
 <script>
 const frames = {frames};
+const names = {names};
 const time = document.getElementById("time"), play = document.getElementById("play");
 let timer = null;
 function show() {{
   const k = Number(time.value);
   document.getElementById("image").src = frames[k][0];
   document.getElementById("depth").src = frames[k][1];
-  document.getElementById("now").textContent = "frame " + k;
+  document.getElementById("now").textContent = "frame " + k + ": " + names[k];
 }}
 time.addEventListener("input", show);
 play.addEventListener("click", () => {{

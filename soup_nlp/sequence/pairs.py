@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from soup_nlp.bench.rows import Job, Row, attempt, failed, measure_all
+from soup_nlp.bench.rows import Job, Row, attempt, failed, measure_all, read_rows
 from soup_nlp.config.problem import make_problem
 from soup_nlp.errors import SolverError
 from soup_nlp.pipeline.run import run
@@ -54,8 +54,9 @@ def solve_pairs(
     overrides: Sequence[str] = (),
     workers: int = 1,
     say: Callable[[int, int, Row], None] | None = None,
+    dask: str | None = None,
 ) -> list[SolvedPair]:
-    """Solve pairs of frames in parallel processes; those that are stored are only read.
+    """Solve pairs of frames in parallel processes or on Dask; what is stored is only read.
 
     Args:
         frames: The sequence.
@@ -64,19 +65,24 @@ def solve_pairs(
         overrides: Of the problem, such as segmentation.superpixels=500.
         workers: Processes.
         say: Called with (done, total, row) after every solve.
+        dask: See `measure_all`; its workers write into the same folder.
 
     Raises:
         SolverError: a pair cannot be solved.
     """
     jobs, places = [], []
+    # a folder holds what was solved into it last
+    last = {row.get("key"): row for row in read_rows(folder / ROWS)}
     for first, second in which:
-        source = frames.pair(first, second)
-        place = folder / "pairs" / f"{first:03d}_{second:03d}"
-        name = {"key": place.name, "input": source, "overrides": list(overrides)}
-        work = partial(attempt, partial(_solve, source, tuple(overrides), place))
-        jobs.append(Job(name, work, stale=not (place / "result.h5").is_file()))
+        place = folder.resolve() / "pairs" / f"{first:03d}_{second:03d}"
+        raw = {"name": place.name, "input": frames.pair(first, second), "base": str(Path.cwd())}
+        name = {"key": place.name, "input": raw["input"], "overrides": list(overrides)}
+        stored = last.get(place.name, {})
+        same = (place / "result.h5").is_file() and all(stored.get(k) == name[k] for k in name)
+        work = partial(attempt, partial(_solve, raw, tuple(overrides), place))
+        jobs.append(Job(name, work, stale=not same))
         places.append(place)
-    rows = measure_all(jobs, folder / ROWS, workers, say=say)
+    rows = measure_all(jobs, folder / ROWS, workers, say=say, dask=dask)
     wrong = [row for row in rows if failed(row)]
     if wrong:
         raise SolverError(
@@ -88,9 +94,8 @@ def solve_pairs(
     return [_read(*pair, place) for pair, place in zip(which, places, strict=True)]
 
 
-def _solve(source: Raw, overrides: tuple[str, ...], place: Path) -> Row:
+def _solve(raw: Raw, overrides: tuple[str, ...], place: Path) -> Row:
     """Solve a pair into its folder."""
-    raw = {"name": place.name, "input": source, "base": str(Path.cwd())}
     done = run(make_problem(raw, overrides, where="sequence"))
     done.save(place)
     return {

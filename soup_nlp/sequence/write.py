@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from soup_nlp.storage.store import write_json
 
 Float = NDArray[np.float64]
 
+SINGLE = "chain.json", "trajectory.tum", "depth.mp4", "chain.html"
+"""Files of a chain that there is one of."""
 POINTS = 100_000
 """Most points of a frame's cloud."""
 RATE = 5.0
@@ -27,16 +30,20 @@ RATE = 5.0
 UNIT = "the first pair's soup unit (free scale: its planes are at mean distance 1)"
 
 
-def write_chain(folder: Path, chain: Chain, name: str) -> list[str]:
-    """Write every file of a chain into an existing folder.
+def chain_files(count: int) -> list[str]:
+    """Names of the files of a chain of so many frames."""
+    clouds = [f"points/{k:04d}.ply" for k in range(count - 1)]
+    return [*SINGLE, *(f"depth/{k:04d}.png" for k in range(count)), *clouds]
+
+
+def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -> None:
+    """Write every file of a chain, `chain_files`, into an existing folder.
 
     Args:
         folder: The folder.
         chain: The chain.
         name: For titles.
-
-    Returns:
-        Names of the files and folders.
+        sources: Where every frame comes from.
     """
     (folder / "depth").mkdir(exist_ok=True)
     (folder / "points").mkdir(exist_ok=True)
@@ -46,13 +53,13 @@ def write_chain(folder: Path, chain: Chain, name: str) -> list[str]:
         write_clipped_depth_png16(folder / "depth" / f"{k:04d}.png", z, scale)
     for k in range(len(chain.pairs)):
         _cloud(folder / "points" / f"{k:04d}.ply", chain, k, name)
-    told = {**summary(chain), "name": name, "depth_png_scale": scale, "score": score(chain)}
+    told = {"name": name, "sources": list(sources), **summary(chain)}
+    told |= {"depth_png_scale": scale, "score": score(chain)}
     write_json(folder / "chain.json", told)
     write_text(folder / "trajectory.tum", trajectory(chain))
     pictures = coloured(depths)
     write_video(folder / "depth.mp4", [np.vstack(p) for p in zip(images(chain), pictures)])
     write_text(folder / "chain.html", chain_page(chain, told, images(chain), pictures))
-    return ["depth", "points", "chain.json", "trajectory.tum", "depth.mp4", "chain.html"]
 
 
 def summary(chain: Chain) -> dict[str, Any]:

@@ -1,0 +1,98 @@
+"""Frames of a sequence as far apart as their parallax asks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from soup_nlp.data.formats.images import read_image
+from soup_nlp.geometry.rotation import exp
+
+Float = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+WANTED = 0.01
+"""Median parallax of two key frames, in larger sides of the image."""
+LONGEST = 10
+"""Most frames from a key frame to the next."""
+SIDE = 640
+"""Larger side of the images in which points are tracked, pixels."""
+LOST = 0.3
+"""Share of the points below which two images have too little in common."""
+FEWEST = 30
+"""The same as a number of points."""
+
+
+def key_frames(images: Sequence[Path], K: Float, most: int | None = None) -> list[int]:
+    """Indices of frames of which each has enough parallax to the one before.
+
+    From a key frame the next one is the first with a parallax of `WANTED`, or the last before
+    points are lost or `LONGEST` frames are passed.
+
+    Args:
+        images: All frames in order.
+        K: (3, 3) intrinsics, pixels.
+        most: Most key frames.
+    """
+    read = lru_cache(LONGEST + 1)(_small)
+    chosen, last = [0], len(images) - 1
+    while chosen[-1] < last and (most is None or len(chosen) < most):
+        here = chosen[-1]
+        one, scale = read(images[here])
+        camera = np.diag([scale, scale, 1.0]) @ K
+        best = here + 1
+        for there in range(here + 1, min(here + LONGEST, last) + 1):
+            found = parallax(one, read(images[there])[0], camera)
+            if found is None:
+                break
+            best = there
+            if found >= WANTED:
+                break
+        chosen.append(best)
+    return chosen
+
+
+def parallax(one: Grey, other: Grey, K: Float) -> float | None:
+    """Median displacement that no rotation of the camera explains, in larger sides of the image.
+
+    Args:
+        one: (H, W) grey image.
+        other: (H, W) the other one.
+        K: (3, 3) their intrinsics, pixels.
+
+    Returns:
+        The share, None where too few points can be tracked.
+    """
+    start = cv2.goodFeaturesToTrack(one, 1000, 0.01, 7)
+    if start is None or one.shape != other.shape:
+        return None
+    options = {"winSize": (21, 21), "maxLevel": 4}
+    end, there, _ = cv2.calcOpticalFlowPyrLK(one, other, start, None, **options)
+    again, back, _ = cv2.calcOpticalFlowPyrLK(other, one, end, None, **options)
+    error = np.linalg.norm(start - again, axis=2).ravel()
+    good = (there.ravel() > 0) & (back.ravel() > 0) & (error < 1)
+    if good.sum() < max(FEWEST, LOST * len(good)):
+        return None
+    p, q = (x.reshape(-1, 2)[good].astype(np.float64) for x in (start, end))
+    rays = np.column_stack([p, np.ones(len(p))]) @ np.linalg.inv(K).T
+
+    def left(turn: Float) -> Float:
+        seen = rays @ exp(turn).T @ K.T
+        return np.asarray(seen[:, :2] / seen[:, 2:] - q)
+
+    turn = least_squares(lambda w: left(w).ravel(), np.zeros(3), loss="soft_l1").x
+    return float(np.median(np.linalg.norm(left(turn), axis=1))) / max(one.shape)
+
+
+def _small(path: Path) -> tuple[Grey, float]:
+    """A picture in grey at a size to track points in, and its scale."""
+    image = cv2.cvtColor(read_image(path, turn=True), cv2.COLOR_RGB2GRAY)
+    scale = min(1.0, SIDE / max(image.shape))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8), scale
