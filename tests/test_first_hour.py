@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -19,6 +20,10 @@ ROOT = Path(__file__).resolve().parents[1]
 HEAVY = ("numpy", "scipy", "cv2", "casadi", "matplotlib", "skimage")
 
 
+def text(name):
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
 def test_help_and_version_import_no_library_of_the_method():
     code = (
         "import sys\nfrom soup_nlp.cli.main import main\n"
@@ -29,6 +34,14 @@ def test_help_and_version_import_no_library_of_the_method():
     assert done.stderr.strip() == "[]"
     assert f"soup-nlp {soup_nlp.__version__}" in done.stdout
     assert "accuracy" in done.stdout
+
+
+def test_a_version_has_its_changelog_and_citation():
+    released = re.search(r"^## \[(\d.*?)\] - \d{4}-\d\d-\d\d$", text("CHANGELOG.md"), re.MULTILINE)
+    cited = re.search(r"^version: (.*)$", text("CITATION.cff"), re.MULTILINE)
+    assert released
+    assert cited
+    assert released[1] == cited[1] == soup_nlp.__version__
 
 
 @pytest.mark.parametrize(("home", "line"), [*COMMANDS.values(), *BENCH.values()])

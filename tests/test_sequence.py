@@ -283,7 +283,7 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     assert row["path"] == told["score"]["path"]["share"]
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
     settings = {"sequence": "street", "frames": 3, "data": None, "overrides": SMALL}
-    study.CHAIN.write(tmp_path, [{**row, "settings": settings, "cpu_seconds": 1.0}])
+    study.CHAIN.write(tmp_path, [{**row, "settings": settings}])
     assert "| street | 3 |" in (tmp_path / "chain.md").read_text()
     # a file of the user is not overwritten
     (tmp_path / "out" / "chain.json").write_text("mine")

@@ -69,11 +69,12 @@ def chain(
     count = len(sequence)
     claim(out, chain_files(count), overwrite)
     sources = [sequence.source(k) for k in range(count)]
-    if stride == AUTO and not quiet:
-        names = ", ".join(Path(s).name for s in sources)
-        print(f"{count} frames far enough apart: {names}", file=sys.stderr)
     which = [(k, k + 1) for k in range(count - 1)]
     over = [(k, k + 2) for k in range(count - 2)] if two_frame else []
+    if not quiet:
+        apart = f", far enough apart: {', '.join(Path(s).name for s in sources)}"
+        found = f"{count} frames{apart if stride == AUTO else ''}"
+        print(f"{found}; {len(which) + len(over)} pairs to solve", file=sys.stderr)
     changes = ["output.page=false", *(overrides or [])]
     pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet), dask)
     done = make_chain(pairs[: len(which)], pairs[len(which) :])
@@ -112,7 +113,7 @@ def _frames(
     first = source[0]
     if first.startswith(SCENE):
         own = first.removeprefix(SCENE)
-        if len(source) > 1 or step != 1 or intrinsics or fov:
+        if len(source) > 1 or step != 1 or intrinsics or fov is not None:
             raise ConfigError("a rendered scene has its own camera and steps", found=source)
         return SceneFrames(own, most or 10)
     path = Path(first).expanduser()
@@ -139,24 +140,11 @@ def _frames(
 
 def _camera(folder: Path, intrinsics: str | None, fov: float | None) -> dict[str, Any]:
     """Keys of an input of files."""
-    if intrinsics and fov:
+    if intrinsics and fov is not None:
         raise ConfigError("two cameras are named", found="--intrinsics and --fov", expected="one")
-    if fov:
+    if fov is not None:
         return {"fov": fov}
     if intrinsics is None:
         own = folder / "K.txt"
         return {"intrinsics": str(own)} if own.is_file() else {}
-    if Path(intrinsics).is_file():
-        return {"intrinsics": str(Path(intrinsics).resolve())}
-    try:
-        numbers = [float(word) for word in intrinsics.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 4:
-        raise ConfigError(
-            "intrinsics are neither a file nor four numbers",
-            where="--intrinsics",
-            found=intrinsics,
-            expected="fx,fy,cx,cy in pixels, or a file of 4 or 9 numbers",
-        )
-    return {"intrinsics": numbers}
+    return {"intrinsics": options.camera(intrinsics, "--intrinsics")}

@@ -14,6 +14,7 @@ from soup_nlp.bench.suites import SUITES
 from soup_nlp.bench.tables import reason
 from soup_nlp.config.presets import PRESETS
 from soup_nlp.errors import ConfigError
+from soup_nlp.storage.files import as_path, is_file
 
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
 PresetName = Annotated[
@@ -95,6 +96,28 @@ def words(text: str, option: str, known: list[str]) -> list[str]:
             "unknown name", where=option, found=", ".join(wrong) or text, expected=", ".join(known)
         )
     return names
+
+
+def camera(text: str, option: str) -> list[float] | str:
+    """Four numbers, or the file that has them, as the key `intrinsics` of a problem file.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    try:
+        values = [float(x) for x in text.split(",")]
+    except ValueError:
+        values = []
+    if not values and is_file(as_path(text, "camera file", home=True)):
+        return text
+    if len(values) != 4:
+        raise ConfigError(
+            "camera is neither four numbers nor a file",
+            where=option,
+            found=text,
+            expected="fx,fy,cx,cy or a text file of 4 or 9 numbers",
+        )
+    return values
 
 
 class Progress:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from soup_nlp.cli.options import PROBLEM, Overwrite, PresetName, Set, preset_first
+from soup_nlp.cli.options import PROBLEM, Overwrite, PresetName, Set, camera, preset_first
 from soup_nlp.cli.progress import SolveLog
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
@@ -21,7 +21,7 @@ from soup_nlp.pipeline.run import run as run_problem
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.verdict import missed, verdict
 from soup_nlp.solve.interrupt import interruptible
-from soup_nlp.storage.files import as_path, is_file
+from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import scratch
 
 
@@ -144,9 +144,9 @@ def _from_options(
         )
     source: dict[str, Any] = {"kind": "files", "ref": ref, "next": following}
     if intrinsics:
-        source["intrinsics"] = _camera(intrinsics, "--intrinsics")
+        source["intrinsics"] = camera(intrinsics, "--intrinsics")
     if intrinsics_next:
-        source["intrinsics_next"] = _camera(intrinsics_next, "--intrinsics-next")
+        source["intrinsics_next"] = camera(intrinsics_next, "--intrinsics-next")
     if fov:
         source["fov"] = float(fov)
     if depth:
@@ -204,21 +204,3 @@ def solve_problem(
     print(summary.read_text(encoding="utf-8") if as_json else log.lines[-1])
     good = run.good and (mre_at_most is None or not missed(run))
     return 0 if good else 1
-
-
-def _camera(text: str, option: str) -> list[float] | str:
-    """Four numbers, or the file that has them, as the key `intrinsics` of a problem file."""
-    try:
-        values = [float(x) for x in text.split(",")]
-    except ValueError:
-        values = []
-    if not values and is_file(as_path(text, "camera file", home=True)):
-        return text
-    if len(values) != 4:
-        raise ConfigError(
-            "camera is neither four numbers nor a file",
-            where=option,
-            found=text,
-            expected="fx,fy,cx,cy or a text file of 4 or 9 numbers",
-        )
-    return values

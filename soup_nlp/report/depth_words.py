@@ -33,9 +33,11 @@ def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
         lines[0] += f", median parallax {pixels[len(pixels) // 2]:.3g} px"
     moving = [part.pixels / run.segmentation.labels.size for part in run.components.members[1:]]
     large = [share for share in moving if share >= SHARE / 5]
-    if large:
-        sizes = ", ".join(f"{share:.0%}" for share in large)
-        lines.append(f"components beside the background: {len(large)} ({sizes} of the image)")
+    if moving:
+        sizes = [f"{share:.0%}" for share in large]
+        rest = [] if len(large) == len(moving) else ["below 1% the others" if large else "below 1%"]
+        words = ", ".join([*sizes, *rest])
+        lines.append(f"components beside the background: {len(moving)} ({words} of the image)")
     if run.full is not None:
         (height, width), (h, w) = run.full.depth_ref.shape, run.pair.size
         scored = "" if run.full.metrics is None else f": MRE {run.full.metrics.mre:.4f}"

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from soup_nlp.bench.rows import Row
+from soup_nlp.bench.rows import Row, read_rows
 from soup_nlp.bench.studies import Study, number
 from soup_nlp.errors import DataError
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import FileFrames, Frames, SceneFrames, find_depths, find_images
-from soup_nlp.sequence.pairs import solve_pairs
+from soup_nlp.sequence.pairs import ROWS, solve_pairs
 from soup_nlp.sequence.score import score
 from soup_nlp.storage.folders import scratch
 
@@ -44,6 +44,7 @@ def measure_chain(
     with scratch() as place:
         which = [(k, k + 1) for k in range(count - 1)]
         chain = make_chain(solve_pairs(source, which, place, ["output.page=false", *overrides]))
+        spent = {row["key"]: row["cpu_seconds"] for row in read_rows(place / ROWS)}
     found = score(chain)
     if found is None:
         raise DataError("sequence has no truth", where=sequence)
@@ -54,6 +55,7 @@ def measure_chain(
         "worst_link": float(np.expm1(max(errors))),
         "path": None if found["path"] is None else found["path"]["share"],
         "flagged": sum(k.flagged for k in chain.links),
+        "pair_seconds": sum(spent.values()) / len(spent),
     }
 
 
@@ -79,7 +81,7 @@ CHAIN = Study(
         "worst link off by": number("worst_link", ".2%"),
         "error of the path": lambda r: "" if r["path"] is None else f"{r['path']:.2%}",
         "links without parallax": number("flagged"),
-        "CPU s": number("cpu_seconds", ".0f"),
+        "CPU s a pair": number("pair_seconds", ".0f"),
     },
     _mean,
 )
