@@ -275,7 +275,8 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
     weight[_discontinuous(tree, settings["energy"], "edges")] *= float(bending["arap_across"])
     bends = _bends(tree, settings["energy"])
     noise = 1.0 if bends else float(np.clip(np.median(tree["start"]["error"]), *NOISE))
-    prior = noise * across * seg["edge_multiplicity"] / max(1, seg["knn"].shape[1])
+    held_prior = np.where(_contact(tree, settings), settings["energy"]["prior_contact"], across)
+    prior = noise * held_prior * seg["edge_multiplicity"] / max(1, seg["knn"].shape[1])
     held = np.full(len(e["pairs"]), 2.0)
     held[_discontinuous(tree, settings["energy"], "pairs")] *= float(bending["orient_across"])
     return {
@@ -307,6 +308,21 @@ def _pair_weights(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Float:
     )
     weight[_discontinuous(tree, form, "pairs")] *= float(form["bending"]["cont_across"])
     return np.asarray(weight)
+
+
+def _contact(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """K-NN edges where a component stands on what lies below it in an upright image."""
+    start, anchors = tree["start"], tree["segmentation"]["anchors"]
+    component, ends = start["component"], tree["energy"]["edges"]
+    # each edge from its upper to its lower end
+    order = np.argsort(anchors[ends, 1], axis=1, kind="stable")
+    top, low = np.take_along_axis(ends, order, axis=1).T
+    fall = anchors[low] - anchors[top]
+    steep = fall[:, 1] > 0.5 * np.sqrt((fall**2).sum(1))
+    apart = (component[top] != component[low]) & (component[top] != np.bincount(component).argmax())
+    depth = start["lam"] * start["d"] / -(start["n"] * tree["energy"]["anchor_ray"]).sum(1)
+    touch = np.maximum(depth[top], depth[low]) < 1.25 * np.minimum(depth[top], depth[low])
+    return np.asarray(steep & apart & touch & bool(settings["start"]["upright"]))
 
 
 def _discontinuous(

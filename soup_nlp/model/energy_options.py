@@ -102,6 +102,9 @@ class EnergyOptions(Section):
     arap_across: Share = 0.03
     """Factor of E_arap and E_prior between superpixels of different components; 1 is the
     paper's."""
+    prior_contact: NonNegative = 3.0
+    """Factor of E_prior where, in an upright image, one of these components stands on what lies
+    below it: contact gives it its scale."""
     cont_occluded: Share = 0.03
     """Factor of E_cont where one of these components hides another; 1 is the paper's."""
     occlusion_gap: Annotated[float, Field(ge=0, lt=1)] = 0.1

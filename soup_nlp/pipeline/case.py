@@ -26,6 +26,7 @@ from soup_nlp.model.reweighting import (
     across_components,
     across_discontinuities,
     at_occlusions,
+    contacts,
     in_length,
     in_noise,
     in_pixels,
@@ -194,7 +195,10 @@ def build_energy(
     if not bends:
         # a start without relief says nothing of the flow's noise
         data = in_noise(data, start.error)
-    data = across_components(data, start.component, e.arap_across)
+    stands = None
+    if problem.start.upright:
+        stands = contacts(data, start.soup, start.component, seg.anchors)
+    data = across_components(data, start.component, e.arap_across, stands, e.prior_contact)
     data = at_occlusions(data, start.soup, start.component, e.occlusion_gap, e.cont_occluded)
     if bends:
         b = e.bending
