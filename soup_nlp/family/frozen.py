@@ -54,7 +54,10 @@ class Frozen:
     @cached_property
     def problem(self) -> Problem:
         """The merged problem."""
-        return make_problem(yaml.safe_load(self.text))
+        raw = yaml.safe_load(self.text)
+        # an option that is younger than the first records
+        raw["energy"].setdefault("prior_contact", raw["energy"]["arap_across"])
+        return make_problem(raw)
 
     @property
     def start(self) -> Soup:
