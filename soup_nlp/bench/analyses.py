@@ -12,6 +12,7 @@ from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
 from soup_nlp.bench.analyses_measures import VIEWS, measure_energy, measure_flow, measure_view
 from soup_nlp.bench.confidence import measure_confidence, plot_confidence, text_confidence
 from soup_nlp.bench.rows import MeasureRows, Row, measure_all
+from soup_nlp.bench.rules import RULES, plot_rules, text_rules
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import Listing
 from soup_nlp.errors import ConfigError
@@ -139,6 +140,13 @@ _ALL = (
         function=measure_confidence,
         page=text_confidence,
         plot=plot_confidence,
+    ),
+    Analysis(
+        "rules",
+        "what every rule of the start and the energy brings, by family",
+        RULES,
+        page=text_rules,
+        plot=plot_rules,
     ),
     Analysis(
         "energy",

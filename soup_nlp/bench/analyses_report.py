@@ -56,7 +56,7 @@ LONG = 60
 """Letters of all variants from which their labels are slanted."""
 
 
-def _by_pair(
+def by_pair(
     rows: Sequence[Row], names: Sequence[str]
 ) -> tuple[list[str], dict[str, dict[str, Row]]]:
     """Variants, and rows by name of the pair and variant."""
@@ -66,7 +66,8 @@ def _by_pair(
     return list(dict.fromkeys(r["variant"] for r in rows)), out
 
 
-def _head(name: str, text: str, rows: Sequence[Row], note: str) -> list[str]:
+def head_of(name: str, text: str, rows: Sequence[Row], note: str) -> list[str]:
+    """Title, question, and how the rows were made."""
     used = dict.fromkeys(r["presets"][0] for r in rows)
     conventions = "; ".join(str(preset(p)) for p in used)
     lines = [f"# Analysis: {name}", "", f"{text[0].upper()}{text[1:]}. {note}", ""]
@@ -75,8 +76,8 @@ def _head(name: str, text: str, rows: Sequence[Row], note: str) -> list[str]:
 
 def text_variants(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     """Table of an analysis: a pair a line, a variant a column."""
-    lines = _head(name, text, rows, note)
-    variants, pairs = _by_pair(rows, titles(rows))
+    lines = head_of(name, text, rows, note)
+    variants, pairs = by_pair(rows, titles(rows))
     complete = [p for p in pairs.values() if all(main_metric(p[v]) is not None for v in variants)]
     for title, (form, measure) in MEASURES.items():
         entries = [
@@ -99,7 +100,7 @@ def text_variants(name: str, text: str, rows: Sequence[Row], note: str = "") -> 
 
 def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     """Table of energies by term and soup, and the two claims about them."""
-    lines = _head(name, text, rows, note)
+    lines = head_of(name, text, rows, note)
     good = [r for r in rows if r.get("ok")]
     entries, summary = [], []
     for title, row in zip(titles(good), good, strict=True):
@@ -130,7 +131,7 @@ def plot_variants(
     path: Path, axis: str, title: str, rows: Sequence[Row], numeric: bool = False
 ) -> None:
     """MRE over the variants, a line a pair, their mean in black."""
-    variants, pairs = _by_pair(rows, titles(rows))
+    variants, pairs = by_pair(rows, titles(rows))
     x = np.array([float(v) for v in variants]) if numeric else np.arange(float(len(variants)))
     picture = figure(7, 4)
     ax = picture.add_subplot()
@@ -193,7 +194,7 @@ def plot_energy(path: Path, rows: Sequence[Row]) -> None:
 def text_flow(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     """Table of flow errors: the means of complete pairs by source, and every pair and source."""
     good = [r for r in rows if r.get("ok")]
-    variants, pairs = _by_pair(good, pair_names(good))
+    variants, pairs = by_pair(good, pair_names(good))
     complete = [own for own in pairs.values() if len(own) == len(variants)]
 
     def cells(some: Iterable[Row]) -> list[str]:
@@ -213,7 +214,7 @@ def text_flow(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
 def plot_flow(path: Path, rows: Sequence[Row]) -> None:
     """Weighted error by pair, a bar a source."""
     good = [r for r in rows if r.get("ok")]
-    variants, pairs = _by_pair(good, pair_names(good))
+    variants, pairs = by_pair(good, pair_names(good))
     picture = figure(max(5.0, 1.1 * len(pairs)), 4)
     ax = picture.add_subplot()
     width = 0.8 / max(1, len(variants))

@@ -28,6 +28,9 @@ COMMANDS = (
     f"{ANALYSIS} energy --suite rendered {TERSE} {NLP}",
     f"{ANALYSIS} flows --suite rendered --suite shared --data {{data}} --flow truth",
     f"{ANALYSIS} views --suite shared --data {{data}} --flow dis {NLP}",
+    f"{ANALYSIS} confidence --suite rendered --suite shared --data {{data}} --flow dis",
+    f"{ANALYSIS} rules --suite rendered --suite shared --data {{data}} --flow dis --width 512"
+    f" {TERSE} {NLP}",
     f"bench search -o {{out}}/accuracy {THREE} --flow dis --trials 8 --seeds 0"
     f" --validation-seeds 1,2 --width 512 --set segmentation.superpixels=300 {NLP}",
     "bench accuracy -o {out}/accuracy --name sheets --suite rendered --only sheet"

@@ -1,0 +1,111 @@
+"""The analysis of rules: what every rule of the start and the energy brings, family by family."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from soup_nlp.bench.analyses_report import by_pair, head_of
+from soup_nlp.bench.rows import Row
+from soup_nlp.bench.tables import failures, figure, joined, main_metric, save, show, table, titles
+
+SHIPPED = "shipped"
+"""Variant with every rule."""
+SAME = 0.01
+"""Relative change of a family's MRE up to which a rule changes nothing there."""
+
+
+def _both(key: str, value: str) -> tuple[str, ...]:
+    # bending surfaces have weights of their own
+    return tuple(f"energy.{w}.{key}={value}" for w in ("weights", "bending.weights"))
+
+
+RULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        SHIPPED: (),
+        "energy of bending surfaces": ("start.bending=1",),
+        "E_prior": _both("prior", "0"),
+        "E_prior holds contacts": ("energy.prior_contact=0.03",),
+        "E_arap weak across components": ("energy.arap_across=1",),
+        "E_arap truncated": _both("sigma_arap", ".inf"),
+        "E_cont weak at occlusions": ("energy.cont_occluded=1",),
+        "contact below": ("start.upright=false",),
+        "ground": ("start.ground=false",),
+        "flow behind a still layer": ("flow.see_through=false",),
+        "borders follow the flow": ("segmentation.follow_flow_px=null",),
+    }
+)
+"""Overrides that leave a rule out, by the rule."""
+
+
+def _changes(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Relative change of the MRE by each rule, by rule and family: geometric mean of its pairs."""
+    _, pairs = by_pair(rows, titles(rows))
+    logs: dict[str, dict[str, list[float]]] = {}
+    for own in pairs.values():
+        shipped = main_metric(own[SHIPPED]) if SHIPPED in own else None
+        for rule, row in own.items():
+            without = main_metric(row)
+            if rule != SHIPPED and shipped and without:
+                family = logs.setdefault(rule, {}).setdefault(str(row["sequence"]), [])
+                family.append(float(np.log(shipped / without)))
+    return {
+        rule: {family: float(np.expm1(np.mean(v))) for family, v in families.items()}
+        for rule, families in logs.items()
+    }
+
+
+def text_rules(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
+    """Tables: families that gain and lose by every rule, the changes, the MRE of every pair."""
+    changes = _changes(rows)
+    families = list(dict.fromkeys(f for own in changes.values() for f in own))
+    summary, detail = [], []
+    for rule, own in changes.items():
+        better = sorted((c, f) for f, c in own.items() if c < -SAME)
+        worse = sorted(((c, f) for f, c in own.items() if c > SAME), reverse=True)
+        total = float(np.expm1(np.mean(np.log1p(list(own.values())))))
+        summary.append(
+            [
+                *(rule, f"`{' '.join(RULES.get(rule, ()))}`", f"{total:+.1%}"),
+                ", ".join(f"{f} {c:+.0%}" for c, f in better) or "-",
+                ", ".join(f"{f} {c:+.0%}" for c, f in worse) or "-",
+            ]
+        )
+        detail.append([rule, *(show(own.get(f), "+.1%") for f in families)])
+    about = (
+        "Change of the MRE that a rule brings: everything as shipped against the same without it;"
+        " negative is better. Geometric means over the pairs of a family, and over the families."
+        f" Changes up to {SAME:.0%} are left out of the lists."
+    )
+    head = ["rule", "without", "all families", "better", "worse"]
+    lines = [*head_of(name, text, rows, note), about, "", *table(head, summary), ""]
+    lines += ["## By family", "", *table(["rule", *families], detail), ""]
+    variants, pairs = by_pair(rows, titles(rows))
+    entries = [
+        [pair, *(show(main_metric(own[v]), ".4f") for v in variants)] for pair, own in pairs.items()
+    ]
+    lines += ["## MRE without each rule", "", *table(["pair, flow", *variants], entries), ""]
+    return joined([*lines, *failures(rows)])
+
+
+def plot_rules(path: Path, rows: Sequence[Row]) -> None:
+    """Change of every family's MRE by every rule, as a map."""
+    changes = _changes(rows)
+    families = list(dict.fromkeys(f for own in changes.values() for f in own))
+    value = np.array([[own.get(f, np.nan) for f in families] for own in changes.values()])
+    value = 100 * value.reshape(len(changes), len(families))
+    picture = figure(2.5 + 0.55 * len(families), 1.8 + 0.38 * len(changes))
+    ax = picture.add_subplot()
+    shown = ax.imshow(value, cmap="RdBu_r", vmin=-50, vmax=50, aspect="auto")
+    for (row, column), v in np.ndenumerate(value):
+        if np.isfinite(v) and abs(v) >= 100 * SAME:
+            colour = "white" if abs(v) > 30 else "black"
+            ax.text(column, row, f"{v:+.0f}", ha="center", va="center", color=colour, fontsize=8)
+    ax.set_xticks(range(len(families)), families, rotation=45, ha="right")
+    ax.set_yticks(range(len(changes)), list(changes))
+    ax.set_title("Change of the MRE by each rule, per cent (blue: better with it)")
+    picture.colorbar(shown, ax=ax, label="%")
+    save(picture, path)
