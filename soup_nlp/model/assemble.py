@@ -51,10 +51,14 @@ class Pattern(NamedTuple):
         """Of the nonzeros of each set of elements."""
         # ten million nonzeros are ranked: half as many bytes take half the time
         kind = np.int32 if shape[0] * shape[1] < 2**31 else np.int64
-        keys = [np.multiply(e.columns, shape[0], dtype=kind) + e.rows.astype(kind) for e in sets]
-        every = np.concatenate([np.zeros(0, kind), *(key.ravel() for key in keys)])
+        sizes = [e.rows.size for e in sets]
+        ends = np.cumsum(sizes[:-1], dtype=int)
+        every: NDArray[np.integer] = np.empty(sum(sizes), kind)
+        for own, e in zip(np.split(every, ends), sets):
+            np.multiply(e.columns.ravel(), shape[0], dtype=kind, out=own)
+            own += e.rows.ravel()
         unique, place = _ranked(every)
-        each = np.split(place, np.cumsum([key.size for key in keys], dtype=int)[:-1])
+        each = np.split(place, ends)
         columns, rows = np.divmod(unique.astype(np.int64), shape[0])
         return cls(shape, rows, columns, [e.of_all(own) for e, own in zip(sets, each)])
 
@@ -65,14 +69,15 @@ class Pattern(NamedTuple):
 
 
 def _ranked(keys: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.int32]]:
-    """`np.unique(keys, return_inverse=True)`, two to four times as fast on keys nearly in order."""
+    """`np.unique(keys, return_inverse=True)`, two to four times as fast on keys nearly in order;
+    overwrites the keys, since a third copy of them is the most memory that a solve takes."""
     order = np.argsort(keys, kind="stable")
-    ranked = keys[order]
-    new = np.ones(len(keys), bool)
-    np.not_equal(ranked[1:], ranked[:-1], out=new[1:])
     place = np.empty(len(keys), np.int32)
+    keys[:] = keys[order]
+    new = np.ones(len(keys), bool)
+    np.not_equal(keys[1:], keys[:-1], out=new[1:])
     place[order] = np.cumsum(new, dtype=np.int32) - 1
-    return ranked[new], place
+    return keys[new], place
 
 
 def jacobian_entries(group: Group) -> Entries:

@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.solve.factor import Back, Factorise, diagonal_places, factorisation, same_pattern
@@ -43,6 +44,7 @@ from soup_nlp.solve.line_search import (
     reach,
 )
 from soup_nlp.solve.phase import Phase, Reached
+from soup_nlp.solve.reuse import held, preconditioned
 from soup_nlp.solve.tangent_problem import HessianKind, TangentProblem
 
 Float = NDArray[np.float64]
@@ -53,6 +55,10 @@ HELD = 1e-3
 """Least damping of a superpixel whose step went too far."""
 BLENDS = (0.0, 0.1, 0.3, 1.0)
 """Shares of the majorant in the exact Hessian, tried until the step is a descent direction."""
+REUSE = 4000
+"""Superpixels from which a factor serves several iterations: below, it costs little."""
+INEXACT: Mapping[HessianKind, float] = {"gauss-newton": 0.3, "exact": 0.03}
+"""Accuracy of steps with an earlier factor."""
 
 
 class Step(NamedTuple):
@@ -60,13 +66,13 @@ class Step(NamedTuple):
 
     Attributes:
         h: (9 N,) the step.
-        H: Nonzeros of its matrix without damping.
+        bent: (9 N,) its matrix without damping times h.
         blend: Share of the majorant to begin with next time.
         newton: Newton step for another gradient of the merit.
     """
 
     h: Float
-    H: Float
+    bent: Float
     blend: float
     newton: Callable[[Float], Float]
 
@@ -100,6 +106,7 @@ class Descent:
         else:
             self.library, self._factorise = factorisation(problem.upper)
         self._diagonal = diagonal_places(problem.upper)
+        self._last: Back | None = None
         self.x: Float = problem.nlp.x0
         self.z: Float | None = None
         self.damping: Float = np.full(problem.layout.count, 1e-2)
@@ -132,7 +139,7 @@ class Descent:
         self.damping = np.minimum(self.damping, 1e-2 if phase.hessian != "exact" else 1e-4)
         gradient = problem.gradient(at.x)
         curvature: tuple[Float, Float] | None = None
-        blend, small = 0.0, 0
+        blend, small, self._last = 0.0, 0, None
         barrier = max(phase.highest, phase.barrier)
         history: list[tuple[float, ...]] = []
         reached: Reached | None = None
@@ -156,11 +163,12 @@ class Descent:
                 curvature = self._curvature(at, phase.hessian)
             step = self._newton(at, curvature, blend, gradient, barrier, phase.hessian)
             search = Search(problem, at, step.h, barrier, step.newton)
-            move = search.run(gradient, self._times(step.H, step.h))
+            move = search.run(gradient, step.bent)
             self._adapt(move)
             history[-1] = (*history[-1][:4], float(move.length.min()))
             if move.point is None:
-                # the majorant's steps descend
+                # the majorant's steps descend, and steps with a factor of its own
+                self._last = None
                 blend = min(1.0, max(BLENDS[1], 9 * step.blend))
                 continue
             fell = at.merit - move.point.merit
@@ -276,28 +284,43 @@ class Descent:
         damping = np.repeat(self.damping, 9)
         right, a = merit_gradient(at, gradient, barrier), self.problem.length(at.x)
         shares = [blend, *(s for s in BLENDS if s > blend)] if kind == "exact" else [1.0]
-        h, newton = np.zeros_like(at.x), _held(np.zeros_like, a)
+        h, bent, newton = np.zeros_like(at.x), np.zeros_like(at.x), held(np.zeros_like, a)
         for share in shares:
-            H = majorant if share == 1.0 else (1 - share) * exact + share * majorant
+            H = _blended(exact, majorant, share)
+            times = self._times(H, damping)
+            if self._last:
+                newton = held(self._last, a)
+                near = preconditioned(times, newton, right, INEXACT[kind])
+                if near.indefinite and share < 1:
+                    continue
+                if near.solved:
+                    h, bent = near.h, near.product
+                    self._last = None if near.worn else self._last
+                    break
             damped = H.copy()
             damped[self._diagonal] += damping
+            self._last = None
             try:
                 back = self._factorise(damped)
             except ArithmeticError:
+                newton = held(np.zeros_like, a)
                 continue
-            newton = _held(back, a)
+            newton = held(back, a)
             h = newton(right)
+            bent = times(h)
             # a library that cannot see definiteness: test the curvature along the step
             # (Chiang and Zavala 2016)
-            curved = float(h @ self._times(H, h)) + float(damping @ h**2)
-            if np.isfinite(h).all() and curved > 0 and float(right @ h) <= 0:
+            if np.isfinite(h).all() and float(h @ bent) > 0 and float(right @ h) <= 0:
+                self._last = back if len(self.damping) >= REUSE else None
                 break
-        return Step(h, H, share / 3 if share > 0.02 else 0.0, newton)
+        return Step(h, bent - damping * h, share / 3 if share > 0.02 else 0.0, newton)
 
-    def _times(self, H: Float, h: Float) -> Float:
-        U = self.problem.upper.copy()
-        U.data = H
-        return np.asarray(U @ h + U.T @ h - H[self._diagonal] * h)
+    def _times(self, H: Float, damping: Float) -> Callable[[Float], Float]:
+        """Product of a damped Hessian, given by its nonzeros, with a vector."""
+        pattern = self.problem.upper
+        U = sparse.csc_matrix((H, pattern.indices, pattern.indptr), pattern.shape)
+        lower, twice = U.T, damping - H[self._diagonal]
+        return lambda h: np.asarray(U @ h + lower @ h + twice * h)
 
     def _adapt(self, move: Move) -> None:
         """Change the damping of every superpixel according to its step."""
@@ -319,12 +342,8 @@ class Descent:
         self.z = np.clip(z, 1e-8 * b / moved.slack, 1e8 * b / moved.slack)
 
 
-def _held(back: Back, a: Float) -> Callable[[Float], Float]:
-    """Newton step for a gradient, within the plane `a . h = 0`."""
-    v = back(a)
-
-    def newton(gradient: Float) -> Float:
-        u = back(gradient)
-        return np.asarray(-u + v * (a @ u) / (a @ v))
-
-    return newton
+def _blended(exact: Float, majorant: Float, share: float) -> Float:
+    """Nonzeros of the Hessian with a share of the majorant."""
+    if share in (0.0, 1.0):
+        return majorant if share else exact
+    return (1 - share) * exact + share * majorant
