@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.storage import folders
 from soup_nlp.storage.folders import claim, recover, scratch, staged
@@ -313,6 +314,7 @@ def test_a_signal_waits(number):
 
 LIMITED = """
 import resource, sys
+from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.storage.folders import staged
 from soup_nlp.storage.store import Array, write_h5, write_json
@@ -340,3 +342,14 @@ def test_a_file_that_cannot_be_written_ends_in_an_error(tmp_path):
     assert content(target) == {"a": "1"}
     assert os.listdir(tmp_path) == ["out"]
     assert json.loads((target / MARK).read_text())["files"].keys() == {"a"}
+
+
+@pytest.mark.parametrize("command", ["bench paper", "bench speed", "bench accuracy", "compare"])
+def test_pages_of_the_user_are_refused_before_anything_is_measured(command, tmp_path, capsys):
+    page = {"bench speed": "table.md", "bench accuracy": "rendered.md"}.get(command, "README.md")
+    (tmp_path / page).write_text("mine")
+    words = {"bench accuracy": ["--suite", "rendered"], "compare": ["orbit"]}.get(command, [])
+    assert main([*command.split(), *words, "-o", str(tmp_path)]) == 2
+    assert "that this program did not make" in " ".join(capsys.readouterr().err.split())
+    assert (tmp_path / page).read_text() == "mine"
+    assert not list(tmp_path.glob("*.jsonl"))

@@ -28,6 +28,7 @@ from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import failures, get, joined, made, mean, show, table
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.folders import staged
 
 Number = float | None
 TEXTS: Mapping[str, str] = {
@@ -38,6 +39,10 @@ TEXTS: Mapping[str, str] = {
     "flow": "Flow: the truth, the truth with noise, DIS",
     "stages": "NLP and refinement apart",
 }
+PAGE = "README.md"
+FIGURES = ("comparison", "depth_maps", "convergence", "departures", "scale", *SECTIONS)
+FILES = (PAGE, *(f"{name}.png" for name in FIGURES))
+"""Names of all files that `write_page` may write."""
 NEAR = 0.1
 """A scale is right that is within this of the truth."""
 
@@ -72,21 +77,21 @@ def write_page(out: Path, results: Results, command: str) -> Path:
         command: How the page is made.
     """
     chosen = results.plan.sizes.sections
-    sections = [
-        _head(results, command),
-        _comparison(out, results),
-        _pictures(out, results),
-        *(_section(out, results, name) for name in SECTIONS if name in chosen),
-        _convergence(out, results),
-        _time(results),
-        _departures(out, results) if "departures" in chosen else [],
-        _scale(out, results) if "scale" in chosen else [],
-        _missing(results),
-        failures([*results.rows, *results.scales]),
-    ]
-    page = out / "README.md"
-    write_text(page, joined([line for lines in sections for line in lines]))
-    return page
+    with staged(out) as new:
+        sections = [
+            _head(results, command),
+            _comparison(new, results),
+            _pictures(new, results, out),
+            *(_section(new, results, name) for name in SECTIONS if name in chosen),
+            _convergence(new, results),
+            _time(results),
+            _departures(new, results) if "departures" in chosen else [],
+            _scale(new, results) if "scale" in chosen else [],
+            _missing(results),
+            failures([*results.rows, *results.scales]),
+        ]
+        write_text(new / PAGE, joined([line for lines in sections for line in lines]))
+    return out / PAGE
 
 
 def _head(r: Results, command: str) -> list[str]:
@@ -195,12 +200,12 @@ def _by_pair(r: Results) -> list[str]:
     return [note, "", *table([*head, "constant depth"], entries), ""]
 
 
-def _pictures(out: Path, r: Results) -> list[str]:
+def _pictures(out: Path, r: Results, stored: Path) -> list[str]:
     items = {i.key: i for i in r.plan.analyses}
     items |= {i.key: i for group in r.plan.datasets.values() for i in group[:2]}
     files = {}
     for item in items.values():
-        a, b = (_compared(r, [item], m)[0].maps(out) for m in METHODS)
+        a, b = (_compared(r, [item], m)[0].maps(stored) for m in METHODS)
         if a.is_file() and b.is_file():
             files[title(item)] = a, b
     text = "Depth maps: image, truth, unorganised soup, preset, defaults"

@@ -9,14 +9,14 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.bench.paper_page import Results, complete, write_page
+from soup_nlp.bench.paper_page import FILES, Results, complete, write_page
 from soup_nlp.bench.paper_plan import ALL, DATASETS, Sizes, make_plan
 from soup_nlp.bench.rows import measure_all
 from soup_nlp.bench.suite_pairs import RENDERED
 from soup_nlp.cli import options
 from soup_nlp.cli.bench_accuracy import mre_of
 from soup_nlp.cli.options import Progress, numbers, words
-from soup_nlp.report.folder import prepare_folder
+from soup_nlp.storage.folders import claim
 
 FAMILIES = [*RENDERED, "motorcycle", *(d.name for d in DATASETS)]
 
@@ -47,6 +47,7 @@ def paper(
     overrides: options.Set = None,
     workers: options.Workers = 1,
     any_code: options.AnyCode = False,
+    overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
     """The paper's tables and figures by `preset: paper` and the defaults; can be continued."""
@@ -67,7 +68,7 @@ def paper(
     said += [f"--sections {sections}"] * (sections != ",".join(ALL))
     said += [f"--limit {limit}"] * (limit is not None) + ["--data DIR"] * (data is not None)
     said += [f"--set {shlex.quote(o)}" for o in chosen.overrides]
-    prepare_folder(out)
+    claim(out, FILES, overwrite)
     plan, progress = make_plan(data, chosen), Progress(quiet, mre_of)
     run = partial(measure_all, workers=workers, say=progress, any_code=any_code)
     scales = run(plan.scale_jobs(), out / "scale.jsonl")
