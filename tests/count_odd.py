@@ -18,7 +18,7 @@ from helpers_odd_cases import CASES
 from helpers_odd_run import Case, fault
 from helpers_odd_world import World
 
-SECONDS = 25
+SECONDS = 120
 MEMORY = 6 << 30
 
 

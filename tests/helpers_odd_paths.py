@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,6 +14,19 @@ Words = Callable[[World, Path, str], list[str]]
 
 READ: dict[str, tuple[str, Words]] = {
     "solve --ref": (".png", lambda w, o, x: solve(w, o, ref=x)),
+    "solve --ref alone": (
+        ".png",
+        lambda w, o, x: [
+            *("solve", "--ref", x, "--next", str(w.good("b.png"))),
+            "-o",
+            str(o / "out"),
+            "-q",
+        ],
+    ),
+    "view": ("", lambda w, o, x: ["view", x, "--no-open"]),
+    "convert": ("", lambda w, o, x: ["convert", x, "--to", "glb", "-o", str(o / "out")]),
+    "chain": ("", lambda w, o, x: ["chain", x, "-q", "-o", str(o / "out")]),
+    "chain image": (".png", lambda w, o, x: ["chain", x, x, "-q", "-o", str(o / "out")]),
     "solve --next": (".png", lambda w, o, x: solve(w, o, next=x)),
     "solve --intrinsics": (".txt", lambda w, o, x: solve(w, o, intrinsics=x)),
     "solve --flow flo": (".flo", lambda w, o, x: solve(w, o, flow=x)),
@@ -95,6 +109,10 @@ WRITE: dict[str, Words] = {
 NO_FOLDER = ("pipe", "zero", "null", "socket", "nul", "long", "deep", "loop", "garbage")
 """Kinds that no output folder can be made at."""
 
+INSTEAD = ("pipe", "zero", "null", "random", "socket", "folder", "dangling", "loop", "empty")
+"""Kinds of which a file of a result is replaced."""
+RESULT = ("depth_ref.png", "points_next.ply", "overview.png", "result.h5", "summary.json")
+
 FOLDERS = ("check", "check --export", "evaluate", "import DIR", "list", "bench accuracy --data")
 """Doors of folders."""
 
@@ -123,3 +141,15 @@ def path_cases() -> Iterator[Case]:
             yield Case(
                 "5 doors", f"{door} -o {kind}", lambda w, o, d=write, k=kind: d(w, o, w.odd(k, ""))
             )
+    for name in RESULT:
+        for kind in INSTEAD:
+
+            def replaced(w: World, o: Path, name=name, kind=kind) -> list[str]:
+                copy = o / "copy"
+                shutil.copytree(w.result, copy)
+                (copy / name).unlink()
+                ODD[kind](copy / name)
+                return ["check", str(copy)]
+
+            needed = name in ("result.h5", "summary.json")
+            yield Case("3 check", f"check {name} {kind}", replaced, (2,) if needed else (1,))

@@ -25,6 +25,7 @@ from soup_nlp.sequence.key_frames import LONGEST
 from soup_nlp.sequence.pairs import solve_pairs
 from soup_nlp.sequence.report import table
 from soup_nlp.sequence.write import SINGLE, chain_files, write_chain
+from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.folders import claim, staged
 
 SCENE = "scene:"
@@ -116,23 +117,23 @@ def _frames(
         if len(source) > 1 or step != 1 or intrinsics or fov is not None:
             raise ConfigError("a rendered scene has its own camera and steps", found=source)
         return SceneFrames(own, most or 10)
-    path = Path(first).expanduser()
+    path = as_path(first, "frames", home=True)
     depths: list[Path] = []
     # as many are chosen among all
     end = most if step else None
     if len(source) > 1:
-        images = [Path(name) for name in source][:: step or 1][:end]
+        images = [as_path(name, "image", home=True) for name in source][:: step or 1][:end]
     elif path.suffix.lower() in VIDEOS:
         read = None if most is None or step else most * LONGEST
         images = video_frames(path, out / "frames", step or 1, end or read)
     else:
         images = find_images(path)[:: step or 1][:end]
         depths = find_depths(images)
-    images = [p.resolve() for p in images]
+    images = [p.absolute() for p in images]
     found = FileFrames(
         tuple(images),
         _camera(images[0].parent, intrinsics, fov),
-        tuple(p.resolve() for p in depths),
+        tuple(p.absolute() for p in depths),
         depth_scale,
     )
     return found if step else found.apart(most)
@@ -146,5 +147,5 @@ def _camera(folder: Path, intrinsics: str | None, fov: float | None) -> dict[str
         return {"fov": fov}
     if intrinsics is None:
         own = folder / "K.txt"
-        return {"intrinsics": str(own)} if own.is_file() else {}
+        return {"intrinsics": str(own)} if is_file(own) else {}
     return {"intrinsics": options.camera(intrinsics, "--intrinsics")}

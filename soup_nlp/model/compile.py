@@ -19,6 +19,8 @@ from pathlib import Path
 import casadi as ca
 
 log = logging.getLogger(__name__)
+MOST_SOURCE = 1_000_000
+"""Characters of C that are compiled: 0.6 million take gcc 9 seconds, 1.4 million minutes."""
 FLAGS = ("-O2", "-march=native", "-fPIC", "-shared", "-fno-math-errno")
 
 
@@ -147,10 +149,13 @@ def _build(source: Callable[[], str], key: str, compiler: str) -> Path:
         folder = _own_folder()
         library = folder / library.name
     if not library.exists():
+        code = source()
+        if len(code) > MOST_SOURCE:
+            raise OSError(f"{len(code)} characters of C would take minutes")
         log.info("compiling kernels with %s; this machine keeps them", Path(compiler).name)
         with tempfile.TemporaryDirectory(dir=folder) as work:
             c_file, made = Path(work) / "kernels.c", Path(work) / library.name
-            c_file.write_text(source())
+            c_file.write_text(code)
             subprocess.run(
                 [compiler, *FLAGS, str(c_file), "-o", str(made), "-lm"],
                 check=True,

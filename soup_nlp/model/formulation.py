@@ -32,8 +32,8 @@ class FormulationOptions(Section):
     """Added to the Gauss-Newton Hessian's diagonal."""
     min_facing: Annotated[float, Field(ge=0, le=0.5)] = 1e-3
     """Visibility: lower bound c of -n . r."""
-    depth_ratio: Annotated[float, Field(ge=1, le=MOST)] = 5.0
-    """Depth at a rim pixel is at most this many times the anchor's."""
+    depth_ratio: Annotated[float, Field(ge=1.01, le=MOST)] = 5.0
+    """Depth at a rim pixel is at most this many times the anchor's (1 leaves one plane only)."""
     compiled: bool = True
     """Compile kernels where a C compiler is found."""
 

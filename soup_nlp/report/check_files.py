@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.errors import DataError
 from soup_nlp.evaluate import recompute, recompute_files
 from soup_nlp.report.claim import HASHED, Claim, same
 from soup_nlp.report.record import RECORD, recorded_files
+from soup_nlp.storage.files import read_bytes
 from soup_nlp.storage.mark import digest_of
 from soup_nlp.storage.store import require
 
@@ -81,9 +83,9 @@ def _depth_png(folder: Path, claims: Entries, which: str, depth: Float) -> Itera
     name = f"depth_{which}.png"
     expected = recompute_files.png_values(depth, scale)
     try:
-        data = (folder / name).read_bytes()
-    except OSError as error:
-        yield Claim(f"{name} pixels", 0, np.nan, 0, False, note=str(error.strerror))
+        data = read_bytes(folder / name, name)
+    except DataError as error:
+        yield Claim(f"{name} pixels", 0, np.nan, 0, False, note=str(error.found or error.what))
         return
     # the size stands in bytes 16 to 23, before anything is decoded
     size = int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
@@ -129,9 +131,10 @@ def _clouds(folder: Path, tree: Entries, state: recompute.State) -> Iterator[Cla
 
 def _read_ply(path: Path) -> NDArray[np.float32] | None:
     """(M, 6) positions and normals of a cloud as we write it; None where it is none."""
-    if not path.is_file():
+    try:
+        data = read_bytes(path, path.name)
+    except DataError:
         return None
-    data = path.read_bytes()
     head, end, _ = data[:4096].partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     count = [line[2] for line in lines if line[:2] == ["element", "vertex"]]

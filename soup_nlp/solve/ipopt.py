@@ -278,6 +278,9 @@ class Ipopt:
         converged = status in GOOD
         x = np.asarray(out["x"]).ravel()
         f = float(out["f"])
+        history = {k: np.asarray(v, float) for k, v in stats.get("iterations", {}).items()}
+        # Ipopt does not count the iteration that begins its restoration; the history has it
+        count = len(history["obj"]) - 1 if len(history.get("obj", ())) else watch.count
         lam_x, lam_g = np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_g"]).ravel()
         if not converged and watch.best_lam is not None:
             x, f, (lam_x, lam_g) = watch.best_x, watch.best_f, watch.best_lam
@@ -291,8 +294,8 @@ class Ipopt:
             lam_x=lam_x,
             lam_g=lam_g,
             objective=f,
-            iterations=int(stats.get("iter_count", watch.count)),
+            iterations=count,
             seconds=time.perf_counter() - begin,
-            history={k: np.asarray(v, float) for k, v in stats.get("iterations", {}).items()},
+            history=history,
             calls={k: float(stats.get(f"t_wall_{s}", 0.0)) for k, s in CALLS.items()},
         )

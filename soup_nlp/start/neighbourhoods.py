@@ -148,7 +148,11 @@ def refine_motion(
         A += np.diag(prior)
         g[:, :3] += prior[:3] * turn
         g[:, 3:] += prior[3:] * np.einsum("nbi,ni->nb", basis, t - t0)
-        step = -np.linalg.solve(A, g[..., None])[..., 0]
+        try:
+            step = -np.linalg.solve(A, g[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            # the prior is below the rounding of A (focal lengths of 1e9)
+            step = -(np.linalg.pinv(A, hermitian=True) @ g[..., None])[..., 0]
         limit = np.minimum(1.0, 0.1 / np.maximum(np.abs(step).max(axis=1), 1e-12))[:, None]
         step = step * limit
         turn = turn + step[:, :3]

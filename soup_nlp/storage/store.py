@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, is_dataclass
@@ -72,23 +71,15 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
     own = {"schema": SCHEMA, "versions": json.dumps(versions()), "machine": platform.platform()}
     try:
         # in memory: on a full disk HDF5 ends the process
-        with h5py.File(
-            os.path.basename(path),
-            "w",
-            driver="core",
-            backing_store=False,
-            track_order=True,
-            libver=FORMAT,
-        ) as file:
+        image = BytesIO()
+        with h5py.File(image, "w", track_order=True, libver=FORMAT) as file:
             for key, value in (dict(attrs) | own).items():
                 if value is not None:
                     _write_attribute(file, key, value)
             _write_group(file, tree)
-            file.flush()
-            image = file.id.get_file_image()
     except (OSError, TypeError, ValueError, RuntimeError) as error:
         raise DataError("cannot write the HDF5 file", where=path, found=error) from error
-    write_bytes(path, image)
+    write_bytes(path, image.getvalue())
 
 
 def replace_group(source: PathLike, target: PathLike, name: str, tree: Tree) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -18,6 +17,7 @@ from soup_nlp.export.verify import Limits
 from soup_nlp.family.frozen import Frozen, load_frozen
 from soup_nlp.family.instances import Instance, build_instance, case_of, parse_name, problems
 from soup_nlp.pipeline.case import Case
+from soup_nlp.storage.files import read_json
 
 INDEX = "index.json"
 REACHED = 1e-4
@@ -36,9 +36,9 @@ def family_tasks(folder: Path, limits: Limits) -> Iterator[list[tuple[Label, Mak
         DataError: the index cannot be read.
     """
     try:
-        entries = json.loads((folder / INDEX).read_text(encoding="utf-8"))["instances"]
+        entries = read_json(folder / INDEX, "index of the family")["instances"]
         best = {e["name"]: float(e["best_known"]["objective"]) for e in entries}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise DataError("index of the family cannot be read", where=folder, found=error) from error
     for scene, size, own in problems([parse_name(name) for name in best]):
         record = load_frozen(scene, size)
