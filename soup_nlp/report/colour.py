@@ -73,15 +73,15 @@ def colourise_error(relative_error: Float) -> Image:
 
 
 def colourise_sigma(sigma: Float, limit: float = SIGMA_LIMIT) -> Image:
-    """Standard deviation of log depth in colour, from 0 (yellow) to `limit` and above (dark).
+    """Standard deviation of log depth in colour, from 0 (dark) to `limit` and above (bright).
 
     Args:
         sigma: (H, W); grey where not finite.
-        limit: At the dark end.
+        limit: At the bright end.
     """
     known = np.isfinite(sigma)
     level = np.clip(np.where(known, sigma, 0.0) / limit, 0.0, 1.0)
-    return _paint(1 - level, known, "viridis")
+    return _paint(level, known, "viridis")
 
 
 def component_colours(count: int) -> Image:

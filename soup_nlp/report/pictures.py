@@ -228,7 +228,7 @@ def _sigma(shown: Shown) -> list[Picture]:
     colours = colourise_sigma(np.linspace(0, SIGMA_LIMIT, 128)[None])
     texts = tuple(f"{100 * x:.0f} %" for x in np.linspace(0, SIGMA_LIMIT, 4))
     bar = Bar(colours, (*texts[:-1], f"\u2265 {texts[-1]}"))
-    title = "expected depth error (1 sigma); dark = a guess"
+    title = "expected depth error (1 sigma); bright = a guess"
     return [Picture("confidence", title, colourise_sigma(sigma), bar)]
 
 
