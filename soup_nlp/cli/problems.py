@@ -64,7 +64,7 @@ def list_(
     for name, path in files.items():
         print(f"{printable(name):<14} {_first_line(path)}")
     if folder is None:
-        print("\nsoup-nlp solve NAME; templates take --set input.root=FOLDER")
+        print("\nsoup-nlp solve NAME; templates take --set input.root=DIR, folder input.path=DIR")
 
 
 def _first_line(path: Path) -> str:

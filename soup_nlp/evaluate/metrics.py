@@ -57,6 +57,14 @@ class DepthMetrics:
     coverage: float
     n_pixels: int
 
+    def __str__(self) -> str:
+        return (
+            f"DepthMetrics(MRE {self.mre:.4f}, median {self.median_relative:.4f},"
+            f" {self.scale_rule} scale {self.scale:.4g}, coverage {self.coverage:.1%})"
+        )
+
+    __repr__ = __str__
+
     def as_dict(self) -> dict[str, Any]:
         """All attributes by name, in the order above: plain numbers, strings and None."""
         return asdict(self)
