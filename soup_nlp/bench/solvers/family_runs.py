@@ -124,7 +124,7 @@ def family_page(rows: Sequence[Row]) -> str:
              for s in solvers]  # fmt: skip
     lines += table(["solver", *parts], cells)
     lines += ["", "![profiles by start and size](profiles.png)", ""]
-    before, mark, after = page(rows).partition("## By solver")
+    before, mark, after = page(rows, each=False).partition("## By solver")
     return before + "\n".join(lines) + "\n" + mark + after
 
 

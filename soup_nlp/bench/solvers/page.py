@@ -27,8 +27,8 @@ LIMITS = (
 )
 
 
-def page(rows: Sequence[Row]) -> str:
-    """Markdown of all rows."""
+def page(rows: Sequence[Row], each: bool = True) -> str:
+    """Markdown of all rows; the conclusion has lines on each problem, or not."""
     machine = sorted({str(r["machine"]) for r in rows})
     packages = sorted({f"{k} {v}" for r in rows for k, v in r["versions"].items()})
     note = (
@@ -37,19 +37,28 @@ def page(rows: Sequence[Row]) -> str:
     )
     made = [*machine, ", ".join(packages), f"code {codes([dict(r) for r in rows])}"]
     pictures = ["![performance profiles](profile.png)", "", "![energy against time](curves.png)"]
-    lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(rows), "", *pictures]
+    lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(rows, each), "", *pictures]
     for title, body in {
         "By solver": [note, "", *by_solver(rows)],
         "By run": by_run(rows),
-        "Limits": [f"- {text}" for text in LIMITS],
+        "Limits": [f"- {text}" for text in (_limits(rows), *LIMITS)],
         "Machine and versions": [f"- {text}" for text in made],
     }.items():
         lines += ["", f"## {title}", "", *body]
     return joined(lines)
 
 
-def conclusion(rows: Sequence[Row]) -> list[str]:
-    """What the rows say, in sentences."""
+def _limits(rows: Sequence[Row]) -> str:
+    """Limits of the runs, which are those of all."""
+    own = rows[0]["limits"]
+    return (
+        f"A run has {own['seconds']:g} CPU seconds, {own['iterations']} iterations and"
+        f" {own['memory'] / 2**30:g} GiB, and is asked for a dual infeasibility of {own['tol']:g}."
+    )
+
+
+def conclusion(rows: Sequence[Row], each: bool = True) -> list[str]:
+    """What the rows say, in sentences; on each problem too, or of all together only."""
     problems, solvers, time = cost_table(rows, "time")
     _, _, energy = cost_table(rows, "energy")
     solved = np.isfinite(time).sum(axis=0)
@@ -62,7 +71,7 @@ def conclusion(rows: Sequence[Row]) -> list[str]:
     if some:
         best = [s for s, n in zip(solvers, solved) if n == solved.max()]
         out[0] += f" Most problems ({solved.max()}): {', '.join(best)}."
-    for k, problem in enumerate(problems):
+    for k, problem in enumerate(problems if each else ()):
         energies = [
             (float(r["energy"]), str(r["solver"]), float(r["seconds"]))
             for r in rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -93,6 +94,15 @@ LABELS = {
 }
 
 
+WORTH_TELLING = 1e-4
+"""Gaps below it are within a solver's tolerance; the axis goes at least so far."""
+
+
+def _style(number: int) -> dict[str, str]:
+    """A solver's look, the same in every panel: ten colours, then again with dashes."""
+    return {"color": f"C{number % 10}", "ls": ("-", "--", ":", "-.")[number // 10 % 4]}
+
+
 def draw_profile(
     axes: Axes, measure: str, count: int, solvers: Sequence[str], steps: Float, share: Float
 ) -> None:
@@ -109,16 +119,21 @@ def draw_profile(
     timed = measure in ("time", "cpu")
     x = steps if timed else steps - 1
     last = x[-1] * 2 if x[-1] > 0 else 1e-3
-    styles = ("-", "--", ":", "-.")
+    last = last if timed else max(last, WORTH_TELLING)
+    none = []
     for j, solver in enumerate(solvers):
         if share[-1, j] > 0:
             line = [*share[:, j], share[-1, j]]
-            # ten colours, then again with dashes
-            axes.step([*x, last], line, where="post", label=solver, ls=styles[j // 10 % 4])
+            axes.step([*x, last], line, where="post", label=solver, **_style(j))
+        else:
+            none.append(solver)
+    if none:
+        axes.plot([], [], " ", label=textwrap.fill("none by " + ", ".join(none), 30))
     if timed:
         axes.set_xscale("log")
     else:
         axes.set_xscale("symlog", linthresh=1e-6)
+        axes.set_xlim(-3e-8, 1.1 * last)
     axes.set(xlabel=LABELS[measure], ylabel=f"share of {count} problems")
     axes.set_ylim(-0.02, 1.05)
     _finish(axes, 7)
@@ -127,6 +142,7 @@ def draw_profile(
 def draw_curves(path: Path, rows: Sequence[Row]) -> None:
     """Picture of exact energy against time, a panel a problem; a dot where a run ended."""
     problems = sorted({problem_key(r) for r in rows})
+    solvers = sorted({str(r["solver"]) for r in rows})
     columns = min(2, len(problems))
     lines = -(-len(problems) // columns)
     picture = figure(5.2 * columns, 3.4 * lines)
@@ -135,13 +151,16 @@ def draw_curves(path: Path, rows: Sequence[Row]) -> None:
         here = [r for r in rows if problem_key(r) == problem]
         start = min(r["energy_start"] for r in here)
         for row in sorted(here, key=lambda r: str(r["solver"])):
-            curve = np.array(row["curve"], float).reshape(-1, 2)
+            # a solver that leaves no iterates behind has its end
+            end = [[row["seconds"], row["energy"]]] if row.get("energy") is not None else []
+            curve = np.array(row["curve"] or end, float).reshape(-1, 2)
             # off the constraints an iterate's energy may be anything
             curve = curve[curve[:, 1] < 3 * start]
             if len(curve):
                 filled = "full" if row["verified"] else "none"
-                line = axes.plot(*curve.T, lw=1, label=row["solver"])[0]
-                axes.plot(*curve[-1], "o", color=line.get_color(), fillstyle=filled, ms=5)
+                style = _style(solvers.index(str(row["solver"])))
+                axes.plot(*curve.T, lw=1, label=row["solver"], **style)
+                axes.plot(*curve[-1], "o", color=style["color"], fillstyle=filled, ms=5)
         axes.axhline(start, color="0.6", lw=0.8, ls=":")
         axes.set_xscale("log")
         axes.set_title(str(problem), fontsize=8)

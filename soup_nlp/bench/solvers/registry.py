@@ -116,7 +116,10 @@ def reference(task: Task) -> Answer:
     # slack variables and switches at their best for this soup
     x = build_matrix_nlp(record.soup, task.data, task.weights, task.form)[0].x0.copy()
     x[: task.layout.size] = task.layout.pack(record.soup)
-    return Answer(x, None, record.status, False, record.iterations, seconds, record.history)
+    # its clock is wall time
+    own_seconds = max(float(record.history[-1, 0]), seconds)
+    curve = record.history * [seconds / own_seconds, 1.0]
+    return Answer(x, None, record.status, False, record.iterations, seconds, curve)
 
 
 def package(task: Task) -> Answer:
