@@ -31,15 +31,13 @@ class Solved(NamedTuple):
         h: The step.
         product: Matrix times step.
         iterations: Made.
-        solved: Whether the tolerance was reached.
-        indefinite: Whether a direction without curvature was found.
+        solved: Whether the tolerance was reached; not so where a direction has no curvature.
     """
 
     h: Float
     product: Float
     iterations: int
     solved: bool = False
-    indefinite: bool = False
 
     @property
     def worn(self) -> bool:
@@ -74,7 +72,7 @@ def preconditioned(times: Times, newton: Times, gradient: Float, tol: float) -> 
         Hp = times(p)
         curved = float(p @ Hp)
         if not curved > 0:
-            return out._replace(indefinite=True)
+            break
         ahead = old / curved
         out = Solved(out.h + ahead * p, out.product + ahead * Hp, out.iterations + 1)
         residual = gradient + out.product

@@ -98,7 +98,7 @@ WORTH_TELLING = 1e-4
 """Gaps below it are within a solver's tolerance; the axis goes at least so far."""
 
 
-def _style(number: int) -> dict[str, str]:
+def _style(number: int) -> dict[str, Any]:
     """A solver's look, the same in every panel: ten colours, then again with dashes."""
     return {"color": f"C{number % 10}", "ls": ("-", "--", ":", "-.")[number // 10 % 4]}
 
