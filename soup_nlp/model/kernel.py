@@ -7,7 +7,7 @@ which variables it reads, which rows of g it adds to, and its data. Nothing here
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal, get_args
 
 import casadi as ca
@@ -20,10 +20,13 @@ Hessian = Literal["exact", "gauss-newton", "gauss-newton+constraints"]
 HESSIANS: tuple[Hessian, ...] = get_args(Hessian)
 """gauss-newton: positive semidefinite part of the objective, without curvature of constraints."""
 
+_once = lru_cache(maxsize=1000)
+"""Derivatives are taken once for all kernels that are equal: the programs of a solve share them."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Kernel:
-    """Symbolic element of an NLP.
+    """Symbolic element of an NLP. Kernels with the same expressions are equal.
 
     Attributes:
         name: Identifier, also of the generated functions.
@@ -47,6 +50,20 @@ class Kernel:
     def __str__(self) -> str:
         return f"Kernel({self.name}, {self.nx} variables, {self.row.numel()} data, {self.nc} rows)"
 
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Kernel) and self._content == other._content
+
+    @cached_property
+    def _content(self) -> tuple[str, ...]:
+        args = [self.x, self.row, self.theta]
+        parts = [self.objective, self.constraints, self.curvature]
+        return tuple(
+            "" if e is None else ca.Function(self.name, args, [e]).serialize() for e in parts
+        )
+
     @property
     def nx(self) -> int:
         """Local variables."""
@@ -68,6 +85,7 @@ class Kernel:
             H += ca.hessian(ca.dot(lam_c, self.constraints), self.x)[0]
         return ca.sparsify(ca.triu(H))
 
+    @_once
     def first_order(self) -> dict[str, ca.Function]:
         """Value, gradient, constraints and Jacobian nonzeros of one element.
 
@@ -85,6 +103,7 @@ class Kernel:
         args = [self.x, self.row, self.theta]
         return {k: ca.Function(f"{self.name}_{k}", args, ca.cse([v])) for k, v in out.items()}
 
+    @_once
     def second_order(self, hessian: str, suffix: str = "") -> ca.Function | None:
         """Nonzeros of the triu-Hessian of one element.
 
@@ -103,10 +122,12 @@ class Kernel:
         name = f"{self.name}_hess{suffix}"
         return ca.Function(name, args, ca.cse([_nonzeros(H)]))
 
+    @_once
     def jacobian_pattern(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """(row, column) of every nonzero of the local Jacobian, in storage order."""
         return _triplet(ca.jacobian(self.constraints, self.x).sparsity())
 
+    @_once
     def hessian_pattern(self, hessian: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """(row, column) of every nonzero of the local triu-Hessian, in storage order."""
         lam_f, lam_c = ca.SX.sym("lam_f"), ca.SX.sym("lam_c", self.nc)

@@ -77,7 +77,7 @@ class Sums:
         self._sizes = nlp.nx, nlp.ng, len(nlp.theta)
         made: list[dict[str, ca.Function]] = []
         for group in nlp.groups:
-            functions = group.kernel.first_order() if first_order else {}
+            functions = dict(group.kernel.first_order()) if first_order else {}
             for k, kind in enumerate(hessians):
                 hessian = group.kernel.second_order(kind, str(k))
                 functions |= {kind: hessian} if hessian else {}
