@@ -7,10 +7,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import BboxImage
+from matplotlib.patches import Rectangle
 from matplotlib.text import Text
+from matplotlib.transforms import Bbox, TransformedBbox
 from numpy.typing import NDArray
 
 from soup_nlp.errors import DataError
@@ -112,29 +114,24 @@ def _draw_panel(figure: Figure, panel: Picture, left: float, top: float, width: 
     _shrink(figure, text, width)
     tall = width * image.shape[0] / image.shape[1]
     bottom = top - _CAPTION - tall
-    axes = _axes(figure, left, bottom, width, tall)
-    axes.imshow(image, interpolation="antialiased", aspect="auto")
-    axes.set(xticks=[], yticks=[])
+    _place(figure, image, left, bottom, width, tall)
     # so that a white panel is seen on white paper
-    for side in axes.spines.values():
-        side.set(linewidth=_FRAME, color="0.6")
+    frame = {"fill": False, "linewidth": _FRAME, "edgecolor": "0.6"}
+    inches = figure.dpi_scale_trans
+    figure.add_artist(Rectangle((left, bottom), width, tall, transform=inches, **frame))
     if isinstance(panel.legend, Bar):
         _draw_bar(figure, panel.legend, left, bottom, width)
     elif isinstance(panel.legend, Swatches):
         _draw_swatches(figure, panel.legend, left, bottom, width)
     elif isinstance(panel.legend, Wheel):
         size = 0.52
-        axes = _axes(figure, left, bottom - size - 0.05, size, size)
-        axes.imshow(panel.legend.image, interpolation="antialiased")
-        axes.set_axis_off()
+        _place(figure, panel.legend.image, left, bottom - size - 0.05, size, size)
         x, y = left + size + 0.1, bottom - 0.5 * size - 0.05
         _shrink(figure, _write(figure, x, y, panel.legend.text, fontsize=8), width - size - 0.1)
 
 
 def _draw_bar(figure: Figure, bar: Bar, left: float, bottom: float, width: float) -> None:
-    axes = _axes(figure, left, bottom - 0.15, width, 0.1)
-    axes.imshow(bar.colours, interpolation="nearest", aspect="auto")
-    axes.set_axis_off()
+    _place(figure, bar.colours, left, bottom - 0.15, width, 0.1)
     last = len(bar.texts) - 1
     for k, text in enumerate(bar.texts):
         side = "left" if k == 0 else "right" if k == last else "center"
@@ -144,14 +141,12 @@ def _draw_bar(figure: Figure, bar: Bar, left: float, bottom: float, width: float
 def _draw_swatches(figure: Figure, key: Swatches, left: float, bottom: float, width: float) -> None:
     x, y = left, bottom - 0.13
     for colour, name in key.entries:
-        axes = _axes(figure, x, y - 0.05, 0.12, 0.1)
-        axes.imshow(np.array(colour, np.uint8)[None, None], aspect="auto")
-        axes.set_axis_off()
+        swatch = _place(figure, np.array(colour, np.uint8)[None, None], x, y - 0.05, 0.12, 0.1)
         text = _write(figure, x + 0.16, y, name, fontsize=8)
         x += 0.16 + _wide(figure, text) + 0.15
         if x > left + width:
             text.set_visible(False)
-            axes.set_visible(False)
+            swatch.set_visible(False)
             break
 
 
@@ -174,10 +169,15 @@ def _write(figure: Figure, x: float, y: float, text: str, **style: Any) -> Text:
     return figure.text(x / wide, y / tall, text, va="center", parse_math=False, **style)
 
 
-def _axes(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
-    """Axes at a rectangle in inches."""
-    wide, tall = figure.get_size_inches()
-    return figure.add_axes((left / wide, bottom / tall, width / wide, height / tall))
+def _place(
+    figure: Figure, image: Image, left: float, bottom: float, width: float, height: float
+) -> BboxImage:
+    """An image in a rectangle, inches. Axes, with their ticks, take twenty times as long."""
+    box = TransformedBbox(Bbox.from_bounds(left, bottom, width, height), figure.dpi_scale_trans)
+    placed = BboxImage(box, interpolation="antialiased", origin="upper")
+    placed.set_data(image)
+    figure.add_artist(placed)
+    return placed
 
 
 def overview(path: PathLike, found: Mapping[str, Picture], title: str) -> None:
