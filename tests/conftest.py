@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
 
 from soup_nlp.config.problem import make_problem
+from soup_nlp.data import inputs
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.pipeline.run import Run, make_run, skipped
 from soup_nlp.solve.tangent_problem import TangentProblem
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def rendered_once() -> Iterator[None]:
+    """Problems of the same scene, of which there are a hundred, have it rendered once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(inputs, "render_scene", lru_cache(maxsize=16)(inputs.render_scene))
+        yield
 
 
 @pytest.fixture(scope="session")

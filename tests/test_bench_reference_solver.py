@@ -29,7 +29,9 @@ FORM = Formulation(compiled=False)
 @pytest.fixture(scope="module")
 def case() -> Case:
     scene = {"kind": "scene", "scene": "street", "seed": 0, "width": 256, "height": 128}
-    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+    return prepare(
+        make_problem({"input": scene, "segmentation": {"superpixels": 30, "neighbours": 6}})
+    )
 
 
 @pytest.fixture(scope="module")

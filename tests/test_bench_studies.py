@@ -44,7 +44,8 @@ def test_a_study_writes_its_table_and_goes_on_where_it_was(tmp_path):
 
 
 def test_components_that_the_border_cuts_off(tmp_path):
-    rows = run_study(CUT_OFF, tmp_path, grid(scene=["street"], seed=[1], superpixels=[40]))
+    settings = grid(scene=["street"], seed=[1], superpixels=[40], width=[256], height=[109])
+    rows = run_study(CUT_OFF, tmp_path, settings)
     assert [r["ok"] for r in rows] == [True], [r["error"] for r in rows]
     assert "street, mean" in (tmp_path / "cut_off.md").read_text()
 

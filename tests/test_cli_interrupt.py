@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -27,11 +28,26 @@ ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
 SMALL = [
     "--set", "input.width=160", "--set", "input.height=120", "--set", "flow.source=truth",
     "--set", "segmentation.superpixels=30", "--set", "segmentation.neighbours=5",
+    "--set", "refine.rounds=1",
 ]  # fmt: skip
 
 
 def solve(out: Path) -> int:
     return cli.main(["solve", ORBIT, "--out", str(out), "-q", *SMALL])
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory) -> Path:
+    """A result folder; to be copied."""
+    out = tmp_path_factory.mktemp("solved")
+    assert solve(out) == 0
+    return out
+
+
+@pytest.fixture
+def earlier(solved, tmp_path) -> Path:
+    """A folder that holds a result already."""
+    return Path(shutil.copytree(solved, tmp_path / "out"))
 
 
 def ctrl_c(times: int = 1, number: int = signal.SIGINT) -> None:
@@ -88,9 +104,8 @@ def test_once_there_is_a_start_the_best_iterate_is_written(at, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_sigterm_ends_like_ctrl_c(times, tmp_path, monkeypatch, capfd):
-    assert solve(tmp_path) == 0
-    before = (tmp_path / "result.h5").read_bytes()
+def test_sigterm_ends_like_ctrl_c(times, earlier, monkeypatch, capfd):
+    before = (earlier / "result.h5").read_bytes()
     sent = iter([lambda: ctrl_c(times, signal.SIGTERM)])
     own = solve_module.SolveLog.iteration
     monkeypatch.setattr(
@@ -98,13 +113,13 @@ def test_sigterm_ends_like_ctrl_c(times, tmp_path, monkeypatch, capfd):
         "iteration",
         lambda *args: (next(sent, lambda: None)(), own(*args)),
     )
-    assert solve(tmp_path) == (1 if times == 1 else 130)
+    assert solve(earlier) == (1 if times == 1 else 130)
     assert "interrupt received" in capfd.readouterr().err
-    status = json.loads((tmp_path / "summary.json").read_text())["status"]
+    status = json.loads((earlier / "summary.json").read_text())["status"]
     assert (status == "Interrupted") == (times == 1)
-    assert ((tmp_path / "result.h5").read_bytes() == before) == (times == 2)
-    assert (tmp_path / folders.FAILED).is_file() == (times == 2)
-    assert cli.main(["check", str(tmp_path)]) == 0
+    assert ((earlier / "result.h5").read_bytes() == before) == (times == 2)
+    assert (earlier / folders.FAILED).is_file() == (times == 2)
+    assert cli.main(["check", str(earlier)]) == 0
 
 
 def test_a_second_one_in_the_solver_aborts_too(tmp_path, monkeypatch, capfd):
@@ -119,20 +134,19 @@ def test_a_second_one_in_the_solver_aborts_too(tmp_path, monkeypatch, capfd):
     assert not (tmp_path / "out" / "summary.json").exists()
 
 
-def test_files_that_are_being_written_are_written(tmp_path, monkeypatch, capfd):
-    assert solve(tmp_path) == 0
+def test_files_that_are_being_written_are_written(earlier, monkeypatch, capfd):
     own, seen = folders.write_h5, []
 
     def interrupted(*args):
-        seen.append((tmp_path / "summary.json").exists())
+        seen.append((earlier / "summary.json").exists())
         ctrl_c(3)
         own(*args)
 
     monkeypatch.setattr(folders, "write_h5", interrupted)
-    assert solve(tmp_path) == 0
+    assert solve(earlier) == 0
     # the earlier result stays until the new one is whole
     assert seen == [True]
-    assert all((tmp_path / name).is_file() for name in folders.FILES)
+    assert all((earlier / name).is_file() for name in folders.FILES)
     assert "files are being written" in capfd.readouterr().err
 
 

@@ -21,7 +21,8 @@ ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
 SMALL = [
     "--set", "input.width=160", "--set", "input.height=120", "--set", "refine.enabled=false",
     "--set", "segmentation.superpixels=30", "--set", "segmentation.neighbours=5",
-    "--set", "solver.presolve_iterations=10", "--set", "solver.max_iter=2",
+    "--set", "solver.presolve_iterations=2", "--set", "solver.max_iter=0",
+    "--set", "output.page=false",
 ]  # fmt: skip
 
 

@@ -73,7 +73,7 @@ def test_gradient_and_exact_hessian_are_derivatives(problem):
     np.testing.assert_allclose(product, expected, atol=1e-4 * np.abs(expected).max())
 
 
-def test_the_exact_hessian_beside_the_stand_in_is_that_of_an_exact_program(problem, small_room):
+def test_the_exact_hessian_beside_the_majorant_is_that_of_an_exact_program(problem, small_room):
     form = FORM.replace(norm="smooth", hessian="exact", theta=0.0, ridge=0.0)
     chart = problem.layout.chart
     nlp = build_tangent_nlp(small_room.soup, small_room.data, small_room.weights, form, chart)[0]
@@ -85,8 +85,8 @@ def test_the_exact_hessian_beside_the_stand_in_is_that_of_an_exact_program(probl
     assert abs(found - expected).max() <= 1e-12 * abs(expected).max()
 
 
-def test_the_stand_in_lies_above_every_norm(problem, small_room):
-    # quadratic model with the stand-in >= f wherever residuals are linear: translations
+def test_the_majorant_lies_above_every_norm(problem, small_room):
+    # quadratic model with the majorant >= f wherever residuals are linear: translations
     problem.smoothing(0.2)
     x = Descent(problem).x
     z = np.zeros_like(problem.slacks(x)[0])
@@ -177,6 +177,7 @@ def test_another_chart_begins_where_the_first_ended(small_room):
     assert last.objective <= first.problem.value(first.x)
 
 
+@pytest.mark.parametrize("problem", ["inverse-depth"], indirect=True)
 def test_a_second_step_leads_back_into_a_bent_valley(problem):
     """The same matrix takes back most of what a step along stiff norms has cost."""
     runner = Descent(problem)
@@ -337,6 +338,7 @@ def test_it_ends_at_a_kkt_point(problem, solved):
     assert (g <= problem.nlp.ubg + 1e-9).all()
 
 
+@pytest.mark.parametrize("problem", ["inverse-depth"], indirect=True)
 def test_steps_go_on_beyond_the_tolerance_while_they_pay(problem):
     def end(**options):
         runner = Descent(problem)
@@ -383,6 +385,7 @@ def test_the_energy_never_rises_within_a_phase(solved):
         assert len(f) == stage.iterations + 1
 
 
+@pytest.mark.parametrize("problem", ["inverse-depth"], indirect=True)
 def test_superlu_ends_at_the_same_point(problem, solved, monkeypatch):
     monkeypatch.setattr(descent_module, "factorisation", lambda upper: ("SuperLU", superlu(upper)))
     runner = Descent(problem)

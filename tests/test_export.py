@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import cache
 from pathlib import Path
 
 import casadi as ca
@@ -46,6 +47,7 @@ def exported(tmp_path_factory) -> Path:
     return out
 
 
+@cache
 def problem_of(folder: Path):
     """NLP, layout, names and order of the files of an exported folder."""
     manifest = json.loads((folder / "manifest.json").read_text())

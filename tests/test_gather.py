@@ -1,4 +1,4 @@
-"""Components take one motion each: torn ones are gathered, halves of them come back, the rest
+"""Components take one motion each: those in pieces are gathered, halves come back, the rest
 stays."""
 
 from __future__ import annotations
@@ -75,11 +75,11 @@ def off(choice: Choice, component: np.ndarray, m: Motion) -> float:
     return float(np.median(np.degrees(np.linalg.norm(turn, axis=1))))
 
 
-def test_a_torn_component_is_gathered(world):
+def test_a_component_with_three_motions_is_gathered(world):
     views, seg, jump, component, (room, wedge) = world
-    torn = [room, turned(wedge, 0.4, 0), turned(wedge, -0.4, 1), turned(wedge, 0.4, 2)]
+    several = [room, turned(wedge, 0.4, 0), turned(wedge, -0.4, 1), turned(wedge, 0.4, 2)]
     part = 1 + np.arange(len(seg)) % 3
-    before = chosen(views, torn, np.where(component == 1, part, 0))
+    before = chosen(views, several, np.where(component == 1, part, 0))
     assert agreement(before, component)[0] < 0.5
     after = gather(views, seg, jump, before, 0.05, OPTIONS)
     assert min(agreement(after, component)) > 0.85

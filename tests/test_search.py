@@ -7,7 +7,7 @@ import pytest
 
 from soup_nlp.solve import line_search as search_module
 from soup_nlp.solve.descent import Descent
-from soup_nlp.solve.line_search import LEAST_SLACK, Point, Search, along, evaluate, led_back
+from soup_nlp.solve.line_search import LEAST_SLACK, Point, Search, along, evaluate, restored
 from soup_nlp.solve.tangent_problem import TangentProblem
 
 GRAZING = 1e-8
@@ -40,7 +40,7 @@ def grazing(problem: TangentProblem, k: int) -> tuple[Point, np.ndarray]:
     return at, h
 
 
-def test_a_step_along_a_curved_bound_is_led_back_to_it(problem):
+def test_a_step_along_a_curved_bound_is_restored_to_it(problem):
     k = 7
     at, h = grazing(problem, k)
     assert evaluate(problem, problem.normalise(at.x + h), 1e-10) is None, "it leaves the bound"
@@ -64,11 +64,11 @@ def test_without_it_the_step_would_be_refused_but_for_a_hundredth(problem, monke
     assert length[7] < 0.01
 
 
-def test_led_back_leaves_alone_what_is_inside(problem):
+def test_a_point_inside_its_bounds_is_left_alone(problem):
     at, h = grazing(problem, 7)
     x = problem.normalise(at.x + h)
     floor = LEAST_SLACK * at.slack
-    back, slack, _ = led_back(problem, x, at.slack + along(at.jacobian, h), floor)
+    back, slack, _ = restored(problem, x, at.slack + along(at.jacobian, h), floor)
     np.testing.assert_array_equal(slack, problem.slacks(back)[0])
     # it stays on the simplex, by one factor for all
     np.testing.assert_allclose(back, problem.normalise(back), rtol=1e-14)
@@ -76,4 +76,4 @@ def test_led_back_leaves_alone_what_is_inside(problem):
     assert np.ptp(np.delete(ratio, 7, axis=0)[:, 0]) < 1e-14
     np.testing.assert_array_equal(back.reshape(-1, 9)[:, 3:], x.reshape(-1, 9)[:, 3:])
     assert (ratio[7, :3] != ratio[0, 0]).any()
-    assert led_back(problem, at.x, at.slack, floor)[0] is at.x
+    assert restored(problem, at.x, at.slack, floor)[0] is at.x

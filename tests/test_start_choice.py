@@ -116,7 +116,7 @@ def test_a_motion_that_pays_goes_from_neighbour_to_neighbour(monkeypatch):
 # --------------------------------------------------------------------------------------
 
 
-def torn(seg: Segmentation, own: np.ndarray) -> np.ndarray:
+def across(seg: Segmentation, own: np.ndarray) -> np.ndarray:
     """(P,) whether two neighbours lie on both sides of an outline."""
     i, k = seg.pairs.T
     return own[i] != own[k]
@@ -129,7 +129,7 @@ def offered(monkeypatch, *angles: float) -> None:
 
 
 @pytest.mark.parametrize("enough", [True, False])
-def test_a_motion_that_many_of_a_component_contradict_is_not_the_bodys(monkeypatch, enough):
+def test_a_motion_that_many_of_a_component_contradict_is_not_its_motion(monkeypatch, enough):
     seg = cells(6, 10)
     column = (seg.anchors[:, 0] // 8).astype(int)
     component = column >= 6
@@ -142,7 +142,7 @@ def test_a_motion_that_many_of_a_component_contradict_is_not_the_bodys(monkeypat
     # everyone explains its own flow, with motions of its own
     before = taken(views, true, np.where(component, -1, 0))
     offered(monkeypatch, 0.2)
-    jump = np.where(torn(seg, component), 10.0, 0.0)
+    jump = np.where(across(seg, component), 10.0, 0.0)
     after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
     assert (after.label[~component] == 0).all()
     if enough:
@@ -152,7 +152,7 @@ def test_a_motion_that_many_of_a_component_contradict_is_not_the_bodys(monkeypat
         assert (after.label[component] == -1).all()
 
 
-def test_components_that_hang_together_by_a_small_tear_are_parted_there(monkeypatch):
+def test_components_with_a_gap_in_their_discontinuity_are_parted_there(monkeypatch):
     """No motion explains both: the smaller jump between them is the outline then."""
     seg = cells(6, 10)
     column = (seg.anchors[:, 0] // 8).astype(int)
@@ -164,8 +164,8 @@ def test_components_that_hang_together_by_a_small_tear_are_parted_there(monkeypa
     least, most = gathering.TEARS[-1], gathering.TEARS[0]
     assert least < most
     between = 0.5 * (least + most) * OPTIONS.discontinuity_px
-    jump = np.where(torn(seg, component), between, 0.0)
-    jump[torn(seg, component > 0)] = 10.0
+    jump = np.where(across(seg, component), between, 0.0)
+    jump[across(seg, component > 0)] = 10.0
     after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
     for b in (1, 2):
         assert len(np.unique(after.label[component == b])) == 1
@@ -186,7 +186,7 @@ def test_one_of_a_component_goes_with_its_neighbours():
     label = np.where(right, 1, 0)
     label[odd] = 0
     before = taken(views, np.where(label == 1, 0.2, 0.0), label)
-    jump = np.where(torn(seg, right), 10.0, 0.0)
+    jump = np.where(across(seg, right), 10.0, 0.0)
     after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
     np.testing.assert_array_equal(after.label, right)
 

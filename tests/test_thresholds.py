@@ -62,7 +62,7 @@ def test_corrections_end_with_the_first_that_is_not_worth_it(falls, taken, monke
     monkeypatch.setattr(line_search, "merit_gradient", lambda *_: np.zeros(18))
     monkeypatch.setattr(line_search, "reach", lambda *_: np.ones(2))
     monkeypatch.setattr(line_search, "along", lambda *_: np.zeros((2, 1)))
-    monkeypatch.setattr(line_search, "led_back", lambda p, x, *_: (x, one, None))
+    monkeypatch.setattr(line_search, "restored", lambda p, x, *_: (x, one, None))
     problem = SimpleNamespace(normalise=lambda x: x, gradient=lambda x: x)
     start = SimpleNamespace(x=np.zeros(18), slack=one, jacobian=None, merit=10.0)
     search = Search(problem, start, np.zeros(18), 1e-10, lambda gradient: gradient)

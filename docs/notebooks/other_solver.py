@@ -40,8 +40,8 @@ folder = Path(tempfile.mkdtemp())
     """
 input: {kind: scene, scene: orbit, width: 192, height: 96}
 flow: {source: truth}
-segmentation: {superpixels: 24, neighbours: 6}
-energy: {pixel_samples: 8}
+segmentation: {superpixels: 16, neighbours: 6}
+energy: {pixel_samples: 4}
 """
 )
 exported = folder / "orbit"

@@ -27,10 +27,10 @@ NODES, LABELS, NEIGHBOURS, ITERATIONS = 1000, 50, 15, 10
 """Sizes of the TRW-S study, those of a refinement."""
 
 
-def measure_cut_off(scene: str, seed: int, superpixels: int) -> Row:
+def measure_cut_off(scene: str, seed: int, superpixels: int, **size: int) -> Row:
     """MRE of start and NLP on a pair without its lower rows, by contact alone and as shipped."""
     raw = {
-        "input": {"kind": "scene", "scene": scene, "seed": seed},
+        "input": {"kind": "scene", "scene": scene, "seed": seed, **size},
         "segmentation": {"superpixels": superpixels},
         "refine": {"enabled": False},
     }

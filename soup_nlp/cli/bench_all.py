@@ -35,7 +35,7 @@ COMMANDS = (
     f" --validation-seeds 1,2 --width 512 --set segmentation.superpixels=300 {NLP}",
     "bench accuracy -o {out}/accuracy --name sheets --suite rendered --only sheet"
     f" --seeds 0,1,2,3,4,5 --flow truth --flow dis {NLP}",
-    "bench accuracy -o {out}/accuracy --name bodies --suite rendered --only street --only room"
+    "bench accuracy -o {out}/accuracy --name components --suite rendered --only street --only room"
     " --seeds 1,2,3,4,5,6,10,11,12,13,14,15,16,17,18 --flow truth --flow dis"
     f" {NLP}",
     "bench cut-off -o {out}/accuracy",

@@ -192,11 +192,11 @@ def _group(text: str, commands: Mapping[str, tuple[str, str]], **options: Any) -
         cls=LazyGroup, no_args_is_help=True, pretty_exceptions_enable=False, help=text, **options
     )
     for name, (_, line) in commands.items():
-        group.command(name=name, help=line)(_stand_in)
+        group.command(name=name, help=line)(_placeholder)
     return group
 
 
-def _stand_in() -> None:
+def _placeholder() -> None:
     """Takes a command's place until it is called."""
 
 

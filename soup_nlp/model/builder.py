@@ -157,7 +157,7 @@ class Builder:
         self.groups.append(Group(kernel, table))
 
     def add_ridge(self, metric: Float) -> None:
-        """Zero objective whose stand-in Hessian is ridge x metric on the diagonal.
+        """Zero objective whose majorant is ridge x metric on the diagonal.
 
         Args:
             metric: (n,) squared inverse length of a natural step of the first n variables.

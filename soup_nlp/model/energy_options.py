@@ -68,7 +68,7 @@ class BendingOptions(Section):
     """The energy where the start finds that surfaces bend, always in pixels.
 
     Bending is a difference of rotations that keeps lengths: E_arap compares motions at the
-    anchors, where a surface that bends hangs together, and its rotations count for next to
+    anchors, where a bending surface is connected, and its rotations count for next to
     nothing. The relief is then held by lengths, continuity and orientation.
     """
 
@@ -78,7 +78,7 @@ class BendingOptions(Section):
     rotation_px: Positive = 1e-3
     """Pixels per radian of rotation difference."""
     arap_across: Share = 0.3
-    """Factor of E_arap where the flow tears; 1 is the paper's, as of the others."""
+    """Factor of E_arap across a discontinuity of the flow; 1 is the paper's, as of the others."""
     cont_across: Share = 0.01
     """Factor of E_cont there."""
     orient_across: Share = 0.3

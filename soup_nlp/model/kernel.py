@@ -35,7 +35,7 @@ class Kernel:
         theta: (nt,) parameters that all elements and kernels share.
         objective: Scalar added to f, or None.
         constraints: (nc,) added to rows of g, or None.
-        curvature: (nx, nx) positive semidefinite stand-in for the objective's Hessian, or None
+        curvature: (nx, nx) positive semidefinite majorant of the objective, or None
             for none (then "gauss-newton" uses the exact one).
     """
 

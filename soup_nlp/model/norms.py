@@ -45,7 +45,7 @@ class Form:
 
     Attributes:
         objective: Its contribution to the objective.
-        curvature: Positive semidefinite stand-in for the objective's Hessian, of the same
+        curvature: Positive semidefinite majorant of the objective, of the same
             size as the kernel's variables.
         constraint: Epigraph constraint `>= 0` (scalar), or None.
     """

@@ -130,12 +130,12 @@ def across_discontinuities(
         cont: Factor of E_cont.
         orient: Factor of E_orient.
     """
-    torn, apart = (surface[a] != surface[b] for a, b in (data.pairs.T, data.edges.T))
+    split, edges = (surface[a] != surface[b] for a, b in (data.pairs.T, data.edges.T))
     return replace(
         data,
-        edge_weight=np.where(apart, arap, 1.0) * data.edge_weight,
-        pair_weight=np.where(torn, cont, 1.0) * data.pair_weight,
-        orient_weight=np.where(torn, orient, 1.0) * data.orient_weight,
+        edge_weight=np.where(edges, arap, 1.0) * data.edge_weight,
+        pair_weight=np.where(split, cont, 1.0) * data.pair_weight,
+        orient_weight=np.where(split, orient, 1.0) * data.orient_weight,
     )
 
 

@@ -116,9 +116,9 @@ def _draw_panel(figure: Figure, panel: Picture, left: float, top: float, width: 
     bottom = top - _CAPTION - tall
     _place(figure, image, left, bottom, width, tall)
     # so that a white panel is seen on white paper
-    frame = {"fill": False, "linewidth": _FRAME, "edgecolor": "0.6"}
-    inches = figure.dpi_scale_trans
-    figure.add_artist(Rectangle((left, bottom), width, tall, transform=inches, **frame))
+    frame = Rectangle((left, bottom), width, tall, fill=False, linewidth=_FRAME, edgecolor="0.6")
+    frame.set_transform(figure.dpi_scale_trans)
+    figure.add_artist(frame)
     if isinstance(panel.legend, Bar):
         _draw_bar(figure, panel.legend, left, bottom, width)
     elif isinstance(panel.legend, Swatches):

@@ -111,7 +111,7 @@ def inside(problem: TangentProblem, x: Float) -> Float:
     return x
 
 
-def led_back(
+def restored(
     problem: TangentProblem, x: Float, aim: Float, floor: Float
 ) -> tuple[Float, Float, Float]:
     """x with superpixels that left a curved bound brought back; its slacks and their derivatives.
@@ -263,7 +263,7 @@ class Search:
             x = self.problem.normalise(trial.x + (length[:, None] * c.reshape(-1, 9)).ravel())
             floor = LEAST_SLACK * self.at.slack
             aim = trial.slack + length[:, None] * along(trial.jacobian, c)
-            x, slack, jacobian = led_back(self.problem, x, np.maximum(aim, 2 * floor), floor)
+            x, slack, jacobian = restored(self.problem, x, np.maximum(aim, 2 * floor), floor)
             if (slack <= floor).any():
                 return best
             moved = _point(self.problem, x, slack, jacobian, self.barrier)
@@ -280,7 +280,7 @@ class Search:
         change = along(self.at.jacobian, self.h)
         for _ in range(40):
             aim = self.at.slack + length[:, None] * change
-            x, slack, jacobian = led_back(self.problem, self._at(length), aim, floor)
+            x, slack, jacobian = restored(self.problem, self._at(length), aim, floor)
             out = (slack <= floor).any(axis=1)
             if not out.any():
                 return _point(self.problem, x, slack, jacobian, self.barrier), length

@@ -18,7 +18,7 @@ from soup_nlp.model.compile import compiler_seconds
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import Chart
+from soup_nlp.model.layout import Chart, MatrixLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.continuation import KEEP, MAJORANT, narrow
@@ -35,6 +35,7 @@ Float = NDArray[np.float64]
 
 POLISH = "presolve polish"
 """Name of the phase with the exact Hessian."""
+_ENDS = ("start", "presolve", "constrained NLP")
 STOPPED = ("Interrupted", "Time_Limit")
 """Status of a stage after which no other begins."""
 
@@ -127,90 +128,9 @@ def solve_soup(
     Returns:
         The solution; a solve that fails is a Solution with its status, not an exception.
     """
-    form, o = form or Formulation(), options or SolverOptions()
     watch = Watch(listener, stop or threading.Event(), say or (lambda line: None), log_file)
-    laps, compiling = _Laps(), compiler_seconds()
-    deadline = laps.begin + o.max_seconds
-    stages: list[Stage] = []
-    presolved, rim = None, None
-    if o.presolve:
-        limit = laps.begin + 0.7 * o.max_seconds
-        presolved, rim = _presolve(start, data, weights, form, o, stages, watch, limit)
-    laps.end("presolve")
-
-    def energy(soup: Soup) -> float:
-        return oracle.energy(soup, data, weights)["total"]
-
-    near, far = bool(stages) and _near(stages[-1]), _far(stages)
-    # far from its minimum the presolve may have raised the exact energy
-    worse = not near and presolved is not None and energy(presolved) > energy(start)
-    soup = start if presolved is None or worse else presolved
-    nlp, layout = build_matrix_nlp(soup, data, weights, form.replace(eps=o.eps, eps_pixel=o.eps))
-    watch.say(str(nlp))
-    warm: dict[str, Any] = {}
-    limit, x0 = o.max_iter, nlp.x0
-    if not o.presolve and o.continuation and o.max_iter:
-        majorant = form.replace(eps=o.eps, eps_pixel=o.eps, hessian=MAJORANT)
-        second, _ = build_matrix_nlp(soup, data, weights, majorant)
-        stages += narrow(second, o, watch, laps.begin + 0.7 * o.max_seconds)
-        # the last stage does the polish's work as well
-        limit, x0 = o.max_iter + o.polish_iterations, stages[-1].x
-        warm = {"lam_x0": stages[-1].lam_x, "lam_g0": stages[-1].lam_g}
-        laps.end("continuation")
-    # the lifted truncation has another solution than the presolve's
-    if form.truncation == "smooth" and soup is presolved and o.polish_iterations and near:
-        assert rim is not None
-        warm = warm_start(nlp, data, soup, rim)
-    kept = (WARM if o.presolve else KEEP) if warm else {}
-    solver = Ipopt(nlp, {**kept, **o.ipopt})
-    laps.end("build")
-    if far:
-        watch.say(
-            f"far from a minimum: Ipopt has {o.far_iterations} iterations (solver.far_iterations)"
-        )
-    stage = solver(
-        x0=x0,
-        **warm,
-        max_iter=min(limit, o.far_iterations) if far else limit,
-        tol=o.tol,
-        seconds=max(1.0, deadline - time.perf_counter()),
-        stage="constrained NLP",
-        listener=listener,
-        stop=watch.stop,
-        log_file=log_file,
-    )
-    laps.end("solve")
-    stages.append(stage)
-    watch.say(str(stage))
-    found = {"constrained NLP": layout.unpack(stage.x), "presolve": presolved, "start": start}
-    ends = {k: s.normalised(data.share).retracted() for k, s in found.items() if s is not None}
-    held = {k: s for k, s in ends.items() if feasible(s, data.rim_ray, form.min_facing)}
-    if not held:
-        # nothing that breaks its constraints is delivered
-        rays = data.visibility_ray(form.depth_ratio)
-        tilted = tilt_to_camera(start, data.anchor_ray, rays, form.min_facing)
-        held = {"start": tilted.normalised(data.share).retracted()}
-    delivered = min(held, key=lambda k: energy(held[k]))
-    final = held[delivered]
-    # the solver's word is not taken for it
-    broken = stage.converged and "constrained NLP" not in held
-    return Solution(
-        soup=final,
-        status=UNMET if broken else stage.status,
-        converged=stage.converged and not broken,
-        stages=tuple(stages),
-        energy_start=oracle.energy(start, data, weights),
-        energy=oracle.energy(final, data, weights),
-        residuals=residuals(nlp, final, stage, data, form.min_facing),
-        multipliers=_multipliers(nlp, stage),
-        nlp=nlp.sizes(),
-        description=str(nlp),
-        seconds={**laps.wall, "compile": compiler_seconds() - compiling},
-        cpu_seconds=laps.cpu,
-        delivered=delivered,
-        far=far,
-        ends={k: energy(ends[k]) for k in ("start", "presolve", "constrained NLP") if k in ends},
-    )
+    own = form or Formulation(), options or SolverOptions()
+    return _Solve(start, data, weights, *own, watch).run()
 
 
 class _Laps:
@@ -259,44 +179,166 @@ def _phases(o: SolverOptions) -> list[Phase]:
     ]
 
 
-def _presolve(
-    start: Soup,
-    data: EnergyData,
-    weights: Weights,
-    form: Formulation,
-    o: SolverOptions,
-    stages: list[Stage],
-    watch: Watch,
-    deadline: float,
-) -> tuple[Soup, Float]:
-    """The presolve's soup and its multipliers of rim visibility; appends its phases to stages."""
-    problem = TangentProblem(start, data, weights, form, exact=False)
-    descent = Descent(problem, watch=watch, deadline=deadline)
-    for phase in _phases(o):
-        stages.append(descent.run(phase))
-        watch.say(str(stages[-1]))
-        if stages[-1].status in STOPPED:
-            return descent.soup, descent.rim
-    if o.polish_iterations:
+@dataclass(frozen=True)
+class _Solve:
+    """One solve: what its stages share, and the stages that have ended."""
+
+    start: Soup
+    data: EnergyData
+    weights: Weights
+    form: Formulation
+    o: SolverOptions
+    watch: Watch
+    stages: list[Stage] = field(default_factory=list)
+    laps: _Laps = field(default_factory=_Laps)
+
+    def run(self) -> Solution:
+        """All stages, and the best of their ends."""
+        compiling, (presolved, rim) = compiler_seconds(), self.presolve()
+        near, far = bool(self.stages) and _near(self.stages[-1]), _far(self.stages)
+        # far from its minimum the presolve may have raised the exact energy
+        worse = not near and self.energy(presolved) > self.energy(self.start)
+        soup = self.start if worse else presolved
+        nlp, layout = self.constrained(soup)
+        self.watch.say(str(nlp))
+        first: dict[str, Any] = {"x0": nlp.x0}
+        if not self.o.presolve and self.o.continuation and self.o.max_iter:
+            first = self.continued(soup)
+        # the lifted truncation has another solution than the presolve's
+        if self.form.truncation == "smooth" and self.o.polish_iterations and near and not worse:
+            first |= warm_start(nlp, self.data, soup, rim)
+        stage = self.ipopt(nlp, first, far)
+        found = {"constrained NLP": layout.unpack(stage.x), "presolve": presolved}
+        if not self.o.presolve:
+            del found["presolve"]
+        found["start"] = self.start
+        ends = {k: s.normalised(self.data.share).retracted() for k, s in found.items()}
+        held = self.held(ends)
+        delivered = min(held, key=lambda k: self.energy(held[k]))
+        final = held[delivered]
+        # the solver's word is not taken for it
+        broken = stage.converged and "constrained NLP" not in held
+        return Solution(
+            soup=final,
+            status=UNMET if broken else stage.status,
+            converged=stage.converged and not broken,
+            stages=tuple(self.stages),
+            energy_start=oracle.energy(self.start, self.data, self.weights),
+            energy=oracle.energy(final, self.data, self.weights),
+            residuals=residuals(nlp, final, stage, self.data, self.form.min_facing),
+            multipliers=_multipliers(nlp, stage),
+            nlp=nlp.sizes(),
+            description=str(nlp),
+            seconds={**self.laps.wall, "compile": compiler_seconds() - compiling},
+            cpu_seconds=self.laps.cpu,
+            delivered=delivered,
+            far=far,
+            ends={k: self.energy(ends[k]) for k in _ENDS if k in ends},
+        )
+
+    def energy(self, soup: Soup) -> float:
+        """Exact energy."""
+        return oracle.energy(soup, self.data, self.weights)["total"]
+
+    def early(self) -> float:
+        """Time at which all stages but the last end."""
+        return self.laps.begin + 0.7 * self.o.max_seconds
+
+    def presolve(self) -> tuple[Soup, Float]:
+        """The presolve's soup and its multipliers of rim visibility; the start where it is off."""
+        soup, rim = self.start, np.zeros(0)
+        if self.o.presolve:
+            descent = self._reweighted()
+            if self.stages[-1].status not in STOPPED and self.o.polish_iterations:
+                descent = self._polished(descent)
+            soup, rim = descent.soup, descent.rim
+        self.laps.end("presolve")
+        return soup, rim
+
+    def _reweighted(self) -> Descent:
+        problem = TangentProblem(self.start, self.data, self.weights, self.form, exact=False)
+        descent = Descent(problem, watch=self.watch, deadline=self.early())
+        for phase in _phases(self.o):
+            self._ended(descent.run(phase))
+            if self.stages[-1].status in STOPPED:
+                break
+        return descent
+
+    def _polished(self, before: Descent) -> Descent:
         # on inverse depths the superpixels of a plane move with it in straight lines; reweighting
         # on depths ends at lower energies. The paper's units need a length unit that is linear.
-        chart: Chart = "inverse-depth" if data.local_units else "depth"
-        problem = TangentProblem(descent.soup, data, weights, form, chart=chart)
-        descent = Descent(problem, after=descent, watch=watch, deadline=deadline)
+        chart: Chart = "inverse-depth" if self.data.local_units else "depth"
+        problem = TangentProblem(before.soup, self.data, self.weights, self.form, chart=chart)
+        descent = Descent(problem, after=before, watch=self.watch, deadline=self.early())
         polish = Phase(
             name=POLISH,
             hessian="exact",
-            eps=o.eps,
+            eps=self.o.eps,
             barrier=1e-10,
-            iterations=o.polish_iterations,
+            iterations=self.o.polish_iterations,
             stagnation=0.0,
-            tol=o.presolve_tol,
+            tol=self.o.presolve_tol,
             beyond=True,
             highest=1e-5,
         )
-        stages.append(descent.run(polish))
-        watch.say(str(stages[-1]))
-    return descent.soup, descent.rim
+        self._ended(descent.run(polish))
+        return descent
+
+    def constrained(self, soup: Soup, **changes: Any) -> tuple[NLP, MatrixLayout]:
+        """The constrained NLP about a soup, at the last smoothing."""
+        form = self.form.replace(eps=self.o.eps, eps_pixel=self.o.eps, **changes)
+        return build_matrix_nlp(soup, self.data, self.weights, form)
+
+    def continued(self, soup: Soup) -> dict[str, Any]:
+        """Point and multipliers at the end of the continuation inside Ipopt."""
+        nlp, _ = self.constrained(soup, hessian=MAJORANT)
+        self.stages.extend(narrow(nlp, self.o, self.watch, self.early()))
+        last = self.stages[-1]
+        self.laps.end("continuation")
+        return {"x0": last.x, "lam_x0": last.lam_x, "lam_g0": last.lam_g}
+
+    def ipopt(self, nlp: NLP, first: dict[str, Any], far: bool) -> Stage:
+        """The last stage, from a point with multipliers if there are any."""
+        o, limit, warm = self.o, self.o.max_iter, "lam_g0" in first
+        if warm and not o.presolve:
+            # it does the polish's work as well
+            limit += o.polish_iterations
+        kept = (WARM if o.presolve else KEEP) if warm else {}
+        solver = Ipopt(nlp, {**kept, **o.ipopt})
+        self.laps.end("build")
+        if far:
+            limit = min(limit, o.far_iterations)
+            self.watch.say(
+                f"far from a minimum: Ipopt has {o.far_iterations} iterations"
+                " (solver.far_iterations)"
+            )
+        stage = solver(
+            **first,
+            max_iter=limit,
+            tol=o.tol,
+            seconds=max(1.0, self.laps.begin + o.max_seconds - time.perf_counter()),
+            stage="constrained NLP",
+            listener=self.watch.listener,
+            stop=self.watch.stop,
+            log_file=self.watch.log_file,
+        )
+        self.laps.end("solve")
+        self._ended(stage)
+        return stage
+
+    def held(self, ends: Mapping[str, Soup]) -> dict[str, Soup]:
+        """Those that keep their constraints; else the start, tilted until it does."""
+        data, facing = self.data, self.form.min_facing
+        held = {k: s for k, s in ends.items() if feasible(s, data.rim_ray, facing)}
+        if held:
+            return held
+        rays = data.visibility_ray(self.form.depth_ratio)
+        tilted = tilt_to_camera(self.start, data.anchor_ray, rays, facing)
+        return {"start": tilted.normalised(data.share).retracted()}
+
+    def _ended(self, stage: Stage) -> None:
+        self.stages.append(stage)
+        self.watch.say(str(stage))
 
 
 def _multipliers(nlp: NLP, stage: Stage) -> dict[str, Float]:

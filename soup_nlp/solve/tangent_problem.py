@@ -107,7 +107,7 @@ class TangentProblem:
         Args:
             x: (9 N,) point.
             z: (N, R) multipliers of the slacks.
-            kind: "exact", or "gauss-newton" for f's reweighted stand-in.
+            kind: "exact", or "gauss-newton" for f's reweighted majorant.
         """
         return self.sums.hessian(self._kinds[kind], x, self._lam_g(z))
 
