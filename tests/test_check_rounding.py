@@ -20,7 +20,7 @@ from soup_nlp.report.folder import prepare_folder, write_folder
 pytestmark = pytest.mark.slow
 
 # the flow is exact, and not that of the images
-OPTIONS = {"segmentation": {"superpixels": 100, "neighbours": 8}, "refine": {"photo": 0.0}}
+OPTIONS = {"segmentation": {"superpixels": 50, "neighbours": 8}, "refine": {"photo": 0.0}}
 
 
 def one_plane() -> Pair:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -56,6 +57,15 @@ def foreign(folder: Path) -> list[str]:
     return ["solve", str(folder / "pair.yaml"), "-q", *SMALL[4:]]
 
 
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory) -> tuple[list[str], Path]:
+    """How a pair is solved, and its result; to be copied."""
+    root = tmp_path_factory.mktemp("solved")
+    args = foreign(root / "pair")
+    assert main([*args, "--out", str(root / "out")]) in (0, 1)
+    return args, root / "out"
+
+
 def test_a_folder_of_inputs_is_no_output_folder(tmp_path, capsys):
     args = foreign(tmp_path / "pair")
     before = sorted(tmp_path.rglob("*"))
@@ -74,19 +84,16 @@ def test_files_of_no_result_are_not_overwritten(name, tmp_path, capsys):
     assert [p.read_text() for p in (tmp_path / "out").iterdir()] == ["precious"]
 
 
-def test_an_input_in_a_result_folder_is_not_overwritten(tmp_path, capsys):
-    args = foreign(tmp_path / "pair")
-    out = tmp_path / "out"
-    assert main([*args, "--out", str(out)]) in (0, 1)
+def test_an_input_in_a_result_folder_is_not_overwritten(solved, tmp_path, capsys):
+    args, out = solved[0], shutil.copytree(solved[1], tmp_path / "out")
     flow = ["--flow", str(out / "flow.png")]
     assert main([*args, "--out", str(out), *flow]) == 2
     assert "an input would be overwritten" in capsys.readouterr().err
 
 
-def test_a_result_folder_takes_the_next_result_and_is_no_input(tmp_path, capsys):
-    args = foreign(tmp_path / "pair")
-    out = tmp_path / "out"
-    assert main([*args, "--out", str(out)]) in (0, 1)
+def test_a_result_folder_takes_the_next_result_and_is_no_input(solved, tmp_path, capsys):
+    args, out = solved[0], shutil.copytree(solved[1], tmp_path / "out")
+    foreign(tmp_path / "pair")
     assert main([*args, "--out", str(out)]) in (0, 1)
     assert main(["solve", str(out / "config.yaml"), "--out", str(out), "-q"]) in (0, 1)
     # without the mark nothing says who made the files

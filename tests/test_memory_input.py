@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from matplotlib.image import BboxImage
 
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import dump_problem, load_problem
+from soup_nlp.config.problem import load_problem
 from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError
 from soup_nlp.pipeline.run import Run, solve_pair
 from soup_nlp.report.check import check_folder
-from soup_nlp.report.folder import prepare_folder, write_folder
 
 pytestmark = pytest.mark.slow
 
@@ -33,6 +35,13 @@ def run() -> Run:
     return solve_pair(render_scene("orbit", 0, 128, 96), **SMALL)
 
 
+@pytest.fixture(scope="module")
+def saved(run, tmp_path_factory) -> tuple[Path, list[str]]:
+    """The folder that the run makes of itself, and the names of its files."""
+    out = tmp_path_factory.mktemp("saved") / "out"
+    return out, run.save(out, formats=["npy", "motions"])
+
+
 def test_the_hash_is_that_of_the_pair(run):
     pair = render_scene("orbit", 0, 128, 96)
     assert run.problem.input.kind == "memory"
@@ -43,10 +52,8 @@ def test_the_hash_is_that_of_the_pair(run):
     assert pair_hash(replace(pair, name="other", truth=None)) == pair_hash(pair)
 
 
-def test_its_config_cannot_be_solved_again(run, tmp_path, capsys):
-    out = tmp_path / "out"
-    write_folder(prepare_folder(out), run, dump_problem(run.problem), "")
-    assert check_folder(out).ok
+def test_its_config_cannot_be_solved_again(run, saved, tmp_path, capsys):
+    out, _ = saved
     problem = load_problem(out / "config.yaml")
     assert problem.digest() == run.problem.digest()
     with pytest.raises(ConfigError, match="in memory"):
@@ -63,9 +70,8 @@ def test_a_run_survives_a_pickle(run):
     np.testing.assert_array_equal(again.reconstruction.depth_ref, run.reconstruction.depth_ref)
 
 
-def test_arrays_of_truth_and_history_are_described(run, tmp_path):
-    write_folder(prepare_folder(tmp_path), run, dump_problem(run.problem), "")
-    with h5py.File(tmp_path / "result.h5") as file:
+def test_arrays_of_truth_and_history_are_described(run, saved):
+    with h5py.File(saved[0] / "result.h5") as file:
         stored = file["truth/scene_flow"]
         np.testing.assert_array_equal(stored[:], run.pair.truth.scene_flow)
         assert stored.attrs["units"] == run.pair.truth.unit
@@ -87,9 +93,9 @@ def test_a_run_prints_itself_in_five_lines(run):
         assert len(repr(record)) < 300, type(record)
 
 
-def test_a_run_saves_itself_and_is_converted(run, tmp_path, capsys):
-    out, other = tmp_path / "out", tmp_path / "other"
-    files = run.save(out, formats=["npy", "motions"])
+def test_a_run_saves_itself_and_is_converted(run, saved, tmp_path, capsys):
+    out, other = shutil.copytree(saved[0], tmp_path / "out"), tmp_path / "other"
+    files = saved[1]
     assert set(files) >= {"result.h5", "points_ref.ply", "motions.json", "depth_ref.npy"}
     assert all((out / name).exists() for name in files)
     assert check_folder(out).ok
@@ -107,14 +113,13 @@ def test_a_run_saves_itself_and_is_converted(run, tmp_path, capsys):
 
 def test_a_run_plots_itself(run, tmp_path):
     figure = run.plot()
-    assert len(figure.axes) >= 9
+    assert len(figure.findobj(BboxImage)) >= 9
     figure.savefig(tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 20_000
 
 
-def test_what_cannot_be_converted_is_refused(run, tmp_path, capsys):
-    out, foreign = tmp_path / "out", tmp_path / "foreign"
-    run.save(out)
+def test_what_cannot_be_converted_is_refused(saved, tmp_path, capsys):
+    out, foreign = shutil.copytree(saved[0], tmp_path / "out"), tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "mesh_ref.glb").write_text("mine")
     for arguments, said in (

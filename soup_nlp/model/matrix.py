@@ -48,6 +48,21 @@ def build_matrix_nlp(
     for name, element in elements(data, weights, layout).items():
         b.add_norms(name, element, view, own)
 
+    _add_constraints(b, layout, data, form)
+    x0 = layout.pack(soup)
+    b.add_ridge(_metric(layout, x0, data))
+    lbx, ubx = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
+    lbx[np.arange(n) * own] = MIN_SCALE
+    if form.gauge != "unit-offset":
+        lbx[np.arange(n) * own + 4] = MIN_SCALE
+    if form.gauge == "unit-translation":
+        lbx[layout.tau] = 1e-8
+    return b.finish("soup", x0, lbx, ubx, layout.names), layout
+
+
+def _add_constraints(b: Builder, layout: MatrixLayout, data: EnergyData, form: Formulation) -> None:
+    """SO(3), unit normals, visibility, simplex, and what the gauge asks for."""
+    n, own = layout.count, layout.stride
     every = layout.of(np.arange(n))
     x = ca.SX.sym("x", own)
     v = matrix_view(x, form.gauge, ca.SX(1.0))
@@ -85,15 +100,6 @@ def build_matrix_nlp(
         index = np.column_stack([every, np.full(n, layout.tau)])
         body = ca.sumsqr(v.t) - tau**2
         b.add_constraint("translation", ca.vertcat(x, tau), body, index, lower=0.0, upper=0.0)
-    x0 = layout.pack(soup)
-    b.add_ridge(_metric(layout, x0, data))
-    lbx, ubx = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
-    lbx[np.arange(n) * own] = MIN_SCALE
-    if form.gauge != "unit-offset":
-        lbx[np.arange(n) * own + 4] = MIN_SCALE
-    if form.gauge == "unit-translation":
-        lbx[layout.tau] = 1e-8
-    return b.finish("soup", x0, lbx, ubx, layout.names), layout
 
 
 def _metric(layout: MatrixLayout, x: Float, data: EnergyData) -> Float:
