@@ -11,11 +11,13 @@ import casadi as ca
 import h5py
 import numpy as np
 import pytest
+from scipy import sparse
 from test_nl import ReadBack, close
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ConfigError, ExportError
+from soup_nlp.evaluate.confidence import information
 from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.names import readable_names
@@ -89,7 +91,7 @@ def test_several_sizes_and_formulations_are_exported_and_read_back(tmp_path):
 
 
 def test_casadi_and_hdf5_agree_with_the_nlp(exported):
-    _, nlp, _, _, _ = problem_of(exported)
+    case, nlp, _, _, _ = problem_of(exported)
     oracle = ca.Function.load(str(exported / "oracle.casadi"))
     hess = ca.Function.load(str(exported / "hess_lag.casadi"))
     with h5py.File(exported / "soup.h5") as file:
@@ -98,8 +100,16 @@ def test_casadi_and_hdf5_agree_with_the_nlp(exported):
         close(oracle(x0, p)[1], file["at_start/g"][:])
         stored = file["at_start/hess_lag/value"][:]
         assert file["x_names"].asstr()[0] == "lam[0]"
+        row, column, value, shape = (
+            file[f"at_start/information/{name}"][:] for name in ("row", "column", "value", "shape")
+        )
     close(np.array(hess(x0, p, 1, np.ones(nlp.ng)).nonzeros()), stored)
     assert np.array_equal(x0, nlp.x0)
+    found = sparse.coo_matrix((value, (row, column)), shape).toarray()
+    form = case.formulation(hessian="exact", compiled=False)
+    expected = information(case.soup, case.data, case.weights, form).matrix.toarray()
+    assert not np.tril(found, -1).any()
+    np.testing.assert_allclose(found, np.triu(expected), rtol=1e-9, atol=1e-9 * expected.max())
 
 
 def answer(folder: Path, name: str, move: float = 0.0, code: int = 0) -> Path:

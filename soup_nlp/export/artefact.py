@@ -228,6 +228,7 @@ def _write_start_h5(
             "grad_f": vector(grad, "gradient of the objective", "X"),
             "jac_g": matrix(to_scipy(jac), "Jacobian of g"),
             "hess_lag": matrix(to_scipy(hess), f"triu Hessian, lam_f = lam_g = 1 ({nlp.hessian})"),
+            "information": matrix(sparse.triu(info.matrix), INFORMATION),
         },
     }
     write_h5(path, tree, attrs)
