@@ -92,8 +92,7 @@ def test_occluded_points_are_hidden_or_outside(name):
 
 def test_labels_name_components_that_can_be_seen():
     for name in ALL:
-        for seed in range(2):
-            p = pair(name, seed, 192, 82)
+        for seed, p in ((0, pair(name)), (1, pair(name, 1, 192, 82))):
             count = np.bincount(p.truth.components.ravel(), minlength=len(p.truth.motions))
             assert len(count) == len(p.truth.motions)
             assert count.min() > 0.003 * count.sum(), (name, seed)
