@@ -34,7 +34,7 @@ Float = NDArray[np.float64]
 VERSION = 1
 """Of the family: the same version has the same bytes."""
 SCENES = ("orbit", "street", "room", "sheet")
-SIZES = (100, 250)
+SIZES = (100, 250, 500)
 STARTS = ("easy", "hard", "cold")
 STANDARD = "unit-offset/smooth/smooth"
 """Formulation of the family unless another is asked for."""
