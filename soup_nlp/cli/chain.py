@@ -79,7 +79,9 @@ def chain(
     changes = ["output.page=false", *(overrides or [])]
     pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet), dask)
     done = make_chain(pairs[: len(which)], pairs[len(which) :])
-    name = source[0] if len(source) == 1 else f"{source[0]} ..."
+    name = Path(source[0]).resolve().name if len(source) == 1 else f"{source[0]} ..."
+    if isinstance(sequence, SceneFrames):
+        name = sequence.scene
     with staged(out, whole=True, overwrite=overwrite) as new:
         write_chain(new, done, name, sources)
     print(table(done))

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.report.colour import Image
+from soup_nlp.report.colour import Image, colourise_depth
 from soup_nlp.sequence.chain import Chain
 
 WIDTH = 720
@@ -26,7 +26,11 @@ COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e
 
 
 def chain_page(
-    chain: Chain, told: Mapping[str, Any], images: Sequence[Image], depths: Sequence[Image]
+    chain: Chain,
+    told: Mapping[str, Any],
+    images: Sequence[Image],
+    depths: Sequence[Image],
+    span: tuple[float, float],
 ) -> str:
     """The page as HTML that needs nothing else.
 
@@ -35,6 +39,7 @@ def chain_page(
         told: Contents of chain.json.
         images: (H, W, 3) image of every frame.
         depths: (H, W, 3) its depth in colour, one range for all.
+        span: That range, (near, far).
     """
     frames = [[_jpeg(a), _jpeg(b)] for a, b in zip(images, depths)]
     title = html.escape(str(told["name"]))
@@ -43,6 +48,7 @@ def chain_page(
         last=len(chain) - 1,
         frames=json.dumps(frames),
         names=json.dumps([Path(x).name for x in told["sources"]]).replace("<", "\\u003c"),
+        bar=_bar(*span),
         plan=_plan(chain),
         table=_table(told),
         unit=html.escape(str(told["unit"])),
@@ -60,8 +66,19 @@ def _jpeg(image: Image) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 
+def _bar(near: float, far: float) -> str:
+    """The colours of depth with their values, as HTML."""
+    z = 1 / np.linspace(1 / far, 1 / near, 25)
+    stops = ",".join("rgb({},{},{})".format(*c) for c in colourise_depth(z[None], near, far)[0])
+    texts = "".join(f"<span>{x:.3g}</span>" for x in z[::6])
+    return (
+        f'<div class="bar" style="background:linear-gradient(to right,{stops})"></div>'
+        f'<div class="ticks">{texts}</div>'
+    )
+
+
 def _plan(chain: Chain) -> str:
-    """Camera and tracks from above, x to the right and z upwards, as SVG."""
+    """Camera and tracks from above, x to the right and z upwards, with a scale, as SVG."""
     camera = np.array([m.t for m in chain.world_from_camera])
     names = sorted({t for own in chain.tracks for t in own.values()} - {0})
     paths = {t: np.array(list(chain.path(t).values())) for t in names}
@@ -89,7 +106,16 @@ def _plan(chain: Chain) -> str:
         )
 
     drawn = [line(camera, "#222", "camera")]
-    drawn += [line(p, COLOURS[t % len(COLOURS)], f"track {t}") for t, p in paths.items()]
+    drawn += [
+        line(p, COLOURS[k % len(COLOURS)], f"track {t}") for k, (t, p) in enumerate(paths.items())
+    ]
+    # a round length of about a fifth of the plot
+    unit = 10 ** np.floor(np.log10(size / 3))
+    long, y = unit / size * 0.86 * PLAN, PLAN - 12
+    drawn.append(
+        f'<path d="M 12 {y} h {long:.1f}" stroke="#222" stroke-width="2"/>'
+        f'<text x="{18 + long:.1f}" y="{y + 4}">{unit:g} units</text>'
+    )
     return f'<svg width="{PLAN}" height="{PLAN}" viewBox="0 0 {PLAN} {PLAN}">{"".join(drawn)}</svg>'
 
 
@@ -130,6 +156,9 @@ body {{ font: 15px/1.4 system-ui, sans-serif; margin: 1.2em; color: #222; }}
 figure {{ margin: 0; }} .pictures figure {{ flex: 1 1 380px; max-width: 720px; }}
 img {{ width: 100%; display: block; }} .row + .row {{ margin-top: 1em; }}
 figcaption {{ color: #555; }} input[type=range] {{ width: 24em; max-width: 60vw; }}
+.row > figure:has(svg) {{ max-width: 362px; }} .words {{ flex: 1 1 300px; min-width: 0; }}
+.bar {{ height: 10px; margin-top: 4px; }}
+.ticks {{ display: flex; justify-content: space-between; font-size: 12px; }}
 table {{ border-collapse: collapse; }} td, th {{ padding: .2em .7em; text-align: right; }}
 tr:nth-child(even) {{ background: #f3f3f3; }} svg {{ border: 1px solid #ddd; font-size: 12px; }}
 </style></head><body>
@@ -139,15 +168,15 @@ tr:nth-child(even) {{ background: #f3f3f3; }} svg {{ border: 1px solid #ddd; fon
 <div class="row pictures">
 <figure><img id="image" alt="image"><figcaption>image</figcaption></figure>
 <figure><img id="depth" alt="depth"><figcaption>
-depth, one scale and one colour range for all frames: red is near, blue is far, black is
+{bar}depth in units, one scale and one colour range for all frames; grey is
 unknown</figcaption></figure>
 </div>
 <div class="row">
 <figure>{plan}<figcaption>
-from above: x to the right, z (ahead) upwards; a dot is a frame. What moves by itself has<br>
-a scale of its own in every pair: its path is as good as its depth.</figcaption>
+from above: x to the right, z (ahead) upwards; a dot is a frame. What moves by itself has a
+scale of its own in every pair: its path is as good as its depth.</figcaption>
 </figure>
-<div>{table}<p>Unit of length: {unit}.</p></div>
+<div class="words">{table}<p>Unit of length: {unit}.</p></div>
 </div>
 <script>
 const frames = {frames};

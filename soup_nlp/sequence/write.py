@@ -57,9 +57,11 @@ def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -
     told |= {"depth_png_scale": scale, "score": score(chain)}
     write_json(folder / "chain.json", told)
     write_text(folder / "trajectory.tum", trajectory(chain))
-    pictures = coloured(depths)
+    span = depth_range(np.concatenate([z.ravel()[::7] for z in depths]))
+    pictures = [colourise_depth(z, *span) for z in depths]
     write_video(folder / "depth.mp4", [np.vstack(p) for p in zip(images(chain), pictures)])
-    write_text(folder / "chain.html", chain_page(chain, told, images(chain), pictures))
+    page = chain_page(chain, told, images(chain), pictures, span)
+    write_text(folder / "chain.html", page)
 
 
 def summary(chain: Chain) -> dict[str, Any]:
@@ -110,12 +112,6 @@ def trajectory(chain: Chain) -> str:
 def images(chain: Chain) -> list[Image]:
     """(H, W, 3) images of all frames."""
     return [*(p.result.images[0] for p in chain.pairs), chain.pairs[-1].result.images[1]]
-
-
-def coloured(depths: list[Float]) -> list[Image]:
-    """Depth of all frames in colours of one range."""
-    near, far = depth_range(np.concatenate([z.ravel()[::7] for z in depths]))
-    return [colourise_depth(z, near, far) for z in depths]
 
 
 def write_video(path: Path, pictures: list[Image]) -> None:
