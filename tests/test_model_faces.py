@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers_model import (
     GAUGES,
+    K_NEXT,
     Tiny,
     directional,
     gradient,
@@ -54,7 +55,7 @@ def tiny(units: str, at_anchors: bool = False) -> Tiny:
 
 def form(units: str = "paper", **options) -> Formulation:
     """Smoothing wide enough that finite differences see a smooth function."""
-    wide = {"paper": (0.1, 0.5), "pixels": (3.0, 0.5)}[units]
+    wide = {"paper": (0.1 * K_NEXT[0, 0], 0.5), "pixels": (3.0, 0.5)}[units]
     return Formulation(
         **{"eps": wide[0], "eps_pixel": wide[1], "compiled": False, "hessian": "exact", **options}
     )

@@ -12,10 +12,14 @@ from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_pr
 from soup_nlp.errors import ConfigError
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
+from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import build_energy_data
+from soup_nlp.model.layout import TangentLayout
 from soup_nlp.model.reweighting import in_length
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.refine.mppbp import refine_soup
+from soup_nlp.solve.stages import solve_soup
+from soup_nlp.solve.tangent_problem import TangentProblem
 from soup_nlp.start.homographies import Matches, fit_homography, in_front, plane_of
 
 PAPER = {
@@ -32,7 +36,6 @@ PAPER = {
     "energy.arap_at_anchors": False,
     "energy.arap_across": 1.0,
     "energy.cont_occluded": 1.0,
-    "energy.weights.arap": 1.0,
     "energy.weights.prior": 0.0,
     "energy.weights.sigma_arap": np.inf,
     "energy.weights.sigma_proj": np.inf,
@@ -68,6 +71,9 @@ def test_the_preset_is_what_the_paper_prints():
     assert {key: value(problem, key) for key in PAPER} == PAPER
     assert 5 <= problem.refine.rounds <= 10
     assert np.isfinite(problem.energy.weights.sigma_cont)
+    # E is printed with the factor 1 of E_arap, here 1 / alpha1 times as much: a pixel costs 1
+    assert problem.energy.weights.proj == 1.0
+    assert problem.energy.weights.arap > 0
 
 
 def test_every_option_of_the_preset_is_in_the_problem():
@@ -83,7 +89,9 @@ def test_keys_of_the_file_and_overrides_lie_above_the_preset(tmp_path):
     path.write_text("preset: paper\ninput: {kind: motorcycle}\nenergy: {weights: {proj: 3.0}}\n")
     problem = load_problem(path, ["refine.rounds=7", "energy.units=pixel"])
     weights = problem.energy.weights
-    assert (weights.proj, weights.arap, weights.prior) == (3.0, 1.0, 0.0)
+    printed = make_problem({"input": STREET, "preset": "paper"}).energy.weights
+    assert (weights.proj, weights.arap, weights.prior) == (3.0, printed.arap, 0.0)
+    assert printed.proj != 3.0
     assert (problem.refine.rounds, problem.refine.particles) == (7, 50)
     assert (problem.energy.units, problem.start.method) == ("pixel", "homography")
     assert load_problem(path, ["preset=null"]).refine == Problem(input=problem.input).refine
@@ -122,17 +130,19 @@ def case() -> Case:
 
 
 def test_the_start_is_one_of_single_superpixels(case):
-    """With a true flow it is right where the scene is static: all translations are the camera's."""
+    """All anchors at one depth; in units of its translation, depth is right where nothing moves."""
     soup, truth = case.start.soup, case.pair.truth
-    length = np.linalg.norm(soup.translation, axis=1)
-    assert np.allclose(length, length[0], rtol=1e-12)
+    depth = soup.depth_at(case.data.anchor_ray)
+    assert np.allclose(depth, depth[0], rtol=1e-9)
+    assert np.ptp(soup.lam * soup.d) > 0
     assert not case.start.component.any()
     u, v = case.segmentation.anchors.round().astype(int).T
     static = truth.components[v, u] == 0
 
     def error(neighbours: int) -> float:
         problem = paper(f"start.motion_neighbours={neighbours}", flow={"source": "truth"})
-        z = prepare(problem, pair=case.pair).start.soup.depth_at(case.data.anchor_ray)
+        start = prepare(problem, pair=case.pair).start.soup
+        z = start.depth_at(case.data.anchor_ray) / np.linalg.norm(start.translation, axis=1)
         ratio = (z / truth.depth_ref[v, u])[static]
         return float(np.median(np.abs(ratio / np.median(ratio) - 1)))
 
@@ -189,3 +199,46 @@ def test_walks_are_the_only_proposals_of_the_paper(case):
         kinds = {kind for kind, count in number.proposed.items() if count}
         assert kinds <= {"current", "kept"} | {k for k in kinds if k.startswith("walk_")}
     assert done.energy["total"] <= done.energy_begin["total"]
+
+
+def test_a_pixel_of_smoothing_is_a_length_and_an_angle(case):
+    """In the paper's units the widths of norms are those that eps pixels have on the scene."""
+    f, unit = case.data.K_next[0, 0], case.data.edge_unit[0]
+    columns = elements(case.data, case.weights, TangentLayout.about(case.soup, case.data))
+    arap, cont = columns["arap"].columns, columns["cont"].columns
+    assert np.allclose(arap["angle"], 1 / f)
+    assert np.allclose(arap["pixel"], 1 / (f * unit))
+    assert np.allclose(cont["pixel"], 1 / (f * case.data.pair_unit))
+
+
+def test_slanted_planes_do_not_lengthen_the_unit(case):
+    """The presolve's length unit is exact: its gradient, and every iterate's simplex."""
+    problem = TangentProblem(case.soup, case.data, case.weights, case.formulation(), exact=False)
+    rng = np.random.default_rng(0)
+    x = problem.nlp.x0 + 1e-2 * rng.normal(size=problem.nlp.nx)
+
+    def unit(x: np.ndarray) -> float:
+        lam, row = x.reshape(-1, 9)[:, :3], problem.layout
+        m = np.column_stack(
+            [lam[:, 1:], row.radius - np.sum(lam[:, 1:] * row.anchor[:, :2], axis=1)]
+        )
+        distance = row.depth * lam[:, 0] * row.radius / np.linalg.norm(m, axis=1)
+        return float(row.share @ distance)
+
+    assert unit(problem.nlp.x0) == pytest.approx(1.0, rel=1e-9)
+    assert unit(problem.normalise(x)) == pytest.approx(1.0, rel=1e-12)
+    h = 1e-6 * rng.normal(size=len(x))
+    slope = (unit(x + h) - unit(x - h)) / 2
+    # central differences of step 1e-6: their error is of third order, rounding 1e-10
+    assert problem.length(x) @ h == pytest.approx(slope, rel=1e-6, abs=1e-13)
+    assert problem.length(x) @ problem.growth(x) == pytest.approx(unit(x), rel=1e-12)
+
+
+def test_the_constrained_nlp_of_the_paper_has_the_minimum_of_the_presolve(case):
+    """Ipopt starts where the presolve ends: with held slopes it started a fifth of E higher."""
+    options = case.options.replace(polish_iterations=20, max_iter=0)
+    done = solve_soup(case.soup, case.data, case.weights, case.formulation(), options)
+    polish, last = done.stages[-2:]
+    # one energy of one soup in two sets of variables
+    assert last.history["obj"][0] == pytest.approx(polish.objective, rel=1e-7)
+    assert done.energy["total"] < 0.5 * done.energy_start["total"]

@@ -162,13 +162,13 @@ def _no_truth(item: Item) -> DataError:
     )
 
 
-def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
+def scores(result: Run, presets: Sequence[str] = ("paper",), fitted: bool = True) -> Row:
     """Metrics by convention and method, energies, flow error and scene flow of a run.
 
     A convention under which the truth has no pixel, or that needs a depth map where the truth is
-    sparse points, is left out.
+    sparse points, is left out. Planes are fitted to the truth and scored if `fitted`.
     """
-    maps = depth_maps(result)
+    maps = depth_maps(result, fitted)
     sigma = result.reconstruction.sigma_ref
     tables = {name: _metrics(result.pair.truth, maps, preset(name), sigma) for name in presets}
     metrics = {name: table for name, table in tables.items() if table}

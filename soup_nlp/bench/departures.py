@@ -64,9 +64,9 @@ def _overrides(values: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 _WEIGHTS = tuple(f"energy.weights.{w}" for w in ("arap", "proj", "cont", "orient", "sigma_cont"))
-_SMOOTHING = ("solver.presolve_eps", "solver.eps")
 _PIXELS = {key: default(key) for key in ("energy.units", "energy.rotation_px", *_WEIGHTS)}
 _MORE = {"energy.pixel_samples": 64, "segmentation.boundary_samples": "all"}
+_SMALL = {"max_size": 0.05}
 _SHARED = {"start.method": "shared"}
 
 DEPARTURES = (
@@ -75,8 +75,8 @@ DEPARTURES = (
         ("start.method", "start.samples", "start.threshold_px", "start.ground"),
     ),
     Departure(
-        "pixel units, their weights and smoothing",
-        ("energy.units", "energy.length", *_WEIGHTS, *_SMOOTHING),
+        "pixel units and their weights",
+        ("energy.units", "energy.length", *_WEIGHTS),
         # half a pixel of motion is next to nothing in the paper's units
         with_off={"energy.weights.sigma_arap": float("inf")},
         needs="off: E_arap not truncated, since its truncation is in pixels",
@@ -102,19 +102,20 @@ DEPARTURES = (
     Departure(
         "another energy where surfaces bend",
         ("start.bending",),
-        with_on={
-            **_SHARED,
-            **_PIXELS,
-            "solver.presolve_eps": [0.1, 0.03, 0.01],
-            "solver.eps": 0.01,
-        },
+        with_on={**_SHARED, **_PIXELS},
         needs="on: with the start that finds them, and pixel units",
     ),
     Departure("prior on relief", ("energy.weights.prior",)),
     Departure("borders that follow the flow", ("segmentation.follow_flow_px",)),
     Departure("confidence of the flow", ("flow.dis.tau", "flow.dis.limit")),
     Departure("flow seen through reflections", ("flow.see_through",)),
-    Departure("large images at a working size", ("max_size",)),
+    Departure(
+        "large images at a working size",
+        ("max_size",),
+        with_off=_SMALL,
+        with_on=_SMALL,
+        needs="on in both, at 0.05 megapixels: no pair here is larger than the limit",
+    ),
     Departure(
         "samples of pixels and boundaries",
         (),

@@ -63,12 +63,13 @@ def unorganised(soup: Soup) -> Soup:
     return Soup(soup.lam / unit, soup.n, soup.d, soup.R, soup.t)
 
 
-def depth_maps(run: Run) -> dict[str, Float]:
+def depth_maps(run: Run, fitted: bool = True) -> dict[str, Float]:
     """(H, W) depths of the reference frame by method, for a run whose pair has a truth of depth.
 
     "nlp" is there where the NLP was refined, the rigid ones where a motion fits, "floor" where the
     truth is dense enough. "plane" and "floor" are fitted to every true pixel, also where a
-    convention leaves some out by a cap or a crop: there another fit may be better.
+    convention leaves some out by a cap or a crop: there another fit may be better. They are left
+    out if not `fitted`.
     """
     pair, seg = run.pair, run.segmentation
     labels = seg.labels
@@ -87,9 +88,11 @@ def depth_maps(run: Run) -> dict[str, Float]:
     truth = true_depth(run)
     if truth is None:
         return out
+    out["constant"] = np.ones(pair.size)
+    if not fitted:
+        return out
     whole = np.zeros(labels.shape, np.int32)
     out["plane"] = plane_depth(fit_planes(whole, truth, pair.K_ref), whole, pair.K_ref)
-    out["constant"] = np.ones(pair.size)
     if np.count_nonzero(np.isfinite(truth)) >= SPARSE * len(seg):
         out["floor"] = plane_depth(fit_planes(labels, truth, pair.K_ref), labels, pair.K_ref)
     return out

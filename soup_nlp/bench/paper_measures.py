@@ -66,7 +66,7 @@ def measure(
     problem = item.problem(overrides)
     pair, seconds = loaded(problem)
     result = run(problem, pair=pair)
-    row = scores(result, item.presets)
+    row = scores(result, item.presets, fitted=False)
     if not row["metrics"]:
         raise DataError("pair has no true depth", where=item.key, found=", ".join(item.presets))
     if maps is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from soup_nlp.bench.paper_plan import (
     title,
 )
 from soup_nlp.bench.paper_scale import KINDS, lowest
+from soup_nlp.bench.processes import processor
 from soup_nlp.bench.published import ABLATION, COMPARISON, DATA, GRID_AGAINST_SLIC, SOURCE
 from soup_nlp.bench.rows import Row, failed
 from soup_nlp.bench.suite_pairs import Item
@@ -100,7 +102,8 @@ def _head(r: Results, command: str) -> list[str]:
     return [
         "# The paper, row by row",
         "",
-        f"Made by `{command}`. {made([*r.rows, *r.scales])}. Flow by OpenCV DIS unless named.",
+        f"Made by `{command}`. {made([*r.rows, *r.scales])}. Flow by OpenCV DIS unless named."
+        f" Machine: {os.cpu_count()} cores of an {processor()}.",
         f"Superpixels wanted: {s.superpixels} in the comparison, {s.analysis} elsewhere."
         + (f" Overrides of every row: {changed}." if changed else ""),
         "",

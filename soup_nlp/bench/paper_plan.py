@@ -16,15 +16,22 @@ from soup_nlp.bench.paper_scale import measure_scale
 from soup_nlp.bench.rows import Job, attempt
 from soup_nlp.bench.suite_pairs import Item, Options, spread
 from soup_nlp.bench.suites import SUITES, list_suite
+from soup_nlp.config.presets import overrides_of
 from soup_nlp.errors import DataError
 
 Overrides = tuple[str, ...]
 
-SCALE_SUPERPIXELS = 500
+SCALE_SUPERPIXELS = 1000
 """Superpixels where the scale of one body is varied: nothing is solved there."""
 
 METHODS: Mapping[str, Overrides] = MappingProxyType({"preset: paper": PAPER, "defaults": ()})
 """Overrides by the name of a method."""
+
+
+PRINTED_SUPERPIXELS = 1000
+"""Superpixels that the preset's weights are for."""
+_LENGTHS = tuple(f"energy.weights.{term}" for term in ("arap", "cont"))
+_PRINTED: Overrides = tuple(o for o in overrides_of("paper") if o.partition("=")[0] in _LENGTHS)
 
 
 @dataclass(frozen=True)
@@ -153,8 +160,7 @@ class Plan:
     def cell(self, item: Item, method: str, *overrides: str, superpixels: int = 0) -> Cell:
         """A pair by a method of METHODS, changed."""
         n = superpixels or self.sizes.analysis
-        own = f"segmentation.superpixels={n}", *self.sizes.overrides
-        return Cell(item, (*METHODS[method], *own, *overrides))
+        return Cell(item, (*_at_size(METHODS[method], n), *self.sizes.overrides, *overrides))
 
     def compared(self) -> list[Cell]:
         """Every pair of every dataset, then the pairs of the analyses, by both methods."""
@@ -186,13 +192,13 @@ class Plan:
 
     def departures(self, item: Item) -> dict[str, tuple[Cell, Cell | None]]:
         """Cells "off alone" and "on alone" by departure."""
-        n = f"segmentation.superpixels={self.sizes.analysis}"
+        n, same = self.sizes.analysis, self.sizes.overrides
         out: dict[str, tuple[Cell, Cell | None]] = {}
         for d in DEPARTURES:
             on = d.on_alone()
-            own = n, *self.sizes.overrides
-            off = Cell(item, (*own, *d.off_alone()))
-            out[d.name] = off, None if on is None else Cell(item, (*PAPER, *own, *on[len(PAPER) :]))
+            off = Cell(item, (*_at_size((), n), *same, *_scaled(d.off_alone(), n)))
+            printed = (*_at_size(PAPER, n), *same)
+            out[d.name] = off, None if on is None else Cell(item, (*printed, *on[len(PAPER) :]))
         return out
 
     def jobs(self, folder: Path) -> list[Job]:
@@ -227,6 +233,27 @@ class Plan:
             )
             for i in self.scenes
         ]
+
+
+def _at_size(method: Overrides, n: int) -> Overrides:
+    """A method with n superpixels."""
+    weights = _PRINTED if method == PAPER else ()
+    return (*method, f"segmentation.superpixels={n}", *_scaled(weights, n))
+
+
+def _scaled(overrides: Overrides, n: int) -> Overrides:
+    """The same with the preset's weights, which are for 1,000 superpixels, for n.
+
+    With `sum lam = 1` every length is proportional to 1 / n.
+    """
+    if not set(_PRINTED) & set(overrides) or n == PRINTED_SUPERPIXELS:
+        return overrides
+    out = []
+    for o in overrides:
+        key, _, value = o.partition("=")
+        factor = n / PRINTED_SUPERPIXELS if o in _PRINTED else None
+        out.append(o if factor is None else f"{key}={float(value) * factor:g}")
+    return tuple(out)
 
 
 def _changes(section: str, method: str, s: Sizes) -> dict[str, Overrides]:

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from soup_nlp.bench.paper_measures import loaded
 from soup_nlp.bench.rows import Row
@@ -132,17 +133,24 @@ def with_motions(pair: Pair) -> Pair:
 
 
 def _moved(pair: Pair, truth: Truth) -> Truth:
-    """The truth with (B, 4, 4) motions; components that determine none are not finite."""
-    assert truth.depth_ref is not None
-    assert truth.components is not None
-    assert truth.flow is not None
-    grid = pixel_grid(*truth.depth_ref.shape)
-    points = truth.depth_ref[..., None] * rays(pair.K_ref, grid)
-    target = grid[..., :2] + truth.flow
+    """The truth with (B, 4, 4) motions; components that determine none are not finite.
+
+    A mask tells what moves, not what moves together: every piece of it that hangs together is a
+    component of its own.
+    """
+    depth, mask, flow = truth.depth_ref, truth.components, truth.flow
+    assert depth is not None
+    assert mask is not None
+    assert flow is not None
+    pieces, _ = ndimage.label(mask > 0)
+    components = np.where(mask < 0, -1, pieces).astype(np.int32)
+    grid = pixel_grid(*depth.shape)
+    points = depth[..., None] * rays(pair.K_ref, grid)
+    target = grid[..., :2] + flow
     known = np.isfinite(points).all(axis=2) & np.isfinite(target).all(axis=2)
-    motions = np.full((int(truth.components.max()) + 1, 4, 4), np.nan)
+    motions = np.full((int(components.max()) + 1, 4, 4), np.nan)
     for c in range(len(motions)):
-        at = known & (truth.components == c)
+        at = known & (components == c)
         if at.sum() < LEAST_POINTS:
             continue
         X, x = points[at].astype(np.float64), target[at].astype(np.float64)
@@ -150,4 +158,4 @@ def _moved(pair: Pair, truth: Truth) -> Truth:
         pose = motion_of_points(X[::step], x[::step], pair.K_next)
         if pose is not None:
             motions[c] = pose
-    return replace(truth, motions=motions)
+    return replace(truth, components=components, motions=motions)

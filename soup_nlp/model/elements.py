@@ -79,6 +79,17 @@ def _full(count: int, value: float) -> Float:
     return np.full(count, value if np.isfinite(value) else 0.0)
 
 
+def _pixel(data: EnergyData, unit: Float) -> dict[str, Float]:
+    """A pixel as a length, and as an angle, where norms are not in pixels: for their smoothing.
+
+    At the mean plane distance, which is the length 1 / unit.
+    """
+    if data.local_units:
+        return {}
+    angle = np.full(len(unit), 1.0 / data.K_next[0, 0])
+    return {"pixel": angle / unit, "angle": angle}
+
+
 def _arap(data: EnergyData, w: Weights) -> Element:
     e, truncated = data.edges, bool(np.isfinite(w.sigma_arap))
     columns = {
@@ -89,6 +100,7 @@ def _arap(data: EnergyData, w: Weights) -> Element:
         "leak": _full(len(e), w.leak_arap),
         "ray_i": data.anchor_ray[e[:, 0]],
         "ray_k": data.anchor_ray[e[:, 1]],
+        **_pixel(data, data.edge_unit),
     }
 
     def norms(v: list[View], row: dict[str, ca.SX], eps: ca.SX, _: ca.SX) -> list[Norm]:
@@ -128,6 +140,7 @@ def _cont(data: EnergyData, w: Weights) -> Element:
         "ray_i": data.anchor_ray[pairs[:, 0]],
         "ray_k": data.anchor_ray[pairs[:, 1]],
         "rays": data.boundary_ray.reshape(len(pairs), 3 * samples),
+        **_pixel(data, data.pair_unit),
     }
 
     def norms(v: list[View], row: dict[str, ca.SX], eps: ca.SX, _: ca.SX) -> list[Norm]:

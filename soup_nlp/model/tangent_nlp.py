@@ -44,21 +44,7 @@ def build_tangent_nlp(
 
     for name, element in elements(data, weights, layout).items():
         b.add_norms(f"t_{name}", element, view, 9)
-    # the simplex with the slopes held, linear in chart "depth": every iterate keeps it, and the
-    # constrained NLP, which has it exactly, starts from the normalised answer
-    share = soup.normalised(layout.share).lam
-    lam, part = ca.SX.sym("lam"), ca.SX.sym("share")
-    b.add_constraint(
-        "t_simplex",
-        lam,
-        part * lam if chart == "depth" else part / lam,
-        np.arange(n)[:, None] * 9,
-        lower=1.0,
-        upper=1.0,
-        row=part,
-        data=share[:, None],
-        total=True,
-    )
+    _add_simplex(b, soup, layout, slanted=not data.local_units and chart == "depth")
     # visibility as in the constrained NLP, divided by the anchor's facing 1 / |m| and in chart
     # "inverse-depth" multiplied by rho: the same set, so that one's solution is the other's
     count = data.rim_ray.shape[1] - 1
@@ -86,6 +72,30 @@ def build_tangent_nlp(
     lower[:, 1:3], upper[:, 1:3] = -20 * form.depth_ratio, 20 * form.depth_ratio
     x0 = _visible(layout.pack(soup), off, form.depth_ratio, chart)
     return b.finish("presolve", x0, lower.ravel(), upper.ravel(), layout.names), layout
+
+
+def _add_simplex(b: Builder, soup: Soup, layout: TangentLayout, slanted: bool) -> None:
+    """The length unit as one row.
+
+    In pixels the energy does not depend on it: the slopes are held, the row is linear in chart
+    "depth", and the constrained NLP, which has it exactly, starts from the normalised answer. In
+    the paper's units a plane that slants is nearer at the same depth (`slanted`), so that with held
+    slopes all of them would slant to lengthen the unit.
+    """
+    lam, part = ca.SX.sym("lam"), ca.SX.sym("share")
+    x, row = lam, part
+    value = part * lam if layout.chart == "depth" else part / lam
+    data = soup.normalised(layout.share).lam[:, None]
+    if slanted:
+        s, ray, reach = ca.SX.sym("slope", 2), ca.SX.sym("ray", 2), ca.SX.sym("radius")
+        m = ca.vertcat(s / reach, 1 - ca.dot(s, ray) / reach)
+        x, row, value = ca.vertcat(lam, s), ca.vertcat(part, ray, reach), part * lam / ca.norm_2(m)
+        own = layout.share * layout.depth, layout.anchor[:, :2], layout.radius
+        data = np.column_stack(own)
+    index = np.arange(layout.count)[:, None] * 9 + np.arange(x.numel())
+    b.add_constraint(
+        "t_simplex", x, value, index, lower=1.0, upper=1.0, row=row, data=data, total=True
+    )
 
 
 def _visible(x: Float, off: Float, depth_ratio: float, chart: Chart) -> Float:

@@ -23,8 +23,11 @@ def arap(
     sigma, leak = (row["sigma"], row["leak"]) if truncated else (None, 0.0)
     Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
     weight, unit = row["weight"], row["unit"]
+    length_eps, angle_eps = eps, eps
     if local:
         unit = unit / _nearness(Xa, Xb)
+    else:
+        length_eps, angle_eps = eps * row["pixel"], eps * row["angle"]
     gap = a.drift_from(b)
     if at_anchors:
         gap = gap + a.turn_from(b) @ ((Xa + Xb) / 2)
@@ -35,9 +38,9 @@ def arap(
     lengths = [ca.sqrt(ca.sumsqr(v) + 1e-12) for v in (before, before + change)]
     stretch = -ca.dot(change, 2 * before + change) / (lengths[0] + lengths[1])
     return [
-        Norm("rotation", weight, row["turn"] * ca.vec(a.turn_from(b)), eps, sigma, leak=leak),
-        Norm("translation", weight, gap / unit, eps, sigma, leak=leak),
-        Norm("distance", weight, stretch / unit, eps, sigma, leak=leak),
+        Norm("rotation", weight, row["turn"] * ca.vec(a.turn_from(b)), angle_eps, sigma, leak=leak),
+        Norm("translation", weight, gap / unit, length_eps, sigma, leak=leak),
+        Norm("distance", weight, stretch / unit, length_eps, sigma, leak=leak),
     ]
 
 
@@ -77,6 +80,8 @@ def continuity(
     f = row["factor"]
     if local:
         f = f * _nearness(a.anchor(row["ray_i"]), b.anchor(row["ray_k"]))
+    else:
+        eps = eps * row["pixel"]
     return [
         Norm(
             "gap_ref",

@@ -160,7 +160,7 @@ class Descent:
             barrier = max(phase.barrier, min(barrier, 1e-6 * dual))
             at = at._replace(merit=merit(at.f, at.slack, barrier))
             if curvature is None:
-                curvature = self._curvature(at, phase.hessian)
+                curvature = self._curvature(at, phase.hessian, nu)
             step = self._newton(at, curvature, blend, gradient, barrier, phase.hessian)
             search = Search(problem, at, step.h, barrier, step.newton)
             move = search.run(gradient, step.bent)
@@ -247,7 +247,7 @@ class Descent:
         nu = -float(self.problem.growth(self.x) @ rest)
         return nu, float(np.abs(rest + nu * self.problem.length(self.x)).max())
 
-    def _curvature(self, at: Point, kind: HessianKind) -> tuple[Float, Float]:
+    def _curvature(self, at: Point, kind: HessianKind, nu: float = 0.0) -> tuple[Float, Float]:
         """Hessian to use and the majorant, both with the condensed slacks."""
         assert self.z is not None
         inner = np.einsum("nrc,nr,nrd->ncd", at.jacobian, self.z / at.slack, at.jacobian)
@@ -256,7 +256,7 @@ class Descent:
         own = condensed[:, self.problem.triangle[0], self.problem.triangle[1]]
         out = []
         for each in dict.fromkeys((kind, "gauss-newton")):
-            H = self.problem.hessian(at.x, self.z, each)
+            H = self.problem.hessian(at.x, self.z, each, nu)
             H[self.problem.block] += own
             out.append(H)
         return out[0], out[-1]

@@ -31,7 +31,8 @@ class TangentProblem:
     Attributes:
         nlp: The tangent NLP with the reweighted Gauss-Newton Hessian.
         layout: Turns its vectors into soups.
-        share: (N,) coefficients of the simplex row, `share . scale = 1` (scale = 1 / rho).
+        share: (N,) coefficients of the simplex row, `share . scale = 1` (scale = 1 / rho); in the
+            paper's units `share . (scale / |m|) = 1`, m the plane of anchor depth 1.
         rims: V, rim pixels of a superpixel.
         upper: (9 N, 9 N) pattern of Hessians, upper triangle, its values number the nonzeros.
         sums: Its values and derivatives.
@@ -79,7 +80,8 @@ class TangentProblem:
         self._visible = tables["t_visible"].rows
         self.rims = self._visible.shape[1]
         self._simplex = int(tables["t_simplex"].rows[0, 0])
-        self.share = tables["t_simplex"].data[:, 0]
+        unit = tables["t_simplex"].data
+        self.share, self._slants = unit[:, 0], unit[:, 1:] if unit.shape[1] > 1 else None
         self._low, self._high = nlp.lbx.reshape(-1, 9), nlp.ubx.reshape(-1, 9)
         self._bound = nlp.lbg[self._visible]
         # derivatives of a row of visibility, by slopes and in "inverse-depth" by rho: found by row
@@ -101,15 +103,19 @@ class TangentProblem:
         """Gradient of the smoothed energy, (9 N,)."""
         return self.sums.gradient(x)
 
-    def hessian(self, x: Float, z: Float, kind: HessianKind) -> Float:
+    def hessian(self, x: Float, z: Float, kind: HessianKind, nu: float = 0.0) -> Float:
         """Nonzeros (in the order of `upper`) of the Hessian of `f - z . c`.
 
         Args:
             x: (9 N,) point.
             z: (N, R) multipliers of the slacks.
             kind: "exact", or "gauss-newton" for f's reweighted majorant.
+            nu: Multiplier of the simplex, whose row is curved in the paper's units.
         """
-        return self.sums.hessian(self._kinds[kind], x, self._lam_g(z))
+        lam_g = self._lam_g(z)
+        if self._slants is not None and kind == "exact":
+            lam_g[self._simplex] = nu
+        return self.sums.hessian(self._kinds[kind], x, lam_g)
 
     def slacks(self, x: Float) -> tuple[Float, Float]:
         """Slacks (N, R) and their derivatives by scale and slopes (N, R, 3)."""
@@ -126,7 +132,7 @@ class TangentProblem:
         """The same soup with its scales on the simplex."""
         a = x.reshape(-1, 9).copy()
         if self.layout.chart == "depth":
-            a[:, 0] /= self.share @ a[:, 0]
+            a[:, 0] /= self.share @ (a[:, 0] * self._facing(a)[0])
         else:
             a[:, :3] *= self.share @ (1 / a[:, 0])
         return a.ravel()
@@ -144,8 +150,26 @@ class TangentProblem:
         """Gradient of the length unit, the simplex row, (9 N,)."""
         out = np.zeros_like(x)
         inverse = self.layout.chart != "depth"
-        out[::9] = -self.share / x[::9] ** 2 if inverse else self.share
+        if inverse:
+            out[::9] = -self.share / x[::9] ** 2
+            return out
+        facing, by_slopes = self._facing(x.reshape(-1, 9))
+        out[::9] = self.share * facing
+        out.reshape(-1, 9)[:, 1:3] = (self.share * x[::9])[:, None] * by_slopes
         return out
+
+    def _facing(self, a: Float) -> tuple[Float, Float]:
+        """(N,) 1 / |m| of the rows (N, 9) of a vector, 1 where slopes are held; its slopes (N, 2).
+
+        m is `(s / h, 1 - s . r_a / h)`.
+        """
+        if self._slants is None:
+            return np.ones(len(a)), np.zeros((len(a), 2))
+        ray, reach = self._slants[:, :2], self._slants[:, 2:]
+        s = a[:, 1:3] / reach
+        last = 1 - np.sum(s * ray, axis=1, keepdims=True)
+        facing = 1 / np.sqrt(np.sum(s**2, axis=1) + last[:, 0] ** 2)
+        return facing, -(facing**3)[:, None] * (s - last * ray) / reach
 
     def calls(self) -> dict[str, float]:
         """Seconds so far in f, grad_f, jac_g (with g) and hess_lag."""

@@ -8,7 +8,8 @@ cameras, mostly two, and that one is taken whose epipolar geometry explains the 
 neighbours better.
 
 A superpixel for which this fails takes the answer of the nearest one for which it does not. All
-translations have unit length and all scales are alike: the unorganised soup.
+scales are alike and all anchors lie at one depth, which the paper takes as a positive constant: the
+unorganised soup.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.plane import normal_and_distance
+from soup_nlp.geometry.plane import about_anchor, at_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.epipolar import Motion, essential_motion, sampson
 from soup_nlp.start.plane_fit import Views
@@ -77,9 +78,11 @@ def unorganised(views: Views, seg: Segmentation, o: SeededStart) -> tuple[Soup, 
         source[fails] = good[cKDTree(seg.anchors[good]).query(seg.anchors[fails])[1]]
     sideways = Patch(Motion(np.eye(3), np.array([1.0, 0.0, 0.0])), np.array([0.0, 0.0, 1.0]))
     own = [found[s] or sideways for s in source]
-    n, D = normal_and_distance(np.stack([p.m for p in own]))
     R, t = (np.stack([getattr(p.motion, name) for p in own]) for name in ("R", "t"))
-    return Soup(np.ones(len(seg)), n, D, R, t), fails
+    # a borrowed plane keeps depth and slopes, since at this anchor it may be behind the camera
+    depth, slope = at_anchor(np.stack([p.m for p in own]), views.anchor[source])
+    n, D = normal_and_distance(about_anchor(np.ones(len(seg)), slope, views.anchor))
+    return Soup(np.ones(len(seg)), n, D, R, t / depth[:, None]), fails
 
 
 def _patch(views: Views, seg: Segmentation, i: int, o: SeededStart) -> Patch | None:
@@ -87,10 +90,10 @@ def _patch(views: Views, seg: Segmentation, i: int, o: SeededStart) -> Patch | N
     own = matches(views, np.array([i]))
     if len(own.ray) < LEAST_PIXELS:
         return None
-    focal = views.focal[0]
+    focal, seen = views.focal[0], np.vstack([own.ray, views.anchor[i]])
     if not o.motion_neighbours:
         H = fit_homography(own)
-        choices = [] if H is None else in_front(H, own.ray)
+        choices = [] if H is None else in_front(H, seen)
         if len(choices) < 2:
             return choices[0] if choices else None
         around = matches(views, seg.knn[i, :JUDGES])
@@ -100,7 +103,7 @@ def _patch(views: Views, seg: Segmentation, i: int, o: SeededStart) -> Patch | N
     if motion is None:
         return None
     m = plane_of(motion, own)
-    return Patch(motion, m) if (own.ray @ m > 0).all() else None
+    return Patch(motion, m) if (seen @ m > 0).all() else None
 
 
 def matches(views: Views, members: Int) -> Matches:
