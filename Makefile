@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/demo
 
-.PHONY: demo test quick lint docs results clean
+.PHONY: demo test quick lint docs results versions clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/.installed: pyproject.toml
@@ -40,6 +40,10 @@ $(VENV)/.docs: $(VENV)/.installed
 # the documentation in site/; a warning is an error
 docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict --quiet
+
+# lowest and newest packages, Python 3.11 to 3.13, odd surroundings: an hour, most of it installation
+versions:
+	$(PYTHON) tests/versions.py
 
 results: $(VENV)/.optional
 	$(BIN)/soup-nlp bench all --out results --overwrite $(if $(DATA),--data $(DATA))

@@ -10,7 +10,11 @@ import pytest
 from helpers_formulation import form, tiny
 from helpers_model import PAPER, Tiny, weights_for
 
-from soup_nlp.export.verify import Limits, Residuals
+from soup_nlp.bench.solvers import runner
+from soup_nlp.bench.solvers.page import conclusion
+from soup_nlp.evaluate import recompute
+from soup_nlp.export import verify
+from soup_nlp.export.verify import ENERGY_SLACK, Limits, Residuals
 from soup_nlp.model import oracle
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.refine.costs import PairCosts, Particles
@@ -106,3 +110,61 @@ def test_the_length_unit_of_a_free_gauge_weighs_distances_by_their_share(gauge):
     # with equal shares the unit would be the mean distance, which is another one
     soup = layout.unpack(nlp.x0[: layout.size])
     assert abs(float(np.mean(soup.distance)) - 1) > 0.01
+
+
+def test_the_energy_of_an_answer_may_be_a_thousandth_above_the_start():
+    assert pytest.approx(1.001, rel=1e-12) == 1 + ENERGY_SLACK
+
+
+def test_a_problem_s_lowest_energy_is_that_of_its_own_runs():
+    def row(problem: str, energy: float) -> dict[str, object]:
+        label = {"problem": problem, "superpixels": 9, "formulation": "f", "solver": "s"}
+        point = {"energy": energy, "primal": 0.0, "seconds": 1.0, "verified": True}
+        return {**label, **point, "claimed": True, "problem_hash": problem, "start": "presolve"}
+
+    text = "\n".join(conclusion([row("a", 1.0), row("b", 2.0)]))
+    assert text.count("lowest exact energy of any run 1 by s") == 1
+    assert text.count("lowest exact energy of any run 2 by s") == 1
+
+
+def test_a_curve_has_the_first_and_the_last_iterate(monkeypatch):
+    monkeypatch.setattr(runner, "_energy", lambda _, x: float(x[0]))
+    for count in (1, 2, 500):
+        at = np.arange(float(count))
+        curve = runner._curve(None, at, at[:, None])
+        assert curve[0] == [0, 0]
+        assert curve[-1] == [count - 1, count - 1]
+        assert len(curve) == min(count, runner.CURVE_POINTS)
+    assert runner._curve(None, np.zeros(0), np.zeros((0, 1))) == []
+
+
+@pytest.mark.parametrize(("slant", "gap"), [(1.0, False), (0.85, True)])
+def test_contact_is_weaker_where_a_component_hides_another(slant, gap):
+    """Depth of a plane at the middle of a border is its distance through the cosine there."""
+    ray = np.array([0.0, 0.0, 1.0])
+    normal = -np.array([ray, slant * ray])
+    tree = {
+        "start": {
+            "n": normal, "lam": np.ones(2), "d": np.ones(2), "component": np.arange(2),
+            "surface": np.zeros(2, int), "bending": False,
+        },
+        "segmentation": {"pair_weight": np.array([0.8])},
+        "energy": {"boundary_ray": np.tile(ray, (1, 3, 1)), "pairs": np.array([[0, 1]])},
+    }  # fmt: skip
+    form = {
+        "occlusion_gap": 0.1, "cont_occluded": 0.25, "units": "pixel",
+        "bending": {"cont_across": 0.5},
+    }  # fmt: skip
+    np.testing.assert_allclose(recompute._pair_weights(tree, form), [0.2 if gap else 0.8])
+
+
+def test_a_bound_s_multiplier_shares_what_is_left_of_the_gradient_with_its_gap(monkeypatch):
+    """Dual infeasibility r - lam and complementarity lam * gap are equal."""
+    left = np.array([2.0, -3.0, 5.0, 4.0])
+    monkeypatch.setattr(verify, "_gradient", lambda *_: -left)
+    monkeypatch.setattr(verify, "_jacobian", lambda *_: np.zeros((1, 4)))
+    bounds = {"lbx": np.array([0.0, 0, 0, 1]), "ubx": np.array([0.5, 1, np.inf, 1])}
+    lam = verify.bound_multipliers(
+        SimpleNamespace(**bounds), np.array([0.25, 0.5, 0.5, 1]), np.zeros(1)
+    )
+    np.testing.assert_allclose(lam, [2 / 1.25, -3 / 1.5, 0, 4], rtol=1e-12)

@@ -21,8 +21,8 @@ from helpers_trws import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soup_nlp.mrf.levels import colours, plan_levels
-from soup_nlp.mrf.trws import mrf_energy, solve_trws
+from soup_nlp.mrf.levels import Tables, colours, plan_levels
+from soup_nlp.mrf.trws import _Passes, mrf_energy, solve_trws
 
 # --- the original, node by node ---------------------------------------------------------------
 
@@ -234,3 +234,14 @@ def test_levels_are_colours_and_hold_every_edge_twice(seed):
 def test_a_bipartite_graph_takes_two_levels():
     edges = np.array([(a, b) for a in range(5) for b in range(5, 11)])
     assert colours(11, edges).max() == 1
+
+
+def test_polishing_goes_on_until_no_single_move_helps():
+    """A label that creeps along a chain from its end: every sweep moves two nodes."""
+    n = 12
+    pairs = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)
+    costs = np.tile([0.0, -0.01], (n, 1))
+    costs[-1] = 10.0, 0.0
+    table = np.tile(1.0 - np.eye(2), (n - 1, 1, 1))
+    solver = _Passes(costs, plan_levels(colours(n, pairs), pairs), Tables(table))
+    assert solver.icm(np.zeros(n, int)).tolist() == [1] * n
