@@ -44,7 +44,9 @@ LABEL = {
 def task(tmp_path_factory) -> Task:
     tiny = Tiny(neighbours=2, samples=3, boundary_samples=1)
     # wide smoothing: with 0.2 the way from a cold start is so long that rounding decides its end
-    form = Formulation(hessian="exact", eps=1.0, eps_pixel=1.0, compiled=False)
+    # (a length of 1, which is the focal length in pixels)
+    wide = float(tiny.data.K_next[0, 0])
+    form = Formulation(hessian="exact", eps=wide, eps_pixel=1.0, compiled=False)
     nlp, layout = tiny.nlp(PAPER, form)
     other, _ = tiny.nlp(PAPER, form.replace(hessian="gauss-newton+constraints"))
     limits = Limits(seconds=20, iterations=200, tol=1e-5)

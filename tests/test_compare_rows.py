@@ -36,7 +36,9 @@ SMALL = [
 
 def make_task(folder: Path, **form: str) -> Task:
     tiny = Tiny(neighbours=2, samples=3, boundary_samples=1)
-    style = Formulation(hessian="exact", eps=1.0, eps_pixel=1.0, compiled=False, **form)
+    # a length of 1 is the focal length in pixels
+    wide = float(tiny.data.K_next[0, 0])
+    style = Formulation(hessian="exact", eps=wide, eps_pixel=1.0, compiled=False, **form)
     nlp, layout = tiny.nlp(PAPER, style)
     limits = Limits(seconds=20, iterations=200, tol=1e-5)
     return Task(nlp, nlp, layout, tiny.soup, tiny.data, PAPER, style, limits, folder)

@@ -26,7 +26,7 @@ def browser(small_run, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(page(shown, pictures(shown)), encoding="utf-8")
     assert CHROMIUM is not None
-    chromium = Chromium(CHROMIUM, 700, 560)
+    chromium = Chromium(CHROMIUM, 1000, 800)
     chromium.open(file_address(path))
     yield chromium
     chromium.close()

@@ -114,7 +114,8 @@ def test_multipliers_of_a_foreign_optimum(tmp_path):
     if pounce is None:
         pytest.skip("pounce (pounce-solver) is not installed")
     tiny = Tiny(neighbours=2, samples=1, boundary_samples=1)
-    nlp, _ = tiny.nlp(PAPER, Formulation(hessian="exact", eps=0.2, eps_pixel=0.2))
+    wide = 0.2 * float(tiny.data.K_next[0, 0])
+    nlp, _ = tiny.nlp(PAPER, Formulation(hessian="exact", eps=wide, eps_pixel=0.2))
     file = write_nl(tmp_path / "soup.nl", nlp)
     command = [pounce, str(file.path), "tol=1e-8", "print_level=0"]
     subprocess.run(command, check=True, capture_output=True)
