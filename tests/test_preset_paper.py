@@ -72,8 +72,8 @@ def test_the_preset_is_what_the_paper_prints():
     assert 5 <= problem.refine.rounds <= 10
     assert np.isfinite(problem.energy.weights.sigma_cont)
     # E is printed with the factor 1 of E_arap, here 1 / alpha1 times as much: a pixel costs 1
-    assert problem.energy.weights.proj == 1.0
-    assert problem.energy.weights.arap > 0
+    own = problem.energy.weights
+    assert (own.arap, own.proj, own.cont, own.orient) == (500.0, 1.0, 15.0, 0.1)
 
 
 def test_every_option_of_the_preset_is_in_the_problem():

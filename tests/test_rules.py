@@ -2,6 +2,7 @@
 
 import pytest
 
+from soup_nlp.bench.analyses import ANALYSES, _chosen
 from soup_nlp.bench.rules import SHIPPED, plot_rules, text_rules
 
 
@@ -52,3 +53,7 @@ def test_a_rule_is_judged_by_family(rows, tmp_path):
     assert "| a, dis | 0.1000 | 0.2000 |" in text
     plot_rules(tmp_path / "rules.png", rows)
     assert (tmp_path / "rules.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_rule_that_is_asked_for_alone_is_compared_with_everything():
+    assert list(_chosen(ANALYSES["rules"], ["ground"]).variants) == [SHIPPED, "ground"]

@@ -12,7 +12,7 @@ from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
 from soup_nlp.bench.analyses_measures import VIEWS, measure_energy, measure_flow, measure_view
 from soup_nlp.bench.confidence import measure_confidence, plot_confidence, text_confidence
 from soup_nlp.bench.rows import MeasureRows, Row, measure_all
-from soup_nlp.bench.rules import RULES, plot_rules, text_rules
+from soup_nlp.bench.rules import RULES, SHIPPED, in_both, plot_rules, text_rules
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import Listing
 from soup_nlp.errors import ConfigError
@@ -34,6 +34,7 @@ class Analysis:
         text: What it asks.
         variants: Overrides by the name of a variant, in the order of tables.
         axis: Label of the variants.
+        base: The variant that others are compared with: measured whatever values are asked for.
         free: Key of the variants' setting where other values than these may be asked for.
         numeric: The variants are numbers, drawn on an axis.
         true_flow_only: Only pairs with a true flow.
@@ -46,6 +47,7 @@ class Analysis:
     text: str
     variants: Mapping[str, Overrides]
     axis: str = ""
+    base: str = ""
     free: str = ""
     numeric: bool = False
     true_flow_only: bool = False
@@ -64,8 +66,7 @@ def _numbers(name: str, text: str, values: Sequence[int]) -> Analysis:
 
 
 def _without(*terms: str) -> Overrides:
-    # bending surfaces have weights of their own
-    return tuple(f"energy.{w}.{t}=0.0" for t in terms for w in ("weights", "bending.weights"))
+    return tuple(o for t in terms for o in in_both(t, "0.0"))
 
 
 _ALL = (
@@ -145,6 +146,7 @@ _ALL = (
         "rules",
         "what every rule of the start and the energy brings, by family",
         RULES,
+        base=SHIPPED,
         page=text_rules,
         plot=plot_rules,
     ),
@@ -267,4 +269,5 @@ def _chosen(analysis: Analysis, values: Sequence[str] | None) -> Analysis:
     wrong = [v for v in values if v not in variants]
     if wrong:
         raise ConfigError("unknown variant", found=wrong[0], expected=", ".join(variants))
-    return replace(analysis, variants={v: variants[v] for v in values})
+    wanted = [analysis.base, *values] if analysis.base else values
+    return replace(analysis, variants={v: variants[v] for v in wanted})

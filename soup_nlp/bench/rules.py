@@ -18,8 +18,8 @@ SAME = 0.01
 """Relative change of a family's MRE up to which a rule changes nothing there."""
 
 
-def _both(key: str, value: str) -> tuple[str, ...]:
-    # bending surfaces have weights of their own
+def in_both(key: str, value: str) -> tuple[str, ...]:
+    """Overrides of a weight; bending surfaces have weights of their own."""
     return tuple(f"energy.{w}.{key}={value}" for w in ("weights", "bending.weights"))
 
 
@@ -27,10 +27,10 @@ RULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         SHIPPED: (),
         "energy of bending surfaces": ("start.bending=1",),
-        "E_prior": _both("prior", "0"),
+        "E_prior": in_both("prior", "0"),
         "E_prior holds contacts": ("energy.prior_contact=0.03",),
         "E_arap weak across components": ("energy.arap_across=1",),
-        "E_arap truncated": _both("sigma_arap", ".inf"),
+        "E_arap truncated": in_both("sigma_arap", ".inf"),
         "E_cont weak at occlusions": ("energy.cont_occluded=1",),
         "contact below": ("start.upright=false",),
         "ground": ("start.ground=false",),
@@ -46,7 +46,7 @@ def _changes(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     _, pairs = by_pair(rows, titles(rows))
     logs: dict[str, dict[str, list[float]]] = {}
     for own in pairs.values():
-        shipped = main_metric(own[SHIPPED]) if SHIPPED in own else None
+        shipped = main_metric(own[SHIPPED])
         for rule, row in own.items():
             without = main_metric(row)
             if rule != SHIPPED and shipped and without:
