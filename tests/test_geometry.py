@@ -85,6 +85,14 @@ def test_exp_of_a_quarter_turn_about_z_takes_x_to_y():
     np.testing.assert_array_equal(rotation.exp([0.0, 0.0, 0.0]), np.eye(3))
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-5, 0.5, 3.0])
+def test_the_right_jacobian_is_that_of_exp(size):
+    w, h = size * np.array([2.0, -1.0, 2.0]) / 3, 1e-6
+    turns = [rotation.exp(w).T @ (rotation.exp(w + e) - rotation.exp(w - e)) for e in h * np.eye(3)]
+    J = rotation.right_jacobian(w)
+    np.testing.assert_allclose(np.array(turns) / (2 * h), rotation.hat(J.T), atol=1e-9)
+
+
 @given(vectors)
 def test_cayley_is_a_rotation_by_twice_the_arc_tangent_about_the_same_axis(w):
     R = rotation.cayley(2 * w)

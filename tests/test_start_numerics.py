@@ -10,7 +10,7 @@ import pytest
 from soup_nlp.geometry import rotation
 from soup_nlp.start import epipolar
 from soup_nlp.start.bending import _affine, constant_depth
-from soup_nlp.start.epipolar import Motion, estimate, sampson
+from soup_nlp.start.epipolar import Motion, estimate, sampson, sampson_slopes
 from soup_nlp.start.neighbourhoods import fit_translation, refine_motion
 from soup_nlp.start.plane_fit import PlaneFit, Views
 
@@ -130,6 +130,17 @@ def test_of_stacked_essential_matrices_the_one_that_explains_most_is_taken(monke
     assert found is not None
     assert np.abs(sampson(found.essential(), r, q, FOCAL)).max() < 1e-6
     assert max(off(m, found.R, found.t)) < 1e-6
+
+
+def test_slopes_of_the_sampson_distance_are_its_differences():
+    m, r, q = rigid(50)
+    q = q + np.random.default_rng(0).normal(0, 0.01, q.shape) * [1, 1, 0]
+    E, directions, h = m.essential(), np.random.default_rng(1).normal(size=(5, 3, 3)), 1e-5
+    ends = [[sampson(E + s * h * D, r, q, FOCAL) for s in (1, -1)] for D in directions]
+    differences = np.stack([(a - b) / (2 * h) for a, b in ends], axis=1)
+    slopes = sampson_slopes(E, directions, r, q, FOCAL)
+    # the next term of Taylor's series is h^2 = 1e-10 of the distance's third derivative
+    np.testing.assert_allclose(slopes, differences, rtol=1e-6, atol=1e-6 * np.abs(slopes).max())
 
 
 # --- planes --------------------------------------------------------------------------------------

@@ -39,12 +39,27 @@ class Motion:
 
 
 def sampson(E: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
-    """Sampson distance (...) of rays r, q (..., 3) to E (..., 3, 3), times focal (pixels)."""
-    Er = np.einsum("...ij,...j->...i", E, r)
-    Eq = np.einsum("...ji,...j->...i", E, q)
-    top = np.sum(q * Er, axis=-1)
-    down = Er[..., 0] ** 2 + Er[..., 1] ** 2 + Eq[..., 0] ** 2 + Eq[..., 1] ** 2
-    return focal * top / np.sqrt(np.maximum(down, 1e-24))
+    """Sampson distance (...) of rays r, q (..., 3) to E (3, 3), times focal (pixels)."""
+    top, root, _, _ = _sampson_parts(E, np.swapaxes(r, -1, -2), np.swapaxes(q, -1, -2))
+    return focal * top / root
+
+
+def _sampson_parts(E: Float, r: Float, q: Float) -> tuple[Float, Float, Float, Float]:
+    """Of columns r, q (..., 3, M): q'E r, the root of its squared slopes, the slopes by q and r."""
+    by_q, by_r = E[:2] @ r, E[:, :2].T @ q
+    squared = np.sum(by_q**2, axis=-2) + np.sum(by_r**2, axis=-2)
+    return np.sum(q * (E @ r), axis=-2), np.sqrt(np.maximum(squared, 1e-24)), by_q, by_r
+
+
+def sampson_slopes(E: Float, directions: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
+    """(M, k) derivatives of the distances of r, q (M, 3) along `directions` (k, 3, 3) of E."""
+    r, q = r.T, q.T
+    top, root, by_q, by_r = _sampson_parts(E, r, q)
+    share = top / root**2
+    left, right = q / root, share * by_r / root
+    left[:2] -= share * by_q / root
+    slopes = [np.sum(left * (D @ r), axis=0) - np.sum(right * (D.T[:2] @ q), 0) for D in directions]
+    return focal * np.stack(slopes, axis=1)
 
 
 def estimate(
@@ -129,11 +144,19 @@ def refine(
     def residual(x: Float) -> Float:
         return root * sampson(unpack(x).essential(), r, q, focal)
 
+    def jacobian(x: Float) -> Float:
+        now = unpack(x)
+        turns = rotation.hat(rotation.right_jacobian(x[:3]).T)
+        shifts = basis - np.outer(basis @ now.t, now.t)
+        shifts /= np.linalg.norm(motion.t + x[3:] @ basis)
+        directions = np.concatenate([now.essential() @ turns, rotation.hat(shifts) @ now.R])
+        return root[:, None] * sampson_slopes(now.essential(), directions, r, q, focal)
+
     # from the inlier distance down to the noise: components that move a little otherwise let go
     scale = max(0.1, 0.5 * threshold)
     x = np.zeros(5)
     for _ in range(REFINEMENTS):
-        x = least_squares(residual, x, loss="cauchy", f_scale=scale, max_nfev=30).x
+        x = least_squares(residual, x, jacobian, loss="cauchy", f_scale=scale, max_nfev=30).x
         error = np.abs(residual(x))
         near = error[error < max(3 * scale, LEAST_NOISE)]
         noise = 1.5 * float(np.median(near)) if len(near) else scale
