@@ -45,6 +45,7 @@ def compiler_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
+@cache
 def _cpu() -> str:
     """What -march=native depends on, so that a cache shared by machines stays right."""
     try:

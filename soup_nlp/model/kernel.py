@@ -57,12 +57,13 @@ class Kernel:
         return isinstance(other, Kernel) and self._content == other._content
 
     @cached_property
-    def _content(self) -> tuple[str, ...]:
+    def _content(self) -> str:
         args = [self.x, self.row, self.theta]
-        parts = [self.objective, self.constraints, self.curvature]
-        return tuple(
-            "" if e is None else ca.Function(self.name, args, [e]).serialize() for e in parts
-        )
+        parts = {"f": self.objective, "g": self.constraints, "h": self.curvature}
+        there = {k: e for k, e in parts.items() if e is not None}
+        names = ["x", "row", "theta"]
+        function = ca.Function(self.name, args, list(there.values()), names, list(there))
+        return str(function.serialize())
 
     @property
     def nx(self) -> int:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property, lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -122,6 +123,12 @@ def c_source(function: ca.Function) -> str:
     return "\n".join([head, declared, *lines, "}", loop])
 
 
+@lru_cache(maxsize=1000)
+def _text(function: ca.Function) -> str:
+    """What the C of a function depends on; equal kernels share their functions."""
+    return str(function.serialize())
+
+
 def compile_lanes(functions: Sequence[ca.Function]) -> ctypes.CDLL:
     """Machine code of functions with distinct names, cached by content.
 
@@ -129,7 +136,7 @@ def compile_lanes(functions: Sequence[ca.Function]) -> ctypes.CDLL:
         NoLanesError: There is no compiler, it fails, or a function has an operation without a twin.
     """
     # what the source depends on, in a tenth of the time that writing it takes
-    key = "\0".join(["lanes", _HEAD, _LOOP, *(f.serialize() for f in functions)])
+    key = "\0".join(["lanes", _HEAD, _LOOP, *map(_text, functions)])
     path = shared_library(key, lambda: "\n".join([_HEAD, *(c_source(f) for f in functions)]))
     if path is None:
         raise NoLanesError("no working C compiler")
@@ -161,7 +168,8 @@ class Lanes:
         return cls(in_lanes(table.index, np.int32), in_lanes(table.data), in_lanes(rows, np.int32))
 
 
-class Summed(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Summed:
     """One function of a kernel, summed over the kernel's table.
 
     Attributes:
@@ -189,6 +197,12 @@ class Summed(NamedTuple):
         call.restype = None
         return cls(call, lanes, in_lanes(place, np.int32, fill=size))
 
+    @cached_property
+    def _table(self) -> list[ctypes.c_void_p]:
+        return [
+            _pointer(a) for a in (self.lanes.index, self.lanes.data, self.lanes.rows, self.place)
+        ]
+
     def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
         """Add the elements' entries to `out`.
 
@@ -199,11 +213,11 @@ class Summed(NamedTuple):
             lam_f: Multiplier of f, for Hessians.
             lam_g: (ng,) multipliers of g, for Hessians.
         """
-        index, data, rows = self.lanes.index, self.lanes.data, self.lanes.rows
+        index, data, rows, place = self._table
         lam = x if lam_g is None else lam_g
-        first = [_pointer(a) for a in (x, index, data, theta)]
-        rest = [_pointer(a) for a in (lam, rows, self.place, out)]
-        self.call(ctypes.c_long(len(index)), *first, ctypes.c_double(lam_f), *rest)
+        blocks, factor = ctypes.c_long(len(self.lanes.index)), ctypes.c_double(lam_f)
+        first = blocks, _pointer(x), index, data, _pointer(theta), factor
+        self.call(*first, _pointer(lam), rows, place, _pointer(out))
 
 
 def _pointer(array: NDArray[Any]) -> ctypes.c_void_p:

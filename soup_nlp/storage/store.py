@@ -108,8 +108,9 @@ def _write_group(group: h5py.Group, tree: Tree) -> None:
             data = np.char.encode(data, "utf-8")
             data = data.astype(h5py.string_dtype(length=max(1, data.dtype.itemsize)))
         _write_array(group, name, data)
+        attributes = group[name].attrs
         for key in ("units", "description", "shape_letters"):
-            group[name].attrs[key] = getattr(item, key)
+            attributes[key] = getattr(item, key)
 
 
 def _write_attribute(file: h5py.File, key: str, value: object) -> None:
