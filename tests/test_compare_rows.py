@@ -64,7 +64,9 @@ def program(folder: Path, text: str) -> Path:
 # --- answers -------------------------------------------------------------------------------------
 
 
-def test_the_start_is_not_the_answer_of_a_solver_that_gave_none(task, tmp_path):
+def test_the_start_is_not_the_answer_of_a_solver_that_gave_none(task, tmp_path, monkeypatch):
+    # a program that waits uses no CPU time, so that wall time ends it
+    monkeypatch.setattr("soup_nlp.bench.solvers.registry.WALL", 1.0)
     mine = program(tmp_path, "exec sleep 30")
     (found,) = run(replace(task, limits=replace(task.limits, seconds=1.0)), [str(mine)], tmp_path)
     assert found["status"] == "Time_Limit"

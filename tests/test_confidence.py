@@ -163,14 +163,14 @@ def test_calibration_is_capped_where_nothing_is_known():
 
 @pytest.mark.slow
 def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room):
-    """Gaussian noise on the flow: log depths of 200 answers spread as the information predicts.
+    """Gaussian noise on the flow: log depths of 100 answers spread as the information predicts.
 
     Without truncation and with a smoothing wider than all residuals the energy is nearly quadratic:
     `w |r|^2 / (2 eps)` a norm. The gradient's covariance under noise of variance s^2 is then
     s^2 times the information F of E_proj with weights w^2 / eps, and that of the answer
     `S F S s^2` with the inverse S of the whole information.
     """
-    draws, wide, noise = 200, 300.0, 0.05
+    draws, wide, noise = 100, 300.0, 0.05
     data, n = small_room.data, len(small_room)
     free = dict.fromkeys(("sigma_proj", "sigma_cont", "sigma_cont_ref", "sigma_arap"), np.inf)
     weights = small_room.weights.replace(**free, sigma_orient=np.inf)
@@ -219,7 +219,7 @@ def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room):
     F = information(at, flow, weights.replace(**own, proj=1.0), FORM, wide).matrix.toarray()
     predicted = noise * np.sqrt((S @ F @ S).diagonal()[::9])
     ratio = spread.std(axis=0) / predicted
-    # 200 draws know a standard deviation to 5 %
+    # 100 draws know a standard deviation to 7 %
     assert abs(np.median(ratio) - 1) < 0.1
     assert np.mean(np.abs(ratio - 1) < 0.2) > 0.9
 

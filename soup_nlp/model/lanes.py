@@ -11,7 +11,7 @@ import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -99,14 +99,13 @@ def c_source(function: ca.Function) -> str:
     """
     f, name = function, function.name()
     lines = []
-    for k in range(f.n_instructions()):
-        op, to, source = f.instruction_id(k), f.instruction_output(k), f.instruction_input(k)
+    for op, to, source, constant in instructions(f):
         if op == ca.OP_INPUT:
             lines.append(f"a{to[0]} = in{source[0]}[{source[1]}];")
         elif op == ca.OP_OUTPUT:
             lines.append(f"out[{to[1]}] = a{source[0]};")
         elif op == ca.OP_CONST:
-            lines.append(f"a{to[0]} = zero + ({f.instruction_constant(k)!r});")
+            lines.append(f"a{to[0]} = zero + ({constant!r});")
         elif op in _OPERATIONS:
             term = _OPERATIONS[op].format(*(f"a{i}" for i in source))
             lines.append(f"a{to[0]} = {term};")
@@ -121,6 +120,30 @@ def c_source(function: ca.Function) -> str:
     declared = f"  real {', '.join(f'a{i}' for i in range(used))};" if used else ""
     loop = _LOOP.format(name=name, nx=size[0], np=size[1], nt=size[2], nc=size[4], no=f.nnz_out(0))
     return "\n".join([head, declared, *lines, "}", loop])
+
+
+class Instruction(NamedTuple):
+    """One of an SX function: operation, where its result goes, operands; or a constant."""
+
+    operation: int
+    output: list[int]
+    inputs: list[int]
+    constant: float
+
+
+@lru_cache(maxsize=200)
+def instructions(function: ca.Function) -> tuple[Instruction, ...]:
+    """What an SX function computes, step by step."""
+    f = function
+    return tuple(
+        Instruction(
+            f.instruction_id(k),
+            f.instruction_output(k),
+            f.instruction_input(k),
+            f.instruction_constant(k) if f.instruction_id(k) == ca.OP_CONST else 0.0,
+        )
+        for k in range(f.n_instructions())
+    )
 
 
 @lru_cache(maxsize=1000)

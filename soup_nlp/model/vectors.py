@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.model.kernel import Table
-from soup_nlp.model.lanes import NoLanesError
+from soup_nlp.model.lanes import NoLanesError, instructions
 
 Float = NDArray[np.float64]
 
@@ -94,12 +94,11 @@ class Vectors:
         work = np.empty((f.sz_w(), size))
         held: dict[int, Float] = {}
         calls: list[tuple[Callable[..., Any], Any]] = []
-        for k in range(f.n_instructions()):
-            op, to, source = f.instruction_id(k), f.instruction_output(k), f.instruction_input(k)
+        for op, to, source, constant in instructions(f):
             if op == ca.OP_INPUT:
                 held[to[0]] = inputs[source[0]][source[1]]
             elif op == ca.OP_CONST:
-                held[to[0]] = np.array([f.instruction_constant(k)])
+                held[to[0]] = np.array([constant])
             elif op == ca.OP_OUTPUT:
                 calls.append((np.copyto, (self._out[to[1]], held[source[0]])))
             elif op in _OPERATIONS:

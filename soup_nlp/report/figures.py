@@ -3,92 +3,72 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import lru_cache
+from pathlib import Path
 
 import cv2
+import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import BboxImage
-from matplotlib.patches import Rectangle
-from matplotlib.text import Text
-from matplotlib.transforms import Bbox, TransformedBbox
 from numpy.typing import NDArray
+from PIL import Image as Pil
+from PIL import ImageDraw, ImageFont
 
 from soup_nlp.errors import DataError
 from soup_nlp.report.colour import Image
-from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
-from soup_nlp.storage.atomic import PathLike, atomic_path, write_bytes
+from soup_nlp.report.pictures import Bar, Legend, Picture, Swatches, Wheel
+from soup_nlp.storage.atomic import PathLike, write_bytes
 
 Float = NDArray[np.floating]
 
 _DPI = 100
-_FRAME = 0.6  # points
-_CAPTION, _GAP = 0.28, 0.08  # inches
-_LEGEND = {Bar: 0.32, Swatches: 0.24, Wheel: 0.62}
-"""Height of a legend, inches."""
+_HEAD, _CAPTION, _GAP = 42, 28, 8
+"""Heights of title and caption, space between panels, pixels."""
+_LEGEND = {Bar: 32, Swatches: 24, Wheel: 62}
+"""Height of a legend, pixels."""
 _SPARE = ("depth_start", "normals")
 """Panels that an overview leaves out, in this order, where its last row would have gaps."""
 
 
-def overview_strip(
-    path: PathLike,
-    panels: Sequence[Picture],
-    title: str,
-    columns: int = 3,
-    panel_width: float = 4.2,
-) -> None:
-    """Write `strip_figure` as PNG.
+def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: int = 420) -> Image:
+    """(H, W, 3) uint8: titled pictures with their legends in a grid, under a title.
 
-    Args:
-        path: PNG file to write; its folder must exist.
-        panels: In reading order.
-        title: Above the panels; "" for none.
-        columns: Largest number of panels in a row.
-        panel_width: Width of a panel, inches at 100 dpi.
-
-    Raises:
-        DataError: the folder cannot be written.
-    """
-    figure = strip_figure(panels, title, columns, panel_width)
-    with atomic_path(path) as temporary:
-        # half the time of the default level, and files a tenth larger
-        figure.savefig(temporary, format="png", dpi=_DPI, pil_kwargs={"compress_level": 3})
-
-
-def strip_figure(
-    panels: Sequence[Picture], title: str, columns: int = 3, panel_width: float = 4.2
-) -> Figure:
-    """Titled pictures with their legends in a grid, under a title.
-
-    Panels keep their aspect; a row is as high as its highest panel. No global state of matplotlib
-    is touched, so it may run in any thread.
+    Panels keep their aspect; a row is as high as its highest panel. PIL draws them, since
+    matplotlib takes five times as long.
 
     Args:
         panels: In reading order.
         title: Above the panels; "" for none.
         columns: Largest number of panels in a row.
-        panel_width: Width of a panel, inches at 100 dpi.
+        panel_width: Width of a panel, pixels.
     """
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
-    # layout in inches, from the top
-    head = 0.42 if title else _GAP
     heights = [
-        panel_width * max(p.image.shape[0] / p.image.shape[1] for p in row)
-        + max(_legend_height(p) for p in row)
+        max(_height(p, panel_width) for p in row) + max(_legend_height(p.legend) for p in row)
         for row in rows
     ]
-    width = columns * (panel_width + _GAP) + _GAP
-    height = head + sum(h + _CAPTION + _GAP for h in heights)
-    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
-    FigureCanvasAgg(figure)
-    _write(figure, _GAP, height - 0.5 * head, title, fontsize=13, weight="bold")
-    top = height - head
-    for row, row_height in zip(rows, heights, strict=True):
+    head = _HEAD if title else _GAP
+    size = columns * (panel_width + _GAP) + _GAP, head + sum(heights)
+    sheet = Pil.new("RGB", (size[0], size[1] + len(rows) * (_CAPTION + _GAP)), "white")
+    _write(sheet, _GAP, head // 2, title, size[0] - 2 * _GAP, points=13, bold=True)
+    top = head
+    for row, height in zip(rows, heights, strict=True):
         for k, panel in enumerate(row):
-            _draw_panel(figure, panel, _GAP + k * (panel_width + _GAP), top, panel_width)
-        top -= row_height + _CAPTION + _GAP
+            _draw_panel(sheet, panel, _GAP + k * (panel_width + _GAP), top, panel_width)
+        top += height + _CAPTION + _GAP
+    return np.array(sheet)
+
+
+def strip_figure(panels: Sequence[Picture], title: str) -> Figure:
+    """`strip` as a figure of matplotlib; it changes no global state of matplotlib."""
+    image = strip(panels, title)
+    figure = Figure(figsize=(image.shape[1] / _DPI, image.shape[0] / _DPI), dpi=_DPI)
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set_axis_off()
+    axes.imshow(image)
     return figure
 
 
@@ -99,85 +79,87 @@ def write_picture(path: PathLike, picture: Picture) -> None:
         DataError: the folder cannot be written.
     """
     # narrower than this a title does not fit
-    width = max(picture.image.shape[1] / _DPI, 5.0)
-    overview_strip(path, [picture], "", panel_width=width)
+    write_png(path, strip([picture], "", panel_width=max(picture.image.shape[1], 500)))
 
 
-def _legend_height(picture: Picture) -> float:
-    return 0.0 if picture.legend is None else _LEGEND[type(picture.legend)]
+def _height(picture: Picture, width: int) -> int:
+    """Of a picture of some width, pixels."""
+    return max(1, round(width * picture.image.shape[0] / picture.image.shape[1]))
 
 
-def _draw_panel(figure: Figure, panel: Picture, left: float, top: float, width: float) -> None:
-    """Title, picture and legend of a panel; inches from the lower left corner."""
-    image = panel.image
-    text = _write(figure, left, top - 0.5 * _CAPTION, panel.title)
-    _shrink(figure, text, width)
-    tall = width * image.shape[0] / image.shape[1]
-    bottom = top - _CAPTION - tall
-    _place(figure, image, left, bottom, width, tall)
+def _legend_height(legend: Legend | None) -> int:
+    return 0 if legend is None else _LEGEND[type(legend)]
+
+
+def _draw_panel(sheet: Pil.Image, panel: Picture, left: int, top: int, width: int) -> None:
+    """Title, picture and legend of a panel; pixels from the upper left corner."""
+    _write(sheet, left, top + _CAPTION // 2, panel.title, width)
+    top, tall = top + _CAPTION, _height(panel, width)
     # so that a white panel is seen on white paper
-    frame = Rectangle((left, bottom), width, tall, fill=False, linewidth=_FRAME, edgecolor="0.6")
-    frame.set_transform(figure.dpi_scale_trans)
-    figure.add_artist(frame)
+    frame = left - 1, top - 1, left + width, top + tall
+    ImageDraw.Draw(sheet).rectangle(frame, outline="#999999")
+    _place(sheet, panel.image, left, top, width, tall)
+    bottom = top + tall
     if isinstance(panel.legend, Bar):
-        _draw_bar(figure, panel.legend, left, bottom, width)
+        _draw_bar(sheet, panel.legend, left, bottom, width)
     elif isinstance(panel.legend, Swatches):
-        _draw_swatches(figure, panel.legend, left, bottom, width)
+        _draw_swatches(sheet, panel.legend, left, bottom, width)
     elif isinstance(panel.legend, Wheel):
-        size = 0.52
-        _place(figure, panel.legend.image, left, bottom - size - 0.05, size, size)
-        x, y = left + size + 0.1, bottom - 0.5 * size - 0.05
-        _shrink(figure, _write(figure, x, y, panel.legend.text, fontsize=8), width - size - 0.1)
+        size = 52
+        _place(sheet, panel.legend.image, left, bottom + 5, size, size)
+        x, room = left + size + 10, width - size - 10
+        _write(sheet, x, bottom + 5 + size // 2, panel.legend.text, room, points=8)
 
 
-def _draw_bar(figure: Figure, bar: Bar, left: float, bottom: float, width: float) -> None:
-    _place(figure, bar.colours, left, bottom - 0.15, width, 0.1)
+def _draw_bar(sheet: Pil.Image, bar: Bar, left: int, bottom: int, width: int) -> None:
+    _place(sheet, bar.colours, left, bottom + 5, width, 10)
     last = len(bar.texts) - 1
     for k, text in enumerate(bar.texts):
-        side = "left" if k == 0 else "right" if k == last else "center"
-        _write(figure, left + width * k / last, bottom - 0.24, text, fontsize=8, ha=side)
+        side = "l" if k == 0 else "r" if k == last else "m"
+        _write(sheet, left + width * k / last, bottom + 24, text, points=8, side=side)
 
 
-def _draw_swatches(figure: Figure, key: Swatches, left: float, bottom: float, width: float) -> None:
-    x, y = left, bottom - 0.13
+def _draw_swatches(sheet: Pil.Image, key: Swatches, left: int, bottom: int, width: int) -> None:
+    x, y = float(left), bottom + 13
     for colour, name in key.entries:
-        swatch = _place(figure, np.array(colour, np.uint8)[None, None], x, y - 0.05, 0.12, 0.1)
-        text = _write(figure, x + 0.16, y, name, fontsize=8)
-        x += 0.16 + _wide(figure, text) + 0.15
-        if x > left + width:
-            text.set_visible(False)
-            swatch.set_visible(False)
+        end = x + 16 + _font(8, False).getlength(name)
+        if end > left + width:
             break
+        ImageDraw.Draw(sheet).rectangle((x, y - 5, x + 11, y + 4), fill=colour)
+        _write(sheet, x + 16, y, name, points=8)
+        x = end + 15
 
 
-def _wide(figure: Figure, text: Text) -> float:
-    """Width of a text, inches."""
-    return float(text.get_window_extent(figure.canvas.get_renderer()).width) / _DPI  # type: ignore[attr-defined]
+@lru_cache(maxsize=100)
+def _font(points: float, bold: bool) -> ImageFont.FreeTypeFont:
+    """The font that comes with matplotlib."""
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    path = Path(matplotlib.get_data_path(), "fonts", "ttf", name)
+    return ImageFont.truetype(path, points * _DPI / 72)
 
 
-def _shrink(figure: Figure, text: Text, width: float) -> None:
-    """Make a text small enough for a width in inches."""
-    found = _wide(figure, text)
-    if found > width:
-        # font sizes are rounded when drawn
-        text.set_fontsize(float(text.get_fontsize()) * 0.96 * width / found)
+def _write(
+    sheet: Pil.Image,
+    x: float,
+    y: float,
+    text: str,
+    room: float = np.inf,
+    *,
+    points: float = 10,
+    bold: bool = False,
+    side: str = "l",
+) -> None:
+    """Text with its left end, middle or right end (`side`) at (x, y); smaller than `room`."""
+    wide = _font(points, bold).getlength(text)
+    font = _font(points * min(1.0, room / max(wide, 1.0)), bold)
+    ImageDraw.Draw(sheet).text((x, y), text, fill="black", font=font, anchor=f"{side}m")
 
 
-def _write(figure: Figure, x: float, y: float, text: str, **style: Any) -> Text:
-    """Text as it is, without mathematics, at (x, y) inches."""
-    wide, tall = figure.get_size_inches()
-    return figure.text(x / wide, y / tall, text, va="center", parse_math=False, **style)
-
-
-def _place(
-    figure: Figure, image: Image, left: float, bottom: float, width: float, height: float
-) -> BboxImage:
-    """An image in a rectangle, inches. Axes, with their ticks, take twenty times as long."""
-    box = TransformedBbox(Bbox.from_bounds(left, bottom, width, height), figure.dpi_scale_trans)
-    placed = BboxImage(box, interpolation="antialiased", origin="upper")
-    placed.set_data(image)
-    figure.add_artist(placed)
-    return placed
+def _place(sheet: Pil.Image, image: Image, left: int, top: int, width: int, height: int) -> None:
+    """An image in a rectangle."""
+    # an enlarged pixel stays a rectangle of one colour
+    scaled = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    sheet.paste(Pil.fromarray(scaled), (left, top))
 
 
 def overview(path: PathLike, found: Mapping[str, Picture], title: str) -> None:
@@ -191,7 +173,7 @@ def overview(path: PathLike, found: Mapping[str, Picture], title: str) -> None:
     Raises:
         DataError: the folder cannot be written.
     """
-    overview_strip(path, without_gaps(found), title)
+    write_png(path, strip(without_gaps(found), title))
 
 
 def without_gaps(found: Mapping[str, Picture]) -> list[Picture]:
@@ -240,7 +222,8 @@ def write_clipped_depth_png16(path: PathLike, depth: Float, scale: float | None 
 
 
 def _encode(path: PathLike, array: NDArray[np.generic]) -> None:
-    good, data = cv2.imencode(".png", array)
+    # a third smaller than at the default level
+    good, data = cv2.imencode(".png", array, [cv2.IMWRITE_PNG_COMPRESSION, 2])
     if not good:
         raise DataError("image cannot be encoded as PNG", where=path, found=array.shape)
     write_bytes(path, data.tobytes())
