@@ -7,6 +7,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/demo
 
+# compiled modules and tests serve the next run
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test quick lint docs results versions clean
 .DEFAULT_GOAL := demo
 

@@ -104,14 +104,16 @@ MODULES = modules()
 
 
 def walk(tree: ast.AST) -> Iterator[ast.AST]:
-    """Every node but what stands under `if TYPE_CHECKING:`."""
-    yield tree
-    for child in ast.iter_child_nodes(tree):
-        if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
-            for other in child.orelse:
-                yield from walk(other)
-        else:
-            yield from walk(child)
+    """Every node but expressions and what stands under `if TYPE_CHECKING:`."""
+    todo = [tree]
+    while todo:
+        node = todo.pop()
+        yield node
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+                todo += child.orelse
+            elif not isinstance(child, ast.expr):
+                todo.append(child)
 
 
 def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[str]:
