@@ -181,3 +181,54 @@ def test_entries_are_as_written(how, place, folder):
         return
     assert not report.ok
     assert any(row.how == HASHED and not row.ok for row in report.rows)
+
+
+def change(folder: Path, edit: Callable[[dict], object]) -> None:
+    path = folder / "summary.json"
+    claims = json.loads(path.read_text())
+    edit(claims)
+    path.write_text(json.dumps(claims))
+
+
+def test_what_a_good_result_claims_is_what_is_found(solved, pair):
+    """A row that claims another number than the one that it allows would mislead."""
+    bounds = "energy falls", "no round raises E", "no choice below its bound"
+    for row in check_folder(solved, images(pair)).rows:
+        if row.name in bounds:
+            continue
+        allowed = max(row.limit, row.limit * abs(row.found)) + 1e-9 * abs(row.found) + 1e-12
+        assert abs(row.claimed - row.found) <= allowed, row
+
+
+def test_rounds_that_raise_the_energy_are_noticed(folder):
+    rows = {row.name for row in check_folder(folder).rows}
+    assert {"no round raises E", "no choice below its bound"} <= rows
+    change(folder, lambda s: s["refinement"]["rounds"][0]["energy"].update(total=1e9))
+    assert "no round raises E" in bad(check_folder(folder))
+
+
+@pytest.mark.parametrize("key", ["status", "delivered", "problem_hash", "seed"])
+@pytest.mark.parametrize("smaller", [False, True])
+def test_labels_are_those_of_the_arrays(key, smaller, folder):
+    """Either neighbour of the right word in the order of words is wrong."""
+    with h5py.File(folder / "result.h5", "a") as file:
+        value = file.attrs[key]
+        if key == "seed":
+            file.attrs[key] = value - 1 if smaller else value + 1
+        else:
+            file.attrs[key] = value[:1] if smaller else value + b"z"
+    name = f"{key.replace('_', ' ')} as in result.h5"
+    assert name in bad(check_folder(folder))
+
+
+def test_a_claim_that_is_missing_is_an_error_of_the_file(folder):
+    change(folder, lambda s: s.pop("converged"))
+    with pytest.raises(DataError, match="lacks a claim"):
+        check_folder(folder)
+
+
+def test_the_delivered_answer_is_ipopt_s(folder):
+    with h5py.File(folder / "result.h5", "a") as file:
+        assert file.attrs["delivered"] == b"constrained NLP"
+        file["answer/n"][0] = file["answer/n"][1]
+    assert "nlp is Ipopt's answer" in bad(check_folder(folder))

@@ -83,6 +83,7 @@ def test_a_solver_named_by_its_path_has_a_folder_of_its_own(task, tmp_path, monk
         (found,) = run(task, [name], tmp_path / str(len(name)))
         assert found["solver"] == name
         assert found["how"] == "raised"
+        assert found["iterations"] == -1
         assert found["status"] == "SolverError: solver wrote no .sol, found exit 3"
     # nothing of the runs beside the program
     assert not list(tmp_path.glob("*.pickle"))
