@@ -8,6 +8,8 @@ from helpers_odd_numbers import number_cases, solve_cases
 from helpers_odd_paths import path_cases
 from helpers_odd_run import Case
 from helpers_odd_texts import row_cases, text_cases, untrusted_cases
+from helpers_odd_uses import use_cases
+from helpers_odd_uses_api import use_api_cases
 
 CASES: list[Case] = [
     *path_cases(),
@@ -19,4 +21,6 @@ CASES: list[Case] = [
     *solve_cases(),
     *untrusted_cases(),
     *api_cases(),
+    *use_cases(),
+    *use_api_cases(),
 ]

@@ -11,7 +11,7 @@ import cv2
 import h5py
 import numpy as np
 from helpers_odd_run import Case
-from helpers_odd_world import SIZE, World, npy, png, solve
+from helpers_odd_world import SIZE, World, encoded_noise, npy, png, solve
 
 HEADER = "{{'descr': {}, 'fortran_order': {}, 'shape': {}, }}"
 LIES: dict[str, bytes] = {
@@ -88,24 +88,19 @@ def huge_header(kind: str) -> bytes:
 
 IMAGES: dict[str, Callable[[], bytes]] = {
     **{f"header {k}": lambda k=k: huge_header(k) for k in ("png", "png rows", "pgm", "bmp", "jpg")},
-    "tall": lambda: encoded((5000, 16)),
-    "wide": lambda: encoded((16, 5000)),
+    "tall": lambda: encoded_noise((5000, 16)),
+    "wide": lambda: encoded_noise((16, 5000)),
     "one colour 20000": lambda: png(20000, 20000, 1, 0, b"\0" * 2501 * 20000),
     "one colour 9000": lambda: png(9000, 9000, 1, 0, b"\0" * 1126 * 9000),
-    "1 x 1": lambda: encoded((1, 1)),
-    "8 x 8": lambda: encoded((8, 8)),
+    "1 x 1": lambda: encoded_noise((1, 1)),
+    "8 x 8": lambda: encoded_noise((8, 8)),
     "png rows missing": lambda: png(64, 48),
     "png without size": lambda: png(0, 0),
     "gif": lambda: b"GIF89a" + struct.pack("<HH", 65535, 65535) + b"\0\0\0;",
     "svg": lambda: b'<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>',
-    "float tiff": lambda: encoded(SIZE, ".tiff", np.float32),
-    "float64 tiff": lambda: encoded(SIZE, ".tiff", np.float64),
+    "float tiff": lambda: encoded_noise(SIZE, ".tiff", np.float32),
+    "float64 tiff": lambda: encoded_noise(SIZE, ".tiff", np.float64),
 }
-
-
-def encoded(size: tuple[int, int], suffix: str = ".png", kind: type = np.uint8) -> bytes:
-    values = np.random.default_rng(1).integers(0, 255, (*size, 3)).astype(kind)
-    return cv2.imencode(suffix, values)[1].tobytes()
 
 
 def content_cases() -> Iterator[Case]:

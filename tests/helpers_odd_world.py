@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 
 from soup_nlp.cli.main import main
+from soup_nlp.config.problem import load_problem
+from soup_nlp.pipeline.run import Run, run
 
 SIZE = (48, 64)
 """Height and width of the tiny images."""
@@ -101,6 +103,11 @@ class World:
             ["solve", *self.pair(depth=str(self.good("d.npy"))), *settings(), "-o", str(out), "-q"]
         ) in (0, 1)
         return out
+
+    @cached_property
+    def run(self) -> Run:
+        """What Python gets of the tiny pair."""
+        return run(load_problem(self.good("p.yaml")))
 
     @cached_property
     def exported(self) -> Path:
@@ -208,6 +215,12 @@ def png(width: int, height: int, depth: int = 8, colour: int = 0, rows: bytes = 
         png_chunk(b"IEND", b""),
     ]
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def encoded_noise(size: tuple[int, int], suffix: str = ".png", kind: type = np.uint8) -> bytes:
+    """An image of noise."""
+    values = np.random.default_rng(1).integers(0, 255, (*size, 3)).astype(kind)
+    return cv2.imencode(suffix, values)[1].tobytes()
 
 
 def npy(

@@ -1,8 +1,12 @@
-"""Kill commands at random times and look at what is left: `python tests/kill_table.py --kills 60`.
+"""Kill commands at random times and look at what is left: `python tests/kill_table.py --kills 84`.
 
 Every command first runs undisturbed. Then it runs again and again and gets a signal: half of the
 times at any moment, half of the times while its files are being written. Afterwards the folder
 must hold the old result or the new one, whole, and one more run must leave no temporary files.
+
+`python tests/kill_table.py --disk` runs every command on file systems of its own instead (tmpfs,
+which needs the right to mount): as large as its files and the space that they take while they are
+replaced, then with every free byte taken, then on a disk of half the size from the beginning.
 """
 
 from __future__ import annotations
@@ -12,13 +16,18 @@ import contextlib
 import json
 import os
 import random
+import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import cv2
+import numpy as np
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
@@ -32,6 +41,7 @@ TINY = [
     "input.width=64", "input.height=48", "flow.source=truth", "segmentation.superpixels=12",
     "segmentation.neighbours=4", "refine.rounds=1", "refine.particles=6", "output.page=false",
 ]  # fmt: skip
+NAMES = ("solve", "export", "import", "compare", "bench", "chain", "family")
 SIGNALS: Mapping[str, Sequence[int]] = {
     "SIGKILL": [signal.SIGKILL],
     "SIGTERM": [signal.SIGTERM],
@@ -53,7 +63,7 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
     """The commands of the table."""
     overrides = [word for text in TINY for word in ("--set", text)]
     export = ["export", "orbit", "-q", *overrides]
-    out = {name: root / name for name in ("solve", "export", "import", "compare", "bench")}
+    out = {name: root / name for name in NAMES}
     words = {
         "solve": ["solve", "orbit", "-q", *overrides, "--out", str(out["solve"])],
         "export": [*export, "--out", str(out["export"])],
@@ -63,6 +73,8 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
         "bench": "bench accuracy --suite rendered --only orbit --only room --flow truth --width 64"
         f" --workers 2 -q -o {out['bench']}".split()
         + overrides[4:],
+        "chain": f"chain {clip(root)} --fov=50 -q -o {out['chain']}".split() + overrides[6:],
+        "family": f"family {out['family']} --sizes 100 --scenes orbit --starts cold".split(),
     }
     if "import" in names:
         run([*export, "--no-presolve", "--out", str(root / "exported")])
@@ -74,10 +86,20 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
             place = {name: k for k, name in enumerate(own)}
             lines = (root / "exported" / "soup").with_suffix(suffix).read_text().split()
             orders.append([place[line] for line in lines[: len(own)]])
-        import numpy as np
-
         write_sol(root / "a.sol", nlp.x0, None, *map(np.array, orders))
     return [Command(name, words[name], out[name]) for name in names]
+
+
+def clip(root: Path) -> Path:
+    """A folder of three frames of noise that moves."""
+    folder = root / "clip"
+    if not folder.is_dir():
+        folder.mkdir()
+        noise = np.random.default_rng(0).integers(0, 255, (64, 96, 3)).astype(np.uint8)
+        texture = cv2.GaussianBlur(noise, (0, 0), 1.0)
+        for k in range(3):
+            cv2.imwrite(str(folder / f"{k}.png"), texture[8:56, 8 + 2 * k : 72 + 2 * k])
+    return folder
 
 
 def start(words: Sequence[str]) -> int:
@@ -151,9 +173,11 @@ def broken(folder: Path) -> list[str]:
     wrong = [
         n for n, d in listed.items() if not (folder / n).is_file() or digest_of(folder / n) != d
     ]
-    others = {p.name for p in folder.iterdir() if not p.name.startswith(".soup_nlp")}
-    rows = {name for name in others if name.endswith(".jsonl")}
-    return wrong + sorted(others - listed.keys() - rows)
+    inner = [p for p in (folder / "pairs").glob("*") if p.is_dir()]
+    wrong += [f"pairs/{p.name}/{name}" for p in inner for name in broken(p)]
+    there = (p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
+    own = {str(p) for p in there if p.parts[0] != "pairs" and p.suffix != ".jsonl"}
+    return wrong + sorted(n for n in own - listed.keys() if not n.startswith(".soup_nlp"))
 
 
 def table(kills: int, names: Sequence[str], seed: int = 0) -> list[dict[str, object]]:
@@ -198,12 +222,81 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> list[dict[str, obj
     return rows
 
 
+@contextlib.contextmanager
+def disk(place: Path, size: int) -> Iterator[None]:
+    """A file system of so many bytes."""
+    place.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
+    subprocess.run(words, check=True, capture_output=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", str(place)], check=True)
+        place.rmdir()
+
+
+def listed(folder: Path) -> dict[str, dict[str, str]]:
+    """The list of files of a folder and of the results in it."""
+    places = [folder, *(folder / "pairs").glob("*")]
+    return {str(p): dict(made(p) or {}) for p in places if p.is_dir()}
+
+
+def fill(folder: Path) -> None:
+    """Take every free byte; rows of earlier runs go, so that there is something to write."""
+    for path in folder.rglob("*.jsonl"):
+        path.unlink()
+    with contextlib.suppress(OSError), (folder / "rest").open("wb") as file:
+        while True:
+            file.write(bytes(4096))
+            file.flush()
+
+
+def on_disk(command: Command, place: Path, states: Sequence[str], size: int) -> Iterator[dict]:
+    """Rows of a command on a file system, one for each state of it."""
+    target = place / command.name
+    words = [w.replace(str(command.folder), str(target)) for w in command.words]
+    with disk(place, size):
+        for state in states:
+            before = listed(target)
+            if state == "taken":
+                fill(place)
+            row = {"command": command.name, "disk": state, "size": size, "exit": run(words)[0]}
+            row |= {"broken": broken(target), "earlier kept": listed(target) == before}
+            yield row | {"left": [n for n in os.listdir(place) if ".soup_nlp-" in n]}
+
+
+def full_disks(names: Sequence[str]) -> list[dict[str, object]]:
+    """One row per command and state of the disk."""
+    rows: list[dict[str, object]] = []
+    with tempfile.TemporaryDirectory() as place:
+        root = Path(place)
+        for command in commands(root, names):
+            run(command.words)
+            files = [p for p in command.folder.rglob("*") if p.is_file()]
+            # whole pages, and the folders
+            size = sum(-(-p.stat().st_size // 4096) * 4096 + 4096 for p in files)
+            shutil.rmtree(command.folder)
+            for states, space in (
+                (("free", "taken"), 2 * size + (1 << 18)),
+                (("small",), size // 2),
+            ):
+                for row in on_disk(command, root / "disk", states, space):
+                    rows.append(row)
+                    print(json.dumps(row), flush=True)
+    return rows
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=60)
-    parser.add_argument("--only", default="solve,export,import,compare,bench")
+    parser.add_argument("--only", default=",".join(NAMES))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--disk", action="store_true", help="full disks instead of kills")
     options = parser.parse_args()
+    if options.disk:
+        rows = full_disks(options.only.split(","))
+        lost = [r for r in rows if r["disk"] == "taken" and not r["earlier kept"]]
+        sys.exit(bool(lost) or any(r["broken"] or r["left"] for r in rows))
     found = table(options.kills, options.only.split(","), options.seed)
     bad = [row for row in found if row["broken"] or row.get("left")]
     done = sum(row["signal"] != "none" for row in found)

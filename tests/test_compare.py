@@ -121,6 +121,7 @@ def test_solvers_reach_a_verified_point(name, task, tmp_path):
     row = rows[0]
     assert row["how"] == "returned", row["status"]
     assert row["verified"], row
+    assert row["status"] != "Time_Limit"
     assert row["energy"] < row["energy_start"]
     assert row["curve"][-1][1] == pytest.approx(row["energy"])
 

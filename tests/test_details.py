@@ -204,7 +204,7 @@ def test_a_row_of_residuals_says_whether_it_holds():
 
 
 def test_an_answer_does_not_print_its_numbers():
-    assert len(repr(Sol("done", 0, np.ones(10**4), np.ones(10**4)))) < 100
+    assert "array" not in repr(Sol("done", 0, np.ones(3), np.ones(3)))
 
 
 # --- the check -----------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,7 +26,7 @@ from soup_nlp.sequence.key_frames import LONGEST
 from soup_nlp.sequence.pairs import solve_pairs
 from soup_nlp.sequence.report import table
 from soup_nlp.sequence.write import SINGLE, chain_files, write_chain
-from soup_nlp.storage.files import as_path, is_file
+from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import claim, staged
 
 SCENE = "scene:"
@@ -96,7 +97,8 @@ def _step(stride: str) -> int | None:
     """
     if stride == AUTO:
         return None
-    if not stride.isdecimal() or int(stride) < 1:
+    # nobody takes one frame in a hundred million
+    if not stride.isdecimal() or len(stride) > 8 or int(stride) < 1:
         raise ConfigError(
             "unknown stride", where="--stride", found=stride, expected=f"a number from 1, or {AUTO}"
         )
@@ -132,6 +134,13 @@ def _frames(
         images = find_images(path)[:: step or 1][:end]
         depths = find_depths(images)
     images = [p.absolute() for p in images]
+    if len(images) < 2:
+        raise ConfigError(
+            "a sequence needs two frames at least",
+            where="--stride" if step != 1 else None,
+            found=len(images),
+            expected="more frames, or a smaller stride",
+        )
     found = FileFrames(
         tuple(images),
         _camera(images[0].parent, intrinsics, fov),
@@ -149,5 +158,5 @@ def _camera(folder: Path, intrinsics: str | None, fov: float | None) -> dict[str
         return {"fov": fov}
     if intrinsics is None:
         own = folder / "K.txt"
-        return {"intrinsics": str(own)} if is_file(own) else {}
+        return {"intrinsics": str(own)} if os.path.lexists(own) else {}
     return {"intrinsics": options.camera(intrinsics, "--intrinsics")}

@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.errors import ExportError
 from soup_nlp.export.body import Body
 from soup_nlp.export.program import orders, take_apart
 from soup_nlp.export.segments import bounds, header, linear, start
@@ -31,6 +32,7 @@ from soup_nlp.export.validate import (
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP
 from soup_nlp.storage.atomic import write_bytes, write_text
+from soup_nlp.storage.files import as_path
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -85,7 +87,8 @@ def write_nl(path: str | Path, nlp: NLP, names: tuple[Names, Names] | None = Non
     x_names, g_names = names or (nlp.x_names(), nlp.g_names())
     theta = nlp.p[: len(nlp.theta)]
     x, g = (nlp.x0, nlp.lbx, nlp.ubx), (nlp.lbg, nlp.ubg)
-    return _write(Path(path), nlp.groups, theta, x, g, (x_names, g_names, "E"))
+    path = as_path(path, "file", error=ExportError)
+    return _write(path, nlp.groups, theta, x, g, (x_names, g_names, "E"))
 
 
 def write_sx_nl(
@@ -125,7 +128,7 @@ def write_sx_nl(
         >>> rosenbrock = {"x": x, "f": (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2}
         >>> write_sx_nl("rosenbrock.nl", rosenbrock, x0=[-1.2, 1])  # doctest: +SKIP
     """
-    path = Path(path)
+    path = as_path(path, "file", error=ExportError)
     x, f, g = plain_problem(problem, path)
     nx, ng = x.numel(), g.numel()
     none = ca.SX(0, 1)

@@ -24,6 +24,13 @@ def plain_problem(problem: Mapping[str, object], where: object) -> tuple[ca.SX, 
         ExportError: an entry is unknown, missing, no SX or of a wrong shape, or there are symbols
             that are not variables.
     """
+    if not isinstance(problem, Mapping):
+        raise ExportError(
+            "NLP is not a dictionary",
+            where=where,
+            found=type(problem).__name__,
+            expected="x, f and, if there are constraints, g",
+        )
     if set(problem) - {"x", "f", "g", "p"} or problem.get("x") is None:
         raise ExportError(
             "NLP is not of the form x, f, g",
@@ -71,7 +78,7 @@ def vector(name: str, values: object, size: int, default: float, where: object) 
     """
     try:
         found = np.asarray(default if values is None else values, float)
-    except (TypeError, ValueError, RuntimeError, NotImplementedError):
+    except (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError):
         raise ExportError(
             f"{name} is not a vector of numbers", where=where, found=type(values).__name__
         ) from None

@@ -11,6 +11,7 @@ import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -159,7 +160,8 @@ def compile_lanes(functions: Sequence[ca.Function]) -> ctypes.CDLL:
         NoLanesError: There is no compiler, it fails, or a function has an operation without a twin.
     """
     # what the source depends on, in a tenth of the time that writing it takes
-    key = "\0".join(["lanes", _HEAD, _LOOP, *map(_text, functions)])
+    translation = Path(__file__).read_text(encoding="utf-8")
+    key = "\0".join([translation, *map(_text, functions)])
     path = shared_library(key, lambda: "\n".join([_HEAD, *(c_source(f) for f in functions)]))
     if path is None:
         raise NoLanesError("no working C compiler")

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.evaluate import recompute, recompute_files
 from soup_nlp.evaluate.scoring import DEPTHS, SURE
 from soup_nlp.report.check_arrays import require_layout
@@ -71,6 +71,8 @@ def check_folder(folder: str | Path, images: Images | None = None) -> CheckRepor
         DataError: a file, a claim or an array is missing or not what it should be.
     """
     folder = as_path(folder, "result folder")
+    if images is not None:
+        _require_images(images)
     recover(folder)
     claims = read_json(folder / "summary.json", "summary.json")
     path = folder / "result.h5"
@@ -91,6 +93,17 @@ def check_folder(folder: str | Path, images: Images | None = None) -> CheckRepor
     photo = "photo" in ((claims.get("refinement") or {}).get("end") or {})
     unseen = ("E_photo of the refinement: the images of config.yaml are not at hand",)
     return CheckReport(rows, LEFT + (unseen if photo and images is None else ()))
+
+
+def _require_images(images: object) -> None:
+    """Raise DataError unless these are two images."""
+    good = isinstance(images, list | tuple) and len(images) == 2
+    if not good or any(getattr(image, "dtype", None) != np.uint8 for image in images):  # type: ignore[attr-defined]
+        raise DataError(
+            "images are of another kind",
+            found=printable(repr_of(images), 60),
+            expected="two arrays (H, W, 3) or (H, W), uint8",
+        )
 
 
 def _rows(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from soup_nlp.errors import DataError
 from soup_nlp.report.tree import LAYOUT, Table
 
@@ -55,6 +57,8 @@ def _require_shapes(
             continue
         if isinstance(value, Mapping) or value.dtype.kind not in "biuf":
             raise _wrong(place, "a group or text", "numbers")
+        if name.startswith("image_") and value.dtype != np.uint8:
+            raise _wrong(place, value.dtype, "uint8")
         axes = letters.split(",") if letters else []
         if len(axes) != value.ndim:
             raise _wrong(place, value.shape, f"axes ({letters})")
@@ -62,7 +66,7 @@ def _require_shapes(
             expected = int(axis) if axis.isdigit() else size
             if axis in SHARED and place not in FREE:
                 expected = sizes.setdefault(axis, size)
-            if size != expected:
+            if size != expected or (axis in ("H", "W") and not size):
                 raise _wrong(place, value.shape, f"({letters}) with {axis} = {expected}")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from soup_nlp.errors import ConfigError
+from soup_nlp.errors import ConfigError, printable, repr_of
 from soup_nlp.report.colmap import write_colmap
 from soup_nlp.report.depth_files import write_npy, write_pfm
 from soup_nlp.report.figures import write_clipped_depth_png16
@@ -93,8 +93,14 @@ def check_formats(names: Sequence[str]) -> list[str]:
     """Names of formats, each once.
 
     Raises:
-        ConfigError: a name is not known, or there is none.
+        ConfigError: a name is not known, or there is none, or they are no list of names.
     """
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise ConfigError(
+            "formats are no list of names",
+            found=printable(repr_of(names), 60),
+            expected=f"a list of {', '.join(FORMATS)}",
+        )
     wrong = [name for name in names if name not in FORMATS]
     if wrong or not names:
         raise ConfigError(

@@ -18,6 +18,8 @@ from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.surface import at_jumps, hidden, joined
+from soup_nlp.report.check_arrays import require_layout
+from soup_nlp.storage.files import as_path
 from soup_nlp.storage.h5_files import read_attrs, read_h5
 from soup_nlp.storage.store import require
 
@@ -135,7 +137,7 @@ def read_result(folder: Path) -> Result:
     Raises:
         DataError: it has no result.h5, or one that does not hold what is needed.
     """
-    path = Path(folder) / "result.h5"
+    path = as_path(folder, "result folder") / "result.h5"
     tree, attrs = read_h5(path), read_attrs(path)
     if "image_ref" not in tree.get("input", {}):
         raise DataError(
@@ -144,6 +146,7 @@ def read_result(folder: Path) -> Result:
             expected="input/image_ref and input/image_next",
             hint="solve the pair again: an older version has written this result",
         )
+    require_layout(tree)
     try:
         return _result(tree, attrs)
     except (KeyError, IndexError, ValueError, TypeError, yaml.YAMLError) as error:
@@ -154,10 +157,14 @@ def _result(tree: Mapping[str, Any], attrs: Mapping[str, Any]) -> Result:
     images = [require(tree, f"input/image_{frame}") for frame in FRAMES]
     K = [require(tree, f"input/K_{frame}") for frame in FRAMES]
     soup = Soup(*(require(tree, f"solution/{key}") for key in ("lam", "n", "d", "R", "t")))
+    turn = np.linalg.det(soup.R)
+    if not np.isfinite(soup.distance).all() or not (np.abs(turn - 1) < 1e-3).all():
+        raise ValueError("planes or rotations of the solution are none")
     parts = tree["segmentation"]
     empty = {key: np.zeros(0) for key in Segmentation.__dataclass_fields__}
     seg = Segmentation(**{**empty, **{k: v for k, v in parts.items() if k in empty}})
     start = tree["start"]
+    metre = attrs.get("scale_to_truth")
     own = soup, seg, start["component"], K[0], K[1], start["borrowed"].astype(bool)
     rec = reconstruct(soup, seg.labels, K[0], K[1], (images[1].shape[0], images[1].shape[1]))
     return Result(
@@ -167,6 +174,6 @@ def _result(tree: Mapping[str, Any], attrs: Mapping[str, Any]) -> Result:
         reconstruction=replace(rec, sigma_ref=tree["depth"].get("sigma_ref")),
         components=find_components(*own),
         flow_confidence=tree["input"]["confidence"],
-        metre=attrs.get("scale_to_truth"),
+        metre=None if metre is None else float(metre),
         metre_unit=str(attrs.get("truth_unit", "m")),
     )

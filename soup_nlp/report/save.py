@@ -44,7 +44,8 @@ def save(
         ConfigError: a format is not known.
         DataError: the folder cannot be written, or holds what is not to be overwritten.
     """
-    names = check_formats(formats) if formats else []
+    none = formats is None or (isinstance(formats, list | tuple) and not formats)
+    names = [] if none else check_formats(formats)
     in_memory = run.problem.input.kind == "memory"
     inputs = [] if in_memory else run.problem.input_paths()
     target = prepare_folder(folder, inputs, overwrite)

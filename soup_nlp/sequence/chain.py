@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, expect
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.sequence.pairs import SolvedPair
 from soup_nlp.sequence.scales import Link, link, solve_scales
@@ -86,7 +86,11 @@ def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> 
     Raises:
         DataError: the pairs are not consecutive, or share no pixel.
     """
-    if [(p.first, p.second) for p in pairs] != [(k, k + 1) for k in range(len(pairs))]:
+    for own in (pairs, over):
+        expect(own, (list, tuple), "pairs of a chain", "soup_nlp.sequence.pairs.solve_pairs(...)")
+    for pair in (*pairs, *over):
+        expect(pair, SolvedPair, "pair of a chain", "soup_nlp.sequence.pairs.solve_pairs(...)")
+    if not pairs or [(p.first, p.second) for p in pairs] != [(k, k + 1) for k in range(len(pairs))]:
         raise DataError("pairs of a chain are not consecutive", found=[p.first for p in pairs])
     links = find_links([*pairs, *over])
     scales = solve_scales(len(pairs) + len(over), links)[: len(pairs)]

@@ -16,6 +16,7 @@ from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import DataError
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence.key_frames import key_frames
+from soup_nlp.storage.files import as_path, require_file
 from soup_nlp.storage.folders import staged
 
 Raw = dict[str, Any]
@@ -120,6 +121,7 @@ def find_images(source: Path) -> list[Path]:
     Raises:
         DataError: there are fewer than two.
     """
+    source = as_path(source, "frames")
     if source.is_dir():
         found = [p for p in source.glob(LAYOUT) if p.suffix.lower() in IMAGES]
         found = found or [p for p in source.iterdir() if p.suffix.lower() in IMAGES]
@@ -154,6 +156,12 @@ def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = N
     Raises:
         DataError: the video cannot be read, or the folder holds other files of these names.
     """
+    path = require_file(path, "video")
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        # OpenCV would crash
+        raise DataError("name of a video is not UTF-8", where=path, hint="rename it") from None
     video = cv2.VideoCapture(str(path))
     names: list[str] = []
     index = 0
@@ -179,4 +187,4 @@ def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = N
 def _by_number(path: Path) -> list[Any]:
     """Key of an order in which 10 comes after 9."""
     words = re.split(r"(\d+)", path.name)
-    return [(1, int(word), "") if word.isdigit() else (0, 0, word) for word in words]
+    return [(1, int(word), "") if word.isdecimal() else (0, 0, word) for word in words]

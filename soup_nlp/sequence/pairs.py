@@ -72,7 +72,7 @@ def solve_pairs(
     """
     jobs, places = [], []
     # a folder holds what was solved into it last
-    last = {row.get("key"): row for row in read_rows(folder / ROWS)}
+    last = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
     for first, second in which:
         place = folder.resolve() / "pairs" / f"{first:03d}_{second:03d}"
         raw = {"name": place.name, "input": frames.pair(first, second), "base": str(Path.cwd())}

@@ -16,7 +16,8 @@ from soup_nlp.report.pointcloud import AXES, write_ply
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.page import chain_page
 from soup_nlp.sequence.score import score
-from soup_nlp.storage.atomic import atomic_path, write_text
+from soup_nlp.storage.atomic import write_bytes, write_text
+from soup_nlp.storage.folders import scratch
 from soup_nlp.storage.store import write_json
 
 Float = NDArray[np.float64]
@@ -115,16 +116,22 @@ def images(chain: Chain) -> list[Image]:
 
 
 def write_video(path: Path, pictures: list[Image]) -> None:
-    """Write pictures of one size as MPEG-4."""
+    """Write pictures as MPEG-4 of the first one's size."""
     height, width = pictures[0].shape[:2]
     # coders want even sides
     size = width - width % 2, height - height % 2
-    with atomic_path(path) as temporary:
+    # OpenCV takes no name that is not UTF-8
+    with scratch() as place:
+        made = place / "video.mp4"
         coder = cv2.VideoWriter.fourcc(*"mp4v")
-        video = cv2.VideoWriter(str(temporary), coder, RATE, size)
+        video = cv2.VideoWriter(str(made), coder, RATE, size)
         for picture in pictures:
-            video.write(cv2.cvtColor(picture[: size[1], : size[0]], cv2.COLOR_RGB2BGR))
+            # frames of another size would be left out
+            same = picture.shape[:2] == (height, width)
+            shown = picture[: size[1], : size[0]] if same else cv2.resize(picture, size)
+            video.write(cv2.cvtColor(shown, cv2.COLOR_RGB2BGR))
         video.release()
+        write_bytes(path, made.read_bytes())
 
 
 def _png_scale(depths: list[Float]) -> float:

@@ -134,6 +134,25 @@ def read_bytes(
     return content
 
 
+def require_file(path: PathLike, what: str, *, error: type[SoupError] = DataError) -> Path:
+    """The path of a regular file, for readers that take a name.
+
+    Raises:
+        SoupError: there is none.
+    """
+    path = as_path(path, what, error=error)
+    if not is_file(path):
+        kind = _kind(path)
+        raise error(
+            f"{what} cannot be read" if kind else f"{what} is missing",
+            where=path,
+            found=kind,
+            expected="an existing file",
+            hint=None if kind else _neighbours(path),
+        )
+    return path
+
+
 def _kind(path: Path) -> str | None:
     """What is there instead of a regular file."""
     try:
