@@ -6,22 +6,16 @@ import os
 from pathlib import Path
 
 import pytest
+from helpers_square import square
 from typer.main import get_command
 
-from soup_nlp.bench.rows import Row, read_rows
+from soup_nlp.bench.rows import read_rows
 from soup_nlp.bench.studies import Study, grid, number, run_study, setting
 from soup_nlp.bench.study_parts import CUT_OFF
 from soup_nlp.cli.bench_all import COMMANDS
 from soup_nlp.cli.main import app, main
 
 pytestmark = pytest.mark.slow
-
-
-def square(number: int, breaks: bool = False) -> Row:
-    """A row that another process makes."""
-    if breaks:
-        raise ValueError("out of numbers")
-    return {"square": number**2, "process": os.getpid()}
 
 
 def test_a_study_writes_its_table_and_goes_on_where_it_was(tmp_path):

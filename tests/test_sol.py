@@ -109,6 +109,7 @@ def test_missing_and_truncated_files_are_refused(tmp_path):
         read_sol(tmp_path / "a.sol", ORDER, ROWS)
 
 
+@pytest.mark.slow
 def test_multipliers_of_a_foreign_optimum(tmp_path):
     pounce = shutil.which("pounce") or shutil.which(str(Path(sys.executable).parent / "pounce"))
     if pounce is None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -137,7 +138,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     """Run the command line; the exit code."""
     try:
-        code = app(args=list(argv) if argv is not None else None, standalone_mode=False)
+        code = _root()(args=list(argv) if argv is not None else None, standalone_mode=False)
         # the command line library makes this code of a KeyboardInterrupt
         return _aborted() if code == ABORTED else int(code or 0)
     except StoppedError as error:
@@ -177,6 +178,13 @@ class LazyGroup(TyperGroup):
         return name, command, rest
 
 
+@cache
+def _root() -> Any:
+    """The whole command line; a process that calls it often builds it once."""
+    return typer.main.get_command(app)
+
+
+@cache
 def _load(name: str, home: str) -> Any:
     """The command of a function such as "solve:solve"."""
     module, _, function = home.partition(":")
