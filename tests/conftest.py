@@ -7,6 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data import inputs
@@ -14,6 +15,10 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.pipeline.run import Run, make_run, skipped
 from soup_nlp.solve.tangent_problem import TangentProblem
+
+# drawn cases are the same in every run
+settings.register_profile("fixed", derandomize=True, deadline=None)
+settings.load_profile("fixed")
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 

@@ -204,6 +204,9 @@ def test_no_round_raises_the_exact_energy_and_the_soup_is_feasible(units):
         assert r.bound <= r.mrf_energy + 1e-9
         assert r.gap >= -1e-9
         assert sum(r.accepted.values()) == len(tiny.soup)
+        assert r.spread.shape == (len(tiny.soup),)
+        assert (r.spread >= 0).all()
+        assert r.spread.max() > 0
         assert sum(r.proposed.values()) <= FEW.particles * len(tiny.soup)
         if units == "pixels" and r.taken:
             assert r.mrf_energy == pytest.approx(r.energy["total"], rel=1e-9)

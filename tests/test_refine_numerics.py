@@ -20,6 +20,7 @@ from soup_nlp.refine.costs import PairCosts, Particles
 from soup_nlp.refine.mppbp import SHARES, refine_soup
 from soup_nlp.refine.particles import KINDS, Proposer
 from soup_nlp.refine.records import RefineOptions
+from soup_nlp.refine.select import spread_of
 
 
 def test_the_mrf_follows_the_exact_energy_when_the_length_unit_changes():
@@ -143,3 +144,14 @@ def test_a_plane_is_tilted_no_further_than_it_must_be():
     assert (kept > 0.01).all()
     more = Local(after.Z, after.g / 0.7, now.R, now.T).particles(data.anchor_ray)
     assert (facing(replace(made, n=more.n[:, 0])) < 1e-3).all()
+
+
+def test_the_spread_of_particles_weighs_depths_by_their_min_marginals():
+    """Depths 1, e and one that is forbidden, the second half as likely as the first."""
+    normal = np.tile([0.0, 0.0, -1.0], (1, 3, 1))
+    D = np.array([[1.0, np.e, -5.0]])
+    p = Particles(normal, D, np.tile(np.eye(3), (1, 3, 1, 1)), np.zeros((1, 3, 3)))
+    cost = np.array([[0.0, np.log(2.0), np.inf]])
+    found = spread_of(p, cost, np.array([[0.0, 0.0, 1.0]]))
+    # mean 1/3, variance 2/3 (1/3)^2 + 1/3 (2/3)^2
+    assert found == pytest.approx([np.sqrt(2 / 9)])

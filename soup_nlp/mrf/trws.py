@@ -45,6 +45,9 @@ class TRWSResult:
         status: ``"gap"``, ``"stagnation"``, ``"iterations"`` or ``"interrupted"``.
         ties: Nodes whose label was a tie, to rounding, when ``labels`` were decoded; 0 if they
             are ``init_labels``.
+        min_marginals: (N, L) costs plus messages of the last backward pass, the least of a node 0:
+            every labelling with this label has at least the bound before that pass plus this much
+            energy. Those of the costs alone before the first pass.
     """
 
     labels: np.ndarray
@@ -56,6 +59,7 @@ class TRWSResult:
     iterations: int
     status: str
     ties: int
+    min_marginals: np.ndarray
 
 
 def solve_trws(
@@ -133,7 +137,8 @@ def solve_trws(
         energy, labels, ties = first, begin, 0  # float32 took a worse labelling for a better one
     bounds, energies, bests = np.array(rows).reshape(-1, 3).T.copy()
     bound = min(float(bounds.max(initial=-math.inf)), energy)
-    return TRWSResult(labels, energy, bound, bounds, energies, bests, len(rows), status, ties)
+    history = bounds, energies, bests, len(rows)
+    return TRWSResult(labels, energy, bound, *history, status, ties, solver.min_marginals)
 
 
 def mrf_energy(
@@ -233,6 +238,7 @@ class _Passes:
             fail("A unary cost is too large.", "unary", costs[~absent].max(), f"within {dtype}")
         self.absent, self.plan, self.tables = absent, plan, tables
         self.messages = np.zeros((len(tables.table), costs.shape[1]), dtype)
+        self.min_marginals = self.costs - self.costs.min(axis=1, keepdims=True)
 
     def sweep(self) -> float:
         """One forward and one backward pass; the lower bound."""
@@ -244,6 +250,7 @@ class _Passes:
                 belief = self._beliefs(level)
                 least = belief.min(axis=1, keepdims=True)
                 belief -= least
+                self.min_marginals[level.nodes] = belief
                 bound += float(least.sum(dtype=np.float64)) + self._send(level.down, level, belief)
         if not math.isfinite(bound):
             hint = "the tables must be finite; scale the costs down, or work in float64"

@@ -34,7 +34,7 @@ from soup_nlp.refine.costs import PairCosts, Particles, feasible, unary_costs
 from soup_nlp.refine.particles import COMMON, KINDS, WALKS, Proposals, Proposer
 from soup_nlp.refine.photometric import Photometric
 from soup_nlp.refine.records import Refined, RefineOptions, Round
-from soup_nlp.refine.select import conditional_costs, diverse, within_reach
+from soup_nlp.refine.select import conditional_costs, diverse, spread_of, within_reach
 from soup_nlp.refine.sweep import swept
 from soup_nlp.solve.ipopt import Listener, Progress
 
@@ -162,7 +162,8 @@ def refine_soup(
         which = diverse(p, labels, cost, round(o.keep * o.particles), data)
         kept = p.take(which)
         del pairwise
-        rounds.append(_round(result, drawn, unary, labels, energy, taken, mark))
+        spread = spread_of(p, result.min_marginals, data.anchor_ray)
+        rounds.append(_round(result, drawn, unary, labels, energy, taken, mark, spread))
         _learn(proposer, shares, drawn, labels, rounds[-1])
         if say:
             say(f"refine {number + 1}: {rounds[-1]}")
@@ -294,6 +295,7 @@ def _round(
     energy: Mapping[str, float],
     taken: bool,
     mark: float,
+    spread: Float,
 ) -> Round:
     possible = np.isfinite(unary)
     proposed = {k: int(possible[:, drawn.kind == c].sum()) for c, k in enumerate(KINDS)}
@@ -310,6 +312,7 @@ def _round(
         proposed=proposed,
         accepted={k: int(chosen[c]) for c, k in enumerate(KINDS)},
         seconds=time.perf_counter() - mark,
+        spread=spread,
     )
 
 

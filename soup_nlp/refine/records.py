@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from soup_nlp.geometry.soup import Soup
@@ -19,6 +21,8 @@ from soup_nlp.schema.section import (
     Truncation,
     Whole,
 )
+
+Float = NDArray[np.float64]
 
 
 class RefineOptions(Section):
@@ -78,6 +82,8 @@ class Round:
         proposed: Feasible particles by kind.
         accepted: Chosen particles by kind.
         seconds: Wall time.
+        spread: (N,) standard deviation of the particles' log depth at the anchors, each weighted
+            by exp(-its min-marginal).
     """
 
     energy: Mapping[str, float]
@@ -91,6 +97,7 @@ class Round:
     proposed: Mapping[str, int] = field(repr=False)
     accepted: Mapping[str, int] = field(repr=False)
     seconds: float
+    spread: Float = field(repr=False, default_factory=lambda: np.zeros(0))
 
     def __str__(self) -> str:
         return (

@@ -79,6 +79,22 @@ def diverse(p: Particles, labels: Int, cost: Float, count: int, data: EnergyData
     return out
 
 
+def spread_of(p: Particles, min_marginals: Float, anchor_ray: Float) -> Float:
+    """(N,) standard deviation of log depth at the anchors, particles weighted by exp(-cost).
+
+    Args:
+        p: (N, L) particles.
+        min_marginals: (N, L) costs, the least of a superpixel 0; infinite where not allowed.
+        anchor_ray: (N, 3).
+    """
+    weight = np.exp(-np.asarray(min_marginals, np.float64))
+    weight /= weight.sum(axis=1, keepdims=True)
+    # what is not allowed may lie behind the camera
+    log = np.log(np.where(weight > 0, anchor_depth(p, anchor_ray), 1.0))
+    mean = np.sum(weight * log, axis=1, keepdims=True)
+    return np.asarray(np.sqrt(np.sum(weight * (log - mean) ** 2, axis=1)))
+
+
 def within_reach(
     p: Particles, soup: Soup, near: Int, anchor_ray: Float, reach: float
 ) -> NDArray[np.bool_]:
