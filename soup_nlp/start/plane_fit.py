@@ -12,6 +12,9 @@ from soup_nlp.start.epipolar import Motion
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+ROUNDING_PX = 1e-3
+"""Parallax in pixels that is none: the flow is not known better."""
+
 
 @dataclass(frozen=True)
 class PlaneFit:
@@ -38,10 +41,12 @@ class PlaneFit:
         return PlaneFit(*(v[:, kept] for v in self.__dict__.values()))
 
     def penalised(self) -> Float:
-        """(N, C) cost in pixels, raised where the plane lies behind the camera."""
-        behind = self.inverse_depth <= 0
-        penalty = 1.0 + 0.5 * self.parallax * np.abs(self.inverse_depth)
-        return self.cost + np.where(behind, penalty, 0.0)
+        """(N, C) cost in pixels, raised where the plane lies behind the camera.
+
+        What stands still is at infinity, on either side of it by rounding.
+        """
+        shift = self.parallax * self.inverse_depth
+        return self.cost + np.where(shift < -ROUNDING_PX, 1.0 - 0.5 * shift, 0.0)
 
 
 def fit_planes(
