@@ -11,6 +11,7 @@ from scipy import sparse
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow
 from soup_nlp.evaluate.confidence import (
+    BENDING_FACTOR,
     MOST_SIGMA,
     POWER,
     SIGMA_PRIOR,
@@ -280,6 +281,15 @@ def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
     quiet, loud = (calibrated(np.array([0.001]), 0.1, m) for m in (0.05, 0.4))
     # the geometric mean of noise and misfit is twice the noise
     assert loud / quiet == pytest.approx(2**POWER, rel=1e-3)
+
+
+def test_where_surfaces_bend_a_misfit_counts_in_full_and_the_spread_by_its_root():
+    spread, misfit = np.array([0.01]), 0.2
+    base = calibrated(spread, 0.1, misfit, prior=np.inf, bending=True)
+    assert base[0] == pytest.approx(BENDING_FACTOR * misfit * np.sqrt(0.01))
+    assert calibrated(spread, 0.6, misfit, prior=np.inf, bending=True) == base
+    assert calibrated(spread, 0.1, 0.0, bending=True)[0] > 0
+    assert calibrated(np.array([np.inf]), 0.1, bending=True)[0] == pytest.approx(SIGMA_PRIOR)
 
 
 def test_an_energy_that_sees_no_plane_leaves_everything_a_guess(small_room):

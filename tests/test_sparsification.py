@@ -61,7 +61,7 @@ def test_coverage_counts_what_lies_within():
     assert coverage([0.5, -1.5, 2.5, 1.0], [1.0, 1.0, 1.0, 1.0]) == [0.5, 0.75]
 
 
-def row(family: str, pair: str, scale: float) -> dict:
+def row(family: str, pair: str, scale: float, bending: bool = False) -> dict:
     rng = np.random.default_rng(3)
     unit = rng.uniform(0.5, 2.0, 2000) ** POWER
     return {
@@ -79,6 +79,7 @@ def row(family: str, pair: str, scale: float) -> dict:
             "within": [0.7, 0.9],
             "guess": 0.1,
             "noise": 0.1,
+            "bending": bending,
             "seconds": 0.5,
             "curve": [[1.0, 0.5], [0.05, 0.02], [0.05, 0.01]],
             "sample": [
@@ -92,11 +93,19 @@ def row(family: str, pair: str, scale: float) -> dict:
 def test_the_factor_of_a_family_is_chosen_on_the_others():
     """Errors of 1 and of 2 thousandths: each family is judged by the other's factor."""
     told = left_out([row("one", "a", 1.0), row("two", "b", 2.0)])
-    # 70 % of a Gaussian lie within 1.04 standard deviations
-    assert told["one"][0] == pytest.approx(2.07e-3, rel=0.05)
-    assert told["two"][0] == pytest.approx(1.04e-3, rel=0.05)
-    assert told["one"][1] == pytest.approx(0.96, abs=0.02)
-    assert told["two"][1] == pytest.approx(0.40, abs=0.03)
+    # 76 % of a Gaussian lie within 1.175 standard deviations
+    assert told["one"][0] == pytest.approx(2.35e-3, rel=0.05)
+    assert told["two"][0] == pytest.approx(1.175e-3, rel=0.05)
+    assert told["one"][1] == pytest.approx(0.98, abs=0.02)
+    assert told["two"][1] == pytest.approx(0.44, abs=0.03)
+
+
+def test_pairs_that_bend_are_judged_by_others_that_bend():
+    rows = [row("one", "a", 1.0), row("two", "b", 9.0, bending=True)]
+    assert left_out(rows) == {}
+    told = left_out([*rows, row("three", "c", 2.0, bending=True)])
+    assert set(told) == {"two", "three"}
+    assert told["three"][0] == pytest.approx(9 * 1.175e-3, rel=0.05)
 
 
 def test_the_page_has_pairs_and_families():

@@ -26,6 +26,7 @@ from soup_nlp.bench.tables import (
 )
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import (
+    BENDING_FACTOR,
     FACTOR,
     SIGMA_PRIOR,
     Information,
@@ -52,12 +53,13 @@ CUES = {
     "flow": "1 - flow confidence",
     "parallax": "(1 - flow confidence) / parallax",
     "photo": "photometric disagreement of the solution (census)",
+    "particles": "spread of the last particles by their min-marginals in TRW-S",
 }
 """Uncertainties that are compared."""
 SAMPLE = 400
 """Pixels of a pair that are kept for the calibration on other families."""
-WITHIN = 0.70
-"""Share of the pixels that FACTOR brings within one sigma."""
+WITHIN = 0.76
+"""Share of the pixels that a factor brings within one sigma."""
 LEAST_PARALLAX = 0.1
 """Pixels of parallax below which the cue divides by this."""
 
@@ -89,8 +91,9 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
     cues = {name: chosen(image) for name, image in _cues(result).items()}
     found = {name: sparsification(relative, cue) for name, cue in cues.items()}
     sure = result.confidence
-    whole = calibrated(sure.spread, sure.noise, sure.misfit[rec.labels], prior=np.inf)
-    unit = chosen(whole) / FACTOR
+    misfit = sure.misfit[rec.labels]
+    whole = calibrated(sure.spread, sure.noise, misfit, np.inf, sure.bending)
+    unit = chosen(whole) / (BENDING_FACTOR if sure.bending else FACTOR)
     picked = np.linspace(0, len(log) - 1, min(SAMPLE, len(log))).astype(int)
     own = found["sigma"]
     return {
@@ -104,6 +107,7 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
             "within": coverage(log, cues["sigma"]),
             "guess": sure.guessed,
             "noise": sure.noise,
+            "bending": sure.bending,
             "seconds": seconds,
             "curve": [own.kept.tolist(), own.error.tolist(), own.oracle.tolist()],
             "sample": np.stack([log[picked], unit[picked]]).round(6).tolist(),
@@ -124,6 +128,8 @@ def _cues(result: Run) -> dict[str, Float]:
         "flow": doubt,
         "parallax": (0.02 + doubt) / np.maximum(start.parallax, LEAST_PARALLAX)[labels],
     }
+    if result.refined and result.refined.rounds:
+        out["particles"] = result.refined.rounds[-1].spread[labels]
     photo = look(pair, labels, result.soup, result.problem.refine)
     if photo is not None:
         out["photo"] = photo.costs(Particles.of(result.soup), photo.unit(result.soup))[:, 0][labels]
@@ -143,22 +149,24 @@ def _own_block(result: Run) -> Float:
 
 
 def left_out(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
-    """By family: FACTOR as the others would choose it, and the coverage of 1, 2 sigma with it."""
-    samples: dict[str, list[Float]] = {}
-    for row in rows:
-        samples.setdefault(row["sequence"], []).append(np.array(row["confidence"]["sample"]))
-    out = {}
-    for family, own in samples.items():
-        others = [s for name, several in samples.items() if name != family for s in several]
+    """By family: its factor as the others would choose it, and the coverage of 1, 2 sigma with it.
+
+    Pairs whose surfaces bend have a factor of their own, chosen on such pairs.
+    """
+    samples = [(r["sequence"], r["confidence"]["bending"], r["confidence"]["sample"]) for r in rows]
+    told: dict[str, list[tuple[float, float, float]]] = {}
+    for family, bends, own in samples:
+        others = [np.array(s) for name, b, s in samples if name != family and b == bends]
         if not others:
             continue
         # every pair counts alike
         ratio = np.concatenate([np.quantile(e / u, np.linspace(0, 1, 101)) for e, u in others])
         factor = float(np.quantile(ratio, WITHIN))
-        told = [coverage(e, factor * u / np.hypot(1, factor * u / SIGMA_PRIOR)) for e, u in own]
-        one, two = (float(np.mean(k)) for k in zip(*told))
-        out[family] = factor, one, two
-    return out
+        log, unit = np.array(own)
+        one, two = coverage(log, factor * unit / np.hypot(1, factor * unit / SIGMA_PRIOR))
+        told.setdefault(family, []).append((factor, one, two))
+    mean_of = {name: np.mean(several, axis=0) for name, several in told.items()}
+    return {name: (float(f), float(one), float(two)) for name, (f, one, two) in mean_of.items()}
 
 
 def text_confidence(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
@@ -177,8 +185,9 @@ def text_confidence(name: str, text: str, rows: Sequence[Row], note: str = "") -
     lines += table(head, [_line(n, r, used) for n, r in zip(titles(good), good, strict=True)])
     lines += ["", *(f"- {c}: {CUES[c]}" for c in used), "", "## By family", ""]
     lines += [
-        f"FACTOR, shipped as {FACTOR:g}, is chosen for each family on all others, so that"
-        f" {WITHIN:.0%} of their pixels lie within one sigma; every pair counts alike.",
+        f"The factor of sigma, shipped as {FACTOR:g} ({BENDING_FACTOR:g} where surfaces bend), is"
+        f" chosen for each family on all others of its kind, so that {WITHIN:.0%} of their pixels"
+        " lie within one sigma; every pair counts alike.",
         "",
     ]
     lines += table(*_families(good, used))
@@ -213,7 +222,7 @@ def _families(good: Sequence[Row], used: Sequence[str]) -> tuple[list[str], list
     last = [mean(column) for column in zip(*numbers)]
     lines.append([f"mean of {len(numbers)} families", *_shown(last, len(used)), ""])
     head = ["family (pairs)", *(f"AUSE {c}" for c in used), "within 1", "within 2"]
-    return [*head, "left out: within 1", "left out: within 2", "FACTOR of the others"], lines
+    return [*head, "left out: within 1", "left out: within 2", "factor of the others"], lines
 
 
 def _shown(numbers: Sequence[Any], areas: int) -> list[str]:

@@ -170,8 +170,10 @@ LEAST_LEARNED = 1e-4
 """Least share of the information that is counted as the flow's."""
 MOST_BORROWED = 0.5
 """Share of superpixels without a depth of their own from which the camera is at rest."""
-FACTOR, POWER = 8.5, 1.25
+FACTOR, POWER = 7.0, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
+BENDING_FACTOR = 2.0
+"""sigma = BENDING_FACTOR misfit sqrt(spread) where surfaces bend."""
 MOST_MISFIT = 5.0
 """Pixels beyond which a flow that the answer contradicts is as wrong as any."""
 LARGEST = 1e6
@@ -191,6 +193,7 @@ class Confidence:
         spread: (H, W) standard deviation of log depth by what the flow adds to the terms on shape.
         marginals: Of the planes and of the components' scales.
         noise: Of the flow, pixels, see `flow_noise`.
+        bending: Whether surfaces are taken to bend.
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
     """
 
@@ -198,6 +201,7 @@ class Confidence:
     spread: Float
     marginals: Marginals
     noise: float
+    bending: bool
     misfit: Float
 
     @property
@@ -208,17 +212,11 @@ class Confidence:
     @property
     def component_sigma(self) -> Float:
         """(C,) calibrated standard deviation of the components' log scale."""
-        return calibrated(np.sqrt(self.marginals.component), self.noise)
+        return calibrated(np.sqrt(self.marginals.component), self.noise, bending=self.bending)
 
 
 def flow_noise(start: Start) -> float:
-    """Noise of the flow, pixels: the start's median re-projection error, within E_prior's limits.
-
-    Where surfaces bend every superpixel has a motion of its own, which fits the flow whatever its
-    errors are: the largest noise is assumed.
-    """
-    if start.bending:
-        return MOST_NOISE
+    """Noise of the flow, pixels: the start's median re-projection error within limits."""
     return float(np.clip(np.median(start.error), LEAST_NOISE, MOST_NOISE))
 
 
@@ -240,9 +238,16 @@ def flow_misfit(rec: Reconstruction, flow: Flow) -> Float:
 
 
 def calibrated(
-    spread: Float, noise: float, misfit: Float | float = 0.0, prior: float = SIGMA_PRIOR
+    spread: Float,
+    noise: float,
+    misfit: Float | float = 0.0,
+    prior: float = SIGMA_PRIOR,
+    bending: bool = False,
 ) -> Float:
     """Standard deviation of log depth that errors keep to.
+
+    Where surfaces bend every superpixel has a motion of its own, which fits nearly any flow: the
+    spread says less there, and a misfit much.
 
     Args:
         spread: What the marginals say.
@@ -250,9 +255,13 @@ def calibrated(
         misfit: Of the same superpixel, pixels; where it is larger than the noise, their geometric
             mean is the noise.
         prior: Standard deviation before looking; its information is added.
+        bending: Whether surfaces are taken to bend.
     """
-    local = np.sqrt(noise * np.maximum(noise, misfit))
-    sigma = np.minimum(FACTOR * (local * spread) ** POWER, LARGEST)
+    if bending:
+        sigma = BENDING_FACTOR * np.maximum(LEAST_NOISE, misfit) * np.sqrt(spread)
+    else:
+        sigma = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
+    sigma = np.minimum(sigma, LARGEST)
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
 
@@ -319,5 +328,5 @@ def confidence(
         )
         spread = np.full(rec.labels.shape, np.inf)
     noise, misfit = flow_noise(start), flow_misfit(rec, flow)
-    sigma = calibrated(spread, noise, misfit[rec.labels])
-    return Confidence(sigma, spread, own, noise, misfit)
+    sigma = calibrated(spread, noise, misfit[rec.labels], bending=start.bending)
+    return Confidence(sigma, spread, own, noise, start.bending, misfit)
