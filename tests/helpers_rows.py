@@ -1,4 +1,4 @@
-"""A row that needs no solve, in a module that worker processes import quickly."""
+"""Rows that need no solve, in a module that worker processes import quickly."""
 
 from __future__ import annotations
 
@@ -12,3 +12,10 @@ def fake_row(scene: str, dies: bool = False) -> dict[str, Any]:
         os._exit(3)
     ok = scene != "sheet"
     return {"ok": ok, "error": None if ok else "no", "seconds": 0.0}
+
+
+def square(number: int, breaks: bool = False) -> dict[str, Any]:
+    """A row that another process makes."""
+    if breaks:
+        raise ValueError("out of numbers")
+    return {"square": number**2, "process": os.getpid()}

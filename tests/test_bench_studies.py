@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from helpers_square import square
+from helpers_rows import square
 from typer.main import get_command
 
 from soup_nlp.bench.rows import read_rows

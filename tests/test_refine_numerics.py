@@ -33,7 +33,9 @@ def test_the_mrf_follows_the_exact_energy_when_the_length_unit_changes():
     h = 1e-4
     # particle 1: plane and translation grow together, and with them the unit
     p = now.joined(Particles(now.n, (1 + h) * now.D, now.R, (1 + h) * now.T))
-    unary, pairwise = mppbp._costs(best, p, tiny.data, weights, pair_costs, RefineOptions())
+    rays, near = tiny.data.visibility_ray(5.0), neighbours(tiny.data.edges, tiny.data.anchor_ray)
+    own = tiny.data, weights, None, RefineOptions(), rays, 1e-3, pair_costs, near
+    unary, pairwise = mppbp._Costs(*own).of(best, p)
     slope = mppbp.length_slope(best, tiny.data, weights)
     for chosen in ([0], [3, 7], range(6), range(len(best))):
         labels = np.zeros(len(best), np.int64)

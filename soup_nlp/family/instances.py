@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import CHOICES, form_label, parse_formulation
-from soup_nlp.family.frozen import Frozen, load_frozen
+from soup_nlp.family.frozen import Frozen
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
@@ -138,15 +138,6 @@ def _whole(form: str) -> str:
     """A formulation with the parts that were left out."""
     own = dict(zip(("gauge", "norm", "truncation"), STANDARD.split("/")))
     return "/".join((own | parse_formulation(form)).values())
-
-
-def build_case(scene: str, size: int) -> Case:
-    """The problem of a scene and size; its soup is the proposal.
-
-    Raises:
-        DataError: the package has no record of it.
-    """
-    return case_of(load_frozen(scene, size))
 
 
 def case_of(record: Frozen, pair: Pair | None = None) -> Case:

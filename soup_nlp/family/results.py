@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.errors import ExportError
 from soup_nlp.export.program import orders, take_apart
 from soup_nlp.export.residuals import Kind, kind
 from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import Limits, Residuals, examine, violations
 from soup_nlp.family.frozen import load_frozen
 from soup_nlp.family.instances import VERSION, build_instance, case_of, parse_name
-from soup_nlp.storage.files import read_json
 from soup_nlp.storage.store import write_json
 
 Float = NDArray[np.float64]
@@ -108,21 +106,3 @@ def write_results(path: Path, rows: list[dict[str, Any]], note: dict[str, Any]) 
         note: Machine, limits and what else is equal for all rows.
     """
     write_json(path, {"set": "SOUP", "version": VERSION, **note, "results": rows})
-
-
-def read_results(path: Path) -> list[dict[str, Any]]:
-    """Results of a file.
-
-    Raises:
-        ExportError: it cannot be read, or a row lacks a field.
-    """
-    try:
-        rows = read_json(path, "results file", error=ExportError)["results"]
-        missing = [f"row {k}: {f}" for k, row in enumerate(rows) for f in FIELDS if f not in row]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ExportError("results cannot be read", where=path, found=error) from error
-    if missing:
-        raise ExportError(
-            "results lack a field", where=path, found=missing[0], expected=", ".join(FIELDS)
-        )
-    return list(rows)

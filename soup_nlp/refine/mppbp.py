@@ -18,7 +18,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +110,7 @@ def refine_soup(
         weights = photo.beside(weights)
     pair_costs = PairCosts(data, weights)
     proposer = Proposer(data, neighbours(pair_costs.edges, data.anchor_ray), seed)
+    layer = _Costs(data, weights, photo, o, rays, min_facing, pair_costs, proposer.near)
     shares = {k: v for k, v in SHARES.items() if o.proposals == "all" or k in WALKS}
     kept: Particles | None = None
     if photo is not None and o.sweep:
@@ -122,12 +123,7 @@ def refine_soup(
         mark = time.perf_counter()
         drawn = _draw(proposer, best, kept, o, shares)
         p = drawn.particles
-        unary, pairwise = _costs(best, p, data, weights, pair_costs, o)
-        if photo is not None:
-            unary += photo.costs(p, photo.unit(best))
-        unary[~feasible(p, rays, min_facing)] = np.inf
-        unary[~within_reach(p, best, proposer.near, data.anchor_ray, o.depth_reach)] = np.inf
-        unary[:, 0] = _current_cost(unary, best, data, weights)
+        unary, pairwise = layer.of(best, p)
 
         def watch(k: int, bound: float, e: float, least: float) -> bool:
             now = time.perf_counter()
@@ -149,13 +145,10 @@ def refine_soup(
         )
         # TRW-S answers Ctrl-C too with the best labels so far: no further round then
         interrupted = result.status == "interrupted" and time.perf_counter() <= deadline
-        labels = result.labels
-        new = p.soup(labels, data.share).retracted()
-        new_energy = _energy(new, data, weights, photo)
-        taken = new_energy["total"] < energy["total"]
-        if not taken:
-            labels = np.zeros(len(best), np.int64)
-        before = energy["total"]
+        new = p.soup(result.labels, data.share).retracted()
+        new_energy, before = _energy(new, data, weights, photo), energy["total"]
+        taken = new_energy["total"] < before
+        labels = result.labels if taken else np.zeros(len(best), np.int64)
         if taken:
             best, energy = new, new_energy
         cost = conditional_costs(labels, unary, pair_costs.edges, pairwise)
@@ -245,26 +238,48 @@ def _counts(shares: Mapping[str, float], total: int, near: int) -> dict[str, int
     return out
 
 
-def _costs(
-    best: Soup,
-    p: Particles,
-    data: EnergyData,
-    weights: Weights,
-    pair_costs: PairCosts,
-    o: RefineOptions,
-) -> tuple[Float, NDArray[np.floating]]:
-    unary, ahead = unary_costs(p, data, weights)
-    unary[~ahead] = np.inf
-    unit = float(np.sum(data.share * best.distance))
-    if not data.local_units:
-        unary -= (
-            length_slope(best, data, weights)
-            * data.share[:, None]
-            * (p.D - best.distance[:, None])
-            / unit
-        )
-    dtype = np.float32 if o.float32 else np.float64
-    return unary, pair_costs.tables(p, unit, dtype)
+@dataclass(frozen=True)
+class _Costs:
+    """The exact energy, laid out over particles.
+
+    Attributes:
+        data: Numbers of the energy.
+        weights: Its constants, beside images if there are any.
+        photo: What the images say; None leaves it to the flow.
+        options: Precision of the tables, and how far depth may go in a round.
+        rays: Where visibility is imposed, see `EnergyData.visibility_ray`.
+        min_facing: Least facing there.
+        pairs: Costs of pairs of particles.
+        near: (N, K) neighbours of every superpixel.
+    """
+
+    data: EnergyData
+    weights: Weights
+    photo: Photometric | None
+    options: RefineOptions
+    rays: Float
+    min_facing: float
+    pairs: PairCosts
+    near: Int
+
+    def of(self, best: Soup, p: Particles) -> tuple[Float, NDArray[np.floating]]:
+        """Unary and pairwise costs of particles; what is not feasible costs infinitely much."""
+        data, o = self.data, self.options
+        unary, ahead = unary_costs(p, data, self.weights)
+        unit = float(np.sum(data.share * best.distance))
+        if not data.local_units:
+            slope = length_slope(best, data, self.weights)
+            unary -= slope * data.share[:, None] * (p.D - best.distance[:, None]) / unit
+        if self.photo is not None:
+            unary += self.photo.costs(p, self.photo.unit(best))
+        reached = within_reach(p, best, self.near, data.anchor_ray, o.depth_reach)
+        unary[~(ahead & feasible(p, self.rays, self.min_facing) & reached)] = np.inf
+        # the current belief is always possible, whatever it violates
+        lost = ~np.isfinite(unary[:, 0])
+        if lost.any():
+            exact = self.weights.proj * oracle.reprojection(best, data, self.weights)
+            unary[lost, 0] = np.minimum(exact, 1e9)[lost]
+        return unary, self.pairs.tables(p, unit, np.float32 if o.float32 else np.float64)
 
 
 def length_slope(soup: Soup, data: EnergyData, weights: Weights, h: float = 1e-4) -> float:
@@ -276,15 +291,6 @@ def length_slope(soup: Soup, data: EnergyData, weights: Weights, h: float = 1e-4
         for s in (1 + h, 1 - h)
     )
     return (down - up) / (2 * h)
-
-
-def _current_cost(unary: Float, best: Soup, data: EnergyData, weights: Weights) -> Float:
-    """Finite costs of the current belief, whatever it violates."""
-    own = unary[:, 0]
-    if np.isfinite(own).all():
-        return own
-    exact = weights.proj * oracle.reprojection(best, data, weights)
-    return np.where(np.isfinite(own), own, np.minimum(exact, 1e9))
 
 
 def _round(
