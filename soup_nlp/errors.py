@@ -12,10 +12,6 @@ def printable(value: object, longest: int = LONGEST) -> str:
     """A text from outside on one line: control characters escaped, the end cut off.
 
     A terminal obeys control characters, and some that order right to left, whoever wrote them.
-
-    Args:
-        value: Anything; its str() is taken.
-        longest: Characters that are kept.
     """
     try:
         text = str(value)

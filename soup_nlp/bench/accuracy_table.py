@@ -26,13 +26,7 @@ Group = tuple[str, str, list[Row]]
 
 
 def report(title: str, rows: Sequence[Row], note: str = "") -> str:
-    """Everything that is known of some rows of one suite.
-
-    Args:
-        title: Headline.
-        rows: Rows; failed ones are listed.
-        note: A line on what was run.
-    """
+    """Everything that is known of some rows of one suite."""
     good = [r for r in rows if r.get("ok")]
     settings = ", ".join(sorted({str(r.get("settings")) for r in rows}))
     lines = [f"# {title}", ""]

@@ -71,13 +71,7 @@ class Results:
 
 
 def write_page(out: Path, results: Results, command: str) -> Path:
-    """Write OUT/README.md and its figures.
-
-    Args:
-        out: Folder.
-        results: Rows that are there.
-        command: How the page is made.
-    """
+    """Write OUT/README.md and its figures."""
     chosen = results.plan.sizes.sections
     with staged(out) as new:
         sections = [

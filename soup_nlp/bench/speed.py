@@ -110,9 +110,6 @@ def problem_of(
 def measure(**settings: Any) -> Row:
     """Solve a problem and say what every stage cost.
 
-    Args:
-        settings: Of `problem_of`.
-
     Returns:
         Plain numbers: "sizes", "wall" and "cpu" (seconds by stage; build, functions and linear
         algebra are parts of nlp's wall time, presolve, build and solve of its CPU time),

@@ -112,10 +112,6 @@ def rescaled(true: TrueSoup, energy: Callable[[Soup], float]) -> Soup:
 
     Flow leaves every component that moves by itself a scale of its own: E(truth) less this is what
     the model would have instead of true distances.
-
-    Args:
-        true: Soup and components.
-        energy: Of a soup.
     """
     soup, size = true.soup, np.bincount(true.component)
     for b in np.argsort(-size, kind="stable")[1 : np.count_nonzero(size)]:

@@ -39,10 +39,6 @@ def rigid_depth(pair: Pair, seed: int = 0) -> Float | None:
     Each pixel with confidence is then triangulated by itself without smoothing, so far points with
     little parallax can have wild depths; only those beyond `FAR` times the median are dropped.
 
-    Args:
-        pair: Cameras and flow.
-        seed: Of the subsample and of RANSAC.
-
     Returns:
         (H, W) z of the reference frame in lengths of the translation; NaN where the flow has no
         confidence, the triangulated point is not in front of both cameras, or it is too far. None

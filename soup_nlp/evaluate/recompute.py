@@ -40,13 +40,7 @@ def lift(s: State, ray: Float, who: Int) -> tuple[Float, Float]:
 
 
 def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, float]:
-    """Exact E and its weighted terms (paper Eq. 1 to 6 as in docs/formulation.md).
-
-    Args:
-        s: Soup.
-        e: Arrays of the energy, as stored.
-        w: Factors and truncations.
-    """
+    """Exact E and its weighted terms (paper Eq. 1 to 6 as in docs/formulation.md)."""
     every = np.arange(len(s["lam"]))
     A, B = (x[:, 0] for x in lift(s, e["anchor_ray"][:, None], every))
     T = s["lam"][:, None] * s["t"]
@@ -238,10 +232,6 @@ def at_points(z: Float, points: Float) -> tuple[Float, Float]:
 
 def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, float]:
     """Differences of the energy's stored data from labels, flow, cameras and the start.
-
-    Args:
-        tree: Arrays of result.h5.
-        settings: The merged problem, as stored.
 
     Returns:
         Largest absolute difference by name; 0 is agreement.

@@ -20,10 +20,6 @@ def readable_names(nlp: NLP, layout: MatrixLayout) -> tuple[list[str], list[str]
     superpixels. A further index counts, from 1, the rows of R'R = I in the order 11 12 22 13 23 33,
     rim rays (the anchor is 1), or sampled pixels.
 
-    Args:
-        nlp: From `build_matrix_nlp`.
-        layout: Its layout.
-
     Returns:
         (nx,) and (ng,) names.
     """

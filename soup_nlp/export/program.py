@@ -51,12 +51,6 @@ class Program:
 def take_apart(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Program:
     """Split, trace and fold every kernel.
 
-    Args:
-        groups: Kernels and tables.
-        nx: Variables of the NLP.
-        ng: Rows of the NLP.
-        theta: Values of the shared parameters.
-
     Raises:
         ExportError: an operation has no opcode, or a number is not finite.
     """

@@ -46,10 +46,6 @@ def split(group: Group, theta: Float) -> Split:
 
     A variable is linear in an output where that entry of the Jacobian depends on no variable.
 
-    Args:
-        group: Kernel and table.
-        theta: Values of the shared parameters.
-
     Raises:
         ExportError: an operation has no opcode.
     """

@@ -30,14 +30,7 @@ def family_problem(scene: str, size: int) -> Problem:
 
 
 def freeze(scene: str, size: int, path: Path, say: Callable[[str], None]) -> None:
-    """Segment, propose and solve a scene at a size, and write its record.
-
-    Args:
-        scene: Rendered scene.
-        size: Superpixels wanted.
-        path: The record.
-        say: Called with a line per stage.
-    """
+    """Segment, propose and solve a scene at a size, and write its record."""
     problem = family_problem(scene, size)
     proposed = record_of(prepare(problem, log=say))
     # the minimum of the numbers that the record leads to

@@ -43,11 +43,6 @@ def write_family(
 ) -> list[Entry]:
     """Write instances with their index into an existing folder.
 
-    Args:
-        folder: Where everything goes.
-        chosen: See `instances.select`.
-        say: Called with a line per instance.
-
     Returns:
         The index's entries. "published" says whether the bytes are those of the published
         version, None where that has no such instance.

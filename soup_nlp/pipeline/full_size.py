@@ -43,12 +43,6 @@ def full_size(full: Pair, small: Pair, result: Reconstruction, expected: Expecte
 
     Superpixels grow along the edges of the images; planes are evaluated at every pixel, in the next
     frame after their motions.
-
-    Args:
-        full: The pair at its own size.
-        small: The pair that was solved.
-        result: Its reconstruction.
-        expected: How depth is scored.
     """
     soup = result.soup
     labels = grown_labels(result.labels, small.image_ref, full.image_ref)

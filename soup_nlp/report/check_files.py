@@ -31,13 +31,7 @@ ULPS = 4 * 2.0**-24
 
 
 def file_claims(folder: Path, claims: Entries, tree: Entries) -> Iterator[Claim]:
-    """Claims about the files of a result.
-
-    Args:
-        folder: Result folder.
-        claims: Contents of summary.json.
-        tree: Arrays of result.h5.
-    """
+    """Claims about the files of a result."""
     yield from _counts(claims, tree)
     state = {
         k: np.asarray(require(tree, f"solution/{k}"), float) for k in ("lam", "n", "d", "R", "t")

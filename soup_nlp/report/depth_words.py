@@ -17,12 +17,7 @@ STILL = 0.3
 
 
 def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
-    """Lines of the verdict: usable flow, parallax, what moves, and what to try.
-
-    Args:
-        run: The run.
-        shares: Of the image, see `certainty.certainty`.
-    """
+    """Lines of the verdict: usable flow, parallax, what moves, and what to try."""
     assert run.pair.flow is not None
     usable = float((run.pair.flow.confidence > 0).mean())
     lines = [f"flow usable at {usable:.0%} of the pixels"]

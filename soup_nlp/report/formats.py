@@ -114,11 +114,6 @@ def check_formats(names: Sequence[str]) -> list[str]:
 def write_formats(folder: Path, result: Result, names: Sequence[str]) -> list[str]:
     """Write a result in several formats into an existing folder.
 
-    Args:
-        folder: The folder.
-        result: What was solved.
-        names: Keys of `FORMATS`.
-
     Returns:
         Names of the files and folders that were written.
 

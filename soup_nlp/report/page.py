@@ -47,12 +47,7 @@ SIDE = 1600
 
 
 def page(shown: Shown, found: Mapping[str, Picture]) -> str:
-    """The page of a result: HTML that holds everything it shows.
-
-    Args:
-        shown: The result.
-        found: Its pictures, see `pictures`.
-    """
+    """The page of a result: HTML that holds everything it shows."""
     scene = make_scene(shown)
     data = {
         "scene": _scene(shown, scene),

@@ -91,13 +91,7 @@ class Shown:
 
 
 def of_run(run: Run, summary: Mapping[str, Any], verdict: str) -> Shown:
-    """What a run shows.
-
-    Args:
-        run: The run.
-        summary: Contents of its summary.json.
-        verdict: What is printed at the end.
-    """
+    """What a run shows."""
     truth, pair = run.pair.truth, run.pair
     unit = truth.unit if truth is not None and "solution" in run.metrics else ""
     return Shown(

@@ -38,14 +38,7 @@ def chain_files(count: int) -> list[str]:
 
 
 def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -> None:
-    """Write every file of a chain, `chain_files`, into an existing folder.
-
-    Args:
-        folder: The folder.
-        chain: The chain.
-        name: For titles.
-        sources: Where every frame comes from.
-    """
+    """Write every file of a chain, `chain_files`, into an existing folder."""
     (folder / "depth").mkdir(exist_ok=True)
     (folder / "points").mkdir(exist_ok=True)
     depths = [chain.depth(k) for k in range(len(chain))]

@@ -12,14 +12,7 @@ class IterationCallback(ca.Callback):
     """
 
     def start(self, name: str, nx: int, ng: int, parameters: int = 0) -> None:
-        """Make the CasADi function of it.
-
-        Args:
-            name: Of the function.
-            nx: Variables.
-            ng: Rows.
-            parameters: Parameters of the solver.
-        """
+        """Make the CasADi function of it."""
         sizes = {"f": 1, "x": nx, "lam_x": nx, "g": ng, "lam_g": ng, "lam_p": parameters}
         self._sizes = [sizes[ca.nlpsol_out(i)] for i in range(ca.nlpsol_n_out())]
         self.construct(name, {})

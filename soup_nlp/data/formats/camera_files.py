@@ -146,10 +146,6 @@ def read_vkitti2_intrinsics(path: PathLike, frames: Sequence[int]) -> list[Float
 
     Its columns are: frame cameraID K[0,0] K[1,1] K[0,2] K[1,2].
 
-    Args:
-        path: The file.
-        frames: Numbers of frames.
-
     Returns:
         (3, 3) intrinsics of these frames, pixels.
 
