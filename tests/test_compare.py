@@ -127,7 +127,7 @@ def test_solvers_reach_a_verified_point(name, task, tmp_path):
 
 
 def test_a_claim_with_the_gauss_newton_hessian_is_true(task, tmp_path):
-    # whether it converges in 200 iterations hangs on rounding; what it claims must hold
+    # whether it converges in 200 iterations depends on rounding; what it claims must hold
     rows = compare(
         [(LABEL, lambda folder: replace(task, folder=folder))],
         ["ipopt-soup"], task.limits, tmp_path / "runs.jsonl", tmp_path, lambda line: None,

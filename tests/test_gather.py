@@ -14,7 +14,7 @@ from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.start.bending import flow_jump
-from soup_nlp.start.choice import Choice, hanging_together, smooth_choice
+from soup_nlp.start.choice import Choice, flow_affinity, smooth_choice
 from soup_nlp.start.components import borrow
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.merge import gather
@@ -143,7 +143,7 @@ def test_neighbours_agree_unless_the_flow_jumps(world):
     # each component prefers its own label by 0.3 pixels, a fifth of the superpixels the wrong one
     wrong = rng.random(n) < 0.2
     cost = np.where(np.arange(2) == np.where(wrong, 1 - component, component)[:, None], 0.0, 0.3)
-    near = hanging_together(jump, OPTIONS)
+    near = flow_affinity(jump, OPTIONS)
     assert near.max() <= 1
     assert near[jump > 3 * OPTIONS.discontinuity_px].max() < 0.01
     label = smooth_choice(cost, near, seg, 0.5)

@@ -161,7 +161,7 @@ def test_components_with_a_gap_in_their_discontinuity_are_parted_there(monkeypat
     views = Turns(true)
     before = taken(views, true + 0.02, np.where(component > 0, -1, 0))
     offered(monkeypatch, 0.3, -0.3)
-    least, most = gathering.TEARS[-1], gathering.TEARS[0]
+    least, most = gathering.DISCONTINUITIES[-1], gathering.DISCONTINUITIES[0]
     assert least < most
     between = 0.5 * (least + most) * OPTIONS.discontinuity_px
     jump = np.where(across(seg, component), between, 0.0)

@@ -1,4 +1,4 @@
-"""Does E_arap find the relative scale of what moves by itself? Energies over one body's scale.
+"""Does E_arap find the relative scale of a moving component? Energies over the scale of one.
 
 Planes and motions are the true ones; the scale of one moving component alone is varied about its
 true value. E_proj and E_orient do not depend on it.
@@ -135,7 +135,7 @@ def with_motions(pair: Pair) -> Pair:
 def _moved(pair: Pair, truth: Truth) -> Truth:
     """The truth with (B, 4, 4) motions; components that determine none are not finite.
 
-    A mask tells what moves, not what moves together: every piece of it that hangs together is a
+    A mask tells what moves, not what moves together: every connected piece of it is a
     component of its own.
     """
     depth, mask, flow = truth.depth_ref, truth.components, truth.flow

@@ -1,4 +1,4 @@
-"""Rigid motions: of the camera, and of whatever moves by itself."""
+"""Rigid motions: of the camera and of independently moving components."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def joined(rec: Reconstruction, K: Float, group: NDArray[np.integer]) -> tuple[M
 def at_jumps(right: Mask, below: Mask) -> Mask:
     """(H, W) True for the pixels on both sides of where the surface breaks off, see `joined`.
 
-    Images and flow are mixed there, and what is in between hangs like a curtain.
+    Images and flow are mixed there, and a mesh would stretch from one surface to the other.
     """
     out = np.zeros((len(right), right.shape[1] + 1), bool)
     for a, b, hold in ((out[:, :-1], out[:, 1:], right), (out[:-1], out[1:], below)):
@@ -81,7 +81,7 @@ def at_jumps(right: Mask, below: Mask) -> Mask:
 def triangles(right: Mask, below: Mask, keep: Mask, step: int = 1) -> NDArray[np.int64]:
     """(M, 3) triangles of pixels v W + u, counter-clockwise as the camera sees them.
 
-    Every cell of `step` pixels whose border and inside hang together has two.
+    Every cell of `step` pixels that no break of the surface crosses has two.
 
     Args:
         right: (H, W - 1) whether the surface goes on to the right, see `joined`.

@@ -101,8 +101,8 @@ def within_reach(
     """(N, L) whether the depth of a particle is one that its surroundings suggest.
 
     Lengths are measured in the depth of their anchors, so a superpixel that runs away to a
-    thousand times the depth of all around it pays next to nothing for its motion. No particle
-    starts that; the current belief is always allowed, and so is whatever is nearer to the
+    thousand times the depth of all around it costs next to nothing for its motion. No particle
+    may begin that; the current belief is always allowed, and so is whatever is nearer to the
     surroundings than it.
 
     Args:

@@ -1,9 +1,9 @@
 """Surfaces that bend: how to tell them from components that move apart, and where to start with
 them.
 
-A rigid component that moves by itself tears the flow along its outline. A bending surface does
-not: its flow is continuous, and yet one rigid motion does not explain it. Cut into rigid pieces,
-each with a parallax of its own, it gets depths that have nothing to do with its shape.
+The flow is discontinuous along the outline of a rigid component that moves independently. On a
+bending surface it is continuous, and yet no single rigid motion explains it. Cut into rigid pieces,
+each with its own parallax, such a surface gets depths that have nothing to do with its shape.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ def bending_share(surface: Int, component: Int) -> float:
     return float(1.0 - count.max(axis=1).sum() / len(surface))
 
 
-ABOVE_NOISE, LEAST_TEAR = 10.0, 0.25
-"""Jumps of the flow that are one are this many times the median jump, which is noise and bending,
-and at least this share of those that tear a surface for certain."""
+ABOVE_NOISE, LEAST_SHARE = 10.0, 0.25
+"""A flow discontinuity is at least this many times the median jump between neighbours (noise and
+bending), and at least this share of `discontinuity_px`."""
 
 
 def surfaces(jump: Float, seg: Segmentation, discontinuity_px: float) -> Int:
-    """(N,) surface of every superpixel, each beside others by outlines that mostly tear.
+    """(N,) surface of every superpixel; along most of their outlines the flow is discontinuous.
 
-    An outline tears here more, there less, and a single gap in it would join both sides. Where
-    the flow allows it surfaces are cut along smaller jumps, and pieces that were too many join
-    again, those with the longest whole outline first.
+    Jumps vary along an outline, and a single gap in it would join both sides. Therefore surfaces
+    are first separated along smaller jumps; two of them are joined again where the flow is
+    continuous along most of their common outline, the longest outline first.
 
     Args:
         jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
         seg: Superpixels and graphs.
-        discontinuity_px: A jump that tears for certain, pixels.
+        discontinuity_px: A jump that is a discontinuity for certain, pixels.
     """
-    least = np.clip(ABOVE_NOISE * np.median(jump), LEAST_TEAR * discontinuity_px, discontinuity_px)
+    least = np.clip(ABOVE_NOISE * np.median(jump), LEAST_SHARE * discontinuity_px, discontinuity_px)
     surface = connected_labels(jump < least, seg)
     n, (i, k) = len(seg), seg.pairs.T
     while True:

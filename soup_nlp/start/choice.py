@@ -157,8 +157,8 @@ def smooth_choice(cost: Float, near: Float, seg: Segmentation, price: float) -> 
     return solve_trws(cost, seg.pairs, tables, max_iter=50).labels
 
 
-def hanging_together(jump: Float, o: SeededStart) -> Float:
-    """(P,) how much two neighbours belong together, from 1 where their flow does not jump to 0.
+def flow_affinity(jump: Float, o: SeededStart) -> Float:
+    """(P,) affinity of two neighbours: 1 where their flow is continuous, towards 0 where it jumps.
 
     Args:
         jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
@@ -221,7 +221,7 @@ class Choice:
 def of_neighbourhoods(
     views: Views, seg: Segmentation, choice: Choice, noise: float, o: SeededStart
 ) -> Choice:
-    """Motions of every superpixel's own neighbourhood and of its neighbours', where they pay.
+    """Motions of every superpixel's own neighbourhood and its neighbours', where they fit better.
 
     Args:
         views: Rays, targets and confidence of every superpixel.

@@ -33,7 +33,7 @@ STANDS = 1.35
 """Inverse depth over that of the ground from which on a superpixel stands above it: superpixels on
 an outline hold some of both sides."""
 WHOLE = 1.15
-"""Ratio of depths on a boundary up to which both sides hang together."""
+"""Ratio of depths on a boundary up to which both sides are one surface."""
 FLOATS, GAP = 1.25, 1.1
 """By how much the ground, and what is seen below the region, are farther than its lower border."""
 FEWEST, MOST_AREA = 3, 0.15
@@ -96,7 +96,7 @@ def above_ground(
     component: Int,
     floor: Float,
 ) -> tuple[Soup, NDArray[np.bool_]]:
-    """The soup with what is not known well, or moves by itself, lifted to the ground.
+    """The soup with what is not known well, or moves independently, lifted to the ground.
 
     A component that lies below with most of its area becomes nearer as a whole, with its
     translation. Other superpixels of the scene itself keep their translation, which they share.
@@ -138,8 +138,8 @@ def floating(
 ) -> list[tuple[NDArray[np.bool_], float]]:
     """Regions that float above the ground: (N,) superpixels of each, and how much farther it is.
 
-    A region stands above the ground, hangs together in depth, and is in front of most that is
-    around it. It floats where the ground is seen along its lower border, clearly farther.
+    A region stands above the ground, is continuous in depth, and is in front of most of its
+    surroundings. It floats where the ground is seen along its lower border, clearly farther.
 
     Args:
         soup: Start, its components scaled.

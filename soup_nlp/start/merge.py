@@ -1,8 +1,8 @@
-"""One motion for every component: what moves by itself and hangs together is rigid where it can be.
+"""Each independently moving, connected region gets one rigid motion if one fits.
 
-Few pixels leave a motion undetermined, so that several explain the flow of a small component as
-well, the camera's among them, each with depths of its own. Superpixels that choose by themselves
-tear it. The flow says better what belongs together: it jumps along a component's outline.
+A few pixels do not determine a motion: several motions, the camera's among them, explain the flow
+of a small region equally well, each with other depths. If its superpixels choose independently,
+the region falls apart. The flow shows the regions better: it is discontinuous along their outlines.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.start.choice import CLIP, Choice, hanging_together, least_gain, smooth_choice
+from soup_nlp.start.choice import CLIP, Choice, flow_affinity, least_gain, smooth_choice
 from soup_nlp.start.components import connected_labels
 from soup_nlp.start.epipolar import Motion, estimate
 from soup_nlp.start.neighbourhoods import fit_translation, refine_motion
@@ -25,16 +25,15 @@ PIXELS = 1500
 """A motion is fitted to at most this many pixels of a component."""
 AGREE = 0.7
 """Share of a component's superpixels that its motion has to explain."""
-TEARS = (1.0, 0.5, 0.25)
-"""Jumps of the flow that part two components, relative to the one that ends a surface; the smaller
-ones where no motion explains what hangs together by the larger ones."""
+DISCONTINUITIES = (1.0, 0.5, 0.25)
+"""Flow discontinuities that separate two regions, relative to `discontinuity_px`. A smaller one is
+tried where no single motion explains the regions that a larger one leaves."""
 
 
 def gather(
     views: Views, seg: Segmentation, jump: Float, choice: Choice, noise: float, o: SeededStart
 ) -> Choice:
-    """Components take one motion each, and then all superpixels that it explains and that hang on
-    them.
+    """Each region takes one motion, and then the neighbouring superpixels that it explains.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
@@ -50,9 +49,9 @@ def gather(
     if not (choice.label >= 0).any():
         return choice
     gain = least_gain(noise, o)
-    for tear in TEARS:
+    for share in DISCONTINUITIES:
         choice = _one_motion_each(
-            views, seg, jump < tear * o.discontinuity_px, choice, noise, gain, o
+            views, seg, jump < share * o.discontinuity_px, choice, noise, gain, o
         )
     return _spread(views, seg, jump, choice, gain, o)
 
@@ -130,10 +129,10 @@ def _candidates(
 def _spread(
     views: Views, seg: Segmentation, jump: Float, choice: Choice, gain: float, o: SeededStart
 ) -> Choice:
-    """Superpixels choose among the motions of whole components, alike where the flow does not jump.
+    """Superpixels choose among the motions of whole regions, the same where the flow is continuous.
 
-    Those with a motion of their own may keep it. Whole pieces change together, which is why this
-    needs a solver: half of a component may have taken the camera's motion.
+    Those with a motion of their own may keep it. TRW-S solves this, because many superpixels have
+    to change together: half of a region may have taken the camera's motion.
     """
     label = choice.label
     count = np.bincount(label[label >= 0])
@@ -149,8 +148,8 @@ def _spread(
     cost = np.minimum(fit.penalised(), CLIP)
     cost[:, 0] -= 0.5 * o.unexplained_px
     stay = np.where(np.isin(label, kept), np.inf, np.minimum(choice.error, CLIP) + 0.5 * gain)
-    # motions of whole components are worth more trust than those of pieces: twice the price
-    near = hanging_together(jump, o)
+    # motions of whole regions are more reliable than those of pieces: twice the price
+    near = flow_affinity(jump, o)
     new = smooth_choice(np.column_stack([cost, stay]), near, seg, 2 * o.smoothness)
     numbers = np.append(kept, -1)[new]
     at = np.flatnonzero((new < m) & (numbers != label))

@@ -18,8 +18,8 @@ from soup_nlp.start.bending import bending_share, constant_depth, flow_jump, sur
 from soup_nlp.start.choice import (
     Choice,
     dominant,
+    flow_affinity,
     flow_noise,
-    hanging_together,
     of_neighbourhoods,
     of_pieces,
     select,
@@ -58,8 +58,8 @@ class Start:
         component: (N,) group that seems to move as one and shares one scale: a dominant motion, or
             a connected piece of superpixels with motions of their own.
         motions: The dominant motions.
-        surface: (N,) group that hangs together: the flow does not tear inside it; where surfaces
-            bend it mostly tears along the outline.
+        surface: (N,) connected group within which the flow has no discontinuity; where surfaces
+            bend, the flow is discontinuous along most of its outline.
         tie: (N,) what gives the component of every superpixel its scale, an index of `TIES`.
         bending_share: Share of the superpixels that move otherwise than most of their surface.
         bending: Whether surfaces are taken to bend: all are one component at a constant depth.
@@ -126,7 +126,7 @@ def propose(
     jump = flow_jump(views, seg.pairs, rays(K_ref, seg.boundary))
     # beyond 5 pixels one motion is as wrong as another
     cost = np.minimum(cost + prefer, 5.0)
-    label = smooth_choice(cost, hanging_together(jump, o), seg, o.smoothness)
+    label = smooth_choice(cost, flow_affinity(jump, o), seg, o.smoothness)
     R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
     choice = Choice(R, t, fit.pick((np.arange(len(seg)), label)), label)
     choice = of_neighbourhoods(views, seg, choice, noise, o)
