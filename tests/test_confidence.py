@@ -259,6 +259,7 @@ def test_a_superpixel_that_nothing_holds_has_the_sigma_of_the_prior(small_room):
     assert sure_of(small_room).sigma[own].mean() < 0.9 * SIGMA_PRIOR
 
 
+@pytest.mark.slow
 def test_the_background_of_a_camera_at_rest_is_a_guess(small_room):
     scene = {"kind": "scene", "scene": "still", "width": 256, "height": 128}
     still = prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))

@@ -97,6 +97,7 @@ def test_a_component_behind_the_camera_takes_the_motion_of_its_first_superpixel(
     assert np.isnan(found[1].residual_px)
 
 
+@pytest.mark.slow
 def test_the_near_car_of_a_street_is_a_component():
     scene = {"kind": "scene", "scene": "street", "seed": 0, "width": 384, "height": 164}
     raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 150}}

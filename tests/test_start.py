@@ -311,6 +311,7 @@ def test_a_single_plane_is_finite():
     assert np.median(start.error) < 0.05
 
 
+@pytest.mark.slow
 def test_random_flow_is_finite(corner):
     _, seg, _ = corner
     uv = np.random.default_rng(99).normal(0, 30, (HEIGHT, WIDTH, 2))

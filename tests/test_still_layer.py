@@ -59,6 +59,7 @@ def test_what_stands_still_leaves_the_images():
         assert 0.5 * given.std() < image.std() < given.std()
 
 
+@pytest.mark.slow
 def test_the_road_moves_behind_a_reflection(reflecting: Pair):
     given = with_flow(reflecting, still=True)
     seen = see_through(given)
@@ -82,6 +83,7 @@ def test_images_without_a_layer_are_left_alone(street: Pair):
     assert see_through(with_flow(street, still=False)) is None
 
 
+@pytest.mark.slow
 def test_true_flow_is_believed(reflecting: Pair):
     """The correction is for flow that was computed, and can be turned off."""
     small = {"input": {"kind": "memory", "hash": "0"}, "segmentation": {"superpixels": 60}}
