@@ -232,3 +232,18 @@ def test_the_delivered_answer_is_ipopt_s(folder):
         assert file.attrs["delivered"] == b"constrained NLP"
         file["answer/n"][0] = file["answer/n"][1]
     assert "nlp is Ipopt's answer" in bad(check_folder(folder))
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["depth/sigma_ref", "iterations/00_presolve_0.3/obj", "truth/flow", "@name", "@machine"],
+)
+def test_contents_of_the_arrays_are_as_written(place, folder):
+    """What HDF5 itself changes has right checksums."""
+    with h5py.File(folder / "result.h5", "a") as file:
+        if place.startswith("@"):
+            file.attrs[place[1:]] = "other"
+        else:
+            first = (0,) * file[place].ndim
+            file[place][first] += 1e-3
+    assert "contents of result.h5 as written" in bad(check_folder(folder))

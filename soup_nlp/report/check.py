@@ -19,7 +19,7 @@ from soup_nlp.report.claim import ABSOLUTE, HASHED, RECOMPUTED, RELATIVE, Claim,
 from soup_nlp.solve.kkt import LIMITS
 from soup_nlp.storage.files import as_path, parse_yaml, read_json, read_text
 from soup_nlp.storage.folders import recover
-from soup_nlp.storage.h5_files import read_attrs, read_h5
+from soup_nlp.storage.h5_files import DIGEST, read_attrs, read_digest, read_h5
 from soup_nlp.storage.store import require
 
 Entries: TypeAlias = Mapping[str, Any]
@@ -30,8 +30,7 @@ ROUNDINGS = 16
 """Error of a pixel coordinate after projection into both frames, in units of machine precision."""
 LEFT = (
     "dual infeasibility and complementarity, which need the model's derivatives",
-    "times, versions, the wording of logs, colours of pictures and points (as written only)",
-    "images, flow, labels, truth and multipliers are taken as they are stored",
+    "images, flow, labels, truth, multipliers, times, logs, colours (as written only)",
 )
 """What nothing recomputes."""
 
@@ -97,8 +96,8 @@ def check_folder(folder: str | Path, images: Images | None = None) -> CheckRepor
 
 def _require_images(images: object) -> None:
     """Raise DataError unless these are two images."""
-    good = isinstance(images, list | tuple) and len(images) == 2
-    if not good or any(getattr(image, "dtype", None) != np.uint8 for image in images):  # type: ignore[attr-defined]
+    two = images if isinstance(images, list | tuple) and len(images) == 2 else (None,)
+    if any(getattr(image, "dtype", None) != np.uint8 for image in two):
         raise DataError(
             "images are of another kind",
             found=printable(repr_of(images), 60),
@@ -137,6 +136,10 @@ def _rows(
     yield from _depths(tree)
     yield from _metrics(tree, claims["metrics"])
     yield from file_claims(folder, claims, tree)
+    # results of earlier versions have none
+    if DIGEST in attrs:
+        good = attrs[DIGEST] == read_digest(folder / "result.h5")
+        yield Claim("contents of result.h5 as written", 1.0, float(good), 0.0, good, how=HASHED)
 
 
 def _weights(tree: Entries, form: Entries, weights: Mapping[str, float]) -> Iterator[Claim]:

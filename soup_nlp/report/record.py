@@ -10,12 +10,9 @@ from typing import Any
 import numpy as np
 
 from soup_nlp.storage.folders import staged
-from soup_nlp.storage.h5_files import read_h5
+from soup_nlp.storage.h5_files import RECORD, read_h5
 from soup_nlp.storage.mark import digest_of, files_in
 from soup_nlp.storage.store import Array, Tree, replace_group
-
-RECORD = "record"
-"""Group of result.h5."""
 
 
 def record_of(folder: Path) -> Tree:

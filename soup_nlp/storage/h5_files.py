@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeAlias
@@ -16,6 +17,10 @@ from soup_nlp.storage.memory import require_memory
 ReadTree: TypeAlias = dict[str, Any]
 """Nested dict of numpy arrays, as `read_h5` returns it."""
 
+RECORD = "record"
+"""Group of the hashes of other files; `convert` renews it, so `contents_digest` leaves it out."""
+DIGEST = "contents_sha256"
+"""Root attribute with that digest."""
 DEEPEST = 16
 """Levels of groups."""
 BROKEN = (OSError, RuntimeError, KeyError, TypeError, ValueError, AttributeError)
@@ -103,6 +108,35 @@ def read_attrs(path: PathLike) -> dict[str, Any]:
         if isinstance(out.get("versions"), str):
             out["versions"] = parse_json(out["versions"])
     return out
+
+
+def contents_digest(file: h5py.File) -> str:
+    """SHA-256 of all arrays and attributes of an open result, however they are stored."""
+    seen = {h5py.h5o.get_info(file["/"].id).addr}
+    items = [(n, i) for n, i in _items(file, "", seen, file.filename) if n.split("/")[0] != RECORD]
+    sha = hashlib.sha256()
+
+    def add(name: str, given: Any) -> None:
+        value = np.asarray(given)
+        sha.update(f"{name}\0{value.dtype.str}\0{value.shape}\0".encode(errors="surrogateescape"))
+        sha.update(repr(value.tolist()).encode() if value.dtype == object else value.tobytes())
+
+    for name, item in sorted([("", file), *items], key=lambda pair: pair[0]):
+        for key in sorted(item.attrs):
+            if (name, key) != ("", DIGEST):
+                add(f"{name}@{key}", item.attrs[key])
+        add(name, item[()] if isinstance(item, h5py.Dataset) else 0)
+    return sha.hexdigest()
+
+
+def read_digest(path: PathLike) -> str:
+    """The digest of a result file as it is now, see `contents_digest`.
+
+    Raises:
+        DataError: as of `read_h5`, which is called first to look at the sizes.
+    """
+    with _opened(path) as file:
+        return contents_digest(file)
 
 
 @contextmanager

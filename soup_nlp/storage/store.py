@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from soup_nlp.errors import DataError
 from soup_nlp.storage.atomic import PathLike, write_bytes, write_text
 from soup_nlp.storage.files import read_bytes
+from soup_nlp.storage.h5_files import DIGEST, contents_digest
 from soup_nlp.storage.versions import versions
 
 SCHEMA = 1
@@ -58,7 +59,7 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
 
     Each array becomes a dataset with the attributes `units`, `description` and `shape_letters`;
     each mapping a group. The root gets `attrs` (None is left out; what HDF5 cannot hold is stored
-    as JSON text) plus `schema`, `versions` (JSON text) and `machine`.
+    as JSON text) plus `schema`, `versions` (JSON text), `machine` and a digest of all of it.
 
     Args:
         path: File to write; its folder must exist.
@@ -77,6 +78,7 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
                 if value is not None:
                     _write_attribute(file, key, value)
             _write_group(file, tree)
+            _write_attribute(file, DIGEST, contents_digest(file))
     except (OSError, TypeError, ValueError, RuntimeError) as error:
         raise DataError("cannot write the HDF5 file", where=path, found=error) from error
     write_bytes(path, image.getvalue())
