@@ -22,8 +22,6 @@ from soup_nlp.storage.store import require
 Entries: TypeAlias = Mapping[str, Any]
 Float = NDArray[np.float64]
 
-VALUES = ("energy", "residuals", "nlp_residuals", "answer_residuals", "metrics")
-"""Entries of summary.json whose values are recomputed; of these only the keys are compared."""
 COLUMNS = ("x", "y", "z", "nx", "ny", "nz")
 """First properties of a cloud."""
 ULPS = 4 * 2.0**-24
@@ -133,7 +131,7 @@ def _read_ply(path: Path) -> NDArray[np.float32] | None:
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     count = [line[2] for line in lines if line[:2] == ["element", "vertex"]]
     floats = [line[2] for line in lines if line[:2] == ["property", "float"] and len(line) == 3]
-    if not end or len(count) != 1 or not count[0].isdigit() or floats[:6] != list(COLUMNS):
+    if not end or len(count) != 1 or not count[0].isdecimal() or floats[:6] != list(COLUMNS):
         return None
     kind = np.dtype([("floats", "<f4", (len(floats),)), ("colour", "u1", (3,))])
     size = len(head) + len(end)
@@ -143,18 +141,13 @@ def _read_ply(path: Path) -> NDArray[np.float32] | None:
 
 
 def _entries(claims: Entries, tree: Entries) -> Claim:
-    """What summary.json says beside what is recomputed is as it was written."""
-    name = "other entries of summary.json"
+    """What summary.json says, recomputed or not, is as it was written."""
+    name = "entries of summary.json"
     if "summary" not in tree.get(RECORD, {}):
         return Claim(name, 0, np.nan, 0, False, how=HASHED, note="result.h5 has no record of them")
     written, now = (_leaves(x) for x in (json.loads(str(tree[RECORD]["summary"])), claims))
-    changed = [
-        key
-        for key in sorted(written.keys() | now.keys())
-        if key not in written
-        or key not in now
-        or (key[0] not in VALUES and written[key] != now[key])
-    ]
+    every = sorted(written.keys() | now.keys())
+    changed = [k for k in every if k not in written or k not in now or written[k] != now[k]]
     told = ", ".join(".".join(key) for key in changed[:3]) + (", ..." if len(changed) > 3 else "")
     note = f"{told}: not as written" if changed else ""
     return Claim(name, 0, len(changed), 0, not changed, how=HASHED, note=note)
