@@ -150,10 +150,10 @@ from soup_nlp.family.frozen import read_frozen
 from soup_nlp.family.instances import STARTS, build_instance, case_of
 record = read_frozen(Path(sys.argv[1]))
 case = case_of(record)
-for form in ("unit-offset/smooth/smooth", "unit-translation/epigraph/lifted"):
-    for start in (*STARTS, "best"):
-        nlp = build_instance(case, record, form, start)[0]
-        print(write_nl(sys.argv[2], nlp).sha256)
+chosen = [("unit-offset/smooth/smooth", start) for start in (*STARTS, "best")]
+for form, start in [*chosen, ("unit-translation/epigraph/lifted", STARTS[0])]:
+    nlp = build_instance(case, record, form, start)[0]
+    print(write_nl(sys.argv[2], nlp).sha256)
 """
 
 
@@ -175,8 +175,8 @@ def test_two_processors_make_the_same_bytes(record, tmp_path):
             check=True,
         ).stdout.split()
     # the record's best point is its proposal, so that easy and hard are one here
-    assert len(made["new"]) == 8
-    assert len(set(made["new"])) == 6
+    assert len(made["new"]) == 5
+    assert len(set(made["new"])) == 4
     assert made["new"] == made["old"]
 
 
