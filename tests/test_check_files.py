@@ -151,7 +151,8 @@ def test_a_forged_entry_is_recomputed(key, folder, pair):
     "place",
     ["versions numpy", "seconds nlp", "start motions", "sizes equalities", "refinement status",
      "flow", "name", "expected", "metrics", "metrics start", "metrics solution mre", "refinement",
-     "sizes hessian_nonzeros", "depth_png_scale next"],
+     "sizes hessian_nonzeros", "depth_png_scale next", "answer_residuals positive",
+     "residuals dual_infeasibility"],
 )  # fmt: skip
 @pytest.mark.parametrize("how", ["changed", "removed"])
 def test_entries_are_as_written(how, place, folder):
