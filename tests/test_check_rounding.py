@@ -51,4 +51,6 @@ def test_an_energy_of_rounding_size_passes_the_check(run, tmp_path):
     for off, expected in ((3e-11, []), (1e-7, ["energy solution proj"])):
         claims["energy"]["solution"]["proj"] += off
         path.write_text(json.dumps(claims))
-        assert [row.name for row in check_folder(tmp_path).rows if not row.ok] == expected
+        wrong = [row.name for row in check_folder(tmp_path).rows if not row.ok]
+        # whatever is changed in the file differs from its copy in result.h5
+        assert [name for name in wrong if name != "entries of summary.json"] == expected
