@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from soup_nlp.bench.paper_measures import read_maps
@@ -30,8 +32,12 @@ SCALE_STYLES = {
     "paper": ("E, preset: paper", "#222222"),
     "defaults": ("E, defaults", "#4477aa"),
 }
+STAGES = ("#88ccee", "#44aa99", "#117733", "#ddaa33", "#882255")
+"""Colours of the stages of a solve, in their order."""
 PANELS = 12
 """Most panels of the figure of scales."""
+HIGHEST = 1.0
+"""MRE at which bars are cut: beyond it no depth is left."""
 
 
 def plot_lines(path: Path, lines: Lines, axis: str, measure: str, text: str) -> None:
@@ -56,32 +62,37 @@ def plot_lines(path: Path, lines: Lines, axis: str, measure: str, text: str) -> 
     save(picture, path)
 
 
-def _scaled(axes: Sequence[object], values: Sequence[float]) -> None:
+def _scaled(axes: Sequence[Axes], values: Sequence[float]) -> None:
     """A logarithmic axis where values differ much, else one from 0."""
     for ax in axes:
         if values and min(values) > 0 and max(values) > 20 * min(values):
-            ax.set_yscale("log")  # type: ignore[attr-defined]
+            ax.set_yscale("log")
         else:
-            ax.set_ylim(bottom=0)  # type: ignore[attr-defined]
+            ax.set_ylim(bottom=0)
 
 
 def plot_comparison(path: Path, bars: Mapping[str, Mapping[str, Number]], text: str) -> None:
-    """Groups of bars: MRE by method for every dataset."""
+    """Groups of bars: MRE by method for every dataset; what is above the axis has its number."""
     names = list(dict.fromkeys(m for own in bars.values() for m in own))
-    picture = figure(max(6.0, 1.3 * len(bars) + 2), 3.8)
+    picture = figure(max(6.0, 1.5 * len(bars) + 1), 4.2)
     ax = picture.add_subplot()
-    width = 0.8 / max(1, len(names))
-    values = []
+    width = 0.84 / max(1, len(names))
     for k, name in enumerate(names):
-        y = [own.get(name) for own in bars.values()]
         x = np.arange(len(bars)) + (k - (len(names) - 1) / 2) * width
-        height = [np.nan if v is None else v for v in y]
-        values += [v for v in y if v is not None]
-        ax.bar(x, height, width, label=name, color=COLOURS.get(name))
-    _scaled([ax], values)
+        for place, value in zip(x, (own.get(name) for own in bars.values()), strict=True):
+            if value is None:
+                continue
+            height = min(value, HIGHEST)
+            ax.bar(place, height, width, color=COLOURS.get(name))
+            form = ".3f" if value < HIGHEST else ".3g"
+            style = {"ha": "center", "va": "bottom", "size": 6, "rotation": 90}
+            ax.text(place, height + 0.01 * HIGHEST, format(value, form), **style)
+        ax.bar([], [], color=COLOURS.get(name), label=name)
+    ax.set_ylim(0, 1.12 * HIGHEST)
+    ax.axhline(HIGHEST, color="k", lw=0.6, ls=":")
     ax.set_xticks(np.arange(len(bars)), list(bars), rotation=15, size=8)
-    ax.set(ylabel="MRE, one median scale, no cap")
-    ax.legend(fontsize=7)
+    ax.set(ylabel=f"MRE, one median scale; bars end at {HIGHEST:g}")
+    picture.legend(loc="outside lower center", ncols=len(names), fontsize=7)
     ax.set_title(text, fontsize=10)
     save(picture, path)
 
@@ -90,37 +101,47 @@ def plot_curves(path: Path, curves: Mapping[str, Mapping[str, Row]]) -> None:
     """Energies over iterations and rounds: a line of panels a pair, solver and rounds by method."""
     pairs = list(curves)
     methods = list(dict.fromkeys(m for own in curves.values() for m in own))
-    picture = figure(2.4 * 2 * len(methods), 2.1 * max(1, len(pairs)) + 0.5)
-    axes = picture.subplots(max(1, len(pairs)), 2 * len(methods), squeeze=False)
+    picture = figure(2.6 * 2 * max(1, len(methods)), 2.1 * max(1, len(pairs)) + 0.7)
+    axes = picture.subplots(max(1, len(pairs)), 2 * max(1, len(methods)), squeeze=False)
     for ax in axes.flat:
         ax.set_axis_off()
+    stages: dict[str, Any] = {}
     for k, pair in enumerate(pairs):
         for m, (method, row) in enumerate(curves[pair].items()):
             left, right = axes[k, 2 * m], axes[k, 2 * m + 1]
-            _stages(left, row)
-            rounds = row["rounds"]
+            stages |= _stages(left, row)
+            rounds = np.asarray(row["rounds"], np.float64)
             right.set_axis_on()
-            right.plot(np.arange(len(rounds)), rounds, "o-", color=COLOURS.get(method), ms=4)
+            if rounds.size and rounds[0]:
+                percent = 100 * (rounds / rounds[0] - 1)
+                right.plot(np.arange(len(rounds)), percent, "o-", color=COLOURS.get(method), ms=4)
+                right.set_ylim(top=0.05 * max(1e-3, -percent.min()))
             left.set_title(f"{pair}\n{method}: solver", fontsize=7)
-            right.set_title("refinement, exact", fontsize=7)
+            right.set_title("refinement, exact objective", fontsize=7)
+            right.set_ylabel("% of its begin", fontsize=7)
             for ax, label in ((left, "iteration"), (right, "round")):
                 ax.tick_params(which="both", labelsize=6)
+                ax.ticklabel_format(axis="x", useOffset=False)
                 ax.set_xlabel(label, fontsize=7)
                 ax.grid(alpha=0.3)
+    picture.legend(stages.values(), stages, loc="outside lower center", ncols=5, fontsize=7)
     save(picture, path)
 
 
-def _stages(ax: object, row: Row) -> None:
-    """The smoothed energy of every stage, one after the other; the start far above is cut off."""
-    begin, ends = 0, []
-    ax.set_axis_on()  # type: ignore[attr-defined]
+def _stages(ax: Axes, row: Row) -> dict[str, Any]:
+    """The smoothed energy of every stage, one after the other; its lines by name."""
+    begin, lines = 0, {}
+    ax.set_axis_on()
     for stage in row["stages"]:
         y = np.asarray(stage["objective"], np.float64)
         x = begin + np.arange(len(y))
-        ax.semilogy(x, np.maximum(y, 1e-12), "-", lw=1.3)  # type: ignore[attr-defined]
+        colour = STAGES[min(len(lines), len(STAGES) - 1)]
+        (lines[stage["name"]],) = ax.semilogy(x, np.maximum(y, 1e-12), "-", lw=1.3, color=colour)
+        if len(y) == 1:
+            ax.plot(x, y, ".", ms=4, color=colour)
         begin += len(y)
-        ends.append(y)
-    ax.set_ylabel("E, smoothed", fontsize=7)  # type: ignore[attr-defined]
+    ax.set_ylabel("E, smoothed", fontsize=7)
+    return lines
 
 
 def plot_bars(path: Path, table: Mapping[str, Mapping[str, Number]], text: str, label: str) -> None:
@@ -165,6 +186,8 @@ def plot_scale(path: Path, bodies: Mapping[str, Mapping[str, Sequence[float]]]) 
         ax.minorticks_off()
         ax.set_title(name, fontsize=7)
         ax.tick_params(labelsize=6)
+    picture.supxlabel("scale of the body; 1 is the truth", fontsize=8)
+    picture.supylabel("energy, from its lowest to its highest value", fontsize=8)
     handles, labels = axes.flat[0].get_legend_handles_labels()
     picture.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=7)
     picture.suptitle("Energy over the scale of one moving body about the truth", fontsize=10)
@@ -195,6 +218,7 @@ def plot_maps(path: Path, files: Mapping[str, tuple[Path, Path]]) -> None:
                 continue
             z = np.asarray(depth, np.float64)
             ax.imshow(np.log(_scaled_to(z, known)), cmap="viridis", vmin=low, vmax=high)
+    picture.suptitle("Depth: dark is near, bright is far; one logarithmic scale a line", fontsize=8)
     save(picture, path)
 
 

@@ -29,6 +29,7 @@ from soup_nlp.bench.rows import Row, failed
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import failures, get, joined, made, mean, show, table
 from soup_nlp.evaluate.protocols import preset
+from soup_nlp.solve.ipopt import GOOD
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import staged
 
@@ -187,14 +188,23 @@ def _by_pair(r: Results) -> list[str]:
             row = r.row(cell)
             median = get(row, "paper", "solution", "median_relative")
             start, nlp = r.mre(cell, "paper", "start"), r.mre(cell, "paper", "nlp")
-            cells += [show(start), show(nlp), show(r.mre(cell)), show(median)]
+            cells += [show(start), show(nlp), show(r.mre(cell)), show(median), _ended(row)]
         cells.append(show(r.mre(cell, "paper", "constant")))
         entries.append(cells)
     head = ["pair"]
     for method in METHODS:
-        head += [f"{method}: start", "NLP", "refined", "its median error"]
-    note = "Every pair, MRE after median scale, no cap (the last column of a method: median error):"
+        head += [f"{method}: start", "NLP", "refined", "its median error", "converged"]
+    note = (
+        "Every pair, MRE after median scale, no cap; the median error of the refined depth; whether"
+        " the constrained NLP reached its tolerance:"
+    )
     return [note, "", *table([*head, "constant depth"], entries), ""]
+
+
+def _ended(row: Row) -> str:
+    """Whether the NLP converged, or how it ended."""
+    status = str(row.get("status", "-"))
+    return "yes" if status in GOOD else status.replace("_", " ").lower()
 
 
 def _pictures(out: Path, r: Results, stored: Path) -> list[str]:
