@@ -130,6 +130,8 @@ def test_a_tiny_dataset_gives_all_sections(dataset, tmp_path, monkeypatch, capsy
     assert all(f"]({name}.png)" in text for name in pictures)
     # the pair with a truth alone, beside the published row
     assert "| kinect_paper | 0.2040 | 0.0920 | 0.0322 | 0.0520 | - | 0.0472 | 1 | 0.5000 |" in text
+    # how each NLP ended stands beside its numbers
+    assert "| 0.5000 | 0.2500 | yes |" in text
     # datasets that are not there say where they come from
     missing = text[text.index("## What is not here") :]
     for d in DATASETS:
