@@ -204,7 +204,7 @@ def test_an_instance_has_the_published_bytes(scene, tmp_path):
 
 def test_the_index_says_what_problem_sets_say(folder):
     index = json.loads((folder / "index.json").read_text())
-    assert (index["set"], index["version"]) == ("SOUP", 1)
+    assert (index["set"], index["version"]) == ("SOUP", 2)
     entries = {e["name"]: e for e in index["instances"]}
     easy = entries["SOUP-room-unit-offset-smooth-smooth-N100-easy"]
     n = easy["superpixels"]
