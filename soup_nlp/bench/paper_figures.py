@@ -85,8 +85,8 @@ def plot_comparison(path: Path, bars: Mapping[str, Mapping[str, Number]], text: 
             height = min(value, HIGHEST)
             ax.bar(place, height, width, color=COLOURS.get(name))
             form = ".3f" if value < HIGHEST else ".3g"
-            style = {"ha": "center", "va": "bottom", "size": 6, "rotation": 90}
-            ax.text(place, height + 0.01 * HIGHEST, format(value, form), **style)
+            at = height + 0.01 * HIGHEST
+            ax.text(place, at, format(value, form), ha="center", va="bottom", size=6, rotation=90)
         ax.bar([], [], color=COLOURS.get(name), label=name)
     ax.set_ylim(0, 1.12 * HIGHEST)
     ax.axhline(HIGHEST, color="k", lw=0.6, ls=":")
@@ -130,7 +130,8 @@ def plot_curves(path: Path, curves: Mapping[str, Mapping[str, Row]]) -> None:
 
 def _stages(ax: Axes, row: Row) -> dict[str, Any]:
     """The smoothed energy of every stage, one after the other; its lines by name."""
-    begin, lines = 0, {}
+    begin = 0
+    lines: dict[str, Any] = {}
     ax.set_axis_on()
     for stage in row["stages"]:
         y = np.asarray(stage["objective"], np.float64)
