@@ -244,7 +244,7 @@ def sure_of(case, data=None, weights=None):
     K = case.pair.K_ref, case.pair.K_next
     rec = reconstruct(case.soup, case.segmentation.labels, *K)
     energy = data or case.data, weights or case.weights, FORM
-    return confidence(rec, case.pair.flow, K[0], case.start, *energy)
+    return confidence(rec, case.pair, case.start, *energy)
 
 
 def test_a_superpixel_that_nothing_holds_has_the_sigma_of_the_prior(small_room):
@@ -291,6 +291,18 @@ def test_where_surfaces_bend_a_misfit_counts_in_full_and_the_spread_by_its_root(
     assert calibrated(spread, 0.6, misfit, prior=np.inf, bending=True) == base
     assert calibrated(spread, 0.1, 0.0, bending=True)[0] > 0
     assert calibrated(np.array([np.inf]), 0.1, bending=True)[0] == pytest.approx(SIGMA_PRIOR)
+
+
+def test_where_surfaces_bend_before_a_camera_at_rest_everything_is_a_guess(small_room):
+    bends = replace(small_room, start=replace(small_room.start, bending=True))
+    assert sure_of(bends).least == 0.0
+    # a third of the superpixels stands still
+    still = np.arange(len(bends.soup)) % 3 == 0
+    R = np.where(still[:, None, None], np.eye(3), bends.soup.R)
+    t = np.where(still[:, None], 0.0, bends.soup.t)
+    rests = replace(bends, soup=replace(bends.soup, R=R, t=t))
+    assert sure_of(rests).least == SIGMA_PRIOR
+    assert sure_of(rests).sigma.min() > MOST_SIGMA
 
 
 def test_an_energy_that_sees_no_plane_leaves_everything_a_guess(small_room):

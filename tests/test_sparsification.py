@@ -80,6 +80,7 @@ def row(family: str, pair: str, scale: float, bending: bool = False) -> dict:
             "guess": 0.1,
             "noise": 0.1,
             "bending": bending,
+            "least": 0.0,
             "seconds": 0.5,
             "curve": [[1.0, 0.5], [0.05, 0.02], [0.05, 0.01]],
             "sample": [

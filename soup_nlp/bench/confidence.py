@@ -78,7 +78,7 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
     assert result.pair.flow is not None
     energy = result.data, result.weights, result.problem.formulation
     rec = result.reconstruction
-    confidence(rec, result.pair.flow, result.pair.K_ref, result.start, *energy)
+    confidence(rec, result.pair, result.start, *energy)
     seconds = time.process_time() - begin
     z, gt = at_truth(truth, rec.depth_ref)
     true = true_pixels(gt, None) & np.isfinite(z)
@@ -108,6 +108,7 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
             "guess": sure.guessed,
             "noise": sure.noise,
             "bending": sure.bending,
+            "least": sure.least,
             "seconds": seconds,
             "curve": [own.kept.tolist(), own.error.tolist(), own.oracle.tolist()],
             "sample": np.stack([log[picked], unit[picked]]).round(6).tolist(),
@@ -153,17 +154,19 @@ def left_out(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
 
     Pairs whose surfaces bend have a factor of their own, chosen on such pairs.
     """
-    samples = [(r["sequence"], r["confidence"]["bending"], r["confidence"]["sample"]) for r in rows]
+    keys = ("bending", "sample", "least")
+    samples = [(r["sequence"], *(r["confidence"][k] for k in keys)) for r in rows]
     told: dict[str, list[tuple[float, float, float]]] = {}
-    for family, bends, own in samples:
-        others = [np.array(s) for name, b, s in samples if name != family and b == bends]
+    for family, bends, own, least in samples:
+        others = [np.array(s) for name, b, s, _ in samples if name != family and b == bends]
         if not others:
             continue
         # every pair counts alike
         ratio = np.concatenate([np.quantile(e / u, np.linspace(0, 1, 101)) for e, u in others])
         factor = float(np.quantile(ratio, WITHIN))
         log, unit = np.array(own)
-        one, two = coverage(log, factor * unit / np.hypot(1, factor * unit / SIGMA_PRIOR))
+        sigma = np.hypot(factor * unit, least)
+        one, two = coverage(log, sigma / np.hypot(1, sigma / SIGMA_PRIOR))
         told.setdefault(family, []).append((factor, one, two))
     mean_of = {name: np.mean(several, axis=0) for name, several in told.items()}
     return {name: (float(f), float(one), float(two)) for name, (f, one, two) in mean_of.items()}

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from soup_nlp.data.pair import Flow
+from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import ModelError
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.soup import Reconstruction, Soup
@@ -174,6 +174,9 @@ FACTOR, POWER = 7.0, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
 BENDING_FACTOR = 2.0
 """sigma = BENDING_FACTOR misfit sqrt(spread) where surfaces bend."""
+STANDS_STILL_PX, MOST_STILL = 0.3, 0.25
+"""Parallax of a superpixel that stands still, pixels, and the share of such superpixels from which
+the camera rests, where surfaces bend."""
 MOST_MISFIT = 5.0
 """Pixels beyond which a flow that the answer contradicts is as wrong as any."""
 LARGEST = 1e6
@@ -194,6 +197,7 @@ class Confidence:
         marginals: Of the planes and of the components' scales.
         noise: Of the flow, pixels, see `flow_noise`.
         bending: Whether surfaces are taken to bend.
+        least: Standard deviation that is added everywhere: of a camera at rest (`camera_rests`).
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
     """
 
@@ -202,6 +206,7 @@ class Confidence:
     marginals: Marginals
     noise: float
     bending: bool
+    least: float
     misfit: Float
 
     @property
@@ -229,6 +234,16 @@ def without_parallax(start: Start) -> NDArray[np.bool_]:
     return np.asarray(start.borrowed & most)
 
 
+def camera_rests(start: Start, soup: Soup, anchor_ray: Float, K_next: Float) -> bool:
+    """Whether surfaces bend and too much stands still for the camera to move.
+
+    Depths of what moves are then not tied to those of what does not.
+    """
+    focal = np.array([K_next[0, 0], K_next[1, 1]])
+    still = np.linalg.norm(soup.parallax(anchor_ray) * focal, axis=1) < STANDS_STILL_PX
+    return start.bending and float(still.mean()) > MOST_STILL
+
+
 def flow_misfit(rec: Reconstruction, flow: Flow) -> Float:
     """(N,) mean distance of a flow from the one that a reconstruction induces, pixels."""
     distance = np.linalg.norm(rec.flow - flow.uv, axis=-1)
@@ -243,6 +258,7 @@ def calibrated(
     misfit: Float | float = 0.0,
     prior: float = SIGMA_PRIOR,
     bending: bool = False,
+    least: float = 0.0,
 ) -> Float:
     """Standard deviation of log depth that errors keep to.
 
@@ -256,12 +272,13 @@ def calibrated(
             mean is the noise.
         prior: Standard deviation before looking; its information is added.
         bending: Whether surfaces are taken to bend.
+        least: Standard deviation that is added.
     """
     if bending:
         sigma = BENDING_FACTOR * np.maximum(LEAST_NOISE, misfit) * np.sqrt(spread)
     else:
         sigma = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
-    sigma = np.minimum(sigma, LARGEST)
+    sigma = np.hypot(np.minimum(sigma, LARGEST), least)
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
 
@@ -292,8 +309,7 @@ def _spread(
 
 def confidence(
     rec: Reconstruction,
-    flow: Flow,
-    K_ref: Float,
+    pair: Pair,
     start: Start,
     data: EnergyData,
     weights: Weights,
@@ -303,18 +319,18 @@ def confidence(
 
     Args:
         rec: The answer.
-        flow: Flow that it was solved with.
-        K_ref: (3, 3) intrinsics of the reference frame.
+        pair: Intrinsics, and the flow that it was solved with.
         start: Rigid components and the flow's noise.
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
         form: Visibility and whether kernels are compiled.
     """
+    assert pair.flow is not None
     weak = weights.replace(prior=PRIOR_SHARE * weights.prior)
     blind = weak.replace(proj=FLOW_SHARE * weights.proj)
     try:
         (own, seen), (without, guessed) = (
-            _spread(rec, data, w, form, start.component, K_ref) for w in (weak, blind)
+            _spread(rec, data, w, form, start.component, pair.K_ref) for w in (weak, blind)
         )
         spread = np.sqrt(learned(seen**2, guessed**2))
         spread[without_parallax(start)[rec.labels]] = np.inf
@@ -327,6 +343,8 @@ def confidence(
             np.full(int(start.component.max()) + 1, np.inf),
         )
         spread = np.full(rec.labels.shape, np.inf)
-    noise, misfit = flow_noise(start), flow_misfit(rec, flow)
-    sigma = calibrated(spread, noise, misfit[rec.labels], bending=start.bending)
-    return Confidence(sigma, spread, own, noise, start.bending, misfit)
+    noise, misfit = flow_noise(start), flow_misfit(rec, pair.flow)
+    rests = camera_rests(start, rec.soup, data.anchor_ray, pair.K_next)
+    least = SIGMA_PRIOR if rests else 0.0
+    sigma = calibrated(spread, noise, misfit[rec.labels], bending=start.bending, least=least)
+    return Confidence(sigma, spread, own, noise, start.bending, least, misfit)

@@ -100,6 +100,15 @@ class Soup:
         total = self.lam.sum()
         return Soup(self.lam / total, n, d, nearest(self.R), self.t)
 
+    def parallax(self, ray: Float) -> Float:
+        """(N, 2) by how much the translations move points seen along rays (N, 3), ray units.
+
+        It is the distance in the next image from where the rotation alone brings them.
+        """
+        far = np.einsum("nij,nj->ni", self.R, self.points(ray))
+        near = far + self.translation
+        return near[:, :2] / near[:, 2:] - far[:, :2] / far[:, 2:]
+
     def homographies(self, K_ref: Float, K_next: Float) -> Float:
         """(N, 3, 3) `K_next (R - t n^T / d) K_ref^-1`, paper Eq. 3."""
         H = self.R - self.t[:, :, None] * self.n[:, None, :] / self.d[:, None, None]

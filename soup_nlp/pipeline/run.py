@@ -329,7 +329,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     between = middle if refined is not None and solution.stages else None
     assert pair.flow is not None
     energy = case.data, case.weights, case.problem.formulation
-    sure = confidence(after, pair.flow, pair.K_ref, case.start, *energy)
+    sure = confidence(after, pair, case.start, *energy)
     after = replace(after, sigma_ref=sure.sigma)
     full = None if case.full is None else full_size(case.full, pair, after, expected)
     rigid = rigid_depth(pair) if pair.truth is not None else None

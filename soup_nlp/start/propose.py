@@ -262,10 +262,7 @@ def _fill_poor(
 
 def _parallax(soup: Soup, views: Views) -> Float:
     """(N,) pixels between where every anchor moves and where its rotation alone brings it."""
-    far = np.einsum("nij,nj->ni", soup.R, soup.points(views.anchor))
-    near = far + soup.translation
-    gap = near[:, :2] / near[:, 2:] - far[:, :2] / far[:, 2:]
-    return np.linalg.norm(gap * np.asarray(views.focal), axis=1)
+    return np.linalg.norm(soup.parallax(views.anchor) * np.asarray(views.focal), axis=1)
 
 
 def _soup(mu: Float, slope: Float, R: Float, t: Float, anchor: Float, radius: Float) -> Soup:
