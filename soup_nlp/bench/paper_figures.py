@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from soup_nlp.bench.paper_measures import read_maps
@@ -87,12 +89,12 @@ def plot_comparison(path: Path, bars: Mapping[str, Mapping[str, Number]], text: 
             form = ".3f" if value < HIGHEST else ".3g"
             at = height + 0.01 * HIGHEST
             ax.text(place, at, format(value, form), ha="center", va="bottom", size=6, rotation=90)
-        ax.bar([], [], color=COLOURS.get(name), label=name)
-    ax.set_ylim(0, 1.12 * HIGHEST)
+    ax.set_ylim(0, 1.2 * HIGHEST)
     ax.axhline(HIGHEST, color="k", lw=0.6, ls=":")
     ax.set_xticks(np.arange(len(bars)), list(bars), rotation=15, size=8)
     ax.set(ylabel=f"MRE, one median scale; bars end at {HIGHEST:g}")
-    picture.legend(loc="outside lower center", ncols=len(names), fontsize=7)
+    keys = [Patch(color=COLOURS.get(name), label=name) for name in names]
+    picture.legend(handles=keys, loc="outside lower center", ncols=len(names), fontsize=7)
     ax.set_title(text, fontsize=10)
     save(picture, path)
 
@@ -157,6 +159,9 @@ def plot_bars(path: Path, table: Mapping[str, Mapping[str, Number]], text: str, 
         x = [table[n].get(group) for n in names]
         ax.barh(y, [np.nan if v is None else v - 1 for v in x], height, left=1, label=group)
     ax.set_xscale("log")
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.xaxis.set_major_formatter(ScalarFormatter())
+    ax.xaxis.set_minor_formatter(NullFormatter())
     ax.axvline(1.0, color="k", lw=0.8)
     ax.set_yticks(np.arange(len(names)), names, size=7)
     ax.invert_yaxis()

@@ -240,9 +240,10 @@ def _section(out: Path, r: Results, name: str) -> list[str]:
                 pairs[f"{title(item)}, RMSE"] = {v: row.get("rmse") for v, row in rows.items()}
         names = list(next(iter(pairs.values()), {}))
         entries = [[pair, *(show(v) for v in own.values())] for pair, own in pairs.items()]
-        if len(pairs) > 1 and name != "flow":
-            means = [mean(own[v] for own in pairs.values()) for v in names]
-            entries.append(["mean", *(show(v) for v in means)])
+        whole = [own for own in pairs.values() if None not in own.values()]
+        if len(whole) > 1 and name != "flow":
+            means = [mean(own[v] for own in whole) for v in names]
+            entries.append([f"mean of {len(whole)}", *(show(v) for v in means)])
         lines += [
             f"{method}, MRE after median scale, no cap:",
             "",
