@@ -80,12 +80,12 @@ def row(family: str, pair: str, scale: float, bending: bool = False) -> dict:
             "guess": 0.1,
             "noise": 0.1,
             "bending": bending,
-            "least": 0.0,
             "seconds": 0.5,
             "curve": [[1.0, 0.5], [0.05, 0.02], [0.05, 0.01]],
             "sample": [
                 (scale * unit * np.abs(rng.normal(size=2000)) * 1e-3).tolist(),
                 unit.tolist(),
+                [0.0] * 2000,
             ],
         },
     }

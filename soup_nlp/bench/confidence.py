@@ -94,6 +94,7 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
     misfit = sure.misfit[rec.labels]
     whole = calibrated(sure.spread, sure.noise, misfit, np.inf, sure.bending)
     unit = chosen(whole) / (BENDING_FACTOR if sure.bending else FACTOR)
+    still = chosen(sure.still[rec.labels].astype(float))
     picked = np.linspace(0, len(log) - 1, min(SAMPLE, len(log))).astype(int)
     own = found["sigma"]
     return {
@@ -108,10 +109,9 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
             "guess": sure.guessed,
             "noise": sure.noise,
             "bending": sure.bending,
-            "least": sure.least,
             "seconds": seconds,
             "curve": [own.kept.tolist(), own.error.tolist(), own.oracle.tolist()],
-            "sample": np.stack([log[picked], unit[picked]]).round(6).tolist(),
+            "sample": np.stack([log[picked], unit[picked], still[picked]]).round(6).tolist(),
         },
     }
 
@@ -154,18 +154,23 @@ def left_out(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
 
     Pairs whose surfaces bend have a factor of their own, chosen on such pairs.
     """
-    keys = ("bending", "sample", "least")
-    samples = [(r["sequence"], *(r["confidence"][k] for k in keys)) for r in rows]
+    samples = [(r["sequence"], r["confidence"]["bending"], r["confidence"]["sample"]) for r in rows]
     told: dict[str, list[tuple[float, float, float]]] = {}
-    for family, bends, own, least in samples:
-        others = [np.array(s) for name, b, s, _ in samples if name != family and b == bends]
+    for family, bends, own in samples:
+        others = [np.array(s) for name, b, s in samples if name != family and b == bends]
         if not others:
             continue
         # every pair counts alike
-        ratio = np.concatenate([np.quantile(e / u, np.linspace(0, 1, 101)) for e, u in others])
+        ratio = np.concatenate(
+            [
+                np.quantile((e / u)[s == 0], np.linspace(0, 1, 101))
+                for e, u, s in others
+                if not s.all()
+            ]
+        )
         factor = float(np.quantile(ratio, WITHIN))
-        log, unit = np.array(own)
-        sigma = np.hypot(factor * unit, least)
+        log, unit, still = np.array(own)
+        sigma = np.hypot(factor * unit, SIGMA_PRIOR * still)
         one, two = coverage(log, sigma / np.hypot(1, sigma / SIGMA_PRIOR))
         told.setdefault(family, []).append((factor, one, two))
     mean_of = {name: np.mean(several, axis=0) for name, several in told.items()}

@@ -174,9 +174,6 @@ FACTOR, POWER = 7.0, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
 BENDING_FACTOR = 2.0
 """sigma = BENDING_FACTOR misfit sqrt(spread) where surfaces bend."""
-STANDS_STILL_PX, MOST_STILL = 0.3, 0.25
-"""Parallax of a superpixel that stands still, pixels, and the share of such superpixels from which
-the camera rests, where surfaces bend."""
 MOST_MISFIT = 5.0
 """Pixels beyond which a flow that the answer contradicts is as wrong as any."""
 LARGEST = 1e6
@@ -197,7 +194,7 @@ class Confidence:
         marginals: Of the planes and of the components' scales.
         noise: Of the flow, pixels, see `flow_noise`.
         bending: Whether surfaces are taken to bend.
-        least: Standard deviation that is added everywhere: of a camera at rest (`camera_rests`).
+        still: (N,) what stands still where surfaces bend, whose depth nothing tells.
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
     """
 
@@ -206,7 +203,7 @@ class Confidence:
     marginals: Marginals
     noise: float
     bending: bool
-    least: float
+    still: NDArray[np.bool_]
     misfit: Float
 
     @property
@@ -234,14 +231,17 @@ def without_parallax(start: Start) -> NDArray[np.bool_]:
     return np.asarray(start.borrowed & most)
 
 
-def camera_rests(start: Start, soup: Soup, anchor_ray: Float, K_next: Float) -> bool:
-    """Whether surfaces bend and too much stands still for the camera to move.
+def stands_still(soup: Soup, anchor_ray: Float, K_next: Float) -> NDArray[np.bool_]:
+    """(N,) superpixels whose translation moves them by less than any flow's noise.
 
-    Depths of what moves are then not tied to those of what does not.
+    Args:
+        soup: The answer.
+        anchor_ray: (N, 3).
+        K_next: (3, 3) intrinsics of the next frame.
     """
     focal = np.array([K_next[0, 0], K_next[1, 1]])
-    still = np.linalg.norm(soup.parallax(anchor_ray) * focal, axis=1) < STANDS_STILL_PX
-    return start.bending and float(still.mean()) > MOST_STILL
+    moved = np.linalg.norm(soup.parallax(anchor_ray) * focal, axis=1)
+    return np.asarray(moved < MOST_NOISE)
 
 
 def flow_misfit(rec: Reconstruction, flow: Flow) -> Float:
@@ -258,7 +258,7 @@ def calibrated(
     misfit: Float | float = 0.0,
     prior: float = SIGMA_PRIOR,
     bending: bool = False,
-    least: float = 0.0,
+    still: NDArray[np.bool_] | bool = False,
 ) -> Float:
     """Standard deviation of log depth that errors keep to.
 
@@ -272,13 +272,13 @@ def calibrated(
             mean is the noise.
         prior: Standard deviation before looking; its information is added.
         bending: Whether surfaces are taken to bend.
-        least: Standard deviation that is added.
+        still: Whether it stands still: `SIGMA_PRIOR` is added, in squares.
     """
     if bending:
         sigma = BENDING_FACTOR * np.maximum(LEAST_NOISE, misfit) * np.sqrt(spread)
     else:
         sigma = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
-    sigma = np.hypot(np.minimum(sigma, LARGEST), least)
+    sigma = np.hypot(np.minimum(sigma, LARGEST), np.where(still, SIGMA_PRIOR, 0.0))
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
 
@@ -344,7 +344,7 @@ def confidence(
         )
         spread = np.full(rec.labels.shape, np.inf)
     noise, misfit = flow_noise(start), flow_misfit(rec, pair.flow)
-    rests = camera_rests(start, rec.soup, data.anchor_ray, pair.K_next)
-    least = SIGMA_PRIOR if rests else 0.0
-    sigma = calibrated(spread, noise, misfit[rec.labels], bending=start.bending, least=least)
-    return Confidence(sigma, spread, own, noise, start.bending, least, misfit)
+    still = stands_still(rec.soup, data.anchor_ray, pair.K_next) & start.bending
+    kept = misfit[rec.labels], SIGMA_PRIOR, start.bending, still[rec.labels]
+    sigma = calibrated(spread, noise, *kept)
+    return Confidence(sigma, spread, own, noise, start.bending, still, misfit)
