@@ -192,11 +192,10 @@ def plot_scale(path: Path, bodies: Mapping[str, Mapping[str, Sequence[float]]]) 
         ax.minorticks_off()
         ax.set_title(name, fontsize=7)
         ax.tick_params(labelsize=6)
-    picture.supxlabel("scale of the body; 1 is the truth", fontsize=8)
     picture.supylabel("energy, from its lowest to its highest value", fontsize=8)
     handles, labels = axes.flat[0].get_legend_handles_labels()
     picture.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=7)
-    picture.suptitle("Energy over the scale of one moving body about the truth", fontsize=10)
+    picture.suptitle("Energy over the scale of one moving body; 1 is the true scale", fontsize=10)
     save(picture, path)
 
 
