@@ -158,17 +158,13 @@ def left_out(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
     told: dict[str, list[tuple[float, float, float]]] = {}
     for family, bends, own in samples:
         others = [np.array(s) for name, b, s in samples if name != family and b == bends]
-        if not others:
-            continue
+        # what stands still has its sigma from elsewhere
+        ratios = [(log / unit)[still == 0] for log, unit, still in others]
         # every pair counts alike
-        ratio = np.concatenate(
-            [
-                np.quantile((e / u)[s == 0], np.linspace(0, 1, 101))
-                for e, u, s in others
-                if not s.all()
-            ]
-        )
-        factor = float(np.quantile(ratio, WITHIN))
+        alike = [np.quantile(r, np.linspace(0, 1, 101)) for r in ratios if len(r)]
+        if not alike:
+            continue
+        factor = float(np.quantile(np.concatenate(alike), WITHIN))
         log, unit, still = np.array(own)
         sigma = np.hypot(factor * unit, SIGMA_PRIOR * still)
         one, two = coverage(log, sigma / np.hypot(1, sigma / SIGMA_PRIOR))

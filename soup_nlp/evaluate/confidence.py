@@ -345,6 +345,6 @@ def confidence(
         spread = np.full(rec.labels.shape, np.inf)
     noise, misfit = flow_noise(start), flow_misfit(rec, pair.flow)
     still = stands_still(rec.soup, data.anchor_ray, pair.K_next) & start.bending
-    kept = misfit[rec.labels], SIGMA_PRIOR, start.bending, still[rec.labels]
-    sigma = calibrated(spread, noise, *kept)
+    own_misfit, at_rest = misfit[rec.labels], still[rec.labels]
+    sigma = calibrated(spread, noise, own_misfit, bending=start.bending, still=at_rest)
     return Confidence(sigma, spread, own, noise, start.bending, still, misfit)
