@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import gc
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from hypothesis import settings
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data import inputs
+from soup_nlp.data.scenes import catalogue
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.pipeline.run import Run, make_run, skipped
@@ -23,12 +24,14 @@ settings.load_profile("fixed")
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 
 
-@pytest.fixture(scope="session", autouse=True)
-def rendered_once() -> Iterator[None]:
-    """Problems of the same scene, of which there are a hundred, have it rendered once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(inputs, "render_scene", lru_cache(maxsize=16)(inputs.render_scene))
-        yield
+# a scene that many tests want is rendered once: test files import this function later
+inputs.render_scene = catalogue.render_scene = lru_cache(maxsize=16)(catalogue.render_scene)
+
+
+def pytest_collection_finish() -> None:
+    """Modules and test items live to the end: the collector need not visit them again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.metrics import depth_metrics
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.pipeline.case import Case, build_energy, prepare, solver_options
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.bending import surfaces
 
@@ -40,7 +41,14 @@ def rendered(scene: str) -> Pair:
 
 @cache
 def case(scene: str, *overrides: str) -> Case:
-    return prepare(problem(scene, *overrides), pair=rendered(scene))
+    own = problem(scene, *overrides)
+    if not overrides or any(key.startswith("start.") for key in overrides):
+        return prepare(own, pair=rendered(scene))
+    # superpixels and start are those of the defaults
+    c = case(scene)
+    data, weights = build_energy(own, c.pair, c.segmentation, c.start)
+    options = solver_options(own, c.start)
+    return replace(c, problem=own, data=data, weights=weights, options=options)
 
 
 @pytest.mark.parametrize("scene", ["street", "room", "orbit"])

@@ -54,9 +54,9 @@ LIFTED = "free/epigraph/lifted"
 
 @pytest.fixture(scope="module")
 def record() -> Frozen:
-    """Sixty superpixels of a small room with the true flow; its best point is the proposal."""
+    """Thirty superpixels of a small room with the true flow; its best point is the proposal."""
     scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
-    own = {"input": scene, "segmentation": {"superpixels": 60}, "flow": {"source": "truth"}}
+    own = {"input": scene, "segmentation": {"superpixels": 30}, "flow": {"source": "truth"}}
     return record_of(prepare(make_problem(own)))
 
 

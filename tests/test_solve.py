@@ -92,11 +92,11 @@ def test_constraint_residuals_by_hand():
 
 
 class Problem:
-    """A rendered scene, cut into about 40 superpixels, with true flow and a start."""
+    """A rendered scene, cut into about 20 superpixels, with true flow and a start."""
 
     def __init__(self, name: str) -> None:
         pair = with_true_flow(render_scene(name, 0, 160, 120))
-        labels = segment(pair.image_ref, 40)
+        labels = segment(pair.image_ref, 20)
         seg = build_segmentation(labels, pair.image_ref, neighbours=6)
         noise = np.random.default_rng(5).normal(0, 0.2, pair.flow.uv.shape)
         flow = replace(pair.flow, uv=pair.flow.uv + noise)

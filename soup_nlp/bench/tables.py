@@ -6,14 +6,15 @@ import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from soup_nlp.bench.rows import Row, failed
 from soup_nlp.storage.atomic import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Number = float | None
 
@@ -105,9 +106,10 @@ def joined(lines: Sequence[str]) -> str:
 
 def figure(width: float, height: float) -> Figure:
     """A figure with constrained layout that needs no display."""
-    out = Figure(figsize=(width, height), dpi=120, layout="constrained")
-    FigureCanvasAgg(out)
-    return out
+    # half a second, which commands without pictures need not wait
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=120, layout="constrained")
 
 
 def save(out: Figure, path: Path) -> None:

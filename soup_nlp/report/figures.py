@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image as Pil
 from PIL import ImageDraw, ImageFont
@@ -19,6 +18,9 @@ from soup_nlp.errors import DataError
 from soup_nlp.report.colour import Image
 from soup_nlp.report.pictures import Bar, Legend, Picture, Swatches, Wheel
 from soup_nlp.storage.atomic import PathLike, write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Float = NDArray[np.floating]
 
@@ -63,9 +65,11 @@ def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: 
 
 def strip_figure(panels: Sequence[Picture], title: str) -> Figure:
     """`strip` as a figure of matplotlib; it changes no global state of matplotlib."""
+    # half a second, which result folders need not wait
+    from matplotlib.figure import Figure
+
     image = strip(panels, title)
     figure = Figure(figsize=(image.shape[1] / _DPI, image.shape[0] / _DPI), dpi=_DPI)
-    FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set_axis_off()
     axes.imshow(image)

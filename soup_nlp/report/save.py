@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from matplotlib.figure import Figure
-
 from soup_nlp.report.figures import strip_figure, without_gaps
 from soup_nlp.report.folder import prepare_folder, summary, write_folder
 from soup_nlp.report.formats import check_formats, write_formats
@@ -18,6 +16,8 @@ from soup_nlp.report.shown import of_run
 from soup_nlp.storage.folders import staged
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from soup_nlp.pipeline.run import Run
 
 
