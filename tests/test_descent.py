@@ -364,6 +364,23 @@ def test_steps_go_on_beyond_the_tolerance_while_they_pay(problem):
     assert dual == pytest.approx(beyond.history["inf_du"][-1], rel=1e-3, abs=1e-10)
 
 
+@pytest.mark.parametrize("problem", ["inverse-depth"], indirect=True)
+@pytest.mark.parametrize("patience", [10, 1000])
+def test_a_superpixel_whose_damping_never_falls_is_let_go(problem, monkeypatch, patience):
+    runner, adapt = Descent(problem), Descent._adapt
+    runner.run(PHASES[0])
+    first = [1e6]
+
+    def stuck(self, move):
+        before = first.pop() if first else self.damping[0]
+        adapt(self, move)
+        self.damping[0] = max(self.damping[0], before if before > 1 else 0.0)
+
+    monkeypatch.setattr(Descent, "_adapt", stuck)
+    monkeypatch.setattr(descent_module, "PATIENCE", patience)
+    assert runner.run(replace(LAST, iterations=30)).converged == (patience == 10)
+
+
 def test_ipopt_stays_where_it_ends(small_room, problem, solved):
     last = solved[1][-1]
     smooth = FORM.replace(hessian="exact", eps=LAST.eps, eps_pixel=LAST.eps)

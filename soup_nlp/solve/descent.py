@@ -53,6 +53,10 @@ DAMPING = (1e-7, 1e6)
 """Least and most damping mu of a superpixel."""
 HELD = 1e-3
 """Least damping of a superpixel whose step went too far."""
+FRESH: Mapping[HessianKind, float] = {"gauss-newton": 1e-2, "exact": 1e-4}
+"""Most damping with which a phase begins, and to which it returns where it hardly descends."""
+SLOW, PATIENCE = 1e-6, 10
+"""Relative decrease of an iteration that is hardly any, and iterations between two such returns."""
 BLENDS = (0.0, 0.1, 0.3, 1.0)
 """Shares of the majorant in the exact Hessian, tried until the step is a descent direction."""
 REUSE = 4000
@@ -136,10 +140,10 @@ class Descent:
         assert at is not None, "the iterate is inside its bounds"
         if self.z is None:
             self.z = phase.barrier / at.slack
-        self.damping = np.minimum(self.damping, 1e-2 if phase.hessian != "exact" else 1e-4)
+        self.damping = np.minimum(self.damping, FRESH[phase.hessian])
         gradient = problem.gradient(at.x)
         curvature: tuple[Float, Float] | None = None
-        blend, small, self._last = 0.0, 0, None
+        blend, small, patient, self._last = 0.0, 0, PATIENCE, None
         barrier = max(phase.highest, phase.barrier)
         history: list[tuple[float, ...]] = []
         reached: Reached | None = None
@@ -173,6 +177,11 @@ class Descent:
                 continue
             fell = at.merit - move.point.merit
             small = small + 1 if fell <= phase.stagnation * abs(at.f) else 0
+            if phase.hessian == "exact" and fell < SLOW * abs(at.f) and iteration >= patient:
+                # held back so far, a superpixel's own step is too short for its slope to tell
+                # anything but what its neighbours do, and its damping never falls
+                self.damping = np.minimum(self.damping, FRESH["exact"])
+                patient = iteration + PATIENCE
             self._step_multipliers(at, step.h, barrier, move.point)
             at, self.x, blend, curvature = move.point, move.point.x, step.blend, None
             gradient = search.gradient(at.x)
