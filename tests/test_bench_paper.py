@@ -13,9 +13,9 @@ import pytest
 from soup_nlp.bench import paper_plan
 from soup_nlp.bench.departures import DEPARTURES, PAPER, default
 from soup_nlp.bench.paper_measures import measure, read_maps
-from soup_nlp.bench.paper_page import TEXTS
 from soup_nlp.bench.paper_plan import DATASETS, METHODS, SECTIONS, Sizes, make_plan
 from soup_nlp.bench.paper_scale import KINDS, SCALES, lowest, measure_scale, with_motions
+from soup_nlp.bench.paper_sections import TEXTS
 from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.cli.main import main
@@ -141,6 +141,10 @@ def test_a_tiny_dataset_gives_all_sections(dataset, tmp_path, monkeypatch, capsy
     # the honest sentence is counted from the rows: two scenes of one body each
     assert "for 0 of 2 bodies (in pixels: 2); that of E_cont for 2" in text
     assert "made to fail" in text
+    rows = [json.loads(line) for line in (out / "paper.jsonl").read_text().splitlines()]
+    good = sum(row["ok"] for row in rows)
+    assert good < len(rows)
+    assert f"{good} of the {len(rows)} rows were measured." in text
     capsys.readouterr()
 
 

@@ -201,11 +201,9 @@ class Plan:
             out[d.name] = off, None if on is None else Cell(item, (*printed, *on[len(PAPER) :]))
         return out
 
-    def jobs(self, folder: Path) -> list[Job]:
-        """All solves, each once, those of one pair together."""
-        compared = self.compared()
-        cells = {c.key: c for c in compared}
-        pictures = set(cells)
+    def cells(self) -> list[Cell]:
+        """All rows, each once, those of one pair together."""
+        cells = {c.key: c for c in self.compared()}
         wanted = self.sizes.sections
         for section in [name for name in SECTIONS if name in wanted]:
             for item in self.items(section):
@@ -218,8 +216,12 @@ class Plan:
         place: dict[str, int] = {}
         for key, _ in cells:
             place.setdefault(key, len(place))
-        ordered = sorted(cells.values(), key=lambda c: place[c.item.key])
-        return [c.job(folder, c.key in pictures) for c in ordered]
+        return sorted(cells.values(), key=lambda c: place[c.item.key])
+
+    def jobs(self, folder: Path) -> list[Job]:
+        """All solves; those of the comparison draw maps."""
+        pictures = {c.key for c in self.compared()}
+        return [c.job(folder, c.key in pictures) for c in self.cells()]
 
     def scale_jobs(self) -> list[Job]:
         """Energies over the scale of moving bodies; nothing is solved."""
