@@ -272,7 +272,8 @@ def test_a_real_run_its_table_and_its_gate(tmp_path, capsys):
     out, base = tmp_path / "out", tmp_path / "base.json"
     size = ["--scenes", "street", "--sizes", "24", "--neighbours", "4", "--seeds", "0"]
     small = ["--width", "128", "--height", "96", "--set", "solver.max_iter=5"]
-    small += ["--set", "formulation.compiled=false"]
+    small += ["--set", "formulation.compiled=false", "--set", "solver.eps=0.3"]
+    small += ["--set", "solver.presolve_eps=[0.3]"]
     words = ["bench", "speed", *size, *small, "--quiet", "--out", str(out)]
     assert main([*words, "--write-baseline", str(base)]) == 0
     (record,) = read_rows(out / "table.jsonl")

@@ -20,8 +20,8 @@ pytestmark = pytest.mark.slow
 
 ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
 SMALL = [
-    "--set", "input.width=160", "--set", "input.height=120", "--set", "refine.enabled=false",
-    "--set", "segmentation.superpixels=30", "--set", "segmentation.neighbours=5",
+    "--set", "input.width=112", "--set", "input.height=84", "--set", "refine.enabled=false",
+    "--set", "segmentation.superpixels=16", "--set", "segmentation.neighbours=5",
     "--set", "solver.presolve_iterations=2", "--set", "solver.max_iter=0",
     "--set", "output.page=false",
 ]  # fmt: skip
@@ -38,7 +38,7 @@ def test_options_of_a_pair_do_not_go_with_a_problem_file(option, tmp_path, capsy
 
 
 def test_a_flow_goes_with_a_problem_file(tmp_path, monkeypatch):
-    flow = render_scene("orbit", 0, 160, 120).truth.flow.astype(np.float32)
+    flow = render_scene("orbit", 0, 112, 84).truth.flow.astype(np.float32)
     write_flo(tmp_path / "own flow.flo", flow)
     monkeypatch.chdir(tmp_path)
     args = ["solve", ORBIT, "--out", "out", "-q", "--flow", "own flow.flo", *SMALL]
@@ -48,7 +48,7 @@ def test_a_flow_goes_with_a_problem_file(tmp_path, monkeypatch):
 
 def foreign(folder: Path) -> list[str]:
     """A folder with the inputs of a pair, under names that results have too."""
-    pair = render_scene("orbit", 0, 160, 120)
+    pair = render_scene("orbit", 0, 112, 84)
     folder.mkdir()
     for name, image in (("frame_0", pair.image_ref), ("frame_1", pair.image_next)):
         cv2.imwrite(str(folder / f"{name}.png"), image[..., ::-1])
@@ -119,10 +119,10 @@ def test_a_result_folder_takes_the_next_result_and_is_no_input(solved, tmp_path,
 
 def test_images_may_differ_in_size(tmp_path, capsys):
     foreign(tmp_path / "pair")
-    pair = render_scene("orbit", 0, 160, 120)
+    pair = render_scene("orbit", 0, 112, 84)
     cut = str(tmp_path / "pair" / "cut.png")
-    cv2.imwrite(cut, pair.image_next[:110, :150, ::-1])
-    np.save(tmp_path / "cut.npy", pair.truth.depth_next[:110, :150])
+    cv2.imwrite(cut, pair.image_next[:76, :104, ::-1])
+    np.save(tmp_path / "cut.npy", pair.truth.depth_next[:76, :104])
     options = ["--ref", str(tmp_path / "pair" / "frame_0.png"), "--next", cut]
     # the camera is a file here, as it may be in a problem file
     options += ["--intrinsics", str(tmp_path / "pair" / "K.txt")]
@@ -134,7 +134,7 @@ def test_images_may_differ_in_size(tmp_path, capsys):
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["metrics"]["solution_next"]["coverage"] > 0.5
     depth = cv2.imread(str(tmp_path / "out" / "depth_next.png"), cv2.IMREAD_UNCHANGED)
-    assert depth.shape == (110, 150)
+    assert depth.shape == (76, 104)
 
 
 @pytest.mark.parametrize("white", [None, 4095])

@@ -239,11 +239,13 @@ def test_pieces_of_what_is_cut_off_are_nearer_together():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scene", "seed"), [("room", 3), ("street", 0)])
-def test_components_that_the_image_cuts_off_are_placed_nearer_the_truth(scene, seed, monkeypatch):
+@pytest.mark.parametrize(("scene", "seed", "count"), [("room", 3, 200), ("street", 0, 300)])
+def test_components_that_the_image_cuts_off_are_placed_nearer_the_truth(
+    scene, seed, count, monkeypatch
+):
     """Rendered pairs whose lower part is cropped: contact alone puts what is cut too far."""
     what = {"kind": "scene", "scene": scene, "seed": seed, "width": 512, "height": 218}
-    problem = make_problem({"input": what, "segmentation": {"superpixels": 300}})
+    problem = make_problem({"input": what, "segmentation": {"superpixels": count}})
     pair = problem.load_pair()
     pair = replace(cropped(pair, 0, 0, 0, int(0.3 * pair.image_ref.shape[0])), flow=None)
     case = prepare(problem, pair=pair)

@@ -148,7 +148,7 @@ def test_margins_that_leave_nothing_are_rejected(pair):
 def test_views_are_measured_with_their_own_flow(tmp_path):
     """A view of a pair with true flow scores as the pair does; so does a flow of a file."""
     listed = list_suite("rendered", options=Options(("truth",), width=160, only=("orbit",)))
-    over = ("segmentation.superpixels=40", "segmentation.neighbours=6", "refine.enabled=false")
+    over = ("segmentation.superpixels=24", "segmentation.neighbours=6", "refine.enabled=false")
     path = tmp_path / "flow.flo"
     write_flo(path, render_scene("orbit", 0, 160, 68).truth.flow)
     for view, more in (

@@ -248,7 +248,7 @@ def test_frames_of_a_scene_follow_each_other():
 
 
 SMALL = [
-    *("input.width=192", "input.height=128", "segmentation.superpixels=60", "flow.source=truth"),
+    *("input.width=160", "input.height=108", "segmentation.superpixels=40", "flow.source=truth"),
     *("refine.enabled=false", "segmentation.neighbours=8"),
 ]
 
