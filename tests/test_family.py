@@ -31,7 +31,6 @@ from soup_nlp.family.frozen import (
 )
 from soup_nlp.family.instances import (
     BITS,
-    SCENES,
     SIZES,
     STANDARD,
     Instance,
@@ -97,6 +96,7 @@ def test_what_is_not_of_the_family_is_refused():
         ([100], ["moon"], ["easy"]),
         ([100], ["room"], ["warm"]),
         ([100], [], ["easy"]),
+        ([1000], ["street", "room"], ["easy"]),
     ):
         with pytest.raises(ConfigError, match="not of the family"):
             select(sizes, scenes, [STANDARD], starts)
@@ -182,8 +182,8 @@ def test_two_processors_make_the_same_bytes(record, tmp_path):
 
 def test_the_package_has_a_record_of_every_size():
     known = published()
-    for scene in SCENES:
-        for size in SIZES:
+    for size, scenes in SIZES.items():
+        for scene in scenes:
             record = load_frozen(scene, size)
             assert len(record.minimum) == record.labels.max() + 1
             assert f"SOUP-{scene}-unit-offset-smooth-smooth-N{size}-easy" in known["sha256"]

@@ -34,7 +34,8 @@ Float = NDArray[np.float64]
 VERSION = 2
 """Of the family: the same version has the same bytes."""
 SCENES = ("orbit", "street", "room", "sheet")
-SIZES = (100, 250, 500)
+SIZES = {100: SCENES, 250: SCENES, 500: SCENES, 1000: ("orbit", "street")}
+"""Superpixels, and the scenes of that size."""
 STARTS = ("easy", "hard", "cold")
 STANDARD = "unit-offset/smooth/smooth"
 """Formulation of the family unless another is asked for."""
@@ -84,7 +85,7 @@ def parse_name(name: str) -> Instance:
         assert found is not None
         if found[2] == form.replace("/", "-"):
             one = Instance(found[1], form, int(found[3]), found[4] or STARTS[0])
-            if one.scene in SCENES and one.size in SIZES and one.start in STARTS:
+            if one.scene in SIZES.get(one.size, ()) and one.start in STARTS:
                 return one
     raise ConfigError(
         "no instance of the family",
@@ -114,7 +115,12 @@ def select(
     Raises:
         ConfigError: one of them is not of the family.
     """
-    known = {"--sizes": (sizes, SIZES), "--scenes": (scenes, SCENES), "--starts": (starts, STARTS)}
+    known = {
+        "--sizes": (sizes, tuple(SIZES)),
+        "--scenes": (scenes, SCENES),
+        "--starts": (starts, STARTS),
+        **{f"--scenes at size {n}": (scenes, SIZES[n]) for n in sizes if n in SIZES},
+    }
     for where, (asked, there) in known.items():
         wrong = [str(a) for a in asked if a not in there]
         if wrong or not len(asked):
