@@ -167,12 +167,10 @@ def test_scene_flow_epe():
     assert out["mean_truth_length"] == pytest.approx(2.5)
     assert out["coverage"] == pytest.approx(2 / 3)
     assert out["n_pixels"] == 2
-    assert scene_flow_epe(truth, truth, mask=[True, False, True, False])["mean"] == 0.0
+    assert scene_flow_epe(truth, truth)["mean"] == 0.0
     assert np.isnan(scene_flow_epe(np.full((4, 3), np.nan), truth)["mean"])
     with pytest.raises(DataError, match="fit"):
         scene_flow_epe(truth, truth[:2])
-    with pytest.raises(DataError, match="differ in shape"):
-        scene_flow_epe(truth, truth, mask=[True])
     with pytest.raises(DataError, match="no pixel"):
         scene_flow_epe(truth, np.full((4, 3), np.nan))
 

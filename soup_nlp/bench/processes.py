@@ -19,14 +19,13 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from soup_nlp.bench.rows import Row, attempt, failure
+from soup_nlp.bench.rows import ONE_THREAD, Row, attempt, failure
 from soup_nlp.errors import SolverError, SoupError
 from soup_nlp.storage.system import end_with_parent
 from soup_nlp.storage.versions import code_version, versions
 
 GRACE = 5.0
 """Seconds beyond its time limit before a process is killed."""
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ def alone(work: Callable[[], Row], folder: Path, seconds: float = 7200.0) -> Row
 
     "peak_bytes" is the largest resident size of the process, unless the work says it itself.
     """
-    with mock.patch.dict(os.environ, dict.fromkeys(THREADS, "1")):
+    with mock.patch.dict(os.environ, ONE_THREAD):
         ended = isolated(partial(attempt, work), folder, seconds, fresh=True)
     if ended.how == "returned":
         return {"peak_bytes": ended.peak_bytes, **ended.value}

@@ -14,9 +14,9 @@ from soup_nlp.bench import tuning
 from soup_nlp.bench.accuracy import pair_job
 from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
-from soup_nlp.bench.rows import Row, measure_all
+from soup_nlp.bench.rows import MeasureRows, Row, measure_all
 from soup_nlp.bench.suite_pairs import Options
-from soup_nlp.bench.suites import SUITES, list_suite
+from soup_nlp.bench.suites import SUITES, Listing, list_suite
 from soup_nlp.bench.tables import main_metric, show
 from soup_nlp.bench.tuning_report import text_search
 from soup_nlp.cli import options
@@ -76,8 +76,6 @@ def accuracy(
     measure_rows = partial(measure_all, workers=workers, say=progress, any_code=any_code)
     listings = [list_suite(known, data, wanted) for known in suite or ["rendered"]]
     _check_names(analysis, folders, name, suite or [])
-    if not analysis:
-        claim(out, [f"{name or listing.suite.name}.md" for listing in listings], overwrite)
     if analysis:
         page = run_analysis(
             analysis,
@@ -90,26 +88,40 @@ def accuracy(
             overwrite=overwrite,
         )
         _tell(page)
-    for listing in [] if analysis else listings:
-        if not quiet:
-            print(listing, file=sys.stderr)
-        jobs = [
-            pair_job(
-                item.scored_by(conventions),
-                changes,
-                folder=folders / item.key.replace(" ", "_") if folders else None,
-            )
-            for item in listing.items
-        ]
-        page = out / f"{name or listing.suite.name}.md"
-        rows = measure_rows(jobs, page.with_suffix(".jsonl"))
-        note = f"Suite `{listing.suite.name}`: {listing.suite.text}."
-        if changes:
-            note += f" Overrides: {', '.join(f'`{o}`' for o in changes)}."
-        with staged(out) as new:
-            write_text(new / page.name, report(f"Accuracy on {page.stem}", rows, note))
-        _tell(page)
+    else:
+        pages = [out / f"{name or listing.suite.name}.md" for listing in listings]
+        claim(out, [page.name for page in pages], overwrite)
+        for listing, page in zip(listings, pages, strict=True):
+            if not quiet:
+                print(listing, file=sys.stderr)
+            _table(listing, page, changes, measure_rows, conventions, folders)
     raise typer.Exit(1 if progress.failed else 0)
+
+
+def _table(
+    listing: Listing,
+    page: Path,
+    changes: tuple[str, ...],
+    measure_rows: MeasureRows,
+    conventions: list[str] | None,
+    folders: Path | None,
+) -> None:
+    """Measure the pairs of a suite, and write and print their table."""
+    jobs = [
+        pair_job(
+            item.scored_by(conventions),
+            changes,
+            folder=folders / item.key.replace(" ", "_") if folders else None,
+        )
+        for item in listing.items
+    ]
+    rows = measure_rows(jobs, page.with_suffix(".jsonl"))
+    note = f"Suite `{listing.suite.name}`: {listing.suite.text}."
+    if changes:
+        note += f" Overrides: {', '.join(f'`{o}`' for o in changes)}."
+    with staged(page.parent) as new:
+        write_text(new / page.name, report(f"Accuracy on {page.stem}", rows, note))
+    _tell(page)
 
 
 def _check_names(

@@ -94,21 +94,22 @@ def compare(
         # an input that cannot be used does not take the others' page away
         rows += of_family
         if rows:
-            with staged(folder) as new:
-                text = family_page(of_family) if of_family else page(rows)
-                write_text(new / "README.md", text)
-                draw_profiles(new / "profile.png", rows)
-                draw_curves(new / "curves.png", rows)
-                if of_family:
-                    _write_family(new, of_family, limits)
+            _write(folder, rows, of_family, limits)
     print("\n".join(conclusion(rows)))
     print(f"files       {out}/: {', '.join(written)}, runs.jsonl")
     raise typer.Exit(0 if any(r["verified"] for r in rows) else 1)
 
 
-def _write_family(folder: Path, rows: list[dict[str, Any]], limits: Limits) -> None:
-    """What OF_FAMILY names."""
-    draw_family(folder / "profiles.png", rows)
-    note = {"limits": asdict(limits), "machine": machine()}
-    write_results(folder / "results.json", [neutral(r) for r in rows], note)
-    write_json(folder / "reached.json", summary(rows))
+def _write(
+    folder: Path, rows: list[dict[str, Any]], of_family: list[dict[str, Any]], limits: Limits
+) -> None:
+    """What FILES names of all rows, and what OF_FAMILY names of those of the family."""
+    with staged(folder) as new:
+        write_text(new / "README.md", family_page(of_family) if of_family else page(rows))
+        draw_profiles(new / "profile.png", rows)
+        draw_curves(new / "curves.png", rows)
+        if of_family:
+            draw_family(new / "profiles.png", of_family)
+            note = {"limits": asdict(limits), "machine": machine()}
+            write_results(new / "results.json", [neutral(r) for r in of_family], note)
+            write_json(new / "reached.json", summary(of_family))

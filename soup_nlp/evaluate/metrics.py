@@ -253,7 +253,7 @@ def sample_at_points(depth: ArrayLike, points: ArrayLike) -> tuple[Float, Float]
 
 
 def scene_flow_epe(
-    estimate: ArrayLike, truth: ArrayLike, *, scale: float = 1.0, mask: ArrayLike | None = None
+    estimate: ArrayLike, truth: ArrayLike, *, scale: float = 1.0
 ) -> dict[str, float | int]:
     """End-point error of a scene flow: mean and median length of s * estimate - truth.
 
@@ -261,7 +261,6 @@ def scene_flow_epe(
         estimate: (..., 3) X' - X; NaN where unknown.
         truth: (..., 3) true X' - X, same shape; NaN where unknown.
         scale: The factor s; use `DepthMetrics.scale` so that depth and motion share one scale.
-        mask: (...) bool; False leaves a pixel out.
 
     Returns:
         mean, median, mean_truth_length (unit of the truth), coverage, n_pixels. The errors are
@@ -277,7 +276,7 @@ def scene_flow_epe(
             found=f"estimate {est.shape}, truth {gt.shape}",
             expected="the same shape (..., 3)",
         )
-    true = _masked(np.asarray(np.isfinite(gt).all(axis=-1)), mask, "scene flow")
+    true = _masked(np.asarray(np.isfinite(gt).all(axis=-1)), None, "scene flow")
     both = np.asarray(true & np.isfinite(est).all(axis=-1))
     error = np.linalg.norm(scale * est[both] - gt[both], axis=-1)
     length = np.linalg.norm(gt[both], axis=-1)

@@ -69,6 +69,8 @@ class NLFile:
 
 
 Names = Sequence[str]
+AllNames = tuple[Names | None, Names | None, str]
+"""Of variables, rows and the objective; None writes no file."""
 
 
 def write_nl(path: str | Path, nlp: NLP, names: tuple[Names, Names] | None = None) -> NLFile:
@@ -155,7 +157,7 @@ def _write(
     theta: Float,
     x: tuple[Float, Float, Float],
     g: tuple[Float, Float],
-    names: tuple[Names | None, Names | None, str],
+    names: AllNames,
     lam_g0: Float | None = None,
 ) -> NLFile:
     """Check, take apart, order and write.
@@ -169,14 +171,7 @@ def _write(
         names: Of variables, rows and the objective.
         lam_g0: (ng,) initial multipliers, or None.
     """
-    if lam_g0 is not None:
-        require_finite("lam_g0", lam_g0, path)
-    require_finite("x0", x[0], path)
-    require_bounds("x", x[1], x[2], path)
-    require_bounds("g", g[0], g[1], path)
-    require_names("x_names", names[0], len(x[0]), path)
-    require_names("g_names", names[1], len(g[0]), path)
-
+    _check(path, x, g, names, lam_g0)
     program = take_apart(groups, len(x[0]), len(g[0]), theta)
     variables, rows = orders(program)
     body = Body(program, np.argsort(variables), np.argsort(rows))
@@ -197,12 +192,7 @@ def _write(
     )
     data = ("\n".join(lines) + "\n").encode("ascii")
     write_bytes(path, data)
-    if names[0] is not None:
-        write_text(path.with_suffix(".col"), "".join(f"{names[0][k]}\n" for k in variables))
-    if names[1] is not None:
-        # the objective's name follows those of the rows
-        text = "".join(f"{names[1][k]}\n" for k in rows) + f"{names[2]}\n"
-        write_text(path.with_suffix(".row"), text)
+    _write_names(path, names, variables, rows)
     both = program.in_rows & program.in_objective
     return NLFile(
         path=path,
@@ -216,3 +206,30 @@ def _write(
         gradient_nonzeros=int(G.nnz),
         defined=body.classes,
     )
+
+
+def _check(
+    path: Path,
+    x: tuple[Float, Float, Float],
+    g: tuple[Float, Float],
+    names: AllNames,
+    lam_g0: Float | None,
+) -> None:
+    """Refuse what no .nl file can say."""
+    if lam_g0 is not None:
+        require_finite("lam_g0", lam_g0, path)
+    require_finite("x0", x[0], path)
+    require_bounds("x", x[1], x[2], path)
+    require_bounds("g", g[0], g[1], path)
+    require_names("x_names", names[0], len(x[0]), path)
+    require_names("g_names", names[1], len(g[0]), path)
+
+
+def _write_names(path: Path, names: AllNames, variables: Int, rows: Int) -> None:
+    """The .col and .row files, in the order of the .nl file."""
+    if names[0] is not None:
+        write_text(path.with_suffix(".col"), "".join(f"{names[0][k]}\n" for k in variables))
+    if names[1] is not None:
+        # the objective's name follows those of the rows
+        text = "".join(f"{names[1][k]}\n" for k in rows) + f"{names[2]}\n"
+        write_text(path.with_suffix(".row"), text)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from soup_nlp.storage.atomic import PathLike, write_bytes
 
 if TYPE_CHECKING:
-    from soup_nlp.report.result import Mask, Result
+    from soup_nlp.report.result import Result
 
 AXES = "x right, y down, z ahead"
 """Axes of a camera, in words."""
@@ -67,22 +67,21 @@ def write_ply(
     return len(table)
 
 
-def write_cloud(path: PathLike, result: Result, frame: int, keep: Mask | None = None) -> int:
+def write_cloud(path: PathLike, result: Result, frame: int) -> int:
     """Write the points of the reference image, where they are in one of the frames, as PLY.
 
     Properties beside position, normal and colour: `confidence` of the flow, `component`, and
-    `sigma_log_depth` where it is known.
+    `sigma_log_depth` where it is known. Points that are not `result.sure` are left out.
 
     Args:
         path: File to write; its folder must exist.
         result: What was solved.
         frame: 0 for the reference frame, 1 for the next one.
-        keep: (H, W) points that are written; default `result.sure`.
 
     Returns:
         The number of points written.
     """
-    keep = result.sure if keep is None else keep
+    keep = result.sure
     scalars = {"confidence": result.flow_confidence, "component": result.components.of_pixel}
     if result.sigma is not None:
         scalars["sigma_log_depth"] = result.sigma

@@ -28,22 +28,7 @@ def save(
     formats: Sequence[str] = (),
     overwrite: bool = False,
 ) -> list[str]:
-    """Write the result folder of a run.
-
-    Args:
-        run: The run.
-        folder: A new or empty folder, or that of an earlier result.
-        config: Merged problem as YAML.
-        formats: Files for other programs beside, see `formats.FORMATS`.
-        overwrite: Overwrite files that the program did not make.
-
-    Returns:
-        Names of the files.
-
-    Raises:
-        ConfigError: a format is not known.
-        DataError: the folder cannot be written, or holds what is not to be overwritten.
-    """
+    """Write the result folder of a run, see `Run.save`; `config` is its merged problem as YAML."""
     none = formats is None or (isinstance(formats, list | tuple) and not formats)
     names = [] if none else check_formats(formats)
     in_memory = run.problem.input.kind == "memory"

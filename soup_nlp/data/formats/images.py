@@ -169,17 +169,7 @@ def read_image(
             expected="1 (grey), 3 (RGB) or 4 (RGBA)",
         )
     if image.dtype == np.uint16:
-        largest = int(image.max())
-        if white is None and 0 < largest < DARK:
-            # the scene may be dark: nothing is guessed
-            full = 2 ** largest.bit_length() - 1
-            warnings.warn(
-                f"{path}: 16-bit image is dark, its largest value is {largest} of 65535; if its"
-                f" white is {full}, say so by the key white of the input (white: {full})",
-                DataWarning,
-                stacklevel=2,
-            )
-        image = np.minimum(np.rint(image * (255.0 / (white or 65535))), 255).astype(np.uint8)
+        image = _to_8_bit(image, white, path)
     elif image.dtype != np.uint8:
         raise DataError(
             "image is neither 8-bit nor 16-bit",
@@ -190,6 +180,21 @@ def read_image(
         )
     rgb = np.repeat(image, 3, axis=2) if channels == 1 else image[:, :, 2::-1]
     return np.ascontiguousarray(rgb)
+
+
+def _to_8_bit(image: NDArray[np.uint16], white: int | None, path: PathLike) -> NDArray[np.uint8]:
+    """round(255 v / white), clipped to 255; a warning where no `white` is given and all is dark."""
+    largest = int(image.max())
+    if white is None and 0 < largest < DARK:
+        # the scene may be dark: nothing is guessed
+        full = 2 ** largest.bit_length() - 1
+        warnings.warn(
+            f"{path}: 16-bit image is dark, its largest value is {largest} of 65535; if its"
+            f" white is {full}, say so by the key white of the input (white: {full})",
+            DataWarning,
+            stacklevel=3,
+        )
+    return np.minimum(np.rint(image * (255.0 / (white or 65535))), 255).astype(np.uint8)
 
 
 def read_mask(path: PathLike) -> NDArray[np.bool_]:
