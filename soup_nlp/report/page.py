@@ -140,10 +140,11 @@ def _data_uri(picture: Picture) -> str:
     # above 100 is without losses
     kind, options = ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, 90]) if photo else (
         "webp", [cv2.IMWRITE_WEBP_QUALITY, 101])  # fmt: skip
-    return _encoded(image, kind, options)
+    return encoded(image, kind, options)
 
 
-def _encoded(image: Image, kind: str, options: list[int] | None = None) -> str:
+def encoded(image: Image, kind: str, options: list[int] | None = None) -> str:
+    """A picture (H, W, 3) as a data address; `kind` is "jpeg", "png" or "webp"."""
     good, data = cv2.imencode(f".{kind}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options or [])
     if not good:
         raise DataError("image cannot be encoded", where="report.html", found=kind)
@@ -154,23 +155,28 @@ def _legend(picture: Picture) -> str:
     """A legend in HTML."""
     legend = picture.legend
     if isinstance(legend, Bar):
-        stops = legend.colours[0, np.linspace(0, legend.colours.shape[1] - 1, 24).astype(int)]
-        ramp = ",".join(_css(c) for c in stops)
-        texts = "".join(f"<span>{escape(text)}</span>" for text in legend.texts)
-        return (
-            f'<div class="bar" style="background:linear-gradient(to right,{ramp})"></div>'
-            f'<div class="ticks">{texts}</div>'
-        )
+        return colour_bar(legend)
     if isinstance(legend, Swatches):
         return '<div class="swatches">' + "".join(
             f'<span><i style="background:{_css(c)}"></i>{escape(text)}</span>'
             for c, text in legend.entries
         ) + "</div>"  # fmt: skip
     if isinstance(legend, Wheel):
-        source = _encoded(legend.image, "png")
+        source = encoded(legend.image, "png")
         text = f"<span>{escape(legend.text)}</span>"
         return f'<div class="wheel"><img src="{source}" alt="">{text}</div>'
     return ""
+
+
+def colour_bar(bar: Bar) -> str:
+    """A scale of colours with its values below, in HTML."""
+    stops = bar.colours[0, np.linspace(0, bar.colours.shape[1] - 1, 24).astype(int)]
+    ramp = ",".join(_css(c) for c in stops)
+    texts = "".join(f"<span>{escape(text)}</span>" for text in bar.texts)
+    return (
+        f'<div class="bar" style="background:linear-gradient(to right,{ramp})"></div>'
+        f'<div class="ticks">{texts}</div>'
+    )
 
 
 def _css(colour: Any) -> str:
@@ -190,7 +196,7 @@ def _number(value: Any, form: str = ".4g") -> str:
     return "" if value is None else format(float(value), form)
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
+def table(head: list[str], rows: list[list[str]]) -> str:
     """A table in HTML; the cells are HTML, the first of a row its name."""
     top = "".join(f"<th>{escape(h)}</th>" for h in head)
     body = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
@@ -231,7 +237,7 @@ def _energy(shown: Shown) -> str:
             f"<p>The refinement lowers E and E_photo together, from {_number(first)} to"
             f" {_number(last)}; E alone may rise.</p>"
         )
-    return _table(["stage", *terms, ""], rows) + note
+    return table(["stage", *terms, ""], rows) + note
 
 
 def _accuracy(shown: Shown) -> str:
@@ -252,7 +258,7 @@ def _accuracy(shown: Shown) -> str:
         for name in order
         if (m := metrics.get(name))
     ]
-    return _table(["depth", "MRE", "median error", "skill", "coverage"], rows)
+    return table(["depth", "MRE", "median error", "skill", "coverage"], rows)
 
 
 def _components(shown: Shown) -> str:
@@ -278,4 +284,4 @@ def _components(shown: Shown) -> str:
     rest = len(parts) - LISTED
     note = f"<p>Smaller components that are not listed: {rest}.</p>" if rest > 0 else ""
     head = ["component", "share of the image", "rotation", "shift", "not rigid by"]
-    return _table(head, rows) + note
+    return table(head, rows) + note

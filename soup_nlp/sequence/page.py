@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.report.colour import Image, colourise_depth
+from soup_nlp.report.page import colour_bar, encoded, table
+from soup_nlp.report.pictures import Bar
 from soup_nlp.sequence.chain import Chain
 
 WIDTH = 720
@@ -61,20 +62,13 @@ def _jpeg(image: Image) -> str:
     if width > WIDTH:
         size = (WIDTH, round(height * WIDTH / width))
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    rgb = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    _, data = cv2.imencode(".jpg", rgb, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    return encoded(image, "jpeg", [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 
 def _bar(near: float, far: float) -> str:
     """The colours of depth with their values, as HTML."""
     z = 1 / np.linspace(1 / far, 1 / near, 25)
-    stops = ",".join("rgb({},{},{})".format(*c) for c in colourise_depth(z[None], near, far)[0])
-    texts = "".join(f"<span>{x:.3g}</span>" for x in z[::6])
-    return (
-        f'<div class="bar" style="background:linear-gradient(to right,{stops})"></div>'
-        f'<div class="ticks">{texts}</div>'
-    )
+    return colour_bar(Bar(colourise_depth(z[None], near, far), tuple(f"{x:.3g}" for x in z[::6])))
 
 
 def _plan(chain: Chain) -> str:
@@ -127,18 +121,10 @@ def _table(told: Mapping[str, Any]) -> str:
         a, b = k["pairs"]
         known = f"{true[a, b]:.3f}" if (a, b) in true else ""
         note = "bridge" if k["bridge"] else "a guess" if k["flagged"] else ""
-        cells = (
-            f"{a}, {b}",
-            f"{k['ratio']:.3f}",
-            f"{k['spread']:.3f}",
-            known,
-            str(k["pixels"]),
-            note,
-        )
-        rows.append("".join(f"<td>{cell}</td>" for cell in cells))
-    heads = "pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", ""
-    head = "".join(f"<th>{h}</th>" for h in heads)
-    out = f"<table><tr>{head}</tr>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
+        numbers = [f"{k['ratio']:.3f}", f"{k['spread']:.3f}", known, str(k["pixels"])]
+        rows.append([f"{a}, {b}", *numbers, note])
+    heads = ["pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", ""]
+    out = table(heads, rows)
     if told["score"]:
         s = told["score"]
         out += (
