@@ -1,4 +1,4 @@
-"""One pair measured: solution and baselines under every convention, as one row of numbers."""
+"""Measurement of one pair: a row with the errors of solution and baselines by convention."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows as tables: per image, per sequence, per dataset, the protocol beside every number."""
+"""Tables of rows by image, sequence and dataset, each with its evaluation protocol."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def head_of(name: str, text: str, rows: Sequence[Row], note: str) -> list[str]:
 
 
 def text_variants(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
-    """Table of an analysis: a pair a line, a variant a column."""
+    """Table of an analysis: one line for each pair, one column for each variant."""
     lines = head_of(name, text, rows, note)
     variants, pairs = by_pair(rows, titles(rows))
     complete = [p for p in pairs.values() if all(main_metric(p[v]) is not None for v in variants)]
@@ -130,7 +130,7 @@ def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> st
 def plot_variants(
     path: Path, axis: str, title: str, rows: Sequence[Row], numeric: bool = False
 ) -> None:
-    """MRE over the variants, a line a pair, their mean in black."""
+    """MRE over the variants, one line for each pair, their mean in black."""
     variants, pairs = by_pair(rows, titles(rows))
     x = np.array([float(v) for v in variants]) if numeric else np.arange(float(len(variants)))
     picture = figure(7, 4)
@@ -163,7 +163,7 @@ def plot_variants(
 
 
 def plot_energy(path: Path, rows: Sequence[Row]) -> None:
-    """Terms of every soup stacked, relative to the solution's energy; a panel a pair.
+    """Terms of every soup stacked, relative to the solution's energy; one panel for each pair.
 
     A start far above all others is cut off at the top.
     """
@@ -212,7 +212,7 @@ def text_flow(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
 
 
 def plot_flow(path: Path, rows: Sequence[Row]) -> None:
-    """Weighted error by pair, a bar a source."""
+    """Weighted error by pair, one bar for each source."""
     good = [r for r in rows if r.get("ok")]
     variants, pairs = by_pair(good, pair_names(good))
     picture = figure(max(5.0, 1.1 * len(pairs)), 4)

@@ -26,7 +26,7 @@ _FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
 def mirrored(pair: Pair) -> Pair:
-    """The pair as a mirror beside the camera shows it: columns run backwards, x points left.
+    """The pair mirrored left to right: columns are reversed, x changes its sign.
 
     Depths stay; intrinsics, flow, motions, points and scene flow are those of the mirrored world.
     """
@@ -69,7 +69,7 @@ def _changed(truth: Truth, changes: Mapping[str, Change]) -> Truth:
 
 
 def _each_image(pair: Pair, change: Change) -> Pair:
-    """The pair with all that it has for every pixel changed; cameras and the rest as they were."""
+    """The pair with every per-pixel array changed; cameras and the rest as they were."""
     flow, truth = pair.flow, pair.truth
     if flow is not None:
         flow = replace(flow, uv=change(flow.uv), confidence=change(flow.confidence))

@@ -1,4 +1,4 @@
-"""Functions in processes of their own, with limits, and the machine that they run on."""
+"""Functions run in separate processes with limits; the description of the machine."""
 
 from __future__ import annotations
 

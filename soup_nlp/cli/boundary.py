@@ -1,4 +1,4 @@
-"""The edge of every command: what nobody foresaw becomes the report of a bug, in a file."""
+"""The outermost layer of every command: an unexpected exception becomes a bug report in a file."""
 
 from __future__ import annotations
 

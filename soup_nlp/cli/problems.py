@@ -1,4 +1,4 @@
-"""Commands show, list and export: problems, merged, counted up, or as files for other solvers."""
+"""Commands show, list and export: print problems, list them, write them as files for solvers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a solve tells while it runs: a line a stage, a bar on a terminal, details where asked."""
+"""Progress of a solve: one line for each stage, a bar on a terminal, details if asked for."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class OutputOptions(Section):
 
 
 def title(text: object) -> str:
-    """A text as the name of a problem: what cannot be in one becomes an underscore."""
+    """A text as the name of a problem: characters that no name may have become underscores."""
     kept = (c if c.isprintable() and c not in "/\\" else "_" for c in printable(text))
     return "".join(kept)[:LONGEST_NAME] or "problem"
 

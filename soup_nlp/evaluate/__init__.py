@@ -1,1 +1,1 @@
-"""Metrics, baselines, scores, and a referee that recomputes stored results."""
+"""Metrics, baselines, scores, confidence, and the recomputation of stored results."""

@@ -103,7 +103,7 @@ def require_finite(name: str, values: Float, where: object) -> None:
 
 
 def require_bounds(name: str, lower: Float, upper: Float, where: object) -> None:
-    """Check that bounds (n,) of "x" or "g" hold for some number.
+    """Check that no lower bound (n,) of "x" or "g" lies above its upper bound.
 
     Raises:
         ExportError: one is NaN, a lower one is +inf, an upper one -inf, or they cross.

@@ -1,4 +1,4 @@
-"""What problem sets say of an instance: sizes, classes, degree, rank of the Jacobian, LICQ."""
+"""Properties of an instance that problem sets list: sizes, classes, rank of the Jacobian, LICQ."""
 
 from __future__ import annotations
 

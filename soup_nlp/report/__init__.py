@@ -1,1 +1,1 @@
-"""Metrics, pictures, point clouds and the result folder."""
+"""Pictures, the page, point clouds, the result folder and its check."""

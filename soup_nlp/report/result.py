@@ -1,4 +1,4 @@
-"""What a solve is worth outside: images, cameras, surfaces and motions, of a run or a folder."""
+"""A result for other programs: images, cameras, surfaces and motions, of a run or a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ranges at the doors: what is beyond them is of no use and takes memory or time without end."""
+"""Limits of input sizes: larger ones are of no use and would take all memory or time."""
 
 from __future__ import annotations
 

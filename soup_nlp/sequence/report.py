@@ -1,4 +1,4 @@
-"""What a chain says of itself in the terminal."""
+"""The summary of a chain that the terminal shows."""
 
 from __future__ import annotations
 

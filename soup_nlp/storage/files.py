@@ -1,4 +1,4 @@
-"""The door of files: what is no regular file, too large or too deep is an error, not a hang."""
+"""Checked reading: anything but a regular file of sensible size and depth is an error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""HDF5 files read: links are not followed, sizes are looked at before memory is taken."""
+"""Reading HDF5 files: links are not followed, sizes are checked before memory is taken."""
 
 from __future__ import annotations
 

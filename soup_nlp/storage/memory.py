@@ -1,4 +1,4 @@
-"""Memory of the machine, asked before it is taken."""
+"""Available memory, checked before large arrays are made."""
 
 from __future__ import annotations
 

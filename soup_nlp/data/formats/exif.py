@@ -1,4 +1,4 @@
-"""Intrinsics of a picture that comes without: EXIF, a field of view, or a guess."""
+"""Intrinsics of a picture without a camera file: from EXIF, a field of view, or a guess."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""NumPy's .npy and .npz files, whose headers are not believed before they were compared."""
+"""NumPy's .npy and .npz files; their headers are checked before memory is taken."""
 
 from __future__ import annotations
 
