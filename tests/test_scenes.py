@@ -17,7 +17,7 @@ from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry import camera, rotation
 
 ALL = list(SCENES)
-WIDTH, HEIGHT = 320, 136
+WIDTH, HEIGHT = 240, 102
 GREY = Texture(((0.5, 0.5, 0.5), (0.4, 0.4, 0.4)), cell=0.3)
 
 
@@ -92,7 +92,7 @@ def test_occluded_points_are_hidden_or_outside(name):
 
 def test_labels_name_components_that_can_be_seen():
     for name in ALL:
-        for seed, p in ((0, pair(name)), (1, pair(name, 1, 192, 82))):
+        for seed, p in ((0, pair(name)), (1, pair(name, 1, 128, 54))):
             count = np.bincount(p.truth.components.ravel(), minlength=len(p.truth.motions))
             assert len(count) == len(p.truth.motions)
             assert count.min() > 0.003 * count.sum(), (name, seed)

@@ -79,6 +79,7 @@ def test_the_road_moves_behind_a_reflection(reflecting: Pair):
     assert np.mean((seen.flow.uv == given.flow.uv)[above]) > 0.95
 
 
+@pytest.mark.slow
 def test_images_without_a_layer_are_left_alone(street: Pair):
     assert see_through(with_flow(street, still=False)) is None
 
