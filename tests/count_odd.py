@@ -58,7 +58,7 @@ def main() -> None:
     total, bad = Counter[str](), Counter[str]()
     with tempfile.TemporaryDirectory() as scratch:
         world = World(Path(scratch))
-        _ = world.result, world.exported
+        _ = world.result, world.exported, world.run
         for k, case in enumerate(cases):
             folder = Path(scratch) / f"case_{k}"
             folder.mkdir()

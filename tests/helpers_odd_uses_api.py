@@ -24,6 +24,7 @@ from soup_nlp.report.result import read_result
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import find_images, video_frames
 
+STREET = {"input": {"kind": "scene", "scene": "street"}}
 Call = Callable[[World, Path, Any], Any]
 CALLS: dict[str, Call] = {
     "save folder": lambda w, o, x: w.run.save(x),
@@ -46,9 +47,20 @@ CALLS: dict[str, Call] = {
     "import_sol file": lambda w, o, x: import_sol(w.exported, x),
     "solve_pair preset": lambda w, o, x: soup_nlp.solve_pair(w.run.pair, preset=x),
     "solve_pair flow": lambda w, o, x: soup_nlp.solve_pair(w.run.pair, flow=x),
-    "make_problem preset": lambda w, o, x: soup_nlp.make_problem(
-        {"input": {"kind": "scene", "scene": "street"}, "preset": x}
+    **{
+        f"run {name}": lambda w, o, x, n=name: soup_nlp.run(w.run.problem, **{n: x})
+        for name in ("listener", "stop", "log", "on_stage", "ipopt_log")
+    },
+    "make_problem overrides": lambda w, o, x: soup_nlp.make_problem(STREET, x),
+    "make_problem where": lambda w, o, x: soup_nlp.make_problem(STREET, where=x),
+    "with_flow": lambda w, o, x: w.run.pair.with_flow(x),
+    "evaluate depth_scale": lambda w, o, x: soup_nlp.evaluate(
+        w.result, depth_png(o), depth_scale=x
     ),
+    "components": lambda w, o, x: w.run.components[x],
+    "own_motion": lambda w, o, x: w.run.components.own_motion(x),
+    "camera": lambda w, o, x: w.run.camera(x),
+    "make_problem preset": lambda w, o, x: soup_nlp.make_problem(STREET | {"preset": x}),
 }
 FINE = {
     ("save formats", "None"),
@@ -59,17 +71,32 @@ FINE = {
     ("write_sx_nl start", "None"),
     ("write_sx_nl start", "int"),
     ("write_sx_nl start", "scalar array"),
+    ("make_problem overrides", "list"),
+    ("make_problem where", "text"),
+    ("with_flow", "None"),
+    ("evaluate depth_scale", "int"),
+    ("camera", "vector"),
+    ("camera", "image"),
 }
 """Arguments that are right, or of no use but harmless."""
 SOLVES = {("solve_pair preset", "None"), ("solve_pair flow", "None"), ("solve_pair flow", "dict")}
-WRITES = {("save folder", "text"), ("write_sx_nl path", "text")}
+SOLVES |= {(f"run {n}", "None") for n in ("listener", "stop", "log", "on_stage", "ipopt_log")}
+WRITES = {("save folder", "text"), ("write_sx_nl path", "text"), ("run ipopt_log", "text")}
 """Right names of files, in the working folder."""
+CALLABLE = {(f"run {n}", k) for n in ("listener", "log", "on_stage") for k in ("type", "function")}
+"""What the caller's own function raises is his."""
+
+
+def depth_png(o: Path) -> Path:
+    """A depth map of 16 bits."""
+    Image.fromarray(np.full(SIZE, 2000, np.uint16)).save(o / "d.png")
+    return o / "d.png"
 
 
 def call_cases() -> Iterator[Case]:
     for name, call in CALLS.items():
         for what, thing in THINGS.items():
-            if (name, what) in SOLVES | WRITES:
+            if (name, what) in SOLVES | WRITES | CALLABLE:
                 continue
 
             def do(w: World, o: Path, call=call, thing=thing) -> None:
@@ -236,6 +263,13 @@ def run_cases() -> Iterator[Case]:
         pair.with_flow(flow)
 
     yield quiet("arrays of other layouts", strided)
+    yield quiet("compare records", lambda w, o: w.run.pair == w.run.pair.with_flow(w.run.pair.flow))
+    yield quiet(
+        "hash of records", lambda w, o: {w.run, w.run.pair, w.run.soup, w.run.reconstruction}
+    )
+    huge = np.full(SIZE, 1e300)
+    own = "truth that overflows"
+    yield Case("5 Python API", own, lambda w, o: (soup_nlp.Truth(depth_ref=huge), None)[1])
 
 
 def use_api_cases() -> Iterator[Case]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -162,3 +165,26 @@ def test_white_reaches_files_too(tmp_path):
     }
     problem = make_problem({"input": {**source, "white": 4095}, "base": str(tmp_path)})
     assert problem.load_pair().image_ref.min() == 255
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        ("list >&-", 0),
+        ("list <&- >&- 2>&-", 0),
+        # no space for what is printed
+        ("--help >/dev/full", 2),
+        ("list >/dev/full", 2),
+    ],
+)
+def test_streams_that_are_closed_or_full(words, code):
+    if "/dev/full" in words and not Path("/dev/full").exists():
+        pytest.skip("there is no /dev/full")
+    command = f'"$0" -m soup_nlp {words}'
+    surroundings = os.environ | {"MPLBACKEND": "garbage"}
+    done = subprocess.run(
+        ["sh", "-c", command, sys.executable], env=surroundings, capture_output=True, text=True
+    )
+    assert done.returncode == code
+    assert ("the system refuses a file" in done.stderr) == (code == 2)
+    assert "Traceback" not in done.stderr

@@ -45,22 +45,27 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
         except (SoupError, typer.Exit, typer.Abort, BrokenPipeError):
             raise
         except Exception as error:
-            if _out_of_memory(error):
-                raise DataError(
-                    "the machine has not enough memory for this",
-                    found=error,
-                    hint="smaller images, or fewer superpixels, neighbours or particles",
-                ) from error
-            if isinstance(error, OSError) and error.errno in SYSTEM:
-                raise DataError(
-                    "the system refuses a file", where=error.filename, found=error.strerror
-                ) from error
+            if refused := refusal(error):
+                raise refused from error
             # usage errors of the command line library carry their own message
             if hasattr(error, "format_message"):
                 raise
             raise typer.Exit(report_bug(error)) from error
 
     return run
+
+
+def refusal(error: Exception) -> DataError | None:
+    """The error of a machine that has no more memory, files or space; None for any other."""
+    if _out_of_memory(error):
+        return DataError(
+            "the machine has not enough memory for this",
+            found=error,
+            hint="smaller images, or fewer superpixels, neighbours or particles",
+        )
+    if isinstance(error, OSError) and error.errno in SYSTEM:
+        return DataError("the system refuses a file", where=error.filename, found=error.strerror)
+    return None
 
 
 def _out_of_memory(error: Exception) -> bool:
@@ -90,7 +95,19 @@ def report_bug(error: BaseException) -> int:
 
 
 def prepare_streams() -> None:
-    """Let characters that a terminal or file cannot show be printed as escapes."""
+    """Let characters that a terminal or file cannot show be printed as escapes.
+
+    A stream that was closed before the start (`>&-`) swallows what is printed. Its number would
+    else be that of the next file that is opened, and native code would print into that.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            # takes the lowest free number
+            os.open(os.devnull, os.O_RDWR)
+    sys.stdout = sys.stdout or os.fdopen(1, "w")
+    sys.stderr = sys.stderr or os.fdopen(2, "w")
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             with suppress(OSError, ValueError):

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -18,6 +19,7 @@ from soup_nlp.cli.boundary import (
     drop_output,
     guarded,
     prepare_streams,
+    refusal,
     report_bug,
 )
 from soup_nlp.errors import SoupError, StoppedError, printable
@@ -125,6 +127,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         interrupted before there was anything to keep, or twice: no result is written.
     """
     prepare_streams()
+    if argv is None:
+        # pictures go to files; a backend of the user's that matplotlib does not know is no matter
+        os.environ["MPLBACKEND"] = "agg"
     try:
         with sigterm_as_ctrl_c():
             code = _run(argv)
@@ -158,6 +163,9 @@ def _run(argv: Sequence[str] | None) -> int:
             return 2
         if isinstance(error, BrokenPipeError):
             raise
+        if refused := refusal(error):
+            print(f"error: {refused}", file=sys.stderr)
+            return 2
         return report_bug(error)
 
 

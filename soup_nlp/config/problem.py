@@ -232,8 +232,10 @@ def make_problem(
         ConfigError: as `load_problem`.
     """
     expect(raw, Mapping, "problem", "a dict of sections: {'input': {'kind': 'motorcycle'}}")
+    expect(overrides, (list, tuple), "overrides", "a list such as ['solver.max_iter=200']")
     for item in overrides:
         expect(item, str, "override", "text such as 'solver.max_iter=200'")
+    expect(where, str, "where", "a name for messages")
     tree = copy.deepcopy(dict(raw))
     overridden = {_override(tree, item): f"--set {item}" for item in overrides}
     lines = {**(lines or {}), **overridden}

@@ -16,6 +16,9 @@ Float = NDArray[np.float64]
 SHORTEST = 0.05
 """Focal length, in sides of the image, below which it cannot be in pixels (168 degrees of view)."""
 
+LARGEST = 1e100
+"""Number of a truth above which sums of squares are no float64 any more."""
+
 
 def check_size(
     what: str,
@@ -43,7 +46,7 @@ def check_size(
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Flow:
     """A dense flow from the reference to the next image.
 
@@ -122,7 +125,7 @@ _KINDS = dict.fromkeys(_SHAPES, "fiu") | {"occluded": "b", "components": "iu"}
 """Shape and kind of number of every part of a truth."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Truth:
     """What is known of the scene, for measuring only; any part may be None.
 
@@ -170,6 +173,14 @@ class Truth:
                     + ("True and False" if kinds == "b" else "numbers"),
                     hint="soup_nlp.Truth(depth_ref=array); files are read by a problem's input",
                 )
+            if made.dtype.kind == "f" and (abs(made[np.isfinite(made)]) > LARGEST).any():
+                raise DataError(
+                    "part of the truth has numbers whose squares overflow",
+                    where=f"truth.{name}",
+                    found=f"{np.abs(made[np.isfinite(made)]).max():g}",
+                    expected=f"at most {LARGEST:g}",
+                    hint="NaN marks what is unknown",
+                )
             object.__setattr__(self, name, made)
 
     def known(self) -> list[str]:
@@ -182,7 +193,7 @@ class Truth:
     __repr__ = __str__
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pair:
     """Two consecutive frames with cameras, flow and truth.
 

@@ -36,7 +36,7 @@ SMOOTHING = 0.03
 """Width in pixels within which a norm is taken for its square: no flow is more exact."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Information:
     """Gauss-Newton information of the energy at a soup.
 
@@ -82,7 +82,7 @@ def information(
     return Information(matrix, problem.growth(x), x.reshape(-1, 9)[:, :3], problem.layout)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Marginals:
     """Marginal covariances of the planes, the global scale left out.
 
@@ -184,7 +184,7 @@ MOST_SIGMA = (1 - MIN_CONFIDENCE) * SIGMA_PRIOR
 """The sigma of that confidence."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Confidence:
     """How sure the depth of an answer is.
 

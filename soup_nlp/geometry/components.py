@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.motion import RigidMotion, fit_motion
@@ -77,7 +78,14 @@ class Components:
         return len(self.members)
 
     def __getitem__(self, label: int) -> Component:
-        return self.members[label]
+        try:
+            return self.members[label]
+        except (IndexError, TypeError):
+            raise DataError(
+                "there is no such component",
+                found=f"{type(label).__name__} {printable(repr_of(label), 60)}",
+                expected=f"0 (the background) to {len(self) - 1}",
+            ) from None
 
     def __iter__(self) -> Iterator[Component]:
         return iter(self.members)

@@ -14,7 +14,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Segmentation:
     """Superpixels and the two graphs over them (N superpixels, E edges, P neighbour pairs).
 

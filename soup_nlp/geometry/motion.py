@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry import rotation
 
 Float = NDArray[np.float64]
@@ -31,8 +32,22 @@ class RigidMotion:
     __repr__ = __str__
 
     def __call__(self, points: Float) -> Float:
-        """The points (..., 3), moved."""
-        return np.asarray(points @ self.R.T + self.t)
+        """The points (..., 3), moved.
+
+        Raises:
+            DataError: they are not numbers, three of each point.
+        """
+        try:
+            x = np.asarray(points, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            x = np.empty(0)
+        if x.shape[-1:] != (3,):
+            raise DataError(
+                "points are no array of points",
+                found=f"{type(points).__name__} {printable(repr_of(points), 60)}",
+                expected="numbers (..., 3)",
+            )
+        return np.asarray(x @ self.R.T + self.t)
 
     def __matmul__(self, first: RigidMotion) -> RigidMotion:
         """This motion after another one."""

@@ -14,7 +14,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Soup:
     """State of N superpixels: what every stage takes and returns.
 
@@ -115,7 +115,7 @@ class Soup:
         return K_next @ H @ np.linalg.inv(K_ref)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Reconstruction:
     """Dense 3D of both frames, in the soup's length unit.
 

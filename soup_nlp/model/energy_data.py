@@ -17,7 +17,7 @@ Int = NDArray[np.int64]
 TERMS = ("arap", "proj", "cont", "orient", "prior")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EnergyData:
     """Everything numeric that E and its constraints need (N superpixels, E edges, P pairs).
 

@@ -39,7 +39,7 @@ from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
     """A problem before it is solved.
 

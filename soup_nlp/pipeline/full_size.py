@@ -17,7 +17,7 @@ from soup_nlp.geometry.soup import Reconstruction
 Map = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FullSize:
     """Depth at the size of the images, in the soup's length unit.
 

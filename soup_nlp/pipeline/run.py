@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
+from types import FunctionType, NoneType
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,7 @@ PAIR = "soup_nlp.Pair(image_ref, image_next, K_ref)"
 """How a pair is made, for messages."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Run:
     """Inputs and results of a solve.
 
@@ -259,6 +260,12 @@ def run(
     expect(problem, Problem, "problem", "soup_nlp.load_problem(FILE), or make_problem({...})")
     if pair is not None:
         expect(pair, Pair, "pair", PAIR)
+    calls = {"listener": listener, "log": log, "on_stage": on_stage}
+    for name, call in calls.items():
+        if not callable(call):
+            expect(call, (FunctionType, NoneType), name, "a function, such as print, or None")
+    expect(stop, (threading.Event, NoneType), "stop", "threading.Event(), or None")
+    expect(ipopt_log, (str, NoneType), "ipopt_log", "the name of a file, or None")
     clock = _Clock(stop, on_stage)
     case = prepare(problem, pair=pair, log=log, on_stage=clock)
 

@@ -114,7 +114,7 @@ class Round:
         return self.mrf_energy - self.bound
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Refined:
     """What the refinement ended with.
 

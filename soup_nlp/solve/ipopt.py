@@ -89,7 +89,7 @@ class Watch:
     log_file: str | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stage:
     """One call of Ipopt and how it ended.
 

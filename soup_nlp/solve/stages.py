@@ -40,7 +40,7 @@ STOPPED = ("Interrupted", "Time_Limit")
 """Status of a stage after which no other begins."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """What the constrained NLP ended with.
 

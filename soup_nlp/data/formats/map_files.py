@@ -14,6 +14,7 @@ import re
 import struct
 from collections.abc import Callable, Mapping
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.data.formats.images import check_body, decode, decode_png16
 from soup_nlp.data.formats.npy_files import read_npy
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, repr_of
 from soup_nlp.schema.limits import check_image_size
 from soup_nlp.storage.files import PathLike, as_path, read_bytes
 
@@ -261,11 +262,11 @@ def read_depth_png16(path: PathLike, scale: float = 1000.0) -> Float:
     Raises:
         DataError: the scale is not positive, or the file is missing, damaged or not 16-bit grey.
     """
-    if not (np.isfinite(scale) and scale > 0):
+    if not (isinstance(scale, Real) and 0 < scale < 1e300):
         raise DataError(
             "depth scale must be positive",
             where=path,
-            found=scale,
+            found=repr_of(scale),
             expected="values per unit of length, e.g. 1000 for millimetres",
         )
     return _known_depth(decode_png16(path, 1, "depth image") / float(scale), path)
