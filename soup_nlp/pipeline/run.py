@@ -280,25 +280,7 @@ def run(
         clock("nlp")
     refined = None
     if problem.refine.enabled:
-        photo = None
-        if not flow_is_exact(case.start):
-            photo = look(case.seen, case.segmentation.labels, solution.soup, problem.refine)
-        refined = refine_soup(
-            solution.soup,
-            case.data,
-            case.weights,
-            problem.refine,
-            photo=photo,
-            seed=problem.seed,
-            min_facing=problem.formulation.min_facing,
-            depth_ratio=problem.formulation.depth_ratio,
-            listener=listener,
-            stop=stop,
-            say=log,
-        )
-        if problem.refine.polish and refined.status != "interrupted":
-            again = nlp(refined.soup).soup
-            refined = _polished(refined, again, objective(again, case.data, case.weights, photo))
+        refined = _refined(case, solution.soup, nlp, listener=listener, stop=stop, say=log)
         if log:
             log(str(refined))
         clock("refine")
@@ -306,6 +288,35 @@ def run(
     clock("evaluation")
     parts = {f"nlp_{k}": v for k, v in solution.seconds.items()}
     return replace(done, seconds={**clock.seconds, **parts})
+
+
+def _refined(case: Case, soup: Soup, nlp: Callable[[Soup], Solution], **watched: Any) -> Refined:
+    """The refinement of a soup, and the NLP's answer from it where the problem asks for one.
+
+    Args:
+        case: The problem before the solve.
+        soup: The NLP's solution, or the start.
+        nlp: Solves the constrained NLP from a soup.
+        watched: Listener, stop event and log of `refine_soup`.
+    """
+    problem, photo = case.problem, None
+    if not flow_is_exact(case.start):
+        photo = look(case.seen, case.segmentation.labels, soup, problem.refine)
+    refined = refine_soup(
+        soup,
+        case.data,
+        case.weights,
+        problem.refine,
+        photo=photo,
+        seed=problem.seed,
+        min_facing=problem.formulation.min_facing,
+        depth_ratio=problem.formulation.depth_ratio,
+        **watched,
+    )
+    if not problem.refine.polish or refined.status == "interrupted":
+        return refined
+    again = nlp(refined.soup).soup
+    return _polished(refined, again, objective(again, case.data, case.weights, photo))
 
 
 def flow_is_exact(start: Start) -> bool:
