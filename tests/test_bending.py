@@ -14,11 +14,15 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.metrics import depth_metrics
+from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.pipeline.case import Case, build_energy, prepare, solver_options
 from soup_nlp.solve.stages import solve_soup
-from soup_nlp.start.bending import surfaces
+from soup_nlp.start.bending import at_rest, surfaces
+from soup_nlp.start.choice import LEAST_NOISE
+from soup_nlp.start.propose import look
+from soup_nlp.start.start_options import SeededStart
 
 pytestmark = pytest.mark.slow
 
@@ -66,6 +70,44 @@ def test_sheet_bends_and_can_be_told_not_to():
     assert (c.start.component == 0).all()
     np.testing.assert_allclose(c.soup.depth_at(c.data.anchor_ray), 1.0, rtol=1e-9)
     assert not case("sheet", "start.bending=1.0").start.bending
+
+
+def test_depth_starts_constant_where_the_camera_is_at_rest():
+    """Its background could as well be far: what moves before it would be given a depth."""
+    c = case("still")
+    assert c.start.at_rest
+    assert c.start.bending
+    np.testing.assert_allclose(c.soup.depth_at(c.data.anchor_ray), 1.0, rtol=1e-9)
+    start = case("still", "start.at_rest=1.0").start
+    assert not start.at_rest
+    assert np.ptp(start.component) > 0
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.02, -0.05, 0.03)])
+def test_a_camera_that_turns_only_is_at_rest(turn):
+    c = case("street")
+    views, _ = look(c.segmentation, c.pair.flow, c.pair.K_ref, c.pair.K_next, SeededStart())
+    R = rotation.exp(np.array(turn))
+    target = views.ray @ R.T
+    target = target / target[..., 2:]
+    turned = replace(views, target=target)
+    assert at_rest(turned, [np.eye(3), R]) == pytest.approx(1.0)
+    # half of the superpixels move by a pixel more
+    own = np.arange(len(target)) % 2 == 0
+    target[own, :, 0] += 1.0 / views.focal[0]
+    share = views.weight[~own].sum() / views.weight.sum()
+    assert at_rest(turned, [R]) == pytest.approx(share)
+    assert at_rest(views, [R]) < 0.2
+
+
+def test_noise_where_surfaces_bend_is_that_of_affine_flows():
+    """The error of a start without relief is no noise."""
+    quiet = case("sheet").start
+    assert quiet.noise == LEAST_NOISE
+    assert np.median(quiet.error) > LEAST_NOISE
+    noisy = case("sheet", "flow.source=truth+noise:0.3", "start.bending=0.0").start
+    assert noisy.bending
+    assert 2 * LEAST_NOISE < noisy.noise < 0.5
 
 
 def test_where_surfaces_bend_the_presolve_begins_with_narrower_norms():

@@ -31,6 +31,7 @@ from soup_nlp.model.energy_data import EnergyData, build_energy_data, sample_pix
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.reweighting import in_noise, in_pixels
+from soup_nlp.start.choice import limited_noise
 
 # --- invariances ---------------------------------------------------------------------------------
 
@@ -305,5 +306,5 @@ def test_prior_is_the_mean_slope_of_inverse_depth_relative_to_it():
 @pytest.mark.parametrize(("error", "noise"), [(0.0, 0.05), (0.3, 0.3), (9.0, 0.6)])
 def test_prior_is_measured_in_the_noise_of_the_flow(error, noise):
     problem = tiny("pixels")
-    data = in_noise(problem.data, np.full(12, error))
+    data = in_noise(problem.data, limited_noise(np.full(12, error)))
     np.testing.assert_allclose(data.prior_weight, noise * problem.data.prior_weight)

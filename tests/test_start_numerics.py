@@ -9,7 +9,7 @@ import pytest
 
 from soup_nlp.geometry import rotation
 from soup_nlp.start import epipolar
-from soup_nlp.start.bending import _affine, constant_depth
+from soup_nlp.start.bending import affine_flow, constant_depth
 from soup_nlp.start.epipolar import Motion, estimate, sampson, sampson_slopes
 from soup_nlp.start.neighbourhoods import fit_translation, refine_motion
 from soup_nlp.start.plane_fit import PlaneFit, Views
@@ -195,10 +195,10 @@ def test_an_affine_flow_is_not_pulled_by_some_wrong_pixels():
     M = np.array([[1.1, 0.2], [-0.1, 0.9]])
     wrong = np.arange(40) % 5 == 0
     target = at @ M + [0.02, 0.01] + np.where(wrong[:, None], 5 / FOCAL, 0.0)
-    fit = _affine(flat_views(target, at, np.ones(40)))[0]
+    fit = affine_flow(flat_views(target, at, np.ones(40)))[0][0]
     np.testing.assert_allclose(fit[0], FOCAL * np.array([0.02, 0.01]), atol=0.1)
     np.testing.assert_allclose(fit[1:], 0.1 * FOCAL * M, atol=0.1)
     # what is not confident does not count at all
     far = at @ M + [0.02, 0.01] + np.where(wrong[:, None], 0.5, 0.0)
-    fit = _affine(flat_views(far, at, np.where(wrong, 0.0, 1.0)))[0]
+    fit = affine_flow(flat_views(far, at, np.where(wrong, 0.0, 1.0)))[0][0]
     np.testing.assert_allclose(fit[1:], 0.1 * FOCAL * M, atol=1e-3)

@@ -38,6 +38,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "samples": 100,
                 "threshold_px": 0.5,
                 "bending": 1.0,
+                "at_rest": 1.0,
                 "ground": False,
             },
             "energy": {

@@ -22,9 +22,9 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation, FormulationOptions
 from soup_nlp.model.layout import TangentLayout
-from soup_nlp.model.reweighting import LEAST_NOISE, MOST_NOISE
 from soup_nlp.solve.selected_inverse import BlockCholesky
 from soup_nlp.solve.tangent_problem import TangentProblem
+from soup_nlp.start.choice import LEAST_NOISE, MOST_NOISE
 from soup_nlp.start.propose import Start
 
 Float = NDArray[np.float64]
@@ -192,7 +192,7 @@ class Confidence:
         sigma: (H, W) calibrated standard deviation of log depth, the global scale left out.
         spread: (H, W) standard deviation of log depth by what the flow adds to the terms on shape.
         marginals: Of the planes and of the components' scales.
-        noise: Of the flow, pixels, see `flow_noise`.
+        noise: Of the flow, pixels.
         bending: Whether surfaces are taken to bend.
         still: (N,) what stands still where surfaces bend, whose depth nothing tells.
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
@@ -215,11 +215,6 @@ class Confidence:
     def component_sigma(self) -> Float:
         """(C,) calibrated standard deviation of the components' log scale."""
         return calibrated(np.sqrt(self.marginals.component), self.noise, bending=self.bending)
-
-
-def flow_noise(start: Start) -> float:
-    """Noise of the flow, pixels: the start's median re-projection error within limits."""
-    return float(np.clip(np.median(start.error), LEAST_NOISE, MOST_NOISE))
 
 
 def without_parallax(start: Start) -> NDArray[np.bool_]:
@@ -343,7 +338,7 @@ def confidence(
             np.full(int(start.component.max()) + 1, np.inf),
         )
         spread = np.full(rec.labels.shape, np.inf)
-    noise, misfit = flow_noise(start), flow_misfit(rec, pair.flow)
+    noise, misfit = start.noise, flow_misfit(rec, pair.flow)
     still = stands_still(rec.soup, data.anchor_ray, pair.K_next) & start.bending
     own_misfit, at_rest = misfit[rec.labels], still[rec.labels]
     sigma = calibrated(spread, noise, own_misfit, bending=start.bending, still=at_rest)

@@ -27,6 +27,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.case import Case, build_energy, solver_options
+from soup_nlp.start.choice import limited_noise
 from soup_nlp.start.propose import Start
 
 Float = NDArray[np.float64]
@@ -173,6 +174,8 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
         surface=record.surface,
         tie=none,
         bending=record.bending,
+        # records of bending surfaces hold their prior in pixels
+        noise=1.0 if record.bending else limited_noise(record.error),
     )
     data, weights = build_energy(problem, pair, seg, start)
     options = solver_options(problem, start)

@@ -33,7 +33,7 @@ class Weights(Section):
     """alpha3."""
     prior: NonNegative = 0.03
     """alpha4, cost of a relative change of inverse depth by 1 per ray unit, in units of the flow's
-    noise (pixels where surfaces bend); 0 is the paper's form."""
+    noise; 0 is the paper's form."""
     sigma_cont: Truncation = 1.0
     """Truncation of E_cont's second-frame gap (rho), length."""
     sigma_cont_ref: Truncation = np.inf
@@ -56,8 +56,8 @@ class BendingWeights(Weights):
     """alpha2."""
     orient: NonNegative = 4.0
     """alpha3, of 1,000 superpixels; it grows with their number."""
-    prior: NonNegative = 0.2
-    """alpha4, pixels."""
+    prior: NonNegative = 4.0
+    """alpha4, in units of the flow's noise, here that of the superpixels' affine flow."""
     sigma_arap: Truncation = 1.0
     """Truncation of every ARAP norm; inf is the paper's form."""
     leak_arap: Share = 0.05

@@ -71,20 +71,15 @@ def contacts(
     return np.asarray((component[i] != component[k]) & stands & touch)
 
 
-LEAST_NOISE, MOST_NOISE = 0.05, 0.6
-"""Limits of the flow's noise, pixels."""
-
-
-def in_noise(data: EnergyData, error: Float) -> EnergyData:
+def in_noise(data: EnergyData, noise: float) -> EnergyData:
     """The same data with E_prior measured in units of the flow's noise.
 
     Relief that explains less of the flow than a share of its noise is not to be believed.
 
     Args:
         data: Data of the pair.
-        error: (N,) mean re-projection error of every superpixel at the start, pixels.
+        noise: Pixels.
     """
-    noise = float(np.clip(np.median(error), LEAST_NOISE, MOST_NOISE))
     return replace(data, prior_weight=noise * data.prior_weight)
 
 

@@ -192,9 +192,7 @@ def build_energy(
     data = build_energy_data(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, bends or e.arap_at_anchors
     )
-    if not bends:
-        # a start without relief says nothing of the flow's noise
-        data = in_noise(data, start.error)
+    data = in_noise(data, start.noise)
     stands = None
     if problem.start.upright:
         stands = contacts(data, start.soup, start.component, seg.anchors)

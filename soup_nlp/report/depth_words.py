@@ -21,7 +21,9 @@ def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
     assert run.pair.flow is not None
     usable = float((run.pair.flow.confidence > 0).mean())
     lines = [f"flow usable at {usable:.0%} of the pixels"]
-    if run.start.bending:
+    if run.start.at_rest:
+        lines.append("the camera is at rest: depth is a guess")
+    elif run.start.bending:
         lines.append("surfaces bend: their relief is weakly determined")
     else:
         pixels = np.sort(run.start.parallax[run.segmentation.labels].ravel())

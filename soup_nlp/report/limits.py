@@ -43,6 +43,11 @@ def _flow(shown: Shown) -> list[str]:
 def _parallax(shown: Shown) -> list[str]:
     """Superpixels whose depth the images say little about."""
     start = shown.tree["start"]
+    if shown.at_rest:
+        return [
+            "Most of the image stands still: the camera is taken to be at rest, and two images from"
+            " one place hold no depth. What is shown is a guess. Try frames between which it moves."
+        ]
     if shown.bending:
         return [
             "Surfaces are taken to bend: without one rigid motion depth follows from the surfaces'"

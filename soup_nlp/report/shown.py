@@ -66,6 +66,11 @@ class Shown:
         return bool(self.tree["start"].get("bending", False))
 
     @property
+    def at_rest(self) -> bool:
+        """Whether the camera was taken to be at rest."""
+        return bool(self.tree["start"].get("at_rest", False))
+
+    @property
     def scale(self) -> float:
         """Factor from the result's unit of length to that of the truth; 1 without truth."""
         found = self.summary["metrics"].get("solution", {}).get("scale")

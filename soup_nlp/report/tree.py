@@ -77,7 +77,9 @@ _START: Table = {
         " 3 cut off below, 4 nothing, 5 ground",
     ),
     "bending_share": ("1", "", "share that moves unlike most of its surface"),
-    "bending": ("1", "", "surfaces are taken to bend"),
+    "bending": ("1", "", "the energy for surfaces that bend is in force"),
+    "at_rest": ("1", "", "because the camera is taken to be at rest"),
+    "noise": ("px", "", "noise of the flow: median error; where the above holds, of affine flows"),
 }
 _SOUP: Table = {
     "lam": ("1", "N", "scales, on the simplex"),
@@ -196,7 +198,8 @@ def result_tree(run: Run) -> Tree:
         "noise": np.float64(run.confidence.noise),
     }
     flow = {"flow": pair.flow.uv, "confidence": pair.flow.confidence}
-    start = vars(run.start) | {"bending": np.float64(run.start.bending)}
+    numbers = "bending", "at_rest", "noise"
+    start = vars(run.start) | {name: np.float64(getattr(run.start, name)) for name in numbers}
     truth = pair.truth
     return {
         "input": _arrays(_INPUT, {**vars(pair), **flow}),

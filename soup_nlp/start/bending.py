@@ -8,6 +8,8 @@ each with its own parallax, such a surface gets depths that have nothing to do w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +35,30 @@ def bending_share(surface: Int, component: Int) -> float:
     count = np.zeros((int(surface.max()) + 1, int(component.max()) + 1))
     np.add.at(count, (surface, component), 1.0)
     return float(1.0 - count.max(axis=1).sum() / len(surface))
+
+
+STILL_PX = 0.5
+"""Parallax up to which a pixel has none, pixels."""
+
+
+def at_rest(views: Views, rotations: Sequence[Float] = ()) -> float:
+    """Largest share of the usable samples that one rotation of the camera explains, or none.
+
+    A small motion before a far background explains these as well, and gives depth to what moves
+    before it; but it is a freer motion, and the background's depth is then arbitrary.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        rotations: (3, 3) each, to be tried beside none.
+    """
+    total = max(float(views.weight.sum()), 1e-9)
+    shares = []
+    for R in (np.eye(3), *rotations):
+        turned = views.ray @ R.T
+        off = (turned[..., :2] / turned[..., 2:] - views.target[..., :2]) * np.asarray(views.focal)
+        near = np.linalg.norm(off, axis=-1) < STILL_PX
+        shares.append(float(np.sum(views.weight * near)) / total)
+    return max(shares)
 
 
 ABOVE_NOISE, LEAST_SHARE = 10.0, 0.25
@@ -79,7 +105,7 @@ def flow_jump(views: Views, pairs: Int, boundary_ray: Float) -> Float:
         pairs: (P, 2) neighbours.
         boundary_ray: (P, B, 3) rays of the shared boundaries, reference frame.
     """
-    fit = _affine(views)
+    fit, _ = affine_flow(views)
 
     def target(j: Int) -> Float:
         off = (boundary_ray - views.anchor[j][:, None])[..., :2] / views.radius[j][:, None, None]
@@ -89,8 +115,18 @@ def flow_jump(views: Views, pairs: Int, boundary_ray: Float) -> Float:
     return np.linalg.norm(target(i) - target(k), axis=-1).mean(axis=1)
 
 
-def _affine(views: Views, noise: float = 0.1, rounds: int = 8) -> Float:
-    """(N, 3, 2) robust affine map from offsets in radii to targets in pixels."""
+def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Float, Float]:
+    """Affine flow of every superpixel, fitted robustly.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        noise: Residual, pixels, below which errors count in squares.
+        rounds: Re-weighted fits.
+
+    Returns:
+        (N, 3, 2) maps from offsets in radii to targets in pixels, and (N,) their mean error,
+        pixels: what the flow's noise leaves, whether surfaces bend or not.
+    """
     off = (views.ray - views.anchor[:, None])[..., :2] / views.radius[:, None, None]
     basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
     target = views.target[..., :2] * np.asarray(views.focal)
@@ -102,7 +138,8 @@ def _affine(views: Views, noise: float = 0.1, rounds: int = 8) -> Float:
         fit = np.linalg.solve(right @ basis + 1e-9 * np.eye(3), right @ target)
         error = np.linalg.norm(basis @ fit - target, axis=2)
         w = (views.weight + 1e-6) / np.sqrt(error**2 + noise**2)
-    return fit
+    total = np.maximum(views.weight.sum(axis=1), 1e-9)
+    return fit, np.sum(views.weight * error, axis=1) / total
 
 
 def constant_depth(views: Views) -> tuple[Soup, Float]:

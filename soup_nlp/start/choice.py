@@ -56,13 +56,13 @@ def dominant(views: Views, o: SeededStart) -> list[Motion]:
     return found
 
 
-def flow_noise(cost: Float) -> float:
-    """Flow noise in pixels: the median error of the best motions, within sensible limits.
+LEAST_NOISE, MOST_NOISE = 0.05, 0.6
+"""Limits of the flow's noise, pixels."""
 
-    Args:
-        cost: (N, M) penalised error of each superpixel under each motion, pixels.
-    """
-    return float(np.clip(np.median(cost.min(axis=1)), 0.05, 0.6))
+
+def limited_noise(error: Float) -> float:
+    """Noise of the flow, pixels: the median of the superpixels' errors (N,), within limits."""
+    return float(np.clip(np.median(error), LEAST_NOISE, MOST_NOISE))
 
 
 def of_pieces(

@@ -14,12 +14,20 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import sample_pixels
-from soup_nlp.start.bending import bending_share, constant_depth, flow_jump, surfaces
+from soup_nlp.start.bending import (
+    affine_flow,
+    at_rest,
+    bending_share,
+    constant_depth,
+    flow_jump,
+    surfaces,
+)
 from soup_nlp.start.choice import (
+    LEAST_NOISE,
     Choice,
     dominant,
     flow_affinity,
-    flow_noise,
+    limited_noise,
     of_neighbourhoods,
     of_pieces,
     select,
@@ -62,7 +70,10 @@ class Start:
             bend, the flow is discontinuous along most of its outline.
         tie: (N,) what gives the component of every superpixel its scale, an index of `TIES`.
         bending_share: Share of the superpixels that move otherwise than most of their surface.
-        bending: Whether surfaces are taken to bend: all are one component at a constant depth.
+        bending: Whether the energy for surfaces that bend is in force: all are one component at a
+            constant depth.
+        at_rest: Whether that is because the camera is taken to be at rest.
+        noise: Of the flow, pixels, see `limited_noise`.
     """
 
     soup: Soup
@@ -76,6 +87,8 @@ class Start:
     tie: Int
     bending_share: float = 0.0
     bending: bool = False
+    at_rest: bool = False
+    noise: float = LEAST_NOISE
 
     def __str__(self) -> str:
         return (
@@ -109,7 +122,7 @@ def propose(
     motions = dominant(views, o)
     fit = views.fit(motions)
     cost = fit.penalised()
-    noise = flow_noise(cost)
+    noise = limited_noise(cost.min(axis=1))
     # what no motion explains yet, piece by piece
     for _ in range(o.rounds):
         extra = of_pieces(views, seg, motions, cost, noise, o)
@@ -120,7 +133,7 @@ def propose(
         cost = fit.penalised()
         kept = select(cost, noise, o)
         motions, fit, cost = [motions[c] for c in kept], fit.columns(kept), cost[:, kept]
-        noise = flow_noise(cost)
+        noise = limited_noise(cost.min(axis=1))
     # the dominant motion is preferred where another is not clearly better
     prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * o.unexplained_px))
     jump = flow_jump(views, seg.pairs, rays(K_ref, seg.boundary))
@@ -132,12 +145,14 @@ def propose(
     choice = of_neighbourhoods(views, seg, choice, noise, o)
     surface = connected_labels(jump < o.discontinuity_px, seg)
     share = bending_share(surface, rigid_components(choice.label, seg))
-    if share > o.bending:
+    rests = at_rest(views, [m.R for m in motions]) > o.at_rest
+    if share > o.bending or rests:
         soup, error = constant_depth(views)
         none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
         parallax, surface = _parallax(soup, views), surfaces(jump, seg, o.discontinuity_px)
-        zero = none + 1
-        return Start(soup, error, parallax, every, none, zero, motions, surface, zero, share, True)
+        zero, noise = none + 1, limited_noise(affine_flow(views)[1])
+        found = soup, error, parallax, every, none, zero, motions, surface, zero, share
+        return Start(*found, bending=True, at_rest=rests, noise=noise)
     choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
     own, label, parallax = choice.fit, choice.label, choice.parallax
     mu, slope = own.inverse_depth[:, 0], own.slope[:, 0]
@@ -162,7 +177,8 @@ def propose(
         soup, component, tie = _on_ground(soup, views.anchor, seg, K_ref, known, component, tie, o)
     soup = soup.normalised()
     error = own.cost[:, 0]
-    return Start(soup, error, parallax, weak, label, component, motions, surface, tie, share)
+    found = soup, error, parallax, weak, label, component, motions, surface, tie, share
+    return Start(*found, noise=limited_noise(error))
 
 
 def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
@@ -174,7 +190,8 @@ def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
     total = np.maximum(views.weight.sum(axis=1), 1e-9)
     error = np.sum(views.weight * np.linalg.norm(gap, axis=2), axis=1) / total
     parallax, whole = _parallax(soup, views), np.zeros(len(seg), np.int64)
-    return Start(soup, error, parallax, borrowed, whole - 1, whole, [], whole, whole)
+    noise = limited_noise(error)
+    return Start(soup, error, parallax, borrowed, whole - 1, whole, [], whole, whole, noise=noise)
 
 
 def _on_ground(

@@ -37,6 +37,9 @@ class StartOptions(Section):
     bending: NonNegative = 0.18
     """Surfaces are taken to bend where more than this share of the superpixels moves otherwise
     than most of its own surface; 1 for never."""
+    at_rest: NonNegative = 0.7
+    """The camera is taken to be at rest, or to turn only, where more than this share of the usable
+    pixels has no parallax: depth starts constant, as where surfaces bend; 1 for never."""
     discontinuity_px: NonNegative = 1.0
     """Where the flow of two neighbours differs by more, a surface ends."""
     upright: bool = True
