@@ -9,7 +9,7 @@ import pytest
 from helpers_files import write_flo
 
 from soup_nlp.bench.analyses_measures import VIEWS, measure_view
-from soup_nlp.bench.pair_views import cropped, mirrored
+from soup_nlp.bench.pair_views import backwards, cropped, mirrored
 from soup_nlp.bench.suite_pairs import Options
 from soup_nlp.bench.suites import list_suite
 from soup_nlp.data.flow.consistency import leaves
@@ -20,7 +20,7 @@ from soup_nlp.geometry.camera import pixel_grid, project, rays
 
 pytestmark = pytest.mark.slow
 
-CHANGED = [v for v in VIEWS.values() if v is not None]
+CHANGED = [v for v in VIEWS.values() if v not in (None, backwards)]
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +50,21 @@ def test_the_truth_explains_the_flow(view, pair):
     np.testing.assert_allclose((moved - X)[known], t.scene_flow[known], atol=1e-9)
     np.testing.assert_allclose((project(seen.K_next, moved) - uv)[known], t.flow[known], atol=1e-6)
     np.testing.assert_allclose(seen.flow.uv[known], t.flow[known], atol=1e-4)
+
+
+def test_backwards_the_truth_explains_the_true_points(pair):
+    """Every motion brings back the points of the next frame to where the reference saw them."""
+    seen = backwards(pair)
+    t = seen.truth
+    np.testing.assert_array_equal(seen.image_ref, pair.image_next)
+    np.testing.assert_array_equal(t.depth_ref, pair.truth.depth_next)
+    assert seen.flow is None
+    assert t.known() == ["depth_ref", "depth_next", "motions"]
+    np.testing.assert_allclose(
+        t.motions @ pair.truth.motions, np.tile(np.eye(4), (3, 1, 1)), atol=1e-12
+    )
+    with pytest.raises(DataError, match="next"):
+        backwards(replace(pair, truth=Truth(depth_ref=pair.truth.depth_ref)))
 
 
 @pytest.mark.parametrize("view", CHANGED)

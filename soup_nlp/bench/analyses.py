@@ -129,7 +129,7 @@ _ALL = (
     ),
     Analysis(
         "views",
-        "the same pairs mirrored and cropped: how much a figure on one pair depends on chance",
+        "the same pairs mirrored, backwards and cropped: does a figure hold on pairs not chosen on",
         dict.fromkeys(VIEWS, ()),
         "view",
         function=measure_view,

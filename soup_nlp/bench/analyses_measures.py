@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from soup_nlp.bench.accuracy import flow_error, measure_pair
-from soup_nlp.bench.pair_views import cropped, mirrored
+from soup_nlp.bench.pair_views import backwards, cropped, mirrored
 from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.truth import moves_by_itself, rescaled, true_soup
@@ -33,10 +33,9 @@ VIEWS: Mapping[str, Callable[[Pair], Pair] | None] = MappingProxyType(
     {
         "as it is": None,
         "mirrored": mirrored,
+        "backwards": backwards,
         "cropped 7x5": lambda pair: cropped(pair, 7, 5),
-        "cropped 25x17": lambda pair: cropped(pair, 16, 11, 9, 6),
         "mirrored and cropped 7x5": lambda pair: mirrored(cropped(pair, 7, 5)),
-        "mirrored and cropped 25x17": lambda pair: mirrored(cropped(pair, 16, 11, 9, 6)),
     }
 )
 """What is made of a pair, by the name of a variant; columns x rows that are cut off."""

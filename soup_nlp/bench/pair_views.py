@@ -1,4 +1,4 @@
-"""The same pair mirrored or cropped, with its truth: how much a figure depends on chance.
+"""The same pair mirrored, reversed or cropped, with its truth: how much a figure depends on chance.
 
 Superpixels, flow and choices come out differently on the same pixels in another order or with
 other margins, so a figure that holds on all views is worth more than one on a single pair.
@@ -52,6 +52,34 @@ def mirrored(pair: Pair) -> Pair:
         truth = _changed(truth, changes)
     K_ref, K_next = _mirrored_camera(pair.K_ref, width), _mirrored_camera(pair.K_next, there)
     return replace(seen, K_ref=K_ref, K_next=K_next, flow=flow, truth=truth)
+
+
+def backwards(pair: Pair) -> Pair:
+    """The pair with its frames exchanged: a pair of the same kind that nothing was chosen on.
+
+    Raises:
+        DataError: the depth of the next frame is not known.
+    """
+    truth = pair.truth
+    if truth is None or truth.depth_next is None:
+        raise DataError(
+            "frames cannot be exchanged without a truth for the next one",
+            where=pair.name,
+            expected="truth.depth_next",
+        )
+    motions = None
+    if truth.motions is not None:
+        motions = np.asarray(np.linalg.inv(truth.motions), np.float64)
+    turned = Truth(truth.depth_next, truth.depth_ref, motions=motions, unit=truth.unit)
+    return replace(
+        pair,
+        image_ref=pair.image_next,
+        image_next=pair.image_ref,
+        K_ref=pair.K_next,
+        K_next=pair.K_ref,
+        flow=None,
+        truth=turned,
+    )
 
 
 def _mirrored_camera(K: Float, width: int) -> Float:
