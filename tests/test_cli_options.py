@@ -188,3 +188,11 @@ def test_streams_that_are_closed_or_full(words, code):
     assert done.returncode == code
     assert ("the system refuses a file" in done.stderr) == (code == 2)
     assert "Traceback" not in done.stderr
+
+
+def test_a_working_folder_that_is_gone(tmp_path, monkeypatch, capsys):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert main(["solve", "orbit"]) == 2
+    assert "the working folder does not exist any more" in capsys.readouterr().err

@@ -63,6 +63,8 @@ def refusal(error: Exception) -> DataError | None:
             found=error,
             hint="smaller images, or fewer superpixels, neighbours or particles",
         )
+    if isinstance(error, FileNotFoundError) and error.filename is None:
+        return DataError("the working folder does not exist any more", hint="cd to another one")
     if isinstance(error, OSError) and error.errno in SYSTEM:
         return DataError("the system refuses a file", where=error.filename, found=error.strerror)
     return None
