@@ -51,7 +51,7 @@ WEIGHTS = Weights(
     sigma_proj=np.inf,
 )
 OPTIONS = SolverOptions(
-    presolve_eps=(0.3, 0.1, 0.03), eps=0.03, max_iter=100, tol=1e-3, max_seconds=60
+    presolve_eps=(0.3, 0.1, 0.03), eps=0.03, max_iter=100, tol=1e-3, max_seconds=3600
 )
 
 
