@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,10 +65,11 @@ def section(out: Path, r: Results, name: str) -> list[str]:
     """Tables of both methods and a figure of one change at a time."""
     lines = [f"## {TEXTS[name]}", ""]
     measure = "RMSE" if name == "flow" else "MRE"
+    items = [i for i in r.plan.items(name) if _compares(r, name, i)]
     drawn: dict[str, dict[str, dict[str, Number]]] = {}
     for method in METHODS:
         pairs: dict[str, dict[str, Number]] = {}
-        for item in r.plan.items(name):
+        for item in items:
             cells = r.plan.variants(name, item, method)
             rows = {v: r.row(c) for v, c in cells.items()}
             pairs[title(item)] = {v: get(row, "paper") for v, row in rows.items()}
@@ -93,6 +94,12 @@ def section(out: Path, r: Results, name: str) -> list[str]:
     label = "RMSE, unit of the truth" if measure == "RMSE" else "MRE"
     figures.plot_lines(out / f"{name}.png", drawn, SECTIONS[name], label, TEXTS[name])
     return [*lines, *figure(name, TEXTS[name])]
+
+
+def _compares(r: Results, name: str, item: Item) -> bool:
+    """Whether a section has two rows of a pair by one of the methods."""
+    own = (r.plan.variants(name, item, method).values() for method in METHODS)
+    return any(sum(bool(r.row(c).get("ok")) for c in cells) > 1 for cells in own)
 
 
 def _published(name: str) -> list[str]:
@@ -166,7 +173,8 @@ def time(r: Results) -> list[str]:
 
 def departures(out: Path, r: Results) -> list[str]:
     """Table and figure of every departure alone."""
-    items = r.plan.analyses
+    cells = {i.key: r.plan.departures(i) for i in r.plan.analyses}
+    items = [i for i in r.plan.analyses if _any(r, cells[i.key].values())]
     lines = ["## Departures, one at a time", ""]
     lines += [
         "MRE of the defaults with one departure undone (*off alone*) and of the preset with one"
@@ -174,7 +182,6 @@ def departures(out: Path, r: Results) -> list[str]:
         " figure has the geometric mean of the ratios to these.",
         "",
     ]
-    cells = {i.key: r.plan.departures(i) for i in items}
     base = {m: [r.mre(r.plan.cell(i, m)) for i in items] for m in METHODS}
     entries = [["as they are", *map(show, base["defaults"]), *map(show, base["preset: paper"]), ""]]
     bars = {}
@@ -193,6 +200,11 @@ def departures(out: Path, r: Results) -> list[str]:
     label = "MRE relative to all others as they are (geometric mean of the pairs)"
     figures.plot_bars(out / "departures.png", bars, text, label)
     return [*lines, *table(head, entries), *figure("departures", text)]
+
+
+def _any(r: Results, pairs: Iterable[tuple[Cell, Cell | None]]) -> bool:
+    """Whether a departure of a pair was measured."""
+    return any(r.row(c).get("ok") for both in pairs for c in both if c is not None)
 
 
 def _ratio(own: Sequence[Number], base: Sequence[Number]) -> Number:
