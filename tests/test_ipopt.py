@@ -270,6 +270,26 @@ def test_control_c_sets_the_event_and_the_old_handler_returns():
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_control_c_ends_a_solve_at_the_next_iteration_and_is_raised(number):
+    """CasADi swallows what is raised in its callbacks: the caller would go on."""
+    seen = []
+
+    def listen(p: Progress) -> None:
+        seen.append(p.iteration)
+        if p.iteration == 2:
+            os.kill(os.getpid(), number)
+
+    old = signal.signal(number, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            solve(rosenbrock(10), listener=listen)
+        assert signal.getsignal(number) is signal.default_int_handler
+    finally:
+        signal.signal(number, old)
+    assert max(seen) <= 3
+
+
 def test_a_nan_in_the_objective_is_a_result_too():
     x, row, one = symbols(1)
     kernel = Kernel("root", x, row, one, objective=ca.sqrt(x - 2))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -48,3 +49,35 @@ class interruptible:  # noqa: N801
     def __exit__(self, *exc: object) -> None:
         for number, handler in self._old.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+@contextmanager
+def raised_at_the_end(stop: threading.Event) -> Iterator[None]:
+    """Where a signal would raise KeyboardInterrupt, it sets `stop`, and the block's end raises.
+
+    CasADi swallows what is raised in its callbacks. Signals that others handle, such as
+    `interruptible`, are left to them; the second one raises at once.
+
+    Args:
+        stop: Ends the work of the block.
+    """
+    came: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        if came:
+            raise KeyboardInterrupt
+        came.append(number)
+        stop.set()
+
+    main = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGINT, signal.SIGTERM) if main else ()
+    own = [n for n in numbers if signal.getsignal(n) is signal.default_int_handler]
+    for number in own:
+        signal.signal(number, note)
+    try:
+        yield
+    finally:
+        for number in own:
+            signal.signal(number, signal.default_int_handler)
+    if came:
+        raise KeyboardInterrupt

@@ -16,6 +16,7 @@ from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.callback import IterationCallback
 from soup_nlp.solve.hessian import LagrangianHessian
+from soup_nlp.solve.interrupt import raised_at_the_end
 
 Float = NDArray[np.float64]
 
@@ -143,7 +144,7 @@ class _Iterations(IterationCallback):
         super().__init__()
         self.stagnation, self.last_f, self.still = stagnation, np.inf, 0
         self.nlp, self.stage, self.listener = nlp, stage, listener
-        self.deadline, self.stop = deadline, stop
+        self.deadline, self.stop, self.signalled = deadline, stop, threading.Event()
         self.begin = time.perf_counter()
         self.count = 0
         self.best = self.best_f = np.inf
@@ -179,7 +180,7 @@ class _Iterations(IterationCallback):
             self.last_f = f
         if self.still >= STILL:
             self.reason = "Stagnated"
-        if self.stop.is_set():
+        if self.stop.is_set() or self.signalled.is_set():
             self.reason = "Interrupted"
         elif now > self.deadline:
             self.reason = "Time_Limit"
@@ -264,6 +265,9 @@ class Ipopt:
             listener: Called at every iteration.
             stop: Event that ends the solve at the next iteration.
             log_file: Ipopt's own log is appended here.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C, which ends the solve at the next iteration.
         """
         nlp = self.nlp
         begin = time.perf_counter()
@@ -272,7 +276,8 @@ class Ipopt:
         solver = self._solver(watch, max_iter, tol, log_file)
         given = {"p": nlp.p if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
         bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}
-        out = solver(x0=x0, **bounds, **{k: v for k, v in given.items() if v is not None})
+        with raised_at_the_end(watch.signalled):
+            out = solver(x0=x0, **bounds, **{k: v for k, v in given.items() if v is not None})
         stats = solver.stats()
         status = watch.reason or str(stats.get("return_status", "Unknown"))
         converged = status in GOOD
