@@ -27,6 +27,7 @@ RULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         SHIPPED: (),
         "energy of bending surfaces": ("start.bending=1",),
+        "camera at rest": ("start.at_rest=1",),
         "E_prior": in_both("prior", "0"),
         "E_prior holds contacts": ("energy.prior_contact=0.03",),
         "E_arap weak across components": ("energy.arap_across=1",),
