@@ -19,7 +19,7 @@ from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.pipeline.case import Case, build_energy, prepare, solver_options
 from soup_nlp.solve.stages import solve_soup
-from soup_nlp.start.bending import at_rest, surfaces
+from soup_nlp.start.bending import at_rest, constant_depth, surfaces
 from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.propose import look
 from soup_nlp.start.start_options import SeededStart
@@ -91,13 +91,20 @@ def test_a_camera_that_turns_only_is_at_rest(turn):
     target = views.ray @ R.T
     target = target / target[..., 2:]
     turned = replace(views, target=target)
-    assert at_rest(turned, [np.eye(3), R]) == pytest.approx(1.0)
+    share, found = at_rest(turned, [R])
+    assert share == pytest.approx(1.0)
+    np.testing.assert_allclose(found, R)
+    # no translation is made of it
+    soup, error = constant_depth(turned, found)
+    np.testing.assert_allclose(soup.R, np.broadcast_to(R, soup.R.shape), atol=1e-9)
+    np.testing.assert_allclose(soup.t, 0.0, atol=1e-9)
+    assert error.max() < 1e-6
     # half of the superpixels move by a pixel more
     own = np.arange(len(target)) % 2 == 0
     target[own, :, 0] += 1.0 / views.focal[0]
     share = views.weight[~own].sum() / views.weight.sum()
-    assert at_rest(turned, [R]) == pytest.approx(share)
-    assert at_rest(views, [R]) < 0.2
+    assert at_rest(turned, [R])[0] == pytest.approx(share)
+    assert at_rest(views, [R])[0] < 0.2
 
 
 def test_noise_where_surfaces_bend_is_that_of_affine_flows():

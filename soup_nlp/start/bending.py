@@ -41,8 +41,8 @@ STILL_PX = 0.5
 """Parallax up to which a pixel has none, pixels."""
 
 
-def at_rest(views: Views, rotations: Sequence[Float] = ()) -> float:
-    """Largest share of the usable samples that one rotation of the camera explains, or none.
+def at_rest(views: Views, rotations: Sequence[Float] = ()) -> tuple[float, Float]:
+    """Largest share of the usable samples that a rotation of the camera explains, and the rotation.
 
     A small motion before a far background explains these as well, and gives depth to what moves
     before it; but it is a freer motion, and the background's depth is then arbitrary.
@@ -50,15 +50,19 @@ def at_rest(views: Views, rotations: Sequence[Float] = ()) -> float:
     Args:
         views: Rays, targets and confidence of every superpixel.
         rotations: (3, 3) each, to be tried beside none.
+
+    Returns:
+        The share, and the (3, 3) rotation.
     """
     total = max(float(views.weight.sum()), 1e-9)
+    tried = [np.eye(3), *rotations]
     shares = []
-    for R in (np.eye(3), *rotations):
+    for R in tried:
         turned = views.ray @ R.T
         off = (turned[..., :2] / turned[..., 2:] - views.target[..., :2]) * np.asarray(views.focal)
         near = np.linalg.norm(off, axis=-1) < STILL_PX
         shares.append(float(np.sum(views.weight * near)) / total)
-    return max(shares)
+    return max(shares), tried[int(np.argmax(shares))]
 
 
 ABOVE_NOISE, LEAST_SHARE = 10.0, 0.25
@@ -142,7 +146,7 @@ def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Floa
     return fit, np.sum(views.weight * error, axis=1) / total
 
 
-def constant_depth(views: Views) -> tuple[Soup, Float]:
+def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float]:
     """Every superpixel at depth 1 in both frames, facing the camera, turned in the image plane.
 
     Two views of a bending surface leave its relief to be found by the energy: a start without
@@ -150,19 +154,24 @@ def constant_depth(views: Views) -> tuple[Soup, Float]:
 
     Args:
         views: Rays, targets and confidence of every superpixel.
+        turn: (3, 3) rotation of the camera, which is applied last; None for none.
 
     Returns:
         The soup, mean plane distance 1, and (N,) its mean re-projection error in pixels.
     """
+    turn = np.eye(3) if turn is None else turn
     w = views.weight + 1e-9
     total = w.sum(axis=1)
-    a, b = (np.sum(w[..., None] * v, axis=1) / total[:, None] for v in (views.ray, views.target))
-    spread = (w[..., None] * (views.target - b[:, None])).transpose(0, 2, 1)
+    target = views.target @ turn
+    target = target / target[..., 2:]
+    a, b = (np.sum(w[..., None] * v, axis=1) / total[:, None] for v in (views.ray, target))
+    spread = (w[..., None] * (target - b[:, None])).transpose(0, 2, 1)
     M = spread @ (views.ray - a[:, None])
     # Procrustes; equal depths leave a turn about the optical axis
     angle = np.arctan2(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1])
     R = rotation.exp(angle[:, None] * np.array([0.0, 0.0, 1.0]))
     T = b - np.einsum("nij,nj->ni", R, a)
+    R, T = turn @ R, T @ turn.T
     moved = views.ray @ R.transpose(0, 2, 1) + T[:, None]
     miss = (moved[..., :2] / moved[..., 2:] - views.target[..., :2]) * np.asarray(views.focal)
     error = np.sum(views.weight * np.linalg.norm(miss, axis=2), axis=1) / total

@@ -145,9 +145,10 @@ def propose(
     choice = of_neighbourhoods(views, seg, choice, noise, o)
     surface = connected_labels(jump < o.discontinuity_px, seg)
     share = bending_share(surface, rigid_components(choice.label, seg))
-    rests = at_rest(views, [m.R for m in motions]) > o.at_rest
+    still, turn = at_rest(views, [m.R for m in motions])
+    rests = still > o.at_rest
     if share > o.bending or rests:
-        soup, error = constant_depth(views)
+        soup, error = constant_depth(views, turn if rests else None)
         none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
         parallax, surface = _parallax(soup, views), surfaces(jump, seg, o.discontinuity_px)
         zero, noise = none + 1, limited_noise(affine_flow(views)[1])
