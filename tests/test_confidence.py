@@ -303,6 +303,11 @@ def test_what_stands_still_where_surfaces_bend_is_a_guess(small_room):
     sure = sure_of(replace(bends, soup=soup))
     np.testing.assert_array_equal(sure.still, still)
     assert sure.sigma[still[bends.segmentation.labels]].min() > MOST_SIGMA
+    # whatever the answer, where the camera rests the start had no parallax
+    parallax = np.where(still, 0.0, 9.0)
+    rests = replace(bends, start=replace(bends.start, at_rest=True, parallax=parallax))
+    moved = replace(rests, soup=replace(soup, t=np.where(still[:, None], 1.0, bends.soup.t)))
+    np.testing.assert_array_equal(sure_of(moved).still, still)
     # where surfaces are rigid the start tells whether the camera rests
     assert not sure_of(replace(small_room, soup=soup)).still.any()
 

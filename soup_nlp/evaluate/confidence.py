@@ -340,6 +340,8 @@ def confidence(
         spread = np.full(rec.labels.shape, np.inf)
     noise, misfit = start.noise, flow_misfit(rec, pair.flow)
     still = stands_still(rec.soup, data.anchor_ray, pair.K_next) & start.bending
+    # the answer may explain a part of the camera's turn by translations
+    still |= start.at_rest & (start.parallax < MOST_NOISE)
     own_misfit, at_rest = misfit[rec.labels], still[rec.labels]
     sigma = calibrated(spread, noise, own_misfit, bending=start.bending, still=at_rest)
     return Confidence(sigma, spread, own, noise, start.bending, still, misfit)
