@@ -13,7 +13,7 @@ from soup_nlp.data.scenes.raycast import render
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.mrf.trws import mrf_energy
-from soup_nlp.start.bending import flow_jump
+from soup_nlp.start.bending import affine_flow, flow_jump
 from soup_nlp.start.choice import Choice, flow_affinity, smooth_choice
 from soup_nlp.start.components import borrow
 from soup_nlp.start.epipolar import Motion
@@ -36,7 +36,7 @@ def world():
     labels, _ = cut_by_part(scene, pair, 100)
     seg = build_segmentation(labels, pair.image_ref, neighbours=10)
     views, _ = look(seg, pair.flow, K, K, OPTIONS)
-    jump = flow_jump(views, seg.pairs, camera.rays(K, seg.boundary))
+    jump = flow_jump(affine_flow(views)[0], views, seg.pairs, camera.rays(K, seg.boundary))
     component = np.array(
         [np.bincount(pair.truth.components[labels == i]).argmax() for i in range(len(seg))]
     )

@@ -1,4 +1,4 @@
-"""The same pair mirrored, reversed or cropped, with its truth: how much a figure depends on chance.
+"""A pair mirrored, backwards or cropped, with its truth: how much a figure depends on chance.
 
 Superpixels, flow and choices come out differently on the same pixels in another order or with
 other margins, so a figure that holds on all views is worth more than one on a single pair.

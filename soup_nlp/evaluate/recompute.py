@@ -265,8 +265,8 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
     weight[_discontinuous(tree, settings["energy"], "edges")] *= float(bending["arap_across"])
     noise = float(np.clip(np.median(tree["start"]["error"]), *NOISE))
     if tree["start"]["bending"]:
-        # that of affine flows, which is not recomputed
-        noise = float(np.clip(tree["start"]["noise"], *NOISE))
+        # that of affine flows, which is not recomputed; older results held the prior in pixels
+        noise = float(tree["start"].get("noise", 1.0))
     held_prior = np.where(_contact(tree, settings), settings["energy"]["prior_contact"], across)
     prior = noise * held_prior * seg["edge_multiplicity"] / max(1, seg["knn"].shape[1])
     held = np.full(len(e["pairs"]), 2.0)

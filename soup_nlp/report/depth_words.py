@@ -22,7 +22,7 @@ def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
     usable = float((run.pair.flow.confidence > 0).mean())
     lines = [f"flow usable at {usable:.0%} of the pixels"]
     if run.start.at_rest:
-        lines.append("the camera is at rest: depth is a guess")
+        lines.append("the camera is at rest or turns only: depth is a guess")
     elif run.start.bending:
         lines.append("surfaces bend: their relief is weakly determined")
     else:

@@ -45,8 +45,9 @@ def _parallax(shown: Shown) -> list[str]:
     start = shown.tree["start"]
     if shown.at_rest:
         return [
-            "Most of the image stands still: the camera is taken to be at rest, and two images from"
-            " one place hold no depth. What is shown is a guess. Try frames between which it moves."
+            "Most of the image has no parallax: the camera is taken to be at rest, or to turn only,"
+            " and images from one place hold no depth. What is shown is a guess. Try frames between"
+            " which the camera moves."
         ]
     if shown.bending:
         return [

@@ -67,7 +67,7 @@ class Shown:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the camera was taken to be at rest."""
+        """Whether the camera was taken to be at rest, or to turn only."""
         return bool(self.tree["start"].get("at_rest", False))
 
     @property

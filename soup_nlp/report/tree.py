@@ -78,8 +78,8 @@ _START: Table = {
     ),
     "bending_share": ("1", "", "share that moves unlike most of its surface"),
     "bending": ("1", "", "the energy for surfaces that bend is in force"),
-    "at_rest": ("1", "", "because the camera is taken to be at rest"),
-    "noise": ("px", "", "noise of the flow: median error; where the above holds, of affine flows"),
+    "at_rest": ("1", "", "the camera is taken to be at rest, or to turn only"),
+    "noise": ("px", "", "noise of the flow: median error; where bending, that of affine flows"),
 }
 _SOUP: Table = {
     "lam": ("1", "N", "scales, on the simplex"),

@@ -101,15 +101,15 @@ def surfaces(jump: Float, seg: Segmentation, discontinuity_px: float) -> Int:
         surface = np.where(surface == pairs[join] % n, pairs[join] // n, surface)
 
 
-def flow_jump(views: Views, pairs: Int, boundary_ray: Float) -> Float:
+def flow_jump(fit: Float, views: Views, pairs: Int, boundary_ray: Float) -> Float:
     """(P,) pixels by which the affine flows of two neighbours differ on their boundary, mean.
 
     Args:
-        views: Rays, targets and confidence of every superpixel.
+        fit: (N, 3, 2) affine flow of every superpixel, see `affine_flow`.
+        views: Anchors and radii of every superpixel.
         pairs: (P, 2) neighbours.
         boundary_ray: (P, B, 3) rays of the shared boundaries, reference frame.
     """
-    fit, _ = affine_flow(views)
 
     def target(j: Int) -> Float:
         off = (boundary_ray - views.anchor[j][:, None])[..., :2] / views.radius[j][:, None, None]

@@ -72,7 +72,7 @@ class Start:
         bending_share: Share of the superpixels that move otherwise than most of their surface.
         bending: Whether the energy for surfaces that bend is in force: all are one component at a
             constant depth.
-        at_rest: Whether that is because the camera is taken to be at rest.
+        at_rest: Whether the camera is taken to be at rest, or to turn only.
         noise: Of the flow, pixels, see `limited_noise`.
     """
 
@@ -136,7 +136,8 @@ def propose(
         noise = limited_noise(cost.min(axis=1))
     # the dominant motion is preferred where another is not clearly better
     prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * o.unexplained_px))
-    jump = flow_jump(views, seg.pairs, rays(K_ref, seg.boundary))
+    affine, residual = affine_flow(views)
+    jump = flow_jump(affine, views, seg.pairs, rays(K_ref, seg.boundary))
     # beyond 5 pixels one motion is as wrong as another
     cost = np.minimum(cost + prefer, 5.0)
     label = smooth_choice(cost, flow_affinity(jump, o), seg, o.smoothness)
@@ -151,7 +152,7 @@ def propose(
         soup, error = constant_depth(views, turn if rests else None)
         none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
         parallax, surface = _parallax(soup, views), surfaces(jump, seg, o.discontinuity_px)
-        zero, noise = none + 1, limited_noise(affine_flow(views)[1])
+        zero, noise = none + 1, limited_noise(residual)
         found = soup, error, parallax, every, none, zero, motions, surface, zero, share
         return Start(*found, bending=True, at_rest=rests, noise=noise)
     choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
