@@ -36,6 +36,7 @@ RULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "contact below": ("start.upright=false",),
         "ground": ("start.ground=false",),
         "flow behind a still layer": ("flow.see_through=false",),
+        "second way of the presolve": ("energy.bending.untruncated=false",),
         "borders follow the flow": ("segmentation.follow_flow_px=null",),
     }
 )

@@ -75,6 +75,8 @@ class BendingOptions(Section):
     widest_eps: Positive = 0.1
     """Widest smoothing of the presolve, pixels: wider ones of solver.presolve_eps become this.
     What shows relief is a fraction of a pixel, a wide norm flattens it."""
+    untruncated: bool = True
+    """Switches solver.untruncated on: truncated from the start, E_arap tears surfaces that bend."""
     rotation_px: Positive = 1e-3
     """Pixels per radian of rotation difference."""
     arap_across: Share = 0.3

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_flow
 from soup_nlp.data.flow.robust import reweighted
@@ -173,11 +171,13 @@ def _bends(problem: Problem, start: Start) -> bool:
 
 def solver_options(problem: Problem, start: Start) -> SolverOptions:
     """The solver's options of a problem, its smoothing no wider than surfaces allow."""
-    own = problem.solver
-    widest = problem.energy.bending.widest_eps if _bends(problem, start) else np.inf
+    own, bending = problem.solver, problem.energy.bending
+    if not _bends(problem, start):
+        return own
     # of several that become the widest one is enough
-    eps = dict.fromkeys(min(e, widest) for e in own.presolve_eps)
-    return own.replace(presolve_eps=tuple(eps))
+    eps = dict.fromkeys(min(e, bending.widest_eps) for e in own.presolve_eps)
+    both = own.untruncated or bending.untruncated
+    return own.replace(presolve_eps=tuple(eps), untruncated=both)
 
 
 def build_energy(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -161,13 +161,13 @@ def _far(stages: Sequence[Stage]) -> bool:
     return ended and not _near(stages[-1])
 
 
-def _phases(o: SolverOptions) -> list[Phase]:
+def _phases(o: SolverOptions, kind: str = "") -> list[Phase]:
     """The reweighted phases: barriers from 1e-3 down to 1e-5 while the smoothing shrinks."""
     last = len(o.presolve_eps) - 1
     barriers = np.geomspace(1e-3, 1e-5, last + 1) if last else np.array([1e-5])
     return [
         Phase(
-            name=f"presolve {eps:g}",
+            name=f"presolve {kind}{eps:g}",
             hessian="gauss-newton",
             eps=eps,
             barrier=float(barrier),
@@ -249,6 +249,9 @@ class _Solve:
         soup, rim = self.start, np.zeros(0)
         if self.o.presolve:
             descent = self._reweighted()
+            if self.o.untruncated and self.stages[-1].status not in STOPPED:
+                other = self._untruncated()
+                descent = min(descent, other, key=lambda d: self.energy(d.soup))
             if self.stages[-1].status not in STOPPED and self.o.polish_iterations:
                 descent = self._polished(descent)
             soup, rim = descent.soup, descent.rim
@@ -257,8 +260,22 @@ class _Solve:
 
     def _reweighted(self) -> Descent:
         problem = TangentProblem(self.start, self.data, self.weights, self.form, exact=False)
-        descent = Descent(problem, watch=self.watch, deadline=self.early())
-        for phase in _phases(self.o):
+        return self._run(Descent(problem, watch=self.watch, deadline=self.early()), _phases(self.o))
+
+    def _untruncated(self) -> Descent:
+        """The second way: without the truncation of E_arap first, then with it."""
+        whole = self.weights.replace(sigma_arap=np.inf)
+        problem = TangentProblem(self.start, self.data, whole, self.form, exact=False)
+        first = Descent(problem, watch=self.watch, deadline=self.early())
+        self._run(first, _phases(self.o, "untruncated "))
+        if self.stages[-1].status in STOPPED:
+            return first
+        problem = TangentProblem(first.soup, self.data, self.weights, self.form, exact=False)
+        after = Descent(problem, after=first, watch=self.watch, deadline=self.early())
+        return self._run(after, [replace(_phases(self.o)[-1], name="presolve truncated")])
+
+    def _run(self, descent: Descent, phases: Sequence[Phase]) -> Descent:
+        for phase in phases:
             self._ended(descent.run(phase))
             if self.stages[-1].status in STOPPED:
                 break
