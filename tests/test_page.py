@@ -198,12 +198,16 @@ def test_limits_name_what_is_wrong(shown):
     tree = {**shown.tree, "input": dict(shown.tree["input"]), "start": dict(shown.tree["start"])}
     tree["input"]["confidence"] = np.zeros_like(tree["input"]["confidence"])
     tree["start"]["parallax"] = np.full_like(tree["start"]["parallax"], 0.1)
-    tree["start"]["borrowed"] = np.ones_like(tree["start"]["borrowed"])
-    told = {**shown.summary, "status": "Time_Limit", "converged": False}
+    shares = {"guess": 0.3, "unseen": 0.2, "still": 0.004, "weak": 0.096}
+    told = {
+        **shown.summary, "status": "Time_Limit", "converged": False, "certainty": shares
+    }  # fmt: skip
     found = limits(replace(shown, tree=tree, summary=told))
     assert found[0] == "The NLP did not converge (Time_Limit): try a larger solver.max_iter."
     assert "usable at 0% of the pixels" in found[1]
-    assert found[2].startswith("100% of the image has no depth of its own")
+    assert found[2].startswith(
+        "30% of the image is a guess (sigma above 25%): 20% no usable flow, 10% little information."
+    )
     assert "parallax below 1 px (median 0.1 px)" in found[3]
 
 

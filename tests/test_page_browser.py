@@ -140,3 +140,14 @@ def test_switches(browser):
     browser.value("soupView.setFar(0.01)")
     assert drawn(canvas(browser)) < 0.01
     assert browser.log == []
+
+
+def test_the_address_opens_a_view_while_the_page_is_shown(browser):
+    browser.value("location.hash = 'mode=normals&time=0.5&view=top'")
+    browser.wait("document.querySelector('#modes .on').value == 'normals'")
+    assert browser.value("document.getElementById('time').value") == "0.5"
+    eye = browser.value("soupView.eye.position.toArray()")
+    assert eye[1] > 3 * abs(eye[0])
+    browser.value("location.hash = ''")
+    browser.wait("document.querySelector('#modes .on').value == 'image_ref'")
+    assert browser.log == []

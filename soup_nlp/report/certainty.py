@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,21 +60,27 @@ def certainty(run: Run) -> dict[str, float]:
     }
 
 
-def certainty_lines(found: dict[str, float]) -> list[str]:
+def certainty_lines(found: Mapping[str, float]) -> list[str]:
     """The shares as sentences: one of what is determined, one of what is a guess."""
-
-    def parts(names: tuple[str, ...]) -> str:
-        return ", ".join(f"{found[k]:.0%} {WORDS[k]}" for k in names if found[k] >= 0.005)
-
     lines = []
     if found["determined"] >= 0.005:
         lines.append(
             f"{found['determined']:.0%} of the image is determined, half of it to"
-            f" {found['median_sigma']:.1%} (1 sigma): {parts(('flow', 'contact', 'outline'))}"
+            f" {found['median_sigma']:.1%} (1 sigma):"
+            f" {_parts(found, ('flow', 'contact', 'outline'))}"
         )
     if found["guess"] >= 0.005:
-        lines.append(
-            f"{found['guess']:.0%} is a guess (sigma above {MOST_SIGMA:.0%}):"
-            f" {parts(('unseen', 'still', 'weak'))}"
-        )
+        lines.append(guess_words(found))
     return lines
+
+
+def guess_words(found: Mapping[str, float], of: str = "") -> str:
+    """What is a guess, and why."""
+    return (
+        f"{found['guess']:.0%}{of} is a guess (sigma above {MOST_SIGMA:.0%}):"
+        f" {_parts(found, ('unseen', 'still', 'weak'))}"
+    )
+
+
+def _parts(found: Mapping[str, float], names: tuple[str, ...]) -> str:
+    return ", ".join(f"{found[k]:.0%} {WORDS[k]}" for k in names if found[k] >= 0.005)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from soup_nlp.report.certainty import guess_words
 from soup_nlp.report.shown import Shown
 
 USABLE = 0.8
@@ -56,16 +57,15 @@ def _parallax(shown: Shown) -> list[str]:
         ]
     pixels = np.asarray(shown.tree["segmentation"]["sizes"], float)
     pixels = pixels / pixels.sum()
-    borrowed = float(pixels[np.asarray(start["borrowed"], bool)].sum())
     parallax = np.asarray(start["parallax"], float)
     little = float(pixels[parallax < PARALLAX].sum())
     order = np.argsort(parallax)
     middle = float(parallax[order][np.searchsorted(np.cumsum(pixels[order]), 0.5)])
     out = []
-    if borrowed >= SHARE:
+    shares = shown.summary.get("certainty", {})
+    if shares.get("guess", 0.0) >= SHARE:
         out.append(
-            f"{borrowed:.0%} of the image has no depth of its own (no usable flow, or no parallax):"
-            " what is shown there is a guess from its neighbours."
+            f"Of the image {guess_words(shares)}. What is shown there follows from the neighbours."
         )
     if little >= SHARE:
         out.append(

@@ -251,7 +251,7 @@ function fit(margin) {
 }
 const m = scene.middle;
 const VIEWS = {
-  aside: () => { fit(1.12); eye.position.copy(up(0.2 * m, -0.17 * m, -0.3 * m)); controls.target.copy(up(0, 0, m)); },
+  aside: () => { fit(1); eye.position.copy(up(0.2 * m, -0.17 * m, -0.45 * m)); controls.target.copy(up(0, 0.02 * m, m)); },
   reference: () => { fit(1); eye.position.copy(up(0, 0, 0)); controls.target.copy(up(0, 0, m)); },
   next: () => {
     fit(1);
@@ -261,7 +261,11 @@ const VIEWS = {
   },
   left: () => { fit(1.1); eye.position.copy(up(-0.75 * m, -0.15 * m, 0.15 * m)); controls.target.copy(up(0, 0, m)); },
   right: () => { fit(1.1); eye.position.copy(up(0.75 * m, -0.15 * m, 0.15 * m)); controls.target.copy(up(0, 0, m)); },
-  top: () => { fit(1.3); eye.position.copy(up(0, -1.6 * m, 0.75 * m)); controls.target.copy(up(0, 0, 1.1 * m)); },
+  top: () => {
+    fit(1.3);
+    const reach = Math.min(scene.far, 4 * m), height = 0.55 * reach / Math.tan(eye.fov * Math.PI / 360);
+    eye.position.copy(up(0, -height, 0.5 * reach - 0.01 * m)); controls.target.copy(up(0, 0, 0.5 * reach));
+  },
 };
 
 let wanted = false;
@@ -348,16 +352,19 @@ $("play").onclick = () => {
   playing = requestAnimationFrame(step);
 };
 
-/* report.html#mode=depth_ref&time=1&view=top opens that view */
-const asked = new URLSearchParams(location.hash.slice(1));
-const mode = asked.get("mode");
+/* report.html#mode=depth_ref&time=1&view=top opens that view, also while the page is shown */
+async function show() {
+  const asked = new URLSearchParams(location.hash.slice(1)), mode = asked.get("mode");
+  setView(asked.get("view") in VIEWS ? asked.get("view") : "aside");
+  if (asked.has("time")) setTime(Math.min(Math.max(Number(asked.get("time")) || 0, 0), 1));
+  else if (asked.get("view") !== "next") setTime(0);
+  await setMode(data.modes.some((one) => one.name === mode) ? mode : data.modes[0].name);
+}
+addEventListener("hashchange", show);
 setFar(scene.far);
 hold(false);
 resize();
-setView(asked.get("view") in VIEWS ? asked.get("view") : "aside");
-if (asked.has("time")) setTime(Math.min(Math.max(Number(asked.get("time")) || 0, 0), 1));
-else setTime(0);
-await setMode(data.modes.some((one) => one.name === mode) ? mode : data.modes[0].name);
+await show();
 $("message").textContent = "";
 document.body.dataset.ready = "yes";
 window.soupView = { setMode, setTime, setView, setFar, eye, modes: data.modes.map((one) => one.name) };
