@@ -64,9 +64,8 @@ def _parallax(shown: Shown) -> list[str]:
     out = []
     shares = shown.summary.get("certainty", {})
     if shares.get("guess", 0.0) >= SHARE:
-        out.append(
-            f"Of the image {guess_words(shares)}. What is shown there follows from the neighbours."
-        )
+        guess = guess_words(shares, " of the image")
+        out.append(f"{guess}. What is shown there follows from the neighbours.")
     if little >= SHARE:
         out.append(
             f"{little:.0%} of the image has a parallax below {PARALLAX:g} px (median {middle:.2g}"

@@ -263,7 +263,7 @@ const VIEWS = {
   right: () => { fit(1.1); eye.position.copy(up(0.75 * m, -0.15 * m, 0.15 * m)); controls.target.copy(up(0, 0, m)); },
   top: () => {
     fit(1.3);
-    const reach = Math.min(scene.far, 4 * m), height = 0.55 * reach / Math.tan(eye.fov * Math.PI / 360);
+    const reach = Math.min(scene.far, 3 * m), height = 0.55 * reach / Math.tan(eye.fov * Math.PI / 360);
     eye.position.copy(up(0, -height, 0.5 * reach - 0.01 * m)); controls.target.copy(up(0, 0, 0.5 * reach));
   },
 };
