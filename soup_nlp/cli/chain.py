@@ -60,7 +60,11 @@ def chain(
     depth_scale: Annotated[
         float, typer.Option(help="Values per unit of length of true depth_*.png (KITTI 256).")
     ] = 1000.0,
+    preset: options.PresetName = None,
     overrides: options.Set = None,
+    superpixels: options.Wanted = None,
+    neighbours: options.Neighbours = None,
+    max_size: options.MaxSize = None,
     workers: options.Workers = 1,
     dask: options.Dask = None,
     overwrite: options.Overwrite = False,
@@ -77,7 +81,12 @@ def chain(
         apart = f", far enough apart: {', '.join(Path(s).name for s in sources)}"
         found = f"{count} frames{apart if stride == AUTO else ''}"
         print(f"{found}; {len(which) + len(over)} pairs to solve", file=sys.stderr)
-    changes = ["output.page=false", *(overrides or [])]
+    short = {
+        "segmentation.superpixels": superpixels,
+        "segmentation.neighbours": neighbours,
+        "max_size": max_size,
+    }
+    changes = ["output.page=false", *options.changed(preset, overrides, short)]
     pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet), dask)
     done = make_chain(pairs[: len(which)], pairs[len(which) :])
     name = Path(source[0]).resolve().name if len(source) == 1 else f"{source[0]} ..."

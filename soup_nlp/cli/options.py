@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +22,11 @@ PresetName = Annotated[
     typer.Option("--preset", help=f"Options below the problem's own: {', '.join(PRESETS)}."),
 ]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Output folder.")]
+Wanted = Annotated[int | None, typer.Option("--superpixels", help="Wanted number N; default 1000.")]
+Neighbours = Annotated[int | None, typer.Option(help="K of the K-NN graph; default 15.")]
+MaxSize = Annotated[
+    float | None, typer.Option(help="Megapixels at which larger images are solved; 1.5.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Overwrite files that this program did not make.")
@@ -61,6 +66,14 @@ AnyCode = Annotated[bool, typer.Option(help="Also take stored rows of other code
 def preset_first(preset: str | None, overrides: list[str] | None) -> list[str]:
     """Overrides with the one that names a preset first, so that `--set preset=null` may undo it."""
     return [*([] if preset is None else [f"preset={preset}"]), *(overrides or [])]
+
+
+def changed(
+    preset: str | None, overrides: list[str] | None, short: Mapping[str, object]
+) -> list[str]:
+    """Overrides of a preset, of `--set`, and of the options that are short for keys, if given."""
+    given = [f"{key}={value}" for key, value in short.items() if value is not None]
+    return [*preset_first(preset, overrides), *given]
 
 
 def numbers(text: str, option: str, least: int = 0) -> list[int]:

@@ -11,7 +11,17 @@ from typing import Annotated, Any
 
 import typer
 
-from soup_nlp.cli.options import PROBLEM, Overwrite, PresetName, Set, camera, preset_first
+from soup_nlp.cli.options import (
+    PROBLEM,
+    MaxSize,
+    Neighbours,
+    Overwrite,
+    PresetName,
+    Set,
+    Wanted,
+    camera,
+    changed,
+)
 from soup_nlp.cli.progress import SolveLog
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
@@ -54,11 +64,9 @@ def solve(
         str | None, typer.Option(help="Confidence of --flow: .npy in [0, 1], or a grey picture.")
     ] = None,
     depth: Annotated[str | None, typer.Option(help="True depth of the reference frame.")] = None,
-    superpixels: Annotated[int | None, typer.Option(help="Wanted number N; default 1000.")] = None,
-    neighbours: Annotated[int | None, typer.Option(help="K of the K-NN graph; default 15.")] = None,
-    max_size: Annotated[
-        float | None, typer.Option(help="Megapixels at which larger images are solved; 1.5.")
-    ] = None,
+    superpixels: Wanted = None,
+    neighbours: Neighbours = None,
+    max_size: MaxSize = None,
     no_refine: Annotated[
         bool, typer.Option("--no-refine", help="The NLP alone, as refine.enabled=false.")
     ] = False,
@@ -86,8 +94,7 @@ def solve(
         "refine.enabled": "false" if no_refine else None,
         "refine.from_start": "true" if no_nlp else None,
     }
-    given = [f"{key}={value}" for key, value in short.items() if value is not None]
-    overrides = [*preset_first(preset, overrides), *given]
+    overrides = changed(preset, overrides, short)
     pair = {
         "--ref": ref,
         "--next": next_,

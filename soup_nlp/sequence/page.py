@@ -140,7 +140,8 @@ _PAGE = """<!doctype html>
 body {{ font: 15px/1.4 system-ui, sans-serif; margin: 1.2em; color: #222; }}
 .row {{ display: flex; flex-wrap: wrap; gap: 1em; align-items: flex-start; }}
 figure {{ margin: 0; }} .pictures figure {{ flex: 1 1 380px; max-width: 720px; }}
-img {{ width: 100%; display: block; }} .row + .row {{ margin-top: 1em; }}
+img {{ width: 100%; max-height: 62vh; object-fit: contain; object-position: left; }}
+img {{ display: block; }} .row + .row {{ margin-top: 1em; }}
 figcaption {{ color: #555; }} input[type=range] {{ width: 24em; max-width: 60vw; }}
 .row > figure:has(svg) {{ max-width: 362px; }} .words {{ flex: 1 1 300px; min-width: 0; }}
 .bar {{ height: 10px; margin-top: 4px; }}
