@@ -16,6 +16,7 @@ from soup_nlp.bench.suite_pairs import RENDERED
 from soup_nlp.cli import options
 from soup_nlp.cli.bench_accuracy import mre_of
 from soup_nlp.cli.options import Progress, numbers, words
+from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
 from soup_nlp.storage.folders import claim
 
 FAMILIES = [*RENDERED, "motorcycle", *(d.name for d in DATASETS)]
@@ -24,8 +25,12 @@ FAMILIES = [*RENDERED, "motorcycle", *(d.name for d in DATASETS)]
 def paper(
     data: options.Data = None,
     out: options.Out = Path("results/paper"),
-    superpixels: Annotated[int, typer.Option(help="Superpixels of the comparison.")] = 1000,
-    analysis: Annotated[int, typer.Option(help="Superpixels of the other sections.")] = 500,
+    superpixels: Annotated[
+        int, typer.Option(help="Superpixels of the comparison.", min=2, max=MAX_SUPERPIXELS)
+    ] = 1000,
+    analysis: Annotated[
+        int, typer.Option(help="Superpixels of the other sections.", min=2, max=MAX_SUPERPIXELS)
+    ] = 500,
     limit: Annotated[
         int | None, typer.Option(help="At most this many pairs a dataset.", min=1)
     ] = None,
@@ -55,8 +60,8 @@ def paper(
         superpixels=superpixels,
         analysis=analysis,
         limit=limit,
-        numbers=tuple(numbers(sizes, "--numbers", 2)),
-        neighbours=tuple(numbers(neighbours, "--neighbours", 1)),
+        numbers=tuple(numbers(sizes, "--numbers", 2, MAX_SUPERPIXELS)),
+        neighbours=tuple(numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS)),
         width=width,
         seeds=tuple(numbers(seeds, "--seeds")),
         families=tuple(words(families, "--families", FAMILIES)),

@@ -16,8 +16,9 @@ from soup_nlp.bench.speed import plan, problem_of
 from soup_nlp.bench.speed_gate import baseline, check, read_baseline
 from soup_nlp.bench.speed_report import SPEED
 from soup_nlp.bench.studies import Settings, run_study
-from soup_nlp.cli.options import Out, Overwrite, Progress, Quiet, Set, numbers, words
+from soup_nlp.cli.options import Out, Overwrite, Progress, Quiet, Set, Width, numbers, words
 from soup_nlp.data.scenes.catalogue import SCENES
+from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SIDE, MAX_SUPERPIXELS
 from soup_nlp.storage.atomic import write_text
 
 
@@ -30,8 +31,10 @@ def speed(
     ] = "250,500,1000,2000",
     neighbours: Annotated[str, typer.Option(help="K of the K-NN graph.")] = "10,15,20",
     seeds: Annotated[str, typer.Option(help="Seeds of the rendered scenes.")] = "0,1",
-    width: Annotated[int, typer.Option(help="Columns of rendered scenes.", min=64)] = 1024,
-    height: Annotated[int, typer.Option(help="Rows of rendered scenes.", min=48)] = 436,
+    width: Width = 1024,
+    height: Annotated[
+        int, typer.Option(help="Rows of rendered scenes.", min=48, max=MAX_SIDE)
+    ] = 436,
     overrides: Set = None,
     gate: Annotated[
         Path | None,
@@ -48,8 +51,8 @@ def speed(
     kept = [] if gate is None else read_baseline(gate)
     settings: Sequence[Settings] = [run.settings for run in kept] or plan(
         words(scenes, "--scenes", [*SCENES, "motorcycle"]),
-        numbers(sizes, "--superpixels", 2),
-        numbers(neighbours, "--neighbours", 1),
+        numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS),
+        numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS),
         numbers(seeds, "--seeds"),
         width=width,
         height=height,

@@ -22,15 +22,16 @@ from soup_nlp.cli.options import (
     Quiet,
     Seeds,
     Set,
+    Size,
     numbers,
     words,
 )
 from soup_nlp.errors import ConfigError
 from soup_nlp.model.layout import GAUGES
+from soup_nlp.schema.limits import MAX_SUPERPIXELS
 from soup_nlp.sequence.study import CHAIN, TRACKING
 from soup_nlp.sequence.study import RENDERED as RENDERED_SEQUENCES
 
-Size = Annotated[int, typer.Option(help="Superpixels wanted.")]
 SCENES = [*RENDERED, "motorcycle"]
 SPEED = Path("out/bench/speed")
 
@@ -66,7 +67,10 @@ def methods(
     quiet: Quiet = False,
 ) -> None:
     """How low every method ends on one energy, before and after refinement."""
-    chosen = words(scenes, "--scenes", SCENES), numbers(superpixels, "--superpixels", 2)
+    chosen = (
+        words(scenes, "--scenes", SCENES),
+        numbers(superpixels, "--superpixels", 2, MAX_SUPERPIXELS),
+    )
     settings = plan(*chosen, [20], numbers(seeds, "--seeds"), refine=not unrefined)
     study = study_energy.METHODS_UNREFINED if unrefined else study_energy.METHODS_REFINED
     _run(study, out, settings, overwrite, quiet)

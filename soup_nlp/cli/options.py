@@ -14,6 +14,7 @@ from soup_nlp.bench.suites import SUITES
 from soup_nlp.bench.tables import reason
 from soup_nlp.config.presets import PRESETS
 from soup_nlp.errors import ConfigError
+from soup_nlp.schema.limits import MAX_SEED, MAX_SIDE, MAX_SUPERPIXELS
 from soup_nlp.storage.files import as_path, is_file
 
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
@@ -53,7 +54,8 @@ Flow = Annotated[
     list[str] | None, typer.Option(help="Flow source instead of the suite's own; may be repeated.")
 ]
 Only = Annotated[list[str] | None, typer.Option(help="Only pairs whose name holds this word.")]
-Width = Annotated[int, typer.Option(help="Columns of rendered scenes.", min=64)]
+Size = Annotated[int, typer.Option(help="Superpixels wanted.", min=2, max=MAX_SUPERPIXELS)]
+Width = Annotated[int, typer.Option(help="Columns of rendered scenes.", min=64, max=MAX_SIDE)]
 Seeds = Annotated[str, typer.Option(help="Seeds of rendered scenes, such as 0,1,2.")]
 Workers = Annotated[int, typer.Option(help="Processes of this machine (extra: bench).", min=1)]
 Dask = Annotated[
@@ -76,33 +78,33 @@ def changed(
     return [*preset_first(preset, overrides), *given]
 
 
-def numbers(text: str, option: str, least: int = 0) -> list[int]:
-    """Whole numbers of a comma-separated list.
+def numbers(text: str, option: str, least: int = 0, most: int = MAX_SEED) -> list[int]:
+    """Different whole numbers of a comma-separated list.
 
     Raises:
-        ConfigError: a word is no whole number, or one is smaller than `least`.
+        ConfigError: a word is no whole number, or one is not from `least` to `most`.
     """
     try:
-        found = [int(word) for word in text.split(",")]
+        found = list(dict.fromkeys(int(word) for word in text.split(",")))
     except ValueError:
         found = []
-    if not found or min(found) < least:
+    if not found or min(found) < least or max(found) > most:
         raise ConfigError(
             "not a list of whole numbers",
             where=option,
             found=text,
-            expected=f"whole numbers from {least}, comma separated",
+            expected=f"whole numbers from {least} to {most}, comma separated",
         )
     return found
 
 
 def words(text: str, option: str, known: list[str]) -> list[str]:
-    """Names of a comma-separated list.
+    """Different names of a comma-separated list.
 
     Raises:
         ConfigError: it is empty, or a name is not known.
     """
-    names = [name.strip() for name in text.split(",") if name.strip()]
+    names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     wrong = [name for name in names if name not in known]
     if wrong or not names:
         raise ConfigError(

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.model.elements import Element
+from soup_nlp.model.elements import Element, Norms
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP, assemble
-from soup_nlp.model.norms import solver_form
+from soup_nlp.model.norms import NormForm, TruncationForm, solver_form
 from soup_nlp.model.superpixel import View
 
 Float = NDArray[np.float64]
@@ -22,6 +23,10 @@ Int = NDArray[np.int64]
 
 THETA = ("eps", "eps_pixel", "theta", "ridge")
 """Names of the numbers that an NLP lets change without a new build."""
+
+
+_SYMBOLS = ca.SX.sym("theta", len(THETA))
+"""One for all kernels, so that they serve every NLP."""
 
 
 class Block(NamedTuple):
@@ -57,7 +62,6 @@ class Builder:
     groups: list[Group] = field(default_factory=list)
     slacks: list[Block] = field(default_factory=list)
     rows: list[Block] = field(default_factory=list)
-    theta: ca.SX = field(default_factory=lambda: ca.SX.sym("theta", len(THETA)))
 
     def new_variables(self, label: str, count: int, upper: float) -> Int:
         """Indices of `count` fresh slack variables, at least 0 and at most `upper`."""
@@ -77,45 +81,19 @@ class Builder:
         Args:
             name: Of the kernel.
             element: Data columns, indices of variables and the norms.
-            view: Makes a View of local variables (own,) and the data row, by position.
+            view: Makes a View of local variables (own,) and the data row, by position; the same
+                one for the same coordinates.
             own: Variables per superpixel.
         """
         size = len(element.index)
         if not size:
             return
-        x = ca.SX.sym("x", own * element.arity)
-        row = {k: ca.SX.sym(k, c) for k, c in element.fields.items()}
-        views = [view(x[own * a : own * (a + 1)], row, a) for a in range(element.arity)]
-        norms = element.norms(views, row, self.theta[0], self.theta[1])
-        local, index = [x], [element.index]
-
-        def extra(prefix: str, label: str, upper: float) -> ca.SX:
-            symbol = ca.SX.sym(f"{prefix}_{label}")
-            local.append(symbol)
-            index.append(self.new_variables(f"{prefix}_{label}", size, upper)[:, None])
-            return symbol
-
-        epigraph, lifted = self.form.norm == "epigraph", self.form.truncation == "lifted"
-        extras = [
-            (
-                extra("s", n.name, np.inf) if epigraph and n.kind == "norm" else None,
-                extra("z", n.name, 1.0) if lifted and n.sigma is not None else None,
-            )
-            for n in norms
-        ]
-        everything = ca.vertcat(*local)
-        forms = [solver_form(n, everything, self.theta[2], *e) for n, e in zip(norms, extras)]
-        cons = {n.name: f.constraint for n, f in zip(norms, forms) if f.constraint is not None}
-        rows = [self.new_rows(f"epigraph_{label}", size, 0.0) for label in cons]
-        kernel = Kernel(
-            name,
-            everything,
-            ca.vertcat(*row.values()),
-            self.theta,
-            objective=sum((f.objective for f in forms), ca.SX(0)),
-            constraints=ca.vertcat(*cons.values()) if cons else None,
-            curvature=sum((f.curvature for f in forms), ca.SX(0)),
-        )
+        fields = tuple(element.fields.items())
+        term = name, element.norms, fields, element.arity, view, own
+        kernel, slacks, constraints = _kernel(*term, self.form.norm, self.form.truncation)
+        index = [element.index]
+        index += [self.new_variables(label, size, upper)[:, None] for label, upper in slacks]
+        rows = [self.new_rows(f"epigraph_{label}", size, 0.0) for label in constraints]
         data = np.column_stack([c.reshape(size, -1) for c in element.columns.values()])
         table = Table(
             np.concatenate(index, axis=1), data, np.array(rows, np.int64).reshape(-1, size).T
@@ -152,7 +130,7 @@ class Builder:
         fresh = self.new_rows(name.removeprefix("t_"), 1 if total else size * count, lower, upper)
         rows = np.broadcast_to(fresh.reshape(-1, count), (size, count))
         symbols = ca.SX.sym("none", 0) if row is None else row
-        kernel = Kernel(name, x, symbols, self.theta, constraints=body)
+        kernel = Kernel(name, x, symbols, _SYMBOLS, constraints=body)
         table = Table(index, np.zeros((size, 0)) if data is None else data, rows)
         self.groups.append(Group(kernel, table))
 
@@ -163,7 +141,7 @@ class Builder:
             metric: (n,) squared inverse length of a natural step of the first n variables.
         """
         x, m = ca.SX.sym("x"), ca.SX.sym("metric")
-        kernel = Kernel("ridge", x, m, self.theta, objective=0 * x, curvature=self.theta[3] * m)
+        kernel = Kernel("ridge", x, m, _SYMBOLS, objective=0 * x, curvature=_SYMBOLS[3] * m)
         self.groups.append(Group(kernel, Table(np.arange(len(metric))[:, None], metric[:, None])))
 
     def finish(
@@ -197,6 +175,56 @@ class Builder:
             compiled=f.compiled,
         )
         return _with_slacks(nlp) if self.slacks else nlp
+
+
+@lru_cache(maxsize=200)
+def _kernel(
+    name: str,
+    norms: Norms,
+    fields: tuple[tuple[str, int], ...],
+    arity: int,
+    view: Callable[..., View],
+    own: int,
+    norm: NormForm,
+    truncation: TruncationForm,
+) -> tuple[Kernel, list[tuple[str, float]], list[str]]:
+    """Kernel of a term's norms in solver form, made once.
+
+    Returns:
+        The kernel; names and upper bounds of its slack variables; names of its constraints.
+    """
+    x = ca.SX.sym("x", own * arity)
+    row = {k: ca.SX.sym(k, c) for k, c in fields}
+    views = [view(x[own * a : own * (a + 1)], row, a) for a in range(arity)]
+    local, slacks = [x], []
+
+    def extra(label: str, upper: float) -> ca.SX:
+        local.append(ca.SX.sym(label))
+        slacks.append((label, upper))
+        return local[-1]
+
+    found = norms(views, row, _SYMBOLS[0], _SYMBOLS[1])
+    epigraph, lifted = norm == "epigraph", truncation == "lifted"
+    extras = [
+        (
+            extra(f"s_{n.name}", np.inf) if epigraph and n.kind == "norm" else None,
+            extra(f"z_{n.name}", 1.0) if lifted and n.sigma is not None else None,
+        )
+        for n in found
+    ]
+    everything = ca.vertcat(*local)
+    forms = [solver_form(n, everything, _SYMBOLS[2], *e) for n, e in zip(found, extras)]
+    cons = {n.name: f.constraint for n, f in zip(found, forms) if f.constraint is not None}
+    kernel = Kernel(
+        name,
+        everything,
+        ca.vertcat(*row.values()),
+        _SYMBOLS,
+        objective=sum((f.objective for f in forms), ca.SX(0)),
+        constraints=ca.vertcat(*cons.values()) if cons else None,
+        curvature=sum((f.curvature for f in forms), ca.SX(0)),
+    )
+    return kernel, slacks, list(cons)
 
 
 def _with_slacks(nlp: NLP) -> NLP:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -19,7 +20,26 @@ from soup_nlp.model.superpixel import View
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Layout = TangentLayout | MatrixLayout
-Norms = Callable[[list[View], dict[str, ca.SX], ca.SX, ca.SX], list[Norm]]
+
+
+class Norms(NamedTuple):
+    """How the norms of an element are made; equal ones make equal kernels, which are made once.
+
+    Attributes:
+        term: Function of `terms`.
+        given: Its arguments after views, row and smoothing.
+        in_pixels: Whether its norms are pixels in the next frame, with a smoothing of their own.
+    """
+
+    term: Callable[..., list[Norm]]
+    given: tuple[Hashable, ...] = ()
+    in_pixels: bool = False
+
+    def __call__(
+        self, views: Sequence[View], row: Mapping[str, ca.SX], eps: ca.SX, eps_pixel: ca.SX
+    ) -> list[Norm]:
+        """The norms of these views."""
+        return self.term(*views, row, eps_pixel if self.in_pixels else eps, *self.given)
 
 
 @dataclass(frozen=True)
@@ -103,10 +123,8 @@ def _arap(data: EnergyData, w: Weights) -> Element:
         **_pixel(data, data.edge_unit),
     }
 
-    def norms(v: list[View], row: dict[str, ca.SX], eps: ca.SX, _: ca.SX) -> list[Norm]:
-        return terms.arap(v[0], v[1], row, eps, truncated, data.arap_at_anchors, data.local_units)
-
-    return Element(e, columns, norms, 2)
+    given = truncated, data.arap_at_anchors, data.local_units
+    return Element(e, columns, Norms(terms.arap, given), 2)
 
 
 def _proj(data: EnergyData, w: Weights) -> Element:
@@ -114,18 +132,18 @@ def _proj(data: EnergyData, w: Weights) -> Element:
     owner, count = np.nonzero(used)[0][:, None], int(used.sum())
     truncated = bool(np.isfinite(w.sigma_proj))
     # intrinsics are data, so that kernels compiled once serve every camera
-    K = ca.sparsify(ca.DM(data.K_next[:2]))
+    K = data.K_next[:2]
+    there = np.nonzero(K.T)[::-1]
     columns = {
         "weight": w.proj * data.pixel_weight[used],
         "sigma": _full(count, w.sigma_proj),
         "ray": data.pixel_ray[used],
         "target": data.pixel_target[used],
-        "K": np.tile(K.nonzeros(), (count, 1)),
+        "K": np.tile(K[there], (count, 1)),
     }
 
-    def norms(v: list[View], row: dict[str, ca.SX], _: ca.SX, eps: ca.SX) -> list[Norm]:
-        return terms.reprojection(v[0], row, eps, K.sparsity(), truncated)
-
+    places = tuple(zip(*(own.tolist() for own in there)))
+    norms = Norms(terms.reprojection, (places, truncated), in_pixels=True)
     return Element(owner, columns, norms, 1)
 
 
@@ -143,10 +161,8 @@ def _cont(data: EnergyData, w: Weights) -> Element:
         **_pixel(data, data.pair_unit),
     }
 
-    def norms(v: list[View], row: dict[str, ca.SX], eps: ca.SX, _: ca.SX) -> list[Norm]:
-        return terms.continuity(v[0], v[1], row, eps, samples, *truncated, data.local_units)
-
-    return Element(pairs, columns, norms, 2)
+    given = samples, *truncated, data.local_units
+    return Element(pairs, columns, Norms(terms.continuity, given), 2)
 
 
 def _prior(data: EnergyData, w: Weights) -> Element:
@@ -158,10 +174,7 @@ def _prior(data: EnergyData, w: Weights) -> Element:
         "ray_k": ray_k,
     }
 
-    def norms(v: list[View], row: dict[str, ca.SX], eps: ca.SX, _: ca.SX) -> list[Norm]:
-        return terms.prior(v[0], v[1], row, eps)
-
-    return Element(data.edges, columns, norms, 2)
+    return Element(data.edges, columns, Norms(terms.prior), 2)
 
 
 def _orient(data: EnergyData, w: Weights) -> Element:
@@ -171,7 +184,4 @@ def _orient(data: EnergyData, w: Weights) -> Element:
         "sigma": _full(len(data.pairs), w.sigma_orient),
     }
 
-    def norms(v: list[View], row: dict[str, ca.SX], eps: ca.SX, _: ca.SX) -> list[Norm]:
-        return terms.orientation(v[0], v[1], row, eps, truncated)
-
-    return Element(data.pairs, columns, norms, 2)
+    return Element(data.pairs, columns, Norms(terms.orientation, (truncated,)), 2)

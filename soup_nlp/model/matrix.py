@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +16,7 @@ from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.layout import Gauge, MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.superpixel import View, matrix_view
 
@@ -21,6 +24,12 @@ Float = NDArray[np.float64]
 
 MIN_SCALE = 1e-4
 """Lower bound of scales and offsets."""
+
+
+@cache
+def _views(gauge: Gauge) -> Callable[[ca.SX, dict[str, ca.SX], int], View]:
+    """Makes the view of a superpixel from its variables and the data row, by position."""
+    return lambda x, row, position: matrix_view(x, gauge, row[f"offset_{position}"])
 
 
 def build_matrix_nlp(
@@ -41,12 +50,8 @@ def build_matrix_nlp(
     layout = MatrixLayout(data.share, form.gauge)
     b = Builder(form, layout.size)
     own = layout.stride
-
-    def view(x: ca.SX, row: dict[str, ca.SX], position: int) -> View:
-        return matrix_view(x, form.gauge, row[f"offset_{position}"])
-
     for name, element in elements(data, weights, layout).items():
-        b.add_norms(name, element, view, own)
+        b.add_norms(name, element, _views(form.gauge), own)
 
     _add_constraints(b, layout, data, form)
     x0 = layout.pack(soup)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +20,17 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.model.superpixel import View, tangent_view
 
 Float = NDArray[np.float64]
+
+
+@cache
+def _views(chart: Chart) -> Callable[[ca.SX, dict[str, ca.SX], int], View]:
+    """Makes the view of a superpixel from its coordinates and the data row, by position."""
+
+    def view(x: ca.SX, row: dict[str, ca.SX], a: int) -> View:
+        base = {k: row[f"{k}_{a}"] for k in ("anchor", "radius", "depth", "R0", "t0")}
+        return tangent_view(x, **base, chart=chart)
+
+    return view
 
 
 def build_tangent_nlp(
@@ -37,13 +51,8 @@ def build_tangent_nlp(
     n = len(data)
     layout = TangentLayout.about(soup, data, chart)
     b = Builder(form, 9 * n)
-
-    def view(x: ca.SX, row: dict[str, ca.SX], a: int) -> View:
-        base = {k: row[f"{k}_{a}"] for k in ("anchor", "radius", "depth", "R0", "t0")}
-        return tangent_view(x, **base, chart=chart)
-
     for name, element in elements(data, weights, layout).items():
-        b.add_norms(f"t_{name}", element, view, 9)
+        b.add_norms(f"t_{name}", element, _views(chart), 9)
     _add_simplex(b, soup, layout, slanted=not data.local_units and chart == "depth")
     # visibility as in the constrained NLP, divided by the anchor's facing 1 / |m| and in chart
     # "inverse-depth" multiplied by rho: the same set, so that one's solution is the other's

@@ -6,7 +6,7 @@ A term takes the views of its superpixels and its row of data, and returns its r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import casadi as ca
 
@@ -50,13 +50,17 @@ def _nearness(Xa: ca.SX, Xb: ca.SX) -> ca.SX:
     return ca.sqrt(ca.sqrt((a * a + b * b) / 2))
 
 
-def reprojection(a: View, row: Row, eps: ca.SX, K: ca.Sparsity, truncated: bool) -> list[Norm]:
+def reprojection(
+    a: View, row: Row, eps: ca.SX, places: Sequence[tuple[int, int]], truncated: bool
+) -> list[Norm]:
     """E_proj of one pixel, Eq. 3: distance of homography and flow target, pixels.
 
-    `K` is where the first two rows of the next frame's intrinsics are not 0; "K" their values.
+    `places` is where the first two rows of the next frame's intrinsics are not 0, column by column;
+    "K" their values.
     """
     y = a.transfer(row["ray"])
-    error = ca.SX(K, row["K"]) @ (y / y[2]) - row["target"]
+    K = ca.SX(ca.Sparsity.triplet(2, 3, *map(list, zip(*places))), row["K"])
+    error = K @ (y / y[2]) - row["target"]
     return [Norm("reprojection", row["weight"], error, eps, row["sigma"] if truncated else None)]
 
 

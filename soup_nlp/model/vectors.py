@@ -8,6 +8,7 @@ by element, a kernel takes four times as long.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -49,6 +50,7 @@ _OPERATIONS: Mapping[int, Callable[..., Any]] = {
     ca.OP_NOT: lambda a, out: np.equal(a, 0.0, out),
     ca.OP_IF_ELSE_ZERO: _if_else_zero,
 }
+_OTHERS = frozenset((ca.OP_INPUT, ca.OP_CONST, ca.OP_OUTPUT))
 
 
 class Vectors:
@@ -70,7 +72,10 @@ class Vectors:
         self._x, self._data = np.empty((count[0], size)), np.empty((count[1], size))
         self._theta, self._lam_f = np.empty(count[2]), np.empty(1)
         self._lam_c, self._out = np.empty((count[4], size)), np.empty((function.nnz_out(0), size))
-        self._calls = self._translated(function, size)
+        unknown = {i.operation for i in instructions(function)} - _OPERATIONS.keys() - _OTHERS
+        if unknown:
+            raise NoLanesError(f"{function.name()}: operation {min(unknown)}")
+        self._function = function
         starts = range(0, len(table), size)
         # the last block is filled with its last element, whose entries are then left out
         blocks = [np.minimum(np.arange(s, s + size), len(table) - 1) for s in starts]
@@ -88,25 +93,29 @@ class Vectors:
         # entries in the order in which blocks give them
         self._place = [np.ascontiguousarray(place[s : s + size].T).ravel() for s in starts]
 
-    def _translated(self, f: ca.Function, size: int) -> list[tuple[Callable[..., Any], Any]]:
-        """Calls of numpy with their arguments: rows of the block's buffers and registers."""
+    @cached_property
+    def _calls(self) -> list[tuple[Callable[..., Any], Any]]:
+        """Calls of numpy with their arguments: rows of the block's buffers and registers.
+
+        Translated by the first evaluation: many a Hessian is never wanted.
+        """
+        f = self._function
         inputs = self._x, self._data, self._theta[:, None], self._lam_f[:, None], self._lam_c
-        work = np.empty((f.sz_w(), size))
+        rows, out = [list(own) for own in inputs], list(self._out)
+        work = list(np.empty((f.sz_w(), self._out.shape[1])))
         held: dict[int, Float] = {}
         calls: list[tuple[Callable[..., Any], Any]] = []
         for op, to, source, constant in instructions(f):
             if op == ca.OP_INPUT:
-                held[to[0]] = inputs[source[0]][source[1]]
+                held[to[0]] = rows[source[0]][source[1]]
             elif op == ca.OP_CONST:
                 held[to[0]] = np.array([constant])
             elif op == ca.OP_OUTPUT:
-                calls.append((np.copyto, (self._out[to[1]], held[source[0]])))
-            elif op in _OPERATIONS:
+                calls.append((np.copyto, (out[to[1]], held[source[0]])))
+            else:
                 given = [held[i] for i in source[: 1 if op in _UNARY else 2]]
                 held[to[0]] = work[to[0]]
                 calls.append((_OPERATIONS[op], (*given, work[to[0]])))
-            else:
-                raise NoLanesError(f"{f.name()}: operation {op}")
         return calls
 
     def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
