@@ -12,6 +12,7 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow
 from soup_nlp.evaluate.confidence import (
     BENDING_FACTOR,
+    LEAST_SPREAD,
     MOST_SIGMA,
     POWER,
     SIGMA_PRIOR,
@@ -285,31 +286,36 @@ def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
 
 
 def test_where_surfaces_bend_a_misfit_counts_in_full_and_the_spread_by_its_root():
-    spread, misfit = np.array([0.01]), 0.2
+    spread, misfit = np.array([4 * LEAST_SPREAD]), 0.2
     base = calibrated(spread, 0.1, misfit, prior=np.inf, bending=True)
-    assert base[0] == pytest.approx(BENDING_FACTOR * misfit * np.sqrt(0.01))
+    assert base[0] == pytest.approx(BENDING_FACTOR * misfit * np.sqrt(spread[0]))
+    least = calibrated(0.1 * spread, 0.1, misfit, prior=np.inf, bending=True)
+    assert least[0] == pytest.approx(0.5 * base[0])
     assert calibrated(spread, 0.6, misfit, prior=np.inf, bending=True) == base
     assert calibrated(spread, 0.1, 0.0, bending=True)[0] > 0
     assert calibrated(np.array([np.inf]), 0.1, bending=True)[0] == pytest.approx(SIGMA_PRIOR)
 
 
-def test_what_stands_still_where_surfaces_bend_is_a_guess(small_room):
+def test_the_more_stands_still_where_surfaces_bend_the_less_sure_is_depth(small_room):
     bends = replace(small_room, start=replace(small_room.start, bending=True))
-    assert not sure_of(bends).still.any()
-    still = np.arange(len(bends.soup)) % 3 == 0
+    assert sure_of(bends).still == 0.0
+    labels, still = bends.segmentation.labels, np.arange(len(bends.soup)) % 3 > 0
     R = np.where(still[:, None, None], np.eye(3), bends.soup.R)
     t = np.where(still[:, None], 0.0, bends.soup.t)
     soup = replace(bends.soup, R=R, t=t)
     sure = sure_of(replace(bends, soup=soup))
-    np.testing.assert_array_equal(sure.still, still)
-    assert sure.sigma[still[bends.segmentation.labels]].min() > MOST_SIGMA
+    share = still[labels].mean()
+    assert sure.still == pytest.approx(share)
+    # what moves is no surer: nothing tells its depth beside that of the rest
+    assert sure.sigma.min() > share * SIGMA_PRIOR / np.hypot(1, share) * (1 - 1e-9)
+    assert sure.guessed == 1.0
     # whatever the answer, where the camera rests the start had no parallax
     parallax = np.where(still, 0.0, 9.0)
     rests = replace(bends, start=replace(bends.start, at_rest=True, parallax=parallax))
     moved = replace(rests, soup=replace(soup, t=np.where(still[:, None], 1.0, bends.soup.t)))
-    np.testing.assert_array_equal(sure_of(moved).still, still)
+    assert sure_of(moved).still == pytest.approx(share)
     # where surfaces are rigid the start tells whether the camera rests
-    assert not sure_of(replace(small_room, soup=soup)).still.any()
+    assert sure_of(replace(small_room, soup=soup)).still == 0.0
 
 
 def test_an_energy_that_sees_no_plane_leaves_everything_a_guess(small_room):

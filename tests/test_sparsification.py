@@ -38,6 +38,15 @@ def test_an_uncertainty_by_chance_keeps_the_mean():
     assert found.ause == pytest.approx(np.mean(0.5 - kept / 2) / 0.5, abs=0.03)
 
 
+def test_equal_uncertainties_are_chance_in_whatever_order_they_come():
+    one = sparsification(ERROR, np.ones(len(ERROR)))
+    np.testing.assert_allclose(one.error, ERROR.mean())
+    half = ERROR > 0.5
+    there, back = (sparsification(ERROR[::k], half[::k]) for k in (1, -1))
+    np.testing.assert_allclose(there.error, back.error)
+    assert 0 < there.ause < one.ause
+
+
 def test_no_error_has_no_area():
     assert sparsification(np.zeros(5), np.arange(5.0)).ause == 0.0
 

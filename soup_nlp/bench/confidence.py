@@ -60,6 +60,8 @@ SAMPLE = 400
 """Pixels of a pair that are kept for the calibration on other families."""
 WITHIN = 0.76
 """Share of the pixels that a factor brings within one sigma."""
+LITTLE_STILL = 0.1
+"""Share of an image up to which what stands still there hardly changes sigma."""
 LEAST_PARALLAX = 0.1
 """Pixels of parallax below which the cue divides by this."""
 
@@ -94,7 +96,7 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
     misfit = sure.misfit[rec.labels]
     whole = calibrated(sure.spread, sure.noise, misfit, np.inf, sure.bending)
     unit = chosen(whole) / (BENDING_FACTOR if sure.bending else FACTOR)
-    still = chosen(sure.still[rec.labels].astype(float))
+    still = np.full(len(log), sure.still)
     picked = np.linspace(0, len(log) - 1, min(SAMPLE, len(log))).astype(int)
     own = found["sigma"]
     return {
@@ -158,8 +160,8 @@ def left_out(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
     told: dict[str, list[tuple[float, float, float]]] = {}
     for family, bends, own in samples:
         others = [np.array(s) for name, b, s in samples if name != family and b == bends]
-        # what stands still has its sigma from elsewhere
-        ratios = [(log / unit)[still == 0] for log, unit, still in others]
+        # where much stands still, sigma comes from that
+        ratios = [(log / unit)[still < LITTLE_STILL] for log, unit, still in others]
         # every pair counts alike
         alike = [np.quantile(r, np.linspace(0, 1, 101)) for r in ratios if len(r)]
         if not alike:

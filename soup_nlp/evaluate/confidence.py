@@ -172,8 +172,10 @@ MOST_BORROWED = 0.5
 """Share of superpixels without a depth of their own from which the camera is at rest."""
 FACTOR, POWER = 7.0, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
-BENDING_FACTOR = 2.0
+BENDING_FACTOR = 0.5
 """sigma = BENDING_FACTOR misfit sqrt(spread) where surfaces bend."""
+LEAST_SPREAD = 0.1
+"""Spreads below it count as this where surfaces bend: errors do not follow them."""
 MOST_MISFIT = 5.0
 """Pixels beyond which a flow that the answer contradicts is as wrong as any."""
 LARGEST = 1e6
@@ -194,7 +196,7 @@ class Confidence:
         marginals: Of the planes and of the components' scales.
         noise: Of the flow, pixels.
         bending: Whether surfaces are taken to bend.
-        still: (N,) what stands still where surfaces bend, whose depth nothing tells.
+        still: Share of the image that stands still where surfaces bend.
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
     """
 
@@ -203,7 +205,7 @@ class Confidence:
     marginals: Marginals
     noise: float
     bending: bool
-    still: NDArray[np.bool_]
+    still: float
     misfit: Float
 
     @property
@@ -253,12 +255,12 @@ def calibrated(
     misfit: Float | float = 0.0,
     prior: float = SIGMA_PRIOR,
     bending: bool = False,
-    still: NDArray[np.bool_] | bool = False,
+    still: float = 0.0,
 ) -> Float:
     """Standard deviation of log depth that errors keep to.
 
     Where surfaces bend every superpixel has a motion of its own, which fits nearly any flow: the
-    spread says less there, and a misfit much.
+    spread says little there, and a misfit much.
 
     Args:
         spread: What the marginals say.
@@ -267,13 +269,15 @@ def calibrated(
             mean is the noise.
         prior: Standard deviation before looking; its information is added.
         bending: Whether surfaces are taken to bend.
-        still: Whether it stands still: `SIGMA_PRIOR` is added, in squares.
+        still: Share of the image that stands still. Nothing tells its depth, nor that of the rest
+            beside it: so much of `SIGMA_PRIOR` is added everywhere, in squares.
     """
     if bending:
-        sigma = BENDING_FACTOR * np.maximum(LEAST_NOISE, misfit) * np.sqrt(spread)
+        known = np.sqrt(np.maximum(spread, LEAST_SPREAD))
+        sigma = BENDING_FACTOR * np.maximum(LEAST_NOISE, misfit) * known
     else:
         sigma = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
-    sigma = np.hypot(np.minimum(sigma, LARGEST), np.where(still, SIGMA_PRIOR, 0.0))
+    sigma = np.hypot(np.minimum(sigma, LARGEST), SIGMA_PRIOR * still)
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
 
@@ -339,9 +343,9 @@ def confidence(
         )
         spread = np.full(rec.labels.shape, np.inf)
     noise, misfit = start.noise, flow_misfit(rec, pair.flow)
-    still = stands_still(rec.soup, data.anchor_ray, pair.K_next) & start.bending
+    stands = stands_still(rec.soup, data.anchor_ray, pair.K_next) & start.bending
     # the answer may explain a part of the camera's turn by translations
-    still |= start.at_rest & (start.parallax < MOST_NOISE)
-    own_misfit, at_rest = misfit[rec.labels], still[rec.labels]
-    sigma = calibrated(spread, noise, own_misfit, bending=start.bending, still=at_rest)
+    stands |= start.at_rest & (start.parallax < MOST_NOISE)
+    still = float(stands[rec.labels].mean())
+    sigma = calibrated(spread, noise, misfit[rec.labels], bending=start.bending, still=still)
     return Confidence(sigma, spread, own, noise, start.bending, still, misfit)

@@ -40,7 +40,7 @@ class Sparsification:
 def sparsification(error: ArrayLike, uncertainty: ArrayLike) -> Sparsification:
     """Sort pixels by uncertainty and compare with sorting them by error.
 
-    Pixels of equal uncertainty are removed in the order in which they are given.
+    Pixels of equal uncertainty are removed in an arbitrary order: each counts as their mean error.
 
     Args:
         error: (M,) errors, not negative.
@@ -60,8 +60,10 @@ def sparsification(error: ArrayLike, uncertainty: ArrayLike) -> Sparsification:
         raise DataError("errors must be finite and not negative, uncertainties not NaN")
     kept = np.linspace(1.0, LAST, STEPS)
     last = np.maximum((kept * len(e)).astype(int) - 1, 0)
-    mean = [np.cumsum(e[np.argsort(key, kind="stable")]) for key in (s, e)]
-    own, best = (m[last] / (last + 1) for m in mean)
+    _, group = np.unique(s, return_inverse=True)
+    alike = np.bincount(group, e) / np.bincount(group)
+    sums = np.cumsum(alike[np.sort(group)]), np.cumsum(np.sort(e))
+    own, best = (total[last] / (last + 1) for total in sums)
     whole = float(e.mean())
     return Sparsification(kept, own, best, float((own - best).mean() / whole) if whole > 0 else 0.0)
 

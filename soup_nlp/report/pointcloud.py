@@ -91,7 +91,8 @@ def write_cloud(path: PathLike, result: Result, frame: int) -> int:
         f"frame: camera of the {name} frame, {AXES}",
         f"unit: {result.unit}",
         "confidence: of the flow, 0 to 1; component: what moves as one, 0 is the background",
-        f"{keep.mean():.1%} of the pixels: without hidden ones and those at jumps of the depth",
+        f"{keep.mean():.1%} of the pixels: without hidden ones, those at jumps of the depth, and"
+        " guesses (output.min_confidence=0 keeps them)",
     ]
     return write_ply(
         path,
