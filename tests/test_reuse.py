@@ -7,8 +7,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from soup_nlp.solve import descent
+from soup_nlp.solve import descent, part
 from soup_nlp.solve.descent import Descent
+from soup_nlp.solve.part import Part
 from soup_nlp.solve.phase import Phase
 from soup_nlp.solve.reuse import LIMIT, held, preconditioned
 
@@ -60,7 +61,12 @@ def test_a_descent_with_fewer_factors_ends_at_a_minimum(problem, monkeypatch):
         Phase("first", "gauss-newton", 0.3, 1e-3, 60, 1e-4, 1e-6),
         Phase("last", "exact", 0.3, 1e-8, 60, 0.0, 1e-6),
     )
-    ends, counts = [], []
+    ends, counts, parts = [], [], []
+    # twelve superpixels have few that are nobody's neighbour, or much better than others
+    monkeypatch.setattr(part, "WORST", 0.3)
+    monkeypatch.setattr(Part, "_with_neighbours", lambda self, some: some)
+    begin = Part._within
+    monkeypatch.setattr(Part, "_within", lambda self, some: parts.append(1) or begin(self, some))
     for least in (10**9, 0):
         monkeypatch.setattr(descent, "REUSE", least)
         runner, made = Descent(problem), []
@@ -72,3 +78,4 @@ def test_a_descent_with_fewer_factors_ends_at_a_minimum(problem, monkeypatch):
     # both gradients are below 1e-6 in a strictly convex neighbourhood, or in two minima
     assert ends[1].objective == pytest.approx(ends[0].objective, rel=1e-3)
     assert counts[1] < 0.7 * counts[0]
+    assert parts

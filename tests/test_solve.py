@@ -217,9 +217,12 @@ def test_without_presolve_the_exact_hessian_converges(room, cold):
 def test_ipopt_alone_narrows_the_smoothing(room, cold):
     options = COLD.replace(continuation=True, presolve_eps=(1.0, 0.3), stagnation=3e-3)
     solution = room.solve(options, form(hessian="exact"))
-    names = ["continuation 1", "continuation 0.3", "constrained NLP"]
+    names = ["continuation 1", "continuation 0.3", "continuation exact", "constrained NLP"]
     assert [s.name for s in solution.stages] == names
-    first, second, _ = solution.stages
+    first, second, third, last = solution.stages
+    assert third.converged
+    # the multipliers go with the point: it is the constrained NLP's KKT point as well
+    assert last.iterations <= 3
     assert first.status == "Stagnated"
     assert all(s.history["obj"][-1] < s.history["obj"][0] for s in (first, second))
     assert solution.converged, solution.status

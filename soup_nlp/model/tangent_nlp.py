@@ -83,6 +83,26 @@ def build_tangent_nlp(
     return b.finish("presolve", x0, lower.ravel(), upper.ravel(), layout.names), layout
 
 
+def majorant(form: Formulation) -> Formulation:
+    """Reweighted least squares: theta = 0 and no ridge, sum c psi / s J^T J."""
+    return form.replace(
+        norm="smooth",
+        truncation="smooth",
+        hessian="gauss-newton+constraints",
+        theta=0.0,
+        ridge=0.0,
+    )
+
+
+def polish_chart(data: EnergyData) -> Chart:
+    """Chart for the exact Hessian.
+
+    On inverse depths the superpixels of a plane move with it in straight lines; reweighting on
+    depths ends at lower energies. The paper's units need a length unit that is linear.
+    """
+    return "inverse-depth" if data.local_units else "depth"
+
+
 def _add_simplex(b: Builder, soup: Soup, layout: TangentLayout, slanted: bool) -> None:
     """The length unit as one row.
 

@@ -43,6 +43,7 @@ from soup_nlp.solve.line_search import (
     merit_gradient,
     reach,
 )
+from soup_nlp.solve.part import Part
 from soup_nlp.solve.phase import Phase, Reached
 from soup_nlp.solve.reuse import held, preconditioned
 from soup_nlp.solve.tangent_problem import HessianKind, TangentProblem
@@ -60,7 +61,8 @@ SLOW, PATIENCE = 1e-6, 10
 BLENDS = (0.0, 0.1, 0.3, 1.0)
 """Shares of the majorant in the exact Hessian, tried until the step is a descent direction."""
 REUSE = 4000
-"""Superpixels from which a factor serves several iterations: below, it costs little."""
+"""Superpixels from which a factor serves several iterations, and parts of them move apart: below, a
+factorisation costs little."""
 INEXACT: Mapping[HessianKind, float] = {"gauss-newton": 0.2, "exact": 0.03}
 """Accuracy of steps with an earlier factor; at 0.3 the majorant stagnates early (N = 8,000)."""
 
@@ -111,6 +113,7 @@ class Descent:
             self.library, self._factorise = factorisation(problem.upper)
         self._diagonal = diagonal_places(problem.upper)
         self._last: Back | None = None
+        self._part: Part | None = None
         self.x: Float = problem.nlp.x0
         self.z: Float | None = None
         self.damping: Float = np.full(problem.layout.count, 1e-2)
@@ -143,12 +146,16 @@ class Descent:
         self.damping = np.minimum(self.damping, FRESH[phase.hessian])
         gradient = problem.gradient(at.x)
         curvature: tuple[Float, Float] | None = None
-        blend, small, patient, self._last = 0.0, 0, PATIENCE, None
+        self._part = Part(problem.upper) if len(self.damping) >= REUSE else None
+        small, patient, slow, self._last = 0, PATIENCE, False, None
+        # of steps of all and of parts; on a large pair four trials are not worth their factors
+        blend = {False: BLENDS[2] if self._part else 0.0, True: 0.0}
         barrier = max(phase.highest, phase.barrier)
         history: list[tuple[float, ...]] = []
         reached: Reached | None = None
         for iteration in itertools.count():
-            nu, dual = self._dual(gradient, at.jacobian)
+            nu, residual = self._dual(gradient, at.jacobian)
+            dual = float(residual.max())
             gap = float((at.slack * self.z).max())
             history.append((at.f, dual, gap, float(np.median(self.damping)), 0.0))
             self._tell(phase, iteration, history[-1], begin)
@@ -163,9 +170,12 @@ class Descent:
                 break
             barrier = max(phase.barrier, min(barrier, 1e-6 * dual))
             at = at._replace(merit=merit(at.f, at.slack, barrier))
+            if self._part:
+                self._part.choose(residual, slow)
+            parted = self._part is not None and self._part.some is not None
             if curvature is None:
                 curvature = self._curvature(at, phase.hessian, nu)
-            step = self._newton(at, curvature, blend, gradient, barrier, phase.hessian)
+            step = self._newton(at, curvature, blend[parted], gradient, barrier, phase.hessian)
             search = Search(problem, at, step.h, barrier, step.newton)
             move = search.run(gradient, step.bent)
             self._adapt(move)
@@ -173,17 +183,19 @@ class Descent:
             if move.point is None:
                 # the majorant's steps descend, and steps with a factor of its own
                 self._last = None
-                blend = min(1.0, max(BLENDS[1], 9 * step.blend))
+                blend[parted] = min(1.0, max(BLENDS[1], 9 * step.blend))
                 continue
             fell = at.merit - move.point.merit
             small = small + 1 if fell <= phase.stagnation * abs(at.f) else 0
+            slow = fell <= max(phase.stagnation, SLOW) * abs(at.f)
             if phase.hessian == "exact" and fell < SLOW * abs(at.f) and iteration >= patient:
                 # held back so far, a superpixel's own step is too short for its slope to tell
                 # anything but what its neighbours do, and its damping never falls
                 self.damping = np.minimum(self.damping, FRESH["exact"])
                 patient = iteration + PATIENCE
             self._step_multipliers(at, step.h, barrier, move.point)
-            at, self.x, blend, curvature = move.point, move.point.x, step.blend, None
+            blend[parted] = step.blend
+            at, self.x, curvature = move.point, move.point.x, None
             gradient = search.gradient(at.x)
         if reached:
             status = "Solve_Succeeded"
@@ -245,8 +257,8 @@ class Descent:
                     log.write("iter    objective    inf_du   compl  damping\n")
                 log.write("{:4d} {:14.7e} {:.2e} {:.2e} {:.2e}\n".format(iteration, *row[:4]))
 
-    def _dual(self, gradient: Float, jacobian: Float) -> tuple[float, float]:
-        """Multiplier of the simplex and the dual infeasibility.
+    def _dual(self, gradient: Float, jacobian: Float) -> tuple[float, Float]:
+        """Multiplier of the simplex and the dual infeasibility of every superpixel (N,).
 
         The multiplier is the slope of the Lagrangian as the whole soup grows. Where E does not
         depend on scale it is near 0 also far from the solution, unlike a least-squares estimate.
@@ -254,7 +266,8 @@ class Descent:
         assert self.z is not None
         rest = less_forces(gradient, jacobian, self.z)
         nu = -float(self.problem.growth(self.x) @ rest)
-        return nu, float(np.abs(rest + nu * self.problem.length(self.x)).max())
+        whole = np.abs(rest + nu * self.problem.length(self.x))
+        return nu, whole.reshape(-1, 9).max(axis=1)
 
     def _curvature(self, at: Point, kind: HessianKind, nu: float = 0.0) -> tuple[Float, Float]:
         """Hessian to use and the majorant, both with the condensed slacks."""
@@ -294,10 +307,11 @@ class Descent:
         right, a = merit_gradient(at, gradient, barrier), self.problem.length(at.x)
         shares = [blend, *(s for s in BLENDS if s > blend)] if kind == "exact" else [1.0]
         h, bent, newton = np.zeros_like(at.x), np.zeros_like(at.x), held(np.zeros_like, a)
+        part = self._part if self._part and self._part.some is not None else None
         for share in shares:
             H = _blended(exact, majorant, share)
             times = self._times(H, damping)
-            if self._last:
+            if self._last and not part:
                 newton = held(self._last, a)
                 near = preconditioned(times, newton, right, INEXACT[kind])
                 if near.solved:
@@ -306,11 +320,11 @@ class Descent:
                     break
             damped = H.copy()
             damped[self._diagonal] += damping
-            self._last = None
             try:
-                back = self._factorise(damped)
+                back = (part.factorise if part else self._factorise)(damped)
             except ArithmeticError:
                 newton = held(np.zeros_like, a)
+                self._last = self._last if part else None
                 continue
             newton = held(back, a)
             h = newton(right)
@@ -318,7 +332,8 @@ class Descent:
             # a library that cannot see definiteness: test the curvature along the step
             # (Chiang and Zavala 2016)
             if np.isfinite(h).all() and float(h @ bent) > 0 and float(right @ h) <= 0:
-                self._last = back if len(self.damping) >= REUSE else None
+                if not part:
+                    self._last = back if len(self.damping) >= REUSE else None
                 break
         return Step(h, bent - damping * h, share / 3 if share > 0.02 else 0.0, newton)
 

@@ -22,7 +22,8 @@ class SolverOptions(Section):
     """Run the tangent presolve; off, Ipopt goes the whole way alone, see `continuation`."""
     continuation: bool = True
     """Without the presolve: Ipopt narrows the smoothing by `presolve_eps` with the majorant Hessian
-    before it takes the exact one; off, it starts at the final smoothing."""
+    before it takes the exact one, in the presolve's coordinates; off, it starts with the
+    constrained NLP at the final smoothing."""
     presolve_eps: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)] = (
         0.3,
         0.03,
@@ -43,8 +44,7 @@ class SolverOptions(Section):
     eps: Tolerance = 0.01
     """Smoothing of the constrained NLP."""
     max_iter: Count = 30
-    """Iteration limit of the constrained NLP; after a continuation `polish_iterations` more, and 0
-    leaves the continuation out."""
+    """Iteration limit of the constrained NLP; 0 leaves Ipopt's continuation out as well."""
     far_iterations: Count = 5
     """Its limit as well where the polish ended far from a minimum: from there Ipopt finds none
     either, and its iterations, of several factorisations each, take seconds."""

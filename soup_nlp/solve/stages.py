@@ -18,10 +18,11 @@ from soup_nlp.model.compile import compiler_seconds
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import Chart, MatrixLayout
+from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
-from soup_nlp.solve.continuation import KEEP, MAJORANT, narrow
+from soup_nlp.model.tangent_nlp import polish_chart
+from soup_nlp.solve.continuation import Continuation
 from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.ipopt import Ipopt, Listener, Stage, Watch
 from soup_nlp.solve.kkt import UNMET, feasible, residuals
@@ -202,8 +203,6 @@ class _Solve:
         nlp, layout = self.constrained(soup)
         self.watch.say(str(nlp))
         first: dict[str, Any] = {"x0": nlp.x0}
-        if not self.o.presolve and self.o.continuation and self.o.max_iter:
-            first = self.continued(soup)
         # the lifted truncation has another solution than the presolve's
         if self.form.truncation == "smooth" and self.o.polish_iterations and near and not worse:
             first |= warm_start(nlp, self.data, soup, rim)
@@ -245,7 +244,8 @@ class _Solve:
         return self.laps.begin + 0.7 * self.o.max_seconds
 
     def presolve(self) -> tuple[Soup, Float]:
-        """The presolve's soup and its multipliers of rim visibility; the start where it is off."""
+        """Soup and multipliers of rim visibility of the presolve or of Ipopt's continuation; the
+        start where both are off."""
         soup, rim = self.start, np.zeros(0)
         if self.o.presolve:
             descent = self._reweighted()
@@ -255,6 +255,13 @@ class _Solve:
             if self.stages[-1].status not in STOPPED and self.o.polish_iterations:
                 descent = self._polished(descent)
             soup, rim = descent.soup, descent.rim
+        elif self.o.continuation and self.o.max_iter:
+            way = Continuation(
+                soup, self.data, self.weights, self.form, self.o, self.watch, self.early()
+            )
+            way.run()
+            self.stages.extend(way.stages)
+            soup, rim = way.soup, way.rim
         self.laps.end("presolve")
         return soup, rim
 
@@ -282,10 +289,9 @@ class _Solve:
         return descent
 
     def _polished(self, before: Descent) -> Descent:
-        # on inverse depths the superpixels of a plane move with it in straight lines; reweighting
-        # on depths ends at lower energies. The paper's units need a length unit that is linear.
-        chart: Chart = "inverse-depth" if self.data.local_units else "depth"
-        problem = TangentProblem(before.soup, self.data, self.weights, self.form, chart=chart)
+        problem = TangentProblem(
+            before.soup, self.data, self.weights, self.form, chart=polish_chart(self.data)
+        )
         descent = Descent(problem, after=before, watch=self.watch, deadline=self.early())
         polish = Phase(
             name=POLISH,
@@ -301,27 +307,15 @@ class _Solve:
         self._ended(descent.run(polish))
         return descent
 
-    def constrained(self, soup: Soup, **changes: Any) -> tuple[NLP, MatrixLayout]:
+    def constrained(self, soup: Soup) -> tuple[NLP, MatrixLayout]:
         """The constrained NLP about a soup, at the last smoothing."""
-        form = self.form.replace(eps=self.o.eps, eps_pixel=self.o.eps, **changes)
+        form = self.form.replace(eps=self.o.eps, eps_pixel=self.o.eps)
         return build_matrix_nlp(soup, self.data, self.weights, form)
-
-    def continued(self, soup: Soup) -> dict[str, Any]:
-        """Point and multipliers at the end of the continuation inside Ipopt."""
-        nlp, _ = self.constrained(soup, hessian=MAJORANT)
-        self.stages.extend(narrow(nlp, self.o, self.watch, self.early()))
-        last = self.stages[-1]
-        self.laps.end("continuation")
-        return {"x0": last.x, "lam_x0": last.lam_x, "lam_g0": last.lam_g}
 
     def ipopt(self, nlp: NLP, first: dict[str, Any], far: bool) -> Stage:
         """The last stage, from a point with multipliers if there are any."""
-        o, limit, warm = self.o, self.o.max_iter, "lam_g0" in first
-        if warm and not o.presolve:
-            # it does the polish's work as well
-            limit += o.polish_iterations
-        kept = (WARM if o.presolve else KEEP) if warm else {}
-        solver = Ipopt(nlp, {**kept, **o.ipopt})
+        o, limit = self.o, self.o.max_iter
+        solver = Ipopt(nlp, {**(WARM if "lam_g0" in first else {}), **o.ipopt})
         self.laps.end("build")
         if far:
             limit = min(limit, o.far_iterations)

@@ -14,7 +14,7 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Chart
 from soup_nlp.model.sums import Sums
-from soup_nlp.model.tangent_nlp import build_tangent_nlp
+from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
 from soup_nlp.solve.factor import numbered
 
 Float = NDArray[np.float64]
@@ -59,15 +59,7 @@ class TangentProblem:
             exact: Also make the exact Hessian.
             chart: Of the coordinates, see TangentLayout.
         """
-        # theta = 0 and no ridge: reweighted least squares, sum c psi / s J^T J
-        majorant = form.replace(
-            norm="smooth",
-            truncation="smooth",
-            hessian="gauss-newton+constraints",
-            theta=0.0,
-            ridge=0.0,
-        )
-        self.nlp, self.layout = build_tangent_nlp(start, data, weights, majorant, chart)
+        self.nlp, self.layout = build_tangent_nlp(start, data, weights, majorant(form), chart)
         nlp, n = self.nlp, self.layout.count
         self._kinds = {"gauss-newton": nlp.hessian, **({"exact": "exact"} if exact else {})}
         self.triangle = np.array(np.triu_indices(9))

@@ -1,0 +1,92 @@
+"""Newton steps of a few superpixels, the others held.
+
+On a large pair the exact Hessian has most superpixels at rest after a few steps, while some are on
+their way to another minimum: they make the matrix indefinite, and a step of all costs several
+factorisations. A step of those and their neighbours costs a hundredth. (Nonlinear elimination:
+Cai and Keyes 2002.)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from soup_nlp.solve.factor import Back, Factorise, factorisation, numbered
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+WORST = 0.01
+"""Superpixels whose residual is above this share of the largest are moved, and their neighbours."""
+MOST = 0.3
+"""Largest share of the superpixels that is a part; more of them move with all."""
+STEPS = 15
+"""Most steps of one part."""
+
+
+class Part:
+    """Which superpixels move: all, or those that the dual infeasibility comes from.
+
+    Attributes:
+        some: (N,) those that move, None for all.
+        factorise: As `Factorise`, for those that move; the step of the others is zero.
+    """
+
+    factorise: Factorise
+
+    def __init__(self, upper: sparse.csc_matrix) -> None:
+        """Nothing is chosen.
+
+        Args:
+            upper: (9 N, 9 N) pattern of the upper triangle, its values number the nonzeros.
+        """
+        self.some: Bool | None = None
+        self._upper, self._steps = upper, 0
+        self._columns = np.repeat(np.arange(upper.shape[0]), np.diff(upper.indptr))
+        self._neighbours: sparse.csr_matrix | None = None
+
+    def choose(self, residual: Float, slow: bool) -> None:
+        """Go on with a part while that pays; after it move all once.
+
+        Args:
+            residual: (N,) largest component of the Lagrangian's gradient by superpixel.
+            slow: Whether the last step hardly lowered the merit.
+        """
+        if self.some is not None:
+            self._steps += 1
+            last = residual[self.some].max() <= residual[~self.some].max()
+            if slow or last or self._steps >= STEPS:
+                self.some = None
+            return
+        some = self._with_neighbours(residual > WORST * residual.max())
+        if some.mean() <= MOST:
+            self.some, self._steps, self.factorise = some, 0, self._within(some)
+
+    def _with_neighbours(self, some: Bool) -> Bool:
+        """Superpixels and those that share a nonzero of the Hessian with them."""
+        if self._neighbours is None:
+            n = len(some)
+            pairs = self._upper.indices // 9, self._columns // 9
+            one = sparse.coo_matrix((np.ones(len(pairs[0]), np.int32), pairs), (n, n)).tocsr()
+            self._neighbours = one + one.T
+        return np.asarray(self._neighbours @ some.astype(np.int32) > 0)
+
+    def _within(self, some: Bool) -> Factorise:
+        """Factorisation of the block of some superpixels."""
+        moves, rows, columns = np.repeat(some, 9), self._upper.indices, self._columns
+        kept = np.flatnonzero(moves[rows] & moves[columns])
+        new = np.cumsum(moves) - 1
+        _, block = factorisation(numbered(new[rows[kept]], new[columns[kept]], int(moves.sum())))
+
+        def factorise(nonzeros: Float) -> Back:
+            back = block(nonzeros[kept])
+
+            def within(b: Float) -> Float:
+                out = np.zeros_like(b)
+                out[moves] = back(b[moves])
+                return out
+
+            return within
+
+        return factorise
