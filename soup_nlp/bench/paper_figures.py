@@ -59,7 +59,8 @@ def plot_lines(path: Path, lines: Lines, axis: str, measure: str, text: str) -> 
         ax.grid(alpha=0.3)
     axes[0].set_ylabel(measure)
     _scaled(axes, values)
-    axes[-1].legend(fontsize=7)
+    if values:
+        axes[-1].legend(fontsize=7)
     picture.suptitle(text, fontsize=10)
     save(picture, path)
 

@@ -124,10 +124,12 @@ def _draw_bar(sheet: Pil.Image, bar: Bar, left: int, bottom: int, width: int) ->
 
 
 def _draw_swatches(sheet: Pil.Image, key: Swatches, left: int, bottom: int, width: int) -> None:
-    x, y = float(left), bottom + 13
-    for colour, name in key.entries:
+    x, y, last = float(left), bottom + 13, len(key.entries) - 1
+    for i, (colour, name) in enumerate(key.entries):
         end = x + 16 + _font(8, False).getlength(name)
-        if end > left + width:
+        # room for the dots where more follow
+        if end + (20 if i < last else 0) > left + width:
+            _write(sheet, x, y, "...", points=8)
             break
         ImageDraw.Draw(sheet).rectangle((x, y - 5, x + 11, y + 4), fill=colour)
         _write(sheet, x + 16, y, name, points=8)
