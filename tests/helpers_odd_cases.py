@@ -5,6 +5,7 @@ from __future__ import annotations
 from helpers_odd_api import api_cases
 from helpers_odd_contents import content_cases, h5_cases
 from helpers_odd_numbers import number_cases, solve_cases
+from helpers_odd_options import option_cases
 from helpers_odd_paths import path_cases
 from helpers_odd_run import Case
 from helpers_odd_texts import row_cases, text_cases, untrusted_cases
@@ -23,4 +24,5 @@ CASES: list[Case] = [
     *api_cases(),
     *use_cases(),
     *use_api_cases(),
+    *option_cases(),
 ]

@@ -27,6 +27,7 @@ from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import TangentLayout
 from soup_nlp.model.norms import Norm, smooth_min, solver_form
 from soup_nlp.model.reweighting import across_components, across_discontinuities
+from soup_nlp.model.sums import Sums
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.report.check import _same_depth
 from soup_nlp.schema.section import Section
@@ -244,3 +245,14 @@ def test_the_pixels_around_a_target_on_a_border_are_in_doubt():
     expected[5:8, 5:8] = True
     np.testing.assert_array_equal(doubt, expected)
     assert np.isfinite(z[6, 6])
+
+
+def test_theta_and_not_the_ridge_is_the_share_of_curvature_that_is_left_out(small_room):
+    own = small_room.soup, small_room.data, small_room.weights
+    form = Formulation(compiled=False, hessian="gauss-newton", ridge=0.0)
+    found = []
+    for theta in (0.0, 0.9):
+        nlp, _ = build_tangent_nlp(*own, form.replace(theta=theta))
+        found.append(Sums(nlp, ["gauss-newton"], first_order=False))
+    whole, less = (s.hessian("gauss-newton", nlp.x0, np.zeros(nlp.ng)) for s in found)
+    assert np.abs(whole - less).max() > 1e-3 * np.abs(whole).max()

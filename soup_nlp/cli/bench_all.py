@@ -10,6 +10,8 @@ from typing import Annotated
 import typer
 
 from soup_nlp.cli.options import Data, Overwrite
+from soup_nlp.errors import ConfigError
+from soup_nlp.storage.files import is_folder
 from soup_nlp.storage.folders import claim, staged
 
 TERSE = "--set segmentation.superpixels=500"
@@ -64,6 +66,8 @@ def everything(
     # it runs the other commands, and main knows this one
     from soup_nlp.cli.main import main
 
+    if data is not None and not dry and not is_folder(data):
+        raise ConfigError("there is no such folder", where="--data", found=data)
     ended = {}
     for text in COMMANDS:
         if "{data}" in text and data is None:

@@ -5,16 +5,18 @@ from __future__ import annotations
 import errno
 import functools
 import os
+import re
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable
+import unicodedata
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import ParamSpec
 
 import typer
 
-from soup_nlp.errors import DataError, SoupError, printable
+from soup_nlp.errors import ConfigError, DataError, SoupError, printable
 from soup_nlp.storage.versions import versions
 
 BUG = 70
@@ -94,6 +96,20 @@ def report_bug(error: BaseException) -> int:
         file=sys.stderr,
     )
     return BUG
+
+
+def refuse_odd(words: Sequence[str]) -> None:
+    """Refuse arguments that nobody means: empty ones, such as of a variable that is not set, which
+    would stand for the working folder; and control characters, which a terminal would obey.
+
+    Raises:
+        ConfigError: There is one.
+    """
+    for word in words:
+        if not word.strip() or re.fullmatch(r"--[a-z-]+=\s*", word):
+            raise ConfigError("an argument is empty", where=word or "command line", found=words)
+        if any(unicodedata.category(c) == "Cc" and c not in "\n\t" for c in word):
+            raise ConfigError("an argument holds control characters", found=word)
 
 
 def prepare_streams() -> None:

@@ -20,6 +20,7 @@ from soup_nlp.cli.boundary import (
     guarded,
     prepare_streams,
     refusal,
+    refuse_odd,
     report_bug,
 )
 from soup_nlp.errors import SoupError, StoppedError, printable
@@ -143,7 +144,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     """Run the command line; the exit code."""
     try:
-        code = _root()(args=list(argv) if argv is not None else None, standalone_mode=False)
+        words = list(sys.argv[1:] if argv is None else argv)
+        refuse_odd(words)
+        code = _root()(args=words, standalone_mode=False)
         # the command line library makes this code of a KeyboardInterrupt
         return _aborted() if code == ABORTED else int(code or 0)
     except StoppedError as error:
