@@ -124,7 +124,7 @@ def test_what_cannot_be_converted_is_refused(saved, tmp_path, capsys):
     for arguments, said in (
         ([str(out), "--to", "glb", "--out", str(foreign)], "files"),
         ([str(out), "--to", "obj"], "unknown format"),
-        ([str(out), "--to", ""], "no format"),
+        ([str(out), "--to", ","], "no format"),
         ([str(foreign), "--to", "glb"], "result"),
     ):
         assert main(["convert", *arguments]) == 2
