@@ -75,6 +75,9 @@ def option_cases(values: tuple[str, ...] = ODD_VALUES) -> Iterator[Case]:
                 # a good folder would have them run to their end
                 ends = head + name in ENDS or word != "--out"
                 for value in values if ends else ("", "\x1b[31m", "/dev/full", "x" * 10_000):
+                    if (word, value) == ("--serve", "0"):
+                        # any free port, and it serves until it is stopped
+                        continue
                     yield _case(head + name, word, parameter.name, value)
 
 

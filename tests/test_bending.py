@@ -142,6 +142,9 @@ def test_the_presolve_takes_the_way_to_the_lower_energy():
     smoothing = abs(end["presolve 0.01"] - one.ends["presolve"])
     assert both.ends["presolve"] == pytest.approx(lower, abs=2 * smoothing)
     assert both.ends["presolve"] <= one.ends["presolve"] * (1 + 1e-9)
+    free = c.weights.replace(sigma_arap=np.inf)
+    never = solve_soup(c.soup, c.data, free, c.formulation(), c.options.replace(**few))
+    assert [s.name for s in never.stages] == [s.name for s in one.stages]
     # truncated that hard, the second way ends lower by 0.1 %
     hard = c.weights.replace(sigma_arap=0.05)
     ends = [

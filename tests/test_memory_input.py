@@ -125,6 +125,7 @@ def test_what_cannot_be_converted_is_refused(saved, tmp_path, capsys):
         ([str(out), "--to", "glb", "--out", str(foreign)], "files"),
         ([str(out), "--to", "obj"], "unknown format"),
         ([str(out), "--to", ","], "no format"),
+        ([str(out), "--to", ""], "an argument is empty"),
         ([str(foreign), "--to", "glb"], "result"),
     ):
         assert main(["convert", *arguments]) == 2

@@ -54,6 +54,8 @@ COMMANDS = (
     " --seconds 45 --set flow.source=truth",
 )
 """What is run, in this order."""
+LONGEST_PATH = 4_096
+"""Bytes of the longest path that Linux takes."""
 
 
 def everything(
@@ -68,6 +70,11 @@ def everything(
 
     if data is not None and not dry and not is_folder(data):
         raise ConfigError("there is no such folder", where="--data", found=data)
+    if not dry:
+        # refused now, not after hours
+        claim(out, ["motorcycle.png"], overwrite)
+    elif len(str(out)) > LONGEST_PATH:
+        raise ConfigError("this name of a folder is too long", where="--out", found=len(str(out)))
     ended = {}
     for text in COMMANDS:
         if "{data}" in text and data is None:

@@ -249,7 +249,8 @@ class _Solve:
         soup, rim = self.start, np.zeros(0)
         if self.o.presolve:
             descent = self._reweighted()
-            if self.o.untruncated and self.stages[-1].status not in STOPPED:
+            two = self.o.untruncated and np.isfinite(self.weights.sigma_arap)
+            if two and self.stages[-1].status not in STOPPED:
                 other = self._untruncated()
                 descent = min(descent, other, key=lambda d: self.energy(d.soup))
             if self.stages[-1].status not in STOPPED and self.o.polish_iterations:
