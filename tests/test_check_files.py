@@ -125,6 +125,11 @@ def test_a_forged_cloud_is_recomputed(name, folder):
     assert f"{name} points" in repaired(folder)
 
 
+def test_clouds_are_looked_at_one_by_one(folder):
+    (folder / "points_ref.ply").write_bytes(b"no cloud")
+    assert {"points_ref.ply points", "points_next.ply points"} <= set(repaired(folder))
+
+
 Change = Callable[[dict], object]
 CHANGES: dict[str, tuple[Change, str]] = {
     "scale": (lambda s: s["depth_png_scale"].update(ref=1.0), "depth_png_scale ref"),

@@ -14,10 +14,11 @@ from test_compare import LABEL, MANY, PROBLEMS, ROWS, row
 
 from soup_nlp.bench.processes import isolated
 from soup_nlp.bench.solvers.page import conclusion, page
-from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profiles
+from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profile, draw_profiles
 from soup_nlp.bench.solvers.registry import executable, find_solver, reference
 from soup_nlp.bench.solvers.runner import compare
 from soup_nlp.bench.solvers.task import Answer, Task
+from soup_nlp.bench.tables import figure
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError, SolverError
@@ -164,6 +165,14 @@ def test_pictures_of_nothing_verified_say_nothing(tmp_path):
         warnings.simplefilter("error")
         draw_profiles(tmp_path / "p.png", failed)
         draw_curves(tmp_path / "c.png", failed)
+
+
+def test_a_profile_names_the_solvers_that_solve_nothing():
+    axes = figure(4, 3).subplots()
+    share = np.array([[1.0, 0.0, 0.0], [1.0, 0.5, 0.0]])
+    draw_profile(axes, "time", 2, ["one", "two", "three"], np.array([1.0, 2.0]), share)
+    told = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert told == ["one", "two", "none by three"]
 
 
 def test_files_are_read_before_anything_runs(tmp_path, capsys):

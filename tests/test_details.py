@@ -31,6 +31,8 @@ from soup_nlp.model.sums import Sums
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.report.check import _same_depth
 from soup_nlp.schema.section import Section
+from soup_nlp.solve.stages import _near
+from soup_nlp.storage.atomic import write_text
 
 # --- the model -----------------------------------------------------------------------------------
 
@@ -164,6 +166,36 @@ def test_rows_near_a_bound_of_zero_are_active(monkeypatch):
     bounds = {"lbg": [-np.inf, -np.inf, 0, 0], "ubg": [0, 0, np.inf, np.inf]}
     lam = least_squares(monkeypatch, np.zeros(4), [-1.0, -1.0, 1.0, 1.0], **rows, **bounds)
     np.testing.assert_allclose(lam, [1, 0, -1, 0], atol=1e-9)
+
+
+def test_a_variable_at_its_bound_takes_the_whole_gradient(monkeypatch):
+    """One at each bound, one in the middle of a distance 4 to the bound that it is pushed to."""
+    gradient = np.array([-2.0, 3.0, -5.0])
+    monkeypatch.setattr(verify, "_gradient", lambda *_: gradient)
+    monkeypatch.setattr(verify, "_jacobian", lambda *_: sparse.csr_matrix((1, 3)))
+    nlp = SimpleNamespace(lbx=np.array([-1.0, 2.0, 0.0]), ubx=np.array([3.0, 9.0, 8.0]))
+    lam = verify.bound_multipliers(nlp, np.array([3.0, 2.0, 4.0]), np.zeros(1))
+    np.testing.assert_allclose(lam, [2.0, -3.0, 1.0], rtol=1e-15)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_residuals_are_within_a_few_times_the_tolerance(place):
+    limits = verify.Limits()
+    bounds = np.array([limits.feasibility, limits.tol, limits.tol])
+    for factor, good in ((0.5, True), (2.0, False)):
+        found = np.zeros(3)
+        found[place] = factor * verify.SLACK * bounds[place]
+        assert verify.Residuals(*found.tolist(), "").within(limits) is good
+
+
+def test_an_ipopt_without_iterations_is_not_near():
+    assert not _near(SimpleNamespace(converged=False, history={}))
+    assert _near(SimpleNamespace(converged=False, history={"inf_du": np.array([2.0, 0.5])}))
+
+
+def test_text_of_names_that_are_no_utf8_is_written(tmp_path):
+    write_text(tmp_path / "log.txt", "folder \udcff")
+    assert (tmp_path / "log.txt").read_text() == "folder \\udcff"
 
 
 def test_groups_without_elements_are_passed_over():

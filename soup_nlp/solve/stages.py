@@ -152,7 +152,9 @@ class _Laps:
 
 def _near(stage: Stage) -> bool:
     """Whether the presolve has come so near that its multipliers are worth starting from."""
-    return stage.converged or bool(stage.history["inf_du"][-1] < 1.0)
+    # Ipopt that fails at its first point has no history
+    dual = stage.history.get("inf_du", np.array([np.inf]))
+    return stage.converged or bool(dual[-1] < 1.0)
 
 
 def _far(stages: Sequence[Stage]) -> bool:

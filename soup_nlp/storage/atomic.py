@@ -83,7 +83,8 @@ def write_bytes(path: PathLike, data: bytes) -> None:
 
 def write_text(path: PathLike, text: str) -> None:
     """Write a text file in UTF-8, see `write_bytes`."""
-    write_bytes(path, text.encode("utf-8"))
+    # names of files may hold bytes that are no UTF-8
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def _mode(target: Path) -> int:
