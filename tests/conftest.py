@@ -14,7 +14,8 @@ from soup_nlp.data import inputs
 from soup_nlp.data.scenes import catalogue
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
-from soup_nlp.pipeline.run import Run, make_run, skipped
+from soup_nlp.pipeline.record import Run
+from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.solve.tangent_problem import TangentProblem
 
 # drawn cases are the same in every run

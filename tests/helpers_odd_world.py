@@ -16,7 +16,8 @@ import numpy as np
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
-from soup_nlp.pipeline.run import Run, run
+from soup_nlp.pipeline.record import Run
+from soup_nlp.pipeline.run import run
 
 SIZE = (48, 64)
 """Height and width of the tiny images."""

@@ -12,7 +12,8 @@ from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.evaluate import recompute
 from soup_nlp.geometry.soup import Soup, reconstruct
-from soup_nlp.pipeline.run import Run, solve_pair
+from soup_nlp.pipeline.record import Run
+from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 

@@ -13,7 +13,8 @@ from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.geometry.camera import pixel_grid, project, rays
-from soup_nlp.pipeline.run import Run, solve_pair
+from soup_nlp.pipeline.record import Run
+from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 

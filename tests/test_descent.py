@@ -14,6 +14,7 @@ from soup_nlp.model.layout import Chart
 from soup_nlp.model.nlp import to_scipy
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.solve import descent as descent_module
+from soup_nlp.solve import newton
 from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.factor import superlu
 from soup_nlp.solve.ipopt import Ipopt, Watch
@@ -164,7 +165,7 @@ def test_another_chart_begins_where_the_first_ended(small_room):
     problem = TangentProblem(first.soup, small_room.data, small_room.weights, FORM, chart=INVERSE)
     second = Descent(problem, after=first)
     # one pattern, one symbolic analysis
-    assert second._factorise is first._factorise
+    assert second.newton._factorise is first.newton._factorise
     for p in (first.problem, problem):
         p.smoothing(LAST.eps)
     assert problem.value(second.x) == pytest.approx(first.problem.value(first.x), rel=1e-9)
@@ -404,10 +405,10 @@ def test_the_energy_never_rises_within_a_phase(solved):
 
 @pytest.mark.parametrize("problem", ["inverse-depth"], indirect=True)
 def test_superlu_ends_at_the_same_point(problem, solved, monkeypatch):
-    monkeypatch.setattr(descent_module, "factorisation", lambda upper: ("SuperLU", superlu(upper)))
+    monkeypatch.setattr(newton, "factorisation", lambda upper: ("SuperLU", superlu(upper)))
     runner = Descent(problem)
     last = [runner.run(p) for p in (*PHASES, LAST)][-1]
-    assert runner.library == "SuperLU"
+    assert runner.newton.library == "SuperLU"
     assert last.converged
     assert last.objective == pytest.approx(solved[1][-1].objective, rel=1e-3)
 

@@ -21,8 +21,9 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.refine.anchored import Local, fit_motion, neighbours
 from soup_nlp.refine.costs import Particles, anchor_depth
+from soup_nlp.refine.kinds import BORROWED, COMMON, KINDS, WALKS
 from soup_nlp.refine.mppbp import refine_soup
-from soup_nlp.refine.particles import BORROWED, COMMON, KINDS, WALKS, Proposer
+from soup_nlp.refine.particles import Proposer
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.solve.kkt import constraint_residuals
 

@@ -17,8 +17,9 @@ from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.refine import mppbp
 from soup_nlp.refine.anchored import Local, fit_motion, neighbours
 from soup_nlp.refine.costs import PairCosts, Particles
-from soup_nlp.refine.mppbp import SHARES, refine_soup
-from soup_nlp.refine.particles import KINDS, Proposer
+from soup_nlp.refine.kinds import KINDS, SHARES
+from soup_nlp.refine.mppbp import refine_soup
+from soup_nlp.refine.particles import Proposer
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.refine.select import spread_of
 

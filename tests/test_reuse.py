@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from soup_nlp.solve import descent, part
+from soup_nlp.solve import newton, part
 from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.part import Part
 from soup_nlp.solve.phase import Phase
@@ -68,10 +68,10 @@ def test_a_descent_with_fewer_factors_ends_at_a_minimum(problem, monkeypatch):
     begin = Part._within
     monkeypatch.setattr(Part, "_within", lambda self, some: parts.append(1) or begin(self, some))
     for least in (10**9, 0):
-        monkeypatch.setattr(descent, "REUSE", least)
+        monkeypatch.setattr(newton, "REUSE", least)
         runner, made = Descent(problem), []
-        factorise = runner._factorise
-        runner._factorise = lambda values, f=factorise, m=made: m.append(1) or f(values)
+        factorise = runner.newton._factorise
+        runner.newton._factorise = lambda values, f=factorise, m=made: m.append(1) or f(values)
         ends.append([runner.run(phase) for phase in phases][-1])
         counts.append(len(made))
     assert all(end.converged for end in ends)

@@ -24,21 +24,19 @@ from soup_nlp.config.problem import Problem, dump_problem
 from soup_nlp.data.flow.sources import is_named, is_network
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import depth_metrics, scene_flow_epe, skill
+from soup_nlp.evaluate.metrics import ERRORS, depth_metrics, scene_flow_epe, skill
 from soup_nlp.evaluate.protocols import Preset, preset
 from soup_nlp.evaluate.scoring import SURE, at_truth, most_certain
 from soup_nlp.model import oracle
-from soup_nlp.pipeline.run import Run, run
+from soup_nlp.pipeline.record import Run
+from soup_nlp.pipeline.run import run
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.storage.folders import scratch
 
 Float = NDArray[np.float64]
 Measure = Callable[[Item, tuple[str, ...], str], Row]
 
-KEPT = (
-    *("mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3"),
-    *("scale", "coverage", "n_pixels"),
-)
+KEPT = (*ERRORS, "scale", "coverage", "n_pixels")
 """Metrics that a row keeps, beside skill."""
 LEAST_PIXELS = 50
 """Fewest true pixels of a moving component whose scale is told."""

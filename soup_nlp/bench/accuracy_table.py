@@ -19,6 +19,7 @@ from soup_nlp.bench.tables import (
     show,
     table,
 )
+from soup_nlp.evaluate.metrics import ERRORS
 from soup_nlp.evaluate.protocols import preset
 
 Group = tuple[str, str, list[Row]]
@@ -177,12 +178,11 @@ def _detail(rows: Sequence[Row], convention: str) -> list[str]:
     """The solution's other errors, its flow, scene flow and energy."""
     if not rows:
         return []
-    errors = ("median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3")
     head = ["pair", "flow", "median", "SqRel", "RMSE", "log-RMSE", "d<1.25", "d<1.25^2"]
     head += ["d<1.25^3", "flow EPE px", "3D EPE (of length)", "bending", "E truth / solution"]
     lines = [
         [
-            *(r["pair"], r["flow"], *(show(get(r, convention, name=k)) for k in errors)),
+            *(r["pair"], r["flow"], *(show(get(r, convention, name=k)) for k in ERRORS[1:])),
             *(show((r["flow_error"] or {}).get("mean"), ".2f"), _moved(r["scene_flow"])),
             *(show(r.get("bending_share"), ".2f"), show(energy_ratio(r), ".3f")),
             *(str(r["status"]), f"{r['cpu_seconds']:.0f}"),

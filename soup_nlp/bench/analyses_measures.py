@@ -24,7 +24,8 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import solver_options, superpixels
-from soup_nlp.pipeline.run import Run, run
+from soup_nlp.pipeline.record import Run
+from soup_nlp.pipeline.run import run
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.records import Refined
 from soup_nlp.solve.stages import solve_soup

@@ -38,7 +38,8 @@ from soup_nlp.evaluate.confidence import (
 from soup_nlp.evaluate.metrics import true_pixels
 from soup_nlp.evaluate.scoring import at_truth
 from soup_nlp.evaluate.sparsification import coverage, sparsification
-from soup_nlp.pipeline.run import Run, run
+from soup_nlp.pipeline.record import Run
+from soup_nlp.pipeline.run import run
 from soup_nlp.refine.costs import Particles
 from soup_nlp.refine.photometric import look
 

@@ -18,7 +18,7 @@ from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.soup import Soup, reconstruct
 
 if TYPE_CHECKING:
-    from soup_nlp.pipeline.run import Run
+    from soup_nlp.pipeline.record import Run
 
 Float = NDArray[np.float64]
 Labels = NDArray[np.integer]

@@ -18,7 +18,8 @@ from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError, SoupError
 from soup_nlp.evaluate.metrics import depth_metrics, sample_at_points
-from soup_nlp.pipeline.run import Run, run
+from soup_nlp.pipeline.record import Run
+from soup_nlp.pipeline.run import run
 from soup_nlp.storage.atomic import atomic_path
 
 MAP_WIDTH = 240

@@ -6,7 +6,6 @@ import copy
 import hashlib
 import json
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ import yaml
 from pydantic import AfterValidator, Field, ValidationError
 
 from soup_nlp.config.presets import with_preset
+from soup_nlp.config.yaml_text import Dumper, parse
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import Input
 from soup_nlp.data.pair import Pair
@@ -28,7 +28,7 @@ from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
 from soup_nlp.schema.section import NonNegative, Positive, Samples, Section, Seed, Share
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.start.start_options import StartOptions
-from soup_nlp.storage.files import as_path, check_length, check_node, is_file, read_text
+from soup_nlp.storage.files import as_path, is_file, read_text
 
 LONGEST_NAME = 100
 """Characters of a problem's name."""
@@ -180,7 +180,7 @@ def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
     """
     path, base = _find(as_path(path, "problem file", error=ConfigError))
     text = read_text(path, "problem file", error=ConfigError)
-    raw, lines = _parse(text, str(path))
+    raw, lines = parse(text, str(path))
     if not isinstance(raw, dict):
         raise ConfigError(
             "problem file must be a mapping",
@@ -261,78 +261,8 @@ def _write(model: Section, pad: str) -> Iterator[str]:
             yield from _write(value, pad + "  ")
         else:
             flow = None if isinstance(value, list | tuple | dict) else False
-            text = yaml.dump({key: value}, Dumper=_Dumper, default_flow_style=flow, width=10**6)
+            text = yaml.dump({key: value}, Dumper=Dumper, default_flow_style=flow, width=10**6)
             yield f"{pad}{text.rstrip()}{comment}"
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML with the numbers and booleans of version 1.2: 1e-3 is a number, `no` is a word."""
-
-
-class _Dumper(yaml.SafeDumper):
-    """Quotes whatever either version would not read as a string."""
-
-
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, rule) for tag, rule in rules if tag.split(":")[-1] in ("null", "merge")]
-    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_FLOAT = r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
-for _tag, _rule, _first in (
-    ("bool", r"true|false|True|False|TRUE|FALSE", "tTfF"),
-    ("int", r"[-+]?\d+", "-+0123456789"),
-    ("float", _FLOAT, "-+.0123456789"),
-):
-    for _class in (_Loader, _Dumper):
-        _class.add_implicit_resolver(
-            f"tag:yaml.org,2002:{_tag}", re.compile(rf"(?:{_rule})\Z"), list(_first)
-        )
-# 010 is ten, not eight
-_Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value))
-_Loader.add_constructor(
-    "tag:yaml.org,2002:float",
-    lambda loader, node: float(node.value.lower().replace(".inf", "inf").replace(".nan", "nan")),
-)
-
-
-def _parse(text: str, source: str) -> tuple[Any, dict[Place, str]]:
-    """The content of a YAML text, and the line of every key."""
-    lines: dict[Place, str] = {}
-    try:
-        check_length(text)
-        loader = _Loader(text)
-    except (yaml.YAMLError, ValueError) as error:
-        # the loader looks for characters that YAML does not have
-        raise ConfigError("text is not YAML", where=source, found=error) from error
-    try:
-        node = loader.get_single_node()
-        if node is None:
-            return None, lines
-        check_node(node)
-        _locate(node, (), lines, source)
-        return loader.construct_document(node), lines
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        raise ConfigError(
-            "text is not YAML",
-            where=f"{source}, line {mark.line + 1}" if mark else source,
-            found=getattr(error, "problem", None) or error,
-        ) from error
-    finally:
-        loader.dispose()
-
-
-def _locate(node: yaml.Node, place: Place, lines: dict[Place, str], source: str) -> None:
-    """Fill in the line of every key; a key that is given twice is an error."""
-    if not isinstance(node, yaml.MappingNode):
-        return
-    for key, value in node.value:
-        here = (*place, str(key.value))
-        line = f"line {key.start_mark.line + 1}"
-        if here in lines:
-            raise ConfigError("key is given twice", where=f"{source}, {line}", found=".".join(here))
-        lines[here] = line
-        _locate(value, here, lines, source)
 
 
 def _override(tree: dict[str, Any], item: str) -> Place:
@@ -352,5 +282,5 @@ def _override(tree: dict[str, Any], item: str) -> Place:
                 found=item,
                 expected=f"{part} is a section",
             )
-    node[place[-1]] = _parse(value, f"--set {item}")[0]
+    node[place[-1]] = parse(value, f"--set {item}")[0]
     return place

@@ -19,6 +19,8 @@ from soup_nlp.errors import DataError, repr_of
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Scale = Literal["median", "mre", "lsq", "none"]
+ERRORS = "mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3"
+"""Names of the errors of a depth map."""
 
 
 @dataclass(frozen=True)
@@ -111,31 +113,34 @@ def depth_metrics(
     if scale not in get_args(Scale):
         raise DataError("unknown scale rule", found=repr(scale), expected=list(get_args(Scale)))
     z, gt, coverage = _compared(estimate, truth, cap, mask)
-    if z.size == 0:
-        nan = float("nan")
-        return DepthMetrics(nan, nan, nan, nan, nan, nan, nan, nan, scale, nan, cap, 0.0, 0)
-    s = _scale(z, gt, scale)
+    s = _scale(z, gt, scale) if z.size else float("nan")
     z = s * z if clamp is None else np.clip(s * z, *clamp)
-    gap = np.abs(gt - z)
-    relative = gap / gt
-    log = np.log(gt) - np.log(z)
-    fold = np.maximum(gt / z, z / gt)
-    delta = [float(np.mean(fold < 1.25**k)) for k in (1, 2, 3)]
     return DepthMetrics(
-        mre=float(np.mean(relative)),
-        median_relative=float(np.median(relative)),
-        sq_rel=float(np.mean(gap * relative)),
-        rmse=float(np.sqrt(np.mean(gap * gap))),
-        log_rmse=float(np.sqrt(np.mean(log * log))),
-        delta1=delta[0],
-        delta2=delta[1],
-        delta3=delta[2],
+        **_errors(z, gt),
         scale_rule=scale,
         scale=float(s),
         cap=None if cap is None else float(cap),
         coverage=coverage,
         n_pixels=int(z.size),
     )
+
+
+def _errors(z: Float, gt: Float) -> dict[str, float]:
+    """Errors of scaled depths by name; NaN where there are none."""
+    if not z.size:
+        return dict.fromkeys(ERRORS, float("nan"))
+    gap = np.abs(gt - z)
+    relative = gap / gt
+    log = np.log(gt) - np.log(z)
+    fold = np.maximum(gt / z, z / gt)
+    return {
+        "mre": float(np.mean(relative)),
+        "median_relative": float(np.median(relative)),
+        "sq_rel": float(np.mean(gap * relative)),
+        "rmse": float(np.sqrt(np.mean(gap * gap))),
+        "log_rmse": float(np.sqrt(np.mean(log * log))),
+        **{f"delta{k}": float(np.mean(fold < 1.25**k)) for k in (1, 2, 3)},
+    }
 
 
 def true_pixels(truth: Float, cap: float | None) -> Mask:

@@ -114,17 +114,10 @@ def prepare(
         (h, w), (rows, columns) = full.size, pair.size
         log(f"{w}x{h} is solved at {columns}x{rows} (max_size {problem.max_size:g} megapixels)")
     done("load")
-    flow = _flow(problem, full, pair)
-    pair = pair.with_flow(flow)
-    computed = is_named(flow.source) and not flow.source.startswith("truth")
-    seen = see_through(pair, problem.seed) if problem.flow.see_through and computed else None
-    if seen is not None and seen.flow is not None:
-        flow = seen.flow
-        pair = pair.with_flow(flow)
-        if log:
-            log("a layer stands still before the scene: flow searched for behind it")
+    pair, seen = _with_flow(problem, full, pair, log)
     done("flow", pair)
-    s = problem.segmentation
+    s, flow = problem.segmentation, pair.flow
+    assert flow is not None
     labels = superpixels(problem, pair)
     if problem.flow.reweight_px is not None:
         flow = reweighted(flow, labels, problem.flow.reweight_px)
@@ -145,6 +138,28 @@ def prepare(
     once = stages.replace(presolve=True, max_iter=1)
     answer = solve_soup(start.soup, data, weights, case.formulation(), once, say=log)
     return replace(case, soup=answer.soup)
+
+
+def _with_flow(
+    problem: Problem, full: Pair, pair: Pair, log: Callable[[str], None] | None
+) -> tuple[Pair, Pair | None]:
+    """A pair with its flow, and without a layer that stands still before the scene if it has one.
+
+    Args:
+        problem: The merged problem.
+        full: The pair at its own size.
+        pair: The pair at the size that is solved.
+        log: Called with a line where there is such a layer.
+    """
+    flow = _flow(problem, full, pair)
+    pair = pair.with_flow(flow)
+    computed = is_named(flow.source) and not flow.source.startswith("truth")
+    seen = see_through(pair, problem.seed) if problem.flow.see_through and computed else None
+    if seen is None or seen.flow is None:
+        return pair, None
+    if log:
+        log("a layer stands still before the scene: flow searched for behind it")
+    return pair.with_flow(seen.flow), seen
 
 
 def _flow(problem: Problem, full: Pair, pair: Pair) -> Flow:

@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,35 +32,18 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.mrf.trws import TRWSResult, solve_trws
 from soup_nlp.refine.anchored import neighbours
 from soup_nlp.refine.costs import PairCosts, Particles, feasible, unary_costs
-from soup_nlp.refine.particles import COMMON, KINDS, WALKS, Proposals, Proposer
+from soup_nlp.refine.kinds import COMMON, KINDS, SHARES, WALKS, counts, relearn
+from soup_nlp.refine.particles import Proposals, Proposer
 from soup_nlp.refine.photometric import Photometric
 from soup_nlp.refine.records import Refined, RefineOptions, Round
 from soup_nlp.refine.select import conditional_costs, diverse, spread_of, within_reach
 from soup_nlp.refine.sweep import swept
-from soup_nlp.solve.ipopt import Listener, Progress
+from soup_nlp.solve.ipopt import Listener, Progress, Watch
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 CURRENT, KEPT = KINDS.index("current"), KINDS.index("kept")
-SHARES: Mapping[str, float] = {
-    "walk_plane": 3,
-    "walk_motion": 3,
-    "walk_pivot": 2,
-    "walk_scale": 3,
-    "walk_all": 2,
-    "common_motion": 2,
-    "neighbour_plane": 3,
-    "neighbour_motion": 3,
-    "neighbour_both": 5,
-    "neighbour_refit": 2,
-    "own_refit": 1,
-    "dominant": 3,
-    "mean": 3,
-}
-"""Proposals by kind in the first round, relative."""
-FEW = ("own_refit",)
-"""Kinds of which there is one proposal at most: they draw nothing."""
 
 
 def refine_soup(
@@ -98,79 +82,22 @@ def refine_soup(
         The best soup, normalised to sum(lam) = 1, and what happened.
     """
     o = options or RefineOptions()
-    stop = stop or threading.Event()
     begin = time.perf_counter()
-    deadline = begin + o.max_seconds
     rays = data.visibility_ray(depth_ratio)
     best = (
         tilt_to_camera(soup, data.anchor_ray, rays, min_facing).normalised(data.share).retracted()
     )
-    energy = energy_begin = objective(best, data, weights, photo)
-    if photo is not None:
-        weights = photo.beside(weights)
-    pair_costs = PairCosts(data, weights)
+    energy = objective(best, data, weights, photo)
+    beside = photo.beside(weights) if photo else weights
+    pair_costs = PairCosts(data, beside)
     proposer = Proposer(data, neighbours(pair_costs.edges, data.anchor_ray), seed)
-    layer = _Costs(data, weights, photo, o, rays, min_facing, pair_costs, proposer.near)
-    shares = {k: v for k, v in SHARES.items() if o.proposals == "all" or k in WALKS}
-    kept: Particles | None = None
+    costs = _Costs(data, beside, photo, o, rays, min_facing, pair_costs, proposer.near)
+    watch = Watch(listener, stop or threading.Event(), say or (lambda line: None))
+    rounds = _Rounds(costs, proposer, watch, best, energy, begin + o.max_seconds)
     if photo is not None and o.sweep:
-        kept = swept(best, *proposer.commonest(best, 2), data, photo, o.sweep)
-    rounds: list[Round] = []
-    status, slow, interrupted = "rounds", 0, False
-    for number in range(o.rounds):
-        if stop.is_set() or time.perf_counter() > deadline:
-            break
-        mark = time.perf_counter()
-        drawn = _draw(proposer, best, kept, o, shares)
-        p = drawn.particles
-        unary, pairwise = layer.of(best, p)
-
-        def watch(k: int, bound: float, e: float, least: float) -> bool:
-            now = time.perf_counter()
-            if listener:
-                stage = f"refine {number + 1}"  # noqa: B023
-                listener(Progress(stage, k - 1, least, 0.0, now - mark))  # noqa: B023
-            return stop.is_set() or now > deadline
-
-        result = solve_trws(
-            unary,
-            pair_costs.edges,
-            pairwise,
-            max_iter=o.trws_iterations,
-            gap=o.trws_gap,
-            dtype=pairwise.dtype,
-            init_labels=np.zeros(len(best), np.int64),
-            polish=True,
-            callback=watch,
-        )
-        # TRW-S answers Ctrl-C too with the best labels so far: no further round then
-        interrupted = result.status == "interrupted" and time.perf_counter() <= deadline
-        new = p.soup(result.labels, data.share).retracted()
-        new_energy, before = _energy(new, data, weights, photo), energy["total"]
-        taken = new_energy["total"] < before
-        labels = result.labels if taken else np.zeros(len(best), np.int64)
-        if taken:
-            best, energy = new, new_energy
-        cost = conditional_costs(labels, unary, pair_costs.edges, pairwise)
-        which = diverse(p, labels, cost, round(o.keep * o.particles), data)
-        kept = p.take(which)
-        del pairwise
-        spread = spread_of(p, result.min_marginals, data.anchor_ray)
-        rounds.append(_round(result, drawn, unary, labels, energy, taken, mark, spread))
-        _learn(proposer, shares, drawn, labels, rounds[-1])
-        if say:
-            say(f"refine {number + 1}: {rounds[-1]}")
-        slow = slow + 1 if before - energy["total"] < o.stagnation * abs(before) else 0
-        if interrupted:
-            break
-        if slow >= 2:
-            status = "stagnated"
-            break
-    if interrupted or stop.is_set():
-        status = "interrupted"
-    elif len(rounds) < o.rounds and status == "rounds":
-        status = "time limit"
-    return Refined(best, energy_begin, energy, tuple(rounds), status, time.perf_counter() - begin)
+        rounds.kept = swept(best, *proposer.commonest(best, 2), data, photo, o.sweep)
+    status, done = rounds.run(), tuple(rounds.done)
+    return Refined(rounds.best, energy, rounds.energy, done, status, time.perf_counter() - begin)
 
 
 def objective(
@@ -209,7 +136,7 @@ def _draw(
     current = Particles.of(best)
     fixed = current if kept is None else current.joined(kept)
     have = fixed.shape[1]
-    count = _counts(shares, max(0, o.particles - have), proposer.near.shape[1])
+    count = counts(shares, max(0, o.particles - have), proposer.near.shape[1])
     kind = np.full(have, KEPT)
     kind[0] = CURRENT
     if not sum(count.values()):
@@ -220,22 +147,6 @@ def _draw(
         np.concatenate([kind, new.kind]),
         np.hstack([np.full((n, have), np.nan), new.step]),
     )
-
-
-def _counts(shares: Mapping[str, float], total: int, near: int) -> dict[str, int]:
-    """`total` proposals split by shares, largest remainders first; limits by kind respected."""
-    most = {
-        k: 1 if k in FEW else near if k.startswith("neighbour") or k == "mean" else total
-        for k in shares
-    }
-    whole = sum(shares.values())
-    exact = {k: min(total * v / whole, most[k]) for k, v in shares.items()}
-    out = {k: int(v) for k, v in exact.items()}
-    for k in sorted(exact, key=lambda k: out[k] - exact[k]):
-        if sum(out.values()) < total and out[k] < most[k]:
-            out[k] += 1
-    out["walk_all"] += total - sum(out.values())
-    return out
 
 
 @dataclass(frozen=True)
@@ -293,7 +204,94 @@ def length_slope(soup: Soup, data: EnergyData, weights: Weights, h: float = 1e-4
     return (down - up) / (2 * h)
 
 
-def _round(
+class _Rounds:
+    """The rounds of a refinement.
+
+    Attributes:
+        best: Soup of the lowest energy so far.
+        energy: Its energy by term, see `objective`.
+        kept: Particles that the next round has besides its proposals.
+        done: Rounds that have ended.
+    """
+
+    def __init__(
+        self,
+        costs: _Costs,
+        proposer: Proposer,
+        watch: Watch,
+        best: Soup,
+        energy: Mapping[str, float],
+        deadline: float,
+    ) -> None:
+        """Nothing is drawn yet; `deadline` is a time of `time.perf_counter`."""
+        self.costs, self.proposer, self.watch = costs, proposer, watch
+        self.best, self.energy, self.deadline = best, energy, deadline
+        walks_only = costs.options.proposals == "walks"
+        self.shares = {k: v for k, v in SHARES.items() if not walks_only or k in WALKS}
+        self.kept: Particles | None = None
+        self.done: list[Round] = []
+
+    def run(self) -> str:
+        """All rounds; the status of `Refined`."""
+        o, slow, interrupted = self.costs.options, 0, False
+        while len(self.done) < o.rounds and slow < 2 and not (interrupted or self._over()):
+            before = self.energy["total"]
+            interrupted = self._round()
+            self.watch.say(f"refine {len(self.done)}: {self.done[-1]}")
+            fell = before - self.energy["total"]
+            slow = slow + 1 if fell < o.stagnation * abs(before) else 0
+        if interrupted or self.watch.stop.is_set():
+            return "interrupted"
+        if slow >= 2:
+            return "stagnated"
+        return "time limit" if len(self.done) < o.rounds else "rounds"
+
+    def _over(self) -> bool:
+        """Whether somebody or the clock ends the rounds."""
+        return self.watch.stop.is_set() or time.perf_counter() > self.deadline
+
+    def _round(self) -> bool:
+        """One round; whether TRW-S was interrupted, after which there is no further round."""
+        mark, costs, o = time.perf_counter(), self.costs, self.costs.options
+        drawn = _draw(self.proposer, self.best, self.kept, o, self.shares)
+        p, edges, none = drawn.particles, costs.pairs.edges, np.zeros(len(self.best), np.int64)
+        unary, pairwise = costs.of(self.best, p)
+        result = solve_trws(
+            unary,
+            edges,
+            pairwise,
+            max_iter=o.trws_iterations,
+            gap=o.trws_gap,
+            dtype=pairwise.dtype,
+            init_labels=none,
+            polish=True,
+            callback=partial(self._follow, mark),
+        )
+        # TRW-S answers Ctrl-C too with the best labels so far
+        interrupted = result.status == "interrupted" and time.perf_counter() <= self.deadline
+        new = p.soup(result.labels, costs.data.share).retracted()
+        energy = _energy(new, costs.data, costs.weights, costs.photo)
+        taken = energy["total"] < self.energy["total"]
+        labels = result.labels if taken else none
+        if taken:
+            self.best, self.energy = new, energy
+        cost = conditional_costs(labels, unary, edges, pairwise)
+        self.kept = p.take(diverse(p, labels, cost, round(o.keep * o.particles), costs.data))
+        spread = spread_of(p, result.min_marginals, costs.data.anchor_ray)
+        done = _record(result, drawn, unary, labels, self.energy, taken, mark, spread)
+        self.done.append(done)
+        _learn(self.proposer, self.shares, drawn, labels, done)
+        return interrupted
+
+    def _follow(self, mark: float, k: int, bound: float, energy: float, least: float) -> bool:
+        """Tell of an iteration of TRW-S; whether it shall be the last."""
+        if self.watch.listener:
+            stage, seconds = f"refine {len(self.done) + 1}", time.perf_counter() - mark
+            self.watch.listener(Progress(stage, k - 1, least, 0.0, seconds))
+        return self._over()
+
+
+def _record(
     result: TRWSResult,
     drawn: Proposals,
     unary: Float,
@@ -334,11 +332,4 @@ def _learn(
     kind, step = drawn.kind[labels], drawn.step[own, labels]
     for name in (*WALKS, *COMMON):
         proposer.spread.learn(name, step[kind == KINDS.index(name)])
-    rate = {k: done.accepted[k] / max(1, done.proposed[k]) for k in shares}
-    mean = sum(rate.values()) / len(rate)
-    if mean > 0:
-        whole = sum(SHARES[k] for k in shares) / len(shares)
-        for k in shares:
-            # half of what is usual stays for every kind: what fails now may help later
-            wanted = 0.5 * SHARES[k] + 0.5 * whole * min(rate[k] / mean, 3.0)
-            shares[k] += 0.5 * (wanted - shares[k])
+    relearn(shares, done)

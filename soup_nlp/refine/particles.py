@@ -10,7 +10,7 @@ re-projection, so that one number fits every scene and every superpixel.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,56 +21,11 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.refine.anchored import Local, fit_motion
 from soup_nlp.refine.costs import Particles
+from soup_nlp.refine.kinds import KINDS, WALKS, Spread
 from soup_nlp.start.plane_fit import PlaneFit, fit_planes
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
-WALKS = ("walk_plane", "walk_motion", "walk_pivot", "walk_scale", "walk_all")
-COMMON = ("common_motion",)
-BORROWED = (
-    "neighbour_plane",
-    "neighbour_motion",
-    "neighbour_both",
-    "neighbour_refit",
-    "own_refit",
-    "dominant",
-    "mean",
-)
-KINDS = ("current", "kept", *WALKS, *COMMON, *BORROWED)
-"""Kinds of proposal by number."""
-
-
-@dataclass
-class Spread:
-    """Step sizes of the walks: log-normal, centred where accepted steps were found.
-
-    A step of a walk is drawn as `px x N(0, 1)` in every coordinate with px log-normal, so that
-    large and small steps are tried at once.
-
-    Attributes:
-        centre: By kind of walk, log of the usual step, pixels.
-        width: Standard deviation of log px.
-        shrink: Factor per round on walks of which nothing is accepted.
-    """
-
-    centre: dict[str, float] = field(
-        default_factory=lambda: {k: float(np.log(0.5)) for k in (*WALKS, *COMMON)}
-    )
-    width: float = 1.2
-    shrink: float = 0.7
-
-    def draw(self, kind: str, shape: tuple[int, ...], rng: np.random.Generator) -> Float:
-        """Steps in pixels."""
-        return np.asarray(np.exp(self.centre[kind] + self.width * rng.standard_normal(shape)))
-
-    def learn(self, kind: str, accepted: Float) -> None:
-        """Move to the accepted steps (M,), pixels, nan for no step; shrink where there are none."""
-        accepted = accepted[np.isfinite(accepted)]
-        if accepted.size >= 3:
-            self.centre[kind] += 0.7 * (float(np.log(accepted).mean()) - self.centre[kind])
-        else:
-            self.centre[kind] += float(np.log(self.shrink))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from soup_nlp.geometry.surface import hidden
 from soup_nlp.start.components import TIES
 
 if TYPE_CHECKING:
-    from soup_nlp.pipeline.run import Run
+    from soup_nlp.pipeline.record import Run
 
 LITTLE = 1.0
 """Parallax in pixels below which an error of the flow is most of it."""

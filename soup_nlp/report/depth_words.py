@@ -10,7 +10,7 @@ import numpy as np
 from soup_nlp.report.limits import SHARE, USABLE
 
 if TYPE_CHECKING:
-    from soup_nlp.pipeline.run import Run
+    from soup_nlp.pipeline.record import Run
 
 STILL = 0.3
 """Share of the image without parallax from which other frames are recommended."""

@@ -32,7 +32,7 @@ from soup_nlp.storage.store import write_h5, write_json
 from soup_nlp.storage.versions import versions
 
 if TYPE_CHECKING:
-    from soup_nlp.pipeline.run import Run
+    from soup_nlp.pipeline.record import Run
 
 FULL = {"ref_full": "depth_ref_full.png", "next_full": "depth_next_full.png"}
 """Depth at the images' own size, where a pair was solved at a smaller one (`max_size`)."""

@@ -24,7 +24,7 @@ from soup_nlp.storage.h5_files import read_attrs, read_h5
 from soup_nlp.storage.store import require
 
 if TYPE_CHECKING:
-    from soup_nlp.pipeline.run import Run
+    from soup_nlp.pipeline.record import Run
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]

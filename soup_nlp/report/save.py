@@ -18,7 +18,7 @@ from soup_nlp.storage.folders import staged
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from soup_nlp.pipeline.run import Run
+    from soup_nlp.pipeline.record import Run
 
 
 def save(

@@ -21,7 +21,7 @@ from soup_nlp.storage.h5_files import ReadTree, read_attrs, read_h5
 from soup_nlp.storage.store import Array, Tree, plain
 
 if TYPE_CHECKING:
-    from soup_nlp.pipeline.run import Run
+    from soup_nlp.pipeline.record import Run
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]

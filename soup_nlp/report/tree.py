@@ -11,7 +11,7 @@ from soup_nlp.solve.ipopt import Stage
 from soup_nlp.storage.store import Array, Tree
 
 if TYPE_CHECKING:
-    from soup_nlp.pipeline.run import Run
+    from soup_nlp.pipeline.record import Run
 
 Table: TypeAlias = Mapping[str, tuple[str, str, str]]
 """Unit, axes and description by name; the unit "truth" stands for that of the truth."""

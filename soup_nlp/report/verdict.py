@@ -13,7 +13,7 @@ from soup_nlp.report.depth_words import depth_words
 from soup_nlp.report.shown import PAGE
 
 if TYPE_CHECKING:
-    from soup_nlp.pipeline.run import Run
+    from soup_nlp.pipeline.record import Run
     from soup_nlp.refine.records import Refined
 
 WORDS = {

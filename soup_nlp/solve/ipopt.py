@@ -135,20 +135,22 @@ class _Iterations(IterationCallback):
     def __init__(
         self,
         nlp: NLP,
+        x0: Float,
         stage: str,
         listener: Listener | None,
-        deadline: float,
+        seconds: float,
         stop: threading.Event,
-        stagnation: float = 0.0,
+        stagnation: float,
     ) -> None:
         super().__init__()
         self.stagnation, self.last_f, self.still = stagnation, np.inf, 0
         self.nlp, self.stage, self.listener = nlp, stage, listener
-        self.deadline, self.stop, self.signalled = deadline, stop, threading.Event()
+        self.stop, self.signalled = stop, threading.Event()
         self.begin = time.perf_counter()
+        self.deadline = self.begin + seconds
         self.count = 0
         self.best = self.best_f = np.inf
-        self.best_x = nlp.x0
+        self.x0 = self.best_x = x0
         self.best_lam: tuple[Float, Float] | None = None
         self.reason = ""
         self.start(f"watch_{nlp.name}", nlp.nx, nlp.ng, len(nlp.p))
@@ -185,6 +187,37 @@ class _Iterations(IterationCallback):
         elif now > self.deadline:
             self.reason = "Time_Limit"
         return int(bool(self.reason))
+
+    def ended(self, stats: Mapping[str, Any], out: Mapping[str, Float]) -> Stage:
+        """The record of the call: Ipopt's answer, or the best iterate where it has none.
+
+        Args:
+            stats: Of CasADi's solver.
+            out: Its answer.
+        """
+        status = self.reason or str(stats.get("return_status", "Unknown"))
+        converged = status in GOOD
+        history = {k: np.asarray(v, float) for k, v in stats.get("iterations", {}).items()}
+        # Ipopt does not count the iteration that begins its restoration; the history has it
+        count = len(history["obj"]) - 1 if len(history.get("obj", ())) else self.count
+        x, f, lam_x, lam_g = out["x"], float(out["f"][0]), out["lam_x"], out["lam_g"]
+        if not converged and self.best_lam is not None:
+            x, f, (lam_x, lam_g) = self.best_x, self.best_f, self.best_lam
+        if not np.isfinite(x).all():
+            x, f = self.x0, np.nan
+        return Stage(
+            name=self.stage,
+            status=status,
+            converged=converged,
+            x=x,
+            lam_x=lam_x,
+            lam_g=lam_g,
+            objective=f,
+            iterations=count,
+            seconds=time.perf_counter() - self.begin,
+            history=history,
+            calls={k: float(stats.get(f"t_wall_{s}", 0.0)) for k, s in CALLS.items()},
+        )
 
 
 class Ipopt:
@@ -270,37 +303,11 @@ class Ipopt:
             KeyboardInterrupt: Ctrl-C, which ends the solve at the next iteration.
         """
         nlp = self.nlp
-        begin = time.perf_counter()
         stop = stop or threading.Event()
-        watch = _Iterations(nlp, stage, listener, begin + seconds, stop, stagnation)
+        watch = _Iterations(nlp, x0, stage, listener, seconds, stop, stagnation)
         solver = self._solver(watch, max_iter, tol, log_file)
         given = {"p": nlp.p if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
         bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}
         with raised_at_the_end(watch.signalled):
             out = solver(x0=x0, **bounds, **{k: v for k, v in given.items() if v is not None})
-        stats = solver.stats()
-        status = watch.reason or str(stats.get("return_status", "Unknown"))
-        converged = status in GOOD
-        x = np.asarray(out["x"]).ravel()
-        f = float(out["f"])
-        history = {k: np.asarray(v, float) for k, v in stats.get("iterations", {}).items()}
-        # Ipopt does not count the iteration that begins its restoration; the history has it
-        count = len(history["obj"]) - 1 if len(history.get("obj", ())) else watch.count
-        lam_x, lam_g = np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_g"]).ravel()
-        if not converged and watch.best_lam is not None:
-            x, f, (lam_x, lam_g) = watch.best_x, watch.best_f, watch.best_lam
-        if not np.isfinite(x).all():
-            x, f = x0, np.nan
-        return Stage(
-            name=stage,
-            status=status,
-            converged=converged,
-            x=x,
-            lam_x=lam_x,
-            lam_g=lam_g,
-            objective=f,
-            iterations=count,
-            seconds=time.perf_counter() - begin,
-            history=history,
-            calls={k: float(stats.get(f"t_wall_{s}", 0.0)) for k, s in CALLS.items()},
-        )
+        return watch.ended(solver.stats(), {k: np.asarray(v).ravel() for k, v in out.items()})

@@ -26,16 +26,13 @@ from soup_nlp.solve.continuation import Continuation
 from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.ipopt import Ipopt, Listener, Stage, Watch
 from soup_nlp.solve.kkt import UNMET, feasible, residuals
-from soup_nlp.solve.phase import Phase
+from soup_nlp.solve.phase import POLISH, Phase, polish, reweighted
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.tangent_problem import TangentProblem
 from soup_nlp.solve.warm import WARM, warm_start
 
 Float = NDArray[np.float64]
 
-
-POLISH = "presolve polish"
-"""Name of the phase with the exact Hessian."""
 _ENDS = ("start", "presolve", "constrained NLP")
 STOPPED = ("Interrupted", "Time_Limit")
 """Status of a stage after which no other begins."""
@@ -164,24 +161,6 @@ def _far(stages: Sequence[Stage]) -> bool:
     return ended and not _near(stages[-1])
 
 
-def _phases(o: SolverOptions, kind: str = "") -> list[Phase]:
-    """The reweighted phases: barriers from 1e-3 down to 1e-5 while the smoothing shrinks."""
-    last = len(o.presolve_eps) - 1
-    barriers = np.geomspace(1e-3, 1e-5, last + 1) if last else np.array([1e-5])
-    return [
-        Phase(
-            name=f"presolve {kind}{eps:g}",
-            hessian="gauss-newton",
-            eps=eps,
-            barrier=float(barrier),
-            iterations=o.presolve_iterations,
-            stagnation=o.stagnation * (0.01 if k == last else 1.0),
-            tol=o.presolve_tol,
-        )
-        for k, (eps, barrier) in enumerate(zip(o.presolve_eps, barriers))
-    ]
-
-
 @dataclass(frozen=True)
 class _Solve:
     """One solve: what its stages share, and the stages that have ended."""
@@ -270,19 +249,21 @@ class _Solve:
 
     def _reweighted(self) -> Descent:
         problem = TangentProblem(self.start, self.data, self.weights, self.form, exact=False)
-        return self._run(Descent(problem, watch=self.watch, deadline=self.early()), _phases(self.o))
+        return self._run(
+            Descent(problem, watch=self.watch, deadline=self.early()), reweighted(self.o)
+        )
 
     def _untruncated(self) -> Descent:
         """The second way: without the truncation of E_arap first, then with it."""
         whole = self.weights.replace(sigma_arap=np.inf)
         problem = TangentProblem(self.start, self.data, whole, self.form, exact=False)
         first = Descent(problem, watch=self.watch, deadline=self.early())
-        self._run(first, _phases(self.o, "untruncated "))
+        self._run(first, reweighted(self.o, "untruncated "))
         if self.stages[-1].status in STOPPED:
             return first
         problem = TangentProblem(first.soup, self.data, self.weights, self.form, exact=False)
         after = Descent(problem, after=first, watch=self.watch, deadline=self.early())
-        return self._run(after, [replace(_phases(self.o)[-1], name="presolve truncated")])
+        return self._run(after, [replace(reweighted(self.o)[-1], name="presolve truncated")])
 
     def _run(self, descent: Descent, phases: Sequence[Phase]) -> Descent:
         for phase in phases:
@@ -296,18 +277,7 @@ class _Solve:
             before.soup, self.data, self.weights, self.form, chart=polish_chart(self.data)
         )
         descent = Descent(problem, after=before, watch=self.watch, deadline=self.early())
-        polish = Phase(
-            name=POLISH,
-            hessian="exact",
-            eps=self.o.eps,
-            barrier=1e-10,
-            iterations=self.o.polish_iterations,
-            stagnation=0.0,
-            tol=self.o.presolve_tol,
-            beyond=True,
-            highest=1e-5,
-        )
-        self._ended(descent.run(polish))
+        self._ended(descent.run(polish(self.o)))
         return descent
 
     def constrained(self, soup: Soup) -> tuple[NLP, MatrixLayout]:

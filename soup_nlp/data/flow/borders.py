@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from soup_nlp.data.flow.robust import fit_affine, refit_affine
+from soup_nlp.data.flow.robust import AffineFlow, fit_affine, refit_affine
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.superpixels import Labels, split_components
+
+Ints = NDArray[np.int64]
 
 
 def follow_flow(
@@ -62,13 +64,8 @@ def follow_flow(
         # a pixel whose surroundings are those of the last sweep stays where it stayed
         border = near & (flow.confidence > 0) & np.any([side != current for side in sides], axis=0)
         v, u = np.nonzero(border)
-        own, uv = current[v, u], flow.uv[v, u].astype(np.float64)
-        best, least = own.copy(), fit.residual(own, u, v, uv) - margin_px
-        for side in sides:
-            other = side[v, u]
-            residual = fit.residual(other, u, v, uv)
-            better = (residual < least) & (other != own)
-            best[better], least[better] = other[better], residual[better]
+        own = current[v, u]
+        best = _nearest(fit, flow, own, [side[v, u] for side in sides], u, v, margin_px)
         moved = best != own
         if not moved.any():
             break
@@ -78,3 +75,22 @@ def follow_flow(
         near[v[moved], u[moved]] = True
         near = ndimage.binary_dilation(near)
     return split_components(current.astype(np.int32), int(min_fraction * current.size / count))
+
+
+def _nearest(
+    fit: AffineFlow,
+    flow: Flow,
+    own: Ints,
+    sides: list[Ints],
+    u: Ints,
+    v: Ints,
+    margin_px: float,
+) -> Ints:
+    """(P,) superpixels of pixels (P,): their own, or that of a side with a nearer affine flow."""
+    uv = flow.uv[v, u].astype(np.float64)
+    best, least = own.copy(), fit.residual(own, u, v, uv) - margin_px
+    for other in sides:
+        residual = fit.residual(other, u, v, uv)
+        better = (residual < least) & (other != own)
+        best[better], least[better] = other[better], residual[better]
+    return best

@@ -1,0 +1,185 @@
+"""What a run holds: inputs, solution, refinement, dense 3D and scores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.config.problem import Problem, dump_problem
+from soup_nlp.data.pair import Pair
+from soup_nlp.evaluate.confidence import Confidence
+from soup_nlp.evaluate.metrics import DepthMetrics
+from soup_nlp.geometry.components import Components, find_components
+from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.geometry.soup import Reconstruction, Soup
+from soup_nlp.model import oracle
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.pipeline.full_size import FullSize
+from soup_nlp.refine.records import Refined
+from soup_nlp.solve.kkt import constraint_residuals
+from soup_nlp.solve.stages import Solution
+from soup_nlp.start.propose import Start
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Inputs and results of a solve.
+
+    Attributes:
+        problem: The merged problem.
+        pair: Images, cameras, flow, truth.
+        segmentation: Superpixels and graphs.
+        start: The unorganised soup.
+        data: Numbers of the energy.
+        weights: Constants of the energy.
+        solution: Result of the constrained NLP, before any refinement.
+        start_reconstruction: Dense 3D of the start.
+        reconstruction: Dense 3D of `soup`.
+        rigid: (H, W) depth by one rigid motion for the whole image, in lengths of its translation;
+            None without truth or where none fits.
+        metrics: By "solution" (delivered), "nlp" (where refined), "start", "constant", "rigid",
+            and "solution_next" for the next frame; a key without truth is absent.
+        seconds: Wall time by stage; those that start with nlp_ are parts of "nlp".
+        confidence: How sure `reconstruction` is.
+        refined: Result of the refinement of `solution`; None where it is off.
+        nlp_reconstruction: Dense 3D of `solution`, where there is an NLP and it was refined.
+        full: Depth at the images' own size, where the pair was solved at a smaller one.
+    """
+
+    problem: Problem
+    pair: Pair
+    segmentation: Segmentation
+    start: Start
+    data: EnergyData
+    weights: Weights
+    solution: Solution
+    start_reconstruction: Reconstruction
+    reconstruction: Reconstruction
+    rigid: Float | None
+    metrics: Mapping[str, DepthMetrics] = field(repr=False)
+    seconds: Mapping[str, float]
+    confidence: Confidence
+    refined: Refined | None = None
+    nlp_reconstruction: Reconstruction | None = None
+    full: FullSize | None = None
+
+    def __str__(self) -> str:
+        h, w = self.pair.size
+        s, energy = self.solution, self.energy["total"]
+        parts = self.components
+        scores = "no truth"
+        if "solution" in self.metrics:
+            m = self.metrics["solution"]
+            scores = f"MRE {m.mre:.4f} at {m.coverage:.1%} of the truth, {m.scale_rule} scale"
+        return "\n".join(
+            [
+                f"Run({self.problem.name}, {w}x{h}, {len(self.segmentation)} superpixels,"
+                f" {sum(v for k, v in self.seconds.items() if not k.startswith('nlp_')):.1f} s)",
+                f"  {'good' if self.good else 'not good'}: {s.status}, E"
+                f" {s.energy_start['total']:.5g} -> {energy:.5g}, delivered by {self._source}",
+                f"  {self.reconstruction}",
+                f"  camera {parts.camera}; {len(parts) - 1} components beside the background",
+                f"  {scores}",
+            ]
+        )
+
+    __repr__ = __str__
+
+    @property
+    def _source(self) -> str:
+        return "the refinement" if self.refined else self.delivered
+
+    @cached_property
+    def components(self) -> Components:
+        """What moves as one, with its rigid motion; the first is the static scene."""
+        pair, start = self.pair, self.start
+        own = self.soup, self.segmentation, start.component, pair.K_ref, pair.K_next
+        return find_components(*own, start.borrowed)
+
+    @property
+    def camera(self) -> RigidMotion:
+        """next_from_ref of the static scene, in the unit of the reconstruction; its `centre` is the
+        next camera as the reference frame sees it."""
+        return self.components.camera
+
+    def save(
+        self, folder: str | Path, formats: Sequence[str] = (), overwrite: bool = False
+    ) -> list[str]:
+        """Write a result folder, as `soup-nlp solve` does.
+
+        Args:
+            folder: A new or empty folder, or that of an earlier result.
+            formats: Files for other programs beside: "glb", "colmap", "npy", "pfm", "rrd" ...
+            overwrite: Overwrite files that the program did not make.
+
+        Returns:
+            Names of the files.
+
+        Raises:
+            ConfigError: a format is not known.
+            DataError: the folder cannot be written, or holds what is not to be overwritten.
+        """
+        # the report room imports this one
+        write = import_module("soup_nlp.report.save").save
+        return list(write(self, folder, dump_problem(self.problem), formats, overwrite))
+
+    def plot(self) -> Any:
+        """The overview as a `matplotlib.figure.Figure`: notebooks show it, `.savefig` writes it."""
+        return import_module("soup_nlp.report.save").plot(self)
+
+    @property
+    def delivered(self) -> str:
+        """Origin of `solution.soup`: "constrained NLP", or "presolve" or "start" where these have
+        the lower exact energy or the NLP was skipped."""
+        return self.solution.delivered
+
+    @property
+    def answer(self) -> Soup:
+        """Ipopt's last iterate, whose constraints hold to its tolerance only; the start where the
+        NLP was skipped."""
+        if not self.solution.stages:
+            return self.solution.soup
+        layout = MatrixLayout(self.data.share, self.problem.formulation.gauge)
+        return layout.unpack(self.solution.stages[-1].x)
+
+    @property
+    def soup(self) -> Soup:
+        """The delivered soup: the refined one, or the NLP's where there is no refinement."""
+        return self.refined.soup if self.refined else self.solution.soup
+
+    @property
+    def energy(self) -> Mapping[str, float]:
+        """Exact energy E by term of `soup`; E_photo of the refinement is not part of it."""
+        if self.refined is None:
+            return self.solution.energy
+        return oracle.energy(self.refined.soup, self.data, self.weights)
+
+    @property
+    def residuals(self) -> dict[str, float]:
+        """Constraint residuals of `soup`, beside those of Ipopt's answer."""
+        facing = self.problem.formulation.min_facing
+        own = constraint_residuals(self.soup, self.data.rim_ray, facing)
+        return {**self.solution.residuals, **own}
+
+    @property
+    def good(self) -> bool:
+        """Whether the solve ended well and at most half of the image is a guess."""
+        return self.solved and self.confidence.guessed <= 0.5
+
+    @property
+    def solved(self) -> bool:
+        """Whether the NLP converged (or was skipped) and nobody interrupted the refinement."""
+        solved = self.solution.converged or self.solution.status == "Skipped"
+        return solved and (self.refined is None or self.refined.status != "interrupted")
