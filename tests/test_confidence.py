@@ -30,6 +30,7 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve import selected_inverse
 from soup_nlp.solve.selected_inverse import BlockCholesky, dissect
 from soup_nlp.solve.tangent_problem import TangentProblem
+from soup_nlp.start.choice import LEAST_NOISE
 
 FORM = Formulation(compiled=False)
 
@@ -286,11 +287,15 @@ def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
 
 
 def test_where_surfaces_bend_a_misfit_counts_in_full_and_the_spread_by_its_root():
-    spread, misfit = np.array([4 * LEAST_SPREAD]), 0.2
+    spread, misfit = np.array([100 * LEAST_SPREAD]), 100 * LEAST_NOISE
     base = calibrated(spread, 0.1, misfit, prior=np.inf, bending=True)
-    assert base[0] == pytest.approx(BENDING_FACTOR * misfit * np.sqrt(spread[0]))
-    least = calibrated(0.1 * spread, 0.1, misfit, prior=np.inf, bending=True)
-    assert least[0] == pytest.approx(0.5 * base[0])
+    # what is added in squares is 1e-4 of either square
+    assert base[0] == pytest.approx(BENDING_FACTOR * misfit * np.sqrt(spread[0]), rel=1e-4)
+    half = calibrated(0.25 * spread, 0.1, misfit, prior=np.inf, bending=True)
+    assert half[0] == pytest.approx(0.5 * base[0], rel=1e-3)
+    # small ones keep their order, and count for little
+    small = calibrated(LEAST_SPREAD * np.array([0.0, 0.1]), 0.1, LEAST_NOISE, bending=True)
+    assert small[0] < small[1] == pytest.approx(small[0], rel=0.01)
     assert calibrated(spread, 0.6, misfit, prior=np.inf, bending=True) == base
     assert calibrated(spread, 0.1, 0.0, bending=True)[0] > 0
     assert calibrated(np.array([np.inf]), 0.1, bending=True)[0] == pytest.approx(SIGMA_PRIOR)

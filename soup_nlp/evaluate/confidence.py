@@ -175,9 +175,10 @@ FACTOR, POWER = 7.0, 1.25
 BENDING_FACTOR = 0.5
 """sigma = BENDING_FACTOR misfit sqrt(spread) where surfaces bend."""
 LEAST_SPREAD = 0.1
-"""Spreads below it count as this where surfaces bend: errors do not follow them."""
-MOST_MISFIT = 5.0
-"""Pixels beyond which a flow that the answer contradicts is as wrong as any."""
+"""Added in squares to spreads where surfaces bend: errors hardly follow smaller ones."""
+MOST_MISFIT, BENDING_MISFIT = 5.0, 100.0
+"""Pixels beyond which a flow that the answer contradicts is as wrong as any; the latter where
+surfaces bend: what an answer with a motion for every superpixel cannot follow is far off."""
 LARGEST = 1e6
 """Of what is calibrated: anything above is as little."""
 MIN_CONFIDENCE = 0.5
@@ -241,10 +242,16 @@ def stands_still(soup: Soup, anchor_ray: Float, K_next: Float) -> NDArray[np.boo
     return np.asarray(moved < MOST_NOISE)
 
 
-def flow_misfit(rec: Reconstruction, flow: Flow) -> Float:
-    """(N,) mean distance of a flow from the one that a reconstruction induces, pixels."""
+def flow_misfit(rec: Reconstruction, flow: Flow, most: float = MOST_MISFIT) -> Float:
+    """(N,) mean distance of a flow from the one that a reconstruction induces, pixels.
+
+    Args:
+        rec: The answer.
+        flow: The flow that it was solved with.
+        most: Larger distances, and those of what is not induced, count as this.
+    """
     distance = np.linalg.norm(rec.flow - flow.uv, axis=-1)
-    limited = np.where(np.isfinite(distance), np.minimum(distance, MOST_MISFIT), MOST_MISFIT)
+    limited = np.where(np.isfinite(distance), np.minimum(distance, most), most)
     flat = rec.labels.ravel()
     return np.asarray(np.bincount(flat, limited.ravel()) / np.bincount(flat))
 
@@ -273,8 +280,9 @@ def calibrated(
             beside it: so much of `SIGMA_PRIOR` is added everywhere, in squares.
     """
     if bending:
-        known = np.sqrt(np.maximum(spread, LEAST_SPREAD))
-        sigma = BENDING_FACTOR * np.maximum(LEAST_NOISE, misfit) * known
+        # no limits: what is below them keeps its order
+        known = np.sqrt(np.hypot(LEAST_SPREAD, spread))
+        sigma = BENDING_FACTOR * np.hypot(LEAST_NOISE, misfit) * known
     else:
         sigma = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
     sigma = np.hypot(np.minimum(sigma, LARGEST), SIGMA_PRIOR * still)
@@ -342,7 +350,8 @@ def confidence(
             np.full(int(start.component.max()) + 1, np.inf),
         )
         spread = np.full(rec.labels.shape, np.inf)
-    noise, misfit = start.noise, flow_misfit(rec, pair.flow)
+    most = BENDING_MISFIT if start.bending else MOST_MISFIT
+    noise, misfit = start.noise, flow_misfit(rec, pair.flow, most)
     stands = stands_still(rec.soup, data.anchor_ray, pair.K_next) & start.bending
     # the answer may explain a part of the camera's turn by translations
     stands |= start.at_rest & (start.parallax < MOST_NOISE)
