@@ -24,8 +24,9 @@ def test_a_guided_flow_must_be_better_by_a_margin(monkeypatch, error, taken):
         return constant(0.1), constant(-0.1)
 
     monkeypatch.setattr(flow_guided, "dominant_homographies", lambda *a: [np.eye(3)])
+    monkeypatch.setattr(flow_guided, "_MARGIN", 0.5)
     first, back = constant(0.0), constant(error)
-    flow, gap = guided_flow(grey, grey, match, first, back, 1, margin_px=0.5)
+    flow, gap = guided_flow(grey, grey, match, first, back, 1)
     inside = (slice(20, 40), slice(20, 60))
     np.testing.assert_allclose(flow[inside][..., 0], 0.1 if taken else 0.0, atol=1e-6)
     np.testing.assert_allclose(gap[inside], 0.0 if taken else error, atol=1e-4)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,6 @@ from soup_nlp.refine.costs import Particles
 from soup_nlp.refine.photometric import look
 
 Float = NDArray[np.float64]
-Chosen = Callable[[Float], Float]
 
 CUES = {
     "sigma": "sigma as delivered",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,7 +67,7 @@ def sparsification(error: ArrayLike, uncertainty: ArrayLike) -> Sparsification:
     return Sparsification(kept, own, best, float((own - best).mean() / whole) if whole > 0 else 0.0)
 
 
-def coverage(error: ArrayLike, sigma: ArrayLike, factors: Sequence[float] = (1, 2)) -> list[float]:
-    """Share of the errors (M,) that are at most each factor times their sigma (M,)."""
+def coverage(error: ArrayLike, sigma: ArrayLike) -> list[float]:
+    """Shares of the errors (M,) that are at most one and two times their sigma (M,)."""
     e, s = np.abs(np.asarray(error, float)), np.asarray(sigma, float)
-    return [float(np.mean(e <= k * s)) for k in factors]
+    return [float(np.mean(e <= k * s)) for k in (1, 2)]

@@ -13,6 +13,9 @@ from soup_nlp.errors import DataError
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+RIM = 8
+"""Directions in which a superpixel has an extreme pixel."""
+
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
@@ -209,15 +212,16 @@ def _sample_along(points: Float, which: Int, count: Int, samples: int | None) ->
     return points[order[start[:, None] + inside]].reshape(n_pairs, b, 2)
 
 
-def _rim(labels: NDArray[np.int32], u: Float, v: Float, n: int, directions: int = 8) -> Float:
+def _rim(labels: NDArray[np.int32], u: Float, v: Float, n: int) -> Float:
+    """(N, RIM, 2) extreme pixels of every superpixel by direction."""
     order = np.argsort(labels.ravel(), kind="stable")
     count = np.bincount(labels.ravel(), minlength=n)
     start = np.concatenate([[0], np.cumsum(count)[:-1]])
     owner, u, v = labels.ravel()[order], u[order], v[order]
-    out = np.empty((n, directions, 2))
+    out = np.empty((n, RIM, 2))
     last = np.empty(n, np.int64)
-    for k in range(directions):
-        angle = 2 * np.pi * k / directions
+    for k in range(RIM):
+        angle = 2 * np.pi * k / RIM
         reach = u * np.cos(angle) + v * np.sin(angle)
         top = np.flatnonzero(reach == np.maximum.reduceat(reach, start)[owner])
         # of pixels that reach equally far the last one stays

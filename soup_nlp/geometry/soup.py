@@ -13,6 +13,9 @@ from soup_nlp.geometry.rotation import nearest
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+LEAST_FACING = 1e-6
+"""A pixel with `-n . ray` below this has no depth."""
+
 
 @dataclass(frozen=True, eq=False)
 class Soup:
@@ -175,7 +178,6 @@ def reconstruct(
     K_ref: Float,
     K_next: Float,
     size_next: tuple[int, int] | None = None,
-    min_facing: float = 1e-6,
 ) -> Reconstruction:
     """Dense reconstruction of both frames.
 
@@ -185,14 +187,13 @@ def reconstruct(
         K_ref: (3, 3) intrinsics of the reference frame.
         K_next: (3, 3) intrinsics of the next frame.
         size_next: (height, width) of the next frame; default as the reference.
-        min_facing: A pixel with `-n . ray` below this has no depth (NaN).
     """
     height, width = labels.shape
     uv = pixel_grid(height, width)
     r = rays(K_ref, uv)
     facing = -np.einsum("hwc,hwc->hw", soup.n[labels], r)
     with np.errstate(divide="ignore", invalid="ignore"):
-        z = np.where(facing > min_facing, soup.distance[labels] / facing, np.nan)
+        z = np.where(facing > LEAST_FACING, soup.distance[labels] / facing, np.nan)
     points = z[..., None] * r
     moved = np.einsum("hwij,hwj->hwi", soup.R[labels], points) + soup.translation[labels]
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -12,6 +12,8 @@ from soup_nlp.errors import DataError
 
 Labels = NDArray[np.int32]
 
+LEAST_PIECE = 0.25
+"""Pieces smaller than this share of the mean area join a neighbour."""
 ENOUGH = 0.5
 """Share of the wanted number below which superpixels are not what was asked for."""
 
@@ -22,7 +24,6 @@ def segment(
     method: Literal["slic", "grid"] = "slic",
     compactness: float = 10.0,
     sigma: float = 0.0,
-    min_fraction: float = 0.25,
 ) -> Labels:
     """Superpixel labels of an image.
 
@@ -33,7 +34,6 @@ def segment(
         compactness: SLIC's balance of colour and distance.
         sigma: Gaussian pre-smoothing of SLIC, pixels; more where texture shatters superpixels
             so that less than half of their number are left, and a grid where that does not help.
-        min_fraction: Pieces smaller than this fraction of the mean area join a neighbour.
 
     Returns:
         (H, W) int32 labels 0..N-1, each connected (4-neighbourhood) and not empty.
@@ -54,7 +54,7 @@ def segment(
     if method == "grid" or np.ptp(image) == 0:
         # SLIC has nothing to follow on an image of one colour: its limit is the grid
         return _grid(height, width, count)
-    least = int(min_fraction * height * width / count)
+    least = int(LEAST_PIECE * height * width / count)
     from skimage.segmentation import slic
 
     # texture as fine as pixels shatters SLIC's clusters, and shards join to a few large ones
@@ -65,7 +65,7 @@ def segment(
             compactness=compactness,
             sigma=smoothing,
             start_label=0,
-            min_size_factor=min_fraction,
+            min_size_factor=LEAST_PIECE,
             max_size_factor=4,
         )
         labels = split_components(raw.astype(np.int32), least)

@@ -137,10 +137,6 @@ class PairCosts:
         self.arap_row = _rows(key, arap)
         self.cont_row = _rows(key, cont)
 
-    def bytes(self, labels: int, dtype: type | np.dtype = np.float64) -> int:
-        """Memory of the tables of so many labels; the buffers beside them are below 8 MiB."""
-        return len(self.edges) * labels * labels * np.dtype(dtype).itemsize
-
     def tables(
         self, p: Particles, unit: float = 1.0, dtype: type | np.dtype = np.float64
     ) -> NDArray[np.floating]:

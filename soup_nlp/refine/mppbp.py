@@ -193,8 +193,9 @@ class _Costs:
         return unary, self.pairs.tables(p, unit, np.float32 if o.float32 else np.float64)
 
 
-def length_slope(soup: Soup, data: EnergyData, weights: Weights, h: float = 1e-4) -> float:
+def length_slope(soup: Soup, data: EnergyData, weights: Weights) -> float:
     """`-dE / d log u`: by how much E rises when the scene's length unit shrinks, all else fixed."""
+    h = 1e-4
     up, down = (
         oracle.energy(
             soup, replace(data, edge_unit=data.edge_unit * s, pair_unit=data.pair_unit * s), weights

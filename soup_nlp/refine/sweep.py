@@ -92,7 +92,7 @@ def _voted(cost: Float, data: EnergyData) -> Float:
     return np.asarray((flat + link @ flat) / total).reshape(cost.shape)
 
 
-def common_normals(n: Float, count: int, rounds: int = 10) -> Float:
+def common_normals(n: Float, count: int) -> Float:
     """(count, 3) a plane parallel to the image and medians of clusters of unit normals (N, 3).
 
     Each cluster starts at a normal that is farther from those before than nine in ten are.
@@ -101,7 +101,7 @@ def common_normals(n: Float, count: int, rounds: int = 10) -> Float:
     for _ in range(count - 1):
         gap = 1 - (n @ centre.T).max(axis=1)
         centre = np.vstack([centre, n[np.argsort(gap, kind="stable")[int(0.9 * len(n))]]])
-    for _ in range(rounds):
+    for _ in range(10):
         own = (n @ centre.T).argmax(axis=1)
         for c in range(1, count):
             if (own == c).any():

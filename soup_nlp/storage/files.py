@@ -134,16 +134,16 @@ def read_bytes(
     return content
 
 
-def require_file(path: PathLike, what: str, *, error: type[SoupError] = DataError) -> Path:
+def require_file(path: PathLike, what: str) -> Path:
     """The path of a regular file, for readers that take a name.
 
     Raises:
-        SoupError: there is none.
+        DataError: there is none.
     """
-    path = as_path(path, what, error=error)
+    path = as_path(path, what)
     if not is_file(path):
         kind = _kind(path)
-        raise error(
+        raise DataError(
             f"{what} cannot be read" if kind else f"{what} is missing",
             where=path,
             found=kind,

@@ -13,20 +13,20 @@ from scipy import ndimage
 
 from soup_nlp.data.flow.robust import AffineFlow, fit_affine, refit_affine
 from soup_nlp.data.pair import Flow
-from soup_nlp.geometry.superpixels import Labels, split_components
+from soup_nlp.geometry.superpixels import LEAST_PIECE, Labels, split_components
 
 Ints = NDArray[np.int64]
+
+SCALE_PX = 0.25
+"""Residual, pixels, below which a fit takes every pixel for an inlier."""
+SWEEPS, REFIT = 24, 8
+"""How far a border may move, pixels, and sweeps between fits."""
 
 
 def follow_flow(
     labels: NDArray[np.integer],
     flow: Flow,
     margin_px: float = 1.0,
-    *,
-    scale_px: float = 0.25,
-    sweeps: int = 24,
-    refit: int = 8,
-    min_fraction: float = 0.25,
 ) -> Labels:
     """Move borders of superpixels, pixel by pixel, to where their affine flows meet.
 
@@ -38,26 +38,22 @@ def follow_flow(
         labels: (H, W) superpixel labels 0..N-1.
         flow: Flow with confidence.
         margin_px: Pixels of flow that a change of sides must win.
-        scale_px: Residual, pixels, below which a fit takes every pixel for an inlier.
-        sweeps: How far a border may move, pixels.
-        refit: Sweeps between fits.
-        min_fraction: Pieces smaller than this share of the mean area join a neighbour.
 
     Returns:
         (H, W) int32 labels 0..N'-1, each connected (4-neighbourhood) and not empty; N' differs
         from N where pieces were cut off or used up.
 
     Raises:
-        DataError: sizes of labels and flow differ, or the scale is not positive.
+        DataError: sizes of labels and flow differ.
     """
     current = labels.astype(np.int64)
     count = int(current.max()) + 1
-    fit, _ = fit_affine(flow, current, scale_px, rounds=5)
+    fit, _ = fit_affine(flow, current, SCALE_PX, rounds=5)
     changed = np.zeros(count, bool)
     near = np.ones(current.shape, bool)
-    for sweep in range(sweeps):
-        if changed.any() and sweep % refit == 0:
-            fit = refit_affine(fit, flow, current, changed, scale_px, rounds=5)
+    for sweep in range(SWEEPS):
+        if changed.any() and sweep % REFIT == 0:
+            fit = refit_affine(fit, flow, current, changed, SCALE_PX, rounds=5)
             changed[:], near[:] = False, True
         framed = np.pad(current, 1, mode="edge")
         sides = (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
@@ -74,7 +70,7 @@ def follow_flow(
         near[:] = False
         near[v[moved], u[moved]] = True
         near = ndimage.binary_dilation(near)
-    return split_components(current.astype(np.int32), int(min_fraction * current.size / count))
+    return split_components(current.astype(np.int32), int(LEAST_PIECE * current.size / count))
 
 
 def _nearest(

@@ -25,6 +25,8 @@ _SURE = 0.5  # confidence above which a pixel is fitted
 _LEAST = 0.03  # share of the confident pixels that a homography must explain
 _INLIER = 2.0  # pixels
 _ROUND_TRIP_CAP = 3.0  # pixels
+_WINDOW = 25  # side of the window of a score, pixels
+_MARGIN = 0.3  # by how much a flow under a homography must be better, pixels
 _GREY_CAP, _PER_GREY = 30.0, 0.05  # pixels that one grey level of difference counts for
 
 
@@ -64,9 +66,6 @@ def guided_flow(
     forward: FloatMap,
     backward: FloatMap,
     planes: int,
-    *,
-    window: int = 25,
-    margin_px: float = 0.3,
 ) -> tuple[FloatMap, FloatMap]:
     """The better, pixel by pixel, of a flow and of those found under its dominant homographies.
 
@@ -81,8 +80,6 @@ def guided_flow(
         forward: (H, W, 2) first flow.
         backward: (H', W', 2) first flow the other way.
         planes: Homographies to try.
-        window: Side of the window, pixels.
-        margin_px: The margin, pixels.
 
     Returns:
         (H, W, 2) flow and (H, W) its round-trip error, both in pixels.
@@ -90,10 +87,10 @@ def guided_flow(
     gap = round_trip_error(forward, backward)
     maps = dominant_homographies(forward, confidence_of(gap, support=5), planes) if planes else []
     best, best_gap = forward.copy(), gap
-    best_score = _score(ref, nxt, forward, gap, window)
+    best_score = _score(ref, nxt, forward, gap)
     for H in maps:
         flow, error = _under(H, ref, nxt, match)
-        score = _score(ref, nxt, flow, error, window) + margin_px
+        score = _score(ref, nxt, flow, error) + _MARGIN
         better = score < best_score
         best[better], best_gap[better] = flow[better], error[better]
         best_score = np.minimum(score, best_score)
@@ -120,7 +117,7 @@ def _under(H: Float, ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, Fl
     return flow.astype(np.float32), gap
 
 
-def _score(ref: Image, nxt: Image, flow: FloatMap, gap: FloatMap, window: int) -> FloatMap:
+def _score(ref: Image, nxt: Image, flow: FloatMap, gap: FloatMap) -> FloatMap:
     height, width = ref.shape
     v, u = np.mgrid[0:height, 0:width].astype(np.float32)
     x, y = u + flow[..., 0], v + flow[..., 1]
@@ -129,6 +126,6 @@ def _score(ref: Image, nxt: Image, flow: FloatMap, gap: FloatMap, window: int) -
     )
     grey = np.minimum(np.abs(there - ref), _GREY_CAP)
     cost = np.minimum(gap, _ROUND_TRIP_CAP) + np.float32(_PER_GREY) * grey
-    score = cv2.blur(cost.astype(np.float32), (window, window))
+    score = cv2.blur(cost.astype(np.float32), (_WINDOW, _WINDOW))
     score[~np.isfinite(gap)] = 2 * (_ROUND_TRIP_CAP + _PER_GREY * _GREY_CAP)
     return np.asarray(score, dtype=np.float32)

@@ -123,9 +123,7 @@ def _medians(which: Ints, values: Float, n: int) -> Float:
     return np.where(count > 0, values[order][np.minimum(middle, len(order) - 1)], 0.0)
 
 
-def reweighted(
-    flow: Flow, labels: NDArray[np.integer], scale_px: float = 0.5, rounds: int = 8
-) -> Flow:
+def reweighted(flow: Flow, labels: NDArray[np.integer], scale_px: float = 0.5) -> Flow:
     """The same flow with confidence lowered where it departs from its superpixel's motion.
 
     The last weights of the superpixels' affine fits multiply the confidence.
@@ -134,7 +132,6 @@ def reweighted(
         flow: Flow with confidence.
         labels: (H, W) superpixel labels 0..N-1.
         scale_px: Smallest residual, pixels, that an outlier can have.
-        rounds: Re-weighted fits.
 
     Returns:
         Flow with the same displacements; no confidence grows, and none that was positive becomes 0.
@@ -142,7 +139,7 @@ def reweighted(
     Raises:
         DataError: sizes differ, or the scale is not positive.
     """
-    _, weight = fit_affine(flow, labels, scale_px, rounds)
+    _, weight = fit_affine(flow, labels, scale_px)
     used = flow.confidence > 0
     confidence = flow.confidence.copy()
     lowered = flow.confidence[used].astype(np.float64) * weight
