@@ -18,7 +18,7 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.refine.costs import Particles
 from soup_nlp.refine.mppbp import objective, refine_soup
-from soup_nlp.refine.photometric import BEHIND, SAMPLES, TAU, UNSEEN, Photometric, look
+from soup_nlp.refine.photometric import BEHIND, SAMPLES, TAU, UNSEEN, Photometric, photometric_term
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.refine.sweep import common_normals, swept
 
@@ -65,7 +65,7 @@ class TwoPlanes:
         return Soup(np.ones(n), normal, depth, turn, np.tile([SHIFT, 0.0, 0.0], (n, 1)))
 
     def look(self, soup: Soup, **changes: float) -> Photometric:
-        photo = look(self.pair, self.labels, soup, OPTIONS.replace(**changes))
+        photo = photometric_term(self.pair, self.labels, soup, OPTIONS.replace(**changes))
         assert photo is not None
         return photo
 
@@ -156,7 +156,7 @@ def test_blocks_do_not_show(two, monkeypatch):
 
 
 def test_weight_zero_leaves_the_images_out(two):
-    assert look(two.pair, two.labels, two.truth, RefineOptions(photo=0)) is None
+    assert photometric_term(two.pair, two.labels, two.truth, RefineOptions(photo=0)) is None
 
 
 def test_sweep_finds_depths_that_the_start_does_not_have(two):

@@ -41,7 +41,7 @@ from soup_nlp.evaluate.sparsification import coverage, sparsification
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
 from soup_nlp.refine.costs import Particles
-from soup_nlp.refine.photometric import look
+from soup_nlp.refine.photometric import photometric_term
 
 Float = NDArray[np.float64]
 
@@ -133,7 +133,7 @@ def _cues(result: Run) -> dict[str, Float]:
     }
     if result.refined and result.refined.rounds:
         out["particles"] = result.refined.rounds[-1].spread[labels]
-    photo = look(pair, labels, result.soup, result.problem.refine)
+    photo = photometric_term(pair, labels, result.soup, result.problem.refine)
     if photo is not None:
         out["photo"] = photo.costs(Particles.of(result.soup), photo.unit(result.soup))[:, 0][labels]
     return out

@@ -64,8 +64,8 @@ class _Part:
 class Body:
     """Expressions of a program.
 
-    Two instances of defined nodes are one defined variable when their text is equal: the same
-    operations on the same variables, numbers and defined variables, in whatever template.
+    Two instances of defined nodes share one defined variable when their text is equal: the same
+    operations on the same variables, numbers and defined variables, in any template.
 
     Attributes:
         classes: Defined variables by use: both, constraints, objective (several), one constraint,

@@ -1,4 +1,4 @@
-"""A foreign solver's answer to an exported problem, verified and made a run."""
+"""Another solver's answer to an exported problem, verified and returned as a run."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
     nlp, layout = case.nlp(form)
     _require_same_problem(folder, manifest, fingerprint(case, nlp, layout))
     answer = read_sol(sol, *_orders(folder, nlp, layout))
-    # at an arbitrary point, values may be infinite or NaN; it is then not verified
+    # at an arbitrary point values may be infinite or NaN: such an answer is not verified
     with np.errstate(all="ignore"):
         run = foreign_run(case, form, nlp, layout, answer, source=Path(sol).name)
     best = manifest["best_known"]

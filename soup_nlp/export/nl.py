@@ -215,7 +215,7 @@ def _check(
     names: AllNames,
     lam_g0: Float | None,
 ) -> None:
-    """Refuse what no .nl file can say."""
+    """Check that a .nl file can hold the problem."""
     if lam_g0 is not None:
         require_finite("lam_g0", lam_g0, path)
     require_finite("x0", x[0], path)

@@ -107,7 +107,7 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
     lines = _Lines(as_path(path, "solution file", error=ExportError))
     message = []
     while (line := lines.next(OPTIONS)) != OPTIONS:
-        # of a program that may be anybody's
+        # the program that wrote the file is not trusted
         message.append(printable(line))
     said = [line for line in message if line]
     (count,) = lines.numbers(1, "number of options", int)

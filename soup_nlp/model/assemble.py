@@ -20,7 +20,7 @@ class Entries(NamedTuple):
 
     Attributes:
         rows, columns: (F, k) or (k,) of elements that differ.
-        which: (E,) the one of them that every element is; None where they are the elements.
+        which: (E,) number of the distinct element that every element equals; None where all differ.
     """
 
     rows: NDArray[np.integer]

@@ -116,7 +116,7 @@ def _own_folder() -> Path:
 
 
 def _ours_alone(path: Path) -> bool:
-    """Whether nobody else can write what a file or folder holds."""
+    """Whether only this user can write a file or folder."""
     if not hasattr(os, "geteuid"):
         return True
     state = path.stat()

@@ -23,7 +23,7 @@ Layout = TangentLayout | MatrixLayout
 
 
 class Norms(NamedTuple):
-    """How the norms of an element are made; equal ones make equal kernels, which are made once.
+    """How the norms of an element are made. Equal records share one kernel.
 
     Attributes:
         term: Function of `terms`.

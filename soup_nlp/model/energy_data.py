@@ -1,4 +1,4 @@
-"""The numbers that the energy is made of: sampled pixels, graphs, weights; no symbols here."""
+"""The numbers of the energy: sampled pixels, graphs, weights. No symbolic expressions."""
 
 from __future__ import annotations
 

@@ -15,12 +15,12 @@ class Weights(Section):
 
     E_prior is not in the paper. It draws depth that the flow leaves undetermined (little parallax,
     a camera at rest, a motion of few superpixels) to that of the neighbours. It is the un-squared
-    slope of the inverse depth relative to the nearer of the two, so that it pulls with a constant
-    force and does not draw a far background to what stands before it.
+    slope of the inverse depth relative to the nearer of the two, so that its gradient is bounded
+    and it does not draw a far background to the foreground.
 
     The defaults belong to `in_pixels`, where every term is measured in pixels; in the paper's
-    units (lengths with sum_i c_i D_i = 1) other values are needed. beta, w1 to w4 live in the
-    segmentation.
+    units (lengths with sum_i c_i D_i = 1) other values are needed. beta and w1 to w4 are options of
+    the segmentation.
     """
 
     arap: NonNegative = 0.15
@@ -74,7 +74,7 @@ class BendingOptions(Section):
 
     widest_eps: Positive = 0.1
     """Widest smoothing of the presolve, pixels: wider ones of solver.presolve_eps become this.
-    What shows relief is a fraction of a pixel, a wide norm flattens it."""
+    Relief shows as a fraction of a pixel of flow; a wider smoothing flattens it."""
     untruncated: bool = True
     """Switches solver.untruncated on: truncated from the start, E_arap tears surfaces that bend."""
     rotation_px: Positive = 1e-3

@@ -74,7 +74,7 @@ def contacts(
 def in_noise(data: EnergyData, noise: float) -> EnergyData:
     """The same data with E_prior measured in units of the flow's noise.
 
-    Relief that explains less of the flow than a share of its noise is not to be believed.
+    Relief that changes the flow by less than a share of its noise is not supported by the flow.
 
     Args:
         data: Data of the pair.
@@ -116,7 +116,7 @@ def across_discontinuities(
     """The same data with terms times a factor each from one surface to another.
 
     At a flow discontinuity one surface passes in front of another: their gap in depth is real, and
-    they need neither move alike nor face the same way. Ties between them flatten both reliefs.
+    they need neither move alike nor face the same way. Terms between them flatten both surfaces.
 
     Args:
         data: Data of the pair.
@@ -142,10 +142,10 @@ def in_pixels(
     A rotation by an angle a moves the image by `focal a`; a length l at depth Z by `focal l / Z`;
     a depth gap g changes the parallax of a baseline T by `focal g / Z * T / Z`. Z is the depth
     of the two anchors as they are, so that no term gains from shrinking or growing the scene: with
-    one global unit, superpixels without parallax run away to shorten all other lengths. It is
-    their power mean of exponent -4, close to the nearer one: the arithmetic mean rewards whoever
-    recedes. The ratio T / Z is a constant of the energy: its median around the superpixels at the
-    start.
+    one global unit, the depth of superpixels without parallax diverges, because that shortens all
+    other lengths. It is their power mean of exponent -4, close to the nearer one: with the
+    arithmetic mean the energy falls as one of the two recedes. The ratio T / Z is a constant of the
+    energy: its median around the superpixels at the start.
 
     Args:
         data: Data in the paper's units.

@@ -1,4 +1,4 @@
-"""A superpixel in symbols: the same five expressions whatever variables stand behind them.
+"""A superpixel in symbols: the same expressions for every choice of variables.
 
 The energy terms are written once against `View`; a parametrisation (matrix rotations in one of
 three gauges, or tangent coordinates about a base) says how its variables make one.
@@ -111,8 +111,8 @@ def tangent_view(
 
     `1 / Z(r) = (1 + s . (r - r_a) / h) / Z`, Z = lam Z0 the depth of the anchor; rotation
     `R = R0 Cayley(w)` about the anchor: `X' = R (X - Z r_a) + Z (q0 + q)`, `q0 = R0 r_a + t0`. A
-    rotation about the camera would carry the superpixel across the image and leave the way back to
-    the translation, exact to first order only. Turn and shift are counted from the base, so that
+    rotation about the camera centre would move the superpixel across the image, and the translation
+    could undo that to first order only. Turn and shift are counted from the base, so that
     differences of two superpixels are those of small numbers: of numbers near 1, rounding alone
     would hold the dual infeasibility near 1e-7, where depths differ much near 1e-6.
 

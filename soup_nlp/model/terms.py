@@ -45,7 +45,7 @@ def arap(
 
 
 def _nearness(Xa: ca.SX, Xb: ca.SX) -> ca.SX:
-    """Inverse depth of two points, mostly of the nearer: little is gained when one recedes."""
+    """Power mean of the inverse depths of two points, close to that of the nearer point."""
     a, b = 1 / (Xa[2] * Xa[2]), 1 / (Xb[2] * Xb[2])
     return ca.sqrt(ca.sqrt((a * a + b * b) / 2))
 
@@ -121,7 +121,7 @@ def prior(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
 
 
 def so3(a: View) -> ca.SX:
-    """(6x1) upper triangle of `R^T R - I`; det = 1 is left to the start (LICQ)."""
+    """(6x1) upper triangle of `R^T R - I`; det R = 1 holds at the start (a row breaks LICQ)."""
     gram = a.R.T @ a.R
     return ca.vertcat(*[gram[r, c] - (1 if r == c else 0) for c in range(3) for r in range(c + 1)])
 

@@ -97,7 +97,7 @@ class Vectors:
     def _calls(self) -> list[tuple[Callable[..., Any], Any]]:
         """Calls of numpy with their arguments: rows of the block's buffers and registers.
 
-        Translated by the first evaluation: many a Hessian is never wanted.
+        Translated at the first evaluation, because many Hessians are never evaluated.
         """
         f = self._function
         inputs = self._x, self._data, self._theta[:, None], self._lam_f[:, None], self._lam_c

@@ -151,7 +151,7 @@ def plan_levels(colour: np.ndarray, edges: np.ndarray) -> list[Level]:
 def _sides(
     near: np.ndarray, far: np.ndarray, head: np.ndarray, level: np.ndarray, place: np.ndarray
 ) -> list[Side]:
-    """One :class:`Side` a level, of the edges seen from their ``near`` node.
+    """One :class:`Side` per level, of the edges seen from their ``near`` node.
 
     Args:
         near: (E,) node on this side of every edge.

@@ -26,7 +26,7 @@ from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.pipeline.full_size import full_size
 from soup_nlp.pipeline.record import Run
 from soup_nlp.refine.mppbp import objective, refine_soup
-from soup_nlp.refine.photometric import look
+from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.refine.records import Refined
 from soup_nlp.solve.ipopt import Listener
 from soup_nlp.solve.kkt import constraint_residuals
@@ -140,7 +140,7 @@ def _refined(case: Case, soup: Soup, nlp: Callable[[Soup], Solution], **watched:
     """
     problem, photo = case.problem, None
     if not flow_is_exact(case.start):
-        photo = look(case.seen, case.segmentation.labels, soup, problem.refine)
+        photo = photometric_term(case.seen, case.segmentation.labels, soup, problem.refine)
     refined = refine_soup(
         soup,
         case.data,

@@ -1,8 +1,8 @@
 """Costs of particles: E_proj of every label, the other terms of every pair of labels, in numpy.
 
-The sum of the costs of chosen labels equals `plain.energy` of the soup that they make: it is the
-same energy, laid out for a pairwise MRF. Differences are taken component by component, not from
-inner products, so that nothing cancels where particles are nearly or exactly alike.
+The sum of the costs of chosen labels equals `oracle.energy` of the soup that they make: it is the
+same energy as a pairwise MRF. Differences are taken component by component, not from inner
+products, which avoids cancellation where particles are nearly equal.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ SHARES: Mapping[str, float] = {
 }
 """Proposals by kind in the first round, relative."""
 FEW = ("own_refit",)
-"""Kinds of which there is one proposal at most: they draw nothing."""
+"""Kinds with at most one proposal, because they are deterministic."""
 
 
 @dataclass
@@ -106,6 +106,6 @@ def relearn(shares: dict[str, float], done: Round) -> None:
     if mean > 0:
         whole = sum(SHARES[k] for k in shares) / len(shares)
         for k in shares:
-            # half of what is usual stays for every kind: what fails now may help later
+            # every kind keeps half of its usual share: it may succeed in a later round
             wanted = 0.5 * SHARES[k] + 0.5 * whole * min(rate[k] / mean, 3.0)
             shares[k] += 0.5 * (wanted - shares[k])

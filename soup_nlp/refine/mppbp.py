@@ -1,7 +1,7 @@
-"""Max-product particle belief propagation: the discrete half of the paper (Sec. 4.4.2).
+"""Max-product particle belief propagation: the discrete optimisation of the paper (Sec. 4.4.2).
 
-Every round draws particles around the current soup, lays the exact energy out over them as a
-pairwise MRF, finds a good joint choice with TRW-S, and goes on from there. The current belief is
+Every round draws particles around the current soup, writes the exact energy over them as a pairwise
+MRF, finds a labelling of low energy with TRW-S, and continues from it. The current belief is
 always particle 0 and a choice is taken only if the exact energy (`objective`) is lower: it never
 rises. Feasibility holds by construction: rotations by the exponential map, normals on the sphere,
 positive distances, visibility by an infinite cost, the simplex by the free global scale.
@@ -70,7 +70,7 @@ def refine_soup(
         data: Numbers of the energy.
         weights: Its constants.
         options: Rounds, particles, limits.
-        photo: What the images say; None leaves it to the flow.
+        photo: Photometric term; None for the flow alone.
         seed: Of every draw.
         min_facing: Visibility, as in the constrained NLP.
         depth_ratio: The same.
@@ -103,13 +103,13 @@ def refine_soup(
 def objective(
     soup: Soup, data: EnergyData, weights: Weights, photo: Photometric | None = None
 ) -> Mapping[str, float]:
-    """What the refinement lowers, by term: E; with images a weaker E_proj, and E_photo.
+    """Objective of the refinement by term: E; with images a weaker E_proj, and E_photo.
 
     Args:
         soup: State.
         data: Numbers of the energy.
         weights: Its constants, without images.
-        photo: What the images say, if anything.
+        photo: Photometric term, if there is one.
     """
     return _energy(soup, data, photo.beside(weights) if photo else weights, photo)
 
@@ -151,12 +151,12 @@ def _draw(
 
 @dataclass(frozen=True)
 class _Costs:
-    """The exact energy, laid out over particles.
+    """The exact energy over particles, as costs of a pairwise MRF.
 
     Attributes:
         data: Numbers of the energy.
         weights: Its constants, beside images if there are any.
-        photo: What the images say; None leaves it to the flow.
+        photo: Photometric term; None for the flow alone.
         options: Precision of the tables, and how far depth may go in a round.
         rays: Where visibility is imposed, see `EnergyData.visibility_ray`.
         min_facing: Least facing there.
@@ -185,7 +185,7 @@ class _Costs:
             unary += self.photo.costs(p, self.photo.unit(best))
         reached = within_reach(p, best, self.near, data.anchor_ray, o.depth_reach)
         unary[~(ahead & feasible(p, self.rays, self.min_facing) & reached)] = np.inf
-        # the current belief is always possible, whatever it violates
+        # the current belief is allowed even where it violates a constraint
         lost = ~np.isfinite(unary[:, 0])
         if lost.any():
             exact = self.weights.proj * oracle.reprojection(best, data, self.weights)
@@ -248,7 +248,7 @@ class _Rounds:
         return "time limit" if len(self.done) < o.rounds else "rounds"
 
     def _over(self) -> bool:
-        """Whether somebody or the clock ends the rounds."""
+        """Whether the stop event is set or the time limit has passed."""
         return self.watch.stop.is_set() or time.perf_counter() > self.deadline
 
     def _round(self) -> bool:
@@ -285,7 +285,7 @@ class _Rounds:
         return interrupted
 
     def _follow(self, mark: float, k: int, bound: float, energy: float, least: float) -> bool:
-        """Tell of an iteration of TRW-S; whether it shall be the last."""
+        """Report an iteration of TRW-S; whether to stop after it."""
         if self.watch.listener:
             stage, seconds = f"refine {len(self.done) + 1}", time.perf_counter() - mark
             self.watch.listener(Progress(stage, k - 1, least, 0.0, seconds))

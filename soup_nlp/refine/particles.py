@@ -1,4 +1,4 @@
-"""Proposals around a current soup: seeded mixture of walks, neighbours, re-fits, common moves.
+"""Proposals around a soup: random walks, states of neighbours, re-fits, shared motions.
 
 A particle is written about the anchor of its superpixel: depth Z there, slope g of the relative
 inverse depth (`1 / Z(r) = (1 + g . (r - r_a)) / Z`, a chart of the sphere of normals), rotation
@@ -63,7 +63,7 @@ class Proposer:
         self.target = np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def propose(self, soup: Soup, counts: dict[str, int]) -> Proposals:
-        """So many particles of every kind around a soup.
+        """A given number of particles of every kind around a soup.
 
         Args:
             soup: Current belief.
@@ -126,14 +126,13 @@ class Proposer:
         if kind == "walk_scale":
             # plane and translation together: the re-projection stays as it is
             scale = np.exp(0.02 * step * rng.standard_normal((n, count)))
-        # beyond a factor of 4 a step is not one
+        # a step changes depth by a factor of 4 at most
         Z = base.Z * np.exp(np.clip(dz, -1.4, 1.4)) * scale
         g = base.g + dg
         return Local(Z, g, R, T * scale[..., None]), step
 
-    # --- moves that all superpixels are offered alike: a component moves as one
-    # --------------------- no common scale: E of a component by its scale is flat, and lower where
-    # its depth is wrong
+    # --- motions that are proposed to all superpixels, so that a component can move as one ------
+    # (no common scale: E hardly depends on the scale of a component, and is lower at wrong depths)
 
     def _common_motion(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, Float]:
         """Motions that many share, fitted again to the flow of their superpixels' present planes.
@@ -259,7 +258,7 @@ class Proposer:
         return R[kept], T[kept], error[:, kept]
 
     def _mean(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, None]:
-        """Means of a few neighbours, the own state among them: what the smooth terms ask for."""
+        """Means of a few neighbours and the own state, which the smoothness terms favour."""
         parts = []
         for c in range(count):
             who = self._some(3 + 2 * (c % 3))
@@ -300,11 +299,11 @@ class Proposer:
             rounds=3,
         )
         mu = fit.inverse_depth
-        # the depth is known to a pixel of parallax: at least half a pixel of it is asked for
+        # depth is known to about a pixel of parallax; half a pixel is required
         known = (mu > 1e-9) & (fit.parallax * mu > 0.5) & (length > 1e-12)
         own = now.repeated(count)
         Z = np.where(known, length / np.where(known, mu, 1.0), own.Z)
-        # a factor of 20 away from the present depth is no proposal
+        # depths beyond 20 times the present one, or below a twentieth, are not proposed
         sane = known & (Z < 20 * own.Z) & (Z > own.Z / 20)
         Z = np.where(sane, Z, own.Z)
         g = own.g

@@ -66,7 +66,7 @@ class Photometric:
     sigma_proj: float
 
     def beside(self, weights: Weights) -> Weights:
-        """The weights of the other terms: where images speak as well, the flow has less to say."""
+        """The weights of the other terms beside E_photo: E_proj is weaker and truncated."""
         sigma = min(weights.sigma_proj, self.sigma_proj)
         return weights.replace(proj=self.proj * weights.proj, sigma_proj=sigma)
 
@@ -117,8 +117,10 @@ class Photometric:
         return u, v, seen
 
 
-def look(pair: Pair, labels: NDArray[np.int32], soup: Soup, o: RefineOptions) -> Photometric | None:
-    """What the images say beside the flow; None where they are left out.
+def photometric_term(
+    pair: Pair, labels: NDArray[np.int32], soup: Soup, o: RefineOptions
+) -> Photometric | None:
+    """The photometric term of a pair; None where its factor is 0.
 
     The samples are spread evenly over every superpixel, in the order of rows.
 

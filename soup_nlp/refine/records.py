@@ -1,4 +1,4 @@
-"""What a refinement is told, and what it says of its rounds."""
+"""Options of the refinement, and the records of its rounds."""
 
 from __future__ import annotations
 
@@ -68,10 +68,10 @@ class RefineOptions(Section):
 
 @dataclass(frozen=True)
 class Round:
-    """One round as it went.
+    """Record of one round.
 
     Attributes:
-        energy: What is lowered (`mppbp.objective`), by term, afterwards.
+        energy: Objective (`mppbp.objective`) by term after the round.
         mrf_energy: Energy of the chosen labels in the MRF.
         bound: TRW-S's lower bound on every choice among these particles.
         iterations: Of TRW-S.
@@ -116,11 +116,11 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """What the refinement ended with.
+    """Result of the refinement.
 
     Attributes:
         soup: Best soup.
-        energy_begin: What was lowered (`mppbp.objective`), by term, before.
+        energy_begin: Objective (`mppbp.objective`) by term before the first round.
         energy: The same of `soup`.
         rounds: Every round.
         status: "rounds" (all of them), "stagnated", "interrupted" or "time limit".

@@ -98,12 +98,11 @@ def spread_of(p: Particles, min_marginals: Float, anchor_ray: Float) -> Float:
 def within_reach(
     p: Particles, soup: Soup, near: Int, anchor_ray: Float, reach: float
 ) -> NDArray[np.bool_]:
-    """(N, L) whether the depth of a particle is one that its surroundings suggest.
+    """(N, L) whether the depth of a particle is within reach of its neighbours' depths.
 
-    Lengths are measured in the depth of their anchors, so a superpixel that runs away to a
-    thousand times the depth of all around it costs next to nothing for its motion. No particle
-    may begin that; the current belief is always allowed, and so is whatever is nearer to the
-    surroundings than it.
+    Lengths are measured in the depth of their anchors, so a superpixel at a thousand times the
+    depth of its neighbours pays hardly anything for its motion. Such depths are not allowed,
+    except the current belief and depths between it and those of the neighbours.
 
     Args:
         p: (N, L) particles.

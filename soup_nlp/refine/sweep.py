@@ -1,8 +1,8 @@
-"""Planes swept over depth under the commonest motions: proposals that the flow cannot make.
+"""Plane sweep over depth under the most common motions: proposals that do not depend on the flow.
 
 Every superpixel is tried at evenly spaced steps along its epipolar line, under each of a few
-motions and orientations, and the images alone say where it fits. Neighbours of like colour vote
-with it: a small patch is ambiguous.
+motions and orientations, and scored by the images alone. Costs are averaged with neighbours of
+similar colour, because a small patch is ambiguous.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def swept(
         R: (M, 3, 3) rotations of the motions tried.
         T: (M, 3) translations.
         data: Anchors and neighbours.
-        photo: What the images say.
+        photo: Photometric term.
         keep: Particles wanted.
     """
     n, ray = len(soup), data.anchor_ray
@@ -52,7 +52,7 @@ def swept(
     normals = [np.broadcast_to(c, (n, 3)) for c in common_normals(soup.n, NORMALS)] + [soup.n]
     tried, cost, unit = [], [], photo.unit(soup)
     for turn, shift in zip(R, T, strict=True):
-        # a camera that passes the nearest thing has no end of the line
+        # the nearest depth may lie behind a camera that moves forward: the line has no end then
         last = most / max(1 + most * shift[2], 0.2)
         s = (np.arange(LEVELS) + 0.5) / LEVELS * last
         mu = s * (ray @ turn.T)[:, 2:] / np.maximum(1 - s * shift[2], 1e-6)

@@ -51,7 +51,7 @@ class Continuation:
         weights: Constants of the energy.
         form: Visibility, and whether kernels are compiled.
         o: Widths, limits and stagnation, those of the presolve.
-        watch: Who follows.
+        watch: Listeners, stop event and log.
         deadline: `time.perf_counter` at which they end.
         rim: (N, V) multipliers of rim visibility as in `Descent.rim`, after the exact Hessian.
         stages: Those that have ended.

@@ -50,9 +50,9 @@ DAMPING = (1e-7, 1e6)
 HELD = 1e-3
 """Least damping of a superpixel whose step went too far."""
 FRESH: Mapping[HessianKind, float] = {"gauss-newton": 1e-2, "exact": 1e-4}
-"""Most damping with which a phase begins, and to which it returns where it hardly descends."""
+"""Largest damping at the begin of a phase, and after PATIENCE iterations of slow descent."""
 SLOW, PATIENCE = 1e-6, 10
-"""Relative decrease of an iteration that is hardly any, and iterations between two such returns."""
+"""Relative decrease below which descent is slow, and iterations between two such resets."""
 
 
 class Descent:
@@ -68,7 +68,7 @@ class Descent:
         deadline: float = np.inf,
         watch: Watch | None = None,
     ) -> None:
-        """Prepare; nothing is solved.
+        """Set up; nothing is solved.
 
         Args:
             problem: Energy and slacks.
@@ -132,7 +132,7 @@ class Descent:
             self._adapt(move)
             history[-1] = (*history[-1][:4], float(move.length.min()))
             if move.point is None:
-                # the majorant's steps descend, and steps with a factor of its own
+                # steps of the majorant, and of a new factor, are descent directions
                 newton.refuse(step)
                 continue
             newton.accept(step)
@@ -140,8 +140,8 @@ class Descent:
             small = small + 1 if fell <= phase.stagnation * abs(at.f) else 0
             slow = fell <= max(phase.stagnation, SLOW) * abs(at.f)
             if phase.hessian == "exact" and fell < SLOW * abs(at.f) and iteration >= patient:
-                # held back so far, a superpixel's own step is too short for its slope to tell
-                # anything but what its neighbours do, and its damping never falls
+                # a superpixel with large damping moves too little for its own slope to show, and
+                # its damping would never fall
                 self.damping = np.minimum(self.damping, FRESH["exact"])
                 patient = iteration + PATIENCE
             self._step_multipliers(at, step.h, barrier, move.point)
@@ -149,7 +149,7 @@ class Descent:
             gradient = search.gradient(at.x)
         if convergence.reached:
             status = "Solve_Succeeded"
-            # the last step may have been one too many
+            # the last step may have made the residual larger
             at, self.z, history[-1] = convergence.reached
             self.x = at.x
             nu, _ = self._dual(problem.gradient(at.x), at.jacobian)
@@ -211,7 +211,7 @@ class Descent:
         if self.watch.listener:
             self.watch.listener(Progress(phase.name, iteration, row[0], 0.0, now))
         if self.watch.log_file:
-            # a full disk takes the log, not the solve
+            # a full disk must not end the solve
             with suppress(OSError), open(self.watch.log_file, "a") as log:
                 if not iteration:
                     log.write(f"\n{phase.name}: {phase.hessian} Hessian, {self.newton.library}\n")

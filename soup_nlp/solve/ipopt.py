@@ -1,4 +1,4 @@
-"""Ipopt on an `NLP`: options, progress, interruption, and the best iterate whatever happens."""
+"""Ipopt on an `NLP`: options, progress, interruption, and the best iterate in every case."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ Listener = Callable[[Progress], None]
 
 @dataclass(frozen=True)
 class Watch:
-    """Who follows a solve, and how it is stopped.
+    """Listeners of a solve, and the event that stops it.
 
     Attributes:
         listener: Called at every iteration.
@@ -97,7 +97,7 @@ class Stage:
     Attributes:
         name: Stage.
         status: Ipopt's return status, or "Interrupted", "Time_Limit", "Stagnated".
-        converged: Ipopt's own claim.
+        converged: Whether the solver reports success.
         x: Best iterate: the last one when converged, else the lowest f + penalty.
         lam_x: Multipliers of the bounds at x.
         lam_g: Multipliers of the constraints at x.
@@ -168,7 +168,7 @@ class _Iterations(IterationCallback):
         g = np.asarray(arg[2]).ravel()
         outside = np.maximum(nlp.lbg - g, g - nlp.ubg)
         infeasible = float(max(outside.max(initial=0.0), 0.0))
-        # an exact penalty: a small violation is repaired by retraction, a large one is not
+        # an exact penalty: retraction repairs a small violation, not a large one
         rank = f + 10.0 * infeasible * max(1.0, abs(f))
         if np.isfinite(f) and rank < self.best:
             self.best, self.best_x, self.best_f = rank, x, f
@@ -189,7 +189,7 @@ class _Iterations(IterationCallback):
         return int(bool(self.reason))
 
     def ended(self, stats: Mapping[str, Any], out: Mapping[str, Float]) -> Stage:
-        """The record of the call: Ipopt's answer, or the best iterate where it has none.
+        """The record of the call: Ipopt's answer, or the best iterate where it did not converge.
 
         Args:
             stats: Of CasADi's solver.

@@ -24,7 +24,7 @@ LIMITS = {
 }
 """Largest violation that a delivered soup may have, by kind of constraint."""
 UNMET = "Constraints_Violated"
-"""Status of a solve whose answer does not satisfy its constraints, whatever the solver says."""
+"""Status of a solve whose answer violates its constraints, whatever status the solver reports."""
 
 
 def feasible(soup: Soup, rim_ray: Float, min_facing: float) -> bool:
@@ -78,7 +78,7 @@ def optimality(nlp: NLP, x: Float, lam_x: Float, lam_g: Float) -> dict[str, floa
         for gap, mult in ((value - lower, -lam), (upper - value, lam)):
             use = open_ & np.isfinite(gap) & (mult > 0)
             products.append(float(np.abs(gap[use] * mult[use]).max(initial=0.0)))
-            # a force from a bound that is not there balances nothing
+            # the multiplier of an infinite bound does not count
             absent = mult[~np.isfinite(gap) & (mult > 0)]
             products.append(float(absent.max(initial=0.0)))
     return {

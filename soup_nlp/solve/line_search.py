@@ -21,7 +21,7 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 TO_BOUNDARY = 0.99
-"""Share of the way to where a slack vanishes that a step may go."""
+"""Fraction-to-the-boundary rule: share of the step to a vanishing slack that is taken."""
 LEAST_SLACK = 1e-3
 """A slack keeps at least this share of itself."""
 TRIES = 4
@@ -208,7 +208,7 @@ class Search:
         length = np.minimum(1.0, TO_BOUNDARY * reach(at.slack, along(at.jacobian, h)))
         before = own(h, gradient)
         scale = np.abs(own(h, bent)) + np.abs(before) + 1e-5 * abs(at.f) / len(length)
-        # where a step promises next to nothing, energies are equal but for rounding
+        # where the predicted decrease is tiny, energies are equal up to rounding
         promised = -0.5 * float(gradient @ h)
         rounding = (1e-10 if promised < 1e-9 * abs(at.f) else 1e-12) * abs(at.merit)
         far, whole, least = np.zeros(len(length), bool), length, 1.0

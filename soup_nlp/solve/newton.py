@@ -20,8 +20,8 @@ Float = NDArray[np.float64]
 BLENDS = (0.0, 0.1, 0.3, 1.0)
 """Shares of the majorant in the exact Hessian, tried until the step is a descent direction."""
 REUSE = 4000
-"""Superpixels from which a factor serves several iterations, and parts of them move apart: below, a
-factorisation costs little."""
+"""Least number of superpixels for which a factor serves several iterations and a part of them may
+move alone; with fewer, a factorisation costs little."""
 INEXACT: Mapping[HessianKind, float] = {"gauss-newton": 0.2, "exact": 0.03}
 """Accuracy of steps with an earlier factor; at 0.3 the majorant stagnates early (N = 8,000)."""
 
@@ -68,11 +68,11 @@ class Newton:
         self.begin()
 
     def begin(self) -> None:
-        """A phase begins: no factor of an earlier one, and no part of the superpixels."""
+        """Begin a phase: forget earlier factors, and move all superpixels."""
         count = self.problem.layout.count
         self._last: Back | None = None
         self._part = Part(self.problem.upper) if count >= REUSE else None
-        # of steps of all and of parts; on a large pair four trials are not worth their factors
+        # by `_parted`; on a large pair one trial costs too much to begin without the majorant
         self._blend = {False: BLENDS[2] if self._part else 0.0, True: 0.0}
 
     @property

@@ -36,7 +36,7 @@ class Part:
     factorise: Factorise
 
     def __init__(self, upper: sparse.csc_matrix) -> None:
-        """Nothing is chosen.
+        """Set up; all superpixels move.
 
         Args:
             upper: (9 N, 9 N) pattern of the upper triangle, its values number the nonzeros.
@@ -47,7 +47,7 @@ class Part:
         self._neighbours: sparse.csr_matrix | None = None
 
     def choose(self, residual: Float, slow: bool) -> None:
-        """Go on with a part while that pays; after it move all once.
+        """Keep moving a part while its residual dominates; then move all superpixels once.
 
         Args:
             residual: (N,) largest component of the Lagrangian's gradient by superpixel.

@@ -98,7 +98,7 @@ class Reached(NamedTuple):
     row: tuple[float, ...]
 
     def done(self, phase: Phase) -> bool:
-        """Whether another step gains nothing: the gap is the barrier's own."""
+        """Whether another step gains nothing: the gap is that of the barrier problem's solution."""
         _, dual, gap, *_ = self.row
         return dual <= FAR_BELOW * phase.tol and gap <= 1.01 * phase.barrier
 

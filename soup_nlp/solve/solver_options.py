@@ -19,7 +19,7 @@ class SolverOptions(Section):
     """
 
     presolve: bool = True
-    """Run the tangent presolve; off, Ipopt goes the whole way alone, see `continuation`."""
+    """Run the tangent presolve; off, Ipopt alone solves the problem, see `continuation`."""
     continuation: bool = True
     """Without the presolve: Ipopt narrows the smoothing by `presolve_eps` with the majorant Hessian
     before it takes the exact one, in the presolve's coordinates; off, it starts with the

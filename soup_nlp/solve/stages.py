@@ -40,14 +40,14 @@ STOPPED = ("Interrupted", "Time_Limit")
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What the constrained NLP ended with.
+    """Result of a solve.
 
     Attributes:
         soup: Solution: Ipopt's answer (best iterate when not converged), or the presolve's or the
             start where that has the lower exact energy, with rounding-size constraint violations
             retracted.
         status: Ipopt's status of the constrained NLP, or why it was stopped.
-        converged: Its claim.
+        converged: Whether Ipopt reports success and the constraints hold.
         stages: Phases of the presolve, then Ipopt's of the constrained NLP.
         energy_start: Exact energy by term of the start.
         energy: Exact energy by term of the solution.
@@ -85,7 +85,7 @@ class Solution:
         """Who found the minimum: "presolve", "Ipopt", or "nobody" where none was reached."""
         if not self.converged:
             return "nobody"
-        # Ipopt only confirms a point that it does not move
+        # without an iteration Ipopt has confirmed the presolve's point
         descent = any(s.name.startswith("presolve") for s in self.stages)
         return "presolve" if descent and not self.stages[-1].iterations else "Ipopt"
 
@@ -148,7 +148,7 @@ class _Laps:
 
 
 def _near(stage: Stage) -> bool:
-    """Whether the presolve has come so near that its multipliers are worth starting from."""
+    """Whether the presolve ended so near a minimum that Ipopt should start from its multipliers."""
     # Ipopt that fails at its first point has no history
     dual = stage.history.get("inf_du", np.array([np.inf]))
     return stage.converged or bool(dual[-1] < 1.0)
@@ -163,7 +163,7 @@ def _far(stages: Sequence[Stage]) -> bool:
 
 @dataclass(frozen=True)
 class _Solve:
-    """One solve: what its stages share, and the stages that have ended."""
+    """State of one solve: its inputs and the stages that have ended."""
 
     start: Soup
     data: EnergyData
@@ -175,7 +175,7 @@ class _Solve:
     laps: _Laps = field(default_factory=_Laps)
 
     def run(self) -> Solution:
-        """All stages, and the best of their ends."""
+        """Run all stages; the result is the best of their final points."""
         compiling, (presolved, rim) = compiler_seconds(), self.presolve()
         near, far = bool(self.stages) and _near(self.stages[-1]), _far(self.stages)
         # far from its minimum the presolve may have raised the exact energy
@@ -196,7 +196,7 @@ class _Solve:
         held = self.held(ends)
         delivered = min(held, key=lambda k: self.energy(held[k]))
         final = held[delivered]
-        # the solver's word is not taken for it
+        # a reported success counts only where the constraints hold
         broken = stage.converged and "constrained NLP" not in held
         return Solution(
             soup=final,
@@ -311,7 +311,7 @@ class _Solve:
         return stage
 
     def held(self, ends: Mapping[str, Soup]) -> dict[str, Soup]:
-        """Those that keep their constraints; else the start, tilted until it does."""
+        """Soups that satisfy the constraints; if none does, the start with tilted planes."""
         data, facing = self.data, self.form.min_facing
         held = {k: s for k, s in ends.items() if feasible(s, data.rim_ray, facing)}
         if held:

@@ -62,7 +62,7 @@ def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, 
     A = J[equal]
     gram = (A @ A.T).tocsc()
     solve = splu(gram + 1e-12 * sparse.identity(len(equal), format="csc")).solve
-    # the squared system loses half the digits: refined until stationarity has them all
+    # normal equations lose half the digits: refined until stationarity has full accuracy
     for _ in range(3):
         lam_g[equal] -= solve(A @ (force + A.T @ lam_g[equal]))
     return {"lam_x0": np.zeros(nlp.nx), "lam_g0": lam_g}
