@@ -59,7 +59,7 @@ def _cpu() -> str:
 def compile_functions(
     functions: Sequence[ca.Function], compiler: str | None = None
 ) -> Mapping[str, ca.Function]:
-    """Compiled twins of CasADi functions; the functions themselves where that is impossible.
+    """Compiled versions of CasADi functions; the functions themselves where that is impossible.
 
     Args:
         functions: SX functions with distinct names.

@@ -1,4 +1,4 @@
-"""Kernel and table: the pattern that carries every nonlinear program of this package.
+"""Kernel and table, of which every nonlinear program of this package is made.
 
 A kernel is the symbolic objective and constraints of ONE element; a table says, for every element,
 which variables it reads, which rows of g it adds to, and its data. Nothing here knows the soup.

@@ -157,7 +157,7 @@ def compile_lanes(functions: Sequence[ca.Function]) -> ctypes.CDLL:
     """Machine code of functions with distinct names, cached by content.
 
     Raises:
-        NoLanesError: There is no compiler, it fails, or a function has an operation without a twin.
+        NoLanesError: There is no compiler, it fails, or an operation has no C code here.
     """
     # what the source depends on, in a tenth of the time that writing it takes
     translation = Path(__file__).read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Where every number of the soup lives in the solver's vector: packing, unpacking, names."""
+"""Positions of the soup's variables in the solver's vector: packing, unpacking, names."""
 
 from __future__ import annotations
 
@@ -110,12 +110,11 @@ class MatrixLayout:
 
 @dataclass(frozen=True)
 class TangentLayout:
-    """Variables of the presolve about a base soup: `lam s w q` per superpixel (`views`).
+    """Variables of the presolve about a base soup: `lam s w q` per superpixel (`tangent_view`).
 
     Chart "inverse-depth" has `rho = 1 / lam` and `rho s` in the place of scale and slopes: the
     inverse-depth plane itself. Superpixels on one plane stay on one plane along a straight line, so
-    that steps are not bent out of valleys of equal continuity. In "depth" the length unit is
-    linear.
+    that E_cont does not limit steps that move them together. In "depth" the length unit is linear.
 
     Attributes:
         anchor: (N, 3) anchor rays.
@@ -195,5 +194,5 @@ class TangentLayout:
 
 
 def _turned(a: Float) -> Float:
-    """(N, 9) variables of the other chart; twice is the same again."""
+    """(N, 9) variables of the other chart; the map is its own inverse."""
     return np.column_stack([1 / a[:, 0], a[:, 1:3] / a[:, :1], a[:, 3:]])

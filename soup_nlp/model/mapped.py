@@ -1,6 +1,6 @@
 """Kernels in CasADi's virtual machine, summed over their table.
 
-They replace `vectors` where a kernel has an operation that numpy has no twin of there.
+They replace `vectors` where a kernel has an operation that `vectors` does not know.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The constrained NLP, which is the product: matrix rotations, unit normals, visibility."""
+"""The constrained NLP: matrix rotations, unit normals, visibility."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def build_matrix_nlp(
 
 
 def _add_constraints(b: Builder, layout: MatrixLayout, data: EnergyData, form: Formulation) -> None:
-    """SO(3), unit normals, visibility, simplex, and what the gauge asks for."""
+    """SO(3), unit normals, visibility, simplex, and the rows that fix the gauge."""
     n, own = layout.count, layout.stride
     every = layout.of(np.arange(n))
     x = ca.SX.sym("x", own)
