@@ -15,6 +15,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "soup_nlp"
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
+PICTURE = re.compile(r"!\[[^\]]*\]\(([^)\s]+)\)")
 NAME = re.compile(r"`([A-Za-z_][\w.]*)`")
 
 
@@ -36,10 +37,12 @@ def on_files(files: Files, config: Any) -> Files:
     readme = re.sub(r"\]\(docs/", "](", readme).replace("](results/", "](../results/")
     readme = readme.replace("](CITATION.cff)", "](../CITATION.cff)")
     readme = readme.replace("](CONTRIBUTING.md)", "](../CONTRIBUTING.md)")
-    readme = readme.replace("](../results/motorcycle.png)", "](motorcycle.png)")
+    for link in PICTURE.findall(readme):
+        picture = Path(link).name
+        readme = readme.replace(f"]({link})", f"]({picture})")
+        source = str(ROOT / "docs" / link)
+        files.append(File.generated(config, picture, abs_src_path=source))
     files.append(File.generated(config, "index.md", content=readme))
-    picture = str(ROOT / "results/motorcycle.png")
-    files.append(File.generated(config, "motorcycle.png", abs_src_path=picture))
     for room in rooms():
         text = f"::: soup_nlp.{room}\n"
         files.append(File.generated(config, f"reference/{room}.md", content=text))

@@ -11,9 +11,10 @@
 # %% [markdown]
 # # From the .nl file to another solver to depth
 #
-# The constrained NLP is a file that any AMPL solver reads. Here it is solved from that file
-# alone: by POUNCE if it is installed, else by CasADi's reader of .nl files and its Ipopt. The
-# answer, a .sol file, becomes a result folder with depth maps.
+# `soup-nlp export` writes the constrained NLP to a file that any AMPL solver can read. This
+# notebook solves the NLP from that file alone. It uses POUNCE if it is installed; otherwise CasADi
+# reads the .nl file and its Ipopt solves it. The answer is a .sol file, and `soup-nlp import` turns
+# it into a result folder with depth maps.
 
 # %%
 import shutil
@@ -32,8 +33,9 @@ folder = Path(tempfile.mkdtemp())
 # %% [markdown]
 # ## Export
 #
-# The same as `soup-nlp export orbit.yaml -o orbit`. The file's start is the presolve's answer, as
-# for Ipopt in `soup-nlp solve`; with `--no-presolve` it is the proposal.
+# This cell does the same as `soup-nlp export orbit.yaml -o orbit`. The starting point in the
+# file is the presolve's answer, as for Ipopt in `soup-nlp solve`. With `--no-presolve` it is the
+# initialisation.
 
 # %%
 (folder / "orbit.yaml").write_text(
@@ -52,8 +54,8 @@ print(sorted(path.name for path in exported.iterdir()))
 # %% [markdown]
 # ## Solve with another solver
 #
-# Any program of the AMPL convention leaves `soup.sol` beside `soup.nl`. Options say that the
-# start is good.
+# A program that follows the AMPL convention writes `soup.sol` next to `soup.nl`. The options tell
+# the interior-point solver that the starting point is already close to the solution.
 
 # %%
 options = {"mu_init": 1e-5, "bound_push": 1e-6, "bound_frac": 1e-6, "nlp_scaling_method": "none"}
@@ -83,7 +85,7 @@ def solve_by_casadi() -> None:
         x0=builder.x_init, lbx=builder.x_lb, ubx=builder.x_ub, lbg=builder.g_lb, ubg=builder.g_ub
     )
     status = solver.stats()["return_status"]
-    # x and g are in the order of the file already; AMPL's multipliers have the other sign
+    # x and g are already in the order of the file; AMPL's multipliers have the opposite sign
     duals, values = -np.asarray(answer["lam_g"]).ravel(), np.asarray(answer["x"]).ravel()
     sizes = [len(duals), len(duals), len(values), len(values)]
     lines = [f"Ipopt on the imported file: {status}", "", "Options", 3, 0, 1, 0, *sizes]
@@ -101,8 +103,8 @@ print((exported / "soup.sol").read_text().splitlines()[0])
 # %% [markdown]
 # ## Check and import
 #
-# `check` names the residuals by kind and the worst superpixels. `import` recomputes energy and
-# residuals from the point and writes the folder that `soup-nlp solve` writes.
+# `check` lists the residuals by kind and the superpixels with the largest ones. `import` recomputes
+# energy and residuals from the point and writes the same folder as `soup-nlp solve`.
 
 # %%
 assert main(["check", str(exported / "soup.sol")]) == 0

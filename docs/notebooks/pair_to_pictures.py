@@ -11,9 +11,10 @@
 # %% [markdown]
 # # From a pair of frames to pictures
 #
-# Two images, two cameras and a flow become a soup of planes with rigid motions, and from it depth
-# maps of both frames. `jupytext --to ipynb docs/notebooks/pair_to_pictures.py` makes a notebook
-# of this file; it also runs as a plain script.
+# This notebook computes a soup of planes with rigid motions from two images, two cameras and a
+# flow, and then depth maps of both frames.
+# `jupytext --to ipynb docs/notebooks/pair_to_pictures.py` converts this file to a notebook; it also
+# runs as a plain script.
 
 # %%
 import matplotlib.pyplot as plt
@@ -24,8 +25,9 @@ import soup_nlp
 # %% [markdown]
 # ## A pair
 #
-# A small rendered street on which two cars move, with its exact flow. Your own pair
-# is a `Pair(image_ref, image_next, K_ref, K_next)`; without a flow OpenCV DIS computes one.
+# The example is a small rendered street on which two cars move, with its exact flow. For your own
+# images, create a `Pair(image_ref, image_next, K_ref, K_next)`; if it has no flow, OpenCV DIS
+# computes one.
 
 # %%
 settings = {
@@ -39,8 +41,8 @@ problem = soup_nlp.make_problem(settings)
 # %% [markdown]
 # ## Solve
 #
-# Superpixels and graphs, the initialisation, the presolve, the constrained NLP in Ipopt and the
-# refinement, one after the other.
+# `soup_nlp.run` builds superpixels and graphs, computes the initialisation, and then runs the
+# presolve, Ipopt on the constrained NLP, and the refinement.
 
 # %%
 run = soup_nlp.run(problem, log=print)
@@ -54,8 +56,8 @@ print("residuals:", {kind: f"{value:.1e}" for kind, value in run.residuals.items
 # %% [markdown]
 # ## The soup
 #
-# The state that every stage takes and returns: scale, normal, offset, rotation and translation of
-# every superpixel.
+# The soup is the state that every stage takes and returns. It holds the scale, normal, offset,
+# rotation and translation of every superpixel.
 
 # %%
 soup = run.soup
@@ -66,8 +68,8 @@ print("energy by term:", {term: round(value, 3) for term, value in run.energy.it
 # %% [markdown]
 # ## Pictures
 #
-# Depth is in the soup's own unit. `run.metrics` compares it with the truth after one median
-# scale.
+# Depth is in the unit of the soup. `run.metrics` compares it with the true depth after scaling by
+# the median ratio.
 
 # %%
 score = run.metrics["solution"]
