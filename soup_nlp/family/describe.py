@@ -1,4 +1,4 @@
-"""Properties of an instance that problem sets list: sizes, classes, rank of the Jacobian, LICQ."""
+"""Properties of an instance for the index: sizes, classes, rank of the Jacobian, LICQ."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Float = NDArray[np.float64]
 
 CLASSES = {0: "constant", 1: "linear", 2: "quadratic", 3: "general"}
 LETTERS = {0: "C", 1: "L", 2: "Q", 3: "O"}
-"""CUTEst's letter of each class of an objective; rows have no C, a constant is linear."""
+"""CUTEst letter of each class of an objective; constant rows count as linear."""
 RANK = 1e-8
-"""Singular values below this times the largest count as 0."""
+"""Singular values below this share of the largest count as 0."""
 
 
 def degree(value: ca.SX, x: ca.SX) -> int:
@@ -36,7 +36,7 @@ def degree(value: ca.SX, x: ca.SX) -> int:
 
 
 def classes(nlp: NLP) -> dict[str, Any]:
-    """Class of the objective; class, kind and number of the rows of every kind of constraint."""
+    """Class of the objective, and class, kind and number of rows of every kind of constraint."""
     objective, rows = 0, {}
     for group in nlp.groups:
         kernel = group.kernel
@@ -54,10 +54,10 @@ def classes(nlp: NLP) -> dict[str, Any]:
 
 
 def classification(nlp: NLP, found: dict[str, Any]) -> str:
-    """CUTEst's string, such as OQR2-MN-1808-1809.
+    """CUTEst classification such as OQR2-MN-1808-1809.
 
-    Objective, constraints, R for twice differentiable, 2 for second derivatives; M for a modelling
-    exercise; Y where slack variables of the formulation are variables; n and m.
+    It has letters for the objective and the constraints, R for twice differentiable, 2 for second
+    derivatives, M for a modelling exercise, Y if there are slack variables, n and m.
     """
     place = {word: number for number, word in CLASSES.items()}
     rows = max(place[c["class"]] for c in found["constraint_classes"].values())
@@ -69,8 +69,8 @@ def classification(nlp: NLP, found: dict[str, Any]) -> str:
 def rank(matrix: sparse.csr_matrix) -> int:
     """Rank of a sparse matrix whose rows share few columns.
 
-    A row with a column of its own is independent of all others; what is left falls into blocks,
-    each of which has its singular values.
+    A row with a column of its own is independent of all others and is removed. The rest is split
+    into independent blocks, whose singular values are computed.
     """
     left = sparse.csr_matrix(matrix)
     left.eliminate_zeros()
@@ -100,12 +100,7 @@ def rank(matrix: sparse.csr_matrix) -> int:
 
 
 def qualification(nlp: NLP, x: Float) -> dict[str, Any]:
-    """Rank of the Jacobian of all rows and of the active ones, and whether LICQ holds at a point.
-
-    Args:
-        nlp: The problem.
-        x: (nx,) a feasible point.
-    """
+    """Rank of the Jacobian and of its active rows, and LICQ, at a feasible point x (nx,)."""
     g, jacobian = nlp.jac_g(x, nlp.p)
     J = sparse.csr_matrix(to_scipy(jacobian))
     g = np.asarray(g).ravel()
@@ -113,7 +108,7 @@ def qualification(nlp: NLP, x: Float) -> dict[str, Any]:
     for bound in (nlp.lbg, nlp.ubg):
         near = np.isfinite(bound)
         active[near] |= np.abs(g - bound)[near] <= ACTIVE * (1 + np.abs(bound[near]))
-    # a variable on its bound has no direction left
+    # variables on their bounds cannot move
     off = (x - nlp.lbx > ACTIVE) & (nlp.ubx - x > ACTIVE)
     own = rank(J[active][:, off])
     return {
@@ -131,8 +126,5 @@ def sizes(nlp: NLP, file: NLFile) -> dict[str, Any]:
     return {
         **nlp.sizes(),
         "bounded_variables": int(finite.sum()),
-        "gradient_nonzeros": file.gradient_nonzeros,
-        "nonlinear_rows": file.nonlinear_rows,
-        "nonlinear_variables": dict(zip(("rows", "objective", "both"), file.nonlinear)),
-        "defined_variables": sum(file.defined),
+        **file.counts(),
     }

@@ -1,4 +1,4 @@
-"""Records of the family in the package: superpixels, start and best known point of each problem."""
+"""Records of the family in the package: superpixels, start and best known point by problem."""
 
 from __future__ import annotations
 
@@ -27,17 +27,20 @@ Int = NDArray[np.int64]
 class Frozen:
     """Record of one scene and size.
 
-    Soups are stored as (N, 10): plane distance, normal, vector part of the rotation's quaternion,
-    translation. They are decoded by sums, products, quotients and square roots of single numbers,
-    which IEEE 754 makes equal on every processor.
+    Soups are stored as (N, 10): plane distance, normal, vector part of the quaternion of the
+    rotation, translation. Decoding uses only sums, products, quotients and square roots, which by
+    IEEE 754 have the same results on every processor.
 
     Attributes:
-        text: The whole problem file, so that a changed default of the package changes nothing.
+        text: The whole problem file, so that it does not depend on the defaults of the package.
         labels: (H, W) int32 superpixels.
-        component: (N,) rigid component that the proposal gave every superpixel.
+        component: (N,) rigid component of every superpixel in the proposal.
         surface: (N,) surface, see `Start`.
         error: (N,) mean re-projection error of the proposal, pixels.
-        bending: Whether surfaces are taken to bend.
+        bending: Whether surfaces are treated as bending.
+        pair_weight: (P,) colour weight w4 of every pair of neighbours. It is stored, since a few
+            pixels of the rendered image lie between two grey levels, and the processor's rounding
+            decides which one they take.
         proposal: (N, 10) the proposal.
         minimum: (N, 10) the best known point of the smooth truncation.
     """
@@ -48,6 +51,7 @@ class Frozen:
     surface: Int
     error: Float
     bending: bool
+    pair_weight: Float
     proposal: Float
     minimum: Float
 
@@ -55,7 +59,7 @@ class Frozen:
     def problem(self) -> Problem:
         """The merged problem."""
         raw = yaml.safe_load(self.text)
-        # an option that is younger than the first records
+        # an option that the first records do not have
         raw["energy"].setdefault("prior_contact", raw["energy"]["arap_across"])
         return make_problem(raw)
 
@@ -74,7 +78,7 @@ def encoded(soup: Soup) -> Float:
     """(N, 10) numbers of a soup with proper rotations."""
     R = soup.R
     trace = R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2]
-    # rotations between two frames are far from half a turn
+    # w > 0, since rotations between two frames are far from 180 degrees
     w = np.sqrt(1 + trace) / 2
     turn = np.stack(
         [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1
@@ -83,7 +87,7 @@ def encoded(soup: Soup) -> Float:
 
 
 def decoded(numbers: Float) -> Soup:
-    """The soup of (N, 10) numbers, its normals and rotations exact to rounding."""
+    """The soup of (N, 10) numbers, with normals and rotations exact to rounding."""
     D, T = numbers[:, 0], numbers[:, 7:]
     a, b, c = numbers[:, 1:4].T
     n = numbers[:, 1:4] / np.sqrt(a * a + b * b + c * c)[:, None]
@@ -108,6 +112,7 @@ def save_frozen(path: Path, record: Frozen) -> None:
         "surface": record.surface.astype(np.int16),
         "error": record.error.astype(np.float32),
         "bending": np.array(record.bending),
+        "pair_weight": record.pair_weight.astype(np.float64),
         "proposal": record.proposal.astype(np.float32),
         "minimum": record.minimum.astype(np.float64),
     }
@@ -124,7 +129,7 @@ def load_frozen(scene: str, size: int) -> Frozen:
     """The package's record of a scene and size.
 
     Raises:
-        DataError: there is none.
+        DataError: there is no such record.
     """
     return read_frozen(Path(str(files("soup_nlp.family") / "records" / f"{scene}-{size}.npz")))
 
@@ -133,7 +138,7 @@ def read_frozen(path: Path) -> Frozen:
     """A record of a file.
 
     Raises:
-        DataError: it is not there or cannot be read.
+        DataError: the file is missing or cannot be read.
     """
     try:
         with np.load(path, allow_pickle=False) as a:
@@ -144,6 +149,7 @@ def read_frozen(path: Path) -> Frozen:
                 surface=a["surface"].astype(np.int64),
                 error=a["error"].astype(np.float64),
                 bending=bool(a["bending"]),
+                pair_weight=a["pair_weight"],
                 proposal=a["proposal"].astype(np.float64),
                 minimum=a["minimum"],
             )

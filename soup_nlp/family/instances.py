@@ -1,8 +1,8 @@
-"""Instances of the family: names, and the NLP that belongs to a name, equal on every processor.
+"""Instances of the family: their names and their NLPs, which are equal on every processor.
 
-What searches or iterates (superpixels, start, presolve) was done once; its answers are records in
-the package (`frozen`). What is left is rendering and arithmetic, whose last bits depend on the
-processor: every number of the NLP is rounded to 20 significant bits, which takes those away.
+Superpixels, start and presolve involve search or iteration. They were computed once, and their
+results are records in the package (`frozen`). The rest is rendering and arithmetic, whose last bits
+depend on the processor. Every number of the NLP is therefore rounded to 20 significant bits.
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ from soup_nlp.start.propose import Start
 
 Float = NDArray[np.float64]
 
-VERSION = 2
-"""Of the family: the same version has the same bytes."""
+VERSION = 3
+"""Version of the family; instances of one version have the same bytes everywhere."""
 SCENES = ("orbit", "street", "room", "sheet")
-SIZES = {100: SCENES, 250: SCENES, 500: SCENES, 1000: ("orbit", "street")}
-"""Superpixels, and the scenes of that size."""
+SIZES = (100, 250, 500, 1000, 2000)
+"""Wanted numbers of superpixels."""
 STARTS = ("easy", "hard", "cold")
 STANDARD = "unit-offset/smooth/smooth"
-"""Formulation of the family unless another is asked for."""
+"""Default formulation of the family."""
 BITS = 20
 """Significant bits of every number of an instance."""
-FLOOR = -30
-"""Numbers are multiples of 2 to this power at least: differences near 0 have no good last bits."""
-SHIFT = 0.381966011250105
-"""Where the rounding changes over, in units of its step: not at a half, where exact data lie."""
+MIN_EXPONENT = -30
+"""Exponent of the smallest rounding step, a power of 2: small differences are inexact."""
+ROUND_UP_FROM = 0.381966011250105
+"""Position in a step at which rounding goes up; not 1/2, where exact data may be."""
 
 
 @dataclass(frozen=True)
 class Instance:
-    """One instance.
+    """An instance of the family.
 
     Attributes:
-        scene: Of SCENES.
+        scene: One of SCENES.
         formulation: gauge/norm/truncation.
-        size: Superpixels that were asked for, of SIZES; the NLP has a few more or less.
+        size: Wanted number of superpixels, one of SIZES; the actual number may differ a little.
         start: easy (presolved), hard (the proposal) or cold (constant depth, true flow).
     """
 
@@ -71,22 +71,22 @@ class Instance:
 
     @property
     def problem(self) -> str:
-        """The name without the start: what the starts share."""
+        """The name without the start."""
         return f"SOUP-{self.scene}-{self.formulation.replace('/', '-')}-N{self.size}"
 
 
 def parse_name(name: str) -> Instance:
-    """The instance of a name; without its start, that of the first.
+    """The instance of a name; a name without start gets the first start.
 
     Raises:
-        ConfigError: it is none of the family.
+        ConfigError: the name is not one of the family.
     """
     found = re.fullmatch(r"SOUP-([a-z]+)-([a-z-]+)-N(\d+)(?:-([a-z]+))?", name)
     for form in formulations() if found else ():
         assert found is not None
         if found[2] == form.replace("/", "-"):
             one = Instance(found[1], form, int(found[3]), found[4] or STARTS[0])
-            if one.scene in SIZES.get(one.size, ()) and one.start in STARTS:
+            if one.scene in SCENES and one.size in SIZES and one.start in STARTS:
                 return one
     raise ConfigError(
         "no instance of the family",
@@ -114,13 +114,12 @@ def select(
     """Instances of sizes, scenes, formulations and starts.
 
     Raises:
-        ConfigError: one of them is not of the family.
+        ConfigError: one of them is not part of the family.
     """
     known = {
-        "--sizes": (sizes, tuple(SIZES)),
+        "--sizes": (sizes, SIZES),
         "--scenes": (scenes, SCENES),
         "--starts": (starts, STARTS),
-        **{f"--scenes at size {n}": (scenes, SIZES[n]) for n in sizes if n in SIZES},
     }
     for where, (asked, there) in known.items():
         wrong = [str(a) for a in asked if a not in there]
@@ -142,17 +141,17 @@ def select(
 
 
 def _whole(form: str) -> str:
-    """A formulation with the parts that were left out."""
+    """A formulation completed by the parts of STANDARD."""
     own = dict(zip(("gauge", "norm", "truncation"), STANDARD.split("/")))
     return "/".join((own | parse_formulation(form)).values())
 
 
 def case_of(record: Frozen, pair: Pair | None = None) -> Case:
-    """The problem of a record: its pair is rendered, its graphs and weights are computed.
+    """The case of a record, with rendered pair, graphs and weights.
 
     Args:
-        record: Of a scene and size.
-        pair: The scene's pair, where it is rendered already.
+        record: Record of a scene and size.
+        pair: Pair of the scene, if it was rendered before.
     """
     problem = record.problem
     pair = pair or problem.load_pair()
@@ -161,20 +160,22 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
     samples = None if s.boundary_samples == "all" else s.boundary_samples
     own = s.neighbours, s.beta, s.beta_colour, samples
     seg = build_segmentation(record.labels, pair.image_ref, *own)
-    # what the energy does not ask for is left out
+    seg = replace(seg, pair_weight=record.pair_weight)
+    # entries that the energy does not use are 0
     none = np.zeros(len(seg), np.int64)
     start = Start(
         soup=record.start,
         error=record.error,
         parallax=none.astype(float),
         borrowed=none.astype(bool),
+        grounded=none.astype(bool),
         motion=none,
         component=record.component,
         motions=[],
         surface=record.surface,
         tie=none,
         bending=record.bending,
-        # records of bending surfaces hold their prior in pixels
+        # records of bending surfaces have their prior in pixels
         noise=1.0 if record.bending else limited_noise(record.error),
     )
     data, weights = build_energy(problem, pair, seg, start)
@@ -184,7 +185,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
 
 
 def rounded_data(data: EnergyData) -> EnergyData:
-    """The same numbers, each rounded: what the NLP makes of them is plain arithmetic."""
+    """The energy data with all real numbers rounded."""
     own = {f.name: getattr(data, f.name) for f in fields(data)}
     reals: dict[str, Any] = {
         k: rounded(v) for k, v in own.items() if np.asarray(v).dtype == np.float64
@@ -198,10 +199,10 @@ def build_instance(
     """The NLP of a formulation at a start, its layout and its formulation.
 
     Args:
-        case: From `case_of`.
-        record: The same record.
+        case: Case of the record.
+        record: The record.
         formulation: gauge/norm/truncation.
-        start: Of STARTS; "best" is the best known point, not rounded.
+        start: One of STARTS; "best" is the best known point without rounding.
         hessian: Kind of the Hessian.
     """
     form = case.formulation(**parse_formulation(formulation), hessian=hessian, compiled=False)
@@ -211,7 +212,7 @@ def build_instance(
     nlp, layout = replace(case, soup=soup).nlp(form)
     x0 = nlp.x0 if start == "best" else rounded(nlp.x0)
     if start == "best":
-        # switches start inside their bounds, and are at one of them where they are best
+        # optimal switches are at one of their bounds
         switch = np.array([s.startswith("z_") for s in nlp.x_names()])
         x0 = np.where(switch, np.round(x0), x0)
     nlp = replace(nlp, x0=np.clip(x0, nlp.lbx, nlp.ubx))
@@ -219,21 +220,21 @@ def build_instance(
 
 
 def rounded(values: Float) -> Float:
-    """Numbers to BITS significant bits, so that last bits which a processor decides are gone.
+    """Numbers rounded to BITS significant bits, which removes bits that depend on the processor.
 
-    The step is a power of 2, hence exact. Two values that differ by d = 1e-15 relative come out
-    different with a probability of about 2 ** BITS * d, one in a thousand million.
+    The step is a power of 2 and therefore exact. Two values with a relative difference of d = 1e-15
+    are rounded differently with a probability of about 2 ** BITS * d = 1e-9.
     """
     values = np.asarray(values, float)
     exponent = np.frexp(np.where(np.isfinite(values), values, 0.0))[1]
-    step = np.ldexp(1.0, np.maximum(exponent - BITS, FLOOR))
-    # whole numbers stay: the shift is less than a step
-    exact = np.floor(values / step + (1 - SHIFT)) * step
+    step = np.ldexp(1.0, np.maximum(exponent - BITS, MIN_EXPONENT))
+    # multiples of the step do not change, since the shift is less than a step
+    exact = np.floor(values / step + (1 - ROUND_UP_FROM)) * step
     return np.where(np.isfinite(values), exact, values)
 
 
 def constant_depth(data: EnergyData) -> Soup:
-    """Planes that face the camera at one depth, moved as their mean flow says, without rotation."""
+    """Fronto-parallel planes at one depth, translated by their mean flow, without rotation."""
     n = len(data)
     target = np.add.reduce(data.pixel_target, axis=1) / data.pixel_target.shape[1]
     source = np.add.reduce(data.pixel_ray, axis=1) / data.pixel_ray.shape[1]
@@ -247,6 +248,6 @@ def constant_depth(data: EnergyData) -> Soup:
 
 
 def problems(chosen: Sequence[Instance]) -> Iterator[tuple[str, int, list[Instance]]]:
-    """Scene, size and the instances of both: what one render serves."""
+    """Scene, size and their instances, which share a record."""
     for scene, size in dict.fromkeys((i.scene, i.size) for i in chosen):
         yield scene, size, [i for i in chosen if (i.scene, i.size) == (scene, size)]

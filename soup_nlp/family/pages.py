@@ -1,4 +1,4 @@
-"""Texts of the family's folder: README in the form of problem sets, licence."""
+"""Texts in the folder of the family: README and licence."""
 
 from __future__ import annotations
 

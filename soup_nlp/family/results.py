@@ -1,4 +1,4 @@
-"""Results of solvers on the family in a form that belongs to no solver, and their verification."""
+"""Results of solvers on the family in a solver-independent form, and their verification."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.export.program import orders, take_apart
+from soup_nlp.export.program import make_program, orders
 from soup_nlp.export.residuals import Kind, kind
 from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import Limits, Residuals, examine, violations
@@ -20,25 +20,25 @@ from soup_nlp.storage.store import write_json
 Float = NDArray[np.float64]
 
 FEASIBLE = 1e-6
-"""Largest violation that a verified point may have."""
+"""Largest violation of a verified point."""
 TOLERANCE = 1e-4
 """Dual infeasibility and complementarity that `compare` asks for; ten times that is verified."""
 FIELDS = ("solver", "name", "n", "m", "status", "objective", "iterations", "time")
-"""What a result must have; everything else is welcome."""
+"""Entries that a result must have; others are allowed."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A solver's point on an instance, recomputed.
+    """Recomputed values of a solver's point for an instance.
 
     Attributes:
-        sol: The solver's file.
-        objective: Of its point.
+        sol: Contents of the .sol file.
+        objective: Objective at the point.
         best: Best known objective.
         residuals: Unscaled KKT residuals.
         kinds: Violations of bounds and rows.
-        n: Variables.
-        m: Rows.
+        n: Number of variables.
+        m: Number of rows.
     """
 
     sol: Sol
@@ -51,7 +51,7 @@ class Verdict:
 
     @property
     def verified(self) -> bool:
-        """A point on the constraints with small KKT residuals."""
+        """Whether the point is feasible with small KKT residuals."""
         r = self.residuals
         return r.primal <= FEASIBLE and r.within(Limits(tol=TOLERANCE))
 
@@ -70,12 +70,12 @@ class Verdict:
 
 
 def check_sol(path: Path) -> Verdict:
-    """Read `<name>.sol`, the answer to the instance of that name, and recompute what it claims.
+    """Read `<name>.sol`, the answer to the instance of that name, and recompute its values.
 
-    The instance is built again; nothing of the .nl file beside it is used.
+    The instance is built again; the .nl file is not used.
 
     Raises:
-        ConfigError: the name is none of the family.
+        ConfigError: the name is not one of the family.
         ExportError: the file cannot be read.
     """
     instance = parse_name(path.stem)
@@ -83,7 +83,7 @@ def check_sol(path: Path) -> Verdict:
     case = case_of(record)
     nlp = build_instance(case, record, instance.formulation, instance.start)[0]
     best = build_instance(case, record, instance.formulation, "best")[0].x0
-    program = take_apart(nlp.groups, nlp.nx, nlp.ng, nlp.p[: len(nlp.theta)])
+    program = make_program(nlp.groups, nlp.nx, nlp.ng, nlp.p[: len(nlp.theta)])
     sol = read_sol(path, *orders(program))
     with np.errstate(all="ignore"):
         return Verdict(
@@ -100,9 +100,6 @@ def check_sol(path: Path) -> Verdict:
 def write_results(path: Path, rows: list[dict[str, Any]], note: dict[str, Any]) -> None:
     """Write results, whole or not at all.
 
-    Args:
-        path: The JSON file.
-        rows: Each with FIELDS.
-        note: Machine, limits and what else is equal for all rows.
+    `note` has entries that hold for all rows, such as machine and limits.
     """
     write_json(path, {"set": "SOUP", "version": VERSION, **note, "results": rows})

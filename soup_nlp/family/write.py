@@ -1,4 +1,4 @@
-"""The family as a folder: .nl files with names, best known points, index, README, licence."""
+"""Writing of the family: .nl files with names, best known points, index, README, licence."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from soup_nlp.storage.store import write_json
 Entry = dict[str, Any]
 
 DIGITS = 9
-"""Of numbers in the index: more would depend on the processor."""
+"""Significant digits in the index; further digits depend on the processor."""
 
 
 def published() -> dict[str, Any]:
-    """What was measured on this version: checksums, and who reached the best known points."""
+    """Published data of this version: checksums, and solvers that reached the best known points."""
     path = files("soup_nlp.family") / "records" / "published.json"
     return dict(json.loads(path.read_text(encoding="utf-8")))
 
@@ -44,8 +44,8 @@ def write_family(
     """Write instances with their index into an existing folder.
 
     Returns:
-        The index's entries. "published" says whether the bytes are those of the published
-        version, None where that has no such instance.
+        Entries of the index. "published" says whether the bytes are those of the published
+        version; None if that version has no such instance.
 
     Raises:
         DataError: the package has no record of a size, or the folder cannot be written.
@@ -78,7 +78,7 @@ def write_family(
 
 
 def _line(entry: Mapping[str, Any]) -> str:
-    """An instance in a line."""
+    """An instance as one line of text."""
     changed = "  NOT the published bytes" if entry["published"] is False else ""
     return (
         f"{entry['file']:<52} n {entry['variables']:>6}  m {entry['constraints']:>6}"
@@ -94,7 +94,7 @@ def _solved(
     file: NLFile,
     known: Mapping[str, Any],
 ) -> Entry:
-    """Best known point of a problem, written as .sol, and what holds for all of its starts."""
+    """Write the best known point of a problem as .sol; returns entries that all starts share."""
     nlp = build_instance(case, record, instance.formulation, "best")[0]
     x = nlp.x0
     message = f"SOUP {VERSION}: best known point of {instance.problem}"
@@ -124,7 +124,7 @@ def _solved(
 def _entry(
     instance: Instance, nlp: NLP, file: NLFile, shared: Entry, known: Mapping[str, Any]
 ) -> Entry:
-    """The index's entry of an instance that was written."""
+    """Entry of an instance in the index."""
     sha = known["sha256"].get(instance.name)
     return {
         "name": instance.name,
@@ -142,12 +142,12 @@ def _entry(
 
 
 def _short(value: Any, digits: int = DIGITS) -> float:
-    """A number with so many digits as do not depend on the processor."""
+    """A number rounded to some significant digits."""
     return float(f"{float(value):.{digits}g}")
 
 
 def as_csv(entries: Sequence[Entry]) -> str:
-    """The entries as a table; nested ones have a dot in their column."""
+    """The entries as a CSV table; columns of nested entries have names with dots."""
     rows = [_flat(e) for e in entries]
     head = list(dict.fromkeys(k for row in rows for k in row))
     out = io.StringIO()
