@@ -70,7 +70,9 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
         arap = float((e["edge_weight"] * cut).sum())
         apart = _length(e["anchor_ray"][i] - e["anchor_ray"][k])
         rho = 1 / A[:, 2]
-        change = np.abs(rho[i] - rho[k]) / ((rho[i] ** 4 + rho[k] ** 4) / 2) ** 0.25
+        change = (rho[i] - rho[k]) / ((rho[i] ** 4 + rho[k] ** 4) / 2) ** 0.25
+        # older results have no relief that is free
+        change = np.abs(change - e.get("prior_relief", 0.0))
         prior = float((e["prior_weight"] * change / apart).sum())
 
     image = lift(s, e["pixel_ray"], every)[1] @ e["K_next"].T
@@ -269,6 +271,9 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
         noise = float(tree["start"].get("noise", 1.0))
     held_prior = np.where(_contact(tree, settings), settings["energy"]["prior_contact"], across)
     prior = noise * held_prior * seg["edge_multiplicity"] / max(1, seg["knn"].shape[1])
+    free = _grounded(tree, settings)
+    prior[free] = noise * (seg["edge_multiplicity"] / max(1, seg["knn"].shape[1]))[free]
+    prior[free] *= float(settings["energy"].get("prior_ground") or 0.0)
     held = np.full(len(e["pairs"]), 2.0)
     held[_discontinuous(tree, settings["energy"], "pairs")] *= float(bending["orient_across"])
     return {
@@ -281,6 +286,7 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
         "K-NN edges": float(len(np.setxor1d(directed, i * n + k))),
         "edge weights": _gap(weight, e["edge_weight"]),
         "prior weights": _gap(prior, e["prior_weight"]),
+        "prior relief": _gap(_relief(tree, free), e.get("prior_relief", np.zeros(len(i)))),
         "pair counts": _gap(held, e["orient_weight"]),
         "pair weights": _gap(_pair_weights(tree, settings["energy"]), e["pair_weight"]),
     }
@@ -300,6 +306,23 @@ def _pair_weights(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Float:
     )
     weight[_discontinuous(tree, form, "pairs")] *= float(form["bending"]["cont_across"])
     return np.asarray(weight)
+
+
+def _grounded(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """K-NN edges along which E_prior holds the relief of the initialisation."""
+    ends = tree["energy"]["edges"]
+    if settings["energy"].get("prior_ground") is None:
+        return np.zeros(len(ends), bool)
+    one, other = tree["start"]["grounded"].astype(bool)[ends.T]
+    return np.asarray(one & other)
+
+
+def _relief(tree: Mapping[str, Any], free: NDArray[np.bool_]) -> Float:
+    """(E,) relative difference of inverse depth that the initialisation has along these edges."""
+    start = tree["start"]
+    rho = -(start["n"] * tree["energy"]["anchor_ray"]).sum(1) / (start["lam"] * start["d"])
+    a, b = rho[tree["energy"]["edges"].T]
+    return np.where(free, (a - b) / np.sqrt(np.sqrt((a**4 + b**4) / 2)), 0.0)
 
 
 def _contact(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> NDArray[np.bool_]:

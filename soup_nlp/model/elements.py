@@ -173,8 +173,10 @@ def _prior(data: EnergyData, w: Weights) -> Element:
         "ray_i": ray_i,
         "ray_k": ray_k,
     }
-
-    return Element(data.edges, columns, Norms(terms.prior), 2)
+    held = bool(data.prior_relief.any())
+    if held:
+        columns["relief"] = data.prior_relief
+    return Element(data.edges, columns, Norms(terms.prior, (held,)), 2)
 
 
 def _orient(data: EnergyData, w: Weights) -> Element:

@@ -34,6 +34,8 @@ class EnergyData:
         prior_weight: (E,) weight of E_prior: 1 / K for each direction of the edge, so that it is
             the mean over the neighbours of a superpixel, times the flow's noise in pixels where
             that is known.
+        prior_relief: (E,) relative difference of inverse depth along each edge that costs nothing
+            in E_prior: the initialisation's where both ends borrow their depth, else 0.
         rotation_scale: Factor of |R_i - R_k| (1 in the paper's units, focal in pixel units).
         pairs: (P, 2) neighbours i < k.
         boundary_ray: (P, B, 3) sampled shared boundary points.
@@ -61,6 +63,7 @@ class EnergyData:
     edge_weight: Float
     edge_unit: Float
     prior_weight: Float
+    prior_relief: Float
     rotation_scale: float
     pairs: Int
     boundary_ray: Float
@@ -169,6 +172,7 @@ def build_energy_data(
         edge_weight=seg.edge_weight,
         edge_unit=np.ones(len(seg.edges)),
         prior_weight=seg.edge_multiplicity / max(1, seg.knn.shape[1]),
+        prior_relief=np.zeros(len(seg.edges)),
         rotation_scale=1.0,
         pairs=seg.pairs,
         boundary_ray=rays(K_ref, seg.boundary),

@@ -107,6 +107,9 @@ class EnergyOptions(Section):
     prior_contact: NonNegative = 3.0
     """Factor of E_prior where, in an upright image, one of these components stands on what lies
     below it: contact gives it its scale."""
+    prior_ground: NonNegative | None = 10.0
+    """Factor of E_prior between two superpixels without depth of their own where the start knows
+    the ground: it holds the relief that the start gave them; null for E_prior as elsewhere."""
     cont_occluded: Share = 0.03
     """Factor of E_cont where one of these components hides another; 1 is the paper's."""
     occlusion_gap: Annotated[float, Field(ge=0, lt=1)] = 0.1

@@ -132,10 +132,16 @@ class Instruction(NamedTuple):
     constant: float
 
 
-@lru_cache(maxsize=200)
 def instructions(function: ca.Function) -> tuple[Instruction, ...]:
     """What an SX function computes, step by step."""
-    f = function
+    return (_of_small if function.n_instructions() < LARGE else _of_large)(function)
+
+
+LARGE = 20_000
+"""Instructions from which a function's list takes megabytes: only those of one solve are kept."""
+
+
+def _instructions(f: ca.Function) -> tuple[Instruction, ...]:
     return tuple(
         Instruction(
             f.instruction_id(k),
@@ -147,7 +153,11 @@ def instructions(function: ca.Function) -> tuple[Instruction, ...]:
     )
 
 
-@lru_cache(maxsize=1000)
+_of_small = lru_cache(maxsize=200)(_instructions)
+_of_large = lru_cache(maxsize=16)(_instructions)
+
+
+@lru_cache(maxsize=100)
 def _text(function: ca.Function) -> str:
     """What the C of a function depends on; equal kernels share their functions."""
     return str(function.serialize())

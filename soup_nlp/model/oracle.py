@@ -116,11 +116,15 @@ def orientation(soup: Soup, data: EnergyData, weights: Weights) -> Float:
 def prior(soup: Soup, data: EnergyData) -> Float:
     """(E,) E_prior of every edge: slope of the inverse depth between its anchors, relative to it.
 
-    `|1 / Z_i - 1 / Z_k| / (m |r_i - r_k|)` with anchor rays r and m the mean of both inverse depths
-    that is near the larger.
+    `|(1 / Z_i - 1 / Z_k) / m - relief| / |r_i - r_k|` with anchor rays r and m the mean of both
+    inverse depths that is near the larger.
     """
-    i, k = data.edges.T
-    inverse, ray = 1 / soup.depth_at(data.anchor_ray), data.anchor_ray
-    larger = np.mean(inverse[data.edges] ** 4, axis=1) ** 0.25
-    change = np.abs(inverse[i] - inverse[k]) / larger
+    (i, k), ray = data.edges.T, data.anchor_ray
+    change = np.abs(relief(soup, data) - data.prior_relief)
     return data.prior_weight * change / np.linalg.norm(ray[i] - ray[k], axis=1)
+
+
+def relief(soup: Soup, data: EnergyData) -> Float:
+    """(E,) difference of the inverse depths of an edge's anchors, relative to the nearer one."""
+    inverse = 1 / soup.depth_at(data.anchor_ray)[data.edges]
+    return (inverse[:, 0] - inverse[:, 1]) / np.mean(inverse**4, axis=1) ** 0.25

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.oracle import relief
 
 Float = NDArray[np.float64]
 
@@ -69,6 +70,28 @@ def contacts(
     stands = ((down > DOWN) & own[i]) | ((down < -DOWN) & own[k])
     touch = np.abs(np.log(z[i] / z[k])) < np.log(TOUCH)
     return np.asarray((component[i] != component[k]) & stands & touch)
+
+
+def over_ground(
+    data: EnergyData, soup: Soup, grounded: NDArray[np.bool_], weight: Float
+) -> EnergyData:
+    """The same data with E_prior holding the initialisation's relief over a known ground.
+
+    Without usable flow only the terms that flatten act on the depth: what is seen below the
+    horizon would recede below the ground, although the initialisation has put it there.
+
+    Args:
+        data: Data of the pair.
+        soup: Start.
+        grounded: (N,) whether a superpixel without depth of its own has ground below it.
+        weight: (E,) weight of E_prior on edges between two of them.
+    """
+    both = grounded[data.edges].all(axis=1)
+    return replace(
+        data,
+        prior_weight=np.where(both, weight, data.prior_weight),
+        prior_relief=np.where(both, relief(soup, data), 0.0),
+    )
 
 
 def in_noise(data: EnergyData, noise: float) -> EnergyData:

@@ -28,6 +28,7 @@ from soup_nlp.model.reweighting import (
     in_length,
     in_noise,
     in_pixels,
+    over_ground,
 )
 from soup_nlp.pipeline.memory import check_fits
 from soup_nlp.pipeline.still_layer import see_through
@@ -208,10 +209,12 @@ def build_energy(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, bends or e.arap_at_anchors
     )
     data = in_noise(data, start.noise)
-    stands = None
+    free, stands = data.prior_weight, None
     if problem.start.upright:
         stands = contacts(data, start.soup, start.component, seg.anchors)
     data = across_components(data, start.component, e.arap_across, stands, e.prior_contact)
+    if e.prior_ground is not None:
+        data = over_ground(data, start.soup, start.grounded, e.prior_ground * free)
     data = at_occlusions(data, start.soup, start.component, e.occlusion_gap, e.cont_occluded)
     if bends:
         b = e.bending

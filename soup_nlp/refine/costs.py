@@ -202,8 +202,9 @@ class PairCosts:
         reach = np.linalg.norm(d.anchor_ray[i] - d.anchor_ray[k], axis=1)
         inverse = 1 / s.Z
         np.subtract(inverse[i][:, :, None], inverse[k][:, None, :], out=x)
-        np.abs(x, out=x)
         x /= _nearness(s, i, k, scale)
+        x -= d.prior_relief[rows][:, None, None]
+        np.abs(x, out=x)
         x *= (w.prior * d.prior_weight[rows] / reach)[:, None, None]
         total += x
         return total

@@ -69,6 +69,7 @@ class Start:
         surface: (N,) connected group within which the flow has no discontinuity; where surfaces
             bend, the flow is discontinuous along most of its outline.
         tie: (N,) what gives the component of every superpixel its scale, an index of `TIES`.
+        grounded: (N,) True where the depth is borrowed and the ground is known below the horizon.
         bending_share: Share of the superpixels that move otherwise than most of their surface.
         bending: Whether the energy for surfaces that bend is in force: all are one component at a
             constant depth.
@@ -85,6 +86,7 @@ class Start:
     motions: list[Motion]
     surface: Int
     tie: Int
+    grounded: NDArray[np.bool_]
     bending_share: float = 0.0
     bending: bool = False
     at_rest: bool = False
@@ -153,7 +155,7 @@ def propose(
         none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
         parallax, surface = _parallax(soup, views), surfaces(jump, seg, o.discontinuity_px)
         zero, noise = none + 1, limited_noise(residual)
-        found = soup, error, parallax, every, none, zero, motions, surface, zero, share
+        found = soup, error, parallax, every, none, zero, motions, surface, zero, ~every, share
         return Start(*found, bending=True, at_rest=rests, noise=noise)
     choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
     own, label, parallax = choice.fit, choice.label, choice.parallax
@@ -174,12 +176,15 @@ def propose(
     component = rigid_components(label, seg)
     scale, tie = contact_scales(soup, component, seg, K_ref, o.upright)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t)
+    grounded = np.zeros(len(seg), bool)
     if o.upright and o.ground:
         known = ~weak & (views.weight.mean(axis=1) > 0.5)
-        soup, component, tie = _on_ground(soup, views.anchor, seg, K_ref, known, component, tie, o)
+        own_ground = views.anchor, seg, K_ref, known, component, tie, o
+        soup, component, tie, floor = _on_ground(soup, *own_ground)
+        grounded = weak & (floor > 0)
     soup = soup.normalised()
     error = own.cost[:, 0]
-    found = soup, error, parallax, weak, label, component, motions, surface, tie, share
+    found = soup, error, parallax, weak, label, component, motions, surface, tie, grounded, share
     return Start(*found, noise=limited_noise(error))
 
 
@@ -193,7 +198,9 @@ def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
     error = np.sum(views.weight * np.linalg.norm(gap, axis=2), axis=1) / total
     parallax, whole = _parallax(soup, views), np.zeros(len(seg), np.int64)
     noise = limited_noise(error)
-    return Start(soup, error, parallax, borrowed, whole - 1, whole, [], whole, whole, noise=noise)
+    none = np.zeros(len(seg), bool)
+    own = soup, error, parallax, borrowed, whole - 1, whole
+    return Start(*own, [], whole, whole, none, noise=noise)
 
 
 def _on_ground(
@@ -205,8 +212,11 @@ def _on_ground(
     component: Int,
     tie: Int,
     o: SeededStart,
-) -> tuple[Soup, Int, Int]:
-    """Soup, components and ties with nothing below the ground and nothing that floats."""
+) -> tuple[Soup, Int, Int, Float]:
+    """Soup, components, ties and (N,) inverse depth of the ground.
+
+    Nothing lies below the ground, and nothing floats above it.
+    """
     known = known & (component == np.argmax(np.bincount(component)))
     area = np.bincount(seg.labels.ravel()).astype(float)
     floor = ground(1 / soup.depth_at(anchor), anchor, area, known, o.seed)
@@ -221,7 +231,7 @@ def _on_ground(
         tie[region] = TIES.index("contact below")
     # components are numbered without gaps
     component = np.unique(component, return_inverse=True)[1].ravel()
-    return Soup(lam, soup.n, soup.d, soup.R, soup.t), component, tie
+    return Soup(lam, soup.n, soup.d, soup.R, soup.t), component, tie, floor
 
 
 def look(
