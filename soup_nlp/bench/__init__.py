@@ -1,1 +1,1 @@
-"""Benchmarks as a command: runs in processes of their own, tables, plots, baseline and gate."""
+"""Benchmarks: rows measured in separate processes, tables, plots, baseline and gate."""

@@ -36,10 +36,10 @@ from soup_nlp.storage.folders import scratch
 Float = NDArray[np.float64]
 Measure = Callable[[Item, tuple[str, ...], str], Row]
 
-KEPT = (*ERRORS, "scale", "coverage", "n_pixels")
-"""Metrics that a row keeps, beside skill."""
-LEAST_PIXELS = 50
-"""Fewest true pixels of a moving component whose scale is told."""
+KEPT_METRICS = (*ERRORS, "scale", "coverage", "n_pixels")
+"""Depth metrics that a row has beside the skill."""
+MIN_PIXELS = 50
+"""Moving components with fewer true pixels have no scale in a row."""
 
 
 def pair_job(
@@ -53,24 +53,24 @@ def pair_job(
 
     Args:
         item: Pair and flow.
-        overrides: Of its problem.
+        overrides: Overrides of the problem.
         variant: Name of the overrides in an analysis; empty for the defaults.
-        folder: Where to write the result folder; a row whose folder is not there is stale.
-        measure: Makes the row of (item, overrides, variant); default `measure_pair`.
+        folder: Where to write the result folder; a stored row without its folder is stale.
+        measure: Makes the row from (item, overrides, variant); default `measure_pair`.
     """
     own = item, tuple(overrides), variant
     work = partial(measure, *own) if measure else partial(measure_pair, *own, folder=folder)
     stale = folder is not None and not (folder / "summary.json").is_file()
-    return Job(head(*own), partial(attempt, work), stale)
+    return Job(row_identity(*own), partial(attempt, work), stale)
 
 
 def settings_hash(problem: Problem) -> str:
-    """Hash of everything but the input: the same settings on every pair and in every place."""
+    """Hash of all options but the input: the same for every pair and folder."""
     return _hash(problem, {"name", "base", "preset", "input", "expected"})
 
 
 def input_hash(problem: Problem) -> str:
-    """Hash of the input but its place: the same frames of the same dataset in every folder."""
+    """Hash of the input without its paths: the same for a pair in every folder."""
     places = {"root", "path", "ref", "next", "depth", "depth_next", "intrinsics"}
     return _hash(problem.input, places)
 
@@ -80,8 +80,8 @@ def _hash(section: Any, exclude: set[str]) -> str:
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def head(item: Item, overrides: Sequence[str] = (), variant: str = "") -> Row:
-    """What identifies a row."""
+def row_identity(item: Item, overrides: Sequence[str] = (), variant: str = "") -> Row:
+    """Entries that identify a row."""
     try:
         problem = item.problem(overrides)
         settings, source = settings_hash(problem), input_hash(problem)
@@ -111,12 +111,7 @@ def measure_pair(
 ) -> Row:
     """Solve and score one pair.
 
-    Args:
-        item: Pair and flow.
-        overrides: Of its problem.
-        variant: Not used here.
-        folder: Where to write the result folder; None for nowhere.
-        change: Makes another pair of the one that was loaded.
+    `folder` gets the result folder, and `change` transforms the loaded pair before the solve.
 
     Raises:
         SoupError: the pair cannot be solved, or no convention has a true pixel.
@@ -149,7 +144,7 @@ def measure_pair(
 
 
 def _no_truth(item: Item) -> DataError:
-    """What is missing where no convention gives a number, and where to get it."""
+    """The error of a pair that no metric convention applies to."""
     suite = SUITES.get(item.suite)
     return DataError(
         "pair has no true depth",
@@ -163,8 +158,8 @@ def _no_truth(item: Item) -> DataError:
 def scores(result: Run, presets: Sequence[str] = ("paper",), fitted: bool = True) -> Row:
     """Metrics by convention and method, energies, flow error and scene flow of a run.
 
-    A convention under which the truth has no pixel, or that needs a depth map where the truth is
-    sparse points, is left out. Planes are fitted to the truth and scored if `fitted`.
+    A convention is left out if no true pixel counts under it, or if it needs a depth map and the
+    truth has sparse points. Planes are fitted to the truth and scored if `fitted`.
     """
     maps = depth_maps(result, fitted)
     sigma = result.reconstruction.sigma_ref
@@ -203,7 +198,7 @@ def _energies(result: Run) -> dict[str, dict[str, float]]:
 
 
 def _applies(truth: Truth | None, convention: Preset) -> bool:
-    """Whether a truth has a pixel that counts; a crop needs a depth map."""
+    """Whether a true pixel counts under a convention; a crop needs a depth map."""
     if truth is None:
         return False
     if truth.depth_ref is not None:
@@ -233,14 +228,14 @@ def _metrics(
     out: dict[str, dict[str, float]] = {}
     for method, (estimate, gt) in scored.items():
         m = convention.score(estimate, gt).as_dict()
-        out[method] = {k: m[k] for k in KEPT}
+        out[method] = {k: m[k] for k in KEPT_METRICS}
     for m in out.values():
         m["skill"] = skill(m["mre"], out["constant"]["mre"])
     return out
 
 
 def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
-    """Errors of the pixels that move by themselves and of the rest, under one scale for both.
+    """Errors of independently moving pixels and of the others, under one common scale.
 
     Args:
         pair: Its truth must have components (0 is the static scene) and dense depth.
@@ -248,9 +243,9 @@ def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
         convention: Rule of the one scale of the whole image, and the pixels that count.
 
     Returns:
-        "mre" and "rest" (MRE of moving pixels and of the others), "share" of moving ones among the
-        true pixels, and "components": pixels and "scale" (median of z / z_true after the scale) of
-        every moving component; None without such a truth or without moving pixels.
+        "mre" and "rest" (MRE of moving and of other pixels), "share" of the true pixels that move,
+        and "components": pixels and "scale" (median of z / z_true after the common scale) of every
+        moving component. None without such a truth or without moving pixels.
     """
     truth = pair.truth
     if truth is None or truth.components is None or truth.depth_ref is None:
@@ -267,7 +262,7 @@ def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
     for k in np.unique(label[own]):
         ratio = (z / np.where(own, gt, np.nan))[own & (label == k)]
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
-        if len(ratio) >= LEAST_PIXELS:
+        if len(ratio) >= MIN_PIXELS:
             components.append({"pixels": len(ratio), "scale": float(np.median(ratio))})
     share = float(own.sum() / counts.sum())
     return {"mre": mre[0], "rest": mre[1], "share": share, "components": components}

@@ -1,4 +1,4 @@
-"""Tables of rows by image, sequence and dataset, each with its evaluation protocol."""
+"""The page of a suite: tables by image, sequence and dataset, each with its protocol."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import (
     energy_ratio,
     failures,
-    get,
-    joined,
-    made,
     mean,
+    metric,
+    page_text,
+    provenance,
     show,
     table,
 )
@@ -27,24 +27,24 @@ Group = tuple[str, str, list[Row]]
 
 
 def report(title: str, rows: Sequence[Row], note: str = "") -> str:
-    """Everything that is known of some rows of one suite."""
+    """The page of the rows of one suite."""
     good = [r for r in rows if r.get("ok")]
     settings = ", ".join(sorted({str(r.get("settings")) for r in rows}))
     lines = [f"# {title}", ""]
     if note:
         lines += [note, ""]
     lines += [_verdict(good, len(rows)), ""]
-    lines += [f"{made(rows)}; settings {settings} (one a flow source).", ""]
+    lines += [f"{provenance(rows)}; settings {settings} (one a flow source).", ""]
     conventions = list(dict.fromkeys(p for r in good for p in r["metrics"]))
     for name in sorted(conventions, key=lambda p: p != good[0]["presets"][0]):
-        lines += _convention(name, [r for r in good if get(r, name) is not None])
+        lines += _convention(name, [r for r in good if metric(r, name) is not None])
     lines += families(good)
     lines += _beaten_by(good)
     for name in dict.fromkeys(_own(r) for r in good):
         lines += _detail([r for r in good if name and _own(r) == name], name)
     for suite in dict.fromkeys(r["suite"] for r in rows):
         lines += _published(suite, [r for r in good if r["suite"] == suite and _own(r)])
-    return joined([*lines[:-1], *failures(rows)])
+    return page_text([*lines[:-1], *failures(rows)])
 
 
 def _verdict(good: Sequence[Row], total: int) -> str:
@@ -58,19 +58,19 @@ def _verdict(good: Sequence[Row], total: int) -> str:
 
 
 def _own(row: Row) -> str:
-    """The first of a row's conventions under which it has numbers; "" without."""
-    return next((p for p in row["presets"] if get(row, p) is not None), "")
+    """The first of a row's conventions under which it has numbers; "" if there is none."""
+    return next((p for p in row["presets"] if metric(row, p) is not None), "")
 
 
 def better_baselines(row: Row) -> dict[str, tuple[float, float]]:
-    """Baselines that are as good as the solution or better: their MRE and the solution's.
+    """MRE of the baselines that are not worse than the solution, and the solution's MRE.
 
-    `rigid` is compared on the pixels where it has a depth.
+    The baseline `rigid` is compared on the pixels where it has a depth.
     """
     name, out = _own(row), {}
-    own, there = get(row, name), get(row, name, "solution_rigid")
+    own, there = metric(row, name), metric(row, name, "solution_rigid")
     for baseline in BASELINES:
-        theirs = get(row, name, baseline)
+        theirs = metric(row, name, baseline)
         mine = there if baseline == "rigid" and there is not None else own
         if theirs is not None and mine is not None and not mine < theirs:
             out[baseline] = theirs, mine
@@ -78,7 +78,7 @@ def better_baselines(row: Row) -> dict[str, tuple[float, float]]:
 
 
 def _groups(rows: Sequence[Row], by: Callable[[Row], str]) -> list[Group]:
-    """Rows of one name and flow together."""
+    """Rows grouped by a name and the flow source."""
     out: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         out.setdefault((by(row), row["flow"]), []).append(row)
@@ -86,7 +86,7 @@ def _groups(rows: Sequence[Row], by: Callable[[Row], str]) -> list[Group]:
 
 
 def families(rows: Sequence[Row]) -> list[str]:
-    """The solution by family (sequence) and flow and in all: means, moving pixels, worst pair."""
+    """Table of the solution by family (sequence) and flow: means, moving pixels, worst pair."""
     own = [r for r in rows if _own(r)]
     groups = _groups(own, lambda r: str(r["sequence"]))
     if len(groups) < 2:
@@ -106,11 +106,11 @@ def _family(name: str, flow: str, rows: Sequence[Row]) -> list[str]:
     there = [m for r in rows if (m := r.get("moving"))]
     scales = [c["scale"] for m in there for c in m["components"]]
     spread = " ".join(f"{np.quantile(scales, q):.2f}" for q in (0, 0.5, 1)) if scales else ""
-    errors = {r["pair"]: get(r, _own(r)) or 0.0 for r in rows}
+    errors = {r["pair"]: metric(r, _own(r)) or 0.0 for r in rows}
     worst = max(errors, key=lambda pair: errors[pair])
-    below = np.mean([(get(r, _own(r), name="skill") or 0.0) < 0 for r in rows])
+    below = np.mean([(metric(r, _own(r), name="skill") or 0.0) < 0 for r in rows])
     numbers = [
-        mean(get(r, _own(r), name=k) for r in rows)
+        mean(metric(r, _own(r), name=k) for r in rows)
         for k in ("mre", "median_relative", "delta1", "skill")
     ]
     numbers += [mean(m[k] for m in there) for k in ("mre", "rest")]
@@ -122,11 +122,11 @@ def _family(name: str, flow: str, rows: Sequence[Row]) -> list[str]:
 
 
 def _beaten_by(rows: Sequence[Row]) -> list[str]:
-    """Where a baseline is better."""
+    """Table of the baselines that are not worse than the solution."""
     lines = [
         [
             *(r["pair"], r["flow"], _own(r), baseline, show(theirs), show(mine)),
-            *(show(get(r, _own(r), baseline, "coverage"), ".1%"), show(theirs - mine, "+.4f")),
+            *(show(metric(r, _own(r), baseline, "coverage"), ".1%"), show(theirs - mine, "+.4f")),
         ]
         for r in rows
         for baseline, (theirs, mine) in better_baselines(r).items()
@@ -139,17 +139,17 @@ def _beaten_by(rows: Sequence[Row]) -> list[str]:
 
 
 def _convention(name: str, rows: Sequence[Row]) -> list[str]:
-    """MRE of every method under one convention: per image, per sequence, per dataset."""
+    """Tables of the MRE of every method under one convention, by image, sequence and dataset."""
     if not rows:
         return []
-    methods = [m for m in METHODS if any(get(r, name, m) is not None for r in rows)]
+    methods = [m for m in METHODS if any(metric(r, name, m) is not None for r in rows)]
 
     cells = [*((m, "mre", ".4f") for m in methods), ("solution", "skill", ".3f")]
     cells += [("solution", "coverage", ".1%")]
 
     def lines(first: str, groups: Iterable[Group]) -> list[str]:
         body = [
-            [title, flow, *(show(mean(get(r, name, m, k) for r in own), f) for m, k, f in cells)]
+            [title, flow, *(show(mean(metric(r, name, m, k) for r in own), f) for m, k, f in cells)]
             for title, flow, own in groups
         ]
         return table([first, "flow", *methods, "skill", "coverage"], body)
@@ -166,23 +166,23 @@ def _convention(name: str, rows: Sequence[Row]) -> list[str]:
             out += ["", f"Mean per {title}:", "", *lines(f"{title} (pairs)", counted)]
     fitted = [f"`{m}`" for m in ("plane", "floor") if m in methods]
     if fitted and (preset(name).cap is not None or preset(name).crop is not None):
-        told = "fitted to all true pixels, not only to those that count here"
-        out += ["", f"{' and '.join(fitted)}: {told}."]
-    held = [c for r in rows if (c := get(r, name, "rigid", "coverage")) is not None]
+        text = "fitted to all true pixels, not only to those that count here"
+        out += ["", f"{' and '.join(fitted)}: {text}."]
+    held = [c for r in rows if (c := metric(r, name, "rigid", "coverage")) is not None]
     if held:
         out += ["", f"`rigid` covers {min(held):.0%} to {max(held):.0%} of the true pixels."]
     return [*out, ""]
 
 
 def _detail(rows: Sequence[Row], convention: str) -> list[str]:
-    """The solution's other errors, its flow, scene flow and energy."""
+    """Table of the solution's other errors, flow error, scene flow and energy."""
     if not rows:
         return []
     head = ["pair", "flow", "median", "SqRel", "RMSE", "log-RMSE", "d<1.25", "d<1.25^2"]
     head += ["d<1.25^3", "flow EPE px", "3D EPE (of length)", "bending", "E truth / solution"]
     lines = [
         [
-            *(r["pair"], r["flow"], *(show(get(r, convention, name=k)) for k in ERRORS[1:])),
+            *(r["pair"], r["flow"], *(show(metric(r, convention, name=k)) for k in ERRORS[1:])),
             *(show((r["flow_error"] or {}).get("mean"), ".2f"), _moved(r["scene_flow"])),
             *(show(r.get("bending_share"), ".2f"), show(energy_ratio(r), ".3f")),
             *(str(r["status"]), f"{r['cpu_seconds']:.0f}"),
@@ -194,7 +194,7 @@ def _detail(rows: Sequence[Row], convention: str) -> list[str]:
 
 
 def _moved(error: Mapping[str, float] | None) -> str:
-    """3D end-point error, and the mean length of the true scene flow."""
+    """3D end-point error, and in brackets the mean length of the true scene flow."""
     if not error:
         return "-"
     return f"{show(error['mean'], '.3g')} ({show(error['mean_truth_length'], '.3g')})"
@@ -208,7 +208,7 @@ def _published(suite: str, rows: Sequence[Row]) -> list[str]:
     measured = _groups(rows, _own)
     for name, flow, group in measured:
         count = f"{len(group)} pair{'' if len(group) == 1 else 's'}"
-        own = mean(get(r, name) for r in group)
+        own = mean(metric(r, name) for r in group)
         lines.append([f"this program, flow {flow}, {name}, {count} (measured)", show(own)])
     text = f"Published rows are copied, not measured: {SOURCE}. {PROTOCOL}. {about}."
     text += "".join(f" Measured: {preset(n)}." for n in dict.fromkeys(n for n, _, _ in measured))

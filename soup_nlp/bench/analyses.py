@@ -1,4 +1,4 @@
-"""The paper's analyses: one change at a time over a list of pairs, a table and a plot each."""
+"""Analyses: the same pairs measured under several variants of the options; a table and a plot."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ NOISE_PX = ("0.1", "0.5", "1", "2")
 
 @dataclass(frozen=True)
 class Analysis:
-    """What is changed.
+    """An analysis.
 
     Attributes:
         name: On the command line.
-        text: What it asks.
-        variants: Overrides by the name of a variant, in the order of tables.
-        axis: Label of the variants.
-        base: The variant that others are compared with: measured whatever values are asked for.
-        free: Key of the variants' setting where other values than these may be asked for.
-        numeric: The variants are numbers, drawn on an axis.
-        true_flow_only: Only pairs with a true flow.
-        function: What measures a pair.
-        page: Makes the table of name, text, rows and a note.
-        plot: Draws rows into a file; None for the MRE over the variants.
+        text: Description.
+        variants: Overrides by name of a variant, in the order of the tables.
+        axis: Axis label of the variants.
+        base: Variant that others are compared with; it is always measured.
+        free: Option of the variants, if the user may ask for other values of it.
+        numeric: The variants are numbers, drawn on a numeric axis.
+        true_flow_only: Only pairs with a true flow are used.
+        function: Measures a pair.
+        page: Makes the page from name, text, rows and a note.
+        plot: Draws the rows into a file; None draws the MRE over the variants.
     """
 
     name: str
@@ -180,23 +180,23 @@ def run_analysis(
         name: One of `ANALYSES`.
         listings: Pairs.
         out: Folder.
-        overrides: Of every problem; a variant's own come after them.
+        overrides: Overrides of every problem; those of a variant come after them.
         measure_rows: Measures the jobs; `measure_all` with its options.
-        values: Only these variants; of a numeric analysis other values as well.
-        presets: Metric conventions instead of the suites' own, the main one first.
+        values: Names of the variants to measure, or values of the option `free`; None for all.
+        presets: Metric conventions instead of those of the suites, the main one first.
         overwrite: Overwrite files that the program did not make.
 
     Returns:
         The table's file.
 
     Raises:
-        ConfigError: there is no such analysis or variant, a value is wrong, no pair is left, or
-            conventions are given where no depth is scored.
+        ConfigError: the analysis or a variant is unknown, a value is wrong, no pair is left, or
+            conventions are given for an analysis that scores no depth.
     """
-    analysis = _chosen(_known(name), values)
+    analysis = _restricted(_analysis(name), values)
     items = _items(analysis, listings, presets)
     for own in analysis.variants.values():
-        # a wrong value ends here, not as a failed row a pair
+        # reports a wrong value here instead of in a failed row for every pair
         items[0].problem((*overrides, *own))
     claim(out, (f"{name}.md", f"{name}.png"), overwrite)
     jobs = [
@@ -217,7 +217,7 @@ def run_analysis(
 
 
 def _items(analysis: Analysis, listings: Sequence[Listing], presets: Sequence[str]) -> list[Item]:
-    """The pairs that an analysis can use, under the conventions that are asked for."""
+    """The pairs that an analysis can use, under the given conventions."""
     listed = [i for listing in listings for i in listing.items]
     items = [i for i in listed if i.flow == "truth" or not analysis.true_flow_only]
     if not items:
@@ -234,12 +234,12 @@ def _items(analysis: Analysis, listings: Sequence[Listing], presets: Sequence[st
 
 
 def split_values(name: str, text: str) -> list[str]:
-    """Variants of a comma-separated list; a name with commas in it is one, the longest first.
+    """Variants of a comma-separated list; names that contain commas are recognised.
 
     Raises:
         ConfigError: there is no such analysis, or a value is empty.
     """
-    names = _known(name).variants
+    names = _analysis(name).variants
     words, out = [w.strip() for w in text.split(",")], []
     while words:
         ends = range(len(words), 1, -1)
@@ -253,14 +253,14 @@ def split_values(name: str, text: str) -> list[str]:
     return out
 
 
-def _known(name: str) -> Analysis:
+def _analysis(name: str) -> Analysis:
     if name not in ANALYSES:
         raise ConfigError("unknown analysis", found=name, expected=", ".join(ANALYSES))
     return ANALYSES[name]
 
 
-def _chosen(analysis: Analysis, values: Sequence[str] | None) -> Analysis:
-    """The analysis with these variants only."""
+def _restricted(analysis: Analysis, values: Sequence[str] | None) -> Analysis:
+    """The analysis restricted to these variants, or with these values of its option `free`."""
     if not values:
         return analysis
     if analysis.free:

@@ -1,4 +1,4 @@
-"""What analyses measure of a pair beside its scores: energy at the truth, flow errors, views."""
+"""Measurements of analyses beside the scores: energy at the truth, flow errors, changed views."""
 
 from __future__ import annotations
 
@@ -39,18 +39,16 @@ VIEWS: Mapping[str, Callable[[Pair], Pair] | None] = MappingProxyType(
         "mirrored and cropped 7x5": lambda pair: mirrored(cropped(pair, 7, 5)),
     }
 )
-"""What is made of a pair, by the name of a variant; columns x rows that are cut off."""
+"""Transformation of a pair by name of the variant; 7x5 are the columns x rows cut off."""
 
 
 def measure_view(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> Row:
-    """Solve and score one pair, changed as its variant says."""
+    """Solve and score one pair after the transformation of a variant."""
     return measure_pair(item, overrides, change=VIEWS[variant])
 
 
 def measure_flow(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> Row:
-    """End-point error of the flow of one pair against its truth; nothing is solved.
-
-    The error that counts is weighted with the confidence, as in the energy.
+    """End-point error of the flow of one pair, in pixels; nothing is solved.
 
     Raises:
         DataError: the pair has no true flow.
@@ -70,8 +68,8 @@ def measure_flow(item: Item, overrides: tuple[str, ...] = (), variant: str = "")
 def measure_energy(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> Row:
     """Exact energies by term and depth errors of start, solution, truth and solves from the truth.
 
-    E(truth) well above E(solution) is an error of the model; below it, of the solver. What a solve
-    from the truth loses in depth, the minimum of the energy has lost.
+    An E(truth) well above E(solution) is an error of the model; one below it is an error of the
+    solver. The depth error of a solve from the truth is that of the nearest minimum of the energy.
 
     Raises:
         DataError: the pair has no dense truth of depth and motion.
@@ -90,7 +88,7 @@ def measure_energy(item: Item, overrides: tuple[str, ...] = (), variant: str = "
         if own.any():
             apart = replace(true, component=np.where(own, true.component, 0))
             soups["truth rescaled"] = rescaled(apart, lambda soup: energy(soup)["total"])
-    soups |= from_soup(result, true.soup)
+    soups |= solutions_from(result, true.soup)
     p = result.pair
     assert truth.depth_ref is not None
     metrics = {}
@@ -107,8 +105,8 @@ def measure_energy(item: Item, overrides: tuple[str, ...] = (), variant: str = "
     }
 
 
-def from_soup(result: Run, soup: Soup) -> dict[str, Soup]:
-    """What the NLP, and then the refinement where it is on, make of another start."""
+def solutions_from(result: Run, soup: Soup) -> dict[str, Soup]:
+    """Solutions of the NLP, and of the refinement if it is enabled, from another start."""
     problem = result.problem
     form = Formulation(**dict(problem.formulation))
     options = solver_options(problem, result.start)
@@ -124,7 +122,7 @@ def from_soup(result: Run, soup: Soup) -> dict[str, Soup]:
 def refined(
     problem: Problem, form: Formulation, soup: Soup, data: EnergyData, weights: Weights
 ) -> Refined:
-    """The refinement of a soup as the problem has it."""
+    """The refinement of a soup with the options of a problem."""
     return refine_soup(
         soup,
         data,

@@ -11,15 +11,16 @@ import numpy as np
 from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC, SOURCE
 from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import (
-    codes,
+    code_versions,
     energy_ratio,
     failures,
     figure,
-    joined,
-    made,
+    grid_of_panels,
     main_metric,
     mean,
+    page_text,
     pair_names,
+    provenance,
     save,
     show,
     table,
@@ -28,10 +29,10 @@ from soup_nlp.bench.tables import (
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.model.energy_data import TERMS
 
-WORSE = 0.01
-"""Median relative error that solving from the truth may add."""
-ABOVE = 1.10
-"""E(truth) / E(solution) beyond which the model prefers something else."""
+MAX_LOSS = 0.01
+"""Largest increase of the median relative error by a solve that starts from the truth."""
+MAX_ENERGY_RATIO = 1.10
+"""E(truth) / E(solution) above which the truth is far from a minimum of the energy."""
 FLOW_ERRORS = {
     "mean": ("mean", ".3f"),
     "weighted_mean": ("weighted mean", ".3f"),
@@ -52,37 +53,43 @@ MEASURES: dict[str, tuple[str, Callable[[Row], float | None]]] = {
 }
 """Format and number of every table of variants."""
 COLOURS = dict(zip(TERMS, ("#4477aa", "#66ccee", "#228833", "#ccbb44", "#aa3377")))
-LONG = 60
-"""Letters of all variants from which their labels are slanted."""
+SLANTED_FROM = 60
+"""Labels of variants are slanted if they have more letters than this together."""
 
 
 def by_pair(
     rows: Sequence[Row], names: Sequence[str]
 ) -> tuple[list[str], dict[str, dict[str, Row]]]:
-    """Variants, and rows by name of the pair and variant."""
+    """Names of the variants, and rows by name of the pair and of the variant."""
     out: dict[str, dict[str, Row]] = {}
     for name, row in zip(names, rows, strict=True):
         out.setdefault(name, {})[row["variant"]] = row
     return list(dict.fromkeys(r["variant"] for r in rows)), out
 
 
-def head_of(name: str, text: str, rows: Sequence[Row], note: str) -> list[str]:
-    """Title, question, and how the rows were made."""
+def lines_by_pair(
+    rows: Sequence[Row], measure: Callable[[Row], float | None], form: str = ".4f"
+) -> list[list[str]]:
+    """Lines of a table: a pair and its flow, then a number for each variant."""
+    variants, pairs = by_pair(rows, titles(rows))
+    return [[pair, *(show(measure(own[v]), form) for v in variants)] for pair, own in pairs.items()]
+
+
+def page_head(name: str, text: str, rows: Sequence[Row], note: str) -> list[str]:
+    """First lines of a page: title, question, note, date, machine and metric conventions."""
     used = dict.fromkeys(r["presets"][0] for r in rows)
     conventions = "; ".join(str(preset(p)) for p in used)
     lines = [f"# Analysis: {name}", "", f"{text[0].upper()}{text[1:]}. {note}", ""]
-    return [*lines, f"{made(rows)}. Depth of the reference frame; {conventions}.", ""]
+    return [*lines, f"{provenance(rows)}. Depth of the reference frame; {conventions}.", ""]
 
 
 def text_variants(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     """Table of an analysis: one line for each pair, one column for each variant."""
-    lines = head_of(name, text, rows, note)
+    lines = page_head(name, text, rows, note)
     variants, pairs = by_pair(rows, titles(rows))
     complete = [p for p in pairs.values() if all(main_metric(p[v]) is not None for v in variants)]
     for title, (form, measure) in MEASURES.items():
-        entries = [
-            [pair, *(show(measure(own[v]), form) for v in variants)] for pair, own in pairs.items()
-        ]
+        entries = lines_by_pair(rows, measure, form)
         if len(complete) > 1:
             averages = [mean(measure(p[v]) for p in complete) for v in variants]
             entries.append([f"mean of {len(complete)}", *(show(a, form) for a in averages)])
@@ -95,12 +102,16 @@ def text_variants(name: str, text: str, rows: Sequence[Row], note: str = "") -> 
     if name == "pattern":
         both = ", ".join(f"{k} {v:.4f}" for k, v in GRID_AGAINST_SLIC.items())
         lines += [f"Published for one frame with 1,000 superpixels (copied, not measured): {both}."]
-    return joined([*lines, *failures(rows)])
+    return page_text([*lines, *failures(rows)])
+
+
+def _yes(holds: bool) -> str:
+    return "yes" if holds else "no"
 
 
 def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
-    """Table of energies by term and soup, and the two claims about them."""
-    lines = head_of(name, text, rows, note)
+    """Page of the analysis `energy`: two claims for each pair, and energies by term and soup."""
+    lines = page_head(name, text, rows, note)
     good = [r for r in rows if r.get("ok")]
     entries, summary = [], []
     for title, row in zip(titles(good), good, strict=True):
@@ -115,16 +126,21 @@ def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> st
         worse = scores[last]["median_relative"] - scores["truth"]["median_relative"]
         summary.append(
             [
-                *[title, f"{ratio:.3f}", "yes" if ratio <= ABOVE else "no", f"{nearest:.3f}"],
-                *[f"{worse:+.4f}", "yes" if worse <= WORSE else "no", f"{row['mixed']:.1%}"],
+                *[
+                    title,
+                    f"{ratio:.3f}",
+                    "yes" if ratio <= MAX_ENERGY_RATIO else "no",
+                    f"{nearest:.3f}",
+                ],
+                *[f"{worse:+.4f}", "yes" if worse <= MAX_LOSS else "no", f"{row['mixed']:.1%}"],
             ]
         )
-    head = ["pair, flow", "E truth / E solution", f"<= {ABOVE:g}", "components rescaled"]
-    head += ["median error from truth", f"<= {WORSE:g}", "mixed superpixels"]
+    head = ["pair, flow", "E truth / E solution", f"<= {MAX_ENERGY_RATIO:g}", "components rescaled"]
+    head += ["median error from truth", f"<= {MAX_LOSS:g}", "mixed superpixels"]
     about = "Components rescaled: E of the truth, each component at its scale of lowest E, instead."
     lines += [*table(head, summary), "", about, "", "## By term", ""]
     lines += table(["pair, flow", "soup", "E", *TERMS, "MRE", "median"], entries)
-    return joined([*lines, *failures(rows)])
+    return page_text([*lines, *failures(rows)])
 
 
 def plot_variants(
@@ -145,7 +161,7 @@ def plot_variants(
         ax.plot(x, whole.mean(axis=0), "ks-", lw=2, label=f"mean of {len(whole)}")
     if numeric and len(x) > 1 and x.max() > 8 * x.min() > 0:
         ax.set_xscale("log")
-    slanted = not numeric and len("".join(variants)) > LONG
+    slanted = not numeric and len("".join(variants)) > SLANTED_FROM
     style: dict[str, Any] = {"rotation": 15, "ha": "right", "size": 8} if slanted else {}
     ax.set_xticks(x, variants, **style)
     ax.minorticks_off()
@@ -163,16 +179,13 @@ def plot_variants(
 
 
 def plot_energy(path: Path, rows: Sequence[Row]) -> None:
-    """Terms of every soup stacked, relative to the solution's energy; one panel for each pair.
+    """Terms of every soup as stacked bars, relative to E(solution); one panel for each pair.
 
-    A start far above all others is cut off at the top.
+    The axis ends above the highest bar that is not the start's.
     """
     good = [r for r in rows if r.get("ok")]
-    columns = min(5, max(1, len(good)))
-    lines = max(1, -(-len(good) // columns))
-    picture = figure(2.4 * columns + 1, 3.2 * lines)
-    for k, (title, row) in enumerate(zip(titles(good), good, strict=True)):
-        ax = picture.add_subplot(lines, columns, k + 1)
+    picture, panels = grid_of_panels(len(good), 5, 2.4, 3.2, margin=(1.0, 0.0))
+    for title, row, ax in zip(titles(good), good, panels, strict=True):
         unit = row["energy"]["solution"]["total"] or 1.0
         soups = list(row["energy"])
         bottom = np.zeros(len(soups))
@@ -184,15 +197,15 @@ def plot_energy(path: Path, rows: Sequence[Row]) -> None:
         ax.axhline(1.0, color="k", lw=0.5)
         ax.set_xticks(np.arange(len(soups)), soups, rotation=90, fontsize=7)
         ax.set_title(title, fontsize=7)
-        if k % columns == 0:
+        if ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
             ax.set_ylabel("E / E(solution)")
-        if k == 0:
+        if ax is panels[0]:
             ax.legend(fontsize=6)
     save(picture, path)
 
 
 def text_flow(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
-    """Table of flow errors: the means of complete pairs by source, and every pair and source."""
+    """Page of flow errors: means over the pairs that have all sources, then all single errors."""
     good = [r for r in rows if r.get("ok")]
     variants, pairs = by_pair(good, pair_names(good))
     complete = [own for own in pairs.values() if len(own) == len(variants)]
@@ -205,14 +218,14 @@ def text_flow(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     means = [[v, *cells(own[v] for own in complete)] for v in variants]
     every = [[pair, v, *cells([row])] for pair, own in pairs.items() for v, row in own.items()]
     lines = [f"# Analysis: {name}", ""]
-    lines += [f"{text[0].upper()}{text[1:]}. {note} Code {codes(rows)}.", ""]
+    lines += [f"{text[0].upper()}{text[1:]}. {note} Code {code_versions(rows)}.", ""]
     lines += [f"Mean of {len(complete)} pairs, pixels:", "", *table(["source", *heads], means)]
     lines += ["", "By pair:", "", *table(["pair", "source", *heads], every)]
-    return joined([*lines, *failures(rows)])
+    return page_text([*lines, *failures(rows)])
 
 
 def plot_flow(path: Path, rows: Sequence[Row]) -> None:
-    """Weighted error by pair, one bar for each source."""
+    """Weighted flow error: one group of bars for each pair, one bar for each source."""
     good = [r for r in rows if r.get("ok")]
     variants, pairs = by_pair(good, pair_names(good))
     picture = figure(max(5.0, 1.1 * len(pairs)), 4)

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import (
-    codes,
+    code_versions,
     failures,
     figure,
-    joined,
-    made,
     mean,
+    page_text,
+    provenance,
     save,
     show,
     table,
@@ -55,15 +55,15 @@ CUES = {
     "photo": "photometric disagreement of the solution (census)",
     "particles": "spread of the last particles by their min-marginals in TRW-S",
 }
-"""Uncertainties that are compared."""
-SAMPLE = 400
-"""Pixels of a pair that are kept for the calibration on other families."""
-WITHIN = 0.76
-"""Share of the pixels that a factor brings within one sigma."""
-LITTLE_STILL = 0.1
-"""Share of an image up to which what stands still there hardly changes sigma."""
-LEAST_PARALLAX = 0.1
-"""Pixels of parallax below which the cue divides by this."""
+"""Descriptions of the uncertainties that are compared."""
+SAMPLE_PIXELS = 400
+"""Number of pixels of a pair that the calibration of other families uses."""
+SHARE_WITHIN = 0.76
+"""Share of the pixels whose error is within one sigma after calibration."""
+MAX_STILL = 0.1
+"""Pairs of which a larger share stands still are not used for the calibration."""
+MIN_PARALLAX = 0.1
+"""Smallest parallax that the cue "parallax" divides by, pixels."""
 
 
 def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> Row:
@@ -97,7 +97,7 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
     whole = calibrated(sure.spread, sure.noise, misfit, np.inf, sure.bending)
     unit = chosen(whole) / (BENDING_FACTOR if sure.bending else FACTOR)
     still = np.full(len(log), sure.still)
-    picked = np.linspace(0, len(log) - 1, min(SAMPLE, len(log))).astype(int)
+    picked = np.linspace(0, len(log) - 1, min(SAMPLE_PIXELS, len(log))).astype(int)
     own = found["sigma"]
     return {
         "status": result.solution.status,
@@ -119,7 +119,7 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
 
 
 def _cues(result: Run) -> dict[str, Float]:
-    """(H, W) uncertainties by name."""
+    """(H, W) uncertainties by the names of CUES."""
     labels, start, pair = result.segmentation.labels, result.start, result.pair
     assert pair.flow is not None
     doubt = 1.0 - pair.flow.confidence.astype(float)
@@ -129,7 +129,7 @@ def _cues(result: Run) -> dict[str, Float]:
         "residual": start.error[labels],
         "misfit": result.confidence.misfit[labels],
         "flow": doubt,
-        "parallax": (0.02 + doubt) / np.maximum(start.parallax, LEAST_PARALLAX)[labels],
+        "parallax": (0.02 + doubt) / np.maximum(start.parallax, MIN_PARALLAX)[labels],
     }
     if result.refined and result.refined.rounds:
         out["particles"] = result.refined.rounds[-1].spread[labels]
@@ -140,7 +140,7 @@ def _cues(result: Run) -> dict[str, Float]:
 
 
 def _own_block(result: Run) -> Float:
-    """Conditional standard deviation: every superpixel while all others are held."""
+    """(H, W) conditional standard deviation of a superpixel while all others are fixed."""
     info: Information = information(
         result.soup, result.data, result.weights, result.problem.formulation
     )
@@ -151,34 +151,41 @@ def _own_block(result: Run) -> Float:
     return spread_in_image(info, plane, result.segmentation.labels, result.pair.K_ref)
 
 
-def left_out(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
-    """By family: its factor as the others would choose it, and the coverage of 1, 2 sigma with it.
+def left_out_factors(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
+    """Calibration factor of every family from all others, and the coverage of 1 and 2 sigma.
 
-    Pairs whose surfaces bend have a factor of their own, chosen on such pairs.
+    Pairs with bending surfaces are calibrated on such pairs only, the other pairs on the rest.
     """
     samples = [(r["sequence"], r["confidence"]["bending"], r["confidence"]["sample"]) for r in rows]
-    told: dict[str, list[tuple[float, float, float]]] = {}
+    by_family: dict[str, list[tuple[float, float, float]]] = {}
     for family, bends, own in samples:
         others = [np.array(s) for name, b, s in samples if name != family and b == bends]
-        # where much stands still, sigma comes from that
-        ratios = [(log / unit)[still < LITTLE_STILL] for log, unit, still in others]
-        # every pair counts alike
+        # sigma of mostly static images does not depend on the factor
+        ratios = [(log / unit)[still < MAX_STILL] for log, unit, still in others]
+        # quantiles, so that every pair has the same weight
         alike = [np.quantile(r, np.linspace(0, 1, 101)) for r in ratios if len(r)]
         if not alike:
             continue
-        factor = float(np.quantile(np.concatenate(alike), WITHIN))
+        factor = float(np.quantile(np.concatenate(alike), SHARE_WITHIN))
         log, unit, still = np.array(own)
         sigma = np.hypot(factor * unit, SIGMA_PRIOR * still)
         one, two = coverage(log, sigma / np.hypot(1, sigma / SIGMA_PRIOR))
-        told.setdefault(family, []).append((factor, one, two))
-    mean_of = {name: np.mean(several, axis=0) for name, several in told.items()}
+        by_family.setdefault(family, []).append((factor, one, two))
+    mean_of = {name: np.mean(several, axis=0) for name, several in by_family.items()}
     return {name: (float(f), float(one), float(two)) for name, (f, one, two) in mean_of.items()}
 
 
 def text_confidence(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
-    """Tables by pair and by family."""
+    """Page of the analysis: tables by pair and by family."""
     good = [r for r in rows if r.get("confidence")]
-    lines = [f"# Analysis: {name}", "", f"{text[0].upper()}{text[1:]}. {note}", "", made(rows), ""]
+    lines = [
+        f"# Analysis: {name}",
+        "",
+        f"{text[0].upper()}{text[1:]}. {note}",
+        "",
+        provenance(rows),
+        "",
+    ]
     lines += [
         "AUSE / MRE is the area between the sparsification curve and the oracle's, over the mean"
         " relative error: 0 is perfect, 0.8 to 1 is chance. Within k: share of the pixels whose"
@@ -192,12 +199,12 @@ def text_confidence(name: str, text: str, rows: Sequence[Row], note: str = "") -
     lines += ["", *(f"- {c}: {CUES[c]}" for c in used), "", "## By family", ""]
     lines += [
         f"The factor of sigma, shipped as {FACTOR:g} ({BENDING_FACTOR:g} where surfaces bend), is"
-        f" chosen for each family on all others of its kind, so that {WITHIN:.0%} of their pixels"
-        " lie within one sigma; every pair counts alike.",
+        f" chosen for each family on all others of its kind, so that {SHARE_WITHIN:.0%} of their"
+        " pixels lie within one sigma; every pair counts alike.",
         "",
     ]
     lines += table(*_families(good, used))
-    return joined([*lines, "", *failures(rows), codes(rows)])
+    return page_text([*lines, "", *failures(rows), code_versions(rows)])
 
 
 def _line(title: str, row: Row, used: Sequence[str]) -> list[str]:
@@ -214,13 +221,13 @@ def _line(title: str, row: Row, used: Sequence[str]) -> list[str]:
 
 
 def _families(good: Sequence[Row], used: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """Head and lines of the table by family; the last line is the mean of the families."""
-    told, lines, numbers = left_out(good), [], []
+    """Head and lines of the table by family; the last line has the means over the families."""
+    factors, lines, numbers = left_out_factors(good), [], []
     for family in dict.fromkeys(r["sequence"] for r in good):
         own = [r["confidence"] for r in good if r["sequence"] == family]
         area = [mean([c["ause"].get(k) for c in own]) for k in used]
         within = [float(np.mean([c["within"][k] for c in own])) for k in (0, 1)]
-        factor, *left = told.get(family, (None, None, None))
+        factor, *left = factors.get(family, (None, None, None))
         numbers.append([*area, *within, *left])
         lines.append(
             [f"{family} ({len(own)})", *_shown(numbers[-1], len(used)), show(factor, ".1f")]
@@ -236,7 +243,7 @@ def _shown(numbers: Sequence[Any], areas: int) -> list[str]:
 
 
 def plot_confidence(path: Path, rows: Sequence[Row]) -> None:
-    """Sparsification curves: sigma and the oracle, a panel a family."""
+    """Sparsification curves of sigma and of the oracle, one panel for each family."""
     good = [r for r in rows if r.get("confidence")]
     families = list(dict.fromkeys(r["sequence"] for r in good))
     across = min(4, max(1, len(families)))

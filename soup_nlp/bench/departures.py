@@ -1,7 +1,8 @@
 """The departures of the defaults from the paper, each with the options that undo it.
 
-A departure is a group of options in which the defaults and `preset: paper` differ. "Off alone" are
-the defaults with the paper's values of the group; "on alone" is the preset with the defaults'.
+A departure is a group of options in which the defaults and `preset: paper` differ. "Off alone"
+means the defaults with the paper's values of the group. "On alone" means the preset with the
+default values of the group.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ class Departure:
     """A group of options.
 
     Attributes:
-        name: Of its row.
-        keys: Options, dotted.
+        name: Title of its row.
+        keys: Dotted names of the options.
         with_off: Further options that "off alone" needs.
-        with_on: Further options that "on alone" needs; None where it has no meaning on the preset.
-        needs: What these further options are, for the table; or why there are none.
+        with_on: Further options that "on alone" needs; None if "on alone" has no meaning.
+        needs: Explanation of the further options, for the table.
     """
 
     name: str
@@ -36,12 +37,12 @@ class Departure:
     needs: str = ""
 
     def off_alone(self) -> tuple[str, ...]:
-        """Overrides of the defaults."""
+        """Overrides of "off alone"."""
         printed = dict(leaves(PRESETS["paper"]))
         return _overrides({**{k: printed[k] for k in self.keys}, **self.with_off})
 
     def on_alone(self) -> tuple[str, ...] | None:
-        """Overrides of the preset, which they name; None where there are none."""
+        """Overrides of "on alone", the preset first; None if it has no meaning."""
         if self.with_on is None:
             return None
         ours = {**{k: default(k) for k in self.keys}, **self.with_on}
@@ -77,7 +78,7 @@ DEPARTURES = (
     Departure(
         "pixel units and their weights",
         ("energy.units", "energy.length", *_WEIGHTS),
-        # half a pixel of motion is next to nothing in the paper's units
+        # a truncation given in pixels has no meaning in the paper's units
         with_off={"energy.weights.sigma_arap": float("inf")},
         needs="off: E_arap not truncated, since its truncation is in pixels",
     ),
@@ -139,4 +140,4 @@ DEPARTURES = (
     Departure("rounds end early", ("refine.rounds", "refine.stagnation")),
     Departure("images in the refinement", ("refine.photo", "refine.sweep")),
 )
-"""Every departure that has a switch; `tests/test_bench_paper.py` holds them complete."""
+"""Every departure that options can undo; `tests/test_bench_paper.py` checks for missing ones."""

@@ -1,6 +1,6 @@
-"""Depth maps that are scored: solution, stages before it, baselines with the same flow, floors.
+"""Depth maps that are scored: solution, earlier stages, baselines with the same flow, floor.
 
-The floor is the best that a piecewise planar depth can score: planes fitted to true depth.
+The superpixel floor is the score of planes fitted to the true depth of every superpixel.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ METHODS: Mapping[str, str] = MappingProxyType(
         "floor": "superpixel floor: true planes in these superpixels",
     }
 )
-"""Depth maps that are scored, in the order of tables."""
+"""Descriptions of the depth maps, in the order of the tables."""
 
 BASELINES = ("unorganised", "rigid", "rigid_filled", "plane", "constant")
-"""Those that the solution has to beat."""
+"""Depth maps that the solution is compared with."""
 
-SPARSE = 4.0
-"""True pixels per superpixel below which the superpixel floor is meaningless."""
+MIN_DENSITY = 4.0
+"""True pixels per superpixel that the superpixel floor needs."""
 
-LEAST_OF_PLANE = 4
-"""Fewest true pixels of a label that make a plane; fewer get a constant depth."""
+MIN_PLANE_PIXELS = 4
+"""True pixels that a plane is fitted to; labels with fewer get a constant depth."""
 
 
 def unorganised(soup: Soup) -> Soup:
-    """The soup before assembly: every superpixel in units of its own translation.
+    """The soup before assembly: the scale of every superpixel makes its translation have length 1.
 
-    From two views each plane and motion is known up to its own scale; with |t_i| = 1 for all, what
-    is left is what independent superpixels give. Superpixels at rest keep their scale.
+    Two views determine each plane and motion up to a scale, so this is the result of independent
+    superpixels. Superpixels at rest keep their scale.
     """
     length = np.linalg.norm(soup.translation, axis=1)
     tiny = 1e-9 * max(float(length.max(initial=0.0)), 1e-300)
@@ -66,10 +66,9 @@ def unorganised(soup: Soup) -> Soup:
 def depth_maps(run: Run, fitted: bool = True) -> dict[str, Float]:
     """(H, W) depths of the reference frame by method, for a run whose pair has a truth of depth.
 
-    "nlp" is there where the NLP was refined, the rigid ones where a motion fits, "floor" where the
-    truth is dense enough. "plane" and "floor" are fitted to every true pixel, also where a
-    convention leaves some out by a cap or a crop: there another fit may be better. They are left
-    out if not `fitted`.
+    "nlp" is present if the NLP was refined, the rigid ones if a motion fits, and "floor" if the
+    truth is dense enough. "plane" and "floor" are fitted to all true pixels, also to those that a
+    convention with a cap or a crop leaves out. They are left out if not `fitted`.
     """
     pair, seg = run.pair, run.segmentation
     labels = seg.labels
@@ -93,13 +92,13 @@ def depth_maps(run: Run, fitted: bool = True) -> dict[str, Float]:
         return out
     whole = np.zeros(labels.shape, np.int32)
     out["plane"] = plane_depth(fit_planes(whole, truth, pair.K_ref), whole, pair.K_ref)
-    if np.count_nonzero(np.isfinite(truth)) >= SPARSE * len(seg):
+    if np.count_nonzero(np.isfinite(truth)) >= MIN_DENSITY * len(seg):
         out["floor"] = plane_depth(fit_planes(labels, truth, pair.K_ref), labels, pair.K_ref)
     return out
 
 
 def true_depth(run: Run) -> Float | None:
-    """(H, W) true depth; sparse points at their nearest pixels; None where nothing is known."""
+    """(H, W) true depth, NaN where unknown; sparse points at their nearest pixels; None if none."""
     truth = run.pair.truth
     if truth is None:
         return None
@@ -117,18 +116,17 @@ def fit_planes(
 ) -> Float:
     """Inverse-depth planes m, 1 / z = m . ray, with the least mean relative error per label.
 
-    Minimises sum |z - 1 / (m . r)| / z = sum |u - 1| / u with u = z m . r by iteratively
-    re-weighted least squares from two planes, the least squares of 1 / z - m . r and of u - 1; the
-    best iterate of each label is kept, the best constant depth where no plane is better. The mean
-    relative error is not convex in m, so this is an upper bound of the best, close to it where one
-    plane suits most pixels.
+    Iteratively reweighted least squares minimises sum |z - 1 / (m . r)| / z = sum |u - 1| / u with
+    u = z m . r. It starts from two planes, the least-squares solutions of 1 / z - m . r and of
+    u - 1. The best iterate of each label is kept, or the best constant depth if no plane is better.
+    The mean relative error is not convex in m, so the result is an upper bound of the minimum.
 
     Args:
         labels: (H, W) label 0..N-1 of every pixel.
         depth: (H, W) true z; NaN where unknown.
         K: (3, 3) intrinsics.
-        rounds: Re-weighted fits from either start.
-        softening: Relative error below which weights stop growing.
+        rounds: Reweighted fits from each start.
+        softening: Relative error below which the weights are constant.
 
     Returns:
         (N, 3); NaN where a label has no true pixel.
@@ -148,8 +146,8 @@ def fit_planes(
     count = np.bincount(which, minlength=n)
     constant = np.column_stack([np.zeros((n, 2)), _best_constant(which, z, count)])
     best, lowest = constant.copy(), _errors(constant, which, zr, count)
-    rich = count >= LEAST_OF_PLANE
-    # equal weights of u - 1 grow with z^2 in inverse depth: some sky outweighs everything near
+    rich = count >= MIN_PLANE_PIXELS
+    # equal weights of u - 1 grow with z^2: a few sky pixels outweigh all near ones
     for weight in (1.0 / (z * z), np.ones(len(z))):
         for _ in range(rounds):
             m = _solve(which, zr, weight, n, constant)
@@ -179,7 +177,7 @@ def _best_constant(which: Labels, z: Float, count: Labels) -> Float:
 
 
 def _solve(which: Labels, zr: Float, weight: Float, n: int, prior: Float) -> Float:
-    """(N, 3) weighted least squares of m . zr = 1, with a trace of a prior."""
+    """(N, 3) weighted least squares of m . zr = 1, with a small ridge towards a prior."""
     A = np.empty((n, 3, 3))
     for a in range(3):
         for b in range(a, 3):
@@ -191,7 +189,7 @@ def _solve(which: Labels, zr: Float, weight: Float, n: int, prior: Float) -> Flo
 
 
 def _errors(m: Float, which: Labels, zr: Float, count: Labels) -> Float:
-    """(N,) mean relative error of every label; infinite where a pixel has no positive depth."""
+    """(N,) mean relative error of every label; infinite if a pixel is behind the plane."""
     u = np.einsum("pc,pc->p", zr, m[which])
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.where(u > 0, np.abs(1 - 1 / u), np.inf)
@@ -206,7 +204,7 @@ def plane_depth(m: Float, labels: Labels, K: Float) -> Float:
 
 
 def points_as_map(points: Float, shape: tuple[int, int]) -> Float:
-    """Sparse truth (M, 3) of (u, v, z) as a depth map, each at its nearest pixel; NaN elsewhere."""
+    """Depth map of sparse truth (M, 3) of (u, v, z), each at its nearest pixel; NaN elsewhere."""
     out = np.full(shape, np.nan)
     u, v = np.floor(points[:, :2] + 0.5).astype(np.int64).T
     inside = (u >= 0) & (v >= 0) & (u < shape[1]) & (v < shape[0])

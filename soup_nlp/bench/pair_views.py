@@ -1,7 +1,7 @@
-"""A pair mirrored, backwards or cropped, with its truth: how much a figure depends on chance.
+"""Mirrored, reversed and cropped versions of a pair with its truth.
 
-Superpixels, flow and choices come out differently on the same pixels in another order or with
-other margins, so a figure that holds on all views is worth more than one on a single pair.
+Superpixels, flow and discrete decisions differ between such versions of the same scene. Measuring
+all of them shows how much a figure depends on chance.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ Float = NDArray[np.float64]
 Change = Callable[[NDArray[Any]], NDArray[Any]]
 
 IMAGES = ("depth_ref", "depth_next", "flow", "occluded", "components", "scene_flow")
-"""Parts of a truth that have a value for every pixel."""
+"""Parts of a truth with a value for every pixel."""
 _FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
 def mirrored(pair: Pair) -> Pair:
-    """The pair mirrored left to right: columns are reversed, x changes its sign.
+    """The pair mirrored left to right: the columns are reversed and x changes its sign.
 
-    Depths stay; intrinsics, flow, motions, points and scene flow are those of the mirrored world.
+    Depths do not change; intrinsics, flow, motions, points and scene flow are mirrored.
     """
     width, there = pair.image_ref.shape[1], pair.image_next.shape[1]
 
@@ -55,7 +55,7 @@ def mirrored(pair: Pair) -> Pair:
 
 
 def backwards(pair: Pair) -> Pair:
-    """The pair with its frames exchanged: a pair of the same kind that nothing was chosen on.
+    """The pair with its two frames exchanged and without a flow.
 
     Raises:
         DataError: the depth of the next frame is not known.
@@ -89,7 +89,7 @@ def _mirrored_camera(K: Float, width: int) -> Float:
 
 
 def _changed(truth: Truth, changes: Mapping[str, Change]) -> Truth:
-    """The truth with the parts of these names changed, where they are known."""
+    """The truth with the known parts of these names changed."""
     own: dict[str, Any] = {
         k: change(v) for k, change in changes.items() if (v := getattr(truth, k)) is not None
     }
@@ -97,7 +97,7 @@ def _changed(truth: Truth, changes: Mapping[str, Change]) -> Truth:
 
 
 def _each_image(pair: Pair, change: Change) -> Pair:
-    """The pair with every per-pixel array changed; cameras and the rest as they were."""
+    """The pair with every per-pixel array changed; cameras and sparse truth do not change."""
     flow, truth = pair.flow, pair.truth
     if flow is not None:
         flow = replace(flow, uv=change(flow.uv), confidence=change(flow.confidence))
@@ -131,12 +131,12 @@ def cropped(pair: Pair, left: int, top: int, right: int = 0, bottom: int = 0) ->
     seen = _each_image(pair, cut)
     truth = seen.truth
     if truth is not None and truth.flow is not None and truth.occluded is not None:
-        # what moves into the margin is not seen there any more
+        # pixels that move into the margin are no longer visible
         known = np.isfinite(truth.flow).all(axis=2)
         gone = known & leaves(truth.flow, seen.image_next.shape[:2])
         truth = replace(truth, occluded=truth.occluded | gone)
     if truth is not None and truth.points is not None:
-        # a point belongs to the pixel that it is nearest to
+        # a point is kept if its nearest pixel is
         pixel = np.floor(truth.points[:, :2] + 0.5) - corner[:2]
         inside = ((pixel >= 0) & (pixel < seen.size[::-1])).all(axis=1)
         truth = replace(truth, points=truth.points[inside] - corner)

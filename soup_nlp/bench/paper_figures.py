@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from soup_nlp.bench.paper_measures import read_maps
 from soup_nlp.bench.paper_scale import SCALES
 from soup_nlp.bench.rows import Row
-from soup_nlp.bench.tables import figure, save
+from soup_nlp.bench.tables import figure, grid_of_panels, save
 
 Number = float | None
 Lines = Mapping[str, Mapping[str, Mapping[str, Number]]]
@@ -36,14 +36,14 @@ SCALE_STYLES = {
 }
 STAGES = ("#88ccee", "#44aa99", "#117733", "#ddaa33", "#882255")
 """Colours of the stages of a solve, in their order."""
-PANELS = 12
-"""Most panels of the figure of scales."""
-HIGHEST = 1.0
-"""MRE at which bars are cut: beyond it no depth is left."""
+MAX_PANELS = 12
+"""Number of panels in the figure of scales."""
+BAR_LIMIT = 1.0
+"""MRE at which bars are cut."""
 
 
 def plot_lines(path: Path, lines: Lines, axis: str, measure: str, text: str) -> None:
-    """A panel a method, a line a pair, over the variants."""
+    """Values over the variants: one panel for each method, one line for each pair."""
     picture = figure(9, 3.6)
     axes = picture.subplots(1, len(lines), sharey=True, squeeze=False)[0]
     values: list[float] = []
@@ -66,7 +66,7 @@ def plot_lines(path: Path, lines: Lines, axis: str, measure: str, text: str) -> 
 
 
 def _scaled(axes: Sequence[Axes], values: Sequence[float]) -> None:
-    """A logarithmic axis where values differ much, else one from 0."""
+    """Make the axes logarithmic if the values differ much, else let them begin at 0."""
     for ax in axes:
         if values and min(values) > 0 and max(values) > 20 * min(values):
             ax.set_yscale("log")
@@ -75,7 +75,7 @@ def _scaled(axes: Sequence[Axes], values: Sequence[float]) -> None:
 
 
 def plot_comparison(path: Path, bars: Mapping[str, Mapping[str, Number]], text: str) -> None:
-    """Groups of bars: MRE by method for every dataset; what is above the axis has its number."""
+    """MRE by method for every dataset as groups of bars, cut at BAR_LIMIT, with their numbers."""
     names = list(dict.fromkeys(m for own in bars.values() for m in own))
     picture = figure(max(6.0, 1.5 * len(bars) + 1), 4.2)
     ax = picture.add_subplot()
@@ -85,15 +85,15 @@ def plot_comparison(path: Path, bars: Mapping[str, Mapping[str, Number]], text: 
         for place, value in zip(x, (own.get(name) for own in bars.values()), strict=True):
             if value is None:
                 continue
-            height = min(value, HIGHEST)
+            height = min(value, BAR_LIMIT)
             ax.bar(place, height, width, color=COLOURS.get(name))
-            form = ".3f" if value < HIGHEST else ".3g"
-            at = height + 0.01 * HIGHEST
+            form = ".3f" if value < BAR_LIMIT else ".3g"
+            at = height + 0.01 * BAR_LIMIT
             ax.text(place, at, format(value, form), ha="center", va="bottom", size=6, rotation=90)
-    ax.set_ylim(0, 1.2 * HIGHEST)
-    ax.axhline(HIGHEST, color="k", lw=0.6, ls=":")
+    ax.set_ylim(0, 1.2 * BAR_LIMIT)
+    ax.axhline(BAR_LIMIT, color="k", lw=0.6, ls=":")
     ax.set_xticks(np.arange(len(bars)), list(bars), rotation=15, size=8)
-    ax.set(ylabel=f"MRE, one median scale; bars end at {HIGHEST:g}")
+    ax.set(ylabel=f"MRE, one median scale; bars end at {BAR_LIMIT:g}")
     keys = [Patch(color=COLOURS.get(name), label=name) for name in names]
     picture.legend(handles=keys, loc="outside lower center", ncols=len(names), fontsize=7)
     ax.set_title(text, fontsize=10)
@@ -101,7 +101,7 @@ def plot_comparison(path: Path, bars: Mapping[str, Mapping[str, Number]], text: 
 
 
 def plot_curves(path: Path, curves: Mapping[str, Mapping[str, Row]]) -> None:
-    """Energies over iterations and rounds: a line of panels a pair, solver and rounds by method."""
+    """Energies over iterations and rounds: a row of panels for each pair, two panels a method."""
     pairs = list(curves)
     methods = list(dict.fromkeys(m for own in curves.values() for m in own))
     picture = figure(2.6 * 2 * max(1, len(methods)), 2.1 * max(1, len(pairs)) + 0.7)
@@ -132,7 +132,7 @@ def plot_curves(path: Path, curves: Mapping[str, Mapping[str, Row]]) -> None:
 
 
 def _stages(ax: Axes, row: Row) -> dict[str, Any]:
-    """The smoothed energy of every stage, one after the other; its lines by name."""
+    """Draw the smoothed energy of all stages in sequence; the lines by name of the stage."""
     begin = 0
     lines: dict[str, Any] = {}
     ax.set_axis_on()
@@ -149,7 +149,7 @@ def _stages(ax: Axes, row: Row) -> dict[str, Any]:
 
 
 def plot_bars(path: Path, table: Mapping[str, Mapping[str, Number]], text: str, label: str) -> None:
-    """Horizontal bars: one group a name, a colour a method; logarithmic about 1."""
+    """Ratios as horizontal bars from 1 on a logarithmic axis: a group for each row of the table."""
     names = list(table)
     groups = list(dict.fromkeys(g for own in table.values() for g in own))
     picture = figure(8, 0.36 * len(names) + 1.2)
@@ -175,14 +175,9 @@ def plot_bars(path: Path, table: Mapping[str, Mapping[str, Number]], text: str, 
 
 def plot_scale(path: Path, bodies: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
     """Energies over the scale of one body, from 0 (lowest) to 1 (highest); the truth is 1."""
-    shown = dict(list(bodies.items())[:PANELS])
-    columns = 4
-    lines = max(1, -(-len(shown) // columns))
-    picture = figure(2.6 * columns, 2.3 * lines + 0.6)
-    axes = picture.subplots(lines, columns, squeeze=False)
-    for ax in axes.flat[len(shown) :]:
-        ax.set_axis_off()
-    for ax, (name, curves) in zip(axes.flat, shown.items(), strict=False):
+    shown = dict(list(bodies.items())[:MAX_PANELS])
+    picture, panels = grid_of_panels(len(shown), 4, 2.6, 2.3, margin=(0.0, 0.6))
+    for ax, (name, curves) in zip(panels, shown.items(), strict=True):
         for kind, (label, colour) in SCALE_STYLES.items():
             y = np.asarray(curves[kind])
             y = (y - y.min()) / max(float(np.ptp(y)), 1e-12)
@@ -194,14 +189,16 @@ def plot_scale(path: Path, bodies: Mapping[str, Mapping[str, Sequence[float]]]) 
         ax.set_title(name, fontsize=7)
         ax.tick_params(labelsize=6)
     picture.supylabel("energy, from its lowest to its highest value", fontsize=8)
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    picture.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=7)
+    if panels:
+        keys = panels[0].get_legend_handles_labels()
+        columns = min(5, 2 * len(panels))
+        picture.legend(*keys, loc="outside lower center", ncols=columns, fontsize=7)
     picture.suptitle("Energy over the scale of one moving body; 1 is the true scale", fontsize=10)
     save(picture, path)
 
 
 def plot_maps(path: Path, files: Mapping[str, tuple[Path, Path]]) -> None:
-    """Image, truth, unorganised soup, preset and defaults: one line a pair."""
+    """Image, truth and depths of start, preset and defaults: one row of panels for each pair."""
     found = {name: (read_maps(a), read_maps(b)) for name, (a, b) in files.items()}
     found = {name: maps for name, maps in found.items() if all(maps)}
     heads = ("image", "truth", "paper's start", "preset: paper", "defaults")

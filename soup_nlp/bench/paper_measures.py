@@ -1,4 +1,4 @@
-"""What `bench paper` measures of a pair: scores, energies on the way, small maps for pictures."""
+"""Measurement of a pair for `bench paper`: scores, energy curves, small depth maps."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def has_truth(item: Item) -> bool:
 
 
 def loaded(problem: Problem) -> tuple[Pair, float]:
-    """The pair of a problem with its flow, and the seconds of the flow; the last few are kept."""
+    """The pair of a problem with its flow, and the wall seconds of the flow; cached."""
     own = problem.model_dump(mode="json", include={"input", "flow", "base", "name"})
     return _loaded(json.dumps(own, sort_keys=True))
 
@@ -55,11 +55,7 @@ def measure(
 ) -> Row:
     """Solve and score one pair.
 
-    Args:
-        item: Pair and flow.
-        overrides: Of its problem.
-        variant: Not used here.
-        maps: File for small depth maps; None for none.
+    Small depth maps are written to the file `maps`, if given.
 
     Raises:
         SoupError: the pair cannot be solved or scored.
@@ -89,10 +85,11 @@ def _rmse(result: Run) -> float | None:
 
 
 def curve(result: Run) -> Row:
-    """Energies on the way: the solver's smoothed one by stage and iteration, the exact one after.
+    """Energies of a run over iterations and rounds.
 
-    "exact" begins with the start and the NLP's solution; "rounds" is what the refinement lowers,
-    before the first round and after each.
+    "stages" has the smoothed energy by stage and iteration, "exact" the exact energy of the start
+    and of the NLP's solution, "rounds" the objective of the refinement before the first round and
+    after each.
     """
     s, refined = result.solution, result.refined
     rounds = []
@@ -109,7 +106,7 @@ def curve(result: Run) -> Row:
 
 
 def write_maps(path: Path, result: Run) -> None:
-    """Write image, truth, start, NLP and solution, thinned out, as .npz."""
+    """Write image, truth, start and solution as .npz, subsampled to MAP_WIDTH columns."""
     pair = result.pair
     step = max(1, -(-pair.size[1] // MAP_WIDTH))
 
@@ -130,7 +127,7 @@ def write_maps(path: Path, result: Run) -> None:
 
 
 def read_maps(path: Path) -> dict[str, NDArray[np.generic]]:
-    """The maps that `write_maps` wrote; {} where the file is not there."""
+    """The maps that `write_maps` wrote; {} if there is no file."""
     if not path.is_file():
         return {}
     with np.load(path) as stored:

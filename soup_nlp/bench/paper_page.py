@@ -1,15 +1,14 @@
-"""The page of `bench paper`: every table and figure of the paper that its rows allow."""
+"""The page of `bench paper`: the tables and figures of the paper that the rows allow."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 from soup_nlp.bench import paper_figures as figures
 from soup_nlp.bench import paper_sections as sections
 from soup_nlp.bench.paper_plan import (
-    ALL,
+    ALL_SECTIONS,
     DATASETS,
     METHODS,
     SECTIONS,
@@ -17,11 +16,11 @@ from soup_nlp.bench.paper_plan import (
     source_of,
     title,
 )
-from soup_nlp.bench.paper_sections import Number, Results, compared, figure
+from soup_nlp.bench.paper_sections import Number, Results, compared_cells, figure
 from soup_nlp.bench.processes import processor
 from soup_nlp.bench.published import COMPARISON, DATA, SOURCE
-from soup_nlp.bench.rows import Row, failed
-from soup_nlp.bench.tables import failures, get, joined, made, mean, show, table
+from soup_nlp.bench.rows import Row
+from soup_nlp.bench.tables import failures, mean, metric, page_text, provenance, show, table
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.solve.ipopt import GOOD
 from soup_nlp.storage.atomic import write_text
@@ -49,7 +48,7 @@ def write_page(out: Path, results: Results, command: str) -> Path:
             _missing(results),
             failures([*results.rows, *results.scales]),
         ]
-        write_text(new / PAGE, joined([line for lines in parts for line in lines]))
+        write_text(new / PAGE, page_text([line for lines in parts for line in lines]))
     return out / PAGE
 
 
@@ -61,7 +60,7 @@ def _head(r: Results, command: str) -> list[str]:
     return [
         "# The paper, row by row",
         "",
-        f"Made by `{command}`. {made([*r.rows, *r.scales])}. Flow by OpenCV DIS unless named."
+        f"Made by `{command}`. {provenance([*r.rows, *r.scales])}. Flow by OpenCV DIS unless named."
         f" Machine: {os.cpu_count()} cores of an {processor()}.",
         f"Superpixels wanted: {s.superpixels} in the comparison, {s.analysis} elsewhere."
         + (f" Overrides of every row: {changed}." if changed else "")
@@ -86,11 +85,11 @@ def _comparison(out: Path, r: Results) -> list[str]:
         own: dict[str, Number] = {"published": known["Superpixel Soup"]}
         cells = []
         for method in METHODS:
-            here = compared(r, items, method)
+            here = compared_cells(r, items, method)
             own[method] = mean(r.mre(c) for c in here)
             capped = mean(r.mre(c, d.cap) for c in here) if d.cap else None
             cells += [show(own[method]), show(mean(r.mre(c, "best") for c in here)), show(capped)]
-        first = compared(r, items, "defaults")
+        first = compared_cells(r, items, "defaults")
         own["constant depth"] = mean(r.mre(c, "paper", "constant") for c in first)
         rigid = mean(r.mre(c, "paper", "rigid") for c in first)
         if own["defaults"] is not None:
@@ -104,10 +103,10 @@ def _comparison(out: Path, r: Results) -> list[str]:
     head += ["constant depth: median", "one rigid motion: median"]
     lines += [*table(head, entries), "", *_protocols()]
     lines += _by_pair(r)
-    told = {i.key for group in r.plan.datasets.values() for i in group}
-    for item in (i for i in r.plan.analyses if i.key not in told):
-        by = {m: r.mre(compared(r, [item], m)[0]) for m in METHODS}
-        flat = r.mre(compared(r, [item], "defaults")[0], "paper", "constant")
+    known_pairs = {i.key for group in r.plan.datasets.values() for i in group}
+    for item in (i for i in r.plan.analyses if i.key not in known_pairs):
+        by = {m: r.mre(compared_cells(r, [item], m)[0]) for m in METHODS}
+        flat = r.mre(compared_cells(r, [item], "defaults")[0], "paper", "constant")
         bars[title(item)] = {"published": None, **by, "constant depth": flat}
     figures.plot_comparison(out / "comparison.png", bars, "MRE by dataset or pair")
     return [*lines, *figure("comparison", "MRE by dataset")]
@@ -127,16 +126,16 @@ def _protocols() -> list[str]:
 
 
 def _by_pair(r: Results) -> list[str]:
-    """Table of every pair, with medians."""
+    """Table of every pair: MRE by stage and median error."""
     items = {i.key: i for group in r.plan.datasets.values() for i in group}
     items |= {i.key: i for i in r.plan.analyses}
     entries = []
     for item in items.values():
         cells = [title(item)]
         for method in METHODS:
-            (cell,) = compared(r, [item], method)
+            (cell,) = compared_cells(r, [item], method)
             row = r.row(cell)
-            median = get(row, "paper", "solution", "median_relative")
+            median = metric(row, "paper", "solution", "median_relative")
             start, nlp = r.mre(cell, "paper", "start"), r.mre(cell, "paper", "nlp")
             cells += [show(start), show(nlp), show(r.mre(cell)), show(median), _ended(row)]
         cells.append(show(r.mre(cell, "paper", "constant")))
@@ -152,7 +151,7 @@ def _by_pair(r: Results) -> list[str]:
 
 
 def _ended(row: Row) -> str:
-    """Whether the NLP converged, or how it ended."""
+    """ "yes" if the NLP converged, else its status."""
     status = str(row.get("status", "-"))
     return "yes" if status in GOOD else status.replace("_", " ").lower()
 
@@ -162,7 +161,7 @@ def _pictures(out: Path, r: Results, stored: Path) -> list[str]:
     items |= {i.key: i for group in r.plan.datasets.values() for i in group[:2]}
     files = {}
     for item in items.values():
-        a, b = (compared(r, [item], m)[0].maps(stored) for m in METHODS)
+        a, b = (compared_cells(r, [item], m)[0].maps(stored) for m in METHODS)
         if a.is_file() and b.is_file():
             files[title(item)] = a, b
     text = "Depth maps: image, truth, unorganised soup, preset, defaults"
@@ -178,11 +177,6 @@ def _pictures(out: Path, r: Results, stored: Path) -> list[str]:
 def _missing(r: Results) -> list[str]:
     entries = [[d.title, source_of(d)] for d in DATASETS if not r.plan.datasets[d.name]]
     entries += [[name, text] for name, text in WITHOUT_TRUTH.items()]
-    left = [name for name in ALL if name not in r.plan.sizes.sections]
+    left = [name for name in ALL_SECTIONS if name not in r.plan.sizes.sections]
     entries += [[f"section {name}", "left out of this run (`--sections`)"] for name in left]
     return ["## What is not here", "", *table(["data", "why, and where from"], entries), ""]
-
-
-def complete(rows: Sequence[Row]) -> bool:
-    """Whether no row failed."""
-    return not any(failed(row) for row in rows)

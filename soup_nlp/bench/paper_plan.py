@@ -1,4 +1,4 @@
-"""What `bench paper` solves: pairs of the paper's datasets, and the rows of its sections."""
+"""The plan of `bench paper`: pairs of the paper's datasets, and the rows of every section."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
-from soup_nlp.bench.accuracy import head
+from soup_nlp.bench.accuracy import row_identity
 from soup_nlp.bench.analyses import ANALYSES, NOISE_PX
 from soup_nlp.bench.departures import DEPARTURES, PAPER
 from soup_nlp.bench.paper_measures import has_truth, measure
@@ -22,14 +22,14 @@ from soup_nlp.errors import DataError
 Overrides = tuple[str, ...]
 
 SCALE_SUPERPIXELS = 1000
-"""Superpixels where the scale of one body is varied: nothing is solved there."""
+"""Superpixels of the section on scales of bodies, which solves nothing."""
 
 METHODS: Mapping[str, Overrides] = MappingProxyType({"preset: paper": PAPER, "defaults": ()})
 """Overrides by the name of a method."""
 
 
 PRINTED_SUPERPIXELS = 1000
-"""Superpixels that the preset's weights are for."""
+"""Number of superpixels for which the preset gives its weights."""
 _LENGTHS = tuple(f"energy.weights.{term}" for term in ("arap", "cont"))
 _PRINTED: Overrides = tuple(o for o in overrides_of("paper") if o.partition("=")[0] in _LENGTHS)
 
@@ -39,11 +39,11 @@ class Dataset:
     """A dataset of the paper.
 
     Attributes:
-        name: As in `bench.published`.
-        title: For tables.
-        suites: Where its pairs are; the first suite that has any is taken.
-        cap: Convention with a depth cap, if one is in use.
-        sequences: Families of the suite `shared` that are pairs of this dataset.
+        name: Name in `bench.published`.
+        title: Title in tables.
+        suites: Suites of its pairs; `shared` is used if none of them has a pair.
+        cap: Metric convention with a depth cap, "" if none is in use.
+        sequences: Families of the suite `shared` that belong to this dataset.
     """
 
     name: str
@@ -69,7 +69,7 @@ WITHOUT_TRUTH = {
     " flow sets",
     "ULDEMV": "the paper draws its errors on KITTI and prints no number",
 }
-"""What the paper has and no row can be made of, and why."""
+"""Data of the paper without a row here, and the reason."""
 
 
 SECTIONS: Mapping[str, str] = MappingProxyType(
@@ -82,26 +82,26 @@ SECTIONS: Mapping[str, str] = MappingProxyType(
         "stages": "stages",
     }
 )
-"""Sections of one change at a time, with the label of their axis."""
-ALL = (*SECTIONS, "departures", "scale")
+"""Sections that vary one option, with the label of their axis."""
+ALL_SECTIONS = (*SECTIONS, "departures", "scale")
 """Sections that can be left out."""
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How large the benchmark is.
+    """Size of the benchmark.
 
     Attributes:
-        superpixels: Of the comparison of datasets.
-        analysis: Of all other sections.
-        limit: Pairs a dataset, spread evenly; None for all.
+        superpixels: Number of superpixels in the comparison of datasets.
+        analysis: Number of superpixels in all other sections.
+        limit: Most pairs of a dataset, evenly spaced; None for all.
         numbers: Numbers of superpixels that are compared.
-        neighbours: K that are compared.
+        neighbours: Values of K that are compared.
         width: Columns of rendered scenes.
         seeds: Seeds of rendered scenes for the scales of bodies.
         families: Pairs of the analyses: names of rendered scenes, of datasets, or motorcycle.
-        overrides: Of every problem.
-        sections: What is measured beside the comparison, of ALL.
+        overrides: Overrides of every problem.
+        sections: Sections of ALL_SECTIONS that are measured beside the comparison.
     """
 
     superpixels: int = 1000
@@ -113,7 +113,7 @@ class Sizes:
     seeds: tuple[int, ...] = (0, 1, 2)
     families: tuple[str, ...] = ("street", "room", "motorcycle", "kitti", "kinect_paper")
     overrides: Overrides = ()
-    sections: tuple[str, ...] = ALL
+    sections: tuple[str, ...] = ALL_SECTIONS
 
 
 @dataclass(frozen=True)
@@ -125,12 +125,12 @@ class Cell:
 
     @property
     def key(self) -> tuple[str, Overrides]:
-        """Tells it from all others."""
+        """Unique among all cells."""
         return self.item.key, self.overrides
 
     def job(self, folder: Path, pictures: bool = False) -> Job:
-        """Its job; pictures go to FOLDER/maps."""
-        name = head(self.item, self.overrides, ", ".join(self.overrides))
+        """The job of the cell; with `pictures`, depth maps are written to FOLDER/maps."""
+        name = row_identity(self.item, self.overrides, ", ".join(self.overrides))
         maps = self.maps(folder) if pictures else None
         work = partial(measure, self.item, self.overrides, maps=maps)
         return Job(name, partial(attempt, work), maps is not None and not maps.is_file())
@@ -143,13 +143,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Plan:
-    """Pairs by dataset, and what is measured of them.
+    """Pairs of the benchmark, and the cells that are measured.
 
     Attributes:
         sizes: See Sizes.
-        datasets: Pairs with truth by dataset; empty where none is there.
+        datasets: Available pairs with truth by dataset.
         analyses: Pairs of the analyses.
-        scenes: Rendered scenes and pairs with moving masks, for the scales of bodies.
+        scenes: Rendered scenes and pairs with masks of what moves, for the scales of bodies.
     """
 
     sizes: Sizes
@@ -158,12 +158,12 @@ class Plan:
     scenes: tuple[Item, ...]
 
     def cell(self, item: Item, method: str, *overrides: str, superpixels: int = 0) -> Cell:
-        """A pair by a method of METHODS, changed."""
+        """The cell of a pair by a method of METHODS with further overrides."""
         n = superpixels or self.sizes.analysis
         return Cell(item, (*_at_size(METHODS[method], n), *self.sizes.overrides, *overrides))
 
     def compared(self) -> list[Cell]:
-        """Every pair of every dataset, then the pairs of the analyses, by both methods."""
+        """Cells of the comparison: all pairs of datasets and analyses, by both methods."""
         items = [i for group in self.datasets.values() for i in group]
         known = {i.key for i in items}
         items += [i for i in self.analyses if i.key not in known]
@@ -171,7 +171,7 @@ class Plan:
         return [self.cell(i, m, superpixels=n) for i in items for m in METHODS]
 
     def variants(self, section: str, item: Item, method: str) -> dict[str, Cell]:
-        """The cells of a section of one change at a time, by the name of the change."""
+        """The cells of a pair in a section that varies one option, by name of the variant."""
         s = self.sizes
         if section == "superpixels":
             return {str(n): self.cell(item, method, superpixels=n) for n in s.numbers}
@@ -185,13 +185,13 @@ class Plan:
         return {name: self.cell(item, method, *own) for name, own in changes.items()}
 
     def items(self, section: str) -> tuple[Item, ...]:
-        """Pairs of a section: of those with a true flow one each where the flow is varied."""
+        """Pairs of a section; the section `flow` has the rendered ones only."""
         if section != "flow":
             return self.analyses
         return tuple(i for i in self.analyses if i.suite == "rendered")
 
     def departures(self, item: Item) -> dict[str, tuple[Cell, Cell | None]]:
-        """Cells "off alone" and "on alone" by departure."""
+        """Cells "off alone" and "on alone" by name of the departure."""
         n, same = self.sizes.analysis, self.sizes.overrides
         out: dict[str, tuple[Cell, Cell | None]] = {}
         for d in DEPARTURES:
@@ -202,7 +202,7 @@ class Plan:
         return out
 
     def cells(self) -> list[Cell]:
-        """All rows, each once, those of one pair together."""
+        """All cells without duplicates, those of one pair next to each other."""
         cells = {c.key: c for c in self.compared()}
         wanted = self.sizes.sections
         for section in [name for name in SECTIONS if name in wanted]:
@@ -219,18 +219,18 @@ class Plan:
         return sorted(cells.values(), key=lambda c: place[c.item.key])
 
     def jobs(self, folder: Path) -> list[Job]:
-        """All solves; those of the comparison draw maps."""
+        """Jobs of all solves; those of the comparison write depth maps."""
         pictures = {c.key for c in self.compared()}
         return [c.job(folder, c.key in pictures) for c in self.cells()]
 
     def scale_jobs(self) -> list[Job]:
-        """Energies over the scale of moving bodies; nothing is solved."""
+        """Jobs of the section `scale`."""
         own = (f"segmentation.superpixels={SCALE_SUPERPIXELS}",)
         if "scale" not in self.sizes.sections:
             return []
         return [
             Job(
-                head(i, own, "scale of one body"),
+                row_identity(i, own, "scale of one body"),
                 partial(attempt, partial(measure_scale, i, own)),
             )
             for i in self.scenes
@@ -238,15 +238,15 @@ class Plan:
 
 
 def _at_size(method: Overrides, n: int) -> Overrides:
-    """A method with n superpixels."""
+    """Overrides of a method with n superpixels."""
     weights = _PRINTED if method == PAPER else ()
     return (*method, f"segmentation.superpixels={n}", *_scaled(weights, n))
 
 
 def _scaled(overrides: Overrides, n: int) -> Overrides:
-    """The same with the preset's weights, which are for 1,000 superpixels, for n.
+    """Overrides with the preset's weights, which are given for 1,000 superpixels, scaled to n.
 
-    With `sum lam = 1` every length is proportional to 1 / n.
+    Since `sum lam = 1`, every length is proportional to 1 / n.
     """
     if not set(_PRINTED) & set(overrides) or n == PRINTED_SUPERPIXELS:
         return overrides
@@ -259,7 +259,7 @@ def _scaled(overrides: Overrides, n: int) -> Overrides:
 
 
 def _changes(section: str, method: str, s: Sizes) -> dict[str, Overrides]:
-    """Overrides by the name of a change."""
+    """Overrides by name of the variant."""
     if section == "terms":
         known = dict(ANALYSES["ablation"].variants)
         if method != "defaults":
@@ -279,7 +279,7 @@ def _changes(section: str, method: str, s: Sizes) -> dict[str, Overrides]:
 
 
 def make_plan(data: Path | None, sizes: Sizes) -> Plan:
-    """The pairs that are there."""
+    """The plan of the pairs that are available in the folder `data`."""
     found = {d.name: _pairs(d, data, sizes) for d in DATASETS}
     wanted = []
     for family in sizes.families:
@@ -314,7 +314,7 @@ def _masked(data: Path | None) -> list[Item]:
 
 
 def _pairs(dataset: Dataset, data: Path | None, sizes: Sizes) -> tuple[Item, ...]:
-    """Pairs of a dataset that have a truth: of its suites, or else of the suite `shared`."""
+    """Pairs of a dataset that have a truth, from its suites or else from the suite `shared`."""
     listed: list[Item] = []
     for name in dataset.suites:
         listed += [i for i in _listed(name, data) if has_truth(i)]
@@ -337,7 +337,7 @@ def _listed(name: str, data: Path | None) -> Iterable[Item]:
 
 
 def source_of(dataset: Dataset) -> str:
-    """Where the data of a dataset come from, and how to lay them out."""
+    """Text on the source and the folder layout of a dataset without pairs."""
     suite = SUITES[dataset.suites[0]]
     return f"no pair was given; from {suite.source}, laid out as {suite.layout}"
 

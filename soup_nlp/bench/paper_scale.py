@@ -1,7 +1,7 @@
-"""Does E_arap find the relative scale of a moving component? Energies over the scale of one.
+"""Does E_arap determine the relative scale of a moving component? Energies over that scale.
 
-Planes and motions are the true ones; the scale of one moving component alone is varied about its
-true value. E_proj and E_orient do not depend on it.
+Planes and motions are the true ones. The scale of one moving component is varied about its true
+value. E_proj and E_orient do not depend on it.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ Float = NDArray[np.float64]
 
 SCALES = np.geomspace(0.25, 4.0, 49)
 """Factors of the true scale; the middle one is 1."""
-LEAST = 4
-"""Fewest superpixels of a component that is looked at."""
-LEAST_POINTS = 30
-"""Fewest true points of a component whose motion is estimated."""
+MIN_SUPERPIXELS = 4
+"""Components with fewer superpixels are left out."""
+MIN_POINTS = 30
+"""The motion of a component with fewer true points is not estimated."""
 KINDS = ("arap", "arap px", "cont", "paper", "defaults")
-"""E_arap as printed, the same in pixels, E_cont as printed, both sums with their weights."""
+"""E_arap as printed, E_arap in pixels, E_cont as printed, E of `preset: paper`, E by default."""
 
 
 def measure_scale(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> Row:
@@ -60,13 +60,13 @@ def measure_scale(item: Item, overrides: tuple[str, ...] = (), variant: str = ""
     bodies = []
     for c in np.unique(true.component[moving]):
         own = moving & (true.component == c)
-        if own.sum() >= LEAST:
+        if own.sum() >= MIN_SUPERPIXELS:
             bodies.append({"superpixels": int(own.sum()), "curves": curves(true, own, energies)})
     if not bodies:
         raise DataError(
             "no moving component is large enough",
             where=item.key,
-            expected=f"{LEAST} superpixels of one",
+            expected=f"{MIN_SUPERPIXELS} superpixels of one",
         )
     return {"metrics": {}, "bodies": bodies, "superpixels": len(seg)}
 
@@ -98,7 +98,7 @@ def _energies(pair: Pair, seg: Segmentation, true: TrueSoup, seed: int) -> Energ
 
 
 def curves(true: TrueSoup, own: NDArray[np.bool_], energies: Energies) -> dict[str, list[float]]:
-    """Every kind of energy over SCALES of the superpixels `own` (N,)."""
+    """Every kind of energy over SCALES, factors of the scale of the superpixels `own` (N,)."""
     out: dict[str, list[float]] = {}
     for kind, (data, weights) in energies.items():
         out[kind] = []
@@ -109,13 +109,13 @@ def curves(true: TrueSoup, own: NDArray[np.bool_], energies: Energies) -> dict[s
     return out
 
 
-def lowest(curve: list[float]) -> float:
-    """The scale of lowest energy."""
+def scale_of_least_energy(curve: list[float]) -> float:
+    """The factor of SCALES at which a curve is lowest."""
     return float(SCALES[int(np.argmin(curve))])
 
 
 def with_motions(pair: Pair) -> Pair:
-    """The pair with motions of its components, by PnP on true depth and flow where unknown.
+    """The pair with motions of its components; unknown ones by PnP on true depth and flow.
 
     Raises:
         DataError: it has no dense depth and flow with components.
@@ -129,14 +129,14 @@ def with_motions(pair: Pair) -> Pair:
         return pair
     if truth.flow is None:
         raise DataError("motions of bodies need a true flow", where=pair.name)
-    return replace(pair, truth=_moved(pair, truth))
+    return replace(pair, truth=_with_estimated_motions(pair, truth))
 
 
-def _moved(pair: Pair, truth: Truth) -> Truth:
-    """The truth with (B, 4, 4) motions; components that determine none are not finite.
+def _with_estimated_motions(pair: Pair, truth: Truth) -> Truth:
+    """The truth with (B, 4, 4) motions, NaN where a component does not determine one.
 
-    A mask tells what moves, not what moves together: every connected piece of it is a
-    component of its own.
+    A mask marks what moves but not what moves together, so every connected piece of it becomes a
+    component.
     """
     depth, mask, flow = truth.depth_ref, truth.components, truth.flow
     assert depth is not None
@@ -151,7 +151,7 @@ def _moved(pair: Pair, truth: Truth) -> Truth:
     motions = np.full((int(components.max()) + 1, 4, 4), np.nan)
     for c in range(len(motions)):
         at = known & (components == c)
-        if at.sum() < LEAST_POINTS:
+        if at.sum() < MIN_POINTS:
             continue
         X, x = points[at].astype(np.float64), target[at].astype(np.float64)
         step = max(1, len(X) // 5000)

@@ -11,11 +11,11 @@ import numpy as np
 from soup_nlp.bench import paper_figures as figures
 from soup_nlp.bench.departures import DEPARTURES
 from soup_nlp.bench.paper_plan import METHODS, SECTIONS, Cell, Plan, title
-from soup_nlp.bench.paper_scale import KINDS, lowest
+from soup_nlp.bench.paper_scale import KINDS, scale_of_least_energy
 from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC
 from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suite_pairs import Item
-from soup_nlp.bench.tables import get, mean, show, table
+from soup_nlp.bench.tables import mean, metric, show, table
 
 Number = float | None
 TEXTS: Mapping[str, str] = {
@@ -26,8 +26,8 @@ TEXTS: Mapping[str, str] = {
     "flow": "Flow: the truth, the truth with noise, DIS",
     "stages": "NLP and refinement apart",
 }
-NEAR = 0.1
-"""A scale is right that is within this of the truth."""
+SCALE_TOLERANCE = 0.1
+"""Relative error up to which a scale counts as right."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Results:
     scales: Sequence[Row]
 
     def row(self, cell: Cell) -> Row:
-        """The row of a cell; one that is not ok where it is not there yet."""
+        """The row of a cell; a row that is not ok if the cell was not measured yet."""
         key, overrides = cell.item.key, list(cell.overrides)
         for row in self.rows:
             if row["overrides"] == overrides and row["key"].startswith(key):
@@ -48,7 +48,7 @@ class Results:
 
     def mre(self, cell: Cell, convention: str = "paper", method: str = "solution") -> Number:
         """MRE of a cell."""
-        return get(self.row(cell), convention, method)
+        return metric(self.row(cell), convention, method)
 
 
 def figure(name: str, text: str) -> list[str]:
@@ -56,13 +56,13 @@ def figure(name: str, text: str) -> list[str]:
     return ["", f"![{text}]({name}.png)", ""]
 
 
-def compared(r: Results, items: Sequence[Item], method: str) -> list[Cell]:
-    """The cells of pairs in the comparison of both methods."""
+def compared_cells(r: Results, items: Sequence[Item], method: str) -> list[Cell]:
+    """The cells of some pairs by one method in the comparison of both methods."""
     return [r.plan.cell(i, method, superpixels=r.plan.sizes.superpixels) for i in items]
 
 
 def section(out: Path, r: Results, name: str) -> list[str]:
-    """Tables of both methods and a figure of one change at a time."""
+    """A section of one change at a time: a table for each method, and a figure."""
     lines = [f"## {TEXTS[name]}", ""]
     measure = "RMSE" if name == "flow" else "MRE"
     items = [i for i in r.plan.items(name) if _compares(r, name, i)]
@@ -72,7 +72,7 @@ def section(out: Path, r: Results, name: str) -> list[str]:
         for item in items:
             cells = r.plan.variants(name, item, method)
             rows = {v: r.row(c) for v, c in cells.items()}
-            pairs[title(item)] = {v: get(row, "paper") for v, row in rows.items()}
+            pairs[title(item)] = {v: metric(row, "paper") for v, row in rows.items()}
             if name == "flow":
                 pairs[f"{title(item)}, RMSE"] = {v: row.get("rmse") for v, row in rows.items()}
         names = list(next(iter(pairs.values()), {}))
@@ -120,12 +120,12 @@ def _published(name: str) -> list[str]:
 
 
 def convergence(out: Path, r: Results) -> list[str]:
-    """Table and figure of the energy on its way down."""
+    """Table and figure of the energy over iterations and rounds."""
     curves: dict[str, dict[str, Row]] = {}
     entries = []
     for item in r.plan.analyses:
         for method in METHODS:
-            (cell,) = compared(r, [item], method)
+            (cell,) = compared_cells(r, [item], method)
             row = r.row(cell)
             if not row.get("ok"):
                 continue
@@ -157,7 +157,7 @@ def time(r: Results) -> list[str]:
     entries = []
     for item in r.plan.analyses:
         for method in METHODS:
-            (cell,) = compared(r, [item], method)
+            (cell,) = compared_cells(r, [item], method)
             row = r.row(cell)
             if row.get("ok"):
                 seconds = [f"{row['stages'].get(s, 0.0):.1f}" for s in stages]
@@ -172,9 +172,9 @@ def time(r: Results) -> list[str]:
 
 
 def departures(out: Path, r: Results) -> list[str]:
-    """Table and figure of every departure alone."""
+    """Table and figure of the departures, each undone or made alone."""
     cells = {i.key: r.plan.departures(i) for i in r.plan.analyses}
-    items = [i for i in r.plan.analyses if _any(r, cells[i.key].values())]
+    items = [i for i in r.plan.analyses if _any_measured(r, cells[i.key].values())]
     lines = ["## Departures, one at a time", ""]
     lines += [
         "MRE of the defaults with one departure undone (*off alone*) and of the preset with one"
@@ -202,13 +202,13 @@ def departures(out: Path, r: Results) -> list[str]:
     return [*lines, *table(head, entries), *figure("departures", text)]
 
 
-def _any(r: Results, pairs: Iterable[tuple[Cell, Cell | None]]) -> bool:
-    """Whether a departure of a pair was measured."""
+def _any_measured(r: Results, pairs: Iterable[tuple[Cell, Cell | None]]) -> bool:
+    """Whether any of the cells of a pair was measured."""
     return any(r.row(c).get("ok") for both in pairs for c in both if c is not None)
 
 
 def _ratio(own: Sequence[Number], base: Sequence[Number]) -> Number:
-    """Geometric mean of the ratios that are known."""
+    """Geometric mean of the known ratios; None where there is none."""
     logs = [np.log(a / b) for a, b in zip(own, base, strict=True) if a and b]
     return float(np.exp(np.mean(logs))) if logs else None
 
@@ -221,17 +221,21 @@ def scale(out: Path, r: Results) -> list[str]:
         for k, body in enumerate(row.get("bodies", [])):
             name = f"{row['pair']} body {k + 1}"
             bodies[name] = body["curves"]
-            lows = [f"{lowest(body['curves'][kind]):.2f}" for kind in KINDS]
+            lows = [f"{scale_of_least_energy(body['curves'][kind]):.2f}" for kind in KINDS]
             entries.append([name, str(body["superpixels"]), *lows])
     counts = {
-        kind: sum(abs(lowest(list(c[kind])) - 1) <= NEAR for c in bodies.values()) for kind in KINDS
+        kind: sum(
+            abs(scale_of_least_energy(list(c[kind])) - 1) <= SCALE_TOLERANCE
+            for c in bodies.values()
+        )
+        for kind in KINDS
     }
     n = len(bodies)
     heads = ["E_arap", "E_arap in pixels", "E_cont", "E, preset: paper", "E, defaults"]
     verdict = (
         f"The paper claims that E_arap alone gives reasonably correct relative scales. With true"
         f" planes and true motions its minimum over the scale of one moving body is within"
-        f" {NEAR:.0%} of the truth for {counts['arap']} of {n} bodies (in pixels:"
+        f" {SCALE_TOLERANCE:.0%} of the truth for {counts['arap']} of {n} bodies (in pixels:"
         f" {counts['arap px']}); that of E_cont for {counts['cont']}, of the whole energy of the"
         f" preset for {counts['paper']}, of the defaults for {counts['defaults']}. The defaults"
         " know here which bodies are apart and, from the true depth, where one hides another;"

@@ -21,6 +21,7 @@ from unittest import mock
 
 from soup_nlp.bench.rows import ONE_THREAD, Row, attempt, failure
 from soup_nlp.errors import SolverError, SoupError
+from soup_nlp.storage.folders import scratch
 from soup_nlp.storage.system import end_with_parent
 from soup_nlp.storage.versions import code_version, versions
 
@@ -29,15 +30,15 @@ GRACE = 5.0
 
 
 @dataclass(frozen=True)
-class Ended:
-    """How a process ended.
+class ProcessResult:
+    """Result of a function that ran in a process of its own.
 
     Attributes:
         how: "returned", "raised", "killed: time", "killed: memory" or "crashed: SIGNAL".
-        value: What the function returned, or its exception in one line.
+        value: Return value of the function, or its exception in one line.
         seconds: Wall time of the process.
-        cpu_seconds: CPU time of it and its children.
-        peak_bytes: Largest resident size of it or a child; 0 where it could not say.
+        cpu_seconds: CPU time of the process and its children.
+        peak_bytes: Largest resident size of the process or of a child; 0 if it is unknown.
     """
 
     how: str
@@ -55,17 +56,18 @@ def isolated(
     *,
     fresh: bool = False,
     cpu_seconds: float | None = None,
-) -> Ended:
-    """Call a function in a process of its own; a crash is an answer as well.
+) -> ProcessResult:
+    """Call a function in a process of its own; a crash becomes a result as well.
 
     Args:
-        work: Takes nothing; its value must pickle.
-        folder: For the value and the output; must exist.
-        seconds: Wall time limit.
-        memory: Bytes that a forked process may have more than this one has now; None for no limit.
+        work: Function without arguments; its return value must pickle.
+        folder: Existing folder for the return value and the output.
+        seconds: Limit of the wall time.
+        memory: Bytes that a forked process may have in addition to those of this one; None for no
+            limit.
         fresh: Start a new interpreter, so that the peak memory is that of the work alone; the work
-            must pickle. Else the process is forked and sees everything of this one.
-        cpu_seconds: CPU time limit of it and of each of its children; None for none.
+            must pickle. Otherwise the process is forked.
+        cpu_seconds: Limit of the CPU time of the process and of each of its children, or None.
 
     Raises:
         SolverError: the system cannot fork.
@@ -101,15 +103,15 @@ def isolated(
         word = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         late = late or word in ("SIGXCPU", "SIGKILL" if cpu >= (cpu_seconds or cpu + 1) else "")
         how, value, peak = "killed: time" if late else f"crashed: {word}", None, 0
-    return Ended(how, value, spent, cpu, peak)
+    return ProcessResult(how, value, spent, cpu, peak)
 
 
-def alone(work: Callable[[], Row], folder: Path, seconds: float = 7200.0) -> Row:
+def alone(work: Callable[[], Row], seconds: float = 7200.0) -> Row:
     """The row of `attempt(work)` in a new interpreter with one thread.
 
-    "peak_bytes" is the largest resident size of the process, unless the work says it itself.
+    "peak_bytes" is the largest resident size of the process, unless the row of the work has it.
     """
-    with mock.patch.dict(os.environ, ONE_THREAD):
+    with scratch() as folder, mock.patch.dict(os.environ, ONE_THREAD):
         ended = isolated(partial(attempt, work), folder, seconds, fresh=True)
     if ended.how == "returned":
         return {"peak_bytes": ended.peak_bytes, **ended.value}
@@ -121,7 +123,7 @@ def _child(
     work: Callable[[], Any], target: Path, memory: int | None, cpu_seconds: float | None
 ) -> None:
     end_with_parent()
-    # what the work prints belongs beside its files
+    # the output of the work goes to a file in its folder
     with target.with_name("output.log").open("wb") as log:
         os.dup2(log.fileno(), 1)
         os.dup2(log.fileno(), 2)
@@ -131,7 +133,7 @@ def _child(
     if cpu_seconds is not None:
         most = math.ceil(1.2 * cpu_seconds) + 1
         resource.setrlimit(resource.RLIMIT_CPU, (most, most + 1))
-    # a Ctrl-C belongs to the parent, which ends this process
+    # the parent handles Ctrl-C and ends this process
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
@@ -153,13 +155,13 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, SoupError):
         found = "" if error.found is None else f", found {error.found}"
         return f"{type(error).__name__}: {error.what}{found}"
-    # the last line of a library's message is its cause
+    # the last line of a library's message has the cause
     text = "".join(traceback.format_exception_only(error)).strip().splitlines()
     return text[-1] if text else type(error).__name__
 
 
 def _virtual_bytes() -> int:
-    """Address space of this process now; 0 where the system does not say."""
+    """Bytes of address space of this process; 0 if the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
     except (OSError, ValueError):

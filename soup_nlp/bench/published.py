@@ -1,4 +1,4 @@
-"""Mean relative errors printed in the paper; nothing here was measured by this program."""
+"""Mean relative errors printed in the paper, copied; this program measured none of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COMPARISON: Mapping[str, Mapping[str, float | None]] = {
     for dataset, row in _TABLE.items()
 }
 """MRE by dataset and method; None where the paper prints none. KITTI is the odometry set 00-09
-with LiDAR truth, not the stereo and flow sets of this program's suites."""
+with LiDAR truth, not the stereo and flow sets of the suites."""
 
 ABLATION: Mapping[str, tuple[float, float, float, float]] = MappingProxyType(
     {
@@ -35,7 +35,7 @@ ABLATION: Mapping[str, tuple[float, float, float, float]] = MappingProxyType(
 """MRE with E_arap, + E_proj, + E_cont, + E_orient (the paper's ablation table)."""
 
 GRID_AGAINST_SLIC = MappingProxyType({"slic": 0.0912, "grid": 0.1442})
-"""MRE of one frame with 1,000 superpixels of either kind."""
+"""MRE of one frame with 1,000 superpixels, by method of segmentation."""
 
 DATA: Mapping[str, str] = MappingProxyType(
     {
@@ -47,12 +47,12 @@ DATA: Mapping[str, str] = MappingProxyType(
         "kinect_tshirt": "Measured rows are of the pairs in the folder, whichever those are",
     }
 )
-"""On which pairs the numbers of a dataset are, as far as it is known."""
+"""Pairs that the published and the measured numbers of a dataset are of, as far as known."""
 
 _DATASET = {"kitti2012": "kitti", "kitti2015": "kitti"}
 
 
 def published(suite: str) -> tuple[dict[str, float | None], str]:
-    """Published MRE by method, and how those data differ from the measured; ({}, "") for none."""
+    """Published MRE by method, and how its pairs differ from the measured; ({}, "") if none."""
     dataset = _DATASET.get(suite, suite)
     return dict(COMPARISON.get(dataset, {})), DATA.get(dataset, "")

@@ -29,23 +29,24 @@ from soup_nlp.solve.factor import diagonal_places, factorisation, numbered
 Float = NDArray[np.float64]
 
 EPS = (1.0, 0.3, 0.1, 0.03, 0.01)
-"""Continuation of the smoothing widths, large to small, in the energy's units (pixels)."""
+"""Smoothing widths of the continuation, in the units of the energy (pixels)."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-6, 1e12
 TOLERANCE, STAGNATION = 1e-5, 1e-3
-"""A width ends (the last one, the others) when f falls by less than this share twice in a row."""
+"""Steps with one smoothing width end after two steps in a row that lower f by less than this share;
+TOLERANCE is for the last width, STAGNATION for the others."""
 
 
 @dataclass(frozen=True)
 class ReferenceSolve:
-    """How far the reference solver came.
+    """Result of the reference solver.
 
     Attributes:
-        soup: The iterate of lowest exact energy; its constraints hold.
+        soup: The iterate of lowest exact energy; it satisfies the constraints.
         energy: Exact energy by term of the soup.
-        iterations: Steps tried, refused ones included.
-        seconds: Wall time: building and steps, without the exact energies of `history`.
-        cpu_seconds: The same in CPU time of this process.
-        history: (I, 2) seconds and exact energy after every accepted step, the start first.
+        iterations: Number of steps, rejected ones included.
+        seconds: Wall time of building and steps, without the exact energies of `history`.
+        cpu_seconds: CPU time of the same.
+        history: (I, 2) seconds and exact energy of the start and after every accepted step.
         status: "Converged", "Iteration_Limit" or "Time_Limit".
     """
 
@@ -59,7 +60,7 @@ class ReferenceSolve:
 
 
 class Tangent:
-    """f, gradient and normal matrix of the presolve's smoothed energy; its feasible set."""
+    """Smoothed energy f of the presolve, its gradient and normal matrix, and the feasible set."""
 
     def __init__(
         self, start: Soup, data: EnergyData, weights: Weights, form: Formulation | None
@@ -79,7 +80,7 @@ class Tangent:
         self.simplex = A[np.flatnonzero(equal)].toarray().sum(axis=0)
         rows = np.flatnonzero(~equal)
         self.rows, self.lower = A[rows], nlp.lbg[rows] - constant[rows]
-        # a row of visibility reads the slopes of one superpixel
+        # a visibility row depends on the slopes of one superpixel only
         self.owner = self.rows.indices[self.rows.indptr[:-1]] // 9
         places, columns = nlp.hess_lag.sparsity_out(0).get_triplet()
         self.upper = numbered(np.asarray(places), np.asarray(columns), nlp.nx)
@@ -103,10 +104,10 @@ class Tangent:
         return np.array(H.nonzeros())
 
     def project(self, x: Float) -> Float:
-        """The point with bounds kept and slopes shrunk until every rim pixel is visible."""
+        """The point clipped to the bounds, its slopes shrunk until every rim pixel is visible."""
         x = np.clip(x, self.nlp.lbx, self.nlp.ubx)
         value = self.rows @ x
-        # the bounds are negative and rows homogeneous in the slopes: shrinking always helps
+        # bounds are negative and rows are homogeneous in the slopes, so shrinking always works
         factor = np.ones(len(value))
         np.divide(self.lower, value, out=factor, where=value < self.lower)
         worst = np.ones(self.layout.count)
@@ -116,7 +117,7 @@ class Tangent:
 
 
 class _Descent:
-    """An iterate with its damping; every step lowers f or raises the damping."""
+    """An iterate with its damping; every step either lowers f or raises the damping."""
 
     def __init__(self, problem: Tangent) -> None:
         self.problem = problem
@@ -126,16 +127,16 @@ class _Descent:
         self.damping, self.growth = FIRST_DAMPING, 2.0
 
     def smoothing(self, eps: float) -> None:
-        """Go on with other smoothing widths."""
+        """Set the smoothing widths for the next steps."""
         self.problem.smoothing(eps)
         self._move(self.x)
 
     def relax(self) -> None:
-        """Forget a damping that refused steps have raised."""
+        """Lower the damping again that rejected steps have raised."""
         self.damping, self.growth = min(self.damping, FIRST_DAMPING), 2.0
 
     def step(self) -> float | None:
-        """Try a step; the relative fall of f, or None where the step is refused."""
+        """Try a step; returns the relative decrease of f, or None if the step is rejected."""
         a, gradient = self.problem.simplex, self.gradient
         damped = self.H.copy()
         damped[self.diagonal] += self.damping
@@ -154,7 +155,7 @@ class _Descent:
             return None
         fall = (self.f - fresh) / abs(self.f)
         self._move(trial)
-        # Nielsen's rule
+        # Nielsen's update of the damping
         self.damping = max(LEAST_DAMPING, self.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3))
         self.growth = 2.0
         return float(fall)
@@ -172,7 +173,7 @@ def _descend(
     end: float,
     note: Callable[[], None],
 ) -> tuple[int, str]:
-    """Every smoothing width in turn until the time `end`; number of steps and status."""
+    """Descend with every smoothing width in turn until the time `end`; steps and status."""
     count, status = 0, "Converged"
     for width in eps:
         last = width == eps[-1]
@@ -190,7 +191,7 @@ def _descend(
                 small = small + 1 if fall <= (TOLERANCE if last else STAGNATION) else 0
                 note()
             elif descent.damping > MOST_DAMPING:
-                # no descent at any length: the point is as good as this eps makes it
+                # no step length lowers f: the point is optimal for this smoothing width
                 small = 2
         else:
             descent.relax()
@@ -207,7 +208,7 @@ def levenberg_marquardt(
     iterations: int = 60,
     seconds: float = np.inf,
 ) -> ReferenceSolve:
-    """Reweighted least squares with Levenberg's damping, smaller and smaller smoothing.
+    """Minimise by reweighted least squares with damping and decreasing smoothing widths.
 
     With residuals v of weight c, s = sqrt(|v|^2 + eps^2) and truncation slope psi the step solves
     `(sum c psi / s J^T J + mu I) h = -grad f`, `sum_i a_i h_i = 0` for the simplex. mu follows the
@@ -217,10 +218,10 @@ def levenberg_marquardt(
         start: Initial soup.
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
-        form: Visibility; its norm, truncation and Hessian are not used.
-        eps: Smoothing widths in turn.
-        iterations: Limit of steps for every eps.
-        seconds: Time limit.
+        form: Visibility constraint; its norm, truncation and Hessian are not used.
+        eps: Smoothing widths, one after the other.
+        iterations: Limit of steps for every width.
+        seconds: Limit of the wall time.
     """
     wall, cpu = time.perf_counter(), time.process_time()
     descent = _Descent(Tangent(start, data, weights, form))
@@ -231,7 +232,7 @@ def levenberg_marquardt(
 
     count, status = _descend(descent, eps, iterations, wall + seconds, note)
     spent = time.perf_counter() - wall, time.process_time() - cpu
-    # exact energies only now, so that the times exclude them
+    # computed here, so that the times exclude the exact energies
     soups = [descent.problem.layout.unpack(x) for _, x in path]
     energies = [oracle.energy(soup, data, weights) for soup in soups]
     history = np.array([(t, energy["total"]) for (t, _), energy in zip(path, energies)])

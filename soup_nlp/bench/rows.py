@@ -1,4 +1,4 @@
-"""Rows of benchmarks: resumable files of JSON lines, measured here or by worker processes."""
+"""Rows of benchmarks, measured here or by worker processes and stored as JSON lines."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Job:
     """One row to be measured.
 
     Attributes:
-        name: What identifies the row beside the code version; part of the row.
-        work: Measures it; must pickle where other processes do the work.
-        stale: Measure it even if it is stored.
+        name: Entries that identify the row together with the code version; part of the row.
+        work: Measures the row; it must pickle if other processes call it.
+        stale: Measure the row even if it is stored.
     """
 
     name: Mapping[str, Any]
@@ -41,21 +41,21 @@ class Job:
 
 
 MeasureRows = Callable[[Sequence[Job], Path], list[Row]]
-"""`measure_all` with its options."""
+"""Type of `measure_all` with its options bound."""
 
 
 def failed(row: Mapping[str, Any]) -> bool:
-    """Whether a row has an error instead of numbers."""
+    """Whether a row holds an error instead of numbers."""
     return bool(row.get("error"))
 
 
 def failure(reason: str) -> Row:
-    """The result of work that has no other than the reason why it failed."""
+    """The row of work that failed, with the reason."""
     return {"ok": False, "error": reason, "seconds": 0.0, "cpu_seconds": 0.0}
 
 
 def attempt(work: Callable[[], Row]) -> Row:
-    """What `work` returns, with "ok", "error", "seconds" and "cpu_seconds", as plain JSON values.
+    """Result of `work`, with "ok", "error", "seconds" and "cpu_seconds", as plain JSON values.
 
     An exception becomes a row with `ok` false and the reason.
     """
@@ -70,10 +70,10 @@ def attempt(work: Callable[[], Row]) -> Row:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Rows of a JSON-lines file in order; a line that a crash cut off is left out.
+    """Rows of a JSON-lines file in order, without lines that a crash cut off.
 
     Raises:
-        DataError: the file cannot be read, or is something else.
+        DataError: the file cannot be read or is not a regular file.
     """
     if not os.path.lexists(path) or (is_file(path) and not path.stat().st_size):
         return []
@@ -89,7 +89,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def append_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Append a row and wait until it is on disk; a line that a crash cut off is ended first.
+    """Append a row and wait until it is on disk; terminate a line that a crash cut off first.
 
     Raises:
         DataError: the file cannot be written.
@@ -118,24 +118,25 @@ def measure_all(
     any_code: bool = False,
     dask: str | None = None,
 ) -> list[Row]:
-    """The row of every job, measured where the file does not hold it yet.
+    """The row of every job; jobs whose row the file does not hold yet are measured.
 
-    A stored row serves a job of the same name and code version unless it failed. Every new row is
-    appended as soon as it is there, so that an interrupted run can be continued.
+    A stored row is used for a job of the same name and code version unless the row failed. Every
+    new row is appended as soon as it is measured, so that an interrupted run can be continued.
 
     Args:
-        jobs: What to measure.
+        jobs: Jobs to measure.
         path: JSON-lines file.
         workers: Processes; 1 measures in this process.
         say: Called with (done, total, row) after every new row.
-        after: Called with all rows that are there so far, in the order of the jobs, after every
-            new row and at the end.
-        any_code: Also take rows of other code versions.
-        dask: Address of the scheduler that gets the work, "local" for one of `workers` processes.
+        after: Called with all rows known so far, in the order of the jobs, after every new row and
+            at the end.
+        any_code: Also use stored rows of other code versions.
+        dask: Address of a Dask scheduler that runs the jobs; "local" starts one with `workers`
+            processes.
 
     Raises:
         DataError: the file cannot be written.
-        ConfigError: joblib or Dask is needed and not installed, or the scheduler does not answer.
+        ConfigError: joblib or Dask is needed but not installed, or the scheduler does not answer.
     """
     code = code_version()
     names = [_identity(job.name) for job in jobs]
@@ -169,7 +170,7 @@ def _identity(row: Mapping[str, Any], keys: Mapping[str, Any] | None = None) -> 
 
 
 def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]]:
-    """Names and results of the jobs, as they end."""
+    """Names and results of the jobs, in the order in which they end."""
     if workers < 2 or not todo:
         yield from ((name, job.work()) for name, job in todo.items())
         return
@@ -181,7 +182,7 @@ def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]
             "parallel processes need joblib", where="--workers", hint="pip install soup-nlp[bench]"
         ) from error
     left = dict(todo)
-    # a broken pool does not tell which job broke it: what is left runs again, one pool per job
+    # a broken pool does not say which job broke it: the remaining jobs run again, one pool each
     for names in ([*todo], *([name] for name in todo)):
         again = [name for name in names if name in left]
         if not again:
@@ -205,7 +206,7 @@ def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]
 
 
 def _on_dask(todo: Mapping[str, Job], address: str, workers: int) -> Iterator[tuple[str, Row]]:
-    """Names and results of the jobs, as the workers of a Dask scheduler end them."""
+    """The same by the workers of a Dask scheduler."""
     if not todo:
         return
     try:

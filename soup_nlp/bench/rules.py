@@ -1,4 +1,4 @@
-"""The analysis of rules: what every rule of the start and the energy brings, family by family."""
+"""The analysis `rules`: effect of every rule of initialisation and energy, by family."""
 
 from __future__ import annotations
 
@@ -8,18 +8,27 @@ from types import MappingProxyType
 
 import numpy as np
 
-from soup_nlp.bench.analyses_report import by_pair, head_of
+from soup_nlp.bench.analyses_report import by_pair, lines_by_pair, page_head
 from soup_nlp.bench.rows import Row
-from soup_nlp.bench.tables import failures, figure, joined, main_metric, save, show, table, titles
+from soup_nlp.bench.tables import (
+    failures,
+    figure,
+    main_metric,
+    page_text,
+    save,
+    show,
+    table,
+    titles,
+)
 
 SHIPPED = "shipped"
-"""Variant with every rule."""
-SAME = 0.01
-"""Relative change of a family's MRE up to which a rule changes nothing there."""
+"""Name of the variant with all rules."""
+NO_CHANGE = 0.01
+"""Relative changes of a family's MRE up to this are not listed."""
 
 
 def in_both(key: str, value: str) -> tuple[str, ...]:
-    """Overrides of a weight; bending surfaces have weights of their own."""
+    """Overrides of a weight for rigid and for bending surfaces."""
     return tuple(f"energy.{w}.{key}={value}" for w in ("weights", "bending.weights"))
 
 
@@ -29,6 +38,7 @@ RULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "energy of bending surfaces": ("start.bending=1",),
         "camera at rest": ("start.at_rest=1",),
         "E_prior": in_both("prior", "0"),
+        "E_prior holds what is over the ground": ("energy.prior_ground=null",),
         "E_prior holds contacts": ("energy.prior_contact=0.03",),
         "E_arap weak across components": ("energy.arap_across=1",),
         "E_arap truncated": in_both("sigma_arap", ".inf"),
@@ -40,11 +50,11 @@ RULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "borders follow the flow": ("segmentation.follow_flow_px=null",),
     }
 )
-"""Overrides that leave a rule out, by the rule."""
+"""Overrides that switch a rule off, by name of the rule."""
 
 
 def _changes(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Relative change of the MRE by each rule, by rule and family: geometric mean of its pairs."""
+    """Relative change of the MRE by rule and family: geometric mean over the pairs."""
     _, pairs = by_pair(rows, titles(rows))
     logs: dict[str, dict[str, list[float]]] = {}
     for own in pairs.values():
@@ -61,13 +71,13 @@ def _changes(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def text_rules(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
-    """Tables: families that gain and lose by every rule, the changes, the MRE of every pair."""
+    """Page of the analysis: families that gain or lose by a rule, changes, MRE of every pair."""
     changes = _changes(rows)
     families = list(dict.fromkeys(f for own in changes.values() for f in own))
     summary, detail = [], []
     for rule, own in changes.items():
-        better = sorted((c, f) for f, c in own.items() if c < -SAME)
-        worse = sorted(((c, f) for f, c in own.items() if c > SAME), reverse=True)
+        better = sorted((c, f) for f, c in own.items() if c < -NO_CHANGE)
+        worse = sorted(((c, f) for f, c in own.items() if c > NO_CHANGE), reverse=True)
         total = float(np.expm1(np.mean(np.log1p(list(own.values())))))
         summary.append(
             [
@@ -80,21 +90,19 @@ def text_rules(name: str, text: str, rows: Sequence[Row], note: str = "") -> str
     about = (
         "Change of the MRE that a rule brings: everything as shipped against the same without it;"
         " negative is better. Geometric means over the pairs of a family, and over the families."
-        f" Changes up to {SAME:.0%} are left out of the lists."
+        f" Changes up to {NO_CHANGE:.0%} are left out of the lists."
     )
     head = ["rule", "without", "all families", "better", "worse"]
-    lines = [*head_of(name, text, rows, note), about, "", *table(head, summary), ""]
+    lines = [*page_head(name, text, rows, note), about, "", *table(head, summary), ""]
     lines += ["## By family", "", *table(["rule", *families], detail), ""]
-    variants, pairs = by_pair(rows, titles(rows))
-    entries = [
-        [pair, *(show(main_metric(own[v]), ".4f") for v in variants)] for pair, own in pairs.items()
-    ]
+    variants, _ = by_pair(rows, titles(rows))
+    entries = lines_by_pair(rows, main_metric)
     lines += ["## MRE without each rule", "", *table(["pair, flow", *variants], entries), ""]
-    return joined([*lines, *failures(rows)])
+    return page_text([*lines, *failures(rows)])
 
 
 def plot_rules(path: Path, rows: Sequence[Row]) -> None:
-    """Change of every family's MRE by every rule, as a map."""
+    """Heat map of the change of the MRE by rule and family."""
     changes = _changes(rows)
     families = list(dict.fromkeys(f for own in changes.values() for f in own))
     value = np.array([[own.get(f, np.nan) for f in families] for own in changes.values()])
@@ -103,7 +111,7 @@ def plot_rules(path: Path, rows: Sequence[Row]) -> None:
     ax = picture.add_subplot()
     shown = ax.imshow(value, cmap="RdBu_r", vmin=-50, vmax=50, aspect="auto")
     for (row, column), v in np.ndenumerate(value):
-        if np.isfinite(v) and abs(v) >= 100 * SAME:
+        if np.isfinite(v) and abs(v) >= 100 * NO_CHANGE:
             colour = "white" if abs(v) > 30 else "black"
             ax.text(column, row, f"{v:+.0f}", ha="center", va="center", color=colour, fontsize=8)
     ax.set_xticks(range(len(families)), families, rotation=45, ha="right")

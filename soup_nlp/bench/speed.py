@@ -1,4 +1,4 @@
-"""One run with clocks: seconds, energy and memory of every stage, beside the reference solver."""
+"""A timed run: seconds, energy and memory by stage, and the reference solver on the same pair."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from soup_nlp.storage.folders import scratch
 Float = NDArray[np.float64]
 
 REFERENCE_ITERATIONS = 100
-"""Limit of Levenberg-Marquardt's steps for every smoothing width."""
+"""Limit of the steps of Levenberg-Marquardt for every smoothing width."""
 HISTORY_POINTS = 60
-"""Rows of the reference solver's history that are kept, enough for a plot."""
+"""Points of the reference solver's history that a row stores for the plot."""
 
 
 def plan(
@@ -39,7 +39,7 @@ def plan(
     seeds: Sequence[int],
     **others: Any,
 ) -> list[Settings]:
-    """Settings of every run, small ones first; the motorcycle is one pair: it has one seed."""
+    """Settings of all runs, small sizes first; the motorcycle has one seed, as it is one pair."""
     every = grid(superpixels=sorted(sizes), neighbours=sorted(neighbours), scene=scenes, seed=seeds)
     return [
         {**own, **others}
@@ -57,7 +57,7 @@ class Clocks:
         self.last = time.perf_counter(), time.process_time()
 
     def lap(self, stage: str) -> None:
-        """End a lap."""
+        """Add the time since the last call to a stage."""
         now = time.perf_counter(), time.process_time()
         for clock, begin, end in zip((self.wall, self.cpu), self.last, now):
             clock[stage] = clock.get(stage, 0.0) + end - begin
@@ -65,7 +65,7 @@ class Clocks:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """A lap of its own."""
+        """Time the block as a stage."""
         self.last = time.perf_counter(), time.process_time()
         yield
         self.lap(name)
@@ -80,16 +80,7 @@ def problem_of(
     height: int = 436,
     overrides: Sequence[str] = (),
 ) -> Problem:
-    """The merged problem of a run; the NLP alone, without refinement.
-
-    Args:
-        scene: A rendered scene, or "motorcycle".
-        superpixels: Wanted number N.
-        neighbours: K of the K-NN graph.
-        seed: Of the scene and of all draws.
-        width: Columns of a rendered scene.
-        height: Rows of a rendered scene.
-        overrides: Of the problem, e.g. "solver.max_iter=200".
+    """The merged problem of a run, with the NLP but without refinement.
 
     Raises:
         ConfigError: an override is wrong.
@@ -108,13 +99,13 @@ def problem_of(
 
 
 def measure(**settings: Any) -> Row:
-    """Solve a problem and say what every stage cost.
+    """Solve a problem and measure the cost of every stage.
 
     Returns:
-        Plain numbers: "sizes", "wall" and "cpu" (seconds by stage; build, functions and linear
-        algebra are parts of nlp's wall time, presolve, build and solve of its CPU time),
-        "iterations" in all, "status", "energy", "mre", "residuals", "peak_bytes" (before the
-        reference solver), and "reference" with the reference solver's own.
+        Plain numbers: "sizes"; "wall" and "cpu" (seconds by stage, where "build", "functions" and
+        "linear algebra" are parts of the wall time of "nlp", and "presolve", "build" and "solve"
+        parts of its CPU time); "iterations" in all; "status", "energy", "mre", "residuals";
+        "peak_bytes" before the reference solver runs; "reference" with the same of that solver.
 
     Raises:
         SoupError: the input cannot be used.
@@ -152,7 +143,7 @@ def measure(**settings: Any) -> Row:
 
 
 def _parts(wall: float, solution: Solution) -> dict[str, float]:
-    """Wall seconds of the NLP's parts; whatever is not a stage's own is building."""
+    """Wall seconds of the parts of the NLP; all time outside the stages counts as building."""
     functions = sum(sum(s.calls.values()) for s in solution.stages)
     stages = sum(s.seconds for s in solution.stages)
     return {
@@ -163,13 +154,13 @@ def _parts(wall: float, solution: Solution) -> dict[str, float]:
 
 
 def schedule(options: SolverOptions) -> tuple[float, ...]:
-    """Smoothing widths of the reference solver: the solver's own."""
+    """Smoothing widths of the reference solver: those of the presolve and of Ipopt."""
     own = tuple(options.presolve_eps) if options.presolve else ()
     return own if own and own[-1] <= options.eps else (*own, options.eps)
 
 
 def _reference(case: Case) -> dict[str, Any]:
-    """Levenberg-Marquardt from the same start on the same energy."""
+    """Result of Levenberg-Marquardt from the same start on the same energy."""
     y = levenberg_marquardt(
         case.soup,
         case.data,

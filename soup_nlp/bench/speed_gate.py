@@ -1,4 +1,4 @@
-"""The gate: ratios of a measurement against a committed baseline, never seconds."""
+"""Regression gate of `bench speed`: ratios of a measurement to a committed baseline."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ LIMITS: dict[str, tuple[float, float]] = {
     "nonzeros": (1.01, 0.0),
     "time_to_reference": (1.5, 0.0),
 }
-"""Allowed (factor, addition) of the baseline's value: a value above factor x old + addition fails.
-Rounding differs between machines, so iterations and energies have room; seconds are compared with
-the reference solver's in the same process, which a slower machine slows down alike."""
+"""(factor, addition) by name of a value: a value above factor x baseline + addition fails.
+Iterations and energies may change a little, since rounding differs between machines. Times are
+compared relative to the reference solver in the same process, so that the machine cancels out."""
 VERSION = 3
 
 
 class Run(NamedTuple):
-    """A run of the baseline: its settings and its values by name."""
+    """A run of the baseline: settings, and values by name."""
 
     settings: dict[str, Any]
     values: dict[str, float]
@@ -37,8 +37,8 @@ class Finding(NamedTuple):
 
     Attributes:
         key: Settings of the run.
-        name: Of LIMITS, or "converged", "run".
-        old: Baseline's value.
+        name: Name in LIMITS, or "converged" or "run".
+        old: Value of the baseline.
         new: Measured value.
         ok: Whether it is within its limit.
     """
@@ -56,7 +56,7 @@ class Finding(NamedTuple):
 
 
 def values(record: Row) -> dict[str, float]:
-    """What the gate looks at."""
+    """The values of a run that the gate compares."""
     sizes, reference, total = record["sizes"], record["reference"], record["energy"]["total"]
     return {
         "iterations": float(record["iterations"]),
@@ -69,10 +69,10 @@ def values(record: Row) -> dict[str, float]:
 
 
 def baseline(records: Sequence[Row], machine: Mapping[str, str]) -> dict[str, Any]:
-    """What is committed.
+    """Contents of a baseline file.
 
     Raises:
-        DataError: a run failed, so it cannot be a baseline.
+        DataError: a run failed, or there is none.
     """
     bad = [r["key"] for r in records if failed(r)]
     if bad or not records:
@@ -103,7 +103,7 @@ def read_baseline(path: Path) -> list[Run]:
 
 
 def check(records: Sequence[Row], kept: Sequence[Run]) -> Iterator[Finding]:
-    """Every value of every run of the baseline; a run that failed or is missing fails the gate."""
+    """Findings on every run of the baseline; a failed or missing run gives one that is not ok."""
     for settings, old in kept:
         key = " ".join(str(v) for v in settings.values() if v != [])
         own = [r for r in records if r["settings"] == settings and not failed(r)]

@@ -1,4 +1,4 @@
-"""Report of `bench speed`: tables with the conclusion first, growth exponents, and plots."""
+"""Page of `bench speed`: conclusion, tables, growth exponents and plots."""
 
 from __future__ import annotations
 
@@ -15,7 +15,16 @@ from soup_nlp.bench.processes import machine
 from soup_nlp.bench.rows import failed
 from soup_nlp.bench.speed import measure
 from soup_nlp.bench.studies import Study
-from soup_nlp.bench.tables import columns, failures, figure, joined, save, show, table
+from soup_nlp.bench.tables import (
+    columns,
+    failures,
+    figure,
+    grid_of_panels,
+    page_text,
+    save,
+    show,
+    table,
+)
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import staged
 
@@ -23,7 +32,7 @@ Row = Mapping[str, Any]
 Cell = Callable[[Row], str]
 
 OUTSIDE = ("flow", "segmentation", "start", "weights", "evaluation", "output")
-"""Stages that are not the NLP's and not the loading or rendering of frames."""
+"""All stages but the NLP and the loading or rendering of the frames."""
 PHASES = (
     "load", "flow", "segmentation", "start", "weights",
     "build", "functions", "linear algebra", "evaluation", "output",
@@ -38,7 +47,9 @@ COSTS: dict[str, Callable[[Row], float]] = {
     "Hessian nonzeros": lambda r: r["sizes"]["hessian_nonzeros"],
     "peak memory": lambda r: r["peak_bytes"],
 }
-"""What growth is fitted of."""
+"""Costs whose growth with N is fitted."""
+MAX_PANELS = 12
+"""Panels of the picture of energies."""
 LIMITS = (
     "Wall times of a shared machine vary with its load; CPU times less so. One thread."
     " Compiling the kernels happens once a machine and is in the wall time (build) of the run"
@@ -49,7 +60,7 @@ LIMITS = (
 
 
 def outside(record: Row) -> float:
-    """CPU seconds of every stage but loading and the NLP."""
+    """CPU seconds of the stages of OUTSIDE."""
     return float(sum(record["cpu"].get(stage, 0.0) for stage in OUTSIDE))
 
 
@@ -62,7 +73,7 @@ def _time_ratio(r: Row) -> float:
 
 
 def _at(form: str, *path: str) -> Cell:
-    """A number of a record under some keys, as a cell."""
+    """Cell with the number of a record at nested keys."""
 
     def cell(record: Row) -> str:
         value: Any = record
@@ -110,11 +121,11 @@ STAGES: dict[str, Cell] = {
 
 
 class Growth(NamedTuple):
-    """cost = factor N^exponent.
+    """Fit of cost = factor N^exponent.
 
     Attributes:
         exponent: Slope of log cost over log N.
-        error: Standard error of the slope; NaN where no degree of freedom is left.
+        error: Standard error of the slope; NaN if no degree of freedom is left.
     """
 
     exponent: float
@@ -133,7 +144,8 @@ def fit(
     Args:
         sizes: N of every run.
         costs: Positive cost of every run.
-        scenes: Scene of every run: one exponent for all, a factor for each. None: all are one.
+        scenes: Scene of every run: one exponent for all scenes, one factor for each. None takes
+            one factor for all runs.
     """
     n, c = np.asarray(sizes, float), np.asarray(costs, float)
     use = (n > 0) & (c > 0)
@@ -151,7 +163,7 @@ def fit(
 
 
 def growth_lines(records: Sequence[Row]) -> list[str]:
-    """Table of the growth of every cost, by scene and K and over all scenes; empty without any."""
+    """Table of the growth of every cost by scene and K, and over all scenes; may be empty."""
     lines = []
     groups = _groups(records)
     for k in sorted({k for _, k in groups}):
@@ -163,13 +175,13 @@ def growth_lines(records: Sequence[Row]) -> list[str]:
         scenes = [r["settings"]["scene"] for r in group]
         fits = [fit(n, [cost(r) for r in group], scenes) for cost in COSTS.values()]
         if any(fits):
-            told = ["-" if f is None else str(f) for f in fits]
-            lines.append([scene, str(k), f"{min(n)} to {max(n)}", *told])
+            texts = ["-" if f is None else str(f) for f in fits]
+            lines.append([scene, str(k), f"{min(n)} to {max(n)}", *texts])
     return table(["pair", "K", "N", *COSTS], lines) if lines else []
 
 
 def conclusion(records: Sequence[Row]) -> str:
-    """What the table says, in sentences made of its numbers."""
+    """Summary of the table in sentences."""
     if not records:
         return "No run ended with a result."
     converged = sum(bool(r["converged"]) for r in records)
@@ -189,7 +201,7 @@ def conclusion(records: Sequence[Row]) -> str:
 
 
 class SpeedStudy(Study):
-    """`bench speed`: a study whose page has several tables and plots."""
+    """The study of `bench speed`, whose page has several tables and plots."""
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -197,7 +209,7 @@ class SpeedStudy(Study):
         return (f"{self.name}.md", "growth.png", "phases.png", "energy.png")
 
     def write(self, out: Path, rows: Sequence[dict[str, Any]]) -> None:
-        """Table and plots of the runs that are there."""
+        """Write the page and the plots of the rows."""
         good = [r for r in rows if not failed(r)]
         sections = {
             "Growth: cost = factor N^p": growth_lines(good),
@@ -210,7 +222,7 @@ class SpeedStudy(Study):
         for title, body in sections.items():
             lines += ["", f"## {title}", "", *body] if body else []
         with staged(out) as new:
-            write_text(new / f"{self.name}.md", joined(lines))
+            write_text(new / f"{self.name}.md", page_text(lines))
             if good:
                 plot_growth(new / "growth.png", good)
                 plot_phases(new / "phases.png", good)
@@ -242,7 +254,7 @@ def _label(r: Row) -> str:
 
 
 def plot_growth(path: Path, records: Sequence[Row]) -> None:
-    """CPU seconds of NLP, reference solver and the rest, and peak memory over N, logarithmic."""
+    """CPU seconds of NLP, reference solver and other stages, and peak memory, over N (log-log)."""
     picture = figure(11, 4)
     left, right = picture.subplots(1, 2)
     for index, ((scene, k), group) in enumerate(_groups(records).items()):
@@ -271,7 +283,7 @@ def plot_growth(path: Path, records: Sequence[Row]) -> None:
 
 
 def plot_phases(path: Path, records: Sequence[Row]) -> None:
-    """Stacked wall seconds by stage, a bar a run."""
+    """Wall seconds by stage as stacked bars, one bar for each run."""
     picture = figure(9, 0.32 * len(records) + 1.4)
     axes = picture.subplots()
     keys = [_label(r) for r in records]
@@ -287,26 +299,16 @@ def plot_phases(path: Path, records: Sequence[Row]) -> None:
     save(picture, path)
 
 
-def plot_energy(path: Path, records: Sequence[Row], most: int = 12) -> None:
-    """Exact energy over seconds: the reference solver's history, Ipopt's end as a point.
-
-    Args:
-        path: PNG.
-        records: Runs; the largest `most` of them are drawn.
-        most: Panels.
-    """
-    drawn = sorted(records, key=lambda r: -r["sizes"]["superpixels"])[:most]
-    width = min(4, len(drawn))
-    rows = -(-len(drawn) // width)
-    picture = figure(3.4 * width, 2.6 * rows)
-    for index, r in enumerate(drawn):
-        panel = picture.add_subplot(rows, width, index + 1)
+def plot_energy(path: Path, records: Sequence[Row]) -> None:
+    """Exact energy over seconds: history of the reference solver, end of Ipopt, largest runs."""
+    drawn = sorted(records, key=lambda r: -r["sizes"]["superpixels"])[:MAX_PANELS]
+    picture, panels = grid_of_panels(len(drawn), 4, 3.4, 2.6)
+    for r, panel in zip(drawn, panels, strict=True):
         panel.plot(*np.transpose(r["reference"]["history"]), label="Levenberg-Marquardt")
         panel.plot(r["wall"]["nlp"], r["energy"]["total"], "k*", label="Ipopt, end")
         panel.set_title(_label(r), fontsize=7)
         panel.tick_params(labelsize=7)
-        if not index:
-            panel.legend(fontsize=7)
+    panels[0].legend(fontsize=7)
     picture.supxlabel("wall s", fontsize=8)
     picture.supylabel("exact energy", fontsize=8)
     save(picture, path)

@@ -1,7 +1,7 @@
-"""Studies of parts of the program: one row per setting, and a table of the rows.
+"""Studies of parts of the program: one row for each setting, and a table of the rows.
 
-Every row is measured in a process of its own with one thread, so that its peak memory and its time
-are its own, and is stored, so that a study that was stopped goes on where it was.
+Every row is measured in a process of its own with one thread, so that time and peak memory are
+those of the row alone. Rows are stored, so that an interrupted study can be continued.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Any
 
 from soup_nlp.bench.processes import alone
 from soup_nlp.bench.rows import Job, Row, Say, failed, measure_all
-from soup_nlp.bench.tables import columns, failures, joined
+from soup_nlp.bench.tables import columns, failures, page_text
 from soup_nlp.storage.atomic import write_text
-from soup_nlp.storage.folders import claim, scratch, staged
+from soup_nlp.storage.folders import claim, staged
 
 Settings = Mapping[str, Any]
 Cells = Mapping[str, Callable[[Row], str]]
@@ -27,14 +27,14 @@ Cells = Mapping[str, Callable[[Row], str]]
 
 @dataclass(frozen=True)
 class Study:
-    """What is measured and how it is told.
+    """A measurement for many settings, and its table.
 
     Attributes:
-        name: Name of the table's file, without its suffix.
-        note: First paragraph of the page; {KEY} is a value of the first settings.
-        measure: Row of keyword arguments; a function of a module, which another process imports.
-        cells: Columns of the table; a row has its "settings" beside what was measured.
-        summary: More lines for the table, made of all rows, or None.
+        name: Stem of the file of the table.
+        note: First paragraph of the page; {KEY} stands for a value of the first settings.
+        measure: Makes a row from keyword arguments; another process imports this function.
+        cells: Columns of the table; a row has "settings" beside the measured entries.
+        summary: Makes more lines of the table from all rows, or None.
     """
 
     name: str
@@ -45,17 +45,17 @@ class Study:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of the files that are written of all rows."""
+        """Names of the files that `write` makes."""
         return (f"{self.name}.md",)
 
     def write(self, out: Path, rows: Sequence[Row]) -> None:
-        """Write the page of the rows that are there; those that failed are listed at its end."""
+        """Write the page of the rows; failed rows are listed at its end."""
         good = [r for r in rows if not failed(r)]
         note = self.note.format(**rows[0]["settings"])
         lines = [f"{note} {date.today()}, {platform.machine()}.", "", *columns(self.cells, good)]
         lines += self.summary(good) if self.summary else []
         with staged(out) as new:
-            write_text(new / f"{self.name}.md", joined([*lines, *failures(list(rows))]))
+            write_text(new / f"{self.name}.md", page_text([*lines, *failures(list(rows))]))
 
 
 def grid(**values: Sequence[Any]) -> list[Settings]:
@@ -64,12 +64,12 @@ def grid(**values: Sequence[Any]) -> list[Settings]:
 
 
 def setting(name: str) -> Callable[[Row], str]:
-    """A cell: the value of a setting."""
+    """Cell with the value of a setting."""
     return lambda row: str(row["settings"][name])
 
 
 def number(name: str, form: str = "") -> Callable[[Row], str]:
-    """A cell: a measured number."""
+    """Cell with a measured number."""
     return lambda row: format(row[name], form)
 
 
@@ -81,27 +81,13 @@ def run_study(
     page: bool = True,
     overwrite: bool = False,
 ) -> list[Row]:
-    """Measure every setting; rows go to OUT/NAME.jsonl.
-
-    Args:
-        study: What is measured.
-        out: Folder.
-        settings: Keyword arguments of `study.measure`, plain JSON values.
-        say: Called after every new row.
-        page: Write OUT/NAME.md after every row.
-        overwrite: Overwrite files that the program did not make.
-    """
+    """Measure every setting; rows go to OUT/NAME.jsonl."""
     claim(out, study.files if page else (), overwrite)
     jobs = []
     for own in settings:
         key = f"{study.name} {' '.join(str(v) for v in own.values() if v != [])}"
-        jobs.append(Job({"key": key, "settings": own}, partial(run_alone, study, own)))
+        work = partial(alone, partial(study.measure, **own))
+        jobs.append(Job({"key": key, "settings": own}, work))
     path = out / f"{study.name}.jsonl"
     after = partial(study.write, out) if page else None
     return measure_all(jobs, path, say=say, after=after)
-
-
-def run_alone(study: Study, settings: Settings, seconds: float = 7200.0) -> Row:
-    """The row of one setting, or why it failed."""
-    with scratch() as folder:
-        return alone(partial(study.measure, **settings), folder, seconds)

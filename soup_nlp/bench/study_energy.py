@@ -1,4 +1,4 @@
-"""Studies of the energy: what refinement and NLP contribute, other methods, formulations."""
+"""Studies of the energy: contribution of NLP and refinement, other methods, formulations."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from soup_nlp.solve.stages import solve_soup
 
 
 def measure_refine(scene: str, superpixels: int) -> Row:
-    """Solve a scene by the refinement alone and by the NLP and the refinement."""
+    """Solve a scene by the refinement alone, and by the NLP followed by the refinement."""
     source = {"kind": "scene", "scene": scene} if scene in RENDERED else {"kind": scene}
     runs, gib = [], []
-    # the smaller one first: the peak of a process never falls
+    # the run with less memory first, since the peak of a process never falls
     for from_start in ("true", "false"):
         changes = [f"segmentation.superpixels={superpixels}", f"refine.from_start={from_start}"]
         runs.append(run(make_problem({"name": scene, "input": source}, changes)))
         gib.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
     alone, both = runs
-    told = scores(both)
+    row = scores(both)
     after = both.refined
     assert after is not None
     totals = [after.energy_begin["total"], *(r.energy["total"] for r in after.rounds)]
-    mre = {name: m["mre"] for name, m in told["metrics"]["paper"].items()}
-    energy = {name: e["total"] for name, e in told["energy"].items()}
+    mre = {name: m["mre"] for name, m in row["metrics"]["paper"].items()}
+    energy = {name: e["total"] for name, e in row["energy"].items()}
     only = scores(alone)
     return {
-        "status": told["status"],
+        "status": row["status"],
         "energy": energy | {"refinement": only["energy"]["solution"]["total"]},
         "mre": mre | {"refinement": only["metrics"]["paper"]["solution"]["mre"]},
         "gap": after.rounds[-1].gap / after.rounds[-1].mrf_energy,
@@ -51,7 +51,7 @@ def measure_refine(scene: str, superpixels: int) -> Row:
 
 
 def _by_method(key: str, form: str, heads: tuple[str, ...]) -> Cells:
-    """Columns of start, either half and both."""
+    """Columns of the start, of each half alone, and of both halves."""
 
     def cell(name: str) -> Callable[[Row], str]:
         return lambda row: format(row[key][name], form)
@@ -88,11 +88,11 @@ METHODS = {
     "LM from 0.3": 0.3,
     "LM from 1": 1.0,
 }
-"""First smoothing width by method, pixels; the next ones are those of EPS below it."""
+"""First smoothing width by method, pixels; the widths of EPS below it follow."""
 
 
 def measure_methods(scene: str, superpixels: int, neighbours: int, seed: int, refine: bool) -> Row:
-    """Exact energies from one start by every method, and what the refinement makes of them."""
+    """Exact energies of every method from one start, before and after refinement."""
     case = prepare(problem_of(scene, superpixels, neighbours, seed))
     solved = [_solved(case, method) for method in METHODS]
     out: Row = {"superpixels": len(case), "before": [energy for _, energy in solved]}
@@ -104,7 +104,7 @@ def measure_methods(scene: str, superpixels: int, neighbours: int, seed: int, re
 
 
 def _solved(case: Case, method: str) -> tuple[Soup, float]:
-    """Soup and exact energy of a method, from the case's start."""
+    """Soup and exact energy of a method from the start of the case."""
     own = case.soup, case.data, case.weights, case.formulation()
     first = METHODS[method]
     eps = case.options.presolve_eps if first is None else EPS[EPS.index(first) :]
@@ -152,7 +152,7 @@ FORMULATION_LIMITS = {"max_iter": 300, "far_iterations": 300, "max_seconds": 240
 def measure_formulation(
     scene: str, superpixels: int, norm: str, truncation: str, gauge: str
 ) -> Row:
-    """Solve one formulation of the constrained NLP from its presolve."""
+    """Solve one formulation of the constrained NLP from the answer of the presolve."""
     raw = {
         "input": {"kind": "scene", "scene": scene},
         "segmentation": {"superpixels": superpixels},

@@ -1,4 +1,4 @@
-"""Studies of parts: components that the lower border cuts off, time and memory of TRW-S."""
+"""Studies of two parts: components cut off by the lower image border, and TRW-S."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from soup_nlp.mrf.levels import colours
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.pipeline.run import run
 
-LOWER = 0.3
-"""Share of the rows that the study of components leaves out."""
-NEARER = "soup_nlp.start.components.nearer_where_cut_off"
-"""What the study of components that are cut off switches off."""
+CROPPED = 0.3
+"""Share of the rows that the study of components crops at the bottom."""
+BORDER_RULE = "soup_nlp.start.components.nearer_where_cut_off"
+"""Function that the study of components replaces in order to switch its rule off."""
 ERRORS = ("start, contact", "NLP, contact", "start", "NLP")
 NODES, LABELS, NEIGHBOURS, ITERATIONS = 1000, 50, 15, 10
-"""Sizes of the TRW-S study, those of a refinement."""
+"""Sizes of the TRW-S problem: those of a refinement with the default options."""
 
 
 def measure_cut_off(scene: str, seed: int, superpixels: int, **size: int) -> Row:
-    """MRE of start and NLP on a pair without its lower rows, by contact alone and as shipped."""
+    """MRE of start and NLP on a pair without its lower rows, without and with the border rule."""
     raw = {
         "input": {"kind": "scene", "scene": scene, "seed": seed, **size},
         "segmentation": {"superpixels": superpixels},
@@ -36,10 +36,10 @@ def measure_cut_off(scene: str, seed: int, superpixels: int, **size: int) -> Row
     }
     problem = make_problem(raw)
     whole = problem.load_pair()
-    pair = replace(cropped(whole, 0, 0, 0, int(LOWER * whole.image_ref.shape[0])), flow=None)
+    pair = replace(cropped(whole, 0, 0, 0, int(CROPPED * whole.image_ref.shape[0])), flow=None)
     assert pair.truth is not None
     assert pair.truth.components is not None
-    with mock.patch(NEARER, lambda soup, label, log_scale, *rest: 0 * log_scale):
+    with mock.patch(BORDER_RULE, lambda soup, label, log_scale, *rest: 0 * log_scale):
         contact = run(problem, pair=pair).metrics
     shipped = run(problem, pair=pair).metrics
     last = pair.truth.components[-1]
@@ -58,8 +58,9 @@ def _means(rows: Sequence[Row]) -> list[str]:
 
 CUT_OFF = Study(
     "cut_off",
-    f"MRE (median scale, no cap) of rendered pairs without the lower {LOWER:.0%} of their rows, by"
-    " contact alone and as shipped: what the lower border cuts off is nearer than what it touches"
+    f"MRE (median scale, no cap) of rendered pairs without the lower {CROPPED:.0%} of their"
+    " rows, by contact alone and as shipped: what the lower border cuts off is nearer than what"
+    " it touches"
     " (`start.components`). DIS flow, {superpixels} superpixels, NLP without refinement.",
     measure_cut_off,
     {

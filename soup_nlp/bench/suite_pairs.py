@@ -17,23 +17,23 @@ KITTI_PRESETS = ("kitti", "eigen80", "best")
 SINTEL_FRAMES = MappingProxyType(
     {"alley_1": 50, "ambush_4": 33, "mountain_1": 50, "sleeping_1": 50, "temple_2": 50}
 )
-"""Sequences of the paper and their number of frames."""
+"""Number of frames of the paper's sequences."""
 VKITTI_FRAMES = MappingProxyType({"0001": 447, "0002": 233, "0006": 270, "0018": 339})
-"""Worlds of the paper and their number of frames."""
+"""Number of frames of the paper's worlds."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """One pair with one flow.
+    """A pair of a suite with one flow source.
 
     Attributes:
-        suite: Its suite.
-        sequence: What it is averaged with first.
-        name: Unique in its suite.
+        suite: Name of the suite.
+        sequence: Sequence or family, over which tables average first.
+        name: Name, unique in the suite.
         flow: Flow source.
-        input: The section `input` of its problem.
-        presets: Metric conventions it is scored under, the main one first.
-        needs: Files that must be there.
+        input: Section `input` of the problem.
+        presets: Metric conventions of the scores, the main one first.
+        needs: Files that must exist.
     """
 
     suite: str
@@ -50,11 +50,11 @@ class Item:
         return f"{self.suite}/{self.name}/{self.flow}"
 
     def scored_by(self, presets: Sequence[str] | None) -> Item:
-        """The same pair under other conventions; itself where none are given."""
+        """The item with other metric conventions; unchanged if none are given."""
         return replace(self, presets=tuple(presets)) if presets else self
 
     def problem(self, overrides: Sequence[str] = ()) -> Problem:
-        """Its problem with the defaults and overrides.
+        """The problem of the pair with default options and overrides.
 
         Raises:
             ConfigError: an override is wrong.
@@ -65,14 +65,14 @@ class Item:
 
 @dataclass(frozen=True)
 class Options:
-    """What changes the list of a suite.
+    """Filters and variants of the list of a suite.
 
     Attributes:
-        flows: Flow sources; None for the suite's own.
+        flows: Flow sources; None for those of the suite.
         width: Columns of rendered scenes; they have 436 rows per 1024 columns.
         seeds: Seeds of rendered scenes.
-        limit: At most this many pairs, spread evenly, each with every flow; None for all.
-        only: Keep names that contain one of these words; empty for all.
+        limit: Most pairs, evenly spaced, each with every flow; None for all.
+        only: Keep pairs whose names contain one of these words; empty for all.
     """
 
     flows: tuple[str, ...] | None = None
@@ -83,9 +83,9 @@ class Options:
 
 
 class Entry(NamedTuple):
-    """One pair of a suite, as in `Item`, and whether its true flow may be solved with.
+    """A pair of a suite with fields of `Item`; empty `presets` stand for those of the suite.
 
-    Without `presets` it is scored under the suite's.
+    `true_flow` says whether the pair has a true flow that it may be solved with.
     """
 
     sequence: str
@@ -103,7 +103,7 @@ def spread(count: int, wanted: int, first: int = 0) -> list[int]:
 
 
 def rendered(root: Path, o: Options) -> Iterator[Entry]:
-    """Every scene of every seed."""
+    """All rendered scenes with all seeds."""
     size = {"width": o.width, "height": max(48, round(o.width * 436 / 1024))}
     for seed in o.seeds:
         for scene in RENDERED:
@@ -112,7 +112,7 @@ def rendered(root: Path, o: Options) -> Iterator[Entry]:
 
 
 def shared(root: Path, o: Options) -> Iterator[Entry]:
-    """The real pairs of development by family, motorcycle first."""
+    """The real pairs that development used, by family, the motorcycle first."""
     kitti = ("kitti", "best", "eigen80")
 
     def folders(family: str, true_flow: bool = False, **more: Any) -> Iterator[Entry]:
@@ -156,13 +156,13 @@ def sintel(root: Path, o: Options) -> Iterator[Entry]:
     """Pairs of the five sequences."""
     base = root / "training" if is_folder(root / "training") else root
     for scene, frames in SINTEL_FRAMES.items():
-        # the paper says 120 pairs of these five, not which: 24 each, evenly spaced
+        # the paper uses 120 pairs of these five sequences but does not name them: 24 each
         for frame in spread(frames - 1, 24, 1):
             raw = {"kind": "sintel", "root": str(root), "scene": scene, "frame": frame}
             names = [f"{scene}/frame_{frame + k:04d}" for k in (0, 1)]
             needs = [base / "clean" / f"{name}.png" for name in names]
             if scene != DEFAULT_SCENE:
-                # the loader knows the camera of one scene only
+                # the loader has a default camera for one scene only
                 needs += [base / "camdata_left" / f"{name}.cam" for name in names]
             yield Entry(scene, f"{scene}-{frame:04d}", raw, tuple(needs))
 
@@ -182,7 +182,7 @@ def vkitti(root: Path, o: Options) -> Iterator[Entry]:
     raw = {"kind": "vkitti2" if second else "vkitti1", "root": str(root), "variation": "morning"}
     for world, frames in VKITTI_FRAMES.items():
         scene = f"Scene{world[2:]}" if second else world
-        # 120 pairs of these four, 30 each, evenly spaced: the paper does not say which
+        # the paper uses 120 pairs of these four worlds but does not name them: 30 each
         for frame in spread(frames - 1, 30):
             if second:
                 folder = root / scene / "morning/frames/rgb/Camera_0"

@@ -1,4 +1,4 @@
-"""Suites by name, with where to get their data and how to lay it out."""
+"""Suites of pairs, with the source and the folder layout of their data."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class Suite:
     """A list of pairs.
 
     Attributes:
-        name: On the command line.
-        text: What it is.
-        entries: Its pairs for a root folder.
-        flows: Flow sources by default.
+        name: Name on the command line.
+        text: Description.
+        entries: Makes the pairs of a root folder.
+        flows: Default flow sources.
         presets: Metric conventions, the main one first.
-        folders: Where under --data its root may be; the first that holds a pair is taken.
-        layout: What the root must hold; empty where no data is needed.
-        source: Where to get it.
+        folders: Candidates for the root below --data; the first one with a pair is used.
+        layout: Contents that the root must have; empty if no data is needed.
+        source: Where to get the data.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Suite:
     source: str = ""
 
     def items(self, root: Path, o: Options) -> Iterator[Item]:
-        """Every wanted pair with every flow, whether it is there or not."""
+        """Every wanted pair with every flow, whether its files exist or not."""
         for e in self.entries(root, o):
             if o.only and not any(word in e.name for word in o.only):
                 continue
@@ -135,13 +135,13 @@ SUITES: Mapping[str, Suite] = MappingProxyType({s.name: s for s in _ALL})
 
 @dataclass(frozen=True)
 class Listing:
-    """The pairs of a suite that are there.
+    """The available pairs of a suite.
 
     Attributes:
         suite: The suite.
-        items: What to measure, one item per pair and flow.
-        left_out: Pairs that are there and were left out by a limit.
-        missing: Pairs of the suite's list (with its filters) that are not there.
+        items: One item for each pair and flow.
+        left_out: Number of available pairs that a limit leaves out.
+        missing: Number of pairs in the filtered list of the suite that do not exist.
     """
 
     suite: Suite
@@ -158,16 +158,13 @@ class Listing:
 
 
 def list_suite(name: str, data: Path | None = None, options: Options | None = None) -> Listing:
-    """The pairs of a suite.
+    """The available pairs of a suite.
 
-    Args:
-        name: One of `SUITES`.
-        data: Root folder of the dataset, or a folder that holds it.
-        options: Filters and variants.
+    `data` is the root folder of the dataset, or a folder that holds it.
 
     Raises:
-        DataError: there is no such suite, or none of its pairs is in the folder; the message says
-            where to get the dataset and how to lay it out.
+        DataError: the suite is unknown, or none of its pairs is in the folder; the message names
+            the source of the dataset and its folder layout.
     """
     if name not in SUITES:
         raise DataError("unknown suite", found=repr(name), expected=", ".join(SUITES))
@@ -197,5 +194,5 @@ def list_suite(name: str, data: Path | None = None, options: Options | None = No
 
 
 def _names(items: Iterable[Item]) -> list[str]:
-    """Pairs, whatever their flow, in order."""
+    """Different names of the pairs, in order."""
     return list(dict.fromkeys(i.name for i in items))

@@ -1,7 +1,7 @@
-"""The true soup: planes fitted to true depth and true motions, to compare its energy with.
+"""The true soup: planes fitted to the true depth, with true motions, for a comparison of energies.
 
-If E(truth) is above E(solution) the model prefers something else to the truth; if it is below, the
-solver has missed it.
+If E(truth) is above E(solution), the minimum of the model differs from the truth. If it is below,
+the solver has not found the minimum.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from soup_nlp.geometry.soup import Soup
 Float = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-LEAST_PIXELS = 6
-"""Fewest true pixels of a superpixel whose plane and motion are fitted."""
+MIN_PIXELS = 6
+"""True pixels that the fit of plane and motion of a superpixel needs."""
 SCALES = np.geomspace(1 / 3, 3, 41)
-"""Factors that `rescaled` tries."""
+"""Factors of the scale that `rescaled` tries."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class TrueSoup:
 
     Attributes:
         soup: The soup, mean plane distance 1.
-        component: (N,) component of every superpixel (that of most of its pixels); 0 where unknown.
-        known: (N,) False where a superpixel has too little truth and borrows its neighbour's.
-        purity: (N,) share of its true pixels that belong to its component.
+        component: (N,) component of most pixels of every superpixel; 0 where unknown.
+        known: (N,) False where plane and motion are those of a neighbour for lack of truth.
+        purity: (N,) share of the true pixels that belong to the component.
     """
 
     soup: Soup
@@ -50,16 +50,16 @@ class TrueSoup:
 def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
     """Plane and rigid motion of every superpixel from the truth.
 
-    The plane is the one of least mean relative error over the pixels of the superpixel's
-    component. The motion is the component's own where it is known; else the rigid motion that fits
-    the true scene flow of the pixels best (least squares).
+    The plane has the least mean relative error over the pixels of the superpixel's component. The
+    motion is that of the component if it is known, else the rigid motion that fits the true scene
+    flow of the pixels best (least squares).
 
     Args:
         pair: A pair with dense true depth, and motions of components or scene flow.
         seg: Its superpixels.
 
     Raises:
-        DataError: that truth is not known, or too little of it.
+        DataError: the truth lacks one of these, or is known for too few superpixels.
     """
     truth = pair.truth
     if truth is None or truth.depth_ref is None:
@@ -73,7 +73,7 @@ def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
         mine &= truth.components == component[seg.labels]
     if truth.scene_flow is not None:
         mine &= np.isfinite(truth.scene_flow).all(axis=2)
-    known = np.bincount(seg.labels[mine], minlength=n) >= LEAST_PIXELS
+    known = np.bincount(seg.labels[mine], minlength=n) >= MIN_PIXELS
     if known.sum() < max(1, n // 2):
         raise DataError(
             "too few superpixels have a truth", where=pair.name, found=int(known.sum()), expected=n
@@ -92,12 +92,9 @@ def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
 
 
 def moves_by_itself(truth: Truth) -> Bools:
-    """(B,) which components move otherwise than component 0, the static scene.
+    """(B,) bool, True for components that move differently from component 0, the static scene.
 
-    Without known motions every component but 0 does.
-
-    Args:
-        truth: With components.
+    Without known motions it is True for all components but 0.
     """
     assert truth.components is not None
     own = np.arange(int(truth.components.max()) + 1) > 0
@@ -108,10 +105,10 @@ def moves_by_itself(truth: Truth) -> Bools:
 
 
 def rescaled(true: TrueSoup, energy: Callable[[Soup], float]) -> Soup:
-    """The true soup with every component but the largest at its scale of lowest energy, in turn.
+    """The true soup with the scale of each component but the largest set to that of lowest energy.
 
-    Flow leaves every component that moves by itself a scale of its own: E(truth) less this is what
-    the model would have instead of true distances.
+    The flow does not determine the scale of an independently moving component. The difference to
+    E(truth) is the energy that the model gains by wrong scales.
     """
     soup, size = true.soup, np.bincount(true.component)
     for b in np.argsort(-size, kind="stable")[1 : np.count_nonzero(size)]:
@@ -133,7 +130,7 @@ def _majority(truth: Truth, seg: Segmentation) -> tuple[NDArray[np.int64], Float
 
 
 def _facing(m: Float, seg: Segmentation, K: Float, depth: Float) -> Float:
-    """Planes that are seen from behind at a pixel of their superpixel become fronto-parallel."""
+    """The planes; those seen from behind at a pixel of their superpixel become fronto-parallel."""
     inverse = np.einsum("hwc,hwc->hw", m[seg.labels], rays(K, pixel_grid(*depth.shape)))
     bad = np.bincount(seg.labels.ravel(), ~(inverse.ravel() > 0), len(m)) > 0
     for i in np.flatnonzero(bad & np.isfinite(m).all(axis=1)):
@@ -165,9 +162,9 @@ def _motions(
     order = np.argsort(which, kind="stable")
     labels, first = np.unique(which[order], return_index=True)
     for i, pixels in zip(labels, np.split(use[order], first[1:]), strict=True):
-        if len(pixels) >= LEAST_PIXELS:
+        if len(pixels) >= MIN_PIXELS:
             a, b = X[pixels].mean(axis=0), Y[pixels].mean(axis=0)
-            # on a flat superpixel the determinant decides the third direction
+            # for coplanar points the sign of the determinant decides the third direction
             R[i] = nearest((Y[pixels] - b).T @ (X[pixels] - a))
             T[i] = b - R[i] @ a
             known[i] = True

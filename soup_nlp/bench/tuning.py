@@ -1,9 +1,10 @@
-"""Search for defaults: what is varied in which range, scored how, on which pairs; repeatable.
+"""Random search for better default options, with two checks of the result.
 
-Trial 0 is the default. The first trials fill the ranges evenly (scrambled Sobol sequence), the
-others vary the best so far with a radius that shrinks. Two checks follow: one family of pairs at a
-time is left out of the choice, and the best trials are scored on pairs that had no part in it. The
-same seed, pairs and code give the same trials, and an interrupted search can be continued.
+Trial 0 is the default. The first half of the trials covers the ranges evenly (scrambled Sobol
+sequence); the others vary the best trial so far with a decreasing radius. Two checks follow: one
+family of pairs at a time is held out of the choice, and the best trials are scored on validation
+pairs. The same seed, pairs and code give the same trials, and an interrupted search can be
+continued.
 """
 
 from __future__ import annotations
@@ -27,21 +28,21 @@ from soup_nlp.errors import ConfigError
 
 Float = NDArray[np.float64]
 
-FAILED = math.log(3.0)
-"""Loss of a pair that failed: as if it were three times worse than a constant depth."""
-LEAST = 2e-3
-"""MRE below which a pair is not worth more."""
-ABOVE = 1.10
-"""E(truth) / E(solution) up to which nothing is charged."""
+FAILED_LOSS = math.log(3.0)
+"""Loss of a failed pair: that of an error three times that of a constant depth."""
+MIN_MRE = 2e-3
+"""MRE below which the loss does not decrease any further."""
+MAX_ENERGY_RATIO = 1.10
+"""E(truth) / E(solution) above which a penalty is added to the loss."""
 LOSS_ALLOWED = 0.05
-"""Share by which the MRE of a family that was left out may grow."""
+"""Largest relative increase of the MRE of a held-out family."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A setting (dotted key), its scale, and its range (low, high) or its choices as YAML.
+    """An option (dotted key) with its range (low, high) or its choices, as YAML.
 
-    The scale `kind` is "log", "linear", "int" or "choice".
+    `kind` is the scale of the range: "log", "linear", "int" or "choice".
     """
 
     key: str
@@ -67,10 +68,10 @@ def _number(value: float) -> str:
 
 
 def parameter(text: str) -> Parameter:
-    """A parameter of a text: key=log:LOW:HIGH, key=linear:LOW:HIGH, key=int:.. or key=choice:A:B.
+    """Parse key=log:LOW:HIGH, key=linear:LOW:HIGH, key=int:LOW:HIGH or key=choice:A:B.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: the text has none of these forms.
     """
     key, _, rest = text.partition("=")
     kind, *values = rest.split(":")
@@ -110,14 +111,15 @@ DEFAULT_SPACE = tuple(
         "flow.dis.tau=log:0.5:2.0",
     )
 )
-"""What is varied where nothing else is asked for. E_proj has weight 1: only ratios matter."""
+"""Parameters that are varied by default. The weight of E_proj is 1, since only ratios matter."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One configuration and its rows, one per pair.
+    """A configuration and its rows, one for each pair.
 
-    The default is t000, without overrides; its place `unit` (P,) in the unit cube is NaN.
+    `unit` (P,) is its position in the unit cube. The default is t000, without overrides and with a
+    position of NaN.
     """
 
     name: str
@@ -127,36 +129,36 @@ class Trial:
 
     @property
     def loss(self) -> float:
-        """Score over its rows, lower is better."""
+        """Mean loss of the rows; lower is better."""
         return float(np.mean([loss(r) for r in self.rows])) if self.rows else math.inf
 
 
 def error(row: Row) -> float:
-    """ln(MRE / MRE of a constant depth); at most `FAILED`, which a pair that failed has.
+    """ln(MRE / MRE of a constant depth), at most `FAILED_LOSS`, which is that of a failed pair.
 
-    The logarithm makes a pair that is twice as good count the same on easy and hard pairs.
+    With the logarithm, halving the error counts the same on easy and on hard pairs.
     """
     own, constant = main_metric(row), main_metric(row, method="constant")
     if own is None or constant is None:
-        return FAILED
-    return min(math.log(max(own, LEAST) / max(constant, LEAST)), FAILED)
+        return FAILED_LOSS
+    return min(math.log(max(own, MIN_MRE) / max(constant, MIN_MRE)), FAILED_LOSS)
 
 
 def loss(row: Row) -> float:
-    """How bad a pair is: its `error`, and what the energy prefers to the truth.
+    """Loss of a pair: its `error` plus a penalty if the energy is lower at the solution.
 
-    Where the truth has a soup, ln of E(truth) / E(solution) beyond 1.1 is added: a minimum far
-    from the truth is a wrong model even where this start happens to end well.
+    If the row has E(truth), the penalty is ln(E(truth) / E(solution) / 1.1), at least 0: a minimum
+    far from the truth shows a wrong model even if this start ends near the truth.
     """
     if main_metric(row) is None:
-        return FAILED
-    return error(row) + max(0.0, math.log((energy_ratio(row) or 1.0) / ABOVE))
+        return FAILED_LOSS
+    return error(row) + max(0.0, math.log((energy_ratio(row) or 1.0) / MAX_ENERGY_RATIO))
 
 
 class LeftOut(NamedTuple):
-    """A family of pairs, the best trial on all others, and what it changes on this one.
+    """A held-out family of pairs, the best trial on all other families, and its change of the MRE.
 
-    The change is that of the family's MRE (geometric mean), relative to the default.
+    The change is that of the geometric mean over the held-out family, relative to the default.
     """
 
     family: str
@@ -165,10 +167,10 @@ class LeftOut(NamedTuple):
 
 
 def leave_one_family_out(trials: Sequence[Trial]) -> tuple[LeftOut, ...]:
-    """Every family (sequence of rows) left out of the choice in turn; () where there is only one.
+    """Hold out every family (sequence of rows) in turn; () if there is only one family.
 
     Args:
-        trials: The default first; all with rows of the same pairs.
+        trials: Trials with rows of the same pairs, the default first.
     """
     families = dict.fromkeys(r["sequence"] for r in trials[0].rows)
     if len(families) < 2:
@@ -188,14 +190,14 @@ def leave_one_family_out(trials: Sequence[Trial]) -> tuple[LeftOut, ...]:
 
 
 def accepted(left_out: Sequence[LeftOut]) -> bool:
-    """Whether left-out families gain together and none loses more than `LOSS_ALLOWED`."""
+    """Whether the held-out families gain in total and none loses more than `LOSS_ALLOWED`."""
     changes = [f.change for f in left_out]
     return bool(changes) and np.log1p(changes).sum() < 0 and max(changes) <= LOSS_ALLOWED
 
 
 @dataclass(frozen=True)
 class Found:
-    """All trials on the training pairs, the default and the best ones on the validation pairs."""
+    """Result of a search: all trials on training pairs, the best ones on validation pairs."""
 
     space: tuple[Parameter, ...]
     train: tuple[Trial, ...]
@@ -203,7 +205,7 @@ class Found:
 
     @property
     def best(self) -> Trial:
-        """The best on the training pairs."""
+        """The trial with the least loss on the training pairs."""
         return min(self.train, key=lambda t: t.loss)
 
 
@@ -223,19 +225,19 @@ def search(
     """Search and validate.
 
     Args:
-        space: What is varied.
-        train: Pairs that choose.
-        validation: Pairs that check; none of them may be among the former.
+        space: Parameters that are varied.
+        train: Training pairs.
+        validation: Validation pairs; none of them may be a training pair.
         path: JSON-lines file of rows.
-        trials: Configurations beside the default.
-        finalists: So many of the best are validated, and the default.
-        seed: Of the trials.
-        overrides: Of every problem; trials come after them.
+        trials: Number of configurations beside the default.
+        finalists: Number of best trials that are validated beside the default.
+        seed: Seed of the trials.
+        overrides: Overrides of every problem; those of a trial come after them.
         measure_rows: Measures the jobs; `measure_all` with its options.
         measure: Makes the row of a pair.
 
     Raises:
-        ConfigError: pairs are missing or stand on both sides, or a parameter is wrong.
+        ConfigError: there is no training pair, a pair is in both sets, or a parameter is wrong.
     """
     _check(space, train, validation)
 
@@ -246,7 +248,7 @@ def search(
 
     first = Trial("t000", (), np.full(len(space), np.nan))
     done = [scored(first, train)]
-    # half of the trials are spread evenly
+    # the first half of the trials covers the space evenly
     half = max(1, (trials + 1) // 2)
     sampler = qmc.Sobol(len(space), scramble=True, rng=np.random.default_rng(seed))
     even = sampler.random_base2((half - 1).bit_length())[:half]
@@ -271,7 +273,7 @@ def _check(space: Sequence[Parameter], train: Sequence[Item], validation: Sequen
 
 
 def _next(k: int, trials: int, even: Float, done: Sequence[Trial], seed: int) -> Float:
-    """Place of trial k: even first, then near the best of those so far."""
+    """Position of trial k: evenly spread at first, later near the best trial so far."""
     if k <= len(even):
         return np.asarray(even[k - 1])
     rng = np.random.default_rng([seed, k])
@@ -280,7 +282,7 @@ def _next(k: int, trials: int, even: Float, done: Sequence[Trial], seed: int) ->
     radius = 0.3 * (1 - share) + 0.05
     step = rng.normal(0, radius, len(best.unit)) * (rng.random(len(best.unit)) < 0.5)
     moved = best.unit + step
-    # reflected at the ends of the range
+    # reflect at the ends of the range
     return np.asarray(1 - np.abs(1 - np.abs(moved) % 2))
 
 
@@ -289,7 +291,7 @@ def split(
 ) -> tuple[list[Item], list[Item]]:
     """(training, validation) pairs: rendered scenes by seed, real pairs alternately by name.
 
-    All flows of a pair are on one side.
+    All flows of a pair are in the same set.
     """
     real = sorted({i.name for i in items if "seed" not in i.input})
     train: list[Item] = []

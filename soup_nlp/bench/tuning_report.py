@@ -1,4 +1,4 @@
-"""The record of a search: what was varied, in which range, scored how, with what result."""
+"""The page of a search: parameters, ranges, score, trials and validation."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import (
     columns,
     energy_ratio,
-    joined,
-    made,
     main_metric,
     mean,
+    page_text,
+    provenance,
     show,
     table,
     titles,
 )
 from soup_nlp.bench.tuning import (
-    ABOVE,
-    FAILED,
-    LEAST,
+    FAILED_LOSS,
     LOSS_ALLOWED,
+    MAX_ENERGY_RATIO,
+    MIN_MRE,
     Found,
     Parameter,
     Trial,
@@ -32,24 +32,19 @@ from soup_nlp.bench.tuning import (
 )
 
 TOP = 10
-"""Trials that the record prints."""
+"""Number of trials in the table."""
 
 
 def text_search(found: Found, command: str) -> str:
-    """Markdown of a search.
-
-    Args:
-        found: The search.
-        command: How it was started, so that it can be repeated.
-    """
+    """Markdown of a search."""
     best, default = found.best, found.train[0]
     own = {t.name: t for t in found.validation}
     rows = [r for t in found.train for r in t.rows]
     score = (
         "Mean over pairs of ln(MRE / MRE of a constant depth), MRE under the pair's own convention"
-        f" and at least {LEAST:g}; plus ln(E(truth) / E(solution) / {ABOVE:g}) where the truth has"
-        f" a soup and that is positive; {FAILED:.2f} for a pair that fails. Lower is better;"
-        " -0.69 is half the error of a constant depth."
+        f" and at least {MIN_MRE:g}; plus ln(E(truth) / E(solution) / {MAX_ENERGY_RATIO:g}) where"
+        f" the truth has a soup and that is positive; {FAILED_LOSS:.2f} for a pair that fails."
+        " Lower is better; -0.69 is half the error of a constant depth."
     )
     top = sorted(found.train, key=lambda t: t.loss)[:TOP]
     sections = {
@@ -67,14 +62,14 @@ def text_search(found: Found, command: str) -> str:
         "",
         _verdict(found),
         "",
-        f"{made(rows)}.",
+        f"{provenance(rows)}.",
         "",
         f"    {command}",
     ]
     for title, text in sections.items():
         if text:
             lines += ["", f"## {title}", "", *text]
-    return joined(lines)
+    return page_text(lines)
 
 
 def _verdict(found: Found) -> str:
@@ -93,7 +88,7 @@ def _verdict(found: Found) -> str:
 
 
 def _left_out(found: Found) -> list[str]:
-    """The change on every family of the trial that the other families choose, and the verdict."""
+    """Table: for every family, the trial chosen by the other families and the change it makes."""
     families = leave_one_family_out(found.train)
     if not families:
         return []
@@ -110,7 +105,7 @@ def _left_out(found: Found) -> list[str]:
 
 
 def _varied(found: Found, best: Trial) -> list[str]:
-    """Ranges, and the best value of every parameter."""
+    """Table: range and best value of every parameter."""
     chosen = dict(o.split("=", 1) for o in best.overrides)
     cells: dict[str, Callable[[Parameter], str]] = {
         "setting": lambda p: f"`{p.key}`",

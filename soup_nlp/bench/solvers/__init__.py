@@ -1,1 +1,1 @@
-"""Real solvers on the same NLP: each in its own process, every claim verified."""
+"""Comparison of solvers on the same NLP, each in a process of its own with verified claims."""

@@ -1,4 +1,4 @@
-"""The SOUP family in the comparison: its instances as tasks, profiles, results."""
+"""The SOUP family in the comparison of solvers: tasks, profiles and results."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from soup_nlp.storage.files import read_json
 
 INDEX = "index.json"
 REACHED = 1e-4
-"""A verified point whose objective is this near to the best known one, relative, has reached it."""
+"""Relative distance up to which an objective has reached the best known one."""
 
 
 def is_family(path: Path) -> bool:
-    """Whether a folder is one that `soup-nlp family` wrote."""
+    """Whether `soup-nlp family` wrote a folder."""
     return (path / INDEX).is_file()
 
 
 def family_tasks(folder: Path, limits: Limits) -> Iterator[list[tuple[Label, Maker]]]:
-    """Label and maker of the task of every instance of a folder, scene and size at a time.
+    """Labels and makers of the tasks of all instances in a folder, one scene and size at a time.
 
     Raises:
         DataError: the index cannot be read.
@@ -71,7 +71,7 @@ def _programs(case: Case, record: Frozen, instance: Instance) -> Programs:
 
 
 def neutral(row: Row) -> dict[str, Any]:
-    """A row in the form of `family.results`."""
+    """A row in the solver-independent form of `family.results`."""
     version = row["versions"].get("casadi" if row["solver"] in CASADI else "soup_nlp", "unknown")
     return {
         "solver": row["solver"],
@@ -84,6 +84,7 @@ def neutral(row: Row) -> dict[str, Any]:
         "iterations": row["iterations"],
         "time": row["cpu_seconds"],
         "wall_time": row["wall_seconds"],
+        "time_limit": row["limits"]["seconds"],
         "claimed": row["claimed"],
         "verified": row["verified"],
         "reached": reached(row),
@@ -95,7 +96,7 @@ CASADI = ("ipopt", "sqpmethod", "uno", "alpaqa", "sleqp", "bonmin", "fatrop")
 
 
 def reached(row: Row) -> bool:
-    """Whether a run ended, verified, at the best known objective."""
+    """Whether a run is verified and has reached the best known objective."""
     found = row.get("objective")
     best = float(row["best_known"])
     return bool(row["verified"] and found is not None and found <= best + REACHED * abs(best))
@@ -110,7 +111,7 @@ def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def family_page(rows: Sequence[Row]) -> str:
-    """The page of a comparison over the family: by start and size first, then as any other."""
+    """The page of a comparison over the family, with a table by start and size first."""
     lines = [
         "## By start and size",
         "",
@@ -138,7 +139,7 @@ def _cell(rows: Sequence[Row]) -> str:
 
 
 def draw_family(path: Path, rows: Sequence[Row]) -> None:
-    """Picture of the profiles of CPU time and of the objective, a line a start and size."""
+    """Write a picture of the profiles of CPU time and objective, a row for each start and size."""
     parts = groups(rows)
     picture = figure(9, 3.1 * len(parts))
     panels = picture.subplots(len(parts), 2, squeeze=False)
@@ -151,7 +152,7 @@ def draw_family(path: Path, rows: Sequence[Row]) -> None:
 
 
 def summary(rows: Sequence[Row]) -> Mapping[str, Any]:
-    """Who tried and who reached the best known point of every problem (name without start)."""
+    """Solvers that tried and that reached the best known point, by problem (name without start)."""
     out: dict[str, dict[str, list[str]]] = {}
     for row in rows:
         own = out.setdefault(row["name"].rpartition("-")[0], {"tried_by": [], "reached_by": []})

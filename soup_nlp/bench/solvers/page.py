@@ -1,4 +1,4 @@
-"""The comparison as a page: conclusion first, tables, limits last."""
+"""The page of a comparison of solvers: conclusion, tables, limits."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from soup_nlp.bench.solvers.profiles import cost_table, problem_key
-from soup_nlp.bench.tables import codes, columns, joined, show, table
+from soup_nlp.bench.tables import code_versions, columns, page_text, show, table
 
 Row = Mapping[str, Any]
 
 FEASIBLE = 1e-5
-"""Largest violation of a point whose energy counts."""
+"""Largest violation of a feasible point."""
 LIMITS = (
     "Times are CPU times of one run each, set-up included, on the machine named; so is the limit.",
     "The presolve's answer is almost optimal: energies hardly move, and the comparison is of how "
@@ -28,37 +28,38 @@ LIMITS = (
 
 
 def page(rows: Sequence[Row], each: bool = True) -> str:
-    """Markdown of all rows; the conclusion has lines on each problem, or not."""
+    """Markdown page of all rows; `each` adds lines on each problem to the conclusion."""
     machine = sorted({str(r["machine"]) for r in rows})
     packages = sorted({f"{k} {v}" for r in rows for k, v in r["versions"].items()})
     note = (
         "Verified: the solver claims an optimum, and the KKT residuals and the exact energy,"
         " recomputed from its point, agree."
     )
-    made = [*machine, ", ".join(packages), f"code {codes([dict(r) for r in rows])}"]
+    details = [*machine, ", ".join(packages), f"code {code_versions([dict(r) for r in rows])}"]
     pictures = ["![performance profiles](profile.png)", "", "![energy against time](curves.png)"]
     lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(rows, each), "", *pictures]
     for title, body in {
         "By solver": [note, "", *by_solver(rows)],
         "By run": by_run(rows),
         "Limits": [f"- {text}" for text in (_limits(rows), *LIMITS)],
-        "Machine and versions": [f"- {text}" for text in made],
+        "Machine and versions": [f"- {text}" for text in details],
     }.items():
         lines += ["", f"## {title}", "", *body]
-    return joined(lines)
+    return page_text(lines)
 
 
 def _limits(rows: Sequence[Row]) -> str:
-    """Limits of the runs, which are those of all."""
+    """Sentence on the limits of the runs, whose time limits may differ."""
     own = rows[0]["limits"]
+    seconds = " or ".join(f"{s:g}" for s in sorted({r["limits"]["seconds"] for r in rows}))
     return (
-        f"A run has {own['seconds']:g} CPU seconds, {own['iterations']} iterations and"
+        f"A run has {seconds} CPU seconds, {own['iterations']} iterations and"
         f" {own['memory'] / 2**30:g} GiB, and is asked for a dual infeasibility of {own['tol']:g}."
     )
 
 
 def conclusion(rows: Sequence[Row], each: bool = True) -> list[str]:
-    """What the rows say, in sentences; on each problem too, or of all together only."""
+    """Conclusion in sentences; `each` adds lines on each problem."""
     problems, solvers, time = cost_table(rows, "time")
     _, _, energy = cost_table(rows, "energy")
     solved = np.isfinite(time).sum(axis=0)
@@ -101,13 +102,13 @@ def conclusion(rows: Sequence[Row], each: bool = True) -> list[str]:
 
 
 def _feasible(row: Row) -> bool:
-    """It has a point on the constraints, whose energy is a number."""
+    """Whether the point of a row is feasible and has an energy."""
     primal = row.get("primal")
     return row.get("energy") is not None and primal is not None and primal <= FEASIBLE
 
 
 def by_solver(rows: Sequence[Row]) -> list[str]:
-    """Table: how many runs, claims, true claims."""
+    """Table of the numbers of runs, claims and verified claims of each solver."""
     lines = []
     for solver in sorted({str(r["solver"]) for r in rows}):
         here = [r for r in rows if r["solver"] == solver]

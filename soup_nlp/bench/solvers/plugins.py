@@ -18,12 +18,12 @@ Options = Mapping[str, Any]
 
 
 class Plugin(NamedTuple):
-    """How a plug-in is called.
+    """A plug-in of nlpsol with its options.
 
     Attributes:
-        library: Its name in CasADi.
-        limits: Its options that are `Limits`: option to attribute.
-        options: Its other options.
+        library: Name of the plug-in in CasADi.
+        limits: Attribute of `Limits` by name of the plug-in's option.
+        options: Further options of the plug-in.
         hessian: "exact" or "gauss-newton".
     """
 
@@ -33,7 +33,7 @@ class Plugin(NamedTuple):
     hessian: str = "exact"
 
     def made_for(self, limits: Limits) -> dict[str, Any]:
-        """Options of `ca.nlpsol`; some libraries have theirs in a dictionary of their own."""
+        """Options of `ca.nlpsol`, for some libraries nested under the name of the library."""
         own = {**self.options, **{k: getattr(limits, name) for k, name in self.limits.items()}}
         return {self.library: own} if self.library in NESTED else own
 
@@ -41,17 +41,17 @@ class Plugin(NamedTuple):
 CLAIMS = ("Solve_Succeeded", "Solved_To_Acceptable_Level", "SUCCESS", "success", "Converged")
 NESTED = ("ipopt", "uno", "bonmin", "fatrop")
 CALLS_BACK = ("ipopt", "sqpmethod")
-"""Libraries that call back at every iteration."""
+"""Libraries that call a callback at every iteration."""
 TOLERANCES = {
     **dict.fromkeys(("tol", "dual_inf_tol", "compl_inf_tol"), "tol"),
     "constr_viol_tol": "feasibility",
     "max_iter": "iterations",
 }
-"""Ipopt's options that are limits."""
-SHORT = {"max_iter": "iterations", "tol": "tol"}
-COLD = {"acceptable_iter": 0, "print_level": 0, "sb": "yes"}
-NEAR = {k: v for k, v in DEFAULTS.items() if k.startswith(("mu_", "bound_", "nlp_scaling"))}
-"""Options of a start near the end, for solvers of Ipopt's family."""
+"""Attribute of `Limits` by name of Ipopt's option."""
+TWO_LIMITS = {"max_iter": "iterations", "tol": "tol"}
+COMMON = {"acceptable_iter": 0, "print_level": 0, "sb": "yes"}
+NEAR_START = {k: v for k, v in DEFAULTS.items() if k.startswith(("mu_", "bound_", "nlp_scaling"))}
+"""Options for a start near the minimum, for solvers with the options of Ipopt."""
 SQP = {
     "qpsol": "osqp",
     "qpsol_options": {
@@ -60,10 +60,12 @@ SQP = {
     **dict.fromkeys(("print_header", "print_iteration", "print_status", "error_on_fail"), False),
 }
 PLUGINS: Mapping[str, Plugin] = {
-    "ipopt": Plugin("ipopt", TOLERANCES, COLD),
-    "ipopt-soup": Plugin("ipopt", TOLERANCES, {**DEFAULTS, **COLD}, "gauss-newton"),
-    "ipopt-tuned": Plugin("ipopt", TOLERANCES, {**DEFAULTS, **COLD}),
-    "ipopt-lbfgs": Plugin("ipopt", TOLERANCES, {**COLD, "hessian_approximation": "limited-memory"}),
+    "ipopt": Plugin("ipopt", TOLERANCES, COMMON),
+    "ipopt-soup": Plugin("ipopt", TOLERANCES, {**DEFAULTS, **COMMON}, "gauss-newton"),
+    "ipopt-tuned": Plugin("ipopt", TOLERANCES, {**DEFAULTS, **COMMON}),
+    "ipopt-lbfgs": Plugin(
+        "ipopt", TOLERANCES, {**COMMON, "hessian_approximation": "limited-memory"}
+    ),
     "sqpmethod": Plugin(
         "sqpmethod",
         {"max_iter": "iterations", "tol_du": "tol", "tol_pr": "feasibility"},
@@ -81,15 +83,17 @@ PLUGINS: Mapping[str, Plugin] = {
     ),
     "alpaqa": Plugin("alpaqa", {}, {}),
     "sleqp": Plugin("sleqp", {"max_iter": "iterations"}, {}),
-    "bonmin": Plugin("bonmin", SHORT, {"print_level": 0}),
-    "fatrop": Plugin("fatrop", SHORT, {"print_level": 0}),
-    "bonmin-tuned": Plugin("bonmin", SHORT, {**NEAR, "print_level": 0}),
-    "fatrop-tuned": Plugin("fatrop", SHORT, {"mu_init": NEAR["mu_init"], "print_level": 0}),
+    "bonmin": Plugin("bonmin", TWO_LIMITS, {"print_level": 0}),
+    "fatrop": Plugin("fatrop", TWO_LIMITS, {"print_level": 0}),
+    "bonmin-tuned": Plugin("bonmin", TWO_LIMITS, {**NEAR_START, "print_level": 0}),
+    "fatrop-tuned": Plugin(
+        "fatrop", TWO_LIMITS, {"mu_init": NEAR_START["mu_init"], "print_level": 0}
+    ),
 }
-""""ipopt-soup" is how `solve` runs Ipopt where it starts from no KKT point, "ipopt-tuned" the same
-with the exact Hessian, "ipopt" Ipopt as it comes; other names with "-tuned" have its options for a
-start near the end. blocksqp is left out: it needs a linear solver (ma27) that CasADi's wheel
-lacks."""
+""""ipopt" has the default options of Ipopt. "ipopt-soup" has those that `solve` uses for a start
+that is no KKT point, and "ipopt-tuned" the same with the exact Hessian. Other names with "-tuned"
+have the options for a start near the minimum. blocksqp is left out, since it needs a linear solver
+(ma27) that the wheel of CasADi lacks."""
 
 UPPER = ("triu_hess_gamma_x_x",)
 IPOPT = {"nlp_grad_f": ("f", "grad_f_x"), "nlp_jac_g": ("g", "jac_g_x"), "nlp_hess_l": UPPER}
@@ -107,11 +111,11 @@ CACHED: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "nlp_hess_l": ("hess_gamma_x_x",),
     },
 }
-"""Functions that a library asks CasADi for, with their outputs."""
+"""Functions that a library requests from CasADi, with their outputs."""
 
 
 class _Watch(IterationCallback):
-    """Iterates of a plug-in into the trace; asks it to stop when the time is over."""
+    """Writes the iterates of a plug-in into the trace and stops it at the time limit."""
 
     def __init__(self, trace: Trace, seconds: float) -> None:
         super().__init__()
@@ -124,7 +128,7 @@ class _Watch(IterationCallback):
 
 
 def plugin(name: str, task: Task) -> Answer:
-    """Solve with a plug-in of CasADi's nlpsol, with this package's derivatives where it may."""
+    """Solve with a plug-in of nlpsol, with the derivatives of this package if it accepts them."""
     chosen = PLUGINS[name]
     library = chosen.library
     nlp = task.gauss_newton if chosen.hessian == "gauss-newton" else task.nlp
@@ -136,7 +140,7 @@ def plugin(name: str, task: Task) -> Answer:
         "error_on_fail": False,
         "no_nlp_grad": library == "ipopt",
     }
-    # with numbers for the parameters: bonmin knows none
+    # parameters are replaced by numbers, since bonmin has no parameters
     if library in CACHED:
         x = ca.MX.sym("x", nlp.nx)
         f, g = nlp.oracle(x, nlp.p)
@@ -167,7 +171,7 @@ def plugin(name: str, task: Task) -> Answer:
 
 
 def _derivatives(nlp: NLP, wanted: Mapping[str, tuple[str, ...]]) -> dict[str, ca.Function]:
-    """The package's derivatives under the names and with the outputs that a library asks for."""
+    """Derivatives of this package with the names and outputs that a library requests."""
     x, q = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", 0)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", nlp.ng)
     f, grad = nlp.grad_f(x, nlp.p)

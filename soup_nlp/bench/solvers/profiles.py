@@ -1,4 +1,4 @@
-"""Performance profiles (Dolan and More, 2002) and pictures of rows."""
+"""Performance profiles (Dolan and More, 2002) and pictures of the runs."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from soup_nlp.bench.tables import figure, save
+from soup_nlp.bench.tables import figure, grid_of_panels, save
 
 Float = NDArray[np.float64]
 Row = Mapping[str, Any]
 
-SHORTEST = 0.01
-"""Seconds below which times are not told apart."""
+MIN_SECONDS = 0.01
+"""Shorter times count as this time, seconds."""
 
 
 class Problem(NamedTuple):
-    """What makes a problem of the profile; the rows of a comparison have one start and limits."""
+    """Identity of a problem in a profile."""
 
     problem: str
     superpixels: int
@@ -33,12 +33,12 @@ class Problem(NamedTuple):
 
 
 def problem_key(row: Row) -> Problem:
-    """The problem that a row is of."""
+    """The problem of a row."""
     return Problem(*(row[name] for name in Problem._fields))
 
 
 def cost_table(rows: Sequence[Row], measure: str) -> tuple[list[Problem], list[str], Float]:
-    """Costs (problems, solvers) of the verified runs; infinite where there is none.
+    """Costs (problems, solvers) of the verified runs; infinite without a verified run.
 
     Args:
         rows: Runs.
@@ -57,7 +57,7 @@ def cost_table(rows: Sequence[Row], measure: str) -> tuple[list[Problem], list[s
 
 def _cost(row: Row, measure: str) -> float:
     if measure in ("time", "cpu"):
-        return max(float(row["seconds" if measure == "time" else "cpu_seconds"]), SHORTEST)
+        return max(float(row["seconds" if measure == "time" else "cpu_seconds"]), MIN_SECONDS)
     return float(row[measure])
 
 
@@ -78,7 +78,7 @@ def profile(cost: Float) -> tuple[Float, Float]:
 
 
 def draw_profiles(path: Path, rows: Sequence[Row]) -> None:
-    """Picture of both profiles: time, and final exact energy."""
+    """Write a picture of the profiles of time and of the final exact energy."""
     picture = figure(9, 3.6)
     for axes, measure in zip(picture.subplots(1, 2), ("time", "energy")):
         problems, solvers, cost = cost_table(rows, measure)
@@ -94,32 +94,26 @@ LABELS = {
 }
 
 
-WORTH_TELLING = 1e-4
-"""Gaps below it are within a solver's tolerance; the axis goes at least so far."""
+MIN_GAP = 1e-4
+"""Smallest end of the axis of relative gaps; smaller gaps are within the solvers' tolerance."""
 
 
 def _style(number: int) -> dict[str, Any]:
-    """A solver's look, the same in every panel: ten colours, then again with dashes."""
+    """Line style of a solver, the same in every panel: ten colours, repeated with dashes."""
     return {"color": f"C{number % 10}", "ls": ("-", "--", ":", "-.")[number // 10 % 4]}
 
 
 def draw_profile(
     axes: Axes, measure: str, count: int, solvers: Sequence[str], steps: Float, share: Float
 ) -> None:
-    """A profile in a panel.
+    """Draw a profile.
 
-    Args:
-        axes: The panel.
-        measure: As of `cost_table`.
-        count: Problems.
-        solvers: Names.
-        steps: (k,) ratios of `profile`.
-        share: (k, solvers) shares of `profile`.
+    `steps` (k,) and `share` (k, solvers) are those of `profile`, `count` is the number of problems.
     """
     timed = measure in ("time", "cpu")
     x = steps if timed else steps - 1
     last = x[-1] * 2 if x[-1] > 0 else 1e-3
-    last = last if timed else max(last, WORTH_TELLING)
+    last = last if timed else max(last, MIN_GAP)
     none = []
     for j, solver in enumerate(solvers):
         if share[-1, j] > 0:
@@ -140,21 +134,18 @@ def draw_profile(
 
 
 def draw_curves(path: Path, rows: Sequence[Row]) -> None:
-    """Picture of exact energy against time, a panel a problem; a dot where a run ended."""
+    """Write a picture of exact energy over time, a panel for each problem; dots mark the ends."""
     problems = sorted({problem_key(r) for r in rows})
     solvers = sorted({str(r["solver"]) for r in rows})
-    columns = min(2, len(problems))
-    lines = -(-len(problems) // columns)
-    picture = figure(5.2 * columns, 3.4 * lines)
-    for k, problem in enumerate(problems):
-        axes = picture.add_subplot(lines, columns, k + 1)
+    picture, panels = grid_of_panels(len(problems), 2, 5.2, 3.4)
+    for problem, axes in zip(problems, panels, strict=True):
         here = [r for r in rows if problem_key(r) == problem]
         start = min(r["energy_start"] for r in here)
         for row in sorted(here, key=lambda r: str(r["solver"])):
-            # a solver that leaves no iterates behind has its end
+            # a run without stored iterates has its end only
             end = [[row["seconds"], row["energy"]]] if row.get("energy") is not None else []
             curve = np.array(row["curve"] or end, float).reshape(-1, 2)
-            # off the constraints an iterate's energy may be anything
+            # iterates that violate the constraints may have very large energies
             curve = curve[curve[:, 1] < 3 * start]
             if len(curve):
                 filled = "full" if row["verified"] else "none"
@@ -170,7 +161,7 @@ def draw_curves(path: Path, rows: Sequence[Row]) -> None:
 
 
 def _finish(axes: Axes, size: int) -> None:
-    """Grid, and a legend where a drawn line has a name."""
+    """Add a grid, and a legend if a line has a label."""
     axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=size)

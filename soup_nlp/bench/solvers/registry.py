@@ -15,8 +15,8 @@ import casadi as ca
 import numpy as np
 
 from soup_nlp.bench.reference_solver import EPS, levenberg_marquardt
-from soup_nlp.bench.solvers.plugins import NEAR, PLUGINS, TOLERANCES, plugin
-from soup_nlp.bench.solvers.task import WALL, Answer, Solver, Task, Trace, clock
+from soup_nlp.bench.solvers.plugins import NEAR_START, PLUGINS, TOLERANCES, plugin
+from soup_nlp.bench.solvers.task import WALL_PER_CPU, Answer, Solver, Task, Trace, clock
 from soup_nlp.errors import SolverError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import read_sol
@@ -31,7 +31,7 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
     begin = clock()
     file = write_nl(task.folder / "soup.nl", task.nlp)
     path = task.folder / "soup.sol"
-    # the folder may hold the answer to another problem
+    # remove an answer to an earlier problem
     path.unlink(missing_ok=True)
     with (task.folder / "solver.log").open("w") as log:
         try:
@@ -40,7 +40,7 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
                 cwd=task.folder,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                timeout=WALL * max(1.0, task.limits.seconds - (clock() - begin)),
+                timeout=WALL_PER_CPU * max(1.0, task.limits.seconds - (clock() - begin)),
                 check=False,
                 preexec_fn=end_with_parent,
             ).returncode
@@ -56,23 +56,23 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
 
 
 def _find(name: str) -> str | None:
-    """Absolute path of an executable that is found on the PATH or beside Python."""
+    """Absolute path of an executable on the PATH or beside Python; None if there is none."""
     found = shutil.which(name) or shutil.which(str(Path(sys.executable).parent / name))
-    # it runs in another folder than this one
+    # absolute, since it runs in another folder
     return None if found is None else str(Path(found).absolute())
 
 
 def pounce(command: str, task: Task, near: bool = False) -> Answer:
-    """POUNCE, which knows Ipopt's options; with those of a start near the end, if asked."""
+    """Solve with POUNCE, which has the options of Ipopt; `near` adds those for a near start."""
     m = task.limits
     options = {option: getattr(m, name) for option, name in TOLERANCES.items()}
     options |= {"acceptable_iter": 0, "max_cpu_time": 0.9 * m.seconds, "print_level": 0}
-    options |= NEAR if near else {}
+    options |= NEAR_START if near else {}
     return executable(command, task, [f"{k}={v}" for k, v in options.items()])
 
 
 def scip(task: Task) -> Answer:
-    """SCIP, a global solver, on the .nl file: for small problems."""
+    """Solve the .nl file with SCIP, a global solver for small problems."""
     import pyscipopt
 
     begin = clock()
@@ -102,32 +102,34 @@ def scip(task: Task) -> Answer:
 
 
 def reference(task: Task) -> Answer:
-    """Levenberg-Marquardt on the manifold, without multipliers.
+    """Solve with Levenberg-Marquardt on the manifold; the answer has no multipliers.
 
-    It ends where the energy stops falling and claims no optimum: whether its point is one, the
-    residuals say.
+    It ends when the energy stops decreasing, and it claims no optimum.
     """
     last = task.form.eps
     eps = [*(e for e in EPS if e > last), last]
     own = task.soup, task.data, task.weights, task.form
     begin = clock()
-    record = levenberg_marquardt(*own, eps=eps, seconds=0.8 * WALL * task.limits.seconds)
+    record = levenberg_marquardt(*own, eps=eps, seconds=0.8 * WALL_PER_CPU * task.limits.seconds)
     seconds = clock() - begin
-    # slack variables and switches at their best for this soup
+    # slack variables and switches with their optimal values for this soup
     x = build_matrix_nlp(record.soup, task.data, task.weights, task.form)[0].x0.copy()
     x[: task.layout.size] = task.layout.pack(record.soup)
-    # its clock is wall time
+    # its history has wall times: convert them to CPU times
     own_seconds = max(float(record.history[-1, 0]), seconds)
     curve = record.history * [seconds / own_seconds, 1.0]
     return Answer(x, None, record.status, False, record.iterations, seconds, curve)
 
 
 def package(task: Task) -> Answer:
-    """This package's own way: presolve, then Ipopt on the constrained NLP."""
+    """Solve as this package does: presolve, then Ipopt on the constrained NLP."""
     begin = clock()
     m = task.limits
     options = SolverOptions(
-        eps=task.form.eps, tol=m.tol, max_iter=m.iterations, max_seconds=0.9 * WALL * m.seconds
+        eps=task.form.eps,
+        tol=m.tol,
+        max_iter=m.iterations,
+        max_seconds=0.9 * WALL_PER_CPU * m.seconds,
     )
     own = task.soup, task.data, task.weights, task.form
     answer = solve_soup(*own, options)
@@ -138,7 +140,7 @@ def package(task: Task) -> Answer:
 
 
 def available() -> dict[str, Solver]:
-    """Every solver that can run here, by name."""
+    """Installed solvers by name."""
     out: dict[str, Solver] = {
         name: partial(plugin, name) for name, row in PLUGINS.items() if ca.has_nlpsol(row.library)
     }
@@ -154,10 +156,10 @@ def available() -> dict[str, Solver]:
 
 
 def find_solver(name: str) -> Solver:
-    """The solver of a name; another name is an executable of the AMPL convention.
+    """The solver of a name, or the executable of that name (AMPL convention).
 
     Raises:
-        SolverError: there is none.
+        SolverError: there is neither.
     """
     known = available()
     if name in known:
@@ -165,7 +167,7 @@ def find_solver(name: str) -> Solver:
     options: list[str] = []
     command = None if name in PLUGINS or name == "scip" else _find(name)
     if command is None and name not in PLUGINS and name != "scip":
-        # options may follow the program's name
+        # options may follow the name of the program
         program, *options = shlex.split(name) or [""]
         command = _find(program)
     if command is None:

@@ -1,4 +1,4 @@
-"""Runs of solvers as rows: every solver in its own process, every claim verified."""
+"""Runs of solvers as rows: each in a process of its own, with its claim verified."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from soup_nlp.bench.processes import isolated, processor
 from soup_nlp.bench.rows import Job, Row, measure_all
 from soup_nlp.bench.solvers.registry import find_solver
-from soup_nlp.bench.solvers.task import WALL, Answer, Task, Trace
+from soup_nlp.bench.solvers.task import WALL_PER_CPU, Answer, Task, Trace
 from soup_nlp.bench.tables import show
 from soup_nlp.export.artefact import form_label
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
@@ -33,9 +33,9 @@ Maker = Callable[[Path], Task]
 Programs = tuple[NLP, NLP, MatrixLayout, Formulation]
 
 CURVE_POINTS = 40
-"""Iterates of a trace whose exact energy is taken."""
+"""Iterates of a trace for which the exact energy is computed."""
 KEY = ("problem", "problem_hash", "superpixels", "formulation", "start")
-"""What identifies a task."""
+"""Entries of a label that identify a task."""
 
 
 def make_tasks(
@@ -43,11 +43,7 @@ def make_tasks(
 ) -> Iterator[tuple[Label, Maker]]:
     """Label and maker of the task of every formulation.
 
-    Args:
-        case: Problem with its start.
-        forms: Gauge, norm, truncation, each or none.
-        limits: For every solver.
-        presolved: The case starts at the presolve's answer.
+    `presolved` says that the case starts at the answer of the presolve.
     """
     ceiling = oracle.energy(case.start.soup, case.data, case.weights)["total"]
     for chosen in forms:
@@ -77,15 +73,15 @@ def task_maker(case: Case, programs: Callable[[], Programs], limits: Limits) -> 
 
     Args:
         case: Data and weights.
-        programs: Makes the NLP with the exact Hessian, with the Gauss-Newton one, their layout and
-            their formulation; the start is theirs.
-        limits: For every solver.
+        programs: Makes the NLP with the exact and with the Gauss-Newton Hessian, their layout and
+            formulation; the start is that of the NLP.
+        limits: Limits of every solver.
     """
 
     @cache
     def built() -> Task:
         nlp, second, layout, form = programs()
-        # assemble now, so that no solver's time includes it
+        # assemble here, so that the time of a solver does not include it
         both = nlp.assembled(), second.assembled()
         soup = layout.unpack(nlp.x0).retracted()
         return Task(*both, layout, soup, case.data, case.weights, form, limits, Path())
@@ -94,12 +90,9 @@ def task_maker(case: Case, programs: Callable[[], Programs], limits: Limits) -> 
 
 
 def run_row(task: Task, label: Label, solver: str) -> Row:
-    """Run one solver in its own process, verify what it says, and make the row.
+    """Run a solver in a process of its own, verify its answer, and make the row.
 
-    Args:
-        task: NLP, start and limits.
-        label: What the row is of, and "energy_limit".
-        solver: Name, see `find_solver`.
+    `label` has the entries that identify the task, and "energy_limit".
     """
     work = find_solver(solver)
     trace = Trace(task.folder / "trace", task.nlp.nx)
@@ -108,7 +101,7 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
     ended = isolated(
         lambda: work(task),
         task.folder,
-        WALL * limits.seconds,
+        WALL_PER_CPU * limits.seconds,
         limits.memory,
         cpu_seconds=limits.seconds,
     )
@@ -133,13 +126,13 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
     if isinstance(ended.value, Answer):
         row |= _verified(task, ended.value, float(label["energy_limit"]))
     elif row["curve"]:
-        # the solver was killed, but its iterates are there
+        # the solver was killed, but its iterates are stored
         row["energy"] = row["curve"][-1][1]
     return row
 
 
 def _energy(task: Task, x: Float) -> float:
-    """Exact energy of a point, retracted to the constraints; infinite where it has none."""
+    """Exact energy of a point retracted to the constraints; infinite if it is not finite."""
     with np.errstate(all="ignore"):
         try:
             soup = task.layout.unpack(x).retracted()
@@ -150,7 +143,7 @@ def _energy(task: Task, x: Float) -> float:
 
 
 def _curve(task: Task, seconds: Float, points: Float) -> list[list[float]]:
-    """(seconds, exact energy) of some iterates, the first and the last among them."""
+    """(seconds, exact energy) of some iterates, including the first and the last."""
     if not len(seconds):
         return []
     chosen = np.unique(np.linspace(0, len(seconds) - 1, CURVE_POINTS).round().astype(int))
@@ -159,7 +152,7 @@ def _curve(task: Task, seconds: Float, points: Float) -> list[list[float]]:
 
 
 def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
-    """What an answer adds to its row: its claim, its exact energy and its residuals."""
+    """Entries of a row from an answer: claim, exact energy and residuals."""
     # a claim after the time limit does not count
     late = not answer.seconds <= task.limits.seconds
     row: Row = {
@@ -191,19 +184,13 @@ def compare(
     scratch: Path,
     say: Callable[[str], None],
 ) -> list[Row]:
-    """Run every solver on every task, unless the file holds the run already.
+    """Run every solver on every task; runs that the file holds already are not repeated.
 
-    Args:
-        tasks: (label, maker of the task in a scratch folder).
-        solvers: Names.
-        limits: Of every task.
-        path: JSON lines.
-        scratch: Folder for the runs' files.
-        say: Called with a line per run.
+    `path` is a JSON-lines file, and `say` is called with a line for each run.
     """
 
     def run(label: Label, make: Maker, solver: str) -> Row:
-        # a solver may be named by its path
+        # the name of a solver may be a path
         folder = scratch / re.sub(r"[^\w-]+", "_", solver)
         folder.mkdir(parents=True, exist_ok=True)
         return run_row(make(folder), label, solver)
@@ -217,7 +204,7 @@ def compare(
 
 
 def one_line(row: Row) -> str:
-    """A row in words."""
+    """A row as one line of text."""
     word = "verified" if row["verified"] else "claimed" if row["claimed"] else "-"
     return (
         f"{row['problem']:<12} {row['superpixels']:>5} {row['formulation']:<28}"

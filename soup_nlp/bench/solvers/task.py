@@ -1,4 +1,4 @@
-"""The task that a solver gets, and the answer that it returns."""
+"""Task and answer of a solver, and the trace of its iterates."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Task:
-    """One NLP for one solver.
+    """An NLP for a solver.
 
     Attributes:
-        nlp: With the exact Hessian.
+        nlp: The NLP with the exact Hessian.
         gauss_newton: The same NLP with the Gauss-Newton Hessian.
-        layout: Of both.
+        layout: Layout of both.
         soup: Start.
-        data, weights, form: Of the energy (for the reference solver, which takes no NLP).
-        limits: Time, iterations, tolerance, memory.
-        folder: Scratch folder of this run.
+        data, weights, form: Energy and formulation, for the reference solver, which takes no NLP.
+        limits: Limits of time, iterations, tolerance and memory.
+        folder: Scratch folder of the run.
     """
 
     nlp: NLP
@@ -51,13 +51,13 @@ class Answer:
     """The answer of a solver.
 
     Attributes:
-        x: (nx,) point, or None where it returned none.
+        x: (nx,) point, or None if the solver returned none.
         lam_g: (ng,) multipliers, or None.
-        status: In the words of the solver.
-        claimed: It claims an optimum.
-        iterations: Outer iterations, -1 where it does not say.
+        status: Status text of the solver.
+        claimed: Whether the solver claims an optimum.
+        iterations: Outer iterations, -1 if unknown.
         seconds: CPU time of set-up and solve.
-        curve: (k, 2) seconds and exact energy, of solvers that record it themselves.
+        curve: (k, 2) seconds and exact energy, from solvers that record it themselves.
     """
 
     x: Float | None
@@ -72,24 +72,24 @@ class Answer:
 def clock() -> float:
     """CPU seconds of this process and of its children that have ended.
 
-    Runs are limited and compared by it: wall time is that of the machine's other work as well.
+    Limits and comparisons use CPU time, since wall time depends on other work of the machine.
     """
     return sum(os.times()[:4])
 
 
-WALL = 20.0
-"""Wall seconds that a CPU second may take before a run is ended: other work may be on the machine,
-and a program that waits uses none."""
+WALL_PER_CPU = 20.0
+"""Limit of the wall time relative to that of the CPU time: other work may slow a run down, and a
+program that waits uses no CPU time."""
 Solver = Callable[[Task], Answer]
 
 
 @dataclass
 class Trace:
-    """Iterates as they happen, on disk, so that a killed solver leaves them behind.
+    """File of the iterates of a solver, written at once so that it survives a killed solver.
 
     Args:
         path: File of float64 records (seconds, x).
-        nx: Variables.
+        nx: Number of variables.
     """
 
     path: Path
@@ -103,7 +103,7 @@ class Trace:
             file.write(record.tobytes())
 
     def read(self) -> tuple[Float, Float]:
-        """(k,) seconds and (k, nx) iterates; a record cut short is left out."""
+        """(k,) seconds and (k, nx) iterates, without an incomplete last record."""
         flat = np.fromfile(self.path) if self.path.is_file() else np.zeros(0)
         width = self.nx + 1
         records = flat[: len(flat) // width * width].reshape(-1, width)
