@@ -28,7 +28,7 @@ from soup_nlp.storage.folders import claim, staged
 
 
 def mre_of(row: Row) -> str:
-    """The main error of a row, for the progress line."""
+    """The main error of a row as text for the progress line."""
     return f"MRE {show(main_metric(row))}"
 
 
@@ -87,7 +87,7 @@ def accuracy(
             presets=conventions or (),
             overwrite=overwrite,
         )
-        _tell(page)
+        _print_page(page)
     else:
         pages = [out / f"{name or listing.suite.name}.md" for listing in listings]
         claim(out, [page.name for page in pages], overwrite)
@@ -121,7 +121,7 @@ def _table(
         note += f" Overrides: {', '.join(f'`{o}`' for o in changes)}."
     with staged(page.parent) as new:
         write_text(new / page.name, report(f"Accuracy on {page.stem}", rows, note))
-    _tell(page)
+    _print_page(page)
 
 
 def _check_names(
@@ -149,7 +149,7 @@ def _wanted(
     return Options(flows, width, tuple(dict.fromkeys(seeds)), limit, tuple(only or ()))
 
 
-def _tell(page: Path) -> None:
+def _print_page(page: Path) -> None:
     print(page.read_text(encoding="utf-8"))
     print(f"files       {page.parent}/{page.stem}.*")
 
@@ -211,5 +211,5 @@ def search(
     page = out / "search.md"
     with staged(out) as new:
         write_text(new / page.name, text_search(found, f"soup-nlp bench search {' '.join(words)}"))
-    _tell(page)
+    _print_page(page)
     raise typer.Exit(1 if progress.failed else 0)

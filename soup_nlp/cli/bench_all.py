@@ -1,4 +1,4 @@
-"""Command bench all: everything under results/ again, one command after the other."""
+"""Command bench all: run the commands that make everything under results/."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ COMMANDS = (
     "compare problems/orbit.yaml problems/street.yaml -o {out}/solvers --superpixels 100"
     " --seconds 45 --set flow.source=truth",
 )
-"""What is run, in this order."""
+"""Commands in the order in which they run."""
 LONGEST_PATH = 4_096
 """Bytes of the longest path that Linux takes."""
 
@@ -65,13 +65,13 @@ def everything(
     dry: Annotated[bool, typer.Option(help="Print the commands only.")] = False,
 ) -> None:
     """Make every table and picture of results/ in a folder; a run that was stopped goes on."""
-    # it runs the other commands, and main knows this one
+    # imported here, since main imports this module
     from soup_nlp.cli.main import main
 
     if data is not None and not dry and not is_folder(data):
         raise ConfigError("there is no such folder", where="--data", found=data)
     if not dry:
-        # refused now, not after hours
+        # check now instead of after hours
         claim(out, ["motorcycle.png"], overwrite)
     elif len(str(out)) > LONGEST_PATH:
         raise ConfigError("this name of a folder is too long", where="--out", found=len(str(out)))

@@ -59,10 +59,10 @@ def speed(
         overrides=overrides or [],
     )
     for own in settings:
-        # a wrong override stops here, not after an hour
+        # check the overrides now instead of after an hour
         problem_of(**own)
     if write_baseline is not None and os.path.lexists(write_baseline) and not overwrite:
-        # refuses what is no baseline
+        # raises an error if the file is no baseline
         read_baseline(write_baseline)
     say = Progress(quiet, _result_of)
     rows = run_study(SPEED, out, settings, say, page=not kept, overwrite=overwrite)
@@ -80,7 +80,7 @@ def speed(
 
 
 def _result_of(record: Row) -> str:
-    """The result of a run in a few words."""
+    """The result of a run as text for the progress line."""
     y = record["reference"]
     return (
         f"{record['status']}, {record['cpu']['nlp']:.1f} CPU s, {record['iterations']}"

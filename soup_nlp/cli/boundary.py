@@ -1,4 +1,4 @@
-"""The outermost layer of every command: an unexpected exception becomes a bug report in a file."""
+"""Outermost layer of every command: unexpected exceptions become bug reports in files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from soup_nlp.storage.versions import versions
 BUG = 70
 """Exit code of a bug of the program (EX_SOFTWARE of sysexits.h)."""
 BROKEN_PIPE = 141
-"""Exit code where the reader of the output has gone, as shells have it."""
+"""Exit code after a broken pipe, as in shells."""
 
 SYSTEM = {
     getattr(errno, name)
@@ -32,13 +32,13 @@ SYSTEM = {
     )
     if hasattr(errno, name)
 }
-"""What the machine refuses, and no program can do anything about."""
+"""Errors of the operating system that are not bugs of the program."""
 
 P = ParamSpec("P")
 
 
 def guarded(command: Callable[P, None]) -> Callable[P, None]:
-    """A command that ends in a SoupError, an exit code, or the report of a bug."""
+    """The command with unexpected exceptions turned into a SoupError or a bug report."""
 
     @functools.wraps(command)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -49,7 +49,7 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
         except Exception as error:
             if refused := refusal(error):
                 raise refused from error
-            # usage errors of the command line library carry their own message
+            # usage errors of the command line library have their own message
             if hasattr(error, "format_message"):
                 raise
             raise typer.Exit(report_bug(error)) from error
@@ -58,7 +58,7 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
 
 
 def refusal(error: Exception) -> DataError | None:
-    """The error of a machine that has no more memory, files or space; None for any other."""
+    """DataError for a lack of memory, files or disk space; None for other errors."""
     if _out_of_memory(error):
         return DataError(
             "the machine has not enough memory for this",
@@ -73,14 +73,14 @@ def refusal(error: Exception) -> DataError | None:
 
 
 def _out_of_memory(error: Exception) -> bool:
-    """Whether Python, NumPy, OpenCV or native code found no memory."""
+    """Whether Python, NumPy, OpenCV or native code ran out of memory."""
     return isinstance(error, MemoryError) or any(
         word in str(error) for word in ("bad_alloc", "Insufficient memory")
     )
 
 
 def report_bug(error: BaseException) -> int:
-    """Write a traceback to a file and ask for it; returns the exit code."""
+    """Write a traceback to a file and ask the user to report it; returns the exit code."""
     lines = traceback.format_exception(error)
     facts = [f"command: {sys.argv!r}", *(f"{k}: {v}" for k, v in versions().items()), ""]
     text = "\n".join(facts) + "".join(lines)
@@ -99,11 +99,10 @@ def report_bug(error: BaseException) -> int:
 
 
 def refuse_odd(words: Sequence[str]) -> None:
-    """Refuse arguments that nobody means: empty ones, such as of a variable that is not set, which
-    would stand for the working folder; and control characters, which a terminal would obey.
+    """Reject empty arguments, which unset shell variables cause, and control characters.
 
     Raises:
-        ConfigError: There is one.
+        ConfigError: there is one.
     """
     for word in words:
         if not word.strip() or re.fullmatch(r"--[a-z-]+=\s*", word):
@@ -113,16 +112,16 @@ def refuse_odd(words: Sequence[str]) -> None:
 
 
 def prepare_streams() -> None:
-    """Let characters that a terminal or file cannot show be printed as escapes.
+    """Print characters that a stream cannot encode as escapes, and open closed streams.
 
-    A stream that was closed before the start (`>&-`) swallows what is printed. Its number would
-    else be that of the next file that is opened, and native code would print into that.
+    A stream that was closed before the start (`>&-`) is connected to the null device. Otherwise the
+    next opened file would get its number, and native code would print into that file.
     """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            # takes the lowest free number
+            # gets the lowest free number
             os.open(os.devnull, os.O_RDWR)
     sys.stdout = sys.stdout or os.fdopen(1, "w")
     sys.stderr = sys.stderr or os.fdopen(2, "w")
@@ -133,6 +132,6 @@ def prepare_streams() -> None:
 
 
 def drop_output() -> None:
-    """Send what is left of the output nowhere: its reader has gone."""
+    """Discard the rest of the output after a broken pipe."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -22,7 +22,7 @@ from soup_nlp.sequence.frames import (
     find_images,
     video_frames,
 )
-from soup_nlp.sequence.key_frames import LONGEST
+from soup_nlp.sequence.key_frames import MAX_STEP
 from soup_nlp.sequence.pairs import solve_pairs
 from soup_nlp.sequence.report import table
 from soup_nlp.sequence.write import SINGLE, chain_files, write_chain
@@ -30,9 +30,9 @@ from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import claim, staged
 
 SCENE = "scene:"
-"""Before the name of a rendered scene."""
+"""Prefix of the name of a rendered scene."""
 AUTO = "auto"
-"""Stride that parallax decides."""
+"""Stride that is chosen by parallax."""
 
 
 def chain(
@@ -99,14 +99,14 @@ def chain(
 
 
 def _step(stride: str) -> int | None:
-    """Every how many frames one is taken; None where parallax decides.
+    """The stride as a number; None if parallax decides.
 
     Raises:
-        ConfigError: it is neither.
+        ConfigError: it is neither a positive number nor AUTO.
     """
     if stride == AUTO:
         return None
-    # nobody takes one frame in a hundred million
+    # limits the number of digits
     if not stride.isdecimal() or len(stride) > 8 or int(stride) < 1:
         raise ConfigError(
             "unknown stride", where="--stride", found=stride, expected=f"a number from 1, or {AUTO}"
@@ -123,7 +123,7 @@ def _frames(
     most: int | None,
     depth_scale: float,
 ) -> Frames:
-    """The frames that the command line names; `step` None takes those with enough parallax."""
+    """The frames of the command line; `step` None takes those with enough parallax."""
     first = source[0]
     if first.startswith(SCENE):
         own = first.removeprefix(SCENE)
@@ -132,12 +132,12 @@ def _frames(
         return SceneFrames(own, most or 10)
     path = as_path(first, "frames", home=True)
     depths: list[Path] = []
-    # as many are chosen among all
+    # with AUTO the limit applies to the chosen frames
     end = most if step else None
     if len(source) > 1:
         images = [as_path(name, "image", home=True) for name in source][:: step or 1][:end]
     elif path.suffix.lower() in VIDEOS:
-        read = None if most is None or step else most * LONGEST
+        read = None if most is None or step else most * MAX_STEP
         images = video_frames(path, out / "frames", step or 1, end or read)
     else:
         images = find_images(path)[:: step or 1][:end]

@@ -34,9 +34,9 @@ from soup_nlp.storage.folders import claim, scratch, staged
 from soup_nlp.storage.store import write_json
 
 FILES = ("README.md", "profile.png", "curves.png")
-"""What is written of all rows, beside the rows themselves."""
+"""Files that are made from all rows."""
 OF_FAMILY = ("profiles.png", "results.json", "reached.json")
-"""What is written besides where instances of the family were solved."""
+"""Further files for rows of the family."""
 
 
 def compare(
@@ -73,7 +73,7 @@ def compare(
     forms = [parse_formulation(text) for text in formulation or []] or [{}]
     limits = Limits(seconds, iterations, tol, int(memory * 2**30))
     sizes = [[f"segmentation.superpixels={n}"] for n in superpixels or ()] or [[]]
-    # a file that is wrong is found before hours of runs, not after
+    # load all problems first: a wrong file must not stop after hours of runs
     sets = [path for path in problems if is_family(path)]
     files = [path for path in problems if path not in sets]
     chosen = [load_problem(path, [*(overrides or []), *own]) for path in files for own in sizes]
@@ -91,7 +91,7 @@ def compare(
                 tasks = list(make_tasks(prepare(problem, presolve), forms, limits, presolve))
                 rows += run_all(tasks, names, limits, runs, temporary, print)
     finally:
-        # an input that cannot be used does not take the others' page away
+        # write the page of the finished runs even after an error
         rows += of_family
         if rows:
             _write(folder, rows, of_family, limits)
@@ -103,7 +103,7 @@ def compare(
 def _write(
     folder: Path, rows: list[dict[str, Any]], of_family: list[dict[str, Any]], limits: Limits
 ) -> None:
-    """What FILES names of all rows, and what OF_FAMILY names of those of the family."""
+    """Write FILES from all rows, and OF_FAMILY from the rows of the family."""
     with staged(folder) as new:
         write_text(new / "README.md", family_page(of_family) if of_family else page(rows))
         draw_profiles(new / "profile.png", rows)

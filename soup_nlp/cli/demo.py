@@ -1,4 +1,4 @@
-"""Command demo: two pairs that need no data, a real one and one in which things move."""
+"""Command demo: a real pair and a rendered pair with moving cars, which need no data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PAIRS = {
     "motorcycle": "a real pair, rigid: here one rigid motion for the whole image is as good",
     "street": "a rendered street: the camera drives and two cars move",
 }
-"""Problems of the demo, and what to see in each."""
+"""Problems of the demo with a description."""
 
 
 def demo(out: Out = Path("out/demo"), overwrite: Overwrite = False, quiet: Quiet = False) -> None:

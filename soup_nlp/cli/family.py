@@ -14,7 +14,7 @@ from soup_nlp.family.write import write_family
 from soup_nlp.storage.folders import claim, staged
 
 QUICK = "100,250"
-"""Sizes that a minute makes."""
+"""Default sizes, which take about a minute."""
 
 TABLES = ("index.json", "index.csv", "README.md", "LICENSE.txt")
 """Files of a set beside its instances."""

@@ -28,7 +28,7 @@ from soup_nlp.storage.system import sigterm_as_ctrl_c
 from soup_nlp.storage.versions import __version__
 
 ABORTED = 130
-"""Exit code of what Ctrl-C ended without a result, as shells have it."""
+"""Exit code of a command that Ctrl-C ended without a result, as in shells."""
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "solve": ("solve:solve", "Solve a pair of frames and write a result folder."),
@@ -69,7 +69,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "Run real solvers on problems, verify their claims, write table and profiles.",
     ),
 }
-"""Commands: module and function under `soup_nlp.cli`, and the first line of its docstring."""
+"""Module and function under `soup_nlp.cli` and first line of the docstring, by command."""
 
 BENCH: Mapping[str, tuple[str, str]] = {
     "accuracy": (
@@ -114,14 +114,11 @@ BENCH: Mapping[str, tuple[str, str]] = {
         "Make every table and picture of results/ in a folder; a run that was stopped goes on.",
     ),
 }
-"""The same of `soup-nlp bench`."""
+"""The same for the commands of `soup-nlp bench`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
-
-    Args:
-        argv: Arguments; default sys.argv.
 
     Returns:
         0 good, 1 not converged (interrupted too) or a claim fails, 2 bad input, 70 a bug, 130
@@ -129,7 +126,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     prepare_streams()
     if argv is None:
-        # pictures go to files; a backend of the user's that matplotlib does not know is no matter
+        # pictures go to files, so that the backend of the user does not matter
         os.environ["MPLBACKEND"] = "agg"
     try:
         with sigterm_as_ctrl_c():
@@ -147,7 +144,7 @@ def _run(argv: Sequence[str] | None) -> int:
         words = list(sys.argv[1:] if argv is None else argv)
         refuse_odd(words)
         code = _root()(args=words, standalone_mode=False)
-        # the command line library makes this code of a KeyboardInterrupt
+        # the command line library turns a KeyboardInterrupt into this code
         return _aborted() if code == ABORTED else int(code or 0)
     except StoppedError as error:
         print(error, file=sys.stderr)
@@ -160,7 +157,7 @@ def _run(argv: Sequence[str] | None) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return _aborted()
     except Exception as error:
-        # usage errors of the command line library carry their own message
+        # usage errors of the command line library have their own message
         if hasattr(error, "format_message"):
             print(f"error: {printable(error.format_message())}", file=sys.stderr)
             return 2
@@ -178,10 +175,10 @@ def _aborted() -> int:
 
 
 class LazyGroup(TyperGroup):
-    """A group that imports a command when it is called; `--help` needs names and sentences only."""
+    """A group that imports a command only when it is called, which makes `--help` fast."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """The command that the arguments name, imported, and the arguments that are its own."""
+        """Name, imported command and remaining arguments."""
         name, command, rest = super().resolve_command(ctx, args)
         homes = BENCH if self.name == "bench" else COMMANDS
         if name is not None and name in homes:
@@ -191,13 +188,13 @@ class LazyGroup(TyperGroup):
 
 @cache
 def _root() -> Any:
-    """The whole command line; a process that calls it often builds it once."""
+    """The command line, built once in a process."""
     return typer.main.get_command(app)
 
 
 @cache
 def _load(name: str, home: str) -> Any:
-    """The command of a function such as "solve:solve"."""
+    """The command of a module and function such as "solve:solve"."""
     module, _, function = home.partition(":")
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     own = getattr(import_module(f"soup_nlp.cli.{module}"), function)
@@ -206,7 +203,7 @@ def _load(name: str, home: str) -> Any:
 
 
 def _group(text: str, commands: Mapping[str, tuple[str, str]], **options: Any) -> typer.Typer:
-    """A group of commands that are not imported yet."""
+    """A group of commands that are imported later."""
     group = typer.Typer(
         cls=LazyGroup, no_args_is_help=True, pretty_exceptions_enable=False, help=text, **options
     )
@@ -216,7 +213,7 @@ def _group(text: str, commands: Mapping[str, tuple[str, str]], **options: Any) -
 
 
 def _placeholder() -> None:
-    """Takes a command's place until it is called."""
+    """Stands for a command until it is called."""
 
 
 def _version(asked: bool) -> None:

@@ -1,4 +1,4 @@
-"""What commands share: options of the same name and meaning, lists in options, progress."""
+"""Parts that commands share: common options, lists in options, progress."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from soup_nlp.bench.rows import Row, failed
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.bench.tables import reason
 from soup_nlp.config.presets import PRESETS
-from soup_nlp.errors import ConfigError
+from soup_nlp.config.problem import load_problem
+from soup_nlp.data.pair import Pair
+from soup_nlp.errors import ConfigError, SoupError
 from soup_nlp.schema.limits import MAX_SEED, MAX_SIDE, MAX_SUPERPIXELS
 from soup_nlp.storage.files import as_path, is_file
 
@@ -66,14 +68,14 @@ AnyCode = Annotated[bool, typer.Option(help="Also take stored rows of other code
 
 
 def preset_first(preset: str | None, overrides: list[str] | None) -> list[str]:
-    """Overrides with the one that names a preset first, so that `--set preset=null` may undo it."""
+    """Overrides with the preset first, so that `--set preset=null` can undo it."""
     return [*([] if preset is None else [f"preset={preset}"]), *(overrides or [])]
 
 
 def changed(
     preset: str | None, overrides: list[str] | None, short: Mapping[str, object]
 ) -> list[str]:
-    """Overrides of a preset, of `--set`, and of the options that are short for keys, if given."""
+    """Overrides of a preset, of `--set`, and of the given options that stand for keys."""
     given = [f"{key}={value}" for key, value in short.items() if value is not None]
     return [*preset_first(preset, overrides), *given]
 
@@ -82,7 +84,7 @@ def numbers(text: str, option: str, least: int = 0, most: int = MAX_SEED) -> lis
     """Different whole numbers of a comma-separated list.
 
     Raises:
-        ConfigError: a word is no whole number, or one is not from `least` to `most`.
+        ConfigError: a word is no whole number from `least` to `most`.
     """
     try:
         found = list(dict.fromkeys(int(word) for word in text.split(",")))
@@ -102,7 +104,7 @@ def words(text: str, option: str, known: list[str]) -> list[str]:
     """Different names of a comma-separated list.
 
     Raises:
-        ConfigError: it is empty, or a name is not known.
+        ConfigError: the list is empty, or a name is unknown.
     """
     names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     wrong = [name for name in names if name not in known]
@@ -114,10 +116,10 @@ def words(text: str, option: str, known: list[str]) -> list[str]:
 
 
 def camera(text: str, option: str) -> list[float] | str:
-    """Four numbers, or the file that has them, as the key `intrinsics` of a problem file.
+    """Value of the key `intrinsics`: four numbers, or the name of a file.
 
     Raises:
-        ConfigError: it is neither.
+        ConfigError: the text is neither.
     """
     try:
         values = [float(x) for x in text.split(",")]
@@ -135,15 +137,23 @@ def camera(text: str, option: str) -> list[float] | str:
     return values
 
 
+def input_pair(folder: Path) -> Pair | None:
+    """The pair of a result folder, by its config.yaml; None if the input cannot be loaded."""
+    try:
+        return load_problem(folder / "config.yaml").load_pair()
+    except SoupError:
+        return None
+
+
 class Progress:
-    """Rows done and time left: one rewritten line on a terminal, a line per row in a log.
+    """Prints finished rows and time left: one updated line on a terminal, else a line per row.
 
     Args:
         quiet: Print nothing.
-        result_of: The result of a row that did not fail, in a few words.
+        result_of: Makes a short text from a row that did not fail.
 
     Attributes:
-        failed: Number of new rows that failed; a stored row never did.
+        failed: Number of new rows that failed.
     """
 
     def __init__(self, quiet: bool, result_of: Callable[[Row], str] = lambda row: "done") -> None:
@@ -153,7 +163,7 @@ class Progress:
         self.failed = 0
 
     def __call__(self, done: int, total: int, row: Row) -> None:
-        """Tell a new row."""
+        """Print a new row."""
         self.failed += failed(row)
         if self.quiet:
             return

@@ -26,7 +26,7 @@ from soup_nlp.config.presets import PRESETS, dump_preset
 from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
 from soup_nlp.errors import ConfigError, DataError, printable
 from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_formulation
-from soup_nlp.export.manifest import OWN
+from soup_nlp.export.manifest import EXPORT_FILES
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.files import MOST_YAML, is_folder, read_text
 from soup_nlp.storage.folders import claim
@@ -68,7 +68,7 @@ def list_(
 
 
 def _first_line(path: Path) -> str:
-    """What a problem file says of itself in its first line."""
+    """The comment in the first line of a problem file."""
     try:
         text = read_text(path, "problem file", most=MOST_YAML)
     except DataError as error:
@@ -93,7 +93,7 @@ def export(
 ) -> None:
     """Write the NLP for other solvers; several sizes or formulations make a folder each."""
     forms = [parse_formulation(text) for text in formulation or []] or [{}]
-    # asked for twice is written once
+    # without repetitions
     sizes: list[int | None] = [*dict.fromkeys(superpixels or ())] or [None]
     several = len(sizes) * len(forms) > 1
     written = set()
@@ -102,14 +102,14 @@ def export(
         own += [f"formulation.{k}={v}" for k, v in form.items()]
         chosen = load_problem(problem, [*(overrides or []), *own])
         if not several:
-            # before the work, not after it
-            claim(out, OWN, overwrite)
+            # check the folder before the work
+            claim(out, EXPORT_FILES, overwrite)
         if form is forms[0]:
             case = prepare(chosen, presolve)
         # the same soup in another formulation
         here = replace(case, problem=chosen)
         style = here.formulation()
-        # two sizes asked for may give the same number of superpixels
+        # the name has the wanted size, since two sizes may give the same number of superpixels
         asked = chosen.segmentation.superpixels
         name = f"{chosen.name}-{asked}-{form_label(style).replace('/', '-')}"
         if name in written:

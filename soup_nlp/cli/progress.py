@@ -1,4 +1,4 @@
-"""Progress of a solve: one line for each stage, a bar on a terminal, details if asked for."""
+"""Progress of a solve: one line for each stage, a bar on a terminal, details on request."""
 
 from __future__ import annotations
 
@@ -16,32 +16,24 @@ from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.solve.ipopt import Progress
 
 PACKAGE = "soup_nlp"
-"""Logger whose messages are told."""
+"""Logger whose messages are printed."""
 
 
 class SolveLog(logging.Handler):
-    """Lines for the terminal and the log.
-
-    Use it as a context: the bars end with it, and so does the listening to the package's logger.
+    """Lines for the terminal and for log.txt, and progress bars, as a context manager.
 
     Attributes:
-        lines: Everything, for log.txt.
+        lines: All lines, for log.txt.
     """
 
     def __init__(self, quiet: bool, verbose: bool = False, problem: Problem | None = None) -> None:
-        """Tell nothing yet.
-
-        Args:
-            quiet: Print nothing.
-            verbose: Print every line of the log but iterations.
-            problem: What is solved, for the length of the bars.
-        """
+        """Make the log; `problem` gives the length of the bars, `verbose` prints all lines."""
         super().__init__(logging.INFO)
         self.console = Console(stderr=True, highlight=False)
         self.quiet, self.verbose = quiet, verbose
         self.lines: list[str] = []
         self._stages = _stages(problem)
-        self._detail, self._told, self._mark = "", set[str](), time.perf_counter()
+        self._detail, self._announced, self._mark = "", set[str](), time.perf_counter()
         self._bars: Bars | None = None
         self._task, self._step, self._done = TaskID(0), "", 0
         if self.console.is_terminal and not quiet:
@@ -79,19 +71,19 @@ class SolveLog(logging.Handler):
         self._logger.setLevel(self._level)
 
     def say(self, line: str) -> None:
-        """A line of the log; the last one of a stage tells what the stage made."""
+        """Add a line to the log; the last line of a stage is its result."""
         self.lines.append(line)
         self._detail = line.partition("\n")[0]
         if self.verbose:
             self._print(line)
 
     def announce(self, line: str) -> None:
-        """A line that is printed at once."""
+        """Add a line to the log and print it."""
         self.lines.append(line)
         self._print(line)
 
     def stage(self, name: str) -> None:
-        """A stage ends: its time and what it made; the next one begins."""
+        """End a stage: print its time and result, and begin the next one."""
         now = time.perf_counter()
         self._print(f"{name:<13}{now - self._mark:6.1f} s  {self._detail}".rstrip())
         self._mark, self._detail = now, ""
@@ -100,14 +92,14 @@ class SolveLog(logging.Handler):
             self._begin()
 
     def iteration(self, progress: Progress) -> None:
-        """An iteration of presolve, Ipopt or TRW-S."""
+        """Add an iteration of presolve, Ipopt or TRW-S."""
         self.lines.append(str(progress))
         if self._bars is None:
             return
         if progress.stage != self._step:
             self._done += bool(self._step)
             self._step = progress.stage
-        # nobody knows how many iterations a phase takes; most take fewer than 15
+        # the number of iterations of a phase is unknown; most take fewer than 15
         part = progress.iteration / (progress.iteration + 7)
         words = f"{progress.stage}, iteration {progress.iteration}"
         self._bars.update(self._task, completed=self._done + part, it=words)
@@ -115,19 +107,19 @@ class SolveLog(logging.Handler):
     def warn(
         self, message: Warning | str, category: type[Warning], *_: object, **__: object
     ) -> None:
-        """Print a warning about the input; warnings of libraries are for developers."""
+        """Print a warning about the input; warnings of libraries are not printed."""
         if issubclass(category, DataWarning):
             self.announce(f"warning: {message}")
 
     def emit(self, record: logging.LogRecord) -> None:
-        """A message of the package's logger; one that comes again is left out."""
+        """Print a message of the logger of the package, unless it was printed before."""
         line = record.getMessage()
-        if line not in self._told:
-            self._told.add(line)
+        if line not in self._announced:
+            self._announced.add(line)
             self.announce(line)
 
     def interrupted(self, line: str) -> None:
-        """A line from a signal handler, where Python's own streams must not be entered again."""
+        """Print a line from a signal handler, where Python's streams cannot be used."""
         self.lines.append(line)
         os.write(2, f"\n{line}\n".encode())
 
@@ -144,7 +136,7 @@ class SolveLog(logging.Handler):
 
 
 def _stages(problem: Problem | None) -> dict[str, int | None]:
-    """Stages in their order, and how many steps a bar of each has; None where nothing counts."""
+    """Stages in their order with the number of steps of their bars; None if unknown."""
     steps: dict[str, int | None] = dict.fromkeys(("load", "flow", "segmentation", "start"))
     if problem is not None:
         refine, solver = problem.refine, problem.solver

@@ -1,16 +1,16 @@
-"""Commands check, evaluate and import: claims, scores and foreign answers as results."""
+"""Commands check, evaluate and import."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args
+from typing import Annotated, cast, get_args
 
 import numpy as np
 import typer
 
-from soup_nlp.cli.options import Overwrite
-from soup_nlp.config.problem import dump_problem, load_problem
-from soup_nlp.errors import ConfigError, ExportError, SoupError
+from soup_nlp.cli.options import Overwrite, input_pair
+from soup_nlp.config.problem import dump_problem
+from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.evaluate.metrics import Scale
 from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
@@ -33,7 +33,9 @@ def check(
 ) -> None:
     """Recompute energy, constraints and metrics of a result, or the constraints of a .sol."""
     if is_folder(folder) or folder.suffix != ".sol":
-        report = check_folder(folder, _images(folder))
+        pair = input_pair(folder)
+        images = None if pair is None else (pair.image_ref, pair.image_next)
+        report = check_folder(folder, images)
         tree = read_h5(folder / "result.h5")
         c = float(tree["weights"]["min_facing"])
         print(table_text(residual_table(tree["solution"], tree["energy"]["rim_ray"], c, LIMITS)))
@@ -52,15 +54,6 @@ def check(
         good, claim = all(r.ok for r in rows), "constraint"
     print(f"every {claim} holds" if good else f"a {claim} does not hold")
     raise typer.Exit(0 if good else 1)
-
-
-def _images(folder: Path) -> tuple[Any, Any] | None:
-    """The two images that a result was made of; None where they are not at hand."""
-    try:
-        pair = load_problem(folder / "config.yaml").load_pair()
-    except SoupError:
-        return None
-    return pair.image_ref, pair.image_next
 
 
 def evaluate(
@@ -112,14 +105,14 @@ def import_(
 
 
 def foreign_verdict(imported: Imported) -> str:
-    """The solver's message, and whether energy and residuals confirm it."""
+    """Message of the solver, and whether recomputed energy and residuals confirm its claim."""
     s, sol = imported.run.solution, imported.sol
     word = "verified" if s.converged else "not verified" if sol.solved else "no success claimed"
     start = imported.manifest["exact_energy_at_start"]["total"]
     said = sol.message.splitlines()[0] if sol.message else "no message"
     lines = [
         f"solver      {said} ({sol.status}, code {sol.code}): {word}",
-        # where the solver started, which after a presolve is not where the soup came from
+        # start of the solver, which after a presolve is not the proposal
         f"energy      start {start:.6g}  solution {s.energy['total']:.6g}",
         "residuals   " + "  ".join(f"{k} {v:.1e}" for k, v in s.residuals.items()),
     ]
@@ -128,6 +121,6 @@ def foreign_verdict(imported: Imported) -> str:
         lines += [" " * 12 + line for line in accuracy(imported.run.metrics)]
     best = imported.manifest["best_known"]
     if best:
-        told = f"{best['exact_energy']:.6g} by {best['found_by']}"
-        lines.append(f"best known  exact energy {told}, as manifest.json says: not recomputed")
+        known = f"{best['exact_energy']:.6g} by {best['found_by']}"
+        lines.append(f"best known  exact energy {known}, as manifest.json says: not recomputed")
     return "\n".join(lines)

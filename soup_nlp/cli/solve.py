@@ -108,7 +108,7 @@ def solve(
         chosen = _from_options(pair, flows, overrides)
     else:
         chosen = _from_file(problem, pair, flows, overrides)
-    # a problem file's expectation is of the file without overrides
+    # the expected MRE is that of the problem file without overrides
     limit = None if overrides else chosen.expected.mre_at_most
     log, folder = SolveLog(quiet, verbose, chosen), out or Path("out") / chosen.name
     raise typer.Exit(solve_problem(chosen, folder, log, limit, json_, overwrite))
@@ -130,7 +130,7 @@ def _from_file(
         )
     for key, flow in flows.items():
         if flow:
-            # a path on the command line starts here, one in a problem file from the file
+            # relative to the working folder, unlike paths in a problem file
             place = key != "source" or is_path(flow)
             source = str(as_path(flow, "flow", home=True).absolute()) if place else flow
             overrides = [f"flow.{key}={json.dumps(source)}", *overrides]
@@ -140,7 +140,7 @@ def _from_file(
 def _from_options(
     pair: Mapping[str, str | None], flows: Mapping[str, str | None], overrides: Sequence[str]
 ) -> Problem:
-    """The problem of the options of a pair."""
+    """The problem of the pair that the options name."""
     ref, following, intrinsics, intrinsics_next, depth, fov = pair.values()
     if not (ref and following):
         raise ConfigError(
@@ -198,15 +198,15 @@ def solve_problem(
             with suppress(SoupError):
                 write_failure(folder, "\n".join(log.lines) + "\n", ipopt_log)
             raise
-        # an interruption must not leave half of the files; writing takes seconds only
+        # files are written completely even after an interruption
         interrupt.deferred = True
 
-        def told(files: list[str]) -> str:
+        def log_text(files: list[str]) -> str:
             log.stage("files")
             log.lines.append(verdict(run, folder, files, mre_at_most))
             return "\n".join(log.lines) + "\n"
 
-        write_folder(folder, run, dump_problem(chosen), told, ipopt_log=ipopt_log)
+        write_folder(folder, run, dump_problem(chosen), log_text, ipopt_log=ipopt_log)
     summary = folder / "summary.json"
     print(summary.read_text(encoding="utf-8") if as_json else log.lines[-1])
     good = run.good and (mre_at_most is None or not missed(run))

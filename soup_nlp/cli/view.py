@@ -10,9 +10,8 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.config.problem import load_problem
-from soup_nlp.data.pair import Pair
-from soup_nlp.errors import DataError, SoupError
+from soup_nlp.cli.options import input_pair
+from soup_nlp.errors import DataError
 from soup_nlp.report.folder import renew_page
 from soup_nlp.report.shown import PAGE
 
@@ -31,7 +30,7 @@ def view(
     """Open the page of a result in a browser, or serve it."""
     place = folder / PAGE
     if renew or not place.is_file():
-        place = renew_page(folder, _input(folder))
+        place = renew_page(folder, input_pair(folder))
     if serve is None:
         address = place.resolve().as_uri()
         opened = not no_open and webbrowser.open(address)
@@ -48,19 +47,11 @@ def view(
             print("stopped")
 
 
-def _input(folder: Path) -> Pair | None:
-    """The pair that a result was made of; None where it is not there any more."""
-    try:
-        return load_problem(folder / "config.yaml").load_pair()
-    except SoupError:
-        return None
-
-
 def _server(folder: Path, port: int) -> ThreadingHTTPServer:
-    """A server of a folder for this machine alone.
+    """A server of a folder that only this machine can reach.
 
     Raises:
-        DataError: the port cannot be had.
+        DataError: the port cannot be used.
     """
     try:
         return ThreadingHTTPServer(

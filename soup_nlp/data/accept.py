@@ -1,4 +1,4 @@
-"""What a caller may give for an image, a camera or a flow, made into arrays or refused."""
+"""Conversion of images, cameras and flows, as callers may give them, to checked arrays."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PICTURES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", 
 
 
 def is_path(given: object) -> bool:
-    """Whether a file is named."""
+    """Whether the argument is the path of a file."""
     return isinstance(given, str | os.PathLike)
 
 
@@ -38,7 +38,7 @@ def image_of(given: ImageLike, where: str) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 RGB of an array, a file or a PIL image; grey is repeated, alpha dropped.
 
     Raises:
-        DataError: it is no such image.
+        DataError: it is not such an image.
     """
     if is_path(given):
         return read_image(Path(given))
@@ -69,7 +69,7 @@ def camera_of(given: CameraLike, where: str) -> Float:
     """(3, 3) intrinsics of a matrix, of (fx, fy, cx, cy), or of a file.
 
     Raises:
-        DataError: it is no camera.
+        DataError: it is not a camera.
     """
     if is_path(given):
         return read_intrinsics(Path(given))
@@ -85,16 +85,16 @@ def flow_of(
 ) -> tuple[NDArray[Any], NDArray[np.float32], str]:
     """Displacements (H, W, 2), confidence (H, W) and source of a flow.
 
-    An array whose first axis has length 2 and whose last has not is taken as (2, H, W).
+    An array is interpreted as (2, H, W) if only its first axis has length 2.
 
     Args:
         given: Array or file.
-        confidence: (H, W) in [0, 1]; None is 1 where the flow is finite and 0 elsewhere, where
-            the displacement becomes 0.
-        source: Its name, "unknown" for that of the file.
+        confidence: (H, W) in [0, 1]; None for 1 where the flow is finite and 0 elsewhere, with the
+            displacement set to 0.
+        source: Name of the flow; "unknown" for the name of the file.
 
     Raises:
-        DataError: it is no flow.
+        DataError: it is not a flow.
     """
     if is_path(given):
         source = str(given) if source == "unknown" else source
@@ -109,7 +109,7 @@ def flow_of(
     if not (uv.dtype.kind == "f" and uv.dtype.itemsize >= 4):
         uv = uv.astype(np.float32)
     if confidence is None and uv.ndim == 3:
-        # 1e9 and more is unknown in Middlebury's files
+        # Middlebury's files mark unknown flow by 1e9 and more
         known = (np.abs(uv) < 1e9).all(axis=2)
         return np.where(known[..., None], uv, 0), known.astype(np.float32), source
     sure = _array(confidence, "flow confidence", source, "numbers (H, W) from 0 to 1")
@@ -124,10 +124,10 @@ def flow_of(
 
 
 def _array(given: object, what: str, where: str, expected: str) -> NDArray[Any]:
-    """What NumPy makes of an object.
+    """An object as NumPy array.
 
     Raises:
-        DataError: it makes nothing of it but an object.
+        DataError: it is not an array of numbers.
     """
     try:
         array = np.asarray(given)

@@ -1,8 +1,8 @@
-"""A soft census: what a pixel's surroundings look like, whatever the exposure.
+"""A soft census transform: a descriptor of the surroundings of a pixel, independent of exposure.
 
-The census transform says of each of some neighbours whether it is brighter. Here it says by how
-much, up to a few grey levels: `tanh((neighbour - centre) / 10)`. Where nothing is to be seen the
-numbers are near zero, so that flat ground contradicts nothing.
+The census transform has a bit for each neighbour, set if it is brighter. The soft version instead
+has the number `tanh((neighbour - centre) / 10)`. In regions without texture the numbers are
+near zero, so that they hardly contribute to matching costs.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from soup_nlp.data.flow.consistency import FloatMap
 
 SOFT_GREY = 10.0
-"""Grey levels at which a difference is told by tanh(1) = 0.76."""
+"""Difference in grey levels that becomes tanh(1) = 0.76."""
 SIGMA_PX = 0.7
-"""Gaussian smoothing before, pixels."""
+"""Standard deviation of the Gaussian smoothing, pixels."""
 NEIGHBOURS = ((-2, -2), (-2, 0), (-2, 2), (0, -2), (0, 2), (2, -2), (2, 0), (2, 2))
 """(dv, du) of the neighbours, pixels."""
 
 
 def census(image: NDArray[np.uint8]) -> FloatMap:
-    """(2, H, W, 4) soft census of an image (H, W, 3) or (H, W), in two layers as OpenCV takes."""
+    """(2, H, W, 4) soft census of an image (H, W, 3) or (H, W), in two layers for OpenCV."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SIGMA_PX)
     height, width = smooth.shape
@@ -37,7 +37,7 @@ def census(image: NDArray[np.uint8]) -> FloatMap:
 def census_at(layers: FloatMap, u: NDArray[np.floating], v: NDArray[np.floating]) -> FloatMap:
     """(2, ..., 4) census at sub-pixel places (R, C) with C < 32768; the border repeats."""
     x, y = np.asarray(u, np.float32), np.asarray(v, np.float32)
-    # cv2.remap takes maps of fewer than 32768 rows
+    # cv2.remap accepts fewer than 32768 rows
     parts = [slice(a, a + 30000) for a in range(0, len(x), 30000)]
     return np.stack(
         [

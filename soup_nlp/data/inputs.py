@@ -1,4 +1,4 @@
-"""Kinds of input of a problem file; every kind loads its own pair."""
+"""Kinds of input of a problem file, each with its loader."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class FilesInput(PairInput):
         else:
             K = camera(self.intrinsics)
         K_next = K if self.intrinsics_next is None else camera(self.intrinsics_next)
-        # what is given for a camera may be of the stored or of the turned picture
+        # a given camera may belong to the stored or to the rotated image
         turn = self.intrinsics is None and self.intrinsics_next is None
         return make_pair(images, [K, K_next], truth, "files", self.white, turn=turn)
 
@@ -226,7 +226,7 @@ class TumInput(PairInput):
 
 
 class MemoryInput(PairInput):
-    """A pair that was in memory: its hash identifies a run, but it cannot be loaded again."""
+    """A pair in memory: its hash identifies a run, but the pair cannot be loaded again."""
 
     kind: Literal["memory"]
     """Kind of input."""
@@ -234,11 +234,7 @@ class MemoryInput(PairInput):
     """Of the images, cameras and flow."""
 
     def load(self, path: Resolve) -> Pair:
-        """Nothing to load: always an error.
-
-        Raises:
-            ConfigError: the pair was in memory only.
-        """
+        """Raise ConfigError: the pair was in memory only."""
         raise ConfigError(
             "pair of this problem was in memory and is not stored",
             where="input.kind",
@@ -248,7 +244,7 @@ class MemoryInput(PairInput):
         )
 
     def files(self) -> list[str]:
-        """As `load`: always an error."""
+        """Raise ConfigError, see `load`."""
         self.load(Path)
         return []
 
@@ -265,11 +261,11 @@ Input = Annotated[
     | MemoryInput,
     Field(discriminator="kind"),
 ]
-"""Input of a problem, discriminated by `kind`."""
+"""Input of a problem, selected by `kind`."""
 
 
 def pair_hash(pair: Pair) -> str:
-    """Hash of what decides a result: images, cameras and, where there is one, the flow."""
+    """Hash of images, cameras and, if there is one, the flow."""
     digest = hashlib.sha256()
     arrays: list[NDArray[Any]] = [pair.image_ref, pair.image_next, pair.K_ref, pair.K_next]
     if pair.flow is not None:

@@ -1,4 +1,4 @@
-"""The input of every solve: two images, two cameras, a flow and, where known, the truth."""
+"""Input of a solve: two images, two cameras, a flow and, if known, the truth."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from soup_nlp.errors import DataError, expect, printable, repr_of
 Float = NDArray[np.float64]
 
 SHORTEST = 0.05
-"""Focal length, in sides of the image, below which it cannot be in pixels (168 degrees of view)."""
+"""Smallest focal length relative to the side of the image (168 degrees of view)."""
 
 LARGEST = 1e100
-"""Number of a truth above which sums of squares are no float64 any more."""
+"""Largest number in a truth, so that sums of squares stay finite."""
 
 
 def check_size(
@@ -27,14 +27,9 @@ def check_size(
     where: object,
     hint: str | None = None,
 ) -> None:
-    """Raise DataError unless two arrays have the same (height, width).
+    """Raise DataError unless two shapes, which may have more axes, have equal (height, width).
 
-    Args:
-        what: Names of the two, e.g. "flow and reference image".
-        found: Shape of the first.
-        expected: Shape of the second; both may have more axes.
-        where: File or array concerned.
-        hint: What to try.
+    `what` names both arrays, e.g. "flow and reference image".
     """
     if found[:2] != expected[:2]:
         raise DataError(
@@ -50,16 +45,16 @@ def check_size(
 class Flow:
     """A dense flow from the reference to the next image.
 
-    It is made of an array (H, W, 2) or (2, H, W), or of a file, with or without a confidence:
-    without one it is 1 where the flow is finite, else 0.
+    It is made from an array (H, W, 2) or (2, H, W) or from a file. The default confidence is 1
+    where the flow is finite, else 0.
 
     Attributes:
         uv: (H, W, 2) float32, displacement in pixels (u right, v down); 0 where unknown.
-        confidence: (H, W) float32 in [0, 1]; 0 drops the pixel from every term.
-        source: Where it comes from, for reports ("dis", "truth", a file name ...).
+        confidence: (H, W) float32 in [0, 1]; pixels with 0 are not used.
+        source: Origin for reports ("dis", "truth", a file name ...).
 
     Raises:
-        DataError: it is no flow, or the confidence does not fit.
+        DataError: the array is no flow, or the confidence has a wrong size or range.
     """
 
     uv: NDArray[np.float32]
@@ -85,7 +80,7 @@ class Flow:
                 expected="(H, W, 2), confidence (H, W)",
             )
         check_size("flow confidence and flow", self.confidence.shape, self.uv.shape, self.source)
-        # false for NaN too
+        # False for NaN
         fits = (self.confidence >= 0) & (self.confidence <= 1)
         if not fits.all():
             raise DataError(
@@ -127,14 +122,14 @@ _KINDS = dict.fromkeys(_SHAPES, "fiu") | {"occluded": "b", "components": "iu"}
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is known of the scene, for measuring only; any part may be None.
+    """Ground truth of the scene, for evaluation only; any part may be None.
 
     Attributes:
         depth_ref: (H, W) z of the reference frame in `unit`; NaN where unknown.
         depth_next: (H', W') z of the next frame; NaN where unknown.
-        flow: (H, W, 2) exact flow, NaN where unknown.
-        occluded: (H, W) bool, True where a reference pixel is not visible in the next frame.
-        components: (H, W) int component label of a reference pixel, -1 for none.
+        flow: (H, W, 2) true flow, pixels; NaN where unknown.
+        occluded: (H, W) bool, True for reference pixels that are not visible in the next frame.
+        components: (H, W) int component of the reference pixels, -1 for none.
         motions: (B, 4, 4) next_from_ref of each component, in `unit`.
         points: (M, 3) sparse truth (u, v, z) of the reference frame, sub-pixel.
         scene_flow: (H, W, 3) X' - X in each frame's own camera coordinates, NaN where unknown.
@@ -197,9 +192,9 @@ class Truth:
 class Pair:
     """Two consecutive frames with cameras, flow and truth.
 
-    Images are taken as arrays, files or PIL images, grey too; cameras as matrices, as
-    (fx, fy, cx, cy) or files, that of the next frame being the same where it is left out; a flow
-    as an array or file too.
+    Images may be arrays, files or PIL images, also grey ones. Cameras may be matrices,
+    (fx, fy, cx, cy) or files; the default camera of the next frame is that of the reference frame.
+    A flow may be an array or a file.
 
     Attributes:
         image_ref: (H, W, 3) uint8 RGB reference image, indexed [v, u].
@@ -207,12 +202,12 @@ class Pair:
         K_ref: (3, 3) intrinsics of the reference frame, pixels; (0, 0) is the centre of the
             top-left pixel.
         K_next: (3, 3) intrinsics of the next frame.
-        flow: The flow from reference to next, or None when it is still to be estimated.
-        truth: What is known, or None.
-        name: For titles and folders.
+        flow: The flow from reference to next, or None if it is not estimated yet.
+        truth: The truth, or None.
+        name: Name for titles and folders.
 
     Raises:
-        DataError: images of the wrong shape or type, an invalid camera, sizes that do not fit.
+        DataError: an image has a wrong shape or type, a camera is invalid, or sizes differ.
     """
 
     image_ref: NDArray[np.uint8]
@@ -284,7 +279,7 @@ class Pair:
 
 
 def _check_focal(K: Float, image: NDArray[np.uint8], where: str) -> None:
-    """Raise DataError for a focal length that no image of this size has."""
+    """Raise DataError for a focal length that is too short for the size of the image."""
     for focal, side, name in ((K[0, 0], image.shape[1], "fx"), (K[1, 1], image.shape[0], "fy")):
         if focal < SHORTEST * side:
             raise DataError(

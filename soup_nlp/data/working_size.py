@@ -1,4 +1,4 @@
-"""A pair at a smaller size: images, cameras, flow and truth together."""
+"""Reduction of a pair to a working size: images, cameras, flow and truth."""
 
 from __future__ import annotations
 
@@ -16,14 +16,10 @@ Size = tuple[int, int]
 
 
 def working_size(pair: Pair, megapixels: float | None) -> Pair:
-    """The pair with a reference image of at most so many megapixels; itself where it is smaller.
+    """The pair reduced to a reference image of at most `megapixels`, None for no limit.
 
-    Images and flow are averaged, the flow by its confidence; depths and labels of the truth are
-    those of the nearest pixel.
-
-    Args:
-        pair: Any pair.
-        megapixels: Largest size of the reference image; None for no limit.
+    Images and flow are averaged, the flow with its confidence as weight. Depths and labels of the
+    truth are those of the nearest pixel.
     """
     height, width = pair.size
     if megapixels is None or height * width <= megapixels * 1e6:
@@ -52,7 +48,7 @@ def scaled_camera(K: Float, old: tuple[int, ...], new: Size) -> Float:
 
 
 def smaller_flow(flow: Flow, pair: Pair, small: Pair) -> Flow:
-    """The flow of a pair at the size of `small`, the same pair made smaller."""
+    """The flow of a pair at the size of `small`, the reduced pair."""
     size = small.size
     confidence = _averaged(flow.confidence, size)
     known = np.maximum(confidence, np.finfo(np.float32).tiny)
@@ -62,7 +58,7 @@ def smaller_flow(flow: Flow, pair: Pair, small: Pair) -> Flow:
     for k in range(2):
         own = pair.size[1 - k] / size[1 - k]
         next_ = small.image_next.shape[1 - k] / pair.image_next.shape[1 - k]
-        # where the middle of a pixel goes, in pixels of the smaller next image
+        # target of the centre of a pixel, in pixels of the reduced next image
         uv[..., k] = ((at[k] + 0.5) * own + mean[..., k]) * next_ - 0.5 - at[k]
     uv[confidence == 0] = 0
     return Flow(uv, np.clip(confidence, 0, 1), flow.source)

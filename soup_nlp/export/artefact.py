@@ -15,10 +15,10 @@ from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import ConfigError
 from soup_nlp.evaluate.confidence import Information, information
 from soup_nlp.export.manifest import (
+    EXPORT_FILES,
     FUNCTIONS,
     MANIFEST,
     NORMS,
-    OWN,
     STUB,
     TRUNCATIONS,
     kept_best,
@@ -47,7 +47,7 @@ CHOICES = {"gauge": GAUGES, "norm": NORMS, "truncation": TRUNCATIONS}
 
 
 def parse_formulation(text: str) -> dict[str, str]:
-    """`gauge/norm/truncation`, shorter where the rest is as in the problem file.
+    """Parse `gauge/norm/truncation`; missing parts are those of the problem file.
 
     Raises:
         ConfigError: a word is not one of the choices.
@@ -78,24 +78,21 @@ def export_case(
     presolved: bool = False,
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Write soup.nl with names, problem.yaml and manifest.json into a folder.
+    """Write soup.nl with names, problem.yaml and manifest.json; returns the manifest.
 
-    An earlier export there stays whole until this one is, and is then removed.
+    An earlier export in the folder is replaced when this one is complete.
 
     Args:
         case: Problem with its start.
-        form: Gauge, norm and truncation; the Hessian that the files carry is exact.
-        folder: Where the files go.
-        formats: Of FORMATS; nl is always written, and soup.h5 with casadi as well.
-        presolved: The case starts at the presolve's answer (for the manifest).
+        form: Gauge, norm and truncation; the Hessian in the files is exact.
+        folder: Output folder.
+        formats: Some of FORMATS; nl is always written, and casadi includes h5.
+        presolved: The case starts at the answer of the presolve (for the manifest).
         overwrite: Overwrite files that the program did not make.
 
-    Returns:
-        The manifest.
-
     Raises:
-        ConfigError: unknown format.
-        DataError: the folder cannot be written, or holds a file of the user of the same name.
+        ConfigError: a format is unknown.
+        DataError: the folder cannot be written, or holds a file of the user with the same name.
         ExportError: the NLP cannot be written.
     """
     for word in formats:
@@ -105,7 +102,7 @@ def export_case(
             )
     form = form.replace(hessian="exact", compiled=False)
     nlp, layout = case.nlp(form)
-    target = claim(folder, OWN, overwrite)
+    target = claim(folder, EXPORT_FILES, overwrite)
     with staged(target, whole=True) as new:
         return _write_files(new, target, case, form, (nlp, layout), formats, presolved)
 
@@ -119,13 +116,13 @@ def _write_files(
     formats: Sequence[str],
     presolved: bool,
 ) -> dict[str, Any]:
-    """Write an export into an empty folder; the best answer known is that of an earlier one."""
+    """Write an export into an empty folder; best_known is taken from an earlier export."""
     nlp, layout = program
     names = readable_names(nlp, layout)
     file = write_nl(folder / f"{STUB}.nl", nlp, names=names)
     if "casadi" in formats:
         for function in FUNCTIONS:
-            # CasADi's own writer does not notice a full disk
+            # the file writer of CasADi ignores a full disk
             text = ca.StringSerializer()
             text.pack(getattr(nlp, function))
             write_text(folder / f"{function}.casadi", text.encode())
@@ -135,13 +132,13 @@ def _write_files(
         "start": "presolve" if presolved else "proposal",
         "best_known": kept_best(earlier, file.sha256),
     }
-    # the functions are of no use without parameters, start and bounds
+    # the functions also need parameters, start and bounds
     if "h5" in formats or "casadi" in formats:
         attrs = {k: manifest[k] for k in ("name", "problem_hash", "formulation", "smoothing")}
         info = information(case.soup, case.data, case.weights, form)
         _write_start_h5(folder / f"{STUB}.h5", nlp, names, attrs, info)
     files = {path.name for path in folder.iterdir()} - {"problem.yaml"}
-    manifest["files"] = sorted(files, key=OWN.index)
+    manifest["files"] = sorted(files, key=EXPORT_FILES.index)
     write_json(folder / MANIFEST, manifest)
     return manifest
 
@@ -161,10 +158,7 @@ def _description(
             "knn_edges": len(case.segmentation.edges),
             "neighbour_pairs": len(case.segmentation.pairs),
             **nlp.sizes(),
-            "gradient_nonzeros": file.gradient_nonzeros,
-            "nonlinear_rows": file.nonlinear_rows,
-            "nonlinear_variables": dict(zip(("rows", "objective", "both"), file.nonlinear)),
-            "defined_variables": sum(file.defined),
+            **file.counts(),
         },
         "nl": {"file": f"{STUB}.nl", "bytes": file.size, "sha256": file.sha256},
         "objective_at_start": float(nlp.oracle(nlp.x0, nlp.p)[0]),
@@ -174,7 +168,7 @@ def _description(
 
 
 def fingerprint(case: Case, nlp: NLP, layout: MatrixLayout) -> dict[str, float]:
-    """f and |g| at the proposal with every slack and switch at 1/2."""
+    """f and |g| at the proposal with all slack variables and switches at 1/2."""
     x = np.full(nlp.nx, 0.5)
     x[: layout.size] = layout.pack(case.start.soup)
     f, g = nlp.oracle(x, nlp.p)
@@ -188,14 +182,10 @@ def _write_start_h5(
     attrs: dict[str, object],
     info: Information,
 ) -> None:
-    """Write sizes, bounds, parameters, sparsities and values at the start, and the information.
+    """Write bounds, parameters, names, and values at the start with their sparsity.
 
-    Args:
-        path: The .h5 file.
-        nlp: The NLP; its Hessian is written as it is, with lam_f = 1 and lam_g = 1.
-        names: Of variables and constraints.
-        attrs: Root attributes.
-        info: Gauss-Newton information at the start.
+    The Hessian is that of the NLP with lam_f = 1 and lam_g = 1; `info` is the Gauss-Newton
+    information at the start.
     """
     f, grad = nlp.grad_f(nlp.x0, nlp.p)
     g, jac = nlp.jac_g(nlp.x0, nlp.p)

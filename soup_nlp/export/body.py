@@ -1,4 +1,4 @@
-"""Expressions of a .nl file: templates filled in for every element, `V`, `C` and `O` segments."""
+"""The `V`, `C` and `O` segments of a .nl file: templates filled in for every element."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from soup_nlp.export.template import DEFINED, NUMBER, VARIABLE, Template, Text
 
 Int = NDArray[np.int64]
 
-NOWHERE = np.iinfo(np.int64).max
+NO_ROW = np.iinfo(np.int64).max
+"""Row of a defined variable that no constraint uses."""
 
 
 @dataclass
 class _Part:
-    """A template on its table, in the numbering of the file.
+    """A template with its table, in the numbering of the file.
 
     Attributes:
         template: Texts with holes.
-        index: (E, nx) variable of every local one.
+        index: (E, nx) variable of the file for every local variable.
         goal: (E, m) row of every output, or OBJECTIVE.
-        identity: (E,) identities of the instances of each defined node.
+        identity: (E,) numbers of the instances of each defined node.
     """
 
     template: Template
@@ -34,7 +35,7 @@ class _Part:
     identity: dict[int, Int] = field(default_factory=dict)
 
     def columns(self, text: Text, elements: Int | slice, final: Int | None = None) -> list[Int]:
-        """Integers that fill the holes of a text: variables, defined variables, bits of numbers."""
+        """Integers for the holes of a text: variables, defined variables, bits of numbers."""
         out = []
         for kind, place in text.holes:
             if kind == VARIABLE:
@@ -49,7 +50,7 @@ class _Part:
         return out
 
     def write(self, text: Text, elements: Int | slice, final: Int) -> list[str]:
-        """The text of elements, defined variables numbered by `final`."""
+        """Texts of elements, with the numbers `final` of the defined variables."""
         columns: list[list[object]] = []
         for (kind, _), column in zip(text.holes, self.columns(text, elements, final)):
             if kind == NUMBER:
@@ -85,7 +86,7 @@ class Body:
         self._count = 0
         self._nodes: list[tuple[_Part, int, Text, Int]] = []
         self._parts = []
-        # the entry past the last row is the objective's, whose row is -1
+        # the last entry is for the objective, whose row is -1
         goals = np.append(row_place, OBJECTIVE)
         for template, index, goal in program.stamped:
             part = _Part(template, place[index], goals[goal])
@@ -93,9 +94,9 @@ class Body:
                 self._identify(part, node, text)
             self._parts.append(part)
         low, high, objective = self._users()
-        used = low != NOWHERE
+        used = low != NO_ROW
         kind = np.select([objective & used, used & (low < high), used], [0, 1, 3], 4)
-        # single-use ones stand before their row, in the order of the rows
+        # a variable with one user is written before its row
         owner = np.where(kind == 3, low, len(row_place))
         self._order = np.lexsort((np.arange(len(kind)), owner, kind))
         self._owner = owner[self._order]
@@ -105,7 +106,7 @@ class Body:
         self.classes = (b, c, o, c1, o1)
 
     def _identify(self, part: _Part, node: int, text: Text) -> None:
-        """Give every instance of a defined node its identity, new where its text is new."""
+        """Number the instances of a defined node; instances with equal text share a number."""
         known = self._known.setdefault(text.pattern, {})
         columns = part.columns(text, slice(None))
         blob, width = np.stack(columns, axis=1).tobytes(), 8 * len(columns)
@@ -115,17 +116,16 @@ class Body:
             self._count += place == self._count
             identity[e] = place
         part.identity[node] = identity
-        # first element of every new identity, in the order of the identities
+        # first element of every new number, in order
         new, first = np.unique(identity, return_index=True)
         self._nodes.append((part, node, text, first[new >= begin]))
 
     def _users(self) -> tuple[Int, Int, NDArray[np.bool_]]:
-        """Users of each defined variable, direct or through others.
+        """Smallest and largest row and use in the objective of each defined variable.
 
-        Returns:
-            Smallest and largest constraint row (NOWHERE, -1 for none) and use in the objective.
+        Indirect uses count too. Without a row the smallest is NO_ROW and the largest -1.
         """
-        low, high = np.full(self._count, NOWHERE), np.full(self._count, -1)
+        low, high = np.full(self._count, NO_ROW), np.full(self._count, -1)
         objective = np.zeros(self._count, bool)
         for part in self._parts:
             for k, root in enumerate(part.template.roots):
@@ -148,7 +148,7 @@ class Body:
         return low, high, objective
 
     def segments(self) -> Iterator[str]:
-        """`V`, `C` and `O` segments; a variable with one user stands right before it."""
+        """`V`, `C` and `O` segments; a variable with one user is written right before it."""
         rows: list[list[str]] = [[] for _ in self._row_place]
         objective: list[str] = []
         for part in self._parts:
@@ -181,7 +181,7 @@ class Body:
 
 
 def _total(terms: list[str], constant: float) -> str:
-    """Sum of prefix texts and a number."""
+    """Prefix text of the sum of terms and a number."""
     if constant or not terms:
         terms = [*terms, f"n{number(constant)}"]
     if len(terms) == 1:

@@ -1,4 +1,4 @@
-"""Another solver's answer to an exported problem, verified and returned as a run."""
+"""Answers of other solvers to exported problems, verified and returned as runs."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ from soup_nlp.storage.store import write_json
 Float = NDArray[np.float64]
 
 SAME = 1e-7
-"""Relative difference of the objective at which an export is no longer the problem at hand."""
+"""Largest relative difference of the fingerprints of an export and of the present problem."""
 KKT_LIMIT = 1e-6
-"""Largest violation of a constraint that a verified answer may have."""
+"""Largest violation of a constraint in a verified answer."""
 LIMITS = Limits()
-"""Of the other KKT residuals of a verified answer: the defaults of `compare`."""
+"""Limits of the other KKT residuals: the defaults of `compare`."""
 
 
 @dataclass(frozen=True)
 class Imported:
-    """A foreign answer as a run.
+    """Answer of another solver as a run.
 
     Attributes:
-        run: As `pipeline.run` returns it; "converged" means claimed and verified.
-        sol: The solver's file.
-        manifest: Of the export, with the new best_known.
-        violations: Of bounds (nx,) and rows (ng,) by the solver's point.
+        run: A run as `pipeline.run` returns it; "converged" means claimed and verified.
+        sol: Contents of the .sol file.
+        manifest: Manifest of the export with an updated best_known.
+        violations: Violations of bounds (nx,) and rows (ng,).
     """
 
     run: Run
@@ -58,19 +58,16 @@ class Imported:
 
 
 def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Imported:
-    """Read a .sol for an exported problem; energy and residuals are recomputed.
-
-    The multipliers are the solver's, or the least-squares ones where these balance better; those
-    of the bounds are what point and multipliers imply.
+    """Read a .sol file for an exported problem and recompute energy and residuals.
 
     Args:
         folder: Exported folder.
-        sol: The solver's file.
-        renew: Write a better verified answer into the manifest's best_known.
+        sol: The .sol file.
+        renew: Store a better verified answer as best_known in the manifest.
 
     Raises:
-        ExportError: a file is missing or does not belong to the other.
-        SoupError: the problem's input cannot be used.
+        ExportError: a file is missing, or the files do not belong together.
+        SoupError: the input of the problem cannot be used.
     """
     folder = as_path(folder, "exported folder", error=ExportError)
     recover(folder)
@@ -82,7 +79,7 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
     nlp, layout = case.nlp(form)
     _require_same_problem(folder, manifest, fingerprint(case, nlp, layout))
     answer = read_sol(sol, *_orders(folder, nlp, layout))
-    # at an arbitrary point values may be infinite or NaN: such an answer is not verified
+    # values at an arbitrary point may be infinite or NaN; such an answer is not verified
     with np.errstate(all="ignore"):
         run = foreign_run(case, form, nlp, layout, answer, source=Path(sol).name)
     best = manifest["best_known"]
@@ -94,7 +91,7 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
             "exact_energy": energy,
             "found_by": message,
         }
-        # it was read as a manifest, and only this entry changes
+        # only this entry of the manifest changes
         with staged(claim(folder, [MANIFEST], overwrite=True)) as new:
             write_json(new / MANIFEST, manifest)
     return Imported(run, answer, manifest, violations(nlp, answer.x))
@@ -103,7 +100,7 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
 def _require_same_problem(
     folder: Path, manifest: Mapping[str, Any], found: Mapping[str, float]
 ) -> None:
-    """Raise ExportError unless the problem has the fingerprint that it had when exported."""
+    """Raise ExportError unless the problem has the fingerprint of the export."""
     for key, value in found.items():
         then = float(manifest["fingerprint"][key])
         if abs(value - then) > SAME * max(1.0, abs(then)):
@@ -117,7 +114,7 @@ def _require_same_problem(
 
 
 def sol_table(imported: Imported) -> list[Kind]:
-    """Residuals by kind of a foreign answer, before it is retracted."""
+    """Residuals of an answer by kind of constraint, before its retraction."""
     run = imported.run
     state = {k: getattr(run.answer, k) for k in ("lam", "n", "d", "R", "t")}
     limits = dict.fromkeys(EQUATIONS, KKT_LIMIT)
@@ -128,7 +125,7 @@ def sol_table(imported: Imported) -> list[Kind]:
 
 
 def _orders(folder: Path, nlp: NLP, layout: MatrixLayout) -> tuple[Any, Any]:
-    """Order of the file, from its names."""
+    """Orders of variables and rows in the file, from its names."""
     out = []
     for suffix, names in zip((".col", ".row"), readable_names(nlp, layout)):
         path = (folder / STUB).with_suffix(suffix)
@@ -152,10 +149,10 @@ def _orders(folder: Path, nlp: NLP, layout: MatrixLayout) -> tuple[Any, Any]:
 def foreign_run(
     case: Case, form: Formulation, nlp: NLP, layout: MatrixLayout, answer: Sol, source: str
 ) -> Run:
-    """A run whose solution is a foreign solver's answer; its claims are recomputed.
+    """A run whose solution is the answer of another solver.
 
-    It converged when success is claimed, the recomputed KKT residuals are within LIMITS and
-    KKT_LIMIT, and the exact energy is not above the proposal's.
+    It has converged if the solver claims success, the recomputed KKT residuals are within LIMITS
+    and KKT_LIMIT, and the exact energy is not above that of the proposal.
     """
     found = examine(nlp, answer.x, answer.lam_g)
     r = found.residuals

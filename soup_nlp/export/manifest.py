@@ -1,4 +1,4 @@
-"""manifest.json of an exported folder: what was exported, and the best answer known."""
+"""manifest.json of an exported folder: description of the export and best known answer."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ MANIFEST = "manifest.json"
 NORMS = ("smooth", "epigraph")
 TRUNCATIONS = ("smooth", "lifted")
 FUNCTIONS = ("oracle", "grad_f", "jac_g", "hess_lag")
-"""Functions of the NLP that the format casadi has."""
-OWN = (
+"""Functions of the NLP in the format casadi."""
+EXPORT_FILES = (
     *(f"{STUB}{suffix}" for suffix in (".nl", ".col", ".row", ".h5")),
     *(f"{function}.casadi" for function in FUNCTIONS),
     "problem.yaml",
     MANIFEST,
 )
-"""Every file that an export may write."""
+"""Files that an export may write."""
 
 
 def _record(name: str, **kinds: Any) -> type[BaseModel]:
-    """A model whose fields are all required; entries beyond these are for people."""
+    """A model with required fields; further entries are ignored."""
     fields: dict[str, Any] = {key: (kind, ...) for key, kind in kinds.items()}
     return create_model(name, __config__=ConfigDict(strict=True), **fields)
 
@@ -54,7 +54,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of an exported folder.
 
     Raises:
-        ExportError: it is missing, or an entry that is needed is missing or wrong.
+        ExportError: the file is missing, or a needed entry is missing or wrong.
     """
     manifest = read_json(folder / MANIFEST, MANIFEST, error=ExportError)
     try:
@@ -71,7 +71,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def kept_best(folder: Path, sha256: str) -> dict[str, Any] | None:
-    """best_known of a manifest that is there already, if it is of the same file."""
+    """best_known of an existing manifest of the same .nl file; None otherwise."""
     try:
         old = read_manifest(folder)
     except ExportError:

@@ -16,12 +16,9 @@ Int = NDArray[np.int64]
 def readable_names(nlp: NLP, layout: MatrixLayout) -> tuple[list[str], list[str]]:
     """Unique names of variables and constraints of the constrained NLP.
 
-    The first index is the superpixel; for an edge or a neighbour pair the first two are the two
-    superpixels. A further index counts, from 1, the rows of R'R = I in the order 11 12 22 13 23 33,
-    rim rays (the anchor is 1), or sampled pixels.
-
-    Returns:
-        (nx,) and (ng,) names.
+    The first index is the superpixel; for an edge or a neighbour pair the first two indices are the
+    two superpixels. A further index counts from 1: the rows of R'R = I in the order 11 12 22 13 23
+    33, rim rays (1 is the anchor), or sampled pixels.
     """
     x_names, g_names = nlp.x_names(), nlp.g_names()
     for group in nlp.groups:
@@ -53,7 +50,7 @@ def readable_names(nlp: NLP, layout: MatrixLayout) -> tuple[list[str], list[str]
 
 
 def _owners(group: Group, layout: MatrixLayout) -> Int | None:
-    """(E, 1 or 2) superpixels of each element; None where the variables are not a soup's."""
+    """(E, 1 or 2) superpixels of each element; None if it has no variables of superpixels."""
     index = group.table.index
     own = index < layout.count * layout.stride
     if group.kernel.name == "ridge" or not own[:, 0].all():
@@ -65,7 +62,7 @@ def _owners(group: Group, layout: MatrixLayout) -> Int | None:
 
 
 def _labels(owner: Int) -> list[str]:
-    """`i`, `i,k`, or `i,3` for the third element of a superpixel that has several."""
+    """Labels `i` or `i,k`; `i,3` for the third of several elements of a superpixel."""
     own = [",".join(map(str, row)) for row in owner.tolist()]
     if len(set(own)) == len(own):
         return own

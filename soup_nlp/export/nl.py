@@ -1,9 +1,9 @@
 """Writers of AMPL's .nl text format, for NLPs of kernels and tables and for plain SX NLPs.
 
-Every kernel's expression is traced once and filled in once per element (`template`, `body`).
-Variables and constraints are in the order that the format demands (nonlinear in both, in
-constraints, in the objective, linear; nonlinear rows before linear ones): `NLFile` says where each
-went. After D. M. Gay, "Writing .nl files" (2005), and the AMPL/MP reader.
+The expression of every kernel is traced once and filled in for every element (`template`, `body`).
+The format requires an order of the variables (nonlinear in both, in constraints, in the objective,
+linear) and of the rows (nonlinear before linear); `NLFile` has the permutations. References: D. M.
+Gay, "Writing .nl files" (2005), and the AMPL/MP reader.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.errors import ExportError
 from soup_nlp.export.body import Body
-from soup_nlp.export.program import orders, take_apart
+from soup_nlp.export.program import make_program, orders
 from soup_nlp.export.segments import bounds, header, linear, start
 from soup_nlp.export.validate import (
     plain_problem,
@@ -43,13 +44,13 @@ class NLFile:
     """A .nl file that was written.
 
     Attributes:
-        path: The file; `.col` and `.row` lie beside it when names were given.
-        sha256: Of its bytes.
-        size: Bytes.
-        variables: (nx,) variable of the NLP that each variable of the file is.
-        rows: (ng,) constraint of the NLP that each row of the file is.
-        nonlinear: Variables nonlinear in (constraints, objective, both).
-        nonlinear_rows: Leading rows of the file that have an expression.
+        path: The file; `.col` and `.row` are beside it if names were given.
+        sha256: SHA-256 of its bytes.
+        size: Number of bytes.
+        variables: (nx,) variable of the NLP for each variable of the file.
+        rows: (ng,) constraint of the NLP for each row of the file.
+        nonlinear: Number of variables nonlinear in (constraints, objective, both).
+        nonlinear_rows: Number of leading rows with an expression.
         jacobian_nonzeros: Entries of the J segments.
         gradient_nonzeros: Entries of the G segment.
         defined: Defined variables by use: both, constraints, objective (several), one constraint,
@@ -67,10 +68,19 @@ class NLFile:
     gradient_nonzeros: int
     defined: tuple[int, int, int, int, int]
 
+    def counts(self) -> dict[str, Any]:
+        """Counts of nonzeros and nonlinear parts, for the manifest and the index of the family."""
+        return {
+            "gradient_nonzeros": self.gradient_nonzeros,
+            "nonlinear_rows": self.nonlinear_rows,
+            "nonlinear_variables": dict(zip(("rows", "objective", "both"), self.nonlinear)),
+            "defined_variables": sum(self.defined),
+        }
+
 
 Names = Sequence[str]
 AllNames = tuple[Names | None, Names | None, str]
-"""Of variables, rows and the objective; None writes no file."""
+"""Names of variables, rows and the objective; None writes no file."""
 
 
 def write_nl(path: str | Path, nlp: NLP, names: tuple[Names, Names] | None = None) -> NLFile:
@@ -78,12 +88,12 @@ def write_nl(path: str | Path, nlp: NLP, names: tuple[Names, Names] | None = Non
 
     Args:
         path: The .nl file; written whole or not at all.
-        nlp: The NLP; the Hessian that it carries does not matter.
-        names: Of variables and constraints; default the NLP's own, see `names.readable_names`.
+        nlp: The NLP; its Hessian does not matter.
+        names: Names of variables and constraints; default those of the NLP.
 
     Raises:
-        ExportError: an operation has no opcode, a number is not finite, bounds cross, or names are
-            not as many as variables and rows.
+        ExportError: an operation has no opcode, a number is not finite, bounds cross, or the
+            number of names is wrong.
         DataError: the folder cannot be written.
     """
     x_names, g_names = names or (nlp.x_names(), nlp.g_names())
@@ -106,7 +116,7 @@ def write_sx_nl(
     g_names: Names | None = None,
     lam_g0: Float | float | None = None,
 ) -> NLFile:
-    """Write any plain NLP of CasADi's nlpsol form.
+    """Write any plain NLP in the form of CasADi's nlpsol.
 
     Args:
         path: The .nl file.
@@ -116,14 +126,14 @@ def write_sx_nl(
         ubx: (nx,) upper bounds, default none.
         lbg: (ng,) lower bounds of g, default none.
         ubg: (ng,) upper bounds of g, default none.
-        x_names: For the .col file; None writes none.
-        g_names: For the .row file; None writes none.
-        lam_g0: (ng,) initial multipliers in CasADi's sign (positive at upper bounds); the file
-            has AMPL's, which is the opposite. None writes none.
+        x_names: Names for the .col file; None writes none.
+        g_names: Names for the .row file; None writes none.
+        lam_g0: (ng,) initial multipliers in CasADi's sign (positive at upper bounds), which is
+            the opposite of AMPL's sign in the file; None writes none.
 
     Raises:
-        ExportError: as `write_nl`; or the problem is not SX, has a free symbol, its objective is
-            not a scalar, or a vector has a wrong length.
+        ExportError: see `write_nl`; or the problem is not SX, has a free symbol or no scalar
+            objective, or a vector has a wrong length.
 
     Example:
         >>> x = ca.SX.sym("x", 2)
@@ -160,19 +170,9 @@ def _write(
     names: AllNames,
     lam_g0: Float | None = None,
 ) -> NLFile:
-    """Check, take apart, order and write.
-
-    Args:
-        path: The .nl file.
-        groups: Kernels and tables.
-        theta: Values of the shared parameters.
-        x: Start, lower and upper bounds of the variables.
-        g: Lower and upper bounds of the rows.
-        names: Of variables, rows and the objective.
-        lam_g0: (ng,) initial multipliers, or None.
-    """
+    """Check and write an NLP."""
     _check(path, x, g, names, lam_g0)
-    program = take_apart(groups, len(x[0]), len(g[0]), theta)
+    program = make_program(groups, len(x[0]), len(g[0]), theta)
     variables, rows = orders(program)
     body = Body(program, np.argsort(variables), np.argsort(rows))
     J = program.jacobian[rows][:, variables].tocsr()
@@ -215,7 +215,7 @@ def _check(
     names: AllNames,
     lam_g0: Float | None,
 ) -> None:
-    """Check that a .nl file can hold the problem."""
+    """Raise ExportError if a .nl file cannot hold the problem."""
     if lam_g0 is not None:
         require_finite("lam_g0", lam_g0, path)
     require_finite("x0", x[0], path)
@@ -226,7 +226,7 @@ def _check(
 
 
 def _write_names(path: Path, names: AllNames, variables: Int, rows: Int) -> None:
-    """The .col and .row files, in the order of the .nl file."""
+    """Write the .col and .row files in the order of the .nl file."""
     if names[0] is not None:
         write_text(path.with_suffix(".col"), "".join(f"{names[0][k]}\n" for k in variables))
     if names[1] is not None:

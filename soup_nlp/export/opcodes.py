@@ -18,9 +18,9 @@ class Op:
 
     Attributes:
         code: Opcode; "o54" (sum), "o11" and "o12" (min, max) are followed by their argument count.
-        before: Constants that stand before the arguments, e.g. 1 of 1 / x.
-        after: Constants that stand after them, e.g. 2 of x^2.
-        fold: The same in numpy.
+        fold: The operation in NumPy.
+        before: Constants before the arguments, e.g. 1 of 1 / x.
+        after: Constants after the arguments, e.g. 2 of x^2.
     """
 
     code: str
@@ -47,7 +47,7 @@ OPS: Mapping[int, Op] = {
     ca.OP_SQ: Op(POWER, np.square, after=("2",)),
     ca.OP_TWICE: Op(TIMES, lambda a: 2 * a, before=("2",)),
     ca.OP_INV: Op(DIVIDE, lambda a: 1 / a, before=("1",)),
-    # beyond what the soup needs, for plain NLPs
+    # used by plain NLPs only
     ca.OP_SIN: Op("o41", np.sin),
     ca.OP_COS: Op("o46", np.cos),
     ca.OP_TAN: Op("o38", np.tan),
@@ -64,14 +64,14 @@ OPS: Mapping[int, Op] = {
     ca.OP_FMIN: Op("o11\n2", np.fmin),
     ca.OP_FMAX: Op("o12\n2", np.fmax),
 }
-"""Every operation that can be written; anything else is an ExportError."""
+"""Operations that can be written; others raise an ExportError."""
 
 COMMUTATIVE = frozenset({ca.OP_ADD, ca.OP_MUL, ca.OP_FMIN, ca.OP_FMAX})
 
 NAMES: Mapping[int, str] = {
     getattr(ca, n): n.removeprefix("OP_").lower() for n in dir(ca) if n.startswith("OP_")
 }
-"""Words for error messages."""
+"""Names of all operations for error messages."""
 
 
 def number(value: float) -> str:

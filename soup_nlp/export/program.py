@@ -1,4 +1,4 @@
-"""An NLP of kernels and tables, taken apart into the parts of a .nl file."""
+"""Conversion of an NLP of kernels and tables to the parts of a .nl file."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ Int = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 OBJECTIVE = -1
+"""Row number of the objective."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """The NLP in parts; variables and rows in the order of the NLP.
+    """Parts of the NLP, with variables and rows in the order of the NLP.
 
     Attributes:
         stamped: (template, (E, nx) variables, (E, m) rows or OBJECTIVE of every output).
         jacobian: (ng, nx) linear coefficients of the rows.
-        gradient: (1, nx) those of the objective; both keep a zero for a nonlinear entry.
+        gradient: (1, nx) those of the objective; both store 0 for nonlinear entries.
         in_rows: (nx,) variable is nonlinear in some row.
         in_objective: (nx,) variable is nonlinear in the objective.
-        curved_rows: (ng,) row has an expression (or a constant, which only those can have).
+        curved_rows: (ng,) row has an expression or a constant.
         curved_objective: The objective has an expression with variables.
-        row_constant: (ng,) numbers to add to the rows' expressions.
+        row_constant: (ng,) numbers that are added to the expressions of the rows.
         objective_constant: The same for the objective.
     """
 
@@ -48,8 +49,8 @@ class Program:
     objective_constant: float
 
 
-def take_apart(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Program:
-    """Split, trace and fold every kernel.
+def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Program:
+    """Split and trace every kernel.
 
     Raises:
         ExportError: an operation has no opcode, or a number is not finite.
@@ -92,7 +93,7 @@ def take_apart(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Progr
                 in_rows[variables] = True
                 curved_rows[goal[:, k]] |= curved
                 np.add.at(row_constant, goal[:, k], constant)
-    # sums of triplets keep zeros: entries of nonlinear variables belong to the structure
+    # sums of triplets keep zeros, so that nonlinear entries stay in the structure
     value, row, column = (np.concatenate(column) for column in zip(*linear))
     own = row == OBJECTIVE
     return Program(
@@ -111,8 +112,8 @@ def take_apart(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Progr
 def orders(program: Program) -> tuple[Int, Int]:
     """Variables and rows in the order of the format.
 
-    Variables: nonlinear in rows and objective, in rows alone, in the objective alone, linear.
-    Rows: nonlinear, linear. Inside a class the NLP's order stays.
+    Variables: nonlinear in rows and objective, in rows only, in the objective only, linear. Rows:
+    nonlinear, linear. The order of the NLP is kept within a class.
     """
     kind = np.where(
         program.in_rows,

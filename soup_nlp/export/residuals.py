@@ -14,6 +14,7 @@ from soup_nlp.evaluate import recompute
 Float = NDArray[np.float64]
 
 WORST = 3
+"""Number of superpixels that are listed for a kind."""
 EQUATIONS: Mapping[str, str] = {
     "so3": "R'R = I",
     "normal": "|n|^2 = 1",
@@ -31,12 +32,12 @@ class Kind:
     """One kind of constraint.
 
     Attributes:
-        name: Of EQUATIONS.
+        name: Name in EQUATIONS.
         largest: Largest violation.
-        limit: Largest that is allowed.
-        count: Superpixels (or entries) beyond the limit.
+        limit: Largest allowed violation.
+        count: Number of superpixels (or entries) beyond the limit.
         total: Number of superpixels (or entries).
-        worst: (superpixel, violation), worst first; empty where entries are no superpixels.
+        worst: (superpixel, violation), worst first; empty if entries are not superpixels.
     """
 
     name: str
@@ -48,7 +49,7 @@ class Kind:
 
     @property
     def ok(self) -> bool:
-        """Within the limit; NaN is not."""
+        """Whether the largest violation is within the limit; False for NaN."""
         return bool(self.largest <= self.limit)
 
     def __str__(self) -> str:
@@ -60,7 +61,7 @@ class Kind:
 
 
 def kind(name: str, violation: Float, limit: float, superpixels: bool = True) -> Kind:
-    """Summary of violations (M,) that are >= 0."""
+    """Summary of nonnegative violations (M,)."""
     # NaN counts as an infinite violation
     v = np.where(np.isfinite(violation), violation, np.inf)
     order = np.argsort(-v, kind="stable")[:WORST]
@@ -72,11 +73,11 @@ def kind(name: str, violation: Float, limit: float, superpixels: bool = True) ->
 def residual_table(
     state: Mapping[str, Any], rim_ray: Float, min_facing: float, limits: Mapping[str, float]
 ) -> list[Kind]:
-    """Residuals of a soup by kind, recomputed from its arrays alone.
+    """Residuals of a soup by kind of constraint, recomputed from its arrays.
 
     Args:
         state: lam, n, d, R, t.
-        rim_ray: (N, V, 3) rays where visibility is imposed.
+        rim_ray: (N, V, 3) rays of the visibility constraint.
         min_facing: c of `-n . r >= c`.
         limits: Largest violation by kind.
     """

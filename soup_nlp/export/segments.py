@@ -1,4 +1,4 @@
-"""Header of a .nl file, and its segments of numbers: start, bounds, sparsity, linear parts."""
+"""Header of a .nl file, and its segments with start, bounds, sparsity and linear parts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def header(
     """The ten lines of counts.
 
     Args:
-        program: The NLP in parts.
+        program: Parts of the NLP.
         bounds: (ng,) lower and upper bounds of the rows.
         longest: Length of the longest name of a row and of a variable.
         defined: Defined variables by use, see `nl.NLFile`.
@@ -30,7 +30,7 @@ def header(
     ranges = np.isfinite(lower) & np.isfinite(upper) & ~equations
     in_rows, both = program.in_rows.sum(), (program.in_rows & program.in_objective).sum()
     only = program.in_objective.sum() - both
-    # the count for objectives spans the constraints' variables where it has some of its own
+    # if the objective has variables of its own, its count includes those of the constraints
     in_objective = in_rows + only if only else both
     n, m = len(program.in_rows), len(lower)
     return [

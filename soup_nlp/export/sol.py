@@ -1,4 +1,4 @@
-"""AMPL's .sol text format: a solver's answer read, and written."""
+"""Reading and writing of answers of solvers in the .sol text format of AMPL."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ Int = NDArray[np.int64]
 N = TypeVar("N", int, float)
 
 OPTIONS = "Options"
-"""Line that ends the message."""
+"""Line after the message."""
 MOST_BYTES = 256 << 20
-"""Size of the largest .sol: millions of variables."""
+"""Size limit of a .sol file, enough for millions of variables."""
 CLASSES = ("solved", "uncertain", "infeasible", "unbounded", "limit", "failure")
 
 
 @dataclass(frozen=True)
 class Sol:
-    """A solver's answer in the order of the NLP (not of the file).
+    """Answer of a solver in the order of the NLP, not of the file.
 
     Attributes:
-        message: The solver's message.
-        code: AMPL's solve_result_num, -1 where the file has none.
+        message: Message of the solver.
+        code: solve_result_num of AMPL, -1 if the file has none.
         x: (nx,) point.
         lam_g: (ng,) multipliers in CasADi's sign (positive at upper bounds), or None.
     """
@@ -43,17 +43,17 @@ class Sol:
 
     @property
     def solved(self) -> bool:
-        """The solver claims success."""
+        """Whether the solver claims success."""
         return 0 <= self.code < 100
 
     @property
     def status(self) -> str:
-        """solve_result_num in a word."""
+        """Meaning of solve_result_num in a word."""
         return CLASSES[self.code // 100] if 0 <= self.code < 600 else "unknown"
 
 
 class _Lines:
-    """Lines of a file with their number for messages."""
+    """Reader of the lines of a file, with line numbers in error messages."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.at = path, 0
@@ -95,23 +95,20 @@ class _Lines:
 def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
     """Read a .sol file.
 
-    Args:
-        path: The file.
-        variables: (nx,) variable of the NLP that each one of the .nl file is, see `NLFile`.
-        rows: (ng,) the same for constraints.
+    `variables` (nx,) and `rows` (ng,) are the orders of the .nl file, see `NLFile`.
 
     Raises:
-        ExportError: the file is missing, not a .sol in text format, holds no point, or is for a
-            problem of another size.
+        ExportError: the file is missing, is not a .sol in text format, has no point, or belongs to
+            a problem of another size.
     """
     lines = _Lines(as_path(path, "solution file", error=ExportError))
     message = []
     while (line := lines.next(OPTIONS)) != OPTIONS:
-        # the program that wrote the file is not trusted
+        # the file may contain control characters
         message.append(printable(line))
     said = [line for line in message if line]
     (count,) = lines.numbers(1, "number of options", int)
-    # two more options announce a tolerance
+    # a count above 4 announces a tolerance
     tolerance = count > 4
     for _ in range(count - 2 * tolerance):
         lines.next("an option")
@@ -136,7 +133,7 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
     if not (np.isfinite(y).all() and np.isfinite(z).all()):
         raise ExportError("solution is not finite", where=path, hint="; ".join(said) or None)
     code = -1
-    # suffixes may follow: multipliers of the bounds are computed from the point instead
+    # suffixes are ignored: multipliers of the bounds are computed from the point
     for line in lines.lines[lines.at :]:
         words = line.split()
         if words[:1] == ["objno"]:
@@ -167,10 +164,10 @@ def write_sol(
         path: The file.
         x: (nx,) point, in the order of the NLP.
         lam_g: (ng,) multipliers in CasADi's sign, or None.
-        variables: (nx,) order of the .nl file, see `NLFile`.
-        rows: (ng,) order of the .nl file.
-        message: First lines; empty lines are left out, and one that would end it is quoted.
-        code: solve_result_num, 0 solved, 400 limit.
+        variables: (nx,) order of the variables, see `NLFile`.
+        rows: (ng,) order of the rows.
+        message: First lines; empty lines are left out, and a line "Options" is quoted.
+        code: solve_result_num, such as 0 for solved and 400 for a limit.
     """
     duals = [] if lam_g is None else [number(-v) for v in lam_g[rows].tolist()]
     head = [line for line in message.splitlines() if line.strip()]

@@ -1,4 +1,4 @@
-"""Linear and nonlinear parts of a kernel: J and G segments, and expressions."""
+"""Split of a kernel into linear parts (J and G segments) and nonlinear expressions."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Split:
-    """A kernel's outputs (the objective first, if it has one, then its rows) in two parts.
+    """Linear and nonlinear part of the outputs of a kernel: objective, if any, then rows.
 
     Attributes:
-        nonlinear: (m,) expressions without the variables that enter them linearly.
+        nonlinear: (m,) expressions without their linear variables.
         row, column: (k,) output and local variable of every Jacobian nonzero.
-        is_linear: (k,) the nonzero does not depend on the variables.
-        coefficient: (E, k) its value for every element where it is linear, else 0.
-        objective: The kernel has an objective (output 0).
+        is_linear: (k,) whether the nonzero is independent of the variables.
+        coefficient: (E, k) its value for every element if it is linear, else 0.
+        objective: Whether output 0 is an objective.
     """
 
     nonlinear: ca.SX
@@ -36,7 +36,7 @@ class Split:
 
 
 def outputs(kernel: Kernel) -> ca.SX:
-    """(m,) objective, if there is one, and constraints."""
+    """(m,) objective, if any, and constraints."""
     parts = [p for p in (kernel.objective, kernel.constraints) if p is not None]
     return ca.densify(ca.vertcat(*parts)) if parts else ca.SX(0, 1)
 
@@ -44,15 +44,15 @@ def outputs(kernel: Kernel) -> ca.SX:
 def split(group: Group, theta: Float) -> Split:
     """Split the outputs of a kernel.
 
-    A variable is linear in an output where that entry of the Jacobian depends on no variable.
+    A variable is linear in an output if that entry of the Jacobian depends on no variable.
 
     Raises:
         ExportError: an operation has no opcode.
     """
     kernel, table = group.kernel, group.table
     out = outputs(kernel)
-    # before the split: a piecewise constant part such as sign(a) has the number 0 in the Jacobian
-    # and would pass for a linear one
+    # before the split, since a piecewise constant part such as sign(a) has a zero derivative and
+    # would look linear
     trace(kernel.name, out, group, theta)
     jacobian = ca.jacobian(out, kernel.x)
     r, c = jacobian.sparsity().get_triplet()

@@ -1,8 +1,8 @@
-"""A kernel's expressions as prefix text with holes, to be filled in once per element.
+"""Expressions of a kernel as prefix text with holes, which are filled in for every element.
 
-The symbolic instructions are read once. What depends on data alone is folded to numbers, for all
-elements at a time. An expression that an element uses more than once, or that many elements have in
-common (the 3D anchor of a superpixel at which fifteen edges meet), becomes a defined variable.
+The symbolic instructions are read once. Parts that depend on data only become numbers, for all
+elements at once. An expression becomes a defined variable if an element uses it repeatedly or if
+many elements share it, such as the 3D anchor of a superpixel with fifteen edges.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 WORTH_NAMING = 4
-"""Operations and leaves that an expression must have to become a defined variable."""
+"""Smallest number of operations and leaves of a defined variable."""
 
 SHARED_BELOW = 0.6
-"""A part is common to elements when it has at most this share of as many distinct instances."""
+"""Largest ratio of distinct instances to elements for a part that elements share."""
 
 VARIABLE, NUMBER, DEFINED = "x", "n", "v"
 
@@ -34,8 +34,8 @@ class Text:
     """Prefix text with a hole `%s` for every entry of `holes`.
 
     Attributes:
-        pattern: Lines joined by newlines, without one at the end.
-        holes: (kind, number): a local variable, a numeric column, or a defined node.
+        pattern: Lines without a newline at the end.
+        holes: (kind, number) of a local variable, a numeric column, or a defined node.
     """
 
     pattern: str
@@ -44,7 +44,7 @@ class Text:
 
 @dataclass
 class _Graph:
-    """Instructions of a kernel after folding; nodes are numbered in their order of evaluation."""
+    """Expression graph of a kernel; nodes are numbered in the order of evaluation."""
 
     op: list[int] = field(default_factory=list)
     args: list[tuple[int, ...]] = field(default_factory=list)
@@ -55,7 +55,7 @@ class _Graph:
     known: dict[object, int] = field(default_factory=dict)
 
     def leaf(self, key: object, number: Float | None = None, variable: int | None = None) -> int:
-        """Node of a number or a variable: the one of this key, if there is one."""
+        """Node of a number or a variable, created unless the key is known."""
         if key not in self.known:
             node = self._add(key, -1, ())
             if number is not None:
@@ -65,7 +65,7 @@ class _Graph:
         return self.known[key]
 
     def apply(self, op: int, args: tuple[int, ...]) -> int:
-        """Node of an operation: an existing one if there is one, a number without variables."""
+        """Node of an operation, created unless it exists; a number if no argument is variable."""
         key = (op, tuple(sorted(args)) if op in COMMUTATIVE else args)
         if key in self.known:
             return self.known[key]
@@ -82,7 +82,7 @@ class _Graph:
 
 
 def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
-    """Instructions of the outputs; a number is a scalar, or (E,) where it depends on the data.
+    """Expression graph of the outputs; numbers are scalars, or (E,) if they depend on data.
 
     Raises:
         ExportError: an operation has no opcode.
@@ -119,13 +119,13 @@ def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
 
 @dataclass(frozen=True)
 class Template:
-    """Texts of a kernel, to be filled in for the elements of a group.
+    """Texts of a kernel, which are filled in for the elements of a group.
 
     Attributes:
         defined: Node and text of every defined variable, dependencies first.
-        roots: Text of every output, or None where it is a number.
-        constants: (E,) or scalar number of every such output, else 0.
-        numbers: Folded columns by node: scalar or (E,).
+        roots: Text of every output; None for a number.
+        constants: Scalar or (E,) number of every output, 0 if it is no number.
+        numbers: Scalar or (E,) values by node.
     """
 
     defined: tuple[tuple[int, Text], ...]
@@ -135,12 +135,12 @@ class Template:
 
 
 def make_template(name: str, outputs: ca.SX, group: Group, theta: Float) -> Template:
-    """Read a kernel's outputs into a template.
+    """Make the template of the outputs of a kernel.
 
     Args:
-        name: For messages.
+        name: Name for messages.
         outputs: (m,) expressions of the kernel's x, row and theta.
-        group: Kernel and table; numbers are folded for its elements.
+        group: Kernel and table.
         theta: Values of the shared parameters.
 
     Raises:
@@ -162,7 +162,7 @@ def make_template(name: str, outputs: ca.SX, group: Group, theta: Float) -> Temp
 
 
 def _operations(graph: _Graph) -> list[int]:
-    """Nodes that outputs need and that depend on variables, leaves left out; arguments first."""
+    """Operations that outputs need and that depend on variables, arguments first."""
     needed = set()
     todo = [r for r in graph.roots if r >= 0]
     while todo:
@@ -194,7 +194,7 @@ def _defined(graph: _Graph, group: Group) -> set[int]:
     names = set()
     for node in nodes:
         size[node] = 1 + sum(1 if a in names else size.get(a, 1) for a in graph.args[node])
-        # the largest part that elements share, not every part of it
+        # only the largest part that elements share
         top = node in common and (node in roots or not common.issuperset(parents[node]))
         if (uses[node] > 1 or top) and size[node] >= WORTH_NAMING:
             names.add(node)
@@ -202,7 +202,7 @@ def _defined(graph: _Graph, group: Group) -> set[int]:
 
 
 def _common(graph: _Graph, nodes: list[int], group: Group) -> set[int]:
-    """Nodes that have the same instance, of the same variables and numbers, in many elements."""
+    """Nodes with equal instances (same variables and numbers) in many elements."""
     mixed: dict[int, NDArray[np.uint64]] = {}
     support: dict[int, frozenset[int]] = {}
 
@@ -270,7 +270,7 @@ def _emit(graph: _Graph, top: int, names: set[int], root: bool = False) -> Text:
 
 
 def _expand(graph: _Graph, node: int, names: set[int], lines: list[str]) -> list[int | str]:
-    """Write the opcode of an operation; what must follow, in order."""
+    """Write the opcode of an operation; returns its operands in order."""
     op, args = graph.op[node], graph.args[node]
     if op == ca.OP_ADD:
         terms: list[int | str] = []

@@ -14,15 +14,15 @@ Float = NDArray[np.float64]
 
 
 def plain_problem(problem: Mapping[str, object], where: object) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """x (nx,), scalar f and g (ng,) of a problem in nlpsol's form.
+    """x (nx,), scalar f and g (ng,) of a problem in the form of nlpsol.
 
     Args:
-        problem: `x`, `f` and, if there are constraints, `g`; `p` may be there when it is empty.
+        problem: `x`, `f` and, if there are constraints, `g`; `p` must be empty.
         where: File, for messages.
 
     Raises:
-        ExportError: an entry is unknown, missing, no SX or of a wrong shape, or there are symbols
-            that are not variables.
+        ExportError: an entry is unknown, missing, not SX or of a wrong shape, or a symbol is not a
+            variable.
     """
     if not isinstance(problem, Mapping):
         raise ExportError(
@@ -58,7 +58,7 @@ def plain_problem(problem: Mapping[str, object], where: object) -> tuple[ca.SX, 
 
 
 def _expression(name: str, value: object, where: object) -> ca.SX:
-    """An entry as SX; None is empty, numbers are expressions as well, MX is none."""
+    """An entry as SX; None becomes an empty vector."""
     try:
         return ca.SX(0, 1) if value is None else ca.SX(value)
     except (NotImplementedError, TypeError, RuntimeError):
@@ -74,7 +74,7 @@ def vector(name: str, values: object, size: int, default: float, where: object) 
     """(size,) numbers; a scalar stands for all entries, None for the default.
 
     Raises:
-        ExportError: they are not numbers, or of another length.
+        ExportError: they are not numbers, or have another length.
     """
     try:
         found = np.asarray(default if values is None else values, float)
@@ -92,22 +92,14 @@ def vector(name: str, values: object, size: int, default: float, where: object) 
 
 
 def require_finite(name: str, values: Float, where: object) -> None:
-    """Check that no entry is NaN or infinite.
-
-    Raises:
-        ExportError: one is.
-    """
+    """Raise ExportError if an entry is NaN or infinite."""
     if not np.isfinite(values).all():
         k = int(np.argmin(np.isfinite(values)))
         raise ExportError(f"{name} is not finite", where=where, found=f"{values[k]} at entry {k}")
 
 
 def require_bounds(name: str, lower: Float, upper: Float, where: object) -> None:
-    """Check that no lower bound (n,) of "x" or "g" lies above its upper bound.
-
-    Raises:
-        ExportError: one is NaN, a lower one is +inf, an upper one -inf, or they cross.
-    """
+    """Raise ExportError for bounds (n,) that are NaN, cross, or admit no finite number."""
     # false for NaN too
     good = (lower <= upper) & (lower < np.inf) & (upper > -np.inf)
     if not good.all():
@@ -120,11 +112,7 @@ def require_bounds(name: str, lower: Float, upper: Float, where: object) -> None
 
 
 def require_names(name: str, names: Sequence[str] | None, size: int, where: object) -> None:
-    """Check that there is a name for everything, each on one line.
-
-    Raises:
-        ExportError: there are too few or too many, or one is empty or has a line break.
-    """
+    """Raise ExportError unless there are `size` nonempty names without line breaks."""
     if names is None:
         return
     if len(names) != size:

@@ -1,4 +1,4 @@
-"""KKT residuals of a foreign solver's point, with the multipliers that balance it best."""
+"""KKT residuals of the point of another solver."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from soup_nlp.solve.kkt import optimality
 Float = NDArray[np.float64]
 
 SLACK = 10.0
-"""Solvers scale their residuals differently; ours are unscaled and may be this much larger."""
+"""Allowed factor of unscaled residuals over the tolerance, since solvers scale theirs."""
 ENERGY_SLACK = 1e-3
-"""A solution's exact energy may be this share above the proposal's because of the smoothing."""
+"""Allowed relative increase of the exact energy over the proposal, due to the smoothing."""
 ACTIVE = 1e-5
-"""A row this close to a bound (relative to 1 + |bound|) counts as active."""
+"""Distance of a row to a bound, relative to 1 + |bound|, up to which it is active."""
 DAMPING = 1e-12
-"""Of least-squares multipliers, relative to the mean square of a row's gradient."""
+"""Damping of least-squares multipliers relative to the mean square gradient of a row."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits that are equal for every solver.
+    """Limits that are the same for every solver.
 
     Attributes:
         seconds: CPU time, set-up included.
-        iterations: Of the solver's outer loop.
-        tol: Dual infeasibility and complementarity; constraints get 1e-2 of it.
-        memory: Bytes beyond what the problem itself takes.
+        iterations: Outer iterations.
+        tol: Dual infeasibility and complementarity; that of the constraints is 1e-2 tol.
+        memory: Bytes beyond those of the problem.
     """
 
     seconds: float = 60.0
@@ -52,10 +52,10 @@ class Residuals:
 
     Attributes:
         primal: Largest violation of a bound or a row.
-        dual: |grad f + J' lam_g + lam_x|, largest entry.
+        dual: Largest entry of |grad f + J' lam_g + lam_x|.
         complementarity: Largest product of a gap and its multiplier.
-        multipliers: "solver" or "least squares": whose lam_g balances better; "none" where the
-            point has no derivatives.
+        multipliers: Origin of lam_g, "solver" or "least squares", whichever gives the smaller
+            residuals; "none" if derivatives at the point are not finite.
     """
 
     primal: float
@@ -64,7 +64,7 @@ class Residuals:
     multipliers: str
 
     def within(self, limits: Limits) -> bool:
-        """Small enough for success."""
+        """Whether the residuals are small enough for a verified answer."""
         return (
             self.primal <= SLACK * limits.feasibility
             and self.dual <= SLACK * limits.tol
@@ -74,10 +74,10 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Optimality:
-    """Residuals of a point with the multipliers that they belong to.
+    """Residuals of a point with their multipliers.
 
     Attributes:
-        residuals: Of point and multipliers.
+        residuals: Residuals of point and multipliers.
         lam_x: (nx,) multipliers of the bounds.
         lam_g: (ng,) multipliers of the rows.
     """
@@ -88,7 +88,7 @@ class Optimality:
 
 
 def violations(nlp: NLP, x: Float) -> dict[str, Float]:
-    """Violation of "bounds" (nx,) and "rows" (ng,); infinite where it is not a number."""
+    """Violations of "bounds" (nx,) and "rows" (ng,); infinite for NaN."""
     with np.errstate(all="ignore"):
         g = np.asarray(nlp.oracle(x, nlp.p)[1]).ravel()
         outside = {
@@ -99,15 +99,10 @@ def violations(nlp: NLP, x: Float) -> dict[str, Float]:
 
 
 def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Optimality:
-    """Residuals of a point with the solver's multipliers or the least-squares ones.
+    """Residuals of a point x (nx,) with the multipliers lam_g (ng,) or with least-squares ones.
 
-    The multipliers that balance the gradient better are taken. Those of the bounds follow from the
-    point. What is not a number counts as infinite.
-
-    Args:
-        nlp: The problem.
-        x: (nx,) point.
-        lam_g: (ng,) the solver's multipliers, or None.
+    The multipliers with the smaller residuals are used. Those of the bounds follow from the point.
+    NaN counts as infinite.
     """
     primal = max(float(v.max(initial=0.0)) for v in violations(nlp, x).values())
     nothing = np.zeros(nlp.ng)
@@ -134,9 +129,8 @@ def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Optimality:
 def bound_multipliers(nlp: NLP, x: Float, lam_g: Float) -> Float:
     """(nx,) multipliers of the bounds that belong to a point and its lam_g.
 
-    What is left of the gradient, r = -(grad f + J' lam_g), is balanced by the bound on the side
-    that it points to; split so that dual infeasibility and complementarity are equal,
-    lam = r / (1 + gap).
+    The rest of the gradient, r = -(grad f + J' lam_g), acts on the bound in its direction. The
+    multiplier lam = r / (1 + gap) makes dual infeasibility and complementarity equal.
     """
     r = -(_gradient(nlp, x) + _jacobian(nlp, x).T @ lam_g)
     with np.errstate(invalid="ignore"):
@@ -148,10 +142,10 @@ def bound_multipliers(nlp: NLP, x: Float, lam_g: Float) -> Float:
 
 
 def least_squares_multipliers(nlp: NLP, x: Float) -> Float:
-    """(ng,) multipliers that balance the gradient best; only active rows have one.
+    """(ng,) multipliers of least dual infeasibility; 0 for inactive rows.
 
-    min |grad f + J_A' lam_A| over the active rows A and the variables that are off their bounds;
-    signs that an inequality cannot have are dropped and the rest solved once more.
+    Minimises |grad f + J_A' lam_A| over the active rows A, in the variables that are not on their
+    bounds. Multipliers with a wrong sign are set to 0 and the others are solved again.
     """
     J, grad = _jacobian(nlp, x), _gradient(nlp, x)
     g = np.asarray(nlp.oracle(x, nlp.p)[1]).ravel()
@@ -173,13 +167,13 @@ def least_squares_multipliers(nlp: NLP, x: Float) -> Float:
 
 
 def _least_squares(A: sparse.csr_matrix, b: Float) -> Float:
-    """x that makes |A x - b| least, by the augmented system [I A; A' -delta]; A may lack rank."""
+    """Minimum of |A x - b| by the augmented system [I A; A' -delta]; A may be rank deficient."""
     k, n = A.shape
     delta = DAMPING * sparse.linalg.norm(A) ** 2 / n
     blocks = [[sparse.identity(k), A], [A.T, -delta * sparse.identity(n)]]
     solve = splu(sparse.csc_matrix(sparse.block_array(blocks))).solve
     x = np.zeros(n)
-    # every repetition takes a factor off what the damping left
+    # each repetition reduces the error caused by the damping
     for _ in range(3):
         x += solve(np.concatenate([b - A @ x, np.zeros(n)]))[k:]
     return x

@@ -1,4 +1,4 @@
-"""How much of the image is determined, by what, and what is a guess."""
+"""Shares of the image whose depth is determined, and by what, and shares that are a guess."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run
 
 LITTLE = 1.0
-"""Parallax in pixels below which an error of the flow is most of it."""
+"""Parallax in pixels below which errors of the flow dominate."""
 WORDS = {
     "flow": "by flow and parallax",
     "contact": "with the scale of a contact",
@@ -28,13 +28,14 @@ WORDS = {
 
 
 def certainty(run: Run) -> dict[str, float]:
-    """Shares of the image, in summary.json and the verdict.
+    """Shares of the image for summary.json and the verdict.
 
     Returns:
-        "determined": where sigma of log depth is at most `MOST_SIGMA`; the sum of "flow" (in the
-        largest component), "contact" and "outline" (in others, by what gives them their scale).
-        "guess": the rest; the sum of "unseen" (no usable flow, or hidden in the next frame),
-        "still" (parallax below a pixel) and "weak". "median_sigma": of what is determined.
+        "determined": share with a sigma of log depth of at most `MOST_SIGMA`; the sum of "flow"
+        (pixels of the largest component), "contact" and "outline" (pixels of other components, by
+        the source of their scale). "guess": the rest; the sum of "unseen" (no usable flow, or
+        hidden in the next frame), "still" (parallax below a pixel) and "weak". "median_sigma":
+        median over the determined pixels.
     """
     sigma = run.confidence.sigma
     labels, start = run.segmentation.labels, run.start
@@ -61,7 +62,7 @@ def certainty(run: Run) -> dict[str, float]:
 
 
 def certainty_lines(found: Mapping[str, float]) -> list[str]:
-    """The shares as sentences: one of what is determined, one of what is a guess."""
+    """The shares as sentences on the determined part and on the guess."""
     lines = []
     if found["determined"] >= 0.005:
         lines.append(
@@ -75,7 +76,7 @@ def certainty_lines(found: Mapping[str, float]) -> list[str]:
 
 
 def guess_words(found: Mapping[str, float], of: str = "") -> str:
-    """What is a guess, and why."""
+    """Sentence on the share that is a guess and the reasons."""
     return (
         f"{found['guess']:.0%}{of} is a guess (sigma above {MOST_SIGMA:.0%}):"
         f" {_parts(found, ('unseen', 'still', 'weak'))}"

@@ -1,4 +1,4 @@
-"""The claims of a result folder, each recomputed from its arrays by independent code."""
+"""Check of a result folder: its claims are recomputed from its arrays by independent code."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from soup_nlp.evaluate.scoring import DEPTHS, SURE
 from soup_nlp.report.check_arrays import require_layout
 from soup_nlp.report.check_files import file_claims
 from soup_nlp.report.claim import ABSOLUTE, HASHED, RECOMPUTED, RELATIVE, Claim, number, same
+from soup_nlp.solve.ipopt import GOOD
 from soup_nlp.solve.kkt import LIMITS
 from soup_nlp.storage.files import as_path, parse_yaml, read_json, read_text
 from soup_nlp.storage.folders import recover
@@ -25,26 +26,25 @@ from soup_nlp.storage.store import require
 Entries: TypeAlias = Mapping[str, Any]
 Images: TypeAlias = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 TERMS = ("arap", "proj", "cont", "orient", "prior")
-GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 ROUNDINGS = 16
 """Error of a pixel coordinate after projection into both frames, in units of machine precision."""
 LEFT = (
     "dual infeasibility and complementarity, which need the model's derivatives",
     "images, flow, labels, truth, multipliers, times, logs, colours (as written only)",
 )
-"""What nothing recomputes."""
+"""Contents of a result that the check does not recompute."""
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """All rows of a check, and what was left unchecked."""
+    """Claims that were checked, and descriptions of what was not."""
 
     rows: tuple[Claim, ...]
     left: tuple[str, ...] = LEFT
 
     @property
     def ok(self) -> bool:
-        """Every claim holds."""
+        """Whether every claim holds."""
         return all(r.ok for r in self.rows)
 
     def __str__(self) -> str:
@@ -64,10 +64,10 @@ def check_folder(folder: str | Path, images: Images | None = None) -> CheckRepor
     Args:
         folder: Result folder.
         images: The two images, (H, W, 3) or (H, W) uint8; without them E_photo of the refinement
-            is left as it is claimed.
+            is not recomputed.
 
     Raises:
-        DataError: a file, a claim or an array is missing or not what it should be.
+        DataError: a file, a claim or an array is missing or malformed.
     """
     folder = as_path(folder, "result folder")
     if images is not None:
@@ -143,7 +143,7 @@ def _rows(
 
 
 def _weights(tree: Entries, form: Entries, weights: Mapping[str, float]) -> Iterator[Claim]:
-    """The stored weights are those of the problem."""
+    """Claims that the stored weights are those of the problem."""
     own = form["weights"]
     if form["units"] == "pixel" and bool(tree["start"].get("bending", False)):
         own = dict(form["bending"]["weights"])
@@ -154,10 +154,10 @@ def _weights(tree: Entries, form: Entries, weights: Mapping[str, float]) -> Iter
 
 
 def _rounding(tree: Entries, weights: Mapping[str, float]) -> float:
-    """Rounding error of an energy that should be zero.
+    """Absolute rounding error of an energy.
 
-    E sums differences of numbers as large as pixel coordinates and focal lengths, so its absolute
-    error is their machine precision times the number of superpixels.
+    E sums differences of numbers as large as pixel coordinates and focal lengths, so its error is
+    their machine precision times the number of superpixels.
     """
     e = tree["energy"]
     used = np.abs(e["pixel_target"][e["pixel_weight"] > 0])
@@ -167,7 +167,7 @@ def _rounding(tree: Entries, weights: Mapping[str, float]) -> float:
 
 
 def _rounds(claims: Entries, slack: float) -> Iterator[Claim]:
-    """E never rises from round to round, and no round has an energy below its lower bound."""
+    """Claims that E does not increase between rounds and is not below its lower bounds."""
     refinement = claims.get("refinement")
     if not refinement or not refinement["rounds"]:
         return
@@ -191,7 +191,7 @@ def _refined(
     slack: float,
     images: Images | None,
 ) -> Iterator[Claim]:
-    """Objective that the refinement began and ended with; E_photo needs the images."""
+    """Claims about the first and last objective of the refinement; E_photo needs the images."""
     refinement = claims.get("refinement")
     if not refinement:
         return
@@ -216,7 +216,7 @@ def _refined(
 
 
 def _labels(claims: Entries, attrs: Entries, config: str) -> Iterator[Claim]:
-    """summary.json, config.yaml and result.h5 agree; 1 is agreement."""
+    """Claims that summary.json, config.yaml and result.h5 agree; 1 is agreement."""
     pairs = {
         "status": claims["status"] == attrs["status"],
         "converged": bool(claims["converged"]) == (attrs["status"] in GOOD),
@@ -254,7 +254,7 @@ def _constraints(claims: Entries, tree: Entries, weights: Mapping[str, float]) -
     rim, facing = require(tree, "energy/rim_ray"), weights["min_facing"]
 
     def satisfied(which: str, key: str, limits: Mapping[str, float]) -> Iterator[Claim]:
-        """Constraints of one soup, and the claims about them."""
+        """Claims about the constraints of one soup."""
         found = recompute.constraints(_state(tree, which), rim, facing)
         for name, limit in limits.items():
             value, claimed = float(found[name].max()), number(claims[key][name])
@@ -266,14 +266,14 @@ def _constraints(claims: Entries, tree: Entries, weights: Mapping[str, float]) -
     if claims["status"] == "Skipped":
         return
     yield from satisfied("nlp", "nlp_residuals", LIMITS)
-    # Ipopt's answer may violate its constraints by as much as claimed, the delivered soup by less
+    # the limit of Ipopt's answer is the claimed violation
     within = float(claims["residuals"]["nlp_infeasibility"]) * (1 + 1e-6) + ABSOLUTE
     own = dict.fromkeys(("so3", "normal", "simplex"), within)
     yield from satisfied("answer", "answer_residuals", own)
     if claims["delivered"] == "constrained NLP":
         a, b = _state(tree, "answer"), _state(tree, "nlp")
         gap = max(float(np.abs(a[k] - b[k]).max()) for k in ("n", "R"))
-        # how a distance is split into lam and d, and the unit of length, are up to the gauge
+        # the gauge decides the unit of length and how a distance is split into lam and d
         ratio = (a["lam"] * a["d"]) / (b["lam"] * b["d"])
         gap = max(gap, float(np.abs(ratio / ratio.mean() - 1).max()))
         limit = 10 * within + RELATIVE
@@ -281,7 +281,7 @@ def _constraints(claims: Entries, tree: Entries, weights: Mapping[str, float]) -
 
 
 def _depths(tree: Entries) -> Iterator[Claim]:
-    """The stored depth maps are those of the stored planes and motions."""
+    """Claims that the stored depth maps follow from the stored planes and motions."""
     labels = require(tree, "segmentation/labels")
     K_ref, K_next = require(tree, "input/K_ref"), require(tree, "input/K_next")
     for which in ("solution", "nlp", "start"):
@@ -298,7 +298,7 @@ def _depths(tree: Entries) -> Iterator[Claim]:
 def _same_depth(
     which: str, depth: recompute.Float, z: recompute.Float, doubt: NDArray[np.bool_]
 ) -> Claim:
-    """A stored depth map must equal a recomputed one where no rounding decides."""
+    """Claim that a stored depth map equals the recomputed one, except at the pixels `doubt`."""
     # a pixel exactly at the horizon may fall on either side
     one = (np.isfinite(depth) != np.isfinite(z)) & ~doubt
     both = np.isfinite(depth) & np.isfinite(z) & ~doubt
@@ -314,7 +314,7 @@ def _same_depth(
 
 
 def _metrics(tree: Entries, claims: Entries) -> Iterator[Claim]:
-    """The scores are those of the stored depth maps against the stored truth."""
+    """Claims that the scores follow from the stored depth maps and the stored truth."""
     constant = float("nan")
     # the skill of the others needs the score of the constant depth
     for name in sorted(claims, key=lambda k: k != "constant"):

@@ -1,4 +1,4 @@
-"""The arrays of a result fit together: shapes, kinds and indices, before anything is computed."""
+"""Checks of shapes, types and indices of the arrays of a result before they are used."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ INDICES = {
     "energy/edges": "N",
     "energy/pairs": "N",
 }
-"""Arrays of indices, and the letter of the axis that they point into."""
+"""Arrays of indices with the letter of the axis that they index."""
 SHARED = ("N", "E", "P", "H", "W")
-"""Letters that stand for one size in all arrays: superpixels, edges, pairs, image."""
+"""Axes with one size in all arrays: superpixels, edges, pairs, rows and columns."""
 FREE = ("depth/next", "depth/sigma_next", "input/image_next", "truth/depth_next")
-"""Maps of the next frame, whose size may be another."""
+"""Maps of the next frame, whose size may differ."""
 
 
 def require_layout(tree: Mapping[str, Any]) -> None:
-    """Check every array that is there against its axes.
+    """Check every stored array against its axes.
 
     Raises:
-        DataError: an array has another shape, no numbers, or indices out of range.
+        DataError: an array has a wrong shape, no numbers, or indices out of range.
     """
     sizes: dict[str, int] = {}
     for group, table in LAYOUT.items():
@@ -50,7 +50,7 @@ def require_layout(tree: Mapping[str, Any]) -> None:
 def _require_shapes(
     group: str, table: Table, values: Mapping[str, Any], sizes: dict[str, int]
 ) -> None:
-    """Shapes are those of the table; a shared letter stands for one size in all arrays."""
+    """Check the shapes of a group; `sizes` collects the sizes of the shared axes."""
     for name, (_, letters, _) in table.items():
         place, value = f"{group}/{name}", values.get(name)
         if value is None:

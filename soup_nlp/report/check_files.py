@@ -23,9 +23,9 @@ Entries: TypeAlias = Mapping[str, Any]
 Float = NDArray[np.float64]
 
 COLUMNS = ("x", "y", "z", "nx", "ny", "nz")
-"""First properties of a cloud."""
+"""First properties of a point cloud."""
 ULPS = 4 * 2.0**-24
-"""Rounding of a coordinate to float32, relative to the numbers that it is the sum of."""
+"""Rounding error of a coordinate in float32, relative to its summands."""
 
 
 def file_claims(folder: Path, claims: Entries, tree: Entries) -> Iterator[Claim]:
@@ -42,7 +42,7 @@ def file_claims(folder: Path, claims: Entries, tree: Entries) -> Iterator[Claim]
 
 
 def _counts(claims: Entries, tree: Entries) -> Iterator[Claim]:
-    """Numbers that are counts of the arrays."""
+    """Claims about numbers that are counts of arrays."""
     height, width = require(tree, "segmentation/labels").shape
     found = {
         "superpixels": len(require(tree, "segmentation/anchors")),
@@ -69,7 +69,7 @@ def _counts(claims: Entries, tree: Entries) -> Iterator[Claim]:
 
 
 def _depth_png(folder: Path, claims: Entries, which: str, depth: Float) -> Iterator[Claim]:
-    """Scale and pixels of a 16-bit depth map."""
+    """Claims about scale and pixels of a 16-bit depth map."""
     scale = recompute_files.png_scale(depth)
     yield same(f"depth_png_scale {which}", claims["depth_png_scale"][which], scale)
     name = f"depth_{which}.png"
@@ -79,7 +79,7 @@ def _depth_png(folder: Path, claims: Entries, which: str, depth: Float) -> Itera
     except DataError as error:
         yield Claim(f"{name} pixels", 0, np.nan, 0, False, note=str(error.found or error.what))
         return
-    # the size stands in bytes 16 to 23, before anything is decoded
+    # check the size in bytes 16 to 23 before decoding the image
     size = int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
     value = None
     if size == depth.shape:
@@ -92,7 +92,7 @@ def _depth_png(folder: Path, claims: Entries, which: str, depth: Float) -> Itera
 
 
 def _clouds(folder: Path, tree: Entries, state: recompute.State) -> Iterator[Claim]:
-    """Points and normals of both clouds; which pixels they show and their colours are hashed."""
+    """Claims about points and normals of both clouds; their pixels and colours are hashed."""
     labels, K = require(tree, "segmentation/labels"), require(tree, "input/K_ref")
     depth = require(tree, "depth/ref").astype(float)
     ref, following, size = recompute_files.clouds(state, depth, labels, K)
@@ -103,7 +103,7 @@ def _clouds(folder: Path, tree: Entries, state: recompute.State) -> Iterator[Cla
         image = tables[0][:, :3].astype(float) @ K.T
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = (np.rint(image[:, k] / image[:, 2]) for k in (0, 1))
-        # a point that is none of the image's matches no pixel
+        # a point outside the image matches no pixel
         inside = (u >= 0) & (v >= 0) & (u < labels.shape[1]) & (v < labels.shape[0])
         index = np.where(inside, v * labels.shape[1] + u, -1).astype(int)
     for name, table, rows in zip(names, tables, (ref, following)):
@@ -122,7 +122,7 @@ def _clouds(folder: Path, tree: Entries, state: recompute.State) -> Iterator[Cla
 
 
 def _read_ply(path: Path) -> NDArray[np.float32] | None:
-    """(M, 6) positions and normals of a cloud as we write it; None where it is none."""
+    """(M, 6) positions and normals of a cloud written by `write_ply`; None if it is malformed."""
     try:
         data = read_bytes(path, path.name)
     except DataError:
@@ -141,20 +141,20 @@ def _read_ply(path: Path) -> NDArray[np.float32] | None:
 
 
 def _entries(claims: Entries, tree: Entries) -> Claim:
-    """What summary.json says, recomputed or not, is as it was written."""
+    """Claim that no entry of summary.json was changed after it was written."""
     name = "entries of summary.json"
     if "summary" not in tree.get(RECORD, {}):
         return Claim(name, 0, np.nan, 0, False, how=HASHED, note="result.h5 has no record of them")
     written, now = (_leaves(x) for x in (json.loads(str(tree[RECORD]["summary"])), claims))
     every = sorted(written.keys() | now.keys())
     changed = [k for k in every if k not in written or k not in now or written[k] != now[k]]
-    told = ", ".join(".".join(key) for key in changed[:3]) + (", ..." if len(changed) > 3 else "")
-    note = f"{told}: not as written" if changed else ""
+    names = ", ".join(".".join(key) for key in changed[:3]) + (", ..." if len(changed) > 3 else "")
+    note = f"{names}: not as written" if changed else ""
     return Claim(name, 0, len(changed), 0, not changed, how=HASHED, note=note)
 
 
 def _leaves(tree: Any, place: tuple[str, ...] = ()) -> dict[tuple[str, ...], Any]:
-    """Every leaf of nested mappings and lists by its place."""
+    """Leaves of nested mappings and lists by their path."""
     if isinstance(tree, Mapping | list) and tree:
         items = tree.items() if isinstance(tree, Mapping) else enumerate(tree)
         return {k: v for name, x in items for k, v in _leaves(x, (*place, str(name))).items()}
@@ -162,13 +162,13 @@ def _leaves(tree: Any, place: tuple[str, ...] = ()) -> dict[tuple[str, ...], Any
 
 
 def _hashes(folder: Path, tree: Entries) -> Iterator[Claim]:
-    """Every file is the one that was written, byte by byte."""
+    """Claims that the files were not changed after they were written."""
     files = recorded_files(tree)
     if not files:
         note = "result.h5 has no record of the files"
         yield Claim("files as written", 1, 0, 0, False, how=HASHED, note=note)
     for name, digest in files.items():
-        # entries of these are claims of their own
+        # other claims compare the entries of these two
         if name in ("summary.json", "config.yaml"):
             continue
         path = folder / name

@@ -1,4 +1,4 @@
-"""One claim of a result folder, and what its check found."""
+"""A claim of a result folder with the result of its check."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 RELATIVE = 1e-9
 ABSOLUTE = 1e-12
 RECOMPUTED, HASHED = "recomputed", "as written"
-"""How a claim is checked: from the arrays, or against what result.h5 keeps of the files."""
+"""How a claim is checked: from the arrays, or against hashes and copies in result.h5."""
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,11 @@ class Claim:
         name: Subject of the claim.
         claimed: Value in summary.json.
         found: Value recomputed from the arrays.
-        limit: Largest allowed found value (constraints) or difference (numbers, relative).
+        limit: Largest allowed value (constraints) or relative difference (numbers).
         ok: Whether the claim holds.
-        worst: Superpixel with the largest residual, -1 where there is none.
+        worst: Superpixel with the largest residual, -1 if there is none.
         note: Explanation.
-        how: RECOMPUTED, or HASHED where nothing but the bytes can be compared.
+        how: RECOMPUTED or HASHED.
     """
 
     name: str
@@ -47,14 +47,14 @@ class Claim:
 
 
 def number(value: Any) -> float:
-    """A claim as a number; JSON has null where it is not finite."""
+    """A claim as a number; null in JSON stands for a number that is not finite."""
     return float("nan") if value is None else float(value)
 
 
 def same(
     name: str, claimed: Any, found: float, of: float = 0.0, absolute: float = ABSOLUTE
 ) -> Claim:
-    """A claim that must equal `found` up to rounding of it, of the sum `of`, or `absolute`."""
+    """Claim that must equal `found` up to rounding of it or the sum `of`, or up to `absolute`."""
     value = number(claimed)
     gap = abs(value - found)
     ok = gap <= RELATIVE * max(abs(found), abs(of)) + absolute or (

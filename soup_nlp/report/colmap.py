@@ -18,24 +18,17 @@ if TYPE_CHECKING:
     from soup_nlp.report.result import Result
 
 POINTS = 50_000
-"""Most points of a model."""
+"""Largest number of points of a model."""
 IMAGES = ("ref.png", "next.png")
 """Names of the images in a model."""
 
 
 def write_colmap(folder: Path, result: Result) -> int:
-    """Write `images/`, `masks/` and `sparse/0/` as COLMAP and what reads its models expect them.
+    """Write `images/`, `masks/` and `sparse/0/` into a folder; returns the number of points.
 
     The world is the reference camera (x right, y down, z ahead); both images have poses
-    cam_from_world. A model of COLMAP stands still: its points are those of the background, seen in
-    both images, and the masks are black where something else moves.
-
-    Args:
-        folder: Folder to write into; it must exist.
-        result: What was solved.
-
-    Returns:
-        The number of points.
+    cam_from_world. COLMAP models are static: the points are background points visible in both
+    images, and the masks are black where something moves by itself.
 
     Raises:
         DataError: a camera has skew, which none of COLMAP's models has.
@@ -106,12 +99,12 @@ def _points(
 
 
 def _moved(result: Result, moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(H', W') where what moves by itself lands in the next image, its cracks closed."""
+    """(H', W') pixels of the next image that show independently moving parts, gaps closed."""
     rec = result.reconstruction
     height, width = rec.depth_next.shape
     v, u = np.nonzero(moving & np.isfinite(rec.flow).all(axis=2))
     at = np.floor(np.stack([u, v], 1) + rec.flow[v, u] + 0.5)
-    # nearest surface: what is hidden by the static scene stays out
+    # only points that are not hidden by the static scene
     inside = (at >= 0).all(1) & (at < [width, height]).all(1)
     u2, v2 = at[inside].astype(np.int64).T
     z = rec.points_next[v[inside], u[inside], 2]

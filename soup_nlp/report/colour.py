@@ -1,6 +1,6 @@
 """Depth, error, flow, normals and superpixels in colour, (H, W, 3) uint8 RGB.
 
-What is unknown is grey, a colour that none of the scales has; flow that cannot be used is black.
+Unknown values are grey, which none of the colour scales contains; unusable flow is black.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ ERROR_LIMIT = 0.2
 """Relative depth error at the upper end of the colours."""
 
 UNKNOWN = 150
-"""Grey level of what is unknown; no scale of depth, error, sigma or normals has a grey."""
+"""Grey level of unknown values."""
 
 SIGMA_LIMIT = 0.3
 """Standard deviation of log depth at the upper end of the colours."""
@@ -26,20 +26,20 @@ _WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 
 
 def depth_range(depth: Float) -> tuple[float, float]:
-    """(near, far) of a depth map, its 2nd and 98th percentile: a colour scale for several maps.
+    """(near, far) of the colour scale of a depth map: its 2nd and 98th percentile.
 
     Args:
         depth: (H, W) z; values that are not finite or not positive are left out.
 
     Returns:
-        near < far, in the unit of the depth; (1, 2) where nothing is known.
+        near < far, in the unit of the depth; (1, 2) if no depth is known.
     """
     z = np.asarray(depth, np.float64)
     z = z[np.isfinite(z) & (z > 0)]
     if z.size == 0:
         return 1.0, 2.0
     near, far = (float(x) for x in np.percentile(z, (2.0, 98.0)))
-    if not far > near * (1 + 1e-9):  # a constant depth still needs a scale
+    if not far > near * (1 + 1e-9):  # a constant depth
         near, far = near / 1.1, far * 1.1
     return near, far
 
@@ -72,22 +72,17 @@ def colourise_error(relative_error: Float) -> Image:
     return _paint(level, known, "inferno")
 
 
-def colourise_sigma(sigma: Float, limit: float = SIGMA_LIMIT) -> Image:
-    """Standard deviation of log depth in colour, from 0 (dark) to `limit` and above (bright).
-
-    Args:
-        sigma: (H, W); grey where not finite.
-        limit: At the bright end.
-    """
+def colourise_sigma(sigma: Float) -> Image:
+    """Standard deviation of log depth (H, W) in colour, from 0 (dark) to `SIGMA_LIMIT` (bright)."""
     known = np.isfinite(sigma)
-    level = np.clip(np.where(known, sigma, 0.0) / limit, 0.0, 1.0)
+    level = np.clip(np.where(known, sigma, 0.0) / SIGMA_LIMIT, 0.0, 1.0)
     return _paint(level, known, "viridis")
 
 
 def component_colours(count: int) -> Image:
-    """(count, 3) colours of components: the first, the largest, is slate, others are vivid."""
+    """(count, 3) colours of components: slate for the first, vivid colours for the others."""
     vivid = (matplotlib.colormaps["tab10"](np.arange(10))[:, :3] * 255).round()
-    # the grey of tab10 is for what is unknown
+    # without the grey of tab10, which means unknown
     vivid = np.delete(vivid, 7, axis=0)[[1, 2, 3, 4, 5, 6, 7, 8, 0]]
     turns = np.arange(max(count - 1, 0))
     faded = 0.75 ** (turns // len(vivid))[:, None]
@@ -97,7 +92,7 @@ def component_colours(count: int) -> Image:
 
 
 def wheel_key(size: int = 64) -> Image:
-    """(size, size, 3) key of the flow's colours: the centre is no motion, the rim the limit."""
+    """(size, size, 3) legend of flow colours: no motion at the centre, the limit at the rim."""
     at = (np.arange(size) + 0.5) / size * 2 - 1
     u, v = np.meshgrid(at, at)
     out = colourise_flow(np.stack([u, v], axis=2), 1.0)
@@ -160,7 +155,7 @@ def colourise_flow(uv: Float, limit: float | None = None) -> Image:
 
 
 def colourise_normals(n_map: Float) -> Image:
-    """Normals in colour: (x, -y, -z) from [-1, 1] to RGB, so one that faces the camera is blue.
+    """Normals in colour: (x, -y, -z) from [-1, 1] to RGB; towards the camera is blue.
 
     Args:
         n_map: (H, W, 3) unit normals in the camera frame (x right, y down, z forward); grey where

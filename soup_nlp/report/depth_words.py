@@ -1,4 +1,4 @@
-"""What a run knows of depth without a truth: flow, parallax, components, what to try."""
+"""Lines of the verdict on the depth: flow, parallax, components, what to try."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run
 
 STILL = 0.3
-"""Share of the image without parallax from which other frames are recommended."""
+"""Other frames are recommended if a larger share of the image has no parallax."""
 
 
 def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
-    """Lines of the verdict: usable flow, parallax, what moves, and what to try."""
+    """Lines of the verdict: usable flow, parallax, moving components, what to try."""
     assert run.pair.flow is not None
     usable = float((run.pair.flow.confidence > 0).mean())
     lines = [f"flow usable at {usable:.0%} of the pixels"]

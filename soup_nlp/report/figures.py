@@ -1,4 +1,7 @@
-"""Pictures with titles and legends as PNG, alone and as an overview; 16-bit depth maps."""
+"""Pictures with titles and legends as PNG, alone and as an overview; 16-bit depth maps.
+
+Every writer raises `DataError` if the file cannot be written.
+"""
 
 from __future__ import annotations
 
@@ -26,24 +29,18 @@ Float = NDArray[np.floating]
 
 _DPI = 100
 _HEAD, _CAPTION, _GAP = 42, 28, 8
-"""Heights of title and caption, space between panels, pixels."""
+"""Height of the title, height of a caption, and space between panels, in pixels."""
 _LEGEND = {Bar: 32, Swatches: 24, Wheel: 62}
 """Height of a legend, pixels."""
 _SPARE = ("depth_start", "normals")
-"""Panels that an overview leaves out, in this order, where its last row would have gaps."""
+"""Panels that an overview leaves out, in this order, to fill its last row."""
 
 
 def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: int = 420) -> Image:
     """(H, W, 3) uint8: titled pictures with their legends in a grid, under a title.
 
-    Panels keep their aspect; a row is as high as its highest panel. PIL draws them, since
-    matplotlib takes five times as long.
-
-    Args:
-        panels: In reading order.
-        title: Above the panels; "" for none.
-        columns: Largest number of panels in a row.
-        panel_width: Width of a panel, pixels.
+    Panels keep their aspect ratio. PIL draws them, since matplotlib takes five times as long.
+    `columns` is the largest number of panels in a row, `panel_width` is in pixels.
     """
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
@@ -64,8 +61,8 @@ def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: 
 
 
 def strip_figure(panels: Sequence[Picture], title: str) -> Figure:
-    """`strip` as a figure of matplotlib; it changes no global state of matplotlib."""
-    # half a second, which result folders need not wait
+    """The image of `strip` as a figure of matplotlib, without changing its global state."""
+    # the import takes half a second, which result folders do not need
     from matplotlib.figure import Figure
 
     image = strip(panels, title)
@@ -77,17 +74,13 @@ def strip_figure(panels: Sequence[Picture], title: str) -> Figure:
 
 
 def write_picture(path: PathLike, picture: Picture) -> None:
-    """Write a picture at its own size with its title above and its legend below, as PNG.
-
-    Raises:
-        DataError: the folder cannot be written.
-    """
-    # narrower than this a title does not fit
+    """Write a picture at its own size with its title above and its legend below, as PNG."""
+    # titles need a width of 500 pixels
     write_png(path, strip([picture], "", panel_width=max(picture.image.shape[1], 500)))
 
 
 def _height(picture: Picture, width: int) -> int:
-    """Of a picture of some width, pixels."""
+    """Height in pixels of a picture that is drawn with some width."""
     return max(1, round(width * picture.image.shape[0] / picture.image.shape[1]))
 
 
@@ -99,7 +92,7 @@ def _draw_panel(sheet: Pil.Image, panel: Picture, left: int, top: int, width: in
     """Title, picture and legend of a panel; pixels from the upper left corner."""
     _write(sheet, left, top + _CAPTION // 2, panel.title, width)
     top, tall = top + _CAPTION, _height(panel, width)
-    # so that a white panel is seen on white paper
+    # makes white panels visible on white paper
     frame = left - 1, top - 1, left + width, top + tall
     ImageDraw.Draw(sheet).rectangle(frame, outline="#999999")
     _place(sheet, panel.image, left, top, width, tall)
@@ -155,35 +148,26 @@ def _write(
     bold: bool = False,
     side: str = "l",
 ) -> None:
-    """Text with its left end, middle or right end (`side`) at (x, y); smaller than `room`."""
+    """Draw text with its left end, middle or right end (`side`) at (x, y), shrunk to `room`."""
     wide = _font(points, bold).getlength(text)
     font = _font(points * min(1.0, room / max(wide, 1.0)), bold)
     ImageDraw.Draw(sheet).text((x, y), text, fill="black", font=font, anchor=f"{side}m")
 
 
 def _place(sheet: Pil.Image, image: Image, left: int, top: int, width: int, height: int) -> None:
-    """An image in a rectangle."""
-    # an enlarged pixel stays a rectangle of one colour
+    """Draw an image in a rectangle."""
+    # INTER_AREA keeps enlarged pixels rectangles of one colour
     scaled = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     sheet.paste(Pil.fromarray(scaled), (left, top))
 
 
 def overview(path: PathLike, found: Mapping[str, Picture], title: str) -> None:
-    """Write the overview of a result: its pictures in a grid of three columns without gaps.
-
-    Args:
-        path: PNG file to write; its folder must exist.
-        found: See `pictures`.
-        title: Above the panels.
-
-    Raises:
-        DataError: the folder cannot be written.
-    """
+    """Write the overview of a result: its pictures in a grid of three columns without gaps."""
     write_png(path, strip(without_gaps(found), title))
 
 
 def without_gaps(found: Mapping[str, Picture]) -> list[Picture]:
-    """The pictures of an overview: without the spare ones that would leave a row open."""
+    """The pictures of an overview, without `_SPARE` ones if they would leave a row incomplete."""
     panels = dict(found)
     for name in _SPARE:
         if len(panels) % 3:
@@ -192,43 +176,42 @@ def without_gaps(found: Mapping[str, Picture]) -> list[Picture]:
 
 
 def write_png(path: PathLike, rgb: Image) -> None:
-    """Write an (H, W, 3) uint8 RGB image as PNG, whole or not at all.
-
-    Raises:
-        DataError: the folder cannot be written.
-    """
+    """Write an (H, W, 3) uint8 RGB image as PNG, whole or not at all."""
     _encode(path, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+
+
+def depth_png_scale(depth: Float) -> float:
+    """Largest power of two at which the 99.9th percentile of the known depths fits 16 bits."""
+    known = np.isfinite(depth) & (depth > 0)
+    far = float(np.percentile(depth[known], 99.9)) if known.any() else 1.0
+    return float(2.0 ** np.floor(np.log2(65535.0) - np.log2(far)))
 
 
 def write_clipped_depth_png16(path: PathLike, depth: Float, scale: float | None = None) -> float:
     """Write a depth map as 16-bit PNG: value = round(depth * scale), 0 where unknown.
 
-    A known depth is at least 1 in the file; what exceeds 65535 is written as 65535.
+    Values of known depths are clipped to 1 .. 65535.
 
     Args:
         path: File to write; its folder must exist.
         depth: (H, W) z; unknown where not finite or not positive.
-        scale: Values per unit of depth, such as 256 (KITTI) or 1000 (millimetres of metres). None
-            takes the largest power of two at which the 99.9th percentile of the depth fits.
+        scale: Values per unit of depth, such as 256 (KITTI) or 1000 (millimetres of metres); None
+            for `depth_png_scale`.
 
     Returns:
         The scale, which a reader needs: depth = value / scale.
-
-    Raises:
-        DataError: the folder cannot be written.
     """
     z = np.asarray(depth, np.float64)
     known = np.isfinite(z) & (z > 0)
     if scale is None:
-        far = float(np.percentile(z[known], 99.9)) if known.any() else 1.0
-        scale = float(2.0 ** np.floor(np.log2(65535.0) - np.log2(far)))
+        scale = depth_png_scale(z)
     value = np.clip(np.round(np.where(known, z, 0.0) * scale), 1, 65535)
     _encode(path, np.where(known, value, 0).astype(np.uint16))
     return float(scale)
 
 
 def _encode(path: PathLike, array: NDArray[np.generic]) -> None:
-    # a third smaller than at the default level
+    # files are a third smaller than at the default level
     good, data = cv2.imencode(".png", array, [cv2.IMWRITE_PNG_COMPRESSION, 2])
     if not good:
         raise DataError("image cannot be encoded as PNG", where=path, found=array.shape)

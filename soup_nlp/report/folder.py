@@ -35,69 +35,32 @@ if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run
 
 FULL = {"ref_full": "depth_ref_full.png", "next_full": "depth_next_full.png"}
-"""Depth at the images' own size, where a pair was solved at a smaller one (`max_size`)."""
+"""Files of the depth at the size of the images, for a pair that was solved at a smaller size."""
 
 FILES = (
-    "config.yaml",
-    "result.h5",
-    "summary.json",
-    "log.txt",
-    "ipopt.log",
-    "depth_ref.png",
-    "depth_next.png",
-    "depth_ref_colour.png",
-    "depth_next_colour.png",
-    "superpixels.png",
-    "components.png",
-    "flow.png",
-    "flow_confidence.png",
-    "normals.png",
-    "confidence.png",
-    "error.png",
-    "overview.png",
-    PAGE,
-    "motions.json",
-    "trajectory.tum",
-    "points_ref.ply",
-    "points_next.ply",
+    *("config.yaml", "result.h5", "summary.json", "log.txt", "ipopt.log"),
+    *("depth_ref.png", "depth_next.png", "depth_ref_colour.png", "depth_next_colour.png"),
+    *("superpixels.png", "components.png", "flow.png", "flow_confidence.png", "normals.png"),
+    *("confidence.png", "error.png", "overview.png", PAGE, "motions.json", "trajectory.tum"),
+    *("points_ref.ply", "points_next.ply"),
 )
-"""Files of a result folder; error.png is there with dense truth only, confidence.png where the
-uncertainty of the depth is known."""
+"""Files of a result folder. error.png needs a dense truth, confidence.png a known uncertainty."""
 
-PICTURES = {
-    "depth_ref": "depth_ref_colour.png",
-    "depth_next": "depth_next_colour.png",
-    **{
-        name: f"{name}.png"
-        for name in (
-            "superpixels",
-            "components",
-            "flow",
-            "flow_confidence",
-            "normals",
-            "confidence",
-            "error",
-        )
-    },
+PICTURES = {name: f"{name}_colour.png" for name in ("depth_ref", "depth_next")} | {
+    name: f"{name}.png"
+    for name in (
+        *("superpixels", "components", "flow", "flow_confidence", "normals", "confidence"),
+        "error",
+    )
 }
-"""Files of the pictures that are written alone, by name."""
+"""Files of the pictures that are also written alone, by name of the picture."""
 
 FAILED = "failed.log"
-"""Log of a solve that ended without a result; the next result removes it."""
+"""Log of a solve that failed; the next result removes it."""
 
 _ROUND = (
-    "energy",
-    "mrf_energy",
-    "bound",
-    "gap",
-    "taken",
-    "moved",
-    "ties",
-    "iterations",
-    "status",
-    "seconds",
-    "proposed",
-    "accepted",
+    *("energy", "mrf_energy", "bound", "gap", "taken", "moved", "ties", "iterations", "status"),
+    *("seconds", "proposed", "accepted"),
 )
 """Entries of a round of the refinement in summary.json."""
 
@@ -109,12 +72,11 @@ def prepare_folder(
 
     Args:
         folder: The folder.
-        inputs: Files and folders of the problem that is solved into it, see `input_paths`; these
-            are never overwritten.
+        inputs: Input files and folders of the problem, which are never overwritten.
         overwrite: Overwrite files that the program did not make.
 
     Raises:
-        DataError: it cannot be written, or holds what is not to be overwritten.
+        DataError: the folder cannot be written, or holds a file that must not be overwritten.
     """
     folder = as_path(folder, "output folder")
     if inputs is not None:
@@ -123,14 +85,14 @@ def prepare_folder(
 
 
 def _keep_inputs(folder: Path, inputs: Iterable[Path]) -> None:
-    """Raise DataError where a result would overwrite, or lie among, its inputs."""
+    """Raise DataError if a result would overwrite its inputs or be in the same folder."""
 
     def refuse(what: str, expected: str, found: str | None = None) -> DataError:
         return DataError(
             what, where=folder, found=found, expected=expected, hint="choose another --out"
         )
 
-    # realpath, unlike resolve, bears a link to itself
+    # realpath, unlike resolve, accepts a link to itself
     here = Path(os.path.realpath(folder))
     for place in inputs:
         if place == here:
@@ -155,16 +117,16 @@ def write_folder(
     ipopt_log: Path | None = None,
     formats: Sequence[str] = (),
 ) -> list[str]:
-    """Write every file of a run; an earlier result stays whole until the new one is.
+    """Write every file of a run; an earlier result is replaced when the new one is complete.
 
     Args:
         folder: Prepared folder.
         run: The run.
         config: Merged problem as YAML.
-        log: Text of the log, or what makes it of the names of the other files.
-        verdict: What the page shows as printed; None for `facts`.
-        ipopt_log: Ipopt's own log.
-        formats: Files for other programs beside, see `formats.FORMATS`.
+        log: Text of the log, or a function that makes it from the names of the other files.
+        verdict: Verdict on the page; None for `facts`.
+        ipopt_log: Log file of Ipopt.
+        formats: Further formats, see `formats.FORMATS`.
 
     Returns:
         Names of the files.
@@ -179,14 +141,14 @@ def write_folder(
         names = {path.name for path in new.iterdir()} | {"log.txt", "result.h5"}
         files = [name for name in FILES if name in names] + sorted(names.difference(FILES))
         write_text(new / "log.txt", log if isinstance(log, str) else log(files))
-        # the last one: it holds the hashes of the others
+        # written last, since it holds the hashes of the others
         tree = {**result_tree(run), RECORD: record_of(new)}
         write_h5(new / "result.h5", tree, attributes(run, config))
     return files
 
 
 def write_failure(folder: Path, log: str, ipopt_log: Path) -> None:
-    """Write the log of a solve that failed, followed by Ipopt's; an earlier result stays."""
+    """Write the log of a failed solve, followed by that of Ipopt; an earlier result is kept."""
     with suppress(OSError):
         log += ipopt_log.read_text(encoding="utf-8", errors="replace")
     with staged(folder) as new:
@@ -198,14 +160,14 @@ def _write_files(
 ) -> None:
     """Every file of a run but its logs and result.h5."""
     write_text(folder / "config.yaml", config)
-    told = summary(run)
-    shown = of_run(run, told, facts(run) if verdict is None else verdict)
+    contents = summary(run)
+    shown = of_run(run, contents, facts(run) if verdict is None else verdict)
     drawn = pictures(shown)
     scales = _pictures(folder, run, drawn)
     write_formats(folder, result_of(run), ("motions", "ply", *formats))
     if run.problem.output.page:
         write_text(folder / PAGE, page(shown, drawn))
-    write_json(folder / "summary.json", {**told, "depth_png_scale": scales})
+    write_json(folder / "summary.json", {**contents, "depth_png_scale": scales})
 
 
 def summary(run: Run) -> dict[str, Any]:
@@ -228,7 +190,7 @@ def summary(run: Run) -> dict[str, Any]:
         "answer_residuals": constraint_residuals(run.answer, run.data.rim_ray, facing),
         "refinement": _refinement(run),
         "metrics": {
-            # the next frame has a constant depth of its own
+            # the constant depth is scored on the reference frame only
             k: m.as_dict() | ({} if k == "solution_next" else {"skill": skill(m.mre, constant)})
             for k, m in run.metrics.items()
         },
@@ -258,7 +220,7 @@ def summary(run: Run) -> dict[str, Any]:
 
 
 def _full_size(run: Run) -> dict[str, Any] | None:
-    """Size and score of the depth at the images' own size; None where that was solved."""
+    """Size and score of the depth at the size of the images; None if it was solved at that size."""
     if run.full is None:
         return None
     height, width = run.full.depth_ref.shape
@@ -267,7 +229,7 @@ def _full_size(run: Run) -> dict[str, Any] | None:
 
 
 def _components(run: Run) -> dict[str, Any]:
-    """How many components there are, and how they overlap with the true ones."""
+    """Number of components, and their overlap with the true ones."""
     truth = run.pair.truth
     out: dict[str, Any] = {"count": len(run.components)}
     if truth is not None and truth.components is not None:
@@ -277,7 +239,7 @@ def _components(run: Run) -> dict[str, Any]:
 
 
 def _refinement(run: Run) -> dict[str, Any] | None:
-    """Progress of the refinement by round; None where it was off."""
+    """Results of the refinement by round; None if it was disabled."""
     r = run.refined
     if r is None:
         return None
@@ -292,7 +254,7 @@ def _refinement(run: Run) -> dict[str, Any] | None:
 
 
 def _pictures(folder: Path, run: Run, drawn: Mapping[str, Picture]) -> dict[str, float]:
-    """Write the pictures; values per unit of length of the two 16-bit depth maps."""
+    """Write the pictures; returns the values per unit of length of the 16-bit depth maps."""
     rec = run.reconstruction
     scales = {
         name: write_clipped_depth_png16(folder / f"depth_{name}.png", depth)
@@ -311,14 +273,11 @@ def _pictures(folder: Path, run: Run, drawn: Mapping[str, Picture]) -> dict[str,
 
 
 def renew_page(folder: Path, pair: Pair | None = None) -> Path:
-    """Make the page of a result folder from its arrays; what else is there stays as it is.
+    """Make the page of a result folder again from its arrays; returns the file of the page.
 
     Args:
-        folder: A result folder, of an earlier version too.
+        folder: Result folder, which an earlier version may have written.
         pair: Its input, see `of_folder`.
-
-    Returns:
-        The page.
 
     Raises:
         DataError: the folder holds no result, or cannot be written.

@@ -1,4 +1,4 @@
-"""What limits a result, in sentences: flow, parallax, guesses, components, convergence."""
+"""Sentences on what limits a result: flow, parallax, guesses, components, convergence."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from soup_nlp.report.certainty import guess_words
 from soup_nlp.report.shown import Shown
 
 USABLE = 0.8
-"""Share of usable flow below which the flow is named as a limit."""
+"""Share of usable flow below which the flow counts as a limit."""
 PARALLAX = 1.0
-"""Pixels of parallax below which the flow's own error decides the depth."""
+"""Parallax in pixels below which errors of the flow dominate the depth."""
 SHARE = 0.05
-"""Share of the image from which a limit is worth a sentence."""
+"""Share of the image above which a limit is mentioned."""
 
 
 def limits(shown: Shown) -> list[str]:
-    """What limits a result, one sentence or two each, and what to try; at least one line."""
+    """Sentences on the limits of a result and on what to try; at least one."""
     found = [*_convergence(shown), *_flow(shown), *_parallax(shown), *_parts(shown)]
     return found or ["Nothing stands out: flow, parallax and convergence are good."]
 
@@ -29,7 +29,7 @@ def _convergence(shown: Shown) -> list[str]:
 
 
 def _flow(shown: Shown) -> list[str]:
-    """Flow that cannot be used, and pixels that leave the image."""
+    """Unusable flow, and pixels that leave the image."""
     confidence = shown.array("input/confidence")
     share = float((np.asarray(confidence) > 0).mean())
     out = []
@@ -42,7 +42,7 @@ def _flow(shown: Shown) -> list[str]:
 
 
 def _parallax(shown: Shown) -> list[str]:
-    """Superpixels whose depth the images say little about."""
+    """Superpixels whose depth the images hardly determine."""
     start = shown.tree["start"]
     if shown.at_rest:
         return [
@@ -75,7 +75,7 @@ def _parallax(shown: Shown) -> list[str]:
 
 
 def _parts(shown: Shown) -> list[str]:
-    """Components whose scale follows from contact alone."""
+    """Components whose scale only follows from contact."""
     parts = shown.components
     if len(parts) == 1:
         return []

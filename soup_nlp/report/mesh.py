@@ -17,21 +17,17 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 CELLS = 250_000
-"""Most cells of a mesh; of larger images every second, third ... pixel is a vertex."""
+"""Largest number of cells of a mesh; larger images are subsampled."""
 QUALITY = 92
-"""Of the texture, JPEG."""
+"""JPEG quality of the texture."""
 GLTF = np.diag([1.0, -1.0, -1.0])
 """glTF has y up and looks along -z: half a turn about x from a camera's axes."""
 
 
 def surface_mesh(result: Result, frame: int) -> tuple[Float, NDArray[np.int64], Float]:
-    """The surface of the reference image in one of the frames, without curtains.
+    """The surface of the reference image in frame 0 (reference) or 1 (next).
 
-    It is cut where the depth jumps, between components, and where nothing is known.
-
-    Args:
-        result: What was solved.
-        frame: 0 for the reference frame, 1 for the next one.
+    It is cut at jumps of the depth, between components, and where depth is unknown.
 
     Returns:
         (V, 3) vertices in camera coordinates, (M, 3) triangles, counter-clockwise from the
@@ -48,18 +44,10 @@ def surface_mesh(result: Result, frame: int) -> tuple[Float, NDArray[np.int64], 
 
 
 def write_glb(path: PathLike, result: Result, frame: int) -> int:
-    """Write the mesh of a frame with the reference image as its texture.
+    """Write the mesh of frame 0 or 1, textured with the image; returns the number of triangles.
 
     Axes are those of glTF: x right, y up, the camera looks along -z from the origin. Lengths are
-    in the unit of the reconstruction, which the asset's extras name.
-
-    Args:
-        path: File to write; its folder must exist.
-        result: What was solved.
-        frame: 0 for the reference frame, 1 for the next one.
-
-    Returns:
-        The number of triangles.
+    in the unit of the reconstruction, which the extras of the asset name.
     """
     import trimesh
     from PIL import Image

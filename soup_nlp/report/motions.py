@@ -30,7 +30,7 @@ CONVENTIONS = {
     "scale": "a component that moves by itself has a scale of its own, which no flow determines:"
     " its translation is as good as its depth",
 }
-"""What the entries of motions.json mean."""
+"""Meaning of the entries of motions.json."""
 
 
 def motions(result: Result) -> dict[str, Any]:

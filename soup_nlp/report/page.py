@@ -36,14 +36,14 @@ MODES = {
     "flow_confidence": "flow confidence",
     "error": "error",
 }
-"""Pictures that colour the 3D view, and the words on their buttons."""
+"""Labels of the buttons that colour the 3D view, by name of the picture."""
 NOTES = {
     "image_next": "<p>The next frame on the points that it shows; dark grey = hidden there.</p>"
 }
 LISTED = 8
-"""Components whose motion is listed."""
+"""Number of components whose motion is listed."""
 SIDE = 1600
-"""Pictures larger than this many pixels on a side are made smaller for the page."""
+"""Larger side of a picture in the page, pixels; larger pictures are resized."""
 
 
 def page(shown: Shown, found: Mapping[str, Picture]) -> str:
@@ -70,7 +70,7 @@ def page(shown: Shown, found: Mapping[str, Picture]) -> str:
         "verdict": escape(shown.verdict) or "not recorded",
         "three": _file("three.js"),
         "script": _file("page.js"),
-        # "<" would end the script element
+        # "<" could end the script element
         "data": json.dumps(plain(data)).replace("<", "\\u003c"),
     }
     head, *rest = _file("page.html").split("{{")
@@ -124,27 +124,27 @@ def _next_size(shown: Shown) -> list[int]:
 def _packed(array: NDArray[Any], kind: type) -> str:
     """An array's numbers, deflated, as base64."""
     if np.issubdtype(kind, np.floating):
-        # a point that no solver should have ended at
+        # limits values of a diverged solve
         array = np.clip(array, np.finfo(kind).min, np.finfo(kind).max)
     little = np.ascontiguousarray(array, np.dtype(kind).newbyteorder("<"))
     return base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
 
 
 def _data_uri(picture: Picture) -> str:
-    """A picture as a data address: photographs as JPEG, what has a legend without losses."""
+    """A picture as a data URI: photographs as JPEG, pictures with a legend as lossless WebP."""
     image, side = picture.image, max(picture.image.shape[:2])
     if side > SIDE:
         size = [round(x * SIDE / side) for x in image.shape[1::-1]]
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     photo = picture.legend is None
-    # above 100 is without losses
+    # a quality above 100 is lossless
     kind, options = ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, 90]) if photo else (
         "webp", [cv2.IMWRITE_WEBP_QUALITY, 101])  # fmt: skip
     return encoded(image, kind, options)
 
 
 def encoded(image: Image, kind: str, options: list[int] | None = None) -> str:
-    """A picture (H, W, 3) as a data address; `kind` is "jpeg", "png" or "webp"."""
+    """A picture (H, W, 3) as a data URI; `kind` is "jpeg", "png" or "webp"."""
     good, data = cv2.imencode(f".{kind}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options or [])
     if not good:
         raise DataError("image cannot be encoded", where="report.html", found=kind)
@@ -169,7 +169,7 @@ def _legend(picture: Picture) -> str:
 
 
 def colour_bar(bar: Bar) -> str:
-    """A scale of colours with its values below, in HTML."""
+    """A colour scale with its values below, in HTML."""
     stops = bar.colours[0, np.linspace(0, bar.colours.shape[1] - 1, 24).astype(int)]
     ramp = ",".join(_css(c) for c in stops)
     texts = "".join(f"<span>{escape(text)}</span>" for text in bar.texts)
@@ -197,7 +197,7 @@ def _number(value: Any, form: str = ".4g") -> str:
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
-    """A table in HTML; the cells are HTML, the first of a row its name."""
+    """A table in HTML; cells are HTML."""
     top = "".join(f"<th>{escape(h)}</th>" for h in head)
     body = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
     return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
@@ -241,7 +241,7 @@ def _energy(shown: Shown) -> str:
 
 
 def _accuracy(shown: Shown) -> str:
-    """Scores of the solution beside those of simpler depths."""
+    """Scores of the solution and of the baselines."""
     metrics: Mapping[str, Any] = shown.summary["metrics"]
     if not metrics:
         return "<p>There is no truth to compare with.</p>"
@@ -268,7 +268,7 @@ def _components(shown: Shown) -> str:
     rows = []
     for part in [*parts][:LISTED]:
         motion = parts.camera.inverse if part.label == 0 else parts.own_motion(part.label)
-        # the camera by where it is, a component by how far its centre goes
+        # shift of the camera centre, or of the centre of a component
         start = np.zeros(3) if part.label == 0 else part.centre
         shift = scale * float(np.linalg.norm(motion(start) - start))
         name = "0, the camera's motion" if part.label == 0 else str(part.label)

@@ -1,4 +1,4 @@
-"""The pictures of a result, each with its title in words and a legend with units."""
+"""The pictures of a result with titles, and legends with units."""
 
 from __future__ import annotations
 
@@ -28,17 +28,12 @@ from soup_nlp.report.shown import Shown
 Float = NDArray[np.floating]
 
 DENSE = 0.5
-"""Share of known pixels below which each is drawn larger: points of a laser are hardly seen."""
+"""If a smaller share of the pixels is known, as with laser points, each is drawn larger."""
 
 
 @dataclass(frozen=True)
 class Bar:
-    """Legend of numbers: colours from left to right, and texts at even steps below them.
-
-    Attributes:
-        colours: (1, M, 3) uint8.
-        texts: At even steps, the first at the left end.
-    """
+    """Legend of numbers: colours (1, M, 3) uint8, and texts at even steps, both left to right."""
 
     colours: Image
     texts: tuple[str, ...]
@@ -46,14 +41,14 @@ class Bar:
 
 @dataclass(frozen=True)
 class Swatches:
-    """Legend of classes: (colour, text) of each."""
+    """Legend of classes as (colour, text)."""
 
     entries: tuple[tuple[tuple[int, int, int], str], ...]
 
 
 @dataclass(frozen=True)
 class Wheel:
-    """Legend of a flow: the wheel's picture (S, S, 3) and what its rim stands for."""
+    """Legend of a flow: picture of the wheel (S, S, 3), and the meaning of its rim."""
 
     image: Image
     text: str
@@ -67,10 +62,10 @@ class Picture:
     """A picture of a result.
 
     Attributes:
-        name: Stem of its file, and key of the page.
-        title: In words, with what unknown looks like.
+        name: Stem of its file.
+        title: Title.
         image: (H, W, 3) uint8 RGB.
-        legend: What its colours stand for; None for photographs.
+        legend: Meaning of the colours; None for photographs.
     """
 
     name: str
@@ -83,8 +78,8 @@ def pictures(shown: Shown) -> dict[str, Picture]:
     """All pictures of a result by name, in the order of the overview.
 
     "image_ref", "image_next", "superpixels", "components", "flow", "flow_confidence",
-    "depth_ref", "depth_next", "depth_start", "depth_true", "error", "confidence" and "normals";
-    what is not known is left out.
+    "depth_ref", "depth_next", "depth_start", "depth_true", "error", "confidence" and "normals".
+    Pictures of unknown quantities are left out.
     """
     found = [
         *_images(shown),
@@ -146,7 +141,7 @@ def _flow(shown: Shown) -> list[Picture]:
 
 
 def _depths(shown: Shown) -> list[Picture]:
-    """Depths of both frames, of the start and of the truth, on one colour range."""
+    """Depths of both frames, of the start and of the truth, with one colour scale."""
     s, truth = shown.scale, shown.array("truth/depth_ref")
     maps = {k: shown.array(f"depth/{k}") for k in ("ref", "next", "start_ref")}
     delivered = maps["ref"]
@@ -179,7 +174,7 @@ def _depths(shown: Shown) -> list[Picture]:
 
 
 def _enlarged(values: Float) -> Float:
-    """Sparse numbers (H, W), NaN where unknown, with every known pixel drawn three pixels wide."""
+    """Numbers (H, W), NaN where unknown; sparse pixels are enlarged to a width of three."""
     known = np.isfinite(values)
     if known.mean() > DENSE or not known.any():
         return values
@@ -188,7 +183,7 @@ def _enlarged(values: Float) -> Float:
 
 
 def _own_scale(shown: Shown, which: str) -> float:
-    """Scale of a depth map to the truth: the start has its own, the next frame the solution's."""
+    """Scale of a depth map to the truth; that of the solution, except for the start."""
     name = "start" if which == "start_ref" else "solution"
     found = shown.summary["metrics"].get(name, {}).get("scale")
     return float(found) if found else 1.0

@@ -27,8 +27,7 @@ def write_ply(
 ) -> int:
     """Write a coloured point cloud (binary little endian, float32 and uchar) atomically.
 
-    Points with a number that is not a finite float32 are left out, so that a depth map with unknown
-    pixels can be given as it is.
+    Points with a number that is not a finite float32 are left out.
 
     Args:
         path: File to write; its folder must exist.
@@ -68,18 +67,10 @@ def write_ply(
 
 
 def write_cloud(path: PathLike, result: Result, frame: int) -> int:
-    """Write the points of the reference image, where they are in one of the frames, as PLY.
+    """Write the points of the reference image in frame 0 or 1 as PLY; returns their number.
 
     Properties beside position, normal and colour: `confidence` of the flow, `component`, and
-    `sigma_log_depth` where it is known. Points that are not `result.sure` are left out.
-
-    Args:
-        path: File to write; its folder must exist.
-        result: What was solved.
-        frame: 0 for the reference frame, 1 for the next one.
-
-    Returns:
-        The number of points written.
+    `sigma_log_depth` if it is known. Points that are not `result.sure` are left out.
     """
     keep = result.sure
     scalars = {"confidence": result.flow_confidence, "component": result.components.of_pixel}

@@ -1,4 +1,4 @@
-"""The record in result.h5 of the other files: their SHA-256 and a copy of summary.json."""
+"""The record of the other files in result.h5: their SHA-256 and a copy of summary.json."""
 
 from __future__ import annotations
 
@@ -16,11 +16,7 @@ from soup_nlp.storage.store import Array, Tree, replace_group
 
 
 def record_of(folder: Path) -> Tree:
-    """The record of every file that a folder holds now.
-
-    Args:
-        folder: Every file of a result, summary.json among them.
-    """
+    """The record of the files in a folder, which must hold summary.json."""
     names = [name for name in files_in(folder) if name != "result.h5"]
     text = (folder / "summary.json").read_text(encoding="utf-8")
     return _record({name: digest_of(folder / name) for name in names}, text)
@@ -36,14 +32,11 @@ def _record(files: Mapping[str, str], summary: str) -> Tree:
 
 @contextmanager
 def extended(folder: Path, overwrite: bool = False) -> Iterator[Path]:
-    """An empty folder whose files are added to a result, and to its record if it has one.
-
-    Args:
-        folder: Result folder.
-        overwrite: Overwrite files that the program did not make.
+    """An empty folder whose files are added to the result in `folder` and to its record.
 
     Raises:
-        DataError: a file cannot be written, or one of the user has the name of a new one.
+        DataError: a file cannot be written, or one of the user has the name of a new file and
+            `overwrite` is not set.
     """
     with staged(folder, overwrite=overwrite) as new:
         yield new
@@ -57,7 +50,7 @@ def extended(folder: Path, overwrite: bool = False) -> Iterator[Path]:
 
 
 def recorded_files(tree: Mapping[str, Any]) -> dict[str, str]:
-    """SHA-256 by name of the files that a result had when it was written; {} without a record."""
+    """SHA-256 of the files of a result by name, from its record; {} without a record."""
     own = tree.get(RECORD, {})
     if not {"files", "sha256"} <= own.keys():
         return {}

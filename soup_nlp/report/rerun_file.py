@@ -16,12 +16,7 @@ if TYPE_CHECKING:
 def write_rrd(path: PathLike, result: Result) -> None:
     """Write images, depth, cameras, points and components of both frames, on a timeline `frame`.
 
-    The world is the reference camera (x right, y down, z ahead), the static scene stands still in
-    it, and components move.
-
-    Args:
-        path: File to write; its folder must exist.
-        result: What was solved.
+    The world is the reference camera (x right, y down, z ahead); the static scene does not move.
 
     Raises:
         DataError: the package rerun-sdk is not installed.

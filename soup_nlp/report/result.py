@@ -1,9 +1,9 @@
-"""A result for other programs: images, cameras, surfaces and motions, of a run or a folder."""
+"""A result for files of other programs, from a run or from a result folder."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,23 +33,23 @@ Mask = NDArray[np.bool_]
 UNIT = "soup unit (free scale: the mean distance of the planes is 1)"
 """Unit of lengths in files."""
 FRAMES = ("ref", "next")
-"""Names of both frames in files."""
+"""Names of the two frames in files."""
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Both frames of a solved pair, ready for files.
+    """Images, cameras, dense 3D and components of a solved pair.
 
     Attributes:
-        name: For titles.
+        name: Name for titles.
         images: (H, W, 3) and (H', W', 3) uint8 RGB.
         K: (3, 3) intrinsics of both frames, pixels.
         reconstruction: Dense 3D of both frames.
-        components: What moves as one, and how.
-        flow_confidence: (H, W) of the flow that was solved with, 0 to 1.
-        metre: Lengths of the truth in a unit of the reconstruction, where a truth is known.
-        metre_unit: Name of the truth's unit.
-        min_confidence: Least confidence of the points in clouds and meshes.
+        components: Rigid components with their motions.
+        flow_confidence: (H, W) confidence of the flow, 0 to 1.
+        metre: Unit of length of the reconstruction in units of the truth; None without truth.
+        metre_unit: Name of the unit of the truth.
+        min_confidence: Smallest confidence of points in clouds.
     """
 
     name: str
@@ -70,12 +70,12 @@ class Result:
 
     @property
     def depths(self) -> tuple[Float, Float]:
-        """z of both frames, each of its own pixels; NaN where unknown."""
+        """z of both frames, each at its own pixels; NaN where unknown."""
         return self.reconstruction.depth_ref, self.reconstruction.depth_next
 
     @property
     def points(self) -> tuple[Float, Float]:
-        """(H, W, 3) the points of the reference image, in the camera of both frames."""
+        """(H, W, 3) points of the reference image in the camera coordinates of both frames."""
         return self.reconstruction.points_ref, self.reconstruction.points_next
 
     @property
@@ -85,31 +85,31 @@ class Result:
 
     @property
     def unit(self) -> str:
-        """Unit of lengths in a sentence for headers of files."""
+        """Unit of length as a phrase for headers of files."""
         if self.metre is None or not np.isfinite(self.metre):
             return UNIT
         return f"{UNIT}; about {self.metre:.6g} {self.metre_unit} by the truth of this pair"
 
     @property
     def sigma(self) -> Float | None:
-        """(H, W) standard deviation of log depth of the reference frame, where it is known."""
+        """(H, W) standard deviation of log depth of the reference frame; None if unknown."""
         return self.reconstruction.sigma_ref
 
     @property
     def confidence(self) -> Float:
-        """(H, W) 1 where depth is certain, 0 where nothing is known of it; 1 without sigma."""
+        """(H, W) confidence of the depth from 0 (unknown) to 1 (certain); 1 without sigma."""
         if self.sigma is None:
             return np.ones(self.flow_confidence.shape)
         return np.asarray(1.0 - self.sigma / SIGMA_PRIOR)
 
     @cached_property
     def surface(self) -> tuple[Mask, Mask]:
-        """Where the surface goes on to the right and downwards, see `geometry.surface.joined`."""
+        """Continuity of the surface to the right and downwards, see `geometry.surface.joined`."""
         return joined(self.reconstruction, self.K[0], self.components.of_pixel)
 
     @cached_property
     def sure(self) -> Mask:
-        """(H, W) pixels of clouds: seen in both frames, no guess and not at a jump of the depth."""
+        """(H, W) pixels of clouds: visible in both frames, confident, not at a depth jump."""
         known = self.confidence >= self.min_confidence
         return known & ~hidden(self.reconstruction) & ~at_jumps(*self.surface)
 
@@ -135,7 +135,7 @@ def read_result(folder: Path) -> Result:
     """The result of a folder that `solve` wrote.
 
     Raises:
-        DataError: it has no result.h5, or one that does not hold what is needed.
+        DataError: result.h5 is missing, or arrays in it are missing or inconsistent.
     """
     path = as_path(folder, "result folder") / "result.h5"
     tree, attrs = read_h5(path), read_attrs(path)
@@ -153,26 +153,33 @@ def read_result(folder: Path) -> Result:
         raise DataError("result does not hold together", where=path, found=error) from error
 
 
+def rebuilt(tree: Mapping[str, Any]) -> tuple[Reconstruction, Components]:
+    """Reconstruction and components of the delivered soup from the arrays of result.h5."""
+    soup = Soup(*(tree["solution"][key] for key in ("lam", "n", "d", "R", "t")))
+    K_ref, K_next = (tree["input"][f"K_{frame}"] for frame in FRAMES)
+    # arrays that are not needed here may be missing in results of earlier versions
+    seg = Segmentation(**{f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)})
+    height, width = tree["depth"]["next"].shape
+    rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
+    component, borrowed = tree["start"]["component"], tree["start"]["borrowed"].astype(bool)
+    return rec, find_components(soup, seg, component, K_ref, K_next, borrowed)
+
+
 def _result(tree: Mapping[str, Any], attrs: Mapping[str, Any]) -> Result:
     images = [require(tree, f"input/image_{frame}") for frame in FRAMES]
     K = [require(tree, f"input/K_{frame}") for frame in FRAMES]
-    soup = Soup(*(require(tree, f"solution/{key}") for key in ("lam", "n", "d", "R", "t")))
-    turn = np.linalg.det(soup.R)
-    if not np.isfinite(soup.distance).all() or not (np.abs(turn - 1) < 1e-3).all():
+    distance, R = (require(tree, f"solution/{key}") for key in ("d", "R"))
+    distance = require(tree, "solution/lam") * distance
+    if not np.isfinite(distance).all() or not (np.abs(np.linalg.det(R) - 1) < 1e-3).all():
         raise ValueError("planes or rotations of the solution are none")
-    parts = tree["segmentation"]
-    empty = {key: np.zeros(0) for key in Segmentation.__dataclass_fields__}
-    seg = Segmentation(**{**empty, **{k: v for k, v in parts.items() if k in empty}})
-    start = tree["start"]
+    rec, parts = rebuilt(tree)
     metre = attrs.get("scale_to_truth")
-    own = soup, seg, start["component"], K[0], K[1], start["borrowed"].astype(bool)
-    rec = reconstruct(soup, seg.labels, K[0], K[1], (images[1].shape[0], images[1].shape[1]))
     return Result(
         name=str(attrs["name"]),
         images=(images[0], images[1]),
         K=(K[0], K[1]),
         reconstruction=replace(rec, sigma_ref=tree["depth"].get("sigma_ref")),
-        components=find_components(*own),
+        components=parts,
         flow_confidence=tree["input"]["confidence"],
         metre=None if metre is None else float(metre),
         metre_unit=str(attrs.get("truth_unit", "m")),

@@ -1,4 +1,4 @@
-"""Results and files for other programs into folders: `Run.save` and `soup-nlp convert`."""
+"""Writing of results and of files for other programs: `Run.save` and `soup-nlp convert`."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def convert(
     Args:
         folder: Result folder of `solve`, `import` or `Run.save`.
         formats: See `formats.FORMATS`.
-        out: Where to; None for the result folder itself.
+        out: Output folder; None for the result folder itself.
         overwrite: Overwrite files that the program did not make.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Numbers of the page's 3D view: planes, motions and cameras, for the browser to rebuild."""
+"""Data of the 3D view of the page: planes, motions and cameras."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Int = NDArray[np.integer]
 Mask = NDArray[np.bool_]
 
 MOST_PIXELS = 600_000
-"""Pixels above which the view takes every second (third, ...) pixel only."""
+"""Larger images are subsampled for the view."""
 
 
 @dataclass(frozen=True)
@@ -26,21 +26,19 @@ class Scene:
     """The 3D view of a result, lengths in the shown unit, camera frame (x right, y down, z ahead).
 
     Attributes:
-        step: Every step-th pixel in either direction is shown.
+        step: Every step-th pixel in both directions is shown.
         labels: (h, w) superpixel of the shown pixels.
         planes: (N, 3) m with depth 1 / (m . ray).
-        motion: (N, 9) motion of every superpixel beside that of the background: rotation vector,
+        motion: (N, 9) motion of every superpixel relative to the background: rotation vector w,
             pivot p and shift s; at time t a point X is at exp(t w) (X - p) + p + t s.
-        motion_camera: (N, 9) the same in the frame of the camera, which then does not move.
+        motion_camera: (N, 9) the same relative to the camera.
         component: (N,) rigid component.
-        guess: (N,) depth comes from neighbours.
-        seen: (h, w) pixels that the next frame shows: inside it, and nothing in front of them.
-        surface: (h - 1, w - 1) every four pixels that are a piece of the surface, no curtain
-            across a jump of the depth.
-        camera: (4, 4) pose of the next camera, reference_from_next; the identity where surfaces
-            bend.
+        guess: (N,) the depth comes from neighbours.
+        seen: (h, w) pixels that are visible in the next frame.
+        surface: (h - 1, w - 1) cells of four pixels without a jump of the depth.
+        camera: (4, 4) pose of the next camera, reference_from_next; the identity if surfaces bend.
         middle: Median depth.
-        far: Depth beyond which the view starts without points.
+        far: Depth beyond which points are hidden at first.
         deepest: Largest depth.
     """
 
@@ -96,7 +94,7 @@ def _surface(shown: Shown, step: int) -> Mask:
     right, below = joined(rec, K, shown.components.of_pixel)
     height, width = rec.labels.shape
     found = triangles(right, below, np.isfinite(rec.depth_ref), step)
-    # every cell has two, the first of which begins at its upper left pixel
+    # every cell has two triangles; the first begins at its upper left pixel
     v, u = np.divmod(found[: len(found) // 2, 0], width)
     out = np.zeros(((height - 1) // step, (width - 1) // step), bool)
     out[v // step, u // step] = True
@@ -104,16 +102,16 @@ def _surface(shown: Shown, step: int) -> Mask:
 
 
 def _far(z: Float) -> tuple[float, float]:
-    """Depth where the view ends at first, and the largest one."""
+    """Depth at which the view ends at first, and largest depth."""
     if not z.size:
         return 1.0, 1.0
     deepest = float(z.max())
-    # sky and horizon are orders of magnitude behind what they are seen with
+    # sky and horizon may be orders of magnitude behind the rest
     return min(float(np.percentile(z, 99.5)), 4.0 * float(np.percentile(z, 70))), deepest
 
 
 def _pivots(shown: Shown) -> Float:
-    """(N, 3) the centre of every superpixel's component, its own where surfaces bend."""
+    """(N, 3) centre of the component of every superpixel, or of the superpixel if surfaces bend."""
     parts, rec = shown.components, shown.reconstruction
     if not shown.bending:
         centre = np.stack([part.centre for part in parts])[parts.of_superpixel]

@@ -1,9 +1,9 @@
-"""What pictures and page show of a result: of a run in memory, or of a result folder."""
+"""Input of pictures and page, from a run in memory or from a result folder."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError, printable
-from soup_nlp.geometry.components import Components, find_components
-from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
+from soup_nlp.geometry.components import Components
+from soup_nlp.geometry.soup import Reconstruction
+from soup_nlp.report.result import rebuilt
 from soup_nlp.report.tree import result_tree
 from soup_nlp.storage.files import is_file, read_json, read_text
 from soup_nlp.storage.h5_files import ReadTree, read_attrs, read_h5
@@ -34,15 +34,15 @@ class Shown:
     """Arrays and texts of a result.
 
     Attributes:
-        name: Of the problem.
+        name: Name of the problem.
         tree: Arrays as in result.h5.
         reconstruction: Dense 3D of both frames, in the result's unit of length.
-        components: What moves as one, and how, in the same unit.
+        components: Rigid components with their motions, in the same unit.
         summary: Contents of summary.json.
-        image_ref: (H, W, 3) uint8 RGB; None where it is not known any more.
+        image_ref: (H, W, 3) uint8 RGB; None if it is not available any more.
         image_next: (H', W', 3) likewise.
-        unit: Unit of length of the truth, "" where there is none.
-        verdict: What was printed at the end.
+        unit: Unit of length of the truth, "" without truth.
+        verdict: Verdict that was printed at the end of the solve.
     """
 
     name: str
@@ -62,17 +62,17 @@ class Shown:
 
     @property
     def bending(self) -> bool:
-        """Whether surfaces are taken to bend: then nothing is known to be rigid."""
+        """Whether the initialisation treats surfaces as bending; then no component is rigid."""
         return bool(self.tree["start"].get("bending", False))
 
     @property
     def at_rest(self) -> bool:
-        """Whether the camera was taken to be at rest, or to turn only."""
+        """Whether the initialisation found the camera at rest or only rotating."""
         return bool(self.tree["start"].get("at_rest", False))
 
     @property
     def scale(self) -> float:
-        """Factor from the result's unit of length to that of the truth; 1 without truth."""
+        """Factor from the unit of length of the result to that of the truth; 1 without truth."""
         found = self.summary["metrics"].get("solution", {}).get("scale")
         return float(found) if found else 1.0
 
@@ -82,7 +82,7 @@ class Shown:
         return self.unit or "units"
 
     def array(self, place: str) -> NDArray[Any] | None:
-        """The array at "a/b" of the tree, None where there is none."""
+        """The array at "a/b" of the tree; None if there is none."""
         here: Any = self.tree
         for key in place.split("/"):
             if key not in here:
@@ -96,7 +96,7 @@ class Shown:
 
 
 def of_run(run: Run, summary: Mapping[str, Any], verdict: str) -> Shown:
-    """What a run shows."""
+    """Arrays and texts of a run."""
     truth, pair = run.pair.truth, run.pair
     unit = truth.unit if truth is not None and "solution" in run.metrics else ""
     return Shown(
@@ -113,11 +113,11 @@ def of_run(run: Run, summary: Mapping[str, Any], verdict: str) -> Shown:
 
 
 def of_folder(folder: Path, pair: Pair | None = None) -> Shown:
-    """What a result folder shows.
+    """Arrays and texts of a result folder.
 
     Args:
         folder: The folder.
-        pair: The result's input, for the images of a folder that does not hold them.
+        pair: Input of the result, for the images of a folder that does not hold them.
 
     Raises:
         DataError: result.h5 or summary.json is missing or damaged.
@@ -137,7 +137,7 @@ def of_folder(folder: Path, pair: Pair | None = None) -> Shown:
         unit = pair.truth.unit if pair.truth is not None else unit
     unit = unit if "solution" in metrics else ""
     try:
-        rec, parts = _rebuilt(tree)
+        rec, parts = rebuilt(tree)
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise DataError("result does not hold together", where=folder, found=error) from error
     return Shown(
@@ -153,19 +153,6 @@ def of_folder(folder: Path, pair: Pair | None = None) -> Shown:
     )
 
 
-def _rebuilt(tree: ReadTree) -> tuple[Reconstruction, Components]:
-    """Reconstruction and components of the delivered soup."""
-    soup = Soup(*(tree["solution"][k] for k in ("lam", "n", "d", "R", "t")))
-    K_ref, K_next = (tree["input"][f"K_{k}"] for k in ("ref", "next"))
-    # what rigid components need of it
-    kept = {f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)}
-    seg, start = Segmentation(**kept), tree["start"]
-    height, width = tree["depth"]["next"].shape
-    rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
-    borrowed = start["borrowed"].astype(bool)
-    return rec, find_components(soup, seg, start["component"], K_ref, K_next, borrowed)
-
-
 def _values(tree: Tree) -> ReadTree:
     """The arrays of a tree without their descriptions, as `read_h5` returns them."""
     return {
@@ -175,7 +162,7 @@ def _values(tree: Tree) -> ReadTree:
 
 
 def _ending(log: Path) -> str:
-    """The verdict at the end of a log; "" where there is none."""
+    """The verdict at the end of a log; "" if there is none."""
     if not is_file(log):
         return ""
     lines = [printable(line) for line in read_text(log, "log.txt").splitlines()]

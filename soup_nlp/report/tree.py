@@ -1,4 +1,4 @@
-"""Layout of result.h5: every array of a run with its unit, its axes and a description."""
+"""Layout of result.h5: unit, axes and description of every array of a run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run
 
 Table: TypeAlias = Mapping[str, tuple[str, str, str]]
-"""Unit, axes and description by name; the unit "truth" stands for that of the truth."""
+"""Unit, axes and description by name; "truth" stands for the unit of the truth."""
 
 _INPUT: Table = {
     "image_ref": ("1", "H,W,3", "reference image, 8-bit RGB"),
@@ -46,6 +46,11 @@ _ENERGY: Table = {
     "edges": ("1", "E,2", "K-NN edges i < k"),
     "edge_weight": ("1", "E", "w1 = w2, both directions folded, less between two components"),
     "prior_weight": ("1", "E", "weight of E_prior: noise of the flow / K for each direction"),
+    "prior_relief": (
+        "1",
+        "E",
+        "relative difference of inverse depth that costs nothing in E_prior",
+    ),
     "edge_unit": ("1", "E", "length unit of an edge, see local_units"),
     "rotation_scale": ("1", "", "factor of |R_i - R_k|"),
     "pairs": ("1", "P,2", "neighbours i < k that share boundary"),
@@ -67,6 +72,7 @@ _START: Table = {
     "error": ("px", "N", "mean re-projection error"),
     "parallax": ("px", "N", "displacement that the translation causes"),
     "borrowed": ("1", "N", "plane or motion from neighbours"),
+    "grounded": ("1", "N", "borrowed, and below the horizon of a known ground"),
     "motion": ("1", "N", "dominant motion, -1 for its own"),
     "component": ("1", "N", "rigid component"),
     "surface": ("1", "N", "region without a flow discontinuity"),
@@ -138,7 +144,7 @@ _DESCENT = {
     "regularization_size": "median damping of the superpixels",
     "alpha_pr": "smallest step size of a superpixel",
 }
-"""History of a phase of the presolve, which keeps the keys of Ipopt's."""
+"""History of a phase of the presolve, with the keys of Ipopt."""
 _ROUNDS = {
     "mrf_energy": "energy of the chosen labels in the MRF of the particles",
     "bound": "TRW-S's lower bound on every choice among the particles",
@@ -174,7 +180,7 @@ LAYOUT: Mapping[str, Table] = {
     "depth": _DEPTH,
     "truth": _TRUTH,
 }
-"""Tables of the groups whose axes are named."""
+"""Tables of the groups by name."""
 
 
 def result_tree(run: Run) -> Tree:
@@ -227,7 +233,7 @@ def result_tree(run: Run) -> Tree:
 
 
 def _arrays(table: Table, values: object, unit: str = "") -> dict[str, Array]:
-    """The values of a record or mapping that a table describes, without those that are None."""
+    """Values of a record or mapping that a table describes, without None."""
     found = values if isinstance(values, Mapping) else vars(values)
     return {
         key: Array(found[key], unit if own == "truth" else own, text, axes)
@@ -248,7 +254,7 @@ def _components(run: Run) -> dict[str, Any]:
 
 
 def _constrained(key: str) -> tuple[str, str]:
-    """Description and axes of a vector of multipliers."""
+    """Description and axis of a vector of multipliers."""
     if key == "lam_x":
         return "of the bounds of the variables, in the order of the NLP", "X"
     return f"of the constraints {key.removeprefix('lam_g_')}, in the order of the NLP", "G"

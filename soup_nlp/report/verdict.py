@@ -42,13 +42,13 @@ DELIVERED = {
     "start": "the start",
 }
 OF_ANSWER = ("nlp_infeasibility", "dual_infeasibility", "complementarity")
-"""Residuals of Ipopt's own answer; the others are those of the delivered soup."""
+"""Residuals that are those of Ipopt's answer; the others are those of the delivered soup."""
 
 PAD = " " * 12
 
 
 def _found(run: Run) -> str:
-    """Who found the minimum, and the exact energy where each stage ended."""
+    """Which stage found the minimum, and the exact energy at the end of each stage."""
     s = run.solution
     ends = dict(s.ends) | ({} if run.refined is None else {"refinement": run.energy["total"]})
     who = {
@@ -60,26 +60,14 @@ def _found(run: Run) -> str:
 
 
 def verdict(run: Run, folder: Path, files: Sequence[str], limit: float | None = None) -> str:
-    """The facts of a run, its files and the next command.
-
-    Args:
-        run: The run.
-        folder: Where its files are.
-        files: Their names.
-        limit: Largest MRE that the problem file allows, if it says so.
-    """
+    """Facts, files and next command; `limit` is the largest MRE that the problem file expects."""
     look = [f"look        soup-nlp view {folder}"] if PAGE in files else []
     lines = [f"files       {folder}/: {', '.join(files)}", *look]
     return "\n".join([facts(run, limit), *lines, f"next        soup-nlp check {folder}"])
 
 
 def facts(run: Run, limit: float | None = None) -> str:
-    """Status, energy, residuals, accuracy and times.
-
-    Args:
-        run: The run.
-        limit: Largest MRE that the problem file allows, if it says so.
-    """
+    """Status, energy, residuals, accuracy and times; `limit` is the largest expected MRE."""
     s = run.solution
     words = WORDS.get(s.status, f"not converged: {s.status}, best iterate kept")
     lines = [f"status      {words} ({s.status})"]
@@ -108,8 +96,8 @@ def facts(run: Run, limit: float | None = None) -> str:
     if answer:
         lines.append(f"{PAD}Ipopt's answer: {answer}")
     shares = certainty(run)
-    said = {"depth": depth_words(run, shares), "certainty": certainty_lines(shares)}
-    for title, (first, *rest) in said.items():
+    sections = {"depth": depth_words(run, shares), "certainty": certainty_lines(shares)}
+    for title, (first, *rest) in sections.items():
         lines += [f"{title:<12}{first}", *(PAD + line for line in rest)]
     if run.metrics:
         lines += [f"accuracy    {protocol(run.metrics)}"]
@@ -155,7 +143,7 @@ def protocol(metrics: Mapping[str, DepthMetrics]) -> str:
 
 
 def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
-    """A table of scores: the solution beside the start, one rigid motion and a constant depth."""
+    """Table of the scores of solution, start and baselines."""
     lines = [f"{'':<17}{'MRE':>8}{'median':>9}{'skill':>8}{'coverage':>10}"]
     if "constant" not in metrics:
         # only the next frame has a truth

@@ -1,4 +1,4 @@
-"""A chain of solved pairs in one scale and one frame of reference."""
+"""A chain of solved pairs with a common scale and frame of reference."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Solved pairs of consecutive frames, the first camera's axes and the first pair's unit.
+    """Solved pairs of consecutive frames in the axes of the first camera and the first unit.
 
     Attributes:
-        pairs: Pair k is of the frames k and k + 1.
-        scales: (K,) factor from each pair's unit to that of the first.
-        links: What the scales were made of, those of pairs over two frames too.
-        world_from_camera: Pose of every frame's camera, K + 1.
-        tracks: Number of the track of every component, by its label, of every pair.
+        pairs: Pair k has the frames k and k + 1.
+        scales: (K,) factor from the unit of each pair to that of the first.
+        links: Links that determine the scales, including those of pairs over two frames.
+        world_from_camera: Camera poses of the K + 1 frames.
+        tracks: Number of the track by label of a component, for every pair.
     """
 
     pairs: tuple[SolvedPair, ...]
@@ -48,18 +48,18 @@ class Chain:
     __repr__ = __str__
 
     def depth(self, frame: int) -> Float:
-        """(H, W) z of a frame in the chain's unit; of the last frame as its pair's next one."""
+        """(H, W) z of a frame in the unit of the chain; the last frame is a next frame."""
         if frame == len(self.pairs):
             return self.scales[-1] * self.pairs[-1].result.depths[1]
         return self.scales[frame] * self.pairs[frame].result.depths[0]
 
     def points(self, frame: int) -> Float:
-        """(H, W, 3) points of a frame that has a pair, in the world."""
+        """(H, W, 3) points of a frame but the last, in world coordinates."""
         local = self.scales[frame] * self.pairs[frame].result.points[0]
         return self.world_from_camera[frame](local)
 
     def motion(self, pair: int, label: int) -> RigidMotion:
-        """What a component does in the world from a frame to the next; label 0 stands still."""
+        """Motion of a component in the world from a frame to the next; label 0 does not move."""
         M, s = self.pairs[pair].result.components[label].motion, self.scales[pair]
         before, after = self.world_from_camera[pair], self.world_from_camera[pair + 1]
         return after @ RigidMotion(M.R, s * M.t) @ before.inverse
@@ -77,11 +77,11 @@ class Chain:
 
 
 def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> Chain:
-    """Put consecutive pairs on one scale and follow camera and components.
+    """Determine a common scale of consecutive pairs, the camera path, and tracks of components.
 
     Args:
-        pairs: Of the frames (0, 1), (1, 2), ...
-        over: Further pairs of the same frames, such as (0, 2), whose links are used too.
+        pairs: Pairs of the frames (0, 1), (1, 2), ...
+        over: Further pairs of the same frames, such as (0, 2), for more links.
 
     Raises:
         DataError: the pairs are not consecutive, or share no pixel.
@@ -110,10 +110,10 @@ def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> 
 
 
 def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
-    """Links of all pairs that share a frame, over the static scene that both are sure of.
+    """Links of all pairs that share a frame, from static pixels that are confident in both.
 
-    A pair without parallax has a depth that is a guess: its links are flagged, and the pairs on
-    both sides of it are linked across it, the depth of the one carried along by its flow.
+    The depth of a pair without parallax is a guess, so its links are flagged. The pairs before and
+    after it are linked directly, with the depth of the former moved by the flow of this pair.
     """
     out: list[Link] = []
     for b, second in enumerate(pairs):
@@ -136,7 +136,7 @@ def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
 
 
 def _view(pair: SolvedPair, frame: int) -> tuple[Float, Mask]:
-    """(H, W) z of one of a pair's frames, and which pixels are of the static scene and sure."""
+    """(H, W) z of a frame of a pair, and the mask of confident pixels of the static scene."""
     result = pair.result
     keep = result.sure & (result.components.of_pixel == 0)
     if frame == pair.first:
@@ -145,7 +145,7 @@ def _view(pair: SolvedPair, frame: int) -> tuple[Float, Mask]:
 
 
 def _carry(before: SolvedPair, still: SolvedPair) -> tuple[Float, Mask]:
-    """The next frame's z of a pair, carried through a pair whose camera rests."""
+    """z and mask of the next frame of a pair, moved by the flow of a following static pair."""
     z, keep = _view(before, before.second)
     _, own = _view(still, still.first)
     source = still.result.reconstruction.source_next

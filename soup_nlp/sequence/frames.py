@@ -24,11 +24,11 @@ Raw = dict[str, Any]
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp", ".webp")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 LAYOUT = "frame_*"
-"""Images of a folder that holds other ones too, such as depth."""
+"""Pattern of the images in a folder that also holds other images, such as depth."""
 
 
 class Frames(ABC):
-    """Frames in order."""
+    """A sequence of frames."""
 
     @abstractmethod
     def __len__(self) -> int:
@@ -40,7 +40,7 @@ class Frames(ABC):
 
     @abstractmethod
     def source(self, frame: int) -> str:
-        """Where a frame comes from."""
+        """Path or description of a frame."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class FileFrames(Frames):
 
     Attributes:
         paths: Images in order.
-        camera: Keys `intrinsics` or `fov` of an input of files.
-        depths: True depth of every frame, for measuring only; empty where unknown.
+        camera: Key `intrinsics` or `fov` of an input of files.
+        depths: True depth of every frame, for evaluation only; empty if unknown.
         depth_scale: Values per unit of length of a 16-bit .png depth.
     """
 
@@ -76,9 +76,9 @@ class FileFrames(Frames):
         return str(self.paths[frame])
 
     def apart(self, most: int | None = None) -> FileFrames:
-        """The frames that are far enough apart, see `key_frames`."""
+        """The frames with enough parallax, see `key_frames`."""
         with warnings.catch_warnings():
-            # every solve says where the focal length comes from
+            # every solve gives this warning too
             warnings.simplefilter("ignore", DataWarning)
             first = make_problem({"input": self.pair(0, 1)}, where="sequence").load_pair()
         keep = key_frames(self.paths, first.K_ref, most)
@@ -88,7 +88,7 @@ class FileFrames(Frames):
 
 @dataclass(frozen=True)
 class SceneFrames(Frames):
-    """Frames of a rendered scene, whose camera and bodies go on as they begin."""
+    """Frames of a rendered scene, whose camera and bodies repeat their first motion."""
 
     scene: str
     count: int
@@ -116,7 +116,7 @@ class SceneFrames(Frames):
 def find_images(source: Path) -> list[Path]:
     """Images of a folder or of a pattern such as `clip/*.jpg`, in the order of their numbers.
 
-    Of a folder with images named frame_* only these are taken.
+    In a folder with images named frame_*, only these are used.
 
     Raises:
         DataError: there are fewer than two.
@@ -138,7 +138,7 @@ def find_images(source: Path) -> list[Path]:
 
 
 def find_depths(images: list[Path]) -> list[Path]:
-    """Files depth_* beside images frame_*, one for each; empty where one is missing."""
+    """Files depth_* beside images frame_*, one for each; empty if one is missing."""
     out = []
     for path in images:
         stem = path.stem.replace("frame_", "depth_")
@@ -151,7 +151,7 @@ def find_depths(images: list[Path]) -> list[Path]:
 
 
 def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = None) -> list[Path]:
-    """Write every `stride`-th frame of a video as PNG into an output folder; their paths.
+    """Write every `stride`-th frame of a video as PNG into a folder; returns their paths.
 
     Raises:
         DataError: the video cannot be read, or the folder holds other files of these names.
@@ -185,6 +185,6 @@ def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = N
 
 
 def _by_number(path: Path) -> list[Any]:
-    """Key of an order in which 10 comes after 9."""
+    """Sort key that orders numbers by value, so that 10 comes after 9."""
     words = re.split(r"(\d+)", path.name)
     return [(1, int(word), "") if word.isdecimal() else (0, 0, word) for word in words]

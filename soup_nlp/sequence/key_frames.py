@@ -1,4 +1,4 @@
-"""Frames of a sequence as far apart as their parallax asks."""
+"""Choice of key frames of a sequence by their parallax."""
 
 from __future__ import annotations
 
@@ -17,57 +17,52 @@ from soup_nlp.geometry.rotation import exp
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
-WANTED = 0.01
-"""Median parallax of two key frames, in larger sides of the image."""
-LONGEST = 10
-"""Most frames from a key frame to the next."""
+KEY_PARALLAX = 0.01
+"""Median parallax of consecutive key frames, relative to the larger side of the image."""
+MAX_STEP = 10
+"""Largest number of frames from a key frame to the next."""
 SIDE = 640
 """Larger side of the images in which points are tracked, pixels."""
-LOST = 0.3
-"""Share of the points below which two images have too little in common."""
-FEWEST = 30
-"""The same as a number of points."""
+MIN_TRACKED = 0.3
+"""Smallest share of the points that must be tracked."""
+MIN_POINTS = 30
+"""Smallest number of tracked points."""
 
 
 def key_frames(images: Sequence[Path], K: Float, most: int | None = None) -> list[int]:
-    """Indices of frames of which each has enough parallax to the one before.
+    """Indices of key frames.
 
-    From a key frame the next one is the first with a parallax of `WANTED`, or the last before
-    points are lost or `LONGEST` frames are passed.
+    The next key frame is the first one with a parallax of `KEY_PARALLAX`, or the last one before
+    points are lost or after `MAX_STEP` frames.
 
     Args:
         images: All frames in order.
         K: (3, 3) intrinsics, pixels.
-        most: Most key frames.
+        most: Largest number of key frames.
     """
-    read = lru_cache(LONGEST + 1)(_small)
+    read = lru_cache(MAX_STEP + 1)(_small)
     chosen, last = [0], len(images) - 1
     while chosen[-1] < last and (most is None or len(chosen) < most):
         here = chosen[-1]
         one, scale = read(images[here])
         camera = np.diag([scale, scale, 1.0]) @ K
         best = here + 1
-        for there in range(here + 1, min(here + LONGEST, last) + 1):
+        for there in range(here + 1, min(here + MAX_STEP, last) + 1):
             found = parallax(one, read(images[there])[0], camera)
             if found is None:
                 break
             best = there
-            if found >= WANTED:
+            if found >= KEY_PARALLAX:
                 break
         chosen.append(best)
     return chosen
 
 
 def parallax(one: Grey, other: Grey, K: Float) -> float | None:
-    """Median displacement that no rotation of the camera explains, in larger sides of the image.
+    """Median displacement of two grey images (H, W) after removal of a camera rotation.
 
-    Args:
-        one: (H, W) grey image.
-        other: (H, W) the other one.
-        K: (3, 3) their intrinsics, pixels.
-
-    Returns:
-        The share, None where too few points can be tracked.
+    It is relative to the larger side of the image; None if too few points can be tracked. K (3, 3)
+    are the intrinsics, pixels.
     """
     start = cv2.goodFeaturesToTrack(one, 1000, 0.01, 7)
     if start is None or one.shape != other.shape:
@@ -77,7 +72,7 @@ def parallax(one: Grey, other: Grey, K: Float) -> float | None:
     again, back, _ = cv2.calcOpticalFlowPyrLK(other, one, end, None, **options)
     error = np.linalg.norm(start - again, axis=2).ravel()
     good = (there.ravel() > 0) & (back.ravel() > 0) & (error < 1)
-    if good.sum() < max(FEWEST, LOST * len(good)):
+    if good.sum() < max(MIN_POINTS, MIN_TRACKED * len(good)):
         return None
     p, q = (x.reshape(-1, 2)[good].astype(np.float64) for x in (start, end))
     rays = np.column_stack([p, np.ones(len(p))]) @ np.linalg.inv(K).T
@@ -91,7 +86,7 @@ def parallax(one: Grey, other: Grey, K: Float) -> float | None:
 
 
 def _small(path: Path) -> tuple[Grey, float]:
-    """A picture in grey at a size to track points in, and its scale."""
+    """An image in grey, reduced to `SIDE`, and its scale."""
     image = cv2.cvtColor(read_image(path, turn=True), cv2.COLOR_RGB2GRAY)
     scale = min(1.0, SIDE / max(image.shape))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""A page of a chain: image and depth of every frame with a slider, paths from above, the table."""
+"""The page of a chain: images and depths with a slider, a plan view of paths, a table."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from soup_nlp.report.pictures import Bar
 from soup_nlp.sequence.chain import Chain
 
 WIDTH = 720
-"""Most columns of a picture in the page."""
+"""Largest width of an image in the page, pixels."""
 QUALITY = 80
-"""Of the pictures, JPEG."""
+"""JPEG quality of the images."""
 PLAN = 360
 """Side of the plan view, pixels."""
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#17becf")
@@ -28,31 +28,31 @@ COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e
 
 def chain_page(
     chain: Chain,
-    told: Mapping[str, Any],
+    contents: Mapping[str, Any],
     images: Sequence[Image],
     depths: Sequence[Image],
     span: tuple[float, float],
 ) -> str:
-    """The page as HTML that needs nothing else.
+    """The page as one HTML file.
 
     Args:
         chain: The chain.
-        told: Contents of chain.json.
+        contents: Contents of chain.json.
         images: (H, W, 3) image of every frame.
         depths: (H, W, 3) its depth in colour, one range for all.
         span: That range, (near, far).
     """
     frames = [[_jpeg(a), _jpeg(b)] for a, b in zip(images, depths)]
-    title = html.escape(str(told["name"]))
+    title = html.escape(str(contents["name"]))
     return _PAGE.format(
         title=title,
         last=len(chain) - 1,
         frames=json.dumps(frames),
-        names=json.dumps([Path(x).name for x in told["sources"]]).replace("<", "\\u003c"),
+        names=json.dumps([Path(x).name for x in contents["sources"]]).replace("<", "\\u003c"),
         bar=_bar(*span),
         plan=_plan(chain),
-        table=_table(told),
-        unit=html.escape(str(told["unit"])),
+        table=_table(contents),
+        unit=html.escape(str(contents["unit"])),
     )
 
 
@@ -76,7 +76,7 @@ def _plan(chain: Chain) -> str:
     camera = np.array([m.t for m in chain.world_from_camera])
     names = sorted({t for own in chain.tracks for t in own.values()} - {0})
     paths = {t: np.array(list(chain.path(t).values())) for t in names}
-    # what is seen in one pair only is mostly no body
+    # tracks in one pair only are mostly not real bodies
     paths = {t: p for t, p in paths.items() if len(p) > 2}
     points = np.concatenate([camera, *paths.values()])[:, [0, 2]]
     low, high = points.min(axis=0), points.max(axis=0)
@@ -113,11 +113,11 @@ def _plan(chain: Chain) -> str:
     return f'<svg width="{PLAN}" height="{PLAN}" viewBox="0 0 {PLAN} {PLAN}">{"".join(drawn)}</svg>'
 
 
-def _table(told: Mapping[str, Any]) -> str:
+def _table(contents: Mapping[str, Any]) -> str:
     """Links, and scores where there is a truth, as a table of HTML."""
-    true = {tuple(k["pairs"]): k["true"] for k in (told["score"] or {}).get("links", ())}
+    true = {tuple(k["pairs"]): k["true"] for k in (contents["score"] or {}).get("links", ())}
     rows = []
-    for k in told["links"]:
+    for k in contents["links"]:
         a, b = k["pairs"]
         known = f"{true[a, b]:.3f}" if (a, b) in true else ""
         note = "bridge" if k["bridge"] else "a guess" if k["flagged"] else ""
@@ -125,8 +125,8 @@ def _table(told: Mapping[str, Any]) -> str:
         rows.append([f"{a}, {b}", *numbers, note])
     heads = ["pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", ""]
     out = table(heads, rows)
-    if told["score"]:
-        s = told["score"]
+    if contents["score"]:
+        s = contents["score"]
         out += (
             f"<p>Mean relative error: {s['mre_own_scale']:.4f} with a scale for every frame,"
             f" {s['mre_one_scale']:.4f} with one for the sequence ({s['cost']:+.1%}).</p>"

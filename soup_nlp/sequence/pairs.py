@@ -1,4 +1,4 @@
-"""Solve the pairs of a sequence, each into a result folder; what is there already is kept."""
+"""Solving of the pairs of a sequence into result folders; existing results are reused."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from soup_nlp.sequence.frames import Frames, Raw
 from soup_nlp.storage.h5_files import read_h5
 
 ROWS = "pairs.jsonl"
-"""Rows of the pairs of a sequence."""
-REST = 0.5
-"""Share of the background whose depth is a guess above which a pair has no parallax."""
+"""File with a row for each pair of a sequence."""
+MAX_GUESSED = 0.5
+"""A pair has no parallax if the depth of a larger share of its background is a guess."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class SolvedPair:
     Attributes:
         first: Index of the reference frame.
         second: Index of the next frame.
-        result: What was solved.
-        truth: Arrays of the truth by name, as in result.h5; empty where unknown.
+        result: Result of the solve.
+        truth: Arrays of the truth by name, as in result.h5; empty if unknown.
         parallax_px: Median displacement that the camera's translation causes, pixels.
     """
 
@@ -44,7 +44,7 @@ class SolvedPair:
     @property
     def still(self) -> bool:
         """Whether most of the background has no parallax, so that its depth is a guess."""
-        return self.result.components.background.borrowed > REST
+        return self.result.components.background.borrowed > MAX_GUESSED
 
 
 def solve_pairs(
@@ -56,14 +56,14 @@ def solve_pairs(
     say: Callable[[int, int, Row], None] | None = None,
     dask: str | None = None,
 ) -> list[SolvedPair]:
-    """Solve pairs of frames in parallel processes or on Dask; what is stored is only read.
+    """Solve pairs of frames in parallel processes or on Dask; stored results are read.
 
     Args:
         frames: The sequence.
         which: Indices of the frames of every pair.
-        folder: Gets `pairs/000_001/` ... and a row a pair in `pairs.jsonl`.
-        overrides: Of the problem, such as segmentation.superpixels=500.
-        workers: Processes.
+        folder: Output folder for `pairs/000_001/` ... and `pairs.jsonl`.
+        overrides: Overrides of the problems, such as segmentation.superpixels=500.
+        workers: Number of processes.
         say: Called with (done, total, row) after every solve.
         dask: See `measure_all`; its workers write into the same folder.
 
@@ -71,7 +71,7 @@ def solve_pairs(
         SolverError: a pair cannot be solved.
     """
     jobs, places = [], []
-    # a folder holds what was solved into it last
+    # the last row of a pair describes its folder
     last = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
     for first, second in which:
         place = folder.resolve() / "pairs" / f"{first:03d}_{second:03d}"

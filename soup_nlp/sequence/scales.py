@@ -1,4 +1,4 @@
-"""One scale for all pairs of a sequence: links between pairs that share a frame."""
+"""Common scale of the pairs of a sequence from links between pairs that share a frame."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from soup_nlp.errors import DataError
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FEWEST = 200
-"""Pixels that a link needs."""
+MIN_PIXELS = 200
+"""Links with fewer pixels are flagged."""
 LEAST_SPREAD = 0.005
-"""Spread of a log ratio below which links do not gain weight."""
+"""Smallest spread of a log ratio in the weight of a link."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """What a frame that two pairs share says of their scales.
+    """Ratio of the scales of two pairs, measured in a common frame.
 
     Attributes:
         first: Index of the pair.
@@ -29,7 +29,7 @@ class Link:
         log_ratio: Logarithm of the second's scale over the first's, the median over pixels.
         spread: Robust standard deviation of the same over pixels (1.4826 MAD).
         pixels: Number of pixels.
-        bridge: Whether it was carried over a pair without parallax in between.
+        bridge: Whether a pair without parallax lies between the two.
         flagged: Whether it is a guess: a pair has no parallax, or few pixels are shared.
     """
 
@@ -52,16 +52,9 @@ def link(
     bridge: bool = False,
     flagged: bool = False,
 ) -> Link | None:
-    """The link of two depth maps of one frame; None where they share no pixel.
+    """The link of depth maps `one` and `other` (H, W) of a frame; None without a shared pixel.
 
-    Args:
-        first: Index of the pair that `one` is of.
-        second: Index of the pair that `other` is of.
-        one: (H, W) z, NaN where unknown.
-        other: (H, W) z of the same frame.
-        keep: (H, W) pixels that count.
-        bridge: See `Link`.
-        flagged: See `Link`.
+    `keep` (H, W) is the mask of used pixels; for the other arguments see `Link`.
     """
     with np.errstate(invalid="ignore"):
         both = keep & (one > 0) & (other > 0)
@@ -71,13 +64,13 @@ def link(
     middle = float(np.median(ratio))
     spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
     count = int(both.sum())
-    return Link(first, second, middle, spread, count, bridge, flagged or count < FEWEST)
+    return Link(first, second, middle, spread, count, bridge, flagged or count < MIN_PIXELS)
 
 
 def solve_scales(count: int, links: Sequence[Link]) -> Float:
-    """(count,) scales of all pairs, the first's 1: a robust linear system of their logarithms.
+    """(count,) scales of all pairs, 1 for the first, by robust least squares of their logarithms.
 
-    Every link weighs by its spread; those that contradict the others lose weight (Cauchy).
+    A link is weighted by its spread; the Cauchy loss lowers the weight of contradictory links.
 
     Raises:
         DataError: a pair is linked to no other.
@@ -100,7 +93,7 @@ def solve_scales(count: int, links: Sequence[Link]) -> Float:
     rows[at, ends[:, 0]] -= 1
     value = np.array([k.log_ratio for k in links])
     sigma = np.maximum([k.spread for k in links], LEAST_SPREAD)
-    # a guess holds only where nothing else does
+    # a flagged link gets a low weight
     sigma = np.where([k.flagged for k in links], 10 * np.maximum(sigma, 0.1), sigma)
     A, b = rows[:, 1:] / sigma[:, None], value / sigma
     first = np.linalg.lstsq(A, b, rcond=None)[0]

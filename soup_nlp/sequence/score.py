@@ -1,4 +1,4 @@
-"""A chain against the truth: one scale for all beside one per pair, and the camera's path."""
+"""Errors of a chain: depth with one scale for all or one for each frame, and the camera path."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def true_depth(chain: Chain, frame: int) -> Float | None:
 def score(chain: Chain) -> dict[str, Any] | None:
     """Errors of depth and path; None without a truth.
 
-    "frames" has the MRE of every frame by a median scale of its own, and by one for the sequence;
-    "links" the true ratio of scales beside the estimated one; "path" the error of the camera's
-    positions after the best similarity, over the length of the true path, where that is known.
+    "frames" has the MRE of every frame with its own median scale and with one for the sequence,
+    "links" the estimated and the true ratio of scales, and "path" the error of the camera positions
+    after the best similarity relative to the length of the true path, if it is known.
     """
     found = [(k, true_depth(chain, k)) for k in range(len(chain))]
     known = {k: z for k, z in found if z is not None and true_pixels(z, None).any()}
@@ -51,8 +51,8 @@ def score(chain: Chain) -> dict[str, Any] | None:
             true = [
                 depth_metrics(p.result.depths[0], known[i]).scale for i, p in ((k, a), (k + 1, b))
             ]
-            said = chain.scales[k + 1] / chain.scales[k]
-            links.append({"pairs": [k, k + 1], "estimated": said, "true": true[1] / true[0]})
+            estimated = chain.scales[k + 1] / chain.scales[k]
+            links.append({"pairs": [k, k + 1], "estimated": estimated, "true": true[1] / true[0]})
     return {
         "scale": one,
         "frames": frames,
@@ -67,7 +67,7 @@ _KEYS = ("mre_own_scale", "mre_one_scale")
 
 
 def path_error(chain: Chain) -> dict[str, float] | None:
-    """Error of the camera's positions after a similarity; None where the true path is unknown."""
+    """Error of the camera positions after a similarity; None if the true path is unknown."""
     motions = [p.truth.get("motions") for p in chain.pairs]
     if any(m is None or not np.isfinite(m[0]).all() for m in motions):
         return None
@@ -87,7 +87,7 @@ def path_error(chain: Chain) -> dict[str, float] | None:
 
 
 def aligned(points: Float, target: Float) -> Float:
-    """Points (M, 3) after the similarity of least squares to target (M, 3) (Umeyama, 1991)."""
+    """Points (M, 3) after the least-squares similarity to `target` (M, 3) (Umeyama, 1991)."""
     a, b = points - points.mean(axis=0), target - target.mean(axis=0)
     U, S, Vt = np.linalg.svd(b.T @ a)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])

@@ -1,4 +1,4 @@
-"""What one scale for a sequence costs: the table of `soup-nlp bench chain`."""
+"""The study of `soup-nlp bench chain`: error caused by one scale for a sequence."""
 
 from __future__ import annotations
 
@@ -25,11 +25,7 @@ def measure_chain(
 ) -> Row:
     """Errors of a sequence with a scale for every frame and with one for all.
 
-    Args:
-        sequence: A rendered scene or `TRACKING`.
-        frames: Most frames.
-        data: Folder of `TRACKING`.
-        overrides: Of the problems.
+    `sequence` is a rendered scene or `TRACKING`, whose folder is in `data`.
 
     Raises:
         DataError: the sequence has no truth.

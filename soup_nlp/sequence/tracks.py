@@ -1,4 +1,4 @@
-"""Components followed through the frames of a sequence."""
+"""Tracking of components through the frames of a sequence."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from soup_nlp.geometry.soup import Reconstruction
 Labels = NDArray[np.integer]
 
 SAME = 0.3
-"""Intersection over union from which two components are one."""
+"""Smallest intersection over union of two components of one track."""
 
 
 def carried(of_pixel: Labels, rec: Reconstruction) -> Labels:
-    """(H', W') labels of the reference frame where they are seen in the next one, -1 elsewhere."""
+    """(H', W') labels of the reference frame in the next frame; -1 where not visible."""
     source = rec.source_next
     return np.where(source >= 0, of_pixel.ravel()[source], -1)
 
 
 def follow(before: Labels, after: Labels) -> dict[int, int]:
-    """Which component of a pair each one of the pair before is, by overlap in the frame they share.
+    """Matches of the components of consecutive pairs by overlap in their common frame.
 
     Args:
-        before: (H, W) labels, carried to the frame; -1 where unknown, 0 is the background.
-        after: (H, W) labels of the other pair.
+        before: (H, W) labels of the first pair in the common frame; -1 unknown, 0 background.
+        after: (H, W) labels of the second pair.
 
     Returns:
-        Label after by label before; each at most once, the largest overlap first.
+        Label after by label before, matched greedily by overlap.
     """
     known = before >= 0
     old, new = before[known].astype(np.int64), after[known].astype(np.int64)
@@ -38,7 +38,7 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
     both = both.reshape(-1, count)
     union = both.sum(axis=0) + both.sum(axis=1, keepdims=True) - both
     share = both / np.maximum(union, 1)
-    # the background is not followed
+    # the background has no track
     share[0], share[:, 0] = 0, 0
     out: dict[int, int] = {}
     while share.max(initial=0.0) >= SAME:
@@ -49,11 +49,11 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
 
 
 def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dict[int, int]]:
-    """Number of the track of every component of every pair; 0 is the background.
+    """Number of the track by label of the component, for every pair; 0 is the background.
 
     Args:
-        matches: What `follow` found between each pair and the next one.
-        counts: Components of every pair, the background counted.
+        matches: Results of `follow` for consecutive pairs.
+        counts: Number of components of every pair, with the background.
     """
     out: list[dict[int, int]] = []
     fresh = 1

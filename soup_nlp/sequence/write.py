@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.report.colour import Image, colourise_depth, depth_range
-from soup_nlp.report.figures import write_clipped_depth_png16
+from soup_nlp.report.figures import depth_png_scale, write_clipped_depth_png16
 from soup_nlp.report.pointcloud import AXES, write_ply
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.page import chain_page
@@ -23,16 +23,16 @@ from soup_nlp.storage.store import write_json
 Float = NDArray[np.float64]
 
 SINGLE = "chain.json", "trajectory.tum", "depth.mp4", "chain.html"
-"""Files of a chain that there is one of."""
+"""Files of a chain that are not made for each frame."""
 POINTS = 100_000
-"""Most points of a frame's cloud."""
+"""Largest number of points in the cloud of a frame."""
 RATE = 5.0
 """Frames a second of the video."""
 UNIT = "the first pair's soup unit (free scale: its planes are at mean distance 1)"
 
 
 def chain_files(count: int) -> list[str]:
-    """Names of the files of a chain of so many frames."""
+    """Names of the files of a chain of `count` frames."""
     clouds = [f"points/{k:04d}.ply" for k in range(count - 1)]
     return [*SINGLE, *(f"depth/{k:04d}.png" for k in range(count)), *clouds]
 
@@ -42,19 +42,19 @@ def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -
     (folder / "depth").mkdir(exist_ok=True)
     (folder / "points").mkdir(exist_ok=True)
     depths = [chain.depth(k) for k in range(len(chain))]
-    scale = _png_scale(depths)
+    scale = depth_png_scale(np.concatenate([z.ravel() for z in depths]))
     for k, z in enumerate(depths):
         write_clipped_depth_png16(folder / "depth" / f"{k:04d}.png", z, scale)
     for k in range(len(chain.pairs)):
         _cloud(folder / "points" / f"{k:04d}.ply", chain, k, name)
-    told = {"name": name, "sources": list(sources), **summary(chain)}
-    told |= {"depth_png_scale": scale, "score": score(chain)}
-    write_json(folder / "chain.json", told)
+    contents = {"name": name, "sources": list(sources), **summary(chain)}
+    contents |= {"depth_png_scale": scale, "score": score(chain)}
+    write_json(folder / "chain.json", contents)
     write_text(folder / "trajectory.tum", trajectory(chain))
     span = depth_range(np.concatenate([z.ravel()[::7] for z in depths]))
     pictures = [colourise_depth(z, *span) for z in depths]
     write_video(folder / "depth.mp4", [np.vstack(p) for p in zip(images(chain), pictures)])
-    page = chain_page(chain, told, images(chain), pictures, span)
+    page = chain_page(chain, contents, images(chain), pictures, span)
     write_text(folder / "chain.html", page)
 
 
@@ -111,15 +111,15 @@ def images(chain: Chain) -> list[Image]:
 def write_video(path: Path, pictures: list[Image]) -> None:
     """Write pictures as MPEG-4 of the first one's size."""
     height, width = pictures[0].shape[:2]
-    # coders want even sides
+    # encoders need even sides
     size = width - width % 2, height - height % 2
-    # OpenCV takes no name that is not UTF-8
+    # OpenCV needs a name in UTF-8
     with scratch() as place:
         made = place / "video.mp4"
         coder = cv2.VideoWriter.fourcc(*"mp4v")
         video = cv2.VideoWriter(str(made), coder, RATE, size)
         for picture in pictures:
-            # frames of another size would be left out
+            # the encoder would drop frames of another size
             same = picture.shape[:2] == (height, width)
             shown = picture[: size[1], : size[0]] if same else cv2.resize(picture, size)
             video.write(cv2.cvtColor(shown, cv2.COLOR_RGB2BGR))
@@ -127,14 +127,8 @@ def write_video(path: Path, pictures: list[Image]) -> None:
         write_bytes(path, made.read_bytes())
 
 
-def _png_scale(depths: list[Float]) -> float:
-    """One number of values per unit for all depth maps, a power of two."""
-    far = float(np.nanpercentile(np.concatenate([z.ravel() for z in depths]), 99.9))
-    return float(2.0 ** np.floor(np.log2(65535.0) - np.log2(far)))
-
-
 def _cloud(path: Path, chain: Chain, frame: int, name: str) -> None:
-    """Write a frame's points in the world, every few pixels."""
+    """Write the points of a frame in world coordinates, subsampled."""
     result = chain.pairs[frame].result
     step = max(1, int(np.ceil(np.sqrt(result.sure.sum() / POINTS))))
     keep = np.zeros_like(result.sure)

@@ -17,17 +17,10 @@ PathLike = str | os.PathLike[str]
 def atomic_path(path: PathLike) -> Iterator[Path]:
     """A temporary path that becomes `path` when the block ends without an exception.
 
-    The temporary file lies in the same folder (a rename within one file system is atomic) and has
-    the same suffix (writers that choose a format by suffix keep working). It exists and is empty
-    when the block starts. On any exception it is removed and what was at `path` stays as it was.
-
-    The new file has the permissions of the one it replaces, else those of the process's umask.
-
-    Args:
-        path: The file to write; its folder must exist.
-
-    Yields:
-        The temporary path.
+    The temporary file is in the same folder, since a rename within one file system is atomic, and
+    has the same suffix. It exists and is empty when the block starts. On an exception it is removed
+    and `path` does not change. The new file has the permissions of the file that it replaces, or
+    those of the umask.
 
     Raises:
         DataError: the folder is missing or cannot be written, `path` is a folder, the disk is
@@ -83,12 +76,12 @@ def write_bytes(path: PathLike, data: bytes) -> None:
 
 def write_text(path: PathLike, text: str) -> None:
     """Write a text file in UTF-8, see `write_bytes`."""
-    # names of files may hold bytes that are no UTF-8
+    # names of files may contain bytes that are not UTF-8
     write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def _mode(target: Path) -> int:
-    """Permission bits for the new file: those of the old one, or the default of the process."""
+    """Permission bits of the old file, or the default of the process."""
     with suppress(OSError):
         return target.stat().st_mode & 0o777
     mask = os.umask(0o022)

@@ -1,4 +1,4 @@
-"""Checked reading: anything but a regular file of sensible size and depth is an error."""
+"""Checked reading of files, JSON and YAML with limits of size and nesting."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from soup_nlp.errors import DataError, SoupError, printable
 PathLike = str | os.PathLike[str]
 
 MOST_BYTES = 2 << 30
-"""Size of the largest file of images or numbers."""
+"""Size limit of files of images or numbers, bytes."""
 MOST_TEXT = 64 << 20
-"""Size of the largest text, bytes."""
+"""Size limit of text files, bytes."""
 MOST_YAML = 1 << 20
-"""Size of the largest YAML text, characters: problem files have some thousand."""
+"""Size limit of YAML texts, characters."""
 MOST_NODES = 100_000
-"""Values of a YAML text, its aliases written out."""
+"""Limit of the values in a YAML text with expanded aliases."""
 DEEPEST = 64
-"""Levels of brackets in JSON and YAML."""
+"""Limit of nesting in JSON and YAML."""
 KINDS = {
     stat.S_ISDIR: "a folder",
     stat.S_ISFIFO: "a named pipe",
@@ -39,14 +39,10 @@ def as_path(
 ) -> Path:
     """A name as a path.
 
-    Args:
-        name: Text or path.
-        what: Name of the file for the message.
-        error: Kind of error.
-        home: Whether `~` is the home folder.
+    `~` stands for the home folder if `home` is set.
 
     Raises:
-        SoupError: it is neither, holds a NUL, or names the home of an unknown user.
+        SoupError: it is neither text nor path, has a NUL, or names the home of an unknown user.
     """
     if not isinstance(name, str | os.PathLike) or isinstance(os.fspath(name), bytes):
         raise error(
@@ -66,7 +62,7 @@ def as_path(
 
 
 def is_file(path: PathLike) -> bool:
-    """Whether there is a regular file; False where the name cannot be one."""
+    """Whether the path is a regular file; False for an impossible path."""
     try:
         return stat.S_ISREG(os.stat(path).st_mode)
     except (OSError, ValueError):
@@ -74,7 +70,7 @@ def is_file(path: PathLike) -> bool:
 
 
 def is_folder(path: PathLike) -> bool:
-    """Whether there is a folder; False where the name cannot be one."""
+    """Whether the path is a folder; False for an impossible path."""
     try:
         return stat.S_ISDIR(os.stat(path).st_mode)
     except (OSError, ValueError):
@@ -86,20 +82,14 @@ def read_bytes(
 ) -> bytes:
     """The content of a regular file.
 
-    Pipes and devices are not waited for, and a file is not read before its size is known.
-
-    Args:
-        path: The file.
-        what: Name of the content for the message, e.g. "flow file".
-        error: Kind of error.
-        most: Bytes that it may have.
+    It does not wait for pipes and devices, and checks the size before reading.
 
     Raises:
         SoupError: the file is missing, not a regular one, empty, too large, or not readable.
     """
     path = as_path(path, what, error=error)
     try:
-        # an open pipe without a writer would wait for one
+        # opening a pipe would otherwise wait for a writer
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     except FileNotFoundError:
         raise error(
@@ -135,10 +125,10 @@ def read_bytes(
 
 
 def require_file(path: PathLike, what: str) -> Path:
-    """The path of a regular file, for readers that take a name.
+    """The path, if it is a regular file.
 
     Raises:
-        DataError: there is none.
+        DataError: it is not.
     """
     path = as_path(path, what)
     if not is_file(path):
@@ -154,7 +144,7 @@ def require_file(path: PathLike, what: str) -> Path:
 
 
 def _kind(path: Path) -> str | None:
-    """What is there instead of a regular file."""
+    """Description of what is at a path instead of a regular file; None if nothing is."""
     try:
         mode = os.stat(path).st_mode
     except OSError:
@@ -163,7 +153,7 @@ def _kind(path: Path) -> str | None:
 
 
 def _neighbours(path: Path) -> str:
-    """A hint that names what the folder of a missing file holds."""
+    """Hint with the contents of the folder of a missing file."""
     if path.is_symlink():
         return "it is a symbolic link whose target is missing"
     try:
@@ -190,10 +180,10 @@ def read_text(
 
 
 def parse_json(text: str) -> Any:
-    """The value of a JSON text: control characters of its strings escaped, numbers that fit.
+    """The value of a JSON text, with escaped control characters in strings.
 
     Raises:
-        ValueError: it is not JSON, nested too deep, or a number is no float64.
+        ValueError: it is not JSON, is nested too deeply, or has a number that is no float64.
     """
     try:
         return _plain(json.loads(text, parse_constant=_constant, parse_int=_whole), 0)
@@ -224,10 +214,10 @@ def _whole(text: str) -> int:
 
 
 def _plain(value: Any, level: int) -> Any:
-    """The value with clean strings.
+    """The value with control characters of strings escaped.
 
     Raises:
-        ValueError: it is nested too deep.
+        ValueError: it is nested too deeply.
     """
     if level > DEEPEST:
         raise ValueError(f"brackets are nested more than {DEEPEST} deep")
@@ -241,11 +231,11 @@ def _plain(value: Any, level: int) -> Any:
 
 
 def check_node(node: yaml.Node) -> None:
-    """Raise ValueError for a YAML document that is nested too deep, or grows by its aliases."""
+    """Raise ValueError for a YAML document with too many values or nested too deeply."""
     sizes: dict[int, int] = {}
 
     def size(node: yaml.Node, level: int) -> int:
-        """Values of a node, its aliases written out."""
+        """Number of values of a node with expanded aliases."""
         if level > DEEPEST:
             raise ValueError(f"brackets are nested more than {DEEPEST} deep")
         if not isinstance(node, yaml.CollectionNode):
@@ -264,7 +254,7 @@ def parse_yaml(text: str) -> Any:
     """The value of a YAML text.
 
     Raises:
-        ValueError: it is not YAML, too long, too deep, or grows by aliases.
+        ValueError: it is not YAML, too long, nested too deeply, or has too many values.
     """
     check_length(text)
     try:

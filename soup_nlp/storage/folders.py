@@ -1,8 +1,8 @@
-"""Output folders: a command's files appear all at once, and no file of the user is overwritten.
+"""Output folders: all files of a command appear at once, and no file of the user is overwritten.
 
 A command first claims the names that it will write (`claim`). Later it writes its files into a new
-folder beside the target, which takes the target's place in one step (`staged`). What the
-program made, and what is the user's, is in `storage.mark`.
+folder beside the target, which replaces the target in one step (`staged`). `storage.mark` records
+which files the program made.
 """
 
 from __future__ import annotations
@@ -18,30 +18,35 @@ from pathlib import Path, PurePosixPath
 from soup_nlp.errors import DataError
 from soup_nlp.storage.atomic import PathLike
 from soup_nlp.storage.files import is_folder
-from soup_nlp.storage.mark import MARK, adopt, digest_of, files_in, is_foreign, made, write_mark
+from soup_nlp.storage.mark import (
+    MARK,
+    adopt,
+    digest_of,
+    files_in,
+    is_foreign,
+    made_files,
+    write_mark,
+)
 from soup_nlp.storage.system import deferred_signals, exchange
 
 _STAGE = ".soup_nlp-"
-"""In the names of temporary folders."""
+"""Part of the names of temporary folders."""
 _COMMIT = f"{_STAGE}commit"
-"""Complete new files inside their folder, that are being moved to their places."""
+"""Folder of complete new files that are being moved to their places."""
 
 
 def claim(folder: PathLike, names: Iterable[str], overwrite: bool = False) -> Path:
-    """Make an output folder, and check that these files may be written into it.
+    """Make an output folder, check that these files may be written into it, and return it.
 
-    What an ended process left behind is finished or removed.
+    Moves that a killed process has begun are finished, and its temporary folders are removed.
 
     Args:
         folder: The output folder.
         names: Files that will be written.
-        overwrite: Take existing files of these names as the program's own.
-
-    Returns:
-        The folder.
+        overwrite: Treat existing files of these names as files of the program.
 
     Raises:
-        DataError: it cannot be written, or holds a file of the user under one of the names.
+        DataError: the folder cannot be written, or holds a file of the user with one of the names.
     """
     try:
         target = Path(folder).resolve()
@@ -51,7 +56,7 @@ def claim(folder: PathLike, names: Iterable[str], overwrite: bool = False) -> Pa
             _sweep(_left_behind(target))
             stage, lock = _new_stage(target)
             _drop(stage, lock)
-            if made(target) is None:
+            if made_files(target) is None:
                 # an early version did not list its files
                 adopt(target, [n for n in names if (target / n).is_file()])
         foreign = [name for name in names if is_foreign(target, name)]
@@ -66,22 +71,19 @@ def claim(folder: PathLike, names: Iterable[str], overwrite: bool = False) -> Pa
 
 @contextmanager
 def staged(folder: PathLike, whole: bool = False, overwrite: bool = False) -> Iterator[Path]:
-    """An empty folder whose files are moved into `folder` together when the block ends well.
+    """An empty folder whose files are moved into `folder` when the block ends without exception.
 
-    On any exception `folder` stays as it was. Where it holds nothing but the program's own files
-    and the file system can exchange two folders, the new files replace the old ones in one step;
-    else one after the other, and `recover` finishes what a killed process has begun.
+    On an exception `folder` does not change. If it holds only files of the program and the file
+    system can exchange two folders, the new files replace the old ones in one step. Otherwise they
+    are moved one after the other, and `recover` finishes what a killed process has begun.
 
     Args:
         folder: The output folder.
-        whole: The new files are a whole result: own files of an earlier one are removed.
+        whole: The new files are a complete result: files of an earlier result are removed.
         overwrite: Overwrite files that the program did not make.
 
-    Yields:
-        The temporary folder, beside or in the output folder.
-
     Raises:
-        DataError: a file cannot be written, or one of the user has a name of a new file.
+        DataError: a file cannot be written, or a file of the user has the name of a new one.
     """
     try:
         target = Path(folder).resolve()
@@ -96,7 +98,7 @@ def staged(folder: PathLike, whole: bool = False, overwrite: bool = False) -> It
         with deferred_signals():
             _commit(stage, target, whole, overwrite)
     except DataError as error:
-        # name the place that the user knows
+        # name the final path instead of the temporary one
         if not isinstance(error.where, Path) or not error.where.is_relative_to(stage):
             raise
         place = target / error.where.relative_to(stage)
@@ -109,10 +111,10 @@ def staged(folder: PathLike, whole: bool = False, overwrite: bool = False) -> It
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """A folder for temporary files, which is removed at the end, or by the next one if killed.
+    """A folder for temporary files, removed at the end, or by a later call if this one is killed.
 
     Raises:
-        DataError: it cannot be made.
+        DataError: the folder cannot be made.
     """
     root = Path(tempfile.gettempdir())
     prefix = f"soup_nlp-{os.getuid()}-"
@@ -132,13 +134,13 @@ def scratch() -> Iterator[Path]:
 
 
 def recover(folder: Path) -> None:
-    """Finish the move of new files into a folder that a killed process has begun."""
+    """Finish moving new files into a folder, if a killed process has begun it."""
     commit = folder / _COMMIT
     if not is_folder(commit) or commit.is_symlink():
         return
     lock = os.open(commit, os.O_RDONLY)
     try:
-        # another process may be at it
+        # another process may be moving the files
         fcntl.flock(lock, fcntl.LOCK_EX)
         if commit.is_dir():
             _move_in(commit, folder)
@@ -176,7 +178,7 @@ def _unwritable(folder: PathLike, error: Exception) -> DataError:
 
 
 def _new_stage(target: Path) -> tuple[Path, int]:
-    """A new temporary folder beside the target, or in it where it cannot be exchanged."""
+    """A new temporary folder beside the target, or in it if they cannot be exchanged."""
     name = f".{target.name[:64]}{_STAGE}"
     places = [(target.parent, name), (target, _STAGE)]
     if os.path.ismount(target) or _inside(target):
@@ -195,14 +197,14 @@ def _new_stage(target: Path) -> tuple[Path, int]:
 
 
 def _inside(target: Path) -> bool:
-    """Whether this process works in the folder: a shell there must not lose it."""
+    """Whether the working folder of this process is in the target, which must then stay."""
     with suppress(OSError):
         return Path.cwd().is_relative_to(target)
     return True
 
 
 def _lock(folder: Path) -> int:
-    """Hold a folder, so that no other process takes it for left behind."""
+    """Lock a folder, so that no other process treats it as left behind."""
     handle = os.open(folder, os.O_RDONLY)
     with suppress(OSError):
         # some network file systems have no locks
@@ -218,14 +220,14 @@ def _drop(stage: Path, lock: int) -> None:
 
 
 def _left_behind(target: Path) -> list[Path]:
-    """Temporary folders of a target, of other processes that run or have ended."""
+    """Temporary folders of a target that other processes have made."""
     own = f".{target.name[:64]}{_STAGE}"
     beside = [p for p in target.parent.iterdir() if p.name.startswith(own)]
     return beside + [p for p in target.iterdir() if p.name.startswith(_STAGE) and p.name != _COMMIT]
 
 
 def _sweep(paths: Iterable[Path]) -> None:
-    """Remove temporary folders whose process has ended: nobody holds them."""
+    """Remove temporary folders whose process has ended, so that nobody locks them."""
     for path in paths:
         with suppress(OSError):
             handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
@@ -237,14 +239,14 @@ def _sweep(paths: Iterable[Path]) -> None:
 
 
 def _commit(stage: Path, target: Path, whole: bool, overwrite: bool) -> None:
-    """Give the files of a temporary folder their places."""
+    """Move the files of a temporary folder to their places."""
     new = {name: digest_of(stage / name) for name in files_in(stage)}
     clash = [name for name in new if is_foreign(target, name)]
     if clash and not overwrite:
         raise _clash(target, clash)
     if clash:
         adopt(target, clash)
-    listed = made(target) or {}
+    listed = made_files(target) or {}
     tops = {PurePosixPath(name).parts[0] for name in [*new, *listed]}
     there = {path.name for path in target.iterdir()} - {MARK, stage.name}
     here = {name for top in there & tops for name in _below(target, top)}
@@ -253,7 +255,7 @@ def _commit(stage: Path, target: Path, whole: bool, overwrite: bool) -> None:
     for name in here & new.keys():
         shutil.copymode(target / name, stage / name)
     _sync(stage)
-    # only the program's own files: nothing else moves with the folder
+    # whether the target holds only files of the program
     alone = there <= tops and here <= (old | new if whole else new).keys()
     if alone and stage.parent == target.parent and exchange(stage, target):
         return
@@ -270,13 +272,13 @@ def _commit(stage: Path, target: Path, whole: bool, overwrite: bool) -> None:
 
 
 def _move_in(commit: Path, target: Path) -> None:
-    """Move complete new files to their places, remove own old ones; may be done again."""
-    new, old = made(commit), made(target)
+    """Move complete new files to their places and remove old ones; may be repeated."""
+    new, old = made_files(commit), made_files(target)
     for name in (old or {}).keys() - (new or {}).keys():
         if os.path.lexists(target / name) and not is_foreign(target, name):
             (target / name).unlink()
             with suppress(OSError):
-                # empty ones only
+                # removes empty folders only
                 os.removedirs((target / name).parent)
     for name in files_in(commit):
         (target / name).parent.mkdir(parents=True, exist_ok=True)
@@ -287,7 +289,7 @@ def _move_in(commit: Path, target: Path) -> None:
 
 
 def _sync(folder: Path) -> None:
-    """Wait until the files of a folder are on disk; some systems tell only now that it is full."""
+    """Wait until the files are on disk; some systems report a full disk only here."""
     for name in [*files_in(folder), MARK]:
         with (folder / name).open("rb") as file:
             os.fsync(file.fileno())

@@ -1,4 +1,4 @@
-"""Reading HDF5 files: links are not followed, sizes are checked before memory is taken."""
+"""Reading of HDF5 files, which rejects links and checks sizes before it allocates memory."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ ReadTree: TypeAlias = dict[str, Any]
 RECORD = "record"
 """Group of the hashes of other files; `convert` renews it, so `contents_digest` leaves it out."""
 DIGEST = "contents_sha256"
-"""Root attribute with that digest."""
+"""Root attribute with the result of `contents_digest`."""
 DEEPEST = 16
-"""Levels of groups."""
+"""Largest number of nested groups."""
 BROKEN = (OSError, RuntimeError, KeyError, TypeError, ValueError, AttributeError)
-"""What h5py raises on files that are damaged."""
+"""Exceptions of h5py for damaged files."""
 
 
 def read_h5(path: PathLike) -> ReadTree:
     """All arrays of a result file, as nested dicts of numpy arrays (text as str or object arrays).
 
     Raises:
-        DataError: the file is missing or is not HDF5, is damaged, holds a link or a type that no
-            result has, or more than fits into memory.
+        DataError: the file is missing, damaged or not HDF5, holds a link or a type that no result
+            has, or does not fit into memory.
     """
     with _opened(path) as file:
         items = list(_items(file, "", {h5py.h5o.get_info(file["/"].id).addr}, path))
@@ -56,10 +56,10 @@ def read_h5(path: PathLike) -> ReadTree:
 def _items(
     group: h5py.Group, place: str, seen: set[Any], path: PathLike
 ) -> Iterator[tuple[str, h5py.Group | h5py.Dataset]]:
-    """Names, groups and datasets below a group; hard links are the only ones.
+    """Names, groups and datasets below a group.
 
     Raises:
-        DataError: there is a link of another kind, or what is neither group nor array.
+        DataError: there is a link, or an object that is neither a group nor an array.
     """
 
     def wrong(name: str, found: object, expected: str) -> DataError:
@@ -111,7 +111,7 @@ def read_attrs(path: PathLike) -> dict[str, Any]:
 
 
 def contents_digest(file: h5py.File) -> str:
-    """SHA-256 of all arrays and attributes of an open result, however they are stored."""
+    """SHA-256 of all arrays and attributes of an open result, independent of their storage."""
     seen = {h5py.h5o.get_info(file["/"].id).addr}
     items = [(n, i) for n, i in _items(file, "", seen, file.filename) if n.split("/")[0] != RECORD]
     sha = hashlib.sha256()
@@ -130,10 +130,10 @@ def contents_digest(file: h5py.File) -> str:
 
 
 def read_digest(path: PathLike) -> str:
-    """The digest of a result file as it is now, see `contents_digest`.
+    """The digest of the present contents of a result file, see `contents_digest`.
 
     Raises:
-        DataError: as of `read_h5`, which is called first to look at the sizes.
+        DataError: see `read_h5`, which must be called before, since it checks the sizes.
     """
     with _opened(path) as file:
         return contents_digest(file)
@@ -141,7 +141,7 @@ def read_digest(path: PathLike) -> str:
 
 @contextmanager
 def _opened(path: PathLike) -> Iterator[h5py.File]:
-    """The file; what goes wrong while it is read is an error of the file."""
+    """An open file; errors of h5py in the block become DataErrors."""
     if not is_file(as_path(path, "result file")):
         raise DataError("result file does not exist", where=path)
     try:

@@ -1,6 +1,6 @@
-"""Which files of a folder the program made: the hidden file MARK lists them with their SHA-256.
+"""The hidden file MARK: a list of the files in a folder that the program made, with their SHA-256.
 
-A file that is not listed, or that was changed since, belongs to the user.
+A file that is not listed, or that was changed, belongs to the user.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ MARK = ".soup_nlp"
 """Hidden file of a folder with results: JSON, SHA-256 by name of every file that was made."""
 
 
-def made(folder: Path) -> dict[str, str] | None:
+def made_files(folder: Path) -> dict[str, str] | None:
     """SHA-256 by name of the files that the program made in a folder.
 
-    None where the mark is empty, as early versions left it: they did not list their files.
+    None if the mark is empty, as in folders of early versions.
     """
     path = folder / MARK
     try:
@@ -31,7 +31,7 @@ def made(folder: Path) -> dict[str, str] | None:
         if not text:
             return None
         listed = json.loads(text)["files"]
-        # nothing outside the folder is the program's own, whatever a mark says
+        # a damaged mark must not name files outside the folder
         inside = [n for n in listed if not PurePosixPath(n).is_absolute() and ".." not in n]
         return {str(name): str(listed[name]) for name in inside}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -39,7 +39,7 @@ def made(folder: Path) -> dict[str, str] | None:
 
 
 def files_in(folder: Path) -> list[str]:
-    """Names of all files in a folder and in those below it, without the mark."""
+    """Names of all files below a folder, without the mark."""
     paths = [path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()]
     return sorted(p.relative_to(folder).as_posix() for p in paths if p != folder / MARK)
 
@@ -60,23 +60,23 @@ def is_foreign(folder: Path, name: str) -> bool:
         return False
     if path.is_symlink() or not path.is_file():
         return True
-    listed = made(folder)
+    listed = made_files(folder)
     return listed is not None and listed.get(name) != digest_of(path)
 
 
 def adopt(folder: Path, names: Iterable[str]) -> None:
-    """Enter files of the user into the mark, so that they may be overwritten."""
+    """Add files of the user to the mark, so that they may be overwritten."""
     there = {name: folder / name for name in names}
     for name, path in there.items():
         if path.is_dir() and not path.is_symlink():
             raise DataError("cannot write a file over a folder", where=folder / name)
         if path.is_symlink():
-            # the link goes, what it leads to stays
+            # remove the link but not its target
             path.unlink()
     digests = {name: digest_of(path) for name, path in there.items() if path.is_file()}
-    write_mark(folder, (made(folder) or {}) | digests)
+    write_mark(folder, (made_files(folder) or {}) | digests)
 
 
 def write_mark(folder: Path, files: dict[str, str]) -> None:
-    """Write the list of a folder's own files, SHA-256 by name."""
+    """Write the mark of a folder: SHA-256 by name of the files that the program made."""
     write_text(folder / MARK, json.dumps({"files": dict(sorted(files.items()))}, indent=1) + "\n")

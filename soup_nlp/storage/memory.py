@@ -10,11 +10,11 @@ import psutil
 from soup_nlp.errors import DataError
 
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-"""What a container may take, where there is one."""
+"""Files with the memory limit of a container."""
 
 
 def usable_memory() -> int:
-    """Bytes that this process may still take without swapping."""
+    """Bytes that this process can still allocate without swapping."""
     free = [int(psutil.virtual_memory().available)]
     for name in _LIMITS:
         with suppress(OSError, ValueError):
@@ -23,13 +23,13 @@ def usable_memory() -> int:
 
 
 def require_memory(size: float, what: str, where: object = None, hint: str | None = None) -> None:
-    """Raise DataError where the machine has no such amount of memory.
+    """Raise DataError if fewer than `size` bytes of memory are usable.
 
     Args:
-        size: Bytes that are about to be taken.
-        what: What takes them, for the message.
-        where: File or setting concerned.
-        hint: What to lower.
+        size: Bytes that will be allocated.
+        what: What needs them, for the message.
+        where: File or option concerned.
+        hint: What to try.
     """
     usable = usable_memory()
     if size > usable:

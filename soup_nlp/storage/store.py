@@ -1,6 +1,6 @@
-"""Results on disk: HDF5 with units on every array, and JSON that any reader accepts.
+"""Writing of results: HDF5 with units for every array, and standard JSON.
 
-`storage.h5_files` reads what is written here.
+`storage.h5_files` reads these files.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from soup_nlp.storage.h5_files import DIGEST, contents_digest
 from soup_nlp.storage.versions import versions
 
 SCHEMA = 1
-"""Version of the layout of result files; grows when a reader would have to change."""
+"""Version of the layout of result files; changes when readers have to change."""
 
 FORMAT = ("v110", "v110")
-"""Versions of HDF5's format that are written: the oldest with checksums everywhere."""
+"""Version of the HDF5 format: the oldest one with checksums of all parts."""
 
 COMPRESS_ABOVE = 64 * 1024
-"""Arrays of more bytes than this are compressed (gzip level 1 after a byte shuffle)."""
+"""Arrays with more bytes are compressed (gzip level 1 after a byte shuffle)."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
     """
     own = {"schema": SCHEMA, "versions": json.dumps(versions()), "machine": platform.platform()}
     try:
-        # in memory: on a full disk HDF5 ends the process
+        # written in memory, since HDF5 would end the process on a full disk
         image = BytesIO()
         with h5py.File(image, "w", track_order=True, libver=FORMAT) as file:
             for key, value in (dict(attrs) | own).items():
@@ -85,7 +85,7 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
 
 
 def replace_group(source: PathLike, target: PathLike, name: str, tree: Tree) -> None:
-    """Write a copy of a result file with other arrays in one of its groups.
+    """Write a copy of a result file with one group replaced.
 
     Raises:
         DataError: the file cannot be read or written.
@@ -120,19 +120,19 @@ def _write_attribute(file: h5py.File, key: str, value: object) -> None:
         file.attrs[key] = value
         return
     text = (value if isinstance(value, str) else json.dumps(plain(value))).encode()
-    # of fixed length: HDF5 has no checksum for others
+    # text of fixed length, since HDF5 has no checksum for variable length
     file.attrs.create(key, text, dtype=h5py.string_dtype(length=max(1, len(text))))
 
 
 def _write_array(group: h5py.Group, name: str, data: NDArray[Any]) -> None:
-    """Write an array under a checksum: HDF5 then notices bytes that were changed."""
+    """Write an array with a checksum."""
     if data.ndim and data.size:
         options: dict[str, Any] = {"fletcher32": True, "chunks": True}
         if data.nbytes > COMPRESS_ABOVE:
             options |= {"compression": "gzip", "compression_opts": 1, "shuffle": True}
         group.create_dataset(name, data=data, **options)
         return
-    # what is no chunk is kept in the header, which has a checksum of its own
+    # scalars and empty arrays are stored in the header, which has a checksum
     kind = h5py.h5t.py_create(data.dtype, logical=True)
     layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     layout.set_layout(h5py.h5d.COMPACT)
@@ -145,7 +145,7 @@ def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:
     """The array at "a/b" of a tree that was read.
 
     Raises:
-        DataError: there is no such array; the message lists what is there.
+        DataError: there is no such array; the message lists the existing ones.
     """
     here: Any = tree
     for key in name.split("/"):
@@ -164,7 +164,7 @@ def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:
 
 
 def plain(obj: object) -> Any:
-    """An object in JSON's types: NumPy to Python, NaN and infinities to None, paths to text.
+    """An object as JSON types: NumPy becomes Python, NaN and infinities None, paths text.
 
     Dataclasses become mappings; tuples, sets and arrays become lists.
 
@@ -198,8 +198,7 @@ def write_json(path: PathLike, obj: object) -> None:
     """Write an object as JSON (see `plain`), whole or not at all; two-space indent, UTF-8.
 
     Raises:
-        DataError: the object holds a type that has no place in JSON, or the file cannot be
-            written.
+        DataError: the object holds a type that JSON does not have, or the file cannot be written.
     """
     text = json.dumps(plain(obj), indent=2, ensure_ascii=False, allow_nan=False)
     write_text(path, text + "\n")

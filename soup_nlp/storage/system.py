@@ -1,4 +1,4 @@
-"""What the operating system offers for safe writing: exchange of two folders, signals that wait."""
+"""Functions of the operating system: exchange of folders, delayed signals, end with the parent."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _RENAME_SWAP = 2
 
 
 def exchange(a: Path, b: Path) -> bool:
-    """Exchange two folders in one step; False where system or file system cannot."""
+    """Exchange two folders in one step; False if the system or file system cannot do so."""
     library, names = ctypes.CDLL(None, use_errno=True), (os.fsencode(a), os.fsencode(b))
     try:
         if sys.platform == "darwin":
@@ -32,7 +32,7 @@ def exchange(a: Path, b: Path) -> bool:
 
 @contextmanager
 def deferred_signals() -> Iterator[None]:
-    """Ctrl-C and SIGTERM take effect when the block ends (main thread only)."""
+    """Delay Ctrl-C and SIGTERM until the block ends (main thread only)."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -53,7 +53,7 @@ def deferred_signals() -> Iterator[None]:
 
 @contextmanager
 def sigterm_as_ctrl_c() -> Iterator[None]:
-    """SIGTERM raises KeyboardInterrupt in the block, as Ctrl-C does (main thread only)."""
+    """Let SIGTERM raise KeyboardInterrupt in the block, like Ctrl-C (main thread only)."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""Versions of the program, of its code and of what it runs on."""
+"""Versions of the program, of its code and of the packages that it uses."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-hea
 
 @cache
 def code_version() -> str:
-    """Version and hash of the package's sources as they were at the first call.
+    """Version and hash of the sources of the package at the first call.
 
-    Rows of benchmarks carry it: what was measured by other code is measured again.
+    Benchmarks store it in their rows and measure again what other code has measured.
     """
     root, digest = Path(__file__).parents[1], hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
@@ -34,7 +34,7 @@ def code_version() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on; "unknown" where a package does not say."""
+    """Versions of the packages that a result depends on; "unknown" if not available."""
     out = {"soup_nlp": __version__, "python": platform.python_version()}
     for name, package in _PACKAGES.items():
         out[name] = "unknown"

@@ -25,7 +25,7 @@ from soup_nlp.storage.files import PathLike
 
 
 class _Kitti(NamedTuple):
-    """Folders and names of one KITTI benchmark; {} is occ or noc."""
+    """Folders and names of one KITTI benchmark; {} stands for occ or noc."""
 
     images: str
     calibration: str
@@ -66,7 +66,7 @@ _VKITTI = {
         "{}/{}/frames/forwardFlow/Camera_0/flow_{:05d}.png",
     ),
 }
-"""Paths of image, depth and flow by scene, variation and frame; * is the version of an archive."""
+"""Paths of image, depth and flow; {} stands for scene, variation and frame, * for a version."""
 
 VKITTI1_CAMERA = (725.0, 725.0, 620.5, 187.0)
 """fx, fy, cx, cy of every Virtual KITTI 1 image (1242 x 375), pixels."""
@@ -75,22 +75,22 @@ VKITTI1_CAMERA = (725.0, 725.0, 620.5, 187.0)
 def load_kitti(benchmark: str, root: PathLike, index: int | str, occ: bool = True) -> Pair:
     """Load a pair of KITTI: frames 10 and 11 of a sequence.
 
-    Depth is f B / disparity. disp_occ_1 of 2015 holds the second frame's disparity at the pixels of
-    the first, so with the flow it gives the true scene flow, not a depth map of the next frame.
+    Depth is f B / disparity. disp_occ_1 of 2015 has the disparity of the second frame at the pixels
+    of the first, so with the flow it gives the scene flow, not a depth map of the next frame.
 
     Args:
         benchmark: "kitti2012" (grey camera 0) or "kitti2015" (colour camera 2).
         root: The dataset (with or without its folder `training`).
         index: Number of the pair, e.g. 27 or "000027".
-        occ: Take the truth that includes occluded pixels (*_occ); else *_noc.
+        occ: Use the truth with occluded pixels (*_occ), else without (*_noc).
 
     Returns:
-        Pair with the truth whose files exist: semi-dense depth and flow; `occluded` marks pixels
-        whose flow is known but absent from flow_noc (False elsewhere, also where nothing is known);
-        in 2015 scene flow, and the moving objects of obj_map as components (0 is the static scene).
+        Pair with the truth of the existing files: semi-dense depth and flow; `occluded` is True
+        where the flow is known but absent from flow_noc; in 2015 also scene flow, and the moving
+        objects of obj_map as components (0 is the static scene).
 
     Raises:
-        DataError: an image or the calibration is missing, or a file is wrong for its format.
+        DataError: an image or the calibration is missing, or a file is malformed.
     """
     own = _KITTI[benchmark]
     base = training_folder(root, own.layout)
@@ -180,13 +180,13 @@ def load_vkitti(
         scene: For example "0001" (1) or "Scene01" (2).
         frame: Number of the reference frame (the first is 0).
         variation: For example "clone", "fog".
-        step: Distance of the next frame; truth flow exists for 1 only.
+        step: Distance of the next frame; a true flow exists for 1 only.
 
     Returns:
-        Pair with depth of both frames and flow where the files exist; sky is unknown.
+        Pair with depth of both frames and flow, if the files exist; the sky is unknown.
 
     Raises:
-        DataError: an image or the intrinsics of Virtual KITTI 2 are missing, or a file is wrong.
+        DataError: an image or the intrinsics are missing, or a file is malformed.
     """
     image, depth, flow = _VKITTI[benchmark]
     layout = f"{image}; optional {depth}, {flow}"

@@ -1,8 +1,8 @@
-"""Pairs with truth from a plain folder, TUM RGB-D and the Motorcycle pair.
+"""Loaders of pairs with truth: plain folders, TUM RGB-D and the Motorcycle pair.
 
-Every loader returns a `Pair` whose `flow` is None; the true flow, where known, is `pair.truth.flow`
-and becomes a flow with `flow_from_truth`. Truth is NaN where unknown. A loader needs the two
-images and the camera; truth files that are not there leave that truth None.
+Every loader returns a `Pair` without a flow; the true flow is `pair.truth.flow` if it is known. A
+loader needs the two images and the camera. The truth is None without its file, and NaN where
+unknown.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def load_folder(
 ) -> Pair:
     """Load a pair from a plain folder.
 
-    Files (the first that exists is taken, in this order; images may also be jpg, tif, ppm, bmp):
+    Files, of which the first existing one is used (images may also be jpg, tif, ppm, bmp):
 
     - `frame_0.png` or `image_ref.png`; `frame_1.png` or `image_next.png`
     - `K.txt`: 3x3 intrinsics, or fx fy cx cy; `K_next.txt` if the next frame's differ
@@ -71,20 +71,16 @@ def load_folder(
       `moving.png` (white = moves by itself; every connected region is one component)
     - optional sparse truth `points.npz`: `uv_0` (M, 2) pixels and `xyz_mm_0` (M, 3) millimetres in
       the reference camera; z is converted to `unit` when that is "m" and kept when it is "mm".
-      (`xyz_mm_1`, the same points in the next frame, has no place in `Truth` and is not read.)
 
     Args:
         folder: The folder.
         depth_scale: Values per `unit` of a 16-bit depth image, e.g. 1000 for mm read as metres.
         unit: Unit of length of the truth.
-        white: Value of a 16-bit image that is white, see `read_image`.
-
-    Returns:
-        Pair named after the folder.
+        white: Value of white in a 16-bit image, see `read_image`.
 
     Raises:
-        DataError: a required file is missing, a file is wrong for its format or its image, or the
-            folder holds a result of a solve.
+        DataError: a required file is missing, a file is malformed or has a wrong size, or the
+            folder holds the result of a solve.
     """
     folder = need_folder(folder, LAYOUT)
     if is_result(folder):
@@ -145,9 +141,9 @@ def _read_points(path: Path, unit: str) -> Float:
 def load_tum(folder: PathLike, frame: int = 0, step: int = 1) -> Pair:
     """Load a pair of a TUM RGB-D sequence, depth in metres.
 
-    Two layouts are known: the original one (`rgb.txt` and `depth.txt` list time stamps and files;
-    a depth image belongs to a colour image within 20 ms), and the plain folder of `load_folder`
-    with 16-bit `depth_0.png`, `depth_1.png` of 5000 values per metre.
+    Two layouts are supported: the original one (`rgb.txt` and `depth.txt` list time stamps and
+    files; a depth image belongs to a colour image within 20 ms), and the plain folder of
+    `load_folder` with 16-bit `depth_0.png` and `depth_1.png` of 5000 values per metre.
 
     Args:
         folder: The sequence.
@@ -155,9 +151,9 @@ def load_tum(folder: PathLike, frame: int = 0, step: int = 1) -> Pair:
         step: Distance of the next image (original layout only).
 
     Returns:
-        Pair with depth truth of both frames where known. In the original layout the intrinsics are
-        those that its authors give for the sensor named in the folder (freiburg1, 2 or 3), else
-        525, 525, 319.5, 239.5; lens distortion is not removed.
+        Pair with the true depth of both frames, if known. In the original layout the intrinsics are
+        those published for the sensor in the name of the folder (freiburg1, 2 or 3), else 525, 525,
+        319.5, 239.5; lens distortion is not removed.
 
     Raises:
         DataError: the layout is unknown, a file is missing or the frame does not exist.
@@ -204,7 +200,7 @@ def _tum_list(path: Path) -> list[tuple[float, Path]]:
 
 
 def _tum_depth(depths: list[tuple[float, Path]], time: float) -> Float | None:
-    """Depth of the image nearest in time, or None when that is more than 20 ms away."""
+    """Depth of the image nearest in time; None if it is more than 20 ms away."""
     if not depths:
         return None
     stamp, path = min(depths, key=lambda entry: abs(entry[0] - time))
@@ -216,12 +212,9 @@ def load_motorcycle() -> Pair:
 
     The rectified cameras differ in their principal points, so a disparity d means
     Z = f B / (d + doffs) with f 994.978 px, doffs 31.086 px, B 0.193001 m, and the next (right)
-    camera has cx + doffs. The motion is the translation (-B, 0, 0) for every pixel; the true flow
-    is (-d, 0). A pixel counts as occluded where it leaves the right image or where a pixel of the
-    same row and nearer depth lands on it or beyond it.
-
-    Returns:
-        Pair "motorcycle" with depth, flow, scene flow, occlusion and one component of known motion.
+    camera has cx + doffs. The motion of every pixel is the translation (-B, 0, 0); the true flow
+    is (-d, 0). A pixel is occluded if it leaves the right image, or if a nearer pixel of the same
+    row lands on it or beyond it.
 
     Raises:
         DataError: the images are not available (scikit-image fetches them once).

@@ -1,4 +1,4 @@
-"""What dataset loaders share: required files, truth that may be absent, folders of results."""
+"""Helpers of dataset loaders: required and optional files, recognition of result folders."""
 
 from __future__ import annotations
 
@@ -16,14 +16,10 @@ T = TypeVar("T")
 
 
 def need(path: PathLike, layout: str) -> Path:
-    """The path, if it is a file.
-
-    Args:
-        path: A file that a loader cannot do without.
-        layout: The layout that the loader expects, for the message.
+    """The path, if it is a file; `layout` is the expected layout for the message.
 
     Raises:
-        DataError: the file is missing; the message names the first folder that is missing too.
+        DataError: the file is missing; the message names the first missing folder.
     """
     path = as_path(path)
     if is_file(path):
@@ -44,7 +40,7 @@ def need_folder(path: PathLike, layout: str) -> Path:
     """The path, if it is a folder.
 
     Raises:
-        DataError: it is not.
+        DataError: it is no folder.
     """
     path = as_path(path, "dataset folder")
     if not is_folder(path):
@@ -58,7 +54,7 @@ def need_folder(path: PathLike, layout: str) -> Path:
 
 
 def training_folder(root: PathLike, layout: str) -> Path:
-    """The folder `training` of a dataset, or the root where that is it already.
+    """The folder `training` of a dataset, or the root if it has no such folder.
 
     Raises:
         DataError: the root is not a folder.
@@ -68,7 +64,7 @@ def training_folder(root: PathLike, layout: str) -> Path:
 
 
 def read_if(reader: Callable[..., T], path: Path | None, *options: object) -> T | None:
-    """What the reader makes of an optional file; None where there is no such file."""
+    """Contents of an optional file; None if there is no such file."""
     return reader(path, *options) if path is not None and is_file(path) else None
 
 
@@ -81,18 +77,18 @@ def make_pair(
     *,
     turn: bool = False,
 ) -> Pair:
-    """The pair of two image files; its truth is None where none of it is known.
+    """The pair of two image files; its truth is None if no part of it is known.
 
     Args:
         images: Reference and next image.
         cameras: (3, 3) intrinsics of both frames, pixels.
-        truth: What its files hold.
+        truth: Truth from its files.
         name: Name of the pair.
-        white: Value of a 16-bit image that is white, see `read_image`.
-        turn: Turn images as their EXIF orientation says, see `read_image`.
+        white: Value of white in a 16-bit image, see `read_image`.
+        turn: Rotate images by their EXIF orientation, see `read_image`.
 
     Raises:
-        DataError: an image is damaged, or the truth does not fit it.
+        DataError: an image is damaged, or the truth has another size.
     """
     ref, following = (read_image(path, white, turn=turn) for path in images)
     K_ref, K_next = cameras
@@ -100,7 +96,7 @@ def make_pair(
 
 
 def is_result(folder: Path) -> bool:
-    """Whether a folder is for results: it has the mark, or a summary that names its problem."""
+    """Whether a folder holds a result: it has the mark, or a summary.json of a solve."""
     if is_file(folder / MARK):
         return True
     try:

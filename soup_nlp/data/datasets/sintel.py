@@ -24,7 +24,7 @@ LAYOUT = (
 )
 
 DEFAULT_CAMERA = (688.00006, 688.00006, 511.5, 217.5)
-"""fx, fy, cx, cy of `DEFAULT_SCENE`, pixels. Other scenes have other focal lengths (some 1120)."""
+"""fx, fy, cx, cy of `DEFAULT_SCENE`, pixels; other scenes differ (some have 1120)."""
 
 DEFAULT_SCENE = "alley_1"
 
@@ -39,15 +39,15 @@ def load_sintel(
         scene: For example "alley_1".
         frame: Number of the reference frame as in its file name (the first is 1).
         render: Render pass, "clean", "final" or "albedo".
-        step: Distance of the next frame; truth flow exists for 1 only.
+        step: Distance of the next frame; a true flow exists for 1 only.
 
     Returns:
-        Pair with the truth whose files exist. `occluded` is the occlusion mask and every pixel
+        Pair with the truth of the existing files. `occluded` is the occlusion mask and all pixels
         whose flow leaves the image; pixels of the mask `invalid` have no true flow. Without
         `camdata_left` the camera is `DEFAULT_CAMERA`.
 
     Raises:
-        DataError: an image is missing, or a file is wrong for its format or its image.
+        DataError: an image is missing, or a file is malformed or has a wrong size.
 
     Warns:
         DataWarning: there is no camera file, and the scene is not alley_1.
@@ -66,7 +66,7 @@ def load_sintel(
 
 
 def _flow_truth(base: Path, name: str) -> tuple[Float | None, NDArray[np.bool_] | None]:
-    """True flow and occlusion of a frame, where their files exist."""
+    """True flow and occlusion of a frame; None without their files."""
     flow = read_if(read_flo, base / "flow" / f"{name}.flo")
     files = [base / kind / f"{name}.png" for kind in ("occlusions", "invalid")]
     occluded, invalid = (read_if(read_mask, file) for file in files)
@@ -83,7 +83,7 @@ def _flow_truth(base: Path, name: str) -> tuple[Float | None, NDArray[np.bool_] 
 
 
 def _cameras(paths: list[Path], scene: str) -> list[Float]:
-    """Intrinsics of the frames; `DEFAULT_CAMERA`, with a warning, where a file is missing."""
+    """Intrinsics of the frames; `DEFAULT_CAMERA` with a warning if a file is missing."""
     absent = [path for path in paths if not is_file(path)]
     if absent and scene != DEFAULT_SCENE:
         warnings.warn(

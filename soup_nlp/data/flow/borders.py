@@ -1,8 +1,8 @@
-"""Borders of superpixels moved to discontinuities of the flow.
+"""Alignment of superpixel borders with discontinuities of the flow.
 
-SLIC follows colours, and a superpixel across the border of two motions is a plane that fits
-neither: the pixels of its smaller part have a re-projection error that no solution can avoid, and
-the depth of the other side. Such pixels go to the neighbouring superpixel that has their flow.
+SLIC follows colours only. A superpixel that covers two motions cannot fit both: the pixels of its
+smaller part have an unavoidable re-projection error and the depth of the other part. Such pixels
+are moved to the neighbouring superpixel with their flow.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from soup_nlp.geometry.superpixels import LEAST_PIECE, Labels, split_components
 Ints = NDArray[np.int64]
 
 SCALE_PX = 0.25
-"""Residual, pixels, below which a fit takes every pixel for an inlier."""
+"""Residual, pixels, below which a fit treats a pixel as inlier."""
 SWEEPS, REFIT = 24, 8
-"""How far a border may move, pixels, and sweeps between fits."""
+"""Number of sweeps (a border moves at most one pixel in each), and sweeps between fits."""
 
 
 def follow_flow(
@@ -28,20 +28,20 @@ def follow_flow(
     flow: Flow,
     margin_px: float = 1.0,
 ) -> Labels:
-    """Move borders of superpixels, pixel by pixel, to where their affine flows meet.
+    """Move the borders of superpixels to discontinuities of the flow.
 
-    In every sweep a pixel on a border goes to the neighbour whose affine flow (fitted robustly,
-    see `fit_affine`) is nearest to its own flow, if it is nearer than its superpixel's by more
-    than the margin. A pixel without confidence stays.
+    In every sweep a border pixel changes to the neighbour whose affine flow (see `fit_affine`) is
+    nearest to the flow of the pixel, if it is nearer than that of its superpixel by more than the
+    margin. Pixels without confidence do not change.
 
     Args:
         labels: (H, W) superpixel labels 0..N-1.
         flow: Flow with confidence.
-        margin_px: Pixels of flow that a change of sides must win.
+        margin_px: Smallest reduction of the residual by a change, pixels.
 
     Returns:
-        (H, W) int32 labels 0..N'-1, each connected (4-neighbourhood) and not empty; N' differs
-        from N where pieces were cut off or used up.
+        (H, W) int32 labels 0..N'-1, each connected (4-neighbourhood) and not empty; N' may differ
+        from N.
 
     Raises:
         DataError: sizes of labels and flow differ.
@@ -57,7 +57,7 @@ def follow_flow(
             changed[:], near[:] = False, True
         framed = np.pad(current, 1, mode="edge")
         sides = (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
-        # a pixel whose surroundings are those of the last sweep stays where it stayed
+        # only pixels near a change of the last sweep can change
         border = near & (flow.confidence > 0) & np.any([side != current for side in sides], axis=0)
         v, u = np.nonzero(border)
         own = current[v, u]
@@ -82,7 +82,7 @@ def _nearest(
     v: Ints,
     margin_px: float,
 ) -> Ints:
-    """(P,) superpixels of pixels (P,): their own, or that of a side with a nearer affine flow."""
+    """(P,) superpixel with the nearest affine flow, the present one or that of a side."""
     uv = flow.uv[v, u].astype(np.float64)
     best, least = own.copy(), fit.residual(own, u, v, uv) - margin_px
     for other in sides:

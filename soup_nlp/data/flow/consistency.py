@@ -1,4 +1,4 @@
-"""Confidence of a flow from its round trip: forward, then backward."""
+"""Confidence of a flow from its forward-backward consistency."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ FloatMap = NDArray[np.float32]
 
 SUPPORT = 15
 """Side of the window over which the round-trip error is averaged, pixels: a wrong flow may be
-consistent in one pixel, rarely in all pixels around it."""
+consistent at a single pixel, but rarely in a whole window."""
 
-_NOISE_CAP = 5.0  # pixels; bounds the effect of an outlier on its window
+_NOISE_CAP = 5.0  # pixels; limits the effect of an outlier on its window
 
 
 def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
-    """Distance between each pixel and where the forward, then the backward flow bring it.
+    """Distance of each pixel to its image under the forward and then the backward flow.
 
     Args:
         forward: (H, W, 2) flow from the first to the second image, pixels.
         backward: (H', W', 2) flow from the second to the first image, pixels.
 
     Returns:
-        (H, W) float32, pixels; infinite where the forward flow leaves the second image and where
-        one of the two is not finite.
+        (H, W) float32, pixels; infinite where the forward flow leaves the second image or one of
+        the flows is not finite.
     """
     height, width = forward.shape[:2]
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -46,15 +46,7 @@ def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
 
 
 def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Where a flow points outside the next image.
-
-    Args:
-        flow: (H, W, 2), pixels.
-        shape: (H', W') of the next image.
-
-    Returns:
-        (H, W) bool; True also where the flow is not finite.
-    """
+    """(H, W) bool, True where a flow (H, W, 2) is not finite or points outside the next image."""
     height, width = flow.shape[:2]
     x = np.arange(width)[None, :] + flow[:, :, 0]
     y = np.arange(height)[:, None] + flow[:, :, 1]
@@ -63,12 +55,9 @@ def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.boo
 
 
 def checked_flow(forward: FloatMap, backward: FloatMap, source: str) -> Flow:
-    """A Flow whose confidence is its forward-backward consistency (`confidence_of`).
+    """A Flow from forward (H, W, 2) and backward (H', W', 2) displacements, pixels.
 
-    Args:
-        forward: (H, W, 2) flow from the reference to the next image, pixels.
-        backward: (H', W', 2) flow from the next to the reference image.
-        source: Name for reports.
+    Its confidence is the forward-backward consistency, see `confidence_of`.
     """
     uv = np.ascontiguousarray(forward, dtype=np.float32)
     confidence = confidence_of(round_trip_error(uv, backward))

@@ -1,4 +1,4 @@
-"""Flow by OpenCV's dense inverse search, with the confidence of its round trip."""
+"""Flow by the dense inverse search of OpenCV, with forward-backward confidence."""
 
 from __future__ import annotations
 
@@ -19,28 +19,25 @@ Image = NDArray[np.uint8]
 MIN_SIDE = 16
 """Smallest image side for DIS, pixels."""
 
-_FLAT = 1.0  # standard deviation, grey levels, below which an image holds nothing to match
+_FLAT = 1.0  # standard deviation in grey levels of an image without contrast
 _WORK_SIDE = 64  # DIS gets images of at least this side; smaller ones are padded
 
 
 def dis_flow(image_ref: Image, image_next: Image, **options: Any) -> Flow:
     """Dense inverse search flow (Kroeger et al., ECCV 2016) with forward-backward confidence.
 
-    The flow is computed in both directions, and once more after each of the dominant homographies
-    (`planes`) has aligned the images; the better one is taken pixel by pixel (`guided_flow`): near
-    a driving camera displacements are too large for the coarse-to-fine search alone.
+    The flow is computed in both directions, and again after each of the dominant homographies
+    (`planes`) has aligned the images. The better one is used for each pixel (`guided_flow`), since
+    displacements near a driving camera are too large for a coarse-to-fine search alone.
 
-    Its confidence is that of its round-trip error (`confidence_of`). A wrong flow that both
-    directions agree on, as on weak texture, keeps its confidence. An image without contrast
-    (standard deviation under one grey level) gives a zero flow with confidence 0 everywhere.
+    The confidence follows from the round-trip error (`confidence_of`). A wrong but consistent flow,
+    as on weak texture, keeps its confidence. An image without contrast (standard deviation below
+    one grey level) gives a zero flow with confidence 0.
 
     Args:
         image_ref: (H, W, 3) or (H, W) uint8 reference image.
         image_next: (H', W', 3) or (H', W') uint8 next image; it may differ in size.
-        **options: Of `DisOptions`.
-
-    Returns:
-        Flow of source "dis", size of the reference image.
+        **options: Options of `DisOptions`.
 
     Raises:
         ConfigError: an option is unknown or out of range.

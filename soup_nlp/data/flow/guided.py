@@ -31,16 +31,15 @@ _GREY_CAP, _PER_GREY = 30.0, 0.05  # pixels that one grey level of difference co
 
 
 def dominant_homographies(flow: FloatMap, confidence: FloatMap, count: int) -> list[Float]:
-    """Homographies that explain most of a flow, one after the other (MAGSAC).
+    """Up to `count` homographies that fit most of a flow, found one after the other (MAGSAC).
 
     Args:
         flow: (H, W, 2), pixels.
         confidence: (H, W), in [0, 1].
-        count: At most so many.
+        count: Largest number of homographies.
 
     Returns:
-        (3, 3) maps of reference pixels to next pixels, the dominant first; fewer than `count`
-        where too few pixels are left.
+        (3, 3) maps from reference to next pixels, the dominant one first.
     """
     height, width = confidence.shape
     v, u = np.mgrid[0:height:_STEP, 0:width:_STEP]
@@ -67,19 +66,19 @@ def guided_flow(
     backward: FloatMap,
     planes: int,
 ) -> tuple[FloatMap, FloatMap]:
-    """The better, pixel by pixel, of a flow and of those found under its dominant homographies.
+    """The best, for each pixel, of a flow and of flows found under its dominant homographies.
 
-    A candidate's score is the mean, over a window, of its round-trip error and of the difference
-    in grey level between the pixel and its target; another than the first flow must be better by
-    a margin.
+    The score of a flow is the mean over a window of its round-trip error and of the grey-level
+    difference between a pixel and its target. A flow under a homography must be better than the
+    first flow by a margin.
 
     Args:
         ref: (H, W) grey reference image.
         nxt: (H', W') grey next image.
         match: The flow method.
         forward: (H, W, 2) first flow.
-        backward: (H', W', 2) first flow the other way.
-        planes: Homographies to try.
+        backward: (H', W', 2) first flow in the other direction.
+        planes: Number of homographies.
 
     Returns:
         (H, W, 2) flow and (H, W) its round-trip error, both in pixels.
@@ -98,7 +97,7 @@ def guided_flow(
 
 
 def _under(H: Float, ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, FloatMap]:
-    """Flow and round-trip error that are found after H has brought the next image to the first."""
+    """Flow and round-trip error after the next image has been warped to the first by H."""
     height, width = ref.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     near = cv2.warpPerspective(

@@ -1,9 +1,9 @@
-"""A layer that stands still before a moving scene: a reflection in a windscreen, dirt on it.
+"""Correction of flow that follows a static layer, such as a reflection in a windscreen.
 
-Where the layer has more contrast than the scene the flow follows it, is zero, closes its round
-trip and is fully confident: the road goes to infinity. The scene's own motion shows once what both
-images have in common at the same place is taken out, and is searched for along the epipolar lines
-of the rigid motion that the rest of the flow has.
+Where the layer has more contrast than the scene, the flow follows the layer: it is zero, consistent
+and fully confident, and the depth of the road becomes infinite. The motion of the scene becomes
+visible when the gradients that both images share at the same place are removed. It is then searched
+along the epipolar lines of the rigid motion of the remaining flow.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ Image = NDArray[np.uint8]
 Float = NDArray[np.float64]
 
 LEVELS = 64
-"""Depths that are tried of either kind of plane."""
+"""Number of depths that are tried for each kind of plane."""
 REACH = 0.25
 """Largest displacement tried, in widths of the image, at unit distance from the epipole."""
 WINDOW = 31
 """Side of the window over which costs are averaged, pixels."""
 TAU = 0.35
-"""A contradiction of census counts at most this much."""
+"""Truncation of the census cost."""
 STRIDE = 4
-"""Every so many pixels are looked at."""
+"""Distance of the examined pixels, pixels."""
 STILL_PX = 0.5
-"""A displacement up to which a pixel stands still, pixels."""
+"""Largest displacement of a static pixel, pixels."""
 MOVED_PX = 2.0
-"""Displacement, pixels, from which one is another."""
-CLEARLY, SLIGHTLY = 0.02, -0.01
-"""By how much the flow found must cost less than the given one: where a still pixel is to count as
-contradicted, and, once enough are, everywhere."""
-ENOUGH = 0.002
-"""Share of the image that has to be contradicted."""
-CONTRARY = 0.25
-"""Cost above which the flow found agrees with nothing either."""
+"""Smallest difference of two displacements that counts as a contradiction, pixels."""
+MIN_GAIN_STATIC, MIN_GAIN = 0.02, -0.01
+"""Smallest reduction of the cost by the new flow for a static pixel to count as contradicted, and
+for any pixel to be replaced once enough static pixels are contradicted."""
+MIN_CONTRADICTED = 0.002
+"""Smallest share of contradicted pixels for a correction."""
+MAX_COST = 0.25
+"""Largest cost of a confident new flow."""
 
 
 def without_still_layer(ref: Image, nxt: Image) -> tuple[Image, Image]:
-    """Both images (H, W, 3), grey (H, W), without the gradients that they share at one place.
+    """Grey versions (H, W) of two images (H, W, 3) without the gradients that they share.
 
-    Of two derivatives of one sign the smaller is taken off both; images are made of what is left
-    (Poisson's equation with free borders, by cosine transforms). Where nothing stands still the
-    images lose a part of their contrast, alike in both.
+    If the derivatives of both images at a pixel have the same sign, the smaller one is subtracted
+    from both. The images are recovered from the rest by Poisson's equation with free borders
+    (cosine transforms). Regions without a static layer lose some contrast in both images.
     """
     ref, nxt = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (ref, nxt))
     first, second = (_derivatives(image.astype(np.float32)) for image in (ref, nxt))
@@ -90,7 +90,7 @@ class EpipolarSearch:
     Args:
         ref: (H, W) grey reference image.
         nxt: (H', W') grey next image.
-        stride: Every so many pixels of the reference image are looked at.
+        stride: Distance of the examined pixels of the reference image.
     """
 
     def __init__(self, ref: Image, nxt: Image, stride: int) -> None:
@@ -101,8 +101,8 @@ class EpipolarSearch:
         self.v, self.u = np.mgrid[0:height:stride, 0:width:stride].astype(np.float32)
 
     def cost(self, x: FloatMap, y: FloatMap) -> FloatMap:
-        """Mean difference of census over a window, of pixels of the grid and (x, y) of the next
-        image; `TAU` beyond its border."""
+        """Census difference of the grid and the pixels (x, y) of the next image, averaged over a
+        window; `TAU` outside the image."""
         height, width = self.there.shape[1:3]
         inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
         c = np.abs(census_at(self.there, x, y) - self.own).sum(axis=(0, 3)) / 16
@@ -118,7 +118,7 @@ class EpipolarSearch:
     def along(self, R: Float, t: Float, K_ref: Float, K_next: Float) -> tuple[FloatMap, FloatMap]:
         """Flow of least cost among planes swept over depth under a rigid motion, and its cost.
 
-        Planes are parallel to the image, and level, as the ground of an upright image.
+        The planes are parallel to the image, or horizontal like the ground in an upright image.
 
         Args:
             R: (3, 3) rotation.
@@ -146,7 +146,7 @@ class EpipolarSearch:
 
 
 def still(flow: Flow) -> NDArray[np.bool_]:
-    """(H, W) pixels that stand still for certain."""
+    """(H, W) static pixels with a confident flow."""
     near: NDArray[np.bool_] = np.linalg.norm(flow.uv, axis=2) < STILL_PX
     return near & (flow.confidence > 0.5)
 
@@ -154,27 +154,27 @@ def still(flow: Flow) -> NDArray[np.bool_]:
 def corrected(
     ref: Image, nxt: Image, flow: Flow, R: Float, t: Float, K_ref: Float, K_next: Float
 ) -> Flow | None:
-    """A flow that follows the scene where the given one follows a layer that stands still.
+    """The flow corrected where it follows a static layer instead of the scene.
 
     Args:
         ref: (H, W) grey reference image without the layer (`without_still_layer`).
         nxt: (H', W') grey next image without it.
-        flow: Flow of the images as they are.
-        R: (3, 3) rotation of the motion that what is not still has.
-        t: (3,) its unit translation.
+        flow: Flow of the original images.
+        R: (3, 3) rotation of the motion of the other pixels.
+        t: (3,) unit translation of that motion.
         K_ref: (3, 3) intrinsics of the reference frame.
         K_next: (3, 3) intrinsics of the next frame.
 
     Returns:
-        The flow with what was found; its confidence there falls with the distance, pixels, from
-        the epipolar line. None where hardly any still pixel is contradicted.
+        The corrected flow, whose confidence there decreases with the distance in pixels from the
+        epipolar line. None if too few static pixels are contradicted.
     """
     search = EpipolarSearch(ref, nxt, STRIDE)
     found, cost = search.along(R, t, K_ref, K_next)
     gain = search.of_flow(flow.uv) - cost
     moved = np.linalg.norm(found - flow.uv[::STRIDE, ::STRIDE], axis=2)
-    contradicted = still(flow)[::STRIDE, ::STRIDE] & (gain > CLEARLY) & (moved > MOVED_PX)
-    if contradicted.mean() < ENOUGH:
+    contradicted = still(flow)[::STRIDE, ::STRIDE] & (gain > MIN_GAIN_STATIC) & (moved > MOVED_PX)
+    if contradicted.mean() < MIN_CONTRADICTED:
         return None
 
     def full(coarse: FloatMap) -> FloatMap:
@@ -183,12 +183,12 @@ def corrected(
         return np.asarray(cv2.resize(coarse, size)[:height, :width], np.float32)
 
     gain = cv2.blur(gain, (9, 9))
-    wrong = (full(gain) > SLIGHTLY) & (full(moved) > MOVED_PX)
+    wrong = (full(gain) > MIN_GAIN) & (full(moved) > MOVED_PX)
     guess = np.where(wrong[..., None], full(found), flow.uv).astype(np.float32)
     uv = _nearby(ref, nxt, guess)
     off = _distance_from_line(uv, R, t, K_ref, K_next)
-    sure = (np.linalg.norm(uv - guess, axis=2) < 3) & (full(cost) < CONTRARY)
-    # what had no confidence mostly leaves the image: the search has found something else
+    sure = (np.linalg.norm(uv - guess, axis=2) < 3) & (full(cost) < MAX_COST)
+    # pixels without confidence mostly leave the image, so that the search finds a wrong match
     sure &= flow.confidence > 0.3
     confidence = np.where(wrong, np.exp(-(off**2)) * sure, flow.confidence)
     uv = np.where(wrong[..., None], uv, flow.uv)
@@ -196,7 +196,7 @@ def corrected(
 
 
 def _nearby(ref: Image, nxt: Image, guess: FloatMap) -> FloatMap:
-    """The flow (H, W, 2) by DIS that starts at a guess, on the two finest scales."""
+    """Flow (H, W, 2) by DIS on the two finest scales, starting at a guess."""
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(0)
     dis.setCoarsestScale(1)

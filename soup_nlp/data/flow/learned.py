@@ -18,11 +18,10 @@ from soup_nlp.storage.files import is_file
 Image = NDArray[np.uint8]
 
 MODELS = {"raft_small": "Raft_Small_Weights", "raft_large": "Raft_Large_Weights"}
-"""Networks of torchvision by name, with the name of their weights (fetched once by torchvision)."""
+"""Name of the weights by name of a network of torchvision, which downloads them once."""
 
 RANGES = {"255": (0.0, 255.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
-"""What black and white are to an ONNX network; a file says which by the metadata key
-`input_range`, "255" where it does not."""
+"""Input values of black and white by the metadata `input_range` of an ONNX file; default "255"."""
 
 RAFT_SIDE = 128
 """Smallest image side of RAFT, pixels: its correlation pyramid has four levels of 1/8 size."""
@@ -32,10 +31,10 @@ class Network(NamedTuple):
     """A network that maps two images to a flow.
 
     Attributes:
-        predict: Outputs for two images (1, 3, H, W); flows among them are (1, 2, h, w), pixels.
-        levels: Values of black and white.
-        size: (H, W) of its images where that is fixed; they are resized to it then.
-        least: Smallest side of its images; they are padded to it and to a multiple of 8.
+        predict: Makes outputs, flows (1, 2, h, w) in pixels among them, of two images (1, 3, H, W).
+        levels: Input values of black and white.
+        size: Fixed (H, W) of the images, to which they are resized; None if any size is possible.
+        least: Smallest side of the images; they are padded to it and to a multiple of 8.
     """
 
     predict: Callable[[list[FloatMap]], list[Any]]
@@ -53,8 +52,7 @@ def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
         image_next: (H, W, 3) uint8 RGB next image of the same size.
 
     Raises:
-        DataError: the library or the file is missing, or the network does not map two images to a
-            flow.
+        DataError: the library or the file is missing, or the network gives no flow.
     """
     if image_ref.shape != image_next.shape or image_ref.shape[2:] != (3,):
         raise DataError(
@@ -72,8 +70,8 @@ def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
 def onnx_network(path: Path) -> Network:
     """A network of an ONNX file, run by onnxruntime on the CPU.
 
-    It takes two images (1, 3, H, W) or one stack (1, 6, H, W), float, RGB, and gives one or more
-    flows (1, 2, h, w) in pixels; the largest one, the last of equals, is taken.
+    Its inputs are two images (1, 3, H, W) or one stack (1, 6, H, W), float, RGB. Of its outputs the
+    largest flow (1, 2, h, w) in pixels is used, and the last one of equal size.
 
     Raises:
         DataError: onnxruntime is not installed, or the file is no such network.
@@ -90,7 +88,7 @@ def onnx_network(path: Path) -> Network:
         session = onnxruntime.InferenceSession(
             str(path), options, providers=["CPUExecutionProvider"]
         )
-    except Exception as error:  # onnxruntime has many of its own
+    except Exception as error:  # onnxruntime raises many types
         raise DataError(
             "file is no network that onnxruntime can run", where=path, found=_first_line(error)
         ) from error
@@ -143,7 +141,7 @@ def raft_network(source: str) -> Network:
             large = any("context_encoder" in k and "running_mean" in k for k in state)
             model = (optical_flow.raft_large if large else optical_flow.raft_small)(weights=None)
             model.load_state_dict(state)
-    except Exception as error:  # urllib, pickle and torch each raise their own
+    except Exception as error:  # urllib, pickle and torch raise many types
         raise DataError(
             "weights of RAFT cannot be loaded",
             where=source,
@@ -174,7 +172,7 @@ def _run(network: Network, first: Image, second: Image, where: str) -> FloatMap:
         images.append((plane / np.float32(255.0)) * np.float32(white - black) + np.float32(black))
     try:
         outputs = network.predict(images)
-    except Exception as error:  # each library raises its own
+    except Exception as error:  # libraries raise many types
         raise DataError("network failed", where=where, found=_first_line(error)) from error
     flows = [o for o in outputs if np.ndim(o) == 4 and o.shape[:2] == (1, 2)]
     if not flows:

@@ -21,15 +21,11 @@ MIN_SIDE = 32
 def rlof_flow(image_ref: Image, image_next: Image) -> Flow:
     """Dense RLOF with forward-backward confidence.
 
-    Sparse robust flow on a grid, checked forward and backward, interpolated along edges (EPIC) and
-    refined variationally.
-
-    Args:
-        image_ref: (H, W, 3) uint8 RGB reference image.
-        image_next: (H, W, 3) uint8 RGB next image of the same size.
+    A robust sparse flow on a grid is checked forward and backward, interpolated along edges (EPIC)
+    and refined by a variational method. Both images are (H, W, 3) uint8 RGB.
 
     Raises:
-        DataError: OpenCV has no contributed modules, or the images do not fit.
+        DataError: OpenCV has no contributed modules, or the images are too small or differ in size.
     """
     if not hasattr(cv2, "optflow"):
         raise DataError(

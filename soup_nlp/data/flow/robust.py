@@ -1,4 +1,4 @@
-"""Affine flow of every superpixel, fitted robustly, and the pixels that disagree with it."""
+"""Robust fit of an affine flow to every superpixel, and detection of outliers."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class AffineFlow:
-    """An affine flow for every superpixel: nearly that of a small plane that moves rigidly.
+    """An affine flow for every superpixel, which approximates that of a small rigid plane.
 
     Attributes:
         coefficients: (N, 3, 2) of (1, (u - u0) / size, (v - v0) / size) -> flow, pixels.
         centre: (N, 2) u0, v0.
-        size: (N,) root of the number of pixels with positive confidence.
-        known: (N,) False where a superpixel has fewer than six of them, and its fit means nothing.
+        size: (N,) square root of the number of pixels with positive confidence.
+        known: (N,) False for superpixels with fewer than six such pixels, whose fit is meaningless.
     """
 
     coefficients: Float
@@ -46,18 +46,18 @@ def fit_affine(
 ) -> tuple[AffineFlow, Float]:
     """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
 
-    The first weights are by the distance from the superpixel's median flow: least squares would
-    fit a slope across two motions, with no outlier in either.
+    The first weights follow from the distance to the median flow of the superpixel, since plain
+    least squares would fit a slope across two motions without outliers.
 
     Args:
-        flow: Flow with confidence, which multiplies the weights.
+        flow: Flow, whose confidence multiplies the weights.
         labels: (H, W) superpixel labels 0..N-1.
-        scale_px: Smallest residual, pixels, that an outlier can have; s is at least this, and at
-            least the superpixel's own spread (1.48 times the weighted mean absolute residual).
-        rounds: Re-weighted fits.
+        scale_px: Smallest residual of an outlier, pixels; s is the larger one of this and the
+            spread of the superpixel (1.48 times the weighted mean absolute residual).
+        rounds: Reweighted fits.
 
     Returns:
-        The fits, and the last weights of the pixels of positive confidence (P,).
+        The fits, and the last weights (P,) of the pixels with positive confidence.
 
     Raises:
         DataError: sizes differ, or the scale is not positive.
@@ -77,7 +77,7 @@ def refit_affine(
     scale_px: float,
     rounds: int = 8,
 ) -> AffineFlow:
-    """The fits of `fit_affine`, computed only for superpixels (N,) that `changed` since `fit`."""
+    """The fits of `fit_affine`, recomputed for the superpixels that `changed` (N,) only."""
     v, u = np.nonzero((flow.confidence > 0) & changed[labels])
     number = np.cumsum(changed) - 1
     new, _ = _fit(flow, number[labels[v, u]], u, v, int(changed.sum()), scale_px, rounds)
@@ -95,7 +95,7 @@ def _fit(
     total = np.maximum(np.bincount(which, base, n), 1e-30)
     centre = np.stack([np.bincount(which, base * x, n) / total for x in (u, v)], axis=1)
     count = np.bincount(which, minlength=n)
-    # coordinates of the size of one, whatever the superpixel's
+    # coordinates are normalised by the size of the superpixel
     fit = AffineFlow(np.zeros((n, 3, 2)), centre, np.sqrt(np.maximum(count, 1)), count >= 6)
     X = fit.basis(which, u, v)
     Y = flow.uv[v, u].astype(np.float64)
@@ -114,7 +114,7 @@ def _fit(
 
 
 def _medians(which: Ints, values: Float, n: int) -> Float:
-    """(N,) lower median of the values (P,) of every superpixel; 0 where it has none."""
+    """(N,) lower median of the values (P,) of every superpixel; 0 without values."""
     order = np.lexsort((values, which))
     count = np.bincount(which, minlength=n)
     middle = np.cumsum(count) - count + np.maximum(count - 1, 0) // 2
@@ -124,17 +124,14 @@ def _medians(which: Ints, values: Float, n: int) -> Float:
 
 
 def reweighted(flow: Flow, labels: NDArray[np.integer], scale_px: float = 0.5) -> Flow:
-    """The same flow with confidence lowered where it departs from its superpixel's motion.
+    """The flow with lower confidence where it differs from the affine flow of its superpixel.
 
-    The last weights of the superpixels' affine fits multiply the confidence.
+    The last weights of the affine fits multiply the confidence; positive confidences stay positive.
 
     Args:
         flow: Flow with confidence.
         labels: (H, W) superpixel labels 0..N-1.
-        scale_px: Smallest residual, pixels, that an outlier can have.
-
-    Returns:
-        Flow with the same displacements; no confidence grows, and none that was positive becomes 0.
+        scale_px: Smallest residual of an outlier, pixels.
 
     Raises:
         DataError: sizes differ, or the scale is not positive.
@@ -156,6 +153,6 @@ def _weighted(which: Ints, X: Float, Y: Float, w: Float, n: int) -> Float:
     right = np.stack(
         [np.bincount(which, w * X[:, a] * Y[:, c], n) for a in range(3) for c in range(2)], axis=1
     ).reshape(n, 3, 2)
-    # few pixels leave the slopes at 0
+    # a small ridge makes the slopes of superpixels with few pixels 0
     A += np.eye(3) * (1e-6 * A[:, 0, 0] + 1e-12)[:, None, None]
     return np.asarray(np.linalg.solve(A, right), np.float64)

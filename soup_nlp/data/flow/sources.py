@@ -1,6 +1,6 @@
-"""Where the flow of a pair comes from: DIS, a file, the truth, or a plug-in.
+"""Sources of the flow of a pair: DIS and other methods, a file, the truth, or a plug-in.
 
-A plug-in is a function `(image_ref, image_next) -> Flow` that an installed package announces as an
+A plug-in is a function `(image_ref, image_next) -> Flow` that an installed package registers as an
 entry point of the group `soup_nlp.flow`; the name of the entry point is the name of the source.
 """
 
@@ -29,29 +29,24 @@ Image = NDArray[np.uint8]
 FlowSource = Callable[[Image, Image], Flow]
 
 ENTRY_POINTS = "soup_nlp.flow"
-"""Entry-point group in which other packages announce flow methods."""
+"""Entry-point group in which other packages register flow methods."""
 
 NOISE = "truth+noise:"
-"""Name of the true flow with noise, followed by the standard deviation in pixels."""
+"""Prefix of the source "true flow with noise", followed by the standard deviation in pixels."""
 
 
 def flow_from_array(uv: NDArray[np.floating], source: str) -> Flow:
-    """A Flow of an array in which NaN means unknown: confidence 1 where known, 0 elsewhere.
-
-    Args:
-        uv: (H, W, 2), pixels; not finite where unknown.
-        source: Name for reports.
-    """
+    """A Flow of displacements (H, W, 2), pixels, with confidence 1 where finite and 0 elsewhere."""
     known = np.isfinite(uv).all(axis=2)
     filled = np.where(known[:, :, None], uv, 0.0).astype(np.float32)
     return Flow(filled, known.astype(np.float32), source)
 
 
 def load_flow(path: PathLike) -> Flow:
-    """A Flow of a file (.flo, KITTI .png, .npy): confidence 1 where the file knows it, else 0.
+    """A Flow of a file (.flo, KITTI .png, .npy) with confidence 1 where known, else 0.
 
     Raises:
-        DataError: the file is wrong (`read_flow`), or knows no pixel.
+        DataError: the file is malformed, or all pixels are unknown.
     """
     flow = flow_from_array(read_flow(path), Path(path).name)
     if not flow.confidence.any():
@@ -66,7 +61,7 @@ def with_confidence(
     size: tuple[int, int],
     check: DisOptions,
 ) -> Flow:
-    """The flow of a file with the confidence of its round trip, or of a file, or their product.
+    """The flow with a confidence from a backward flow, from a file, or the product of both.
 
     Args:
         flow: From the reference to the next image.
@@ -76,7 +71,7 @@ def with_confidence(
         check: Its `tau`, `limit` and `support` make confidence of the round-trip error.
 
     Raises:
-        DataError: a file is wrong or does not fit.
+        DataError: a file is malformed or has another size.
     """
     own = flow.confidence.copy()
     if backward is not None:
@@ -99,13 +94,12 @@ def with_confidence(
 
 
 def flow_from_truth(pair: Pair, occluded_confidence: float = 1.0) -> Flow:
-    """The true flow of a pair as its Flow; confidence 0 where the truth is unknown.
+    """The true flow of a pair, with confidence 0 where it is unknown.
 
     Args:
         pair: A pair whose truth has a flow.
-        occluded_confidence: Confidence of pixels that `truth.occluded` marks, in [0, 1]. The true
-            flow is known there too, so they are kept by default; 0 leaves them out, as any method
-            that matches images must.
+        occluded_confidence: Confidence of occluded pixels, in [0, 1]. The true flow is known there
+            too; 0 leaves them out, as in a flow that is estimated from images.
 
     Raises:
         DataError: the pair has no true flow.
@@ -124,9 +118,9 @@ def flow_from_truth(pair: Pair, occluded_confidence: float = 1.0) -> Flow:
 
 
 def add_noise(flow: Flow, sigma: float, correlation: float = 5.0) -> Flow:
-    """A flow with Gaussian noise that is correlated over a few pixels, as errors of real flows are.
+    """A flow with Gaussian noise that is correlated over a few pixels, like errors of real flows.
 
-    White noise would average out within a superpixel. The noise is the same in every call.
+    White noise would average out within a superpixel. Every call adds the same noise.
 
     Args:
         flow: Any flow.
@@ -140,14 +134,14 @@ def add_noise(flow: Flow, sigma: float, correlation: float = 5.0) -> Flow:
     if correlation > 0:
         noise = np.asarray(cv2.GaussianBlur(noise, (0, 0), correlation), np.float32)
     noise = noise[pad : pad + height, pad : pad + width]
-    # in a small image the deviation of blurred noise differs from its expectation
+    # normalise: the deviation of blurred noise differs from its expectation in a small image
     noise = noise * np.float32(sigma / max(float(noise.std()), 1e-12))
     uv = np.where(flow.confidence[:, :, None] > 0, flow.uv + noise, flow.uv)
     return Flow(uv.astype(np.float32), flow.confidence.copy(), f"{flow.source}+noise:{sigma:g}")
 
 
 def _noise_level(source: str) -> float:
-    """Standard deviation in pixels that a source such as "truth+noise:0.5" names."""
+    """Standard deviation in pixels of a source such as "truth+noise:0.5"."""
     try:
         sigma = float(source.removeprefix(NOISE))
     except ValueError:
@@ -189,7 +183,7 @@ class FlowOptions(Section):
             path: Resolves the name of a file.
 
         Raises:
-            DataError: the source is unknown, or its flow is damaged or does not fit.
+            DataError: the source is unknown, or its flow is damaged or has another size.
         """
         if self.backward or self.confidence:
             return self._load_with_confidence(pair, path)
@@ -219,12 +213,12 @@ class FlowOptions(Section):
         return is_path(self.source) and not is_network(self.source)
 
     def files(self) -> list[str]:
-        """Names of the files that may be read; what is no file, such as "dis", is among them."""
+        """Names that may be files, including a source that is a method such as "dis"."""
         return [name for name in (self.source, self.backward, self.confidence) if name]
 
 
 def flow_sources() -> dict[str, EntryPoint]:
-    """Flow methods that installed packages announce, by name."""
+    """Flow methods of installed plug-ins by name."""
     return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
 
 
@@ -234,7 +228,7 @@ def is_named(source: str) -> bool:
 
 
 def is_path(source: str) -> bool:
-    """Whether a flow source is a path: no known name, and with a suffix or a folder."""
+    """Whether a flow source is a path: not a known name, and with a suffix or a folder."""
     return not is_named(source) and bool(Path(source).suffix or "/" in source)
 
 
@@ -257,13 +251,12 @@ def resolve_flow(pair: Pair, source: str) -> Flow:
     """The flow of a pair from a named source.
 
     Args:
-        pair: The pair; its own `flow` is not looked at.
-        source: One of `METHODS`, with their defaults, "truth+noise:SIGMA" (`add_noise`), the name
-            of an installed plug-in (entry-point group `soup_nlp.flow`), the path of a network
-            (.onnx, or .pth for RAFT) or of a flow file.
+        pair: The pair; its `flow` is ignored.
+        source: One of `METHODS` with default options, "truth+noise:SIGMA" (`add_noise`), the name
+            of a plug-in, the path of a network (.onnx, or .pth for RAFT) or of a flow file.
 
     Raises:
-        DataError: the source is unknown or fails, or its flow does not fit the pair.
+        DataError: the source is unknown or fails, or its flow has another size.
     """
     if source in METHODS:
         return METHODS[source](pair)

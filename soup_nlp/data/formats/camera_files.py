@@ -1,6 +1,7 @@
 """Camera files: Sintel .cam, KITTI calibration, Virtual KITTI intrinsics, plain text.
 
-Every reader raises `DataError` for a file that is missing or of another kind, or holds no camera.
+All intrinsics are (3, 3), in pixels. Every reader raises `DataError` for a file that is missing, of
+another kind, or without a valid camera.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def check_intrinsics(given: object, where: object) -> Float:
     """Rows of numbers as (3, 3) intrinsics.
 
     Raises:
-        DataError: it is no finite, upper-triangular 3x3 matrix with positive focal lengths.
+        DataError: it is not a finite, upper-triangular 3x3 matrix with positive focal lengths.
     """
     try:
         K = np.array(given, dtype=np.float64)
@@ -76,9 +77,6 @@ def read_intrinsics(path: PathLike) -> Float:
 
     The file holds nine numbers (the 3x3 matrix, row by row) or four (fx fy cx cy), separated by
     blanks or commas; lines that start with # are comments.
-
-    Returns:
-        (3, 3) intrinsics, pixels.
     """
     lines = [x for x in read_text(path, "intrinsics").splitlines() if not x.strip().startswith("#")]
     values = _numbers("\n".join(lines), path, "intrinsics file")
@@ -94,11 +92,7 @@ def read_intrinsics(path: PathLike) -> Float:
 
 
 def read_cam(path: PathLike) -> Float:
-    """Read the intrinsics of a Sintel .cam file; its extrinsics are not used.
-
-    Returns:
-        (3, 3) intrinsics, pixels.
-    """
+    """Read the intrinsics of a Sintel .cam file; its extrinsics are not used."""
     content = read_bytes(path, "camera file")
     check_magic(content, path, "camera file")
     check_body(len(content) - 4, _CAM_BYTES, path, "camera file")
@@ -106,17 +100,11 @@ def read_cam(path: PathLike) -> Float:
 
 
 def read_kitti_projections(path: PathLike, names: Sequence[str]) -> list[Float]:
-    """Read projections from a KITTI calibration file of 'name: numbers' lines.
+    """Read projections (3, 4), pixels and metres, of a KITTI calibration file.
 
     Args:
         path: A stereo/flow 2012 file ('P0: ...') or a 'calib_cam_to_cam.txt' ('P_rect_02: ...').
-        names: Which projections.
-
-    Returns:
-        (3, 4) matrices, pixels and metres.
-
-    Raises:
-        DataError: the file is missing, a name is not in it, or has other than 12 finite numbers.
+        names: Names of the projections.
     """
     lines = read_text(path, "calibration file").splitlines()
     entries = {name.strip(): rest for name, _, rest in (line.partition(":") for line in lines)}
@@ -142,15 +130,9 @@ def read_kitti_projections(path: PathLike, names: Sequence[str]) -> list[Float]:
 
 
 def read_vkitti2_intrinsics(path: PathLike, frames: Sequence[int]) -> list[Float]:
-    """Read intrinsics of the left camera from a Virtual KITTI 2 intrinsic.txt.
+    """Read intrinsics of the left camera at these frames from a Virtual KITTI 2 intrinsic.txt.
 
     Its columns are: frame cameraID K[0,0] K[1,1] K[0,2] K[1,2].
-
-    Returns:
-        (3, 3) intrinsics of these frames, pixels.
-
-    Raises:
-        DataError: the file, a column or a frame is missing, a row is not numeric, or no camera.
     """
     lines = [line.split() for line in read_text(path, "intrinsics file").splitlines()]
     header = lines[0] if lines else []

@@ -16,7 +16,7 @@ from soup_nlp.geometry.camera import intrinsics
 Float = NDArray[np.float64]
 
 GUESS = 1.2
-"""Focal length in larger sides of the image where nothing else is known (45 degrees of view)."""
+"""Default focal length relative to the larger side of the image (45 degrees of view)."""
 
 _DIAGONAL_35 = math.hypot(36.0, 24.0)
 """Diagonal of a frame of 35 mm film, mm."""
@@ -28,9 +28,9 @@ def estimated_intrinsics(path: PathLike, fov: float | None = None) -> Float:
     """Intrinsics with square pixels and the principal point in the middle of the image.
 
     Args:
-        path: The image; its axes are those in which it is shown, turned by its EXIF orientation.
-        fov: Horizontal field of view, degrees; None for EXIF's focal length, or else `GUESS` times
-            the larger side.
+        path: The image; the axes are those after rotation by its EXIF orientation.
+        fov: Horizontal field of view, degrees; None for the focal length of EXIF, or else `GUESS`
+            times the larger side.
 
     Returns:
         (3, 3) intrinsics, pixels.
@@ -39,7 +39,7 @@ def estimated_intrinsics(path: PathLike, fov: float | None = None) -> Float:
         ConfigError: the field of view is not between 0 and 180 degrees.
 
     Warns:
-        DataWarning: the focal length is not given: where it comes from.
+        DataWarning: `fov` is not given; the warning names the origin of the focal length.
     """
     height, width = decode(path, "image", SHOWN).shape[:2]
     if fov is not None:
@@ -67,10 +67,10 @@ def estimated_intrinsics(path: PathLike, fov: float | None = None) -> Float:
 
 
 def exif_focal(path: PathLike) -> float | None:
-    """Focal length of EXIF in pixels; None where it says nothing that can be used.
+    """Focal length of EXIF in pixels; None if EXIF does not determine it.
 
-    The equivalent for 35 mm film is relative to the diagonal, as cameras give it; else the focal
-    length in millimetres counts with the resolution of the sensor.
+    It follows from the equivalent for 35 mm film, relative to the diagonal, or else from the focal
+    length in millimetres and the resolution of the sensor.
     """
     try:
         with Image.open(path) as image:

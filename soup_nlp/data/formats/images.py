@@ -1,4 +1,4 @@
-"""Images, and the checks that readers of every format share.
+"""Reading of images, and checks that the readers of all formats share.
 
 Every reader raises `DataError` for a file that is missing, empty, truncated or of another kind.
 """
@@ -20,18 +20,18 @@ from soup_nlp.schema.limits import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, read_bytes
 
 DARK = 65535 // 3
-"""A 16-bit image whose largest value is below this may hold fewer bits."""
+"""A 16-bit image with a smaller largest value may hold fewer bits."""
 
 SHOWN = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-"""Flags with which OpenCV turns a picture as its EXIF orientation says."""
+"""OpenCV flags that rotate an image by its EXIF orientation."""
 
 
 class DataWarning(UserWarning):
-    """An input can be used, but may not be what it seems."""
+    """An input can be used, but it may not be what the user expects."""
 
 
 def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
-    """Raise DataError unless a file body has the number of bytes that its header promises."""
+    """Raise DataError unless a file body has the number of bytes given by its header."""
     if found != expected:
         problem = "is truncated" if found < expected else "has bytes left over"
         raise DataError(
@@ -44,15 +44,12 @@ def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
 
 
 def decode(path: PathLike, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
-    """Decode an image file, unless `flags` say otherwise without changing its depth or channels.
-
-    OpenCV's order: BGR, BGRA.
-    """
+    """Decode an image file to BGR or BGRA with flags of OpenCV; by default it keeps all bits."""
     content = read_bytes(path, what)
     png = content.startswith(b"\x89PNG\r\n\x1a\n") and b"IEND" not in content
     last_scan, end = content.rfind(b"\xff\xda"), content.rfind(b"\xff\xd9")
     if png or (content.startswith(b"\xff\xd8") and end < last_scan):
-        # OpenCV would decode the part that is there
+        # OpenCV would decode the first part without an error
         raise DataError(
             f"{what} is truncated",
             where=path,
@@ -75,9 +72,9 @@ def decode(path: PathLike, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDAr
 
 
 def _check_header(content: bytes, path: PathLike, what: str) -> None:
-    """Raise DataError where an image's header claims a size beyond the limits.
+    """Raise DataError if the size in the header of an image exceeds the limits.
 
-    The pixels are not decoded: those of one colour take next to no place in the file.
+    A small file can have many pixels of one colour, so the pixels are not decoded here.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -91,7 +88,7 @@ def _check_header(content: bytes, path: PathLike, what: str) -> None:
                 found=error,
                 expected=f"at most {MAX_PIXELS} pixels",
             ) from None
-        except Exception:  # what Pillow does not know OpenCV may
+        except Exception:  # OpenCV may read formats that Pillow does not
             return
     check_image_size(width, height, what, path)
 
@@ -112,13 +109,13 @@ def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]
 
 
 def exif_orientation(path: PathLike) -> int:
-    """EXIF's orientation of an image file, 1 to 8; 1 (as stored) where it says nothing."""
+    """EXIF orientation of an image file, 1 to 8; 1 (as stored) if it has none."""
     try:
         with Image.open(io.BytesIO(read_bytes(path, "image"))) as image:
             found = image.getexif().get(ExifTags.Base.Orientation, 1)
     except DataError:
         raise
-    except Exception:  # what Pillow does not know OpenCV may
+    except Exception:  # OpenCV may read formats that Pillow does not
         return 1
     return found if found in range(1, 9) else 1
 
@@ -128,21 +125,21 @@ def read_image(
 ) -> NDArray[np.uint8]:
     """Read a picture as 8-bit RGB.
 
-    8 and 16 bit, grey, RGB and RGBA are accepted. Grey is repeated in the three channels, alpha is
-    dropped (not blended). 16-bit values v become round(255 v / white), clipped to 255. A picture
-    that its EXIF orientation turns is refused unless `turn`: its camera may be that of either.
+    8 and 16 bit, grey, RGB and RGBA are accepted. Grey is repeated in the three channels, and alpha
+    is dropped. 16-bit values v become round(255 v / white), clipped to 255. An image with an EXIF
+    rotation is rejected unless `turn` is set, since its camera may be that of either orientation.
 
     Args:
         path: Image file (PNG, JPEG, TIFF, PPM ...).
-        white: Value of a 16-bit image that becomes 255: 65535 when None; 4095 for 12-bit
-            pictures stored in 16 bits, which would come out nearly black otherwise.
-        turn: Turn it as its EXIF orientation says, as viewers do.
+        white: Value of a 16-bit image that becomes 255, such as 4095 for 12-bit images; None for
+            65535.
+        turn: Rotate the image by its EXIF orientation, as viewers do.
 
     Returns:
         (H, W, 3) uint8 RGB image, indexed [v, u].
 
     Raises:
-        DataError: the file is damaged, of another kind, or turned by EXIF without `turn`.
+        DataError: the file is damaged, of another kind, or has an EXIF rotation without `turn`.
 
     Warns:
         DataWarning: no `white` is given and a 16-bit image is dark throughout.
@@ -183,10 +180,10 @@ def read_image(
 
 
 def _to_8_bit(image: NDArray[np.uint16], white: int | None, path: PathLike) -> NDArray[np.uint8]:
-    """round(255 v / white), clipped to 255; a warning where no `white` is given and all is dark."""
+    """round(255 v / white), clipped to 255; warns if `white` is None and the image is dark."""
     largest = int(image.max())
     if white is None and 0 < largest < DARK:
-        # the scene may be dark: nothing is guessed
+        # only a warning, since the scene may be dark
         full = 2 ** largest.bit_length() - 1
         warnings.warn(
             f"{path}: 16-bit image is dark, its largest value is {largest} of 65535; if its"

@@ -1,8 +1,8 @@
 """Flow and depth files: Middlebury .flo, Sintel .dpt, .pfm, 16-bit PNG, NumPy arrays.
 
-In memory a flow is (H, W, 2) float64 of float32 precision, displacement (u right, v down) in
-pixels, NaN in both components where unknown. A depth is (H, W) float64, z along the optical axis,
-NaN where unknown; zero, negative and infinite depths count as unknown.
+All readers return a flow as (H, W, 2) float64 of float32 precision, displacement (u right, v down)
+in pixels, NaN in both components where unknown, and a depth as (H, W) float64, z along the optical
+axis, NaN where unknown. Zero, negative and infinite depths count as unknown.
 
 Every reader raises `DataError` for a file that is missing, empty, of another format, of an
 impossible size, or longer or shorter than its header says.
@@ -37,7 +37,7 @@ UNKNOWN_FLOW = 1e9
 """A component larger than this marks an unknown flow."""
 
 VKITTI_SKY = 65535
-"""Virtual KITTI stores depths of 655.35 m and more, the sky, as this value."""
+"""Value of Virtual KITTI for depths of 655.35 m and more, such as the sky."""
 
 KITTI_DISPARITY = 256.0
 """Values per pixel of a KITTI disparity image."""
@@ -61,7 +61,7 @@ def _raster(
     """The float32 numbers of byte order `order` after a header of `start` bytes, as an array.
 
     Raises:
-        DataError: no image has this size (H, W, ...), or the file is shorter or longer.
+        DataError: the size (H, W, ...) is impossible, or the file is shorter or longer.
     """
     check_image_size(size[1], size[0], what, path)
     check_body(len(content) - start, 4 * int(np.prod(size)), path, what)
@@ -112,11 +112,7 @@ def _known_flow(flow: NDArray[Any], path: PathLike) -> Float:
 
 
 def read_flo(path: PathLike) -> Float:
-    """Read a Middlebury .flo file (little endian; also used by Sintel).
-
-    Returns:
-        (H, W, 2) float64, pixels; NaN where a component is NaN or larger than 1e9 in magnitude.
-    """
+    """Read a Middlebury .flo file (also used by Sintel); NaN and values above 1e9 are unknown."""
     return _known_flow(_read_pieh(path, (2,), "flow file"), path)
 
 
@@ -129,22 +125,15 @@ def _read_flow_png(path: PathLike, what: str) -> Float:
 
 
 def read_kitti_flow(path: PathLike) -> Float:
-    """Read a KITTI flow PNG: 16-bit RGB, u = (R - 2^15) / 64, v = (G - 2^15) / 64, B > 0 valid.
-
-    Returns:
-        (H, W, 2) float64, pixels; NaN where not valid.
-    """
+    """Read a KITTI flow PNG: 16-bit RGB, u = (R - 2^15) / 64, v = (G - 2^15) / 64, B > 0 valid."""
     return (_read_flow_png(path, "KITTI flow") - 2.0**15) / 64.0
 
 
 def read_vkitti_flow(path: PathLike) -> Float:
     """Read a Virtual KITTI 1 or 2 flow PNG.
 
-    16-bit RGB: u = (2 R / 65535 - 1) (W - 1), v = (2 G / 65535 - 1) (H - 1), B = 0 invalid
-    (sky and the like).
-
-    Returns:
-        (H, W, 2) float64, pixels; NaN where invalid.
+    16-bit RGB: u = (2 R / 65535 - 1) (W - 1), v = (2 G / 65535 - 1) (H - 1), B = 0 invalid such as
+    the sky.
     """
     unit = 2.0 / 65535.0 * _read_flow_png(path, "Virtual KITTI flow") - 1.0
     height, width = unit.shape[:2]
@@ -154,12 +143,8 @@ def read_vkitti_flow(path: PathLike) -> Float:
 def read_flow(path: PathLike) -> Float:
     """Read a flow by the suffix of its file.
 
-    `.flo` is Middlebury, `.png` is KITTI (for Virtual KITTI call `read_vkitti_flow`, the two look
-    alike), `.npy` is a plain (H, W, 2) or (2, H, W) array in pixels with NaN or values over 1e9
-    where unknown.
-
-    Returns:
-        (H, W, 2) float64, pixels; NaN where unknown.
+    `.flo` is Middlebury, `.png` is KITTI (Virtual KITTI needs `read_vkitti_flow`), `.npy` is an
+    array (H, W, 2) or (2, H, W) in pixels with NaN or values above 1e9 where unknown.
     """
     readers: dict[str, Reader] = {
         ".flo": read_flo,
@@ -170,11 +155,7 @@ def read_flow(path: PathLike) -> Float:
 
 
 def read_confidence(path: PathLike) -> NDArray[np.float32]:
-    """Read a confidence map: .npy in [0, 1], or a grey picture of 8 or 16 bits, black for 0.
-
-    Returns:
-        (H, W) float32 in [0, 1].
-    """
+    """(H, W) confidence in [0, 1] of a .npy file or a grey image of 8 or 16 bits (black is 0)."""
     if Path(path).suffix == ".npy":
         found = read_npy(path, "confidence file")
     else:
@@ -211,21 +192,14 @@ def _known_depth(depth: NDArray[Any], path: PathLike) -> Float:
 
 
 def read_dpt(path: PathLike) -> Float:
-    """Read a Sintel .dpt depth file.
-
-    Returns:
-        (H, W) float64 depth in scene units (metres in Sintel); NaN where unknown.
-    """
+    """Read a Sintel .dpt depth file, in scene units (metres in Sintel)."""
     return _known_depth(_read_pieh(path, (), "depth file"), path)
 
 
 def read_pfm(path: PathLike) -> Float:
-    """Read a depth from a grey .pfm map of either byte order, flipped so that row 0 is the top.
+    """Read a depth from a grey .pfm map, flipped so that row 0 is the top.
 
-    The size of the scale in the header is ignored, its sign is the byte order.
-
-    Returns:
-        (H, W) float64; NaN where unknown.
+    The sign of the scale in the header is the byte order; its magnitude is ignored.
     """
     content = read_bytes(path, "PFM file")
     if content[:2] == b"PF":
@@ -253,14 +227,8 @@ def read_depth_png16(path: PathLike, scale: float = 1000.0) -> Float:
 
     Args:
         path: The file.
-        scale: Values per unit of length: 1000 for millimetres, 5000 for TUM RGB-D, 256 for KITTI
-            depth, 100 for Virtual KITTI; `KITTI_DISPARITY` gives disparities in pixels.
-
-    Returns:
-        (H, W) float64 depth; NaN where unknown.
-
-    Raises:
-        DataError: the scale is not positive, or the file is missing, damaged or not 16-bit grey.
+        scale: Positive values per unit of length: 1000 for millimetres, 5000 for TUM RGB-D, 256 for
+            KITTI depth, 100 for Virtual KITTI; `KITTI_DISPARITY` gives disparities in pixels.
     """
     if not (isinstance(scale, Real) and 0 < scale < 1e300):
         raise DataError(
@@ -273,11 +241,7 @@ def read_depth_png16(path: PathLike, scale: float = 1000.0) -> Float:
 
 
 def read_vkitti_depth(path: PathLike) -> Float:
-    """Read a Virtual KITTI 1 or 2 depth PNG: 16-bit grey, centimetres, 65535 for the sky.
-
-    Returns:
-        (H, W) float64 depth, metres; NaN for the sky and unknown pixels.
-    """
+    """Depth in metres of a Virtual KITTI PNG: 16-bit grey, centimetres, 65535 for the sky."""
     depth = read_depth_png16(path, 100.0)
     depth[depth >= VKITTI_SKY / 100.0] = np.nan
     return depth
@@ -286,12 +250,7 @@ def read_vkitti_depth(path: PathLike) -> Float:
 def read_depth(path: PathLike, png_scale: float = 1000.0) -> Float:
     """Read a depth by the suffix of its file: .dpt, .npy, .pfm or 16-bit .png.
 
-    Args:
-        path: The file.
-        png_scale: Values per unit of length of a .png, see `read_depth_png16`.
-
-    Returns:
-        (H, W) float64 depth in the unit of the file; NaN where unknown, not positive or infinite.
+    `png_scale` are the values per unit of length of a .png, see `read_depth_png16`.
     """
     readers: dict[str, Reader] = {
         ".dpt": read_dpt,

@@ -1,4 +1,4 @@
-"""NumPy's .npy and .npz files; their headers are checked before memory is taken."""
+"""Reading of .npy and .npz files, which checks headers before it allocates memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def read_npy(path: PathLike, what: str) -> NDArray[Any]:
     """One array of real numbers from a .npy file, without pickles.
 
     Raises:
-        DataError: the file is missing, holds something else, or other than its header says.
+        DataError: the file is missing, malformed, or differs from its header.
     """
     return _array(read_bytes(path, what), path, what)
 
@@ -29,12 +29,12 @@ def read_npy(path: PathLike, what: str) -> NDArray[Any]:
 def _array(content: bytes, path: PathLike, what: str) -> NDArray[Any]:
     stream = io.BytesIO(content)
     try:
-        # from version 2 on the header has four bytes for its length, in version 3 it is UTF-8
+        # from version 2 on the length of the header has four bytes; version 3 uses UTF-8
         if npy.read_magic(stream)[0] == 1:
             shape, fortran, kind = npy.read_array_header_1_0(stream)
         else:
             shape, fortran, kind = npy.read_array_header_2_0(stream)
-    except Exception as error:  # the header is a Python literal: its parser has many of its own
+    except Exception as error:  # parsing the header, a Python literal, raises many types
         raise DataError(
             f"{what} is not a readable .npy file", where=path, found=str(error)
         ) from error
@@ -60,12 +60,12 @@ def read_npz(path: PathLike, what: str) -> dict[str, NDArray[Any]]:
     """The arrays of a .npz file by name, see `read_npy`.
 
     Raises:
-        DataError: the file is missing, is no .npz, or holds more than images do.
+        DataError: the file is missing, is no .npz, or is too large when unpacked.
     """
     content, most = read_bytes(path, what), 32 * MAX_PIXELS
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            # unpacked, a small file may be large
+            # a small file may be large when unpacked
             size = sum(entry.file_size for entry in archive.infolist())
             if size > most:
                 raise DataError(

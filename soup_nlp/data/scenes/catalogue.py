@@ -31,7 +31,7 @@ def render_scene(
         seed: Changes layout, textures and motions within sensible ranges; same seed, same bytes.
         width: Columns of both images, at least 64; the focal length grows with it.
         height: Rows of both images, at least 48.
-        frame: The pair's first frame: camera and bodies go on as from frame 0 to frame 1.
+        frame: First frame of the pair; camera and bodies repeat their motion from frame 0 to 1.
 
     Returns:
         A `Pair` with full `Truth` in metres and no flow. Component 0 is the static background.
@@ -39,7 +39,7 @@ def render_scene(
     """
     check_image_size(width, height, "scene", name)
     layout, focal = _LAYOUTS[name]
-    # tall images keep the field of view of a 4:3 image, or the ground would pass the camera
+    # tall images keep the field of view of a 4:3 image, else the ground would be behind the camera
     f = focal * max(width, 4 / 3 * height)
     K = camera.intrinsics(f, f, (width - 1) / 2, (height - 1) / 2)
     rng = np.random.default_rng([seed, list(_LAYOUTS).index(name)])
@@ -214,7 +214,7 @@ _WALL = 6.4
 def _objects(
     rng: Random, m: _Materials, spots: tuple[tuple[float, float], ...], half_width: float
 ) -> list[tuple[Part, Float]]:
-    """Boxes and spheres in turn, one standing on each spot; with its foot (3,)."""
+    """Alternating boxes and spheres, one on each spot, with their foot points (3,)."""
     out = []
     for k, (across, distance) in enumerate(spots):
         z = distance + rng.uniform(-0.1, 0.1)
@@ -338,4 +338,4 @@ _LAYOUTS: dict[str, tuple[Callable[[Random, float, float], Scene], float]] = {
 """Layout and focal length (in image widths) of each scene."""
 
 SCENES = {name: str(layout.__doc__) for name, (layout, _) in _LAYOUTS.items()}
-"""Names that `render_scene` knows, with one line on each."""
+"""Description of every scene by name."""

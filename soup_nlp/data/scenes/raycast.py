@@ -1,9 +1,9 @@
 """A small ray caster for dynamic scenes: exact depth, flow and visibility, textured images.
 
-A `Scene` holds bodies; a body holds parts that move together; a part is a shape at a pose with a
-texture. Rays are `K^-1 (u, v, 1)`, so the ray parameter of a hit *is* its depth z. Depth, flow,
-labels and visibility are computed at pixel centres in closed form; only colour is averaged over
-the pixel.
+A `Scene` consists of bodies, a body of parts that move together, and a part is a shape with a pose
+and a texture. Rays are `K^-1 (u, v, 1)`, so the ray parameter of a hit is its depth z. Depth, flow,
+labels and visibility are computed at pixel centres in closed form; only colour is averaged over the
+pixel.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 SAME_DEPTH = 1e-6
-"""Relative difference of depth up to which two hits are the same point."""
+"""Largest relative difference of depth of two hits of the same point."""
 
 TAPS = 3
-"""Colour samples per pixel along the direction in which a surface is foreshortened."""
+"""Colour samples of a pixel along the direction of foreshortening."""
 
 TILTED = 0.75
 """Cosine between normal and ray below which a surface gets `TAPS` colour samples."""
@@ -74,7 +74,7 @@ class Body:
     """Parts that move together.
 
     Attributes:
-        parts: What the body is made of.
+        parts: Parts of the body.
         motion: (4, 4) motion in scene coordinates from the reference to the next time.
     """
 
@@ -125,7 +125,7 @@ class Scene:
         return out
 
     def trace(self, K: Float, uv: Float, frame: int) -> tuple[Float, Int]:
-        """First surface behind pixels.
+        """First hit of the rays through pixels.
 
         Args:
             K: (3, 3) intrinsics.
@@ -149,10 +149,10 @@ class Scene:
 
 
 def advanced(scene: Scene, steps: int) -> Scene:
-    """The scene some frames later: camera and bodies go on as from the first frame to the second.
+    """The scene some frames later; camera and bodies repeat their motion between the first frames.
 
     Raises:
-        DataError: a shape bends; it does so from the first frame to the second only.
+        DataError: a shape bends; bending is defined for the first two frames only.
     """
     if steps and not all(part.shape.rigid for part in scene.parts):
         raise DataError("a scene that bends has two frames", found=f"frame {steps}", expected="0")
@@ -183,7 +183,7 @@ def render(scene: Scene, K: Float, height: int, width: int, name: str = "scene")
     """Both images of a scene and its exact truth.
 
     Args:
-        scene: What to render.
+        scene: The scene.
         K: (3, 3) intrinsics of both frames, pixels.
         height: Rows of the images.
         width: Columns of the images.
@@ -191,9 +191,9 @@ def render(scene: Scene, K: Float, height: int, width: int, name: str = "scene")
 
     Returns:
         A `Pair` without a flow but with full truth in the unit of the scene. A reference pixel is
-        occluded when its point is hidden in the next frame, or projects outside the rectangle of
-        the next frame's pixel centres, or lies behind its camera (its flow is NaN then). Every ray
-        must hit a surface, such as an infinite plane behind the bodies.
+        occluded if its point is hidden in the next frame, projects outside the rectangle of the
+        pixel centres, or is behind the camera (with a flow of NaN). Every ray must hit a surface,
+        such as an infinite plane behind the bodies.
     """
     uv = camera.pixel_grid(height, width).reshape(-1, 2)
     depths, images, hits = [], [], []
@@ -207,7 +207,7 @@ def render(scene: Scene, K: Float, height: int, width: int, name: str = "scene")
     in_front = X_next[:, 2] > NEAR
     target = np.full_like(uv, np.nan)
     target[in_front] = camera.project(K, X_next[in_front])
-    # a target within rounding of the border counts as inside
+    # tolerates rounding at the border
     edge = np.array([width, height]) - 1 + 1e-6
     inside = in_front & ((target >= -1e-6) & (target <= edge)).all(axis=1)
     visible = inside.copy()
@@ -276,8 +276,8 @@ def _shade(
 ) -> tuple[NDArray[np.float32], Float]:
     """Colours and normals of hits.
 
-    A tilted surface is foreshortened in one image direction only. Its texture keeps the finer
-    resolution where TAPS samples along that direction average the rest away.
+    A tilted surface is foreshortened in one image direction only. Its texture has the finer
+    resolution of the other direction, and TAPS samples are averaged along the first.
 
     Args:
         scene: The scene.
@@ -286,7 +286,7 @@ def _shade(
         depth: (N,) depth of the surface there.
         part: (N,) part index.
         frame: 0 or 1.
-        taps: Samples along the foreshortened direction; 1 where the caller averages by itself.
+        taps: Samples along the foreshortened direction; 1 if the caller averages samples.
 
     Returns:
         Colours (N, 3) and unit normals (N, 3) in camera coordinates.
@@ -310,7 +310,7 @@ def _shade(
         shown = np.empty((len(on), 3), np.float32)
         shown[~several] = item.colour(local[~several], footprint[~several], frame)
         if several.any():
-            # the direction within the surface along which a pixel covers most of it
+            # direction of foreshortening within the surface
             along = (ray - towards[:, None] * n)[several]
             along *= ((across / cosine)[several] / np.linalg.norm(along, axis=1))[:, None]
             step, start = along @ R, local[several]

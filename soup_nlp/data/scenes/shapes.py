@@ -1,7 +1,7 @@
-"""Surfaces that a ray can hit: intersections, normals and material coordinates.
+"""Surfaces for ray casting: intersections, normals and material coordinates.
 
-Material coordinates name a point of a surface in both frames (`material` and `place`); for rigid
-shapes they are the shape's own coordinates.
+Material coordinates identify a point of a surface in both frames (`material` and `place`). For
+rigid shapes they are the coordinates of the shape.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 NEAR = 1e-6
-"""Hits closer than this depth are ignored, unit of length."""
+"""Smallest depth of a hit, unit of length."""
 
 
 class Shape(ABC):
@@ -44,7 +44,7 @@ class Shape(ABC):
         return points
 
     def place(self, material: Float, frame: int) -> Float:
-        """Where material coordinates (N, 3) lie in a frame, (N, 3)."""
+        """Positions (N, 3) of material coordinates (N, 3) in a frame."""
         return material
 
     def chart(self, material: Float) -> Float:
@@ -64,7 +64,7 @@ def _first_hit(*roots: Float) -> Float:
 
 @dataclass(frozen=True)
 class Plane(Shape):
-    """The infinite plane z = 0, normal -z; seen from both sides."""
+    """The infinite plane z = 0 with normal -z, visible from both sides."""
 
     def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
         """See `Shape`."""
@@ -94,9 +94,9 @@ class Box(Shape):
         """See `Shape`."""
         half = np.asarray(self.half)
         with np.errstate(divide="ignore", invalid="ignore"):
-            # one contiguous row per axis: much faster than reducing over rows of three
+            # one contiguous row for each axis is much faster than reducing over rows of three
             a, b = ((sign * half - origin)[:, None] / rays.T for sign in (-1, 1))
-        # fmin and fmax let a ray within a face (0/0) be decided by the other axes
+        # for a ray within a face (0/0), fmin and fmax use the other axes
         enter = np.fmax.reduce(np.fmin(a, b))
         leave = np.fmin.reduce(np.fmax(a, b))
         return np.where(enter <= leave, _first_hit(enter, leave), np.inf)
@@ -177,7 +177,7 @@ class Sheet(Shape):
         return points @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
-        """See `Shape`; the cylinder is `k (x^2 + z^2) = 2 z`, which stays sound for k = 0."""
+        """See `Shape`; the cylinder is `k (x^2 + z^2) = 2 z`, which is valid for k = 0 too."""
         k = self.curvature[frame]
         o = self._turn(origin[None], -self.angle[frame])[0]
         d = self._turn(rays, -self.angle[frame])

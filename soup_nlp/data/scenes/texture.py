@@ -1,8 +1,8 @@
 """Procedural textures: seeded solid noise, band-limited to the size of a pixel.
 
-A texture is a function of a body's own (material) coordinates, so that it sticks to the body
-while the body moves, turns or bends: the two frames of a rendered pair then show the same colours
-at corresponding points (brightness constancy), up to the sampling by pixels.
+A texture is a function of the material coordinates of a body and moves with it. The two frames of a
+rendered pair therefore have the same colours at corresponding points (brightness constancy), up to
+the sampling by pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PERIOD = 32
 """Cells after which the noise of one octave repeats; a power of two."""
 
 FINEST_CELLS = (1.25, 2.5)
-"""An octave fades in while its cells grow from the first to the second many footprints."""
+"""Cell size in footprints of pixels at which an octave begins to appear, and is complete."""
 
 LACUNARITY = 1.93
 """Ratio of the cell sizes of consecutive octaves."""
@@ -49,7 +49,7 @@ def value_noise(points: Float, seed: int) -> Float32:
 
     Args:
         points: (N, 3) positions in lattice cells.
-        seed: Which noise.
+        seed: Seed of the noise.
 
     Returns:
         (N,) values in [-1, 1], twice continuously differentiable, period `PERIOD` in each axis.
@@ -88,9 +88,9 @@ def fractal_noise(
         points: (N, 3) positions in the unit of length.
         footprint: (N,) size of a pixel on the surface, same unit.
         cell: Cell size of the coarsest octave, same unit.
-        seed: Which noise.
+        seed: Seed of the noise.
         persistence: Amplitude of an octave relative to the next coarser one.
-        octaves: At most this many.
+        octaves: Largest number of octaves.
 
     Returns:
         (N,) noise of zero mean and, with five octaves, standard deviation of about 0.4.
@@ -166,7 +166,7 @@ class Texture:
         colours: Two RGB colours in [0, 1]; slow noise mixes them.
         cell: Size of the coarsest noise cells, unit of length.
         contrast: Strength of the fine multi-octave noise, 0 for flat colours.
-        seed: Which noise.
+        seed: Seed of the noise.
         panels: Rectangles painted over the two colours, or None.
     """
 
