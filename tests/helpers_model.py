@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -106,6 +107,9 @@ class Tiny:
         self.data: EnergyData = build_energy_data(
             self.seg, self.flow, K_REF, K_NEXT, samples, seed, arap_at_anchors=at_anchors
         )
+        # E_prior lets every third edge have a relief for nothing
+        relief = np.where(np.arange(len(self.data.edges)) % 3, 0.0, 0.3)
+        self.data = replace(self.data, prior_relief=relief)
         if units == "pixels":
             self.data = in_pixels(self.data, self.soup, self.seg)
 

@@ -35,7 +35,7 @@ from soup_nlp.export.names import readable_names
 from soup_nlp.export.sol import write_sol
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.folders import recover
-from soup_nlp.storage.mark import digest_of, made
+from soup_nlp.storage.mark import digest_of, made_files
 
 TINY = [
     "input.width=64", "input.height=48", "flow.source=truth", "segmentation.superpixels=12",
@@ -169,7 +169,7 @@ def broken(folder: Path) -> list[str]:
     if not folder.is_dir():
         return []
     recover(folder)
-    listed = made(folder) or {}
+    listed = made_files(folder) or {}
     wrong = [
         n for n, d in listed.items() if not (folder / n).is_file() or digest_of(folder / n) != d
     ]
@@ -238,7 +238,7 @@ def disk(place: Path, size: int) -> Iterator[None]:
 def listed(folder: Path) -> dict[str, dict[str, str]]:
     """The list of files of a folder and of the results in it."""
     places = [folder, *(folder / "pairs").glob("*")]
-    return {str(p): dict(made(p) or {}) for p in places if p.is_dir()}
+    return {str(p): dict(made_files(p) or {}) for p in places if p.is_dir()}
 
 
 def fill(folder: Path) -> None:

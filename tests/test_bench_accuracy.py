@@ -1,4 +1,4 @@
-"""Accuracy of pairs: rows that have every number, that survive, and that are as asked."""
+"""Accuracy of pairs: contents of rows, storage of rows, metric conventions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from helpers_rows import fake_row
 
-from soup_nlp.bench.accuracy import head, input_hash, moving, pair_job, settings_hash
+from soup_nlp.bench.accuracy import input_hash, moving, pair_job, row_identity, settings_hash
 from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.depth_maps import METHODS
 from soup_nlp.bench.rows import Job, Row, append_row, attempt, measure_all, read_rows
@@ -88,7 +88,7 @@ def test_a_pair_that_fails_is_a_row():
 
 
 def test_a_pair_without_truth_is_a_row_that_failed(tmp_path):
-    """So it is measured once the truth is there; it is not solved before."""
+    """A pair without truth is not solved; it is measured once the truth exists."""
     for k in (0, 1):
         cv2.imwrite(str(tmp_path / f"frame_{k}.png"), np.zeros((48, 64, 3), np.uint8))
     np.savetxt(tmp_path / "K.txt", K)
@@ -113,7 +113,7 @@ def test_settings_hash_is_the_same_on_every_pair():
 def test_input_hash_is_of_the_frames_not_of_their_place():
     def head_at(root: str, *overrides: str) -> Row:
         raw = {"kind": "sintel", "root": root, "scene": "alley_1", "frame": 2}
-        return head(Item("sintel", "alley_1", "alley_1-0002", "dis", raw), overrides)
+        return row_identity(Item("sintel", "alley_1", "alley_1-0002", "dis", raw), overrides)
 
     here, final = head_at("/a"), head_at("/a", "input.render=final")
     assert here == head_at("/b")

@@ -1,4 +1,4 @@
-"""The paper's tables and figures: all sections from made-up rows, real rows of tiny pairs."""
+"""The tables and figures of the paper: sections from artificial rows, real rows of tiny pairs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,13 @@ from soup_nlp.bench import paper_plan
 from soup_nlp.bench.departures import DEPARTURES, PAPER, default
 from soup_nlp.bench.paper_measures import measure, read_maps
 from soup_nlp.bench.paper_plan import DATASETS, METHODS, SECTIONS, Sizes, make_plan
-from soup_nlp.bench.paper_scale import KINDS, SCALES, lowest, measure_scale, with_motions
+from soup_nlp.bench.paper_scale import (
+    KINDS,
+    SCALES,
+    measure_scale,
+    scale_of_least_energy,
+    with_motions,
+)
 from soup_nlp.bench.paper_sections import TEXTS
 from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suite_pairs import Item
@@ -66,7 +72,7 @@ def test_a_departure_changes_the_defaults_and_the_preset(departure):
 
 
 def fake(job: Item, overrides: tuple[str, ...] = (), variant: str = "", *, maps=None) -> Row:
-    """A row of numbers that tell where they come from."""
+    """A row whose numbers identify its cell."""
     if any("orient" in o for o in overrides) and job.suite == "shared":
         raise DataError("made to fail", where=job.key)
     value = 0.5 if overrides[:1] == PAPER else 0.25
@@ -173,20 +179,20 @@ def test_a_row_has_energies_on_the_way_and_small_maps(tmp_path):
 
 
 def test_energies_over_the_scale_of_a_body():
-    """At scale 1 they are those of the truth; E_cont of touching bodies falls towards it."""
+    """At scale 1 the energies are those of the truth, and E_cont of touching bodies is lowest."""
     row = measure_scale(item("street", 256, 112), ("segmentation.superpixels=250",))
     assert row["bodies"]
     for body in row["bodies"]:
         assert set(body["curves"]) == set(KINDS)
         assert all(len(c) == len(SCALES) and np.isfinite(c).all() for c in body["curves"].values())
-        assert 0.25 <= lowest(body["curves"]["cont"]) <= 4.0
+        assert 0.25 <= scale_of_least_energy(body["curves"]["cont"]) <= 4.0
     assert SCALES[len(SCALES) // 2] == pytest.approx(1.0)
     with pytest.raises(DataError, match="no moving component"):
         measure_scale(item("orbit"), ("segmentation.superpixels=40",))
 
 
 def test_motions_of_bodies_follow_from_true_depth_and_flow():
-    """PnP finds the motions that a rendered scene was made with, for every piece of the mask."""
+    """PnP finds the motions of a rendered scene for every piece of the mask."""
     pair = SceneInput(kind="scene", scene="street", width=256, height=112).load(Path)
     with pytest.raises(DataError, match="mask of what moves"):
         with_motions(replace(pair, truth=None))

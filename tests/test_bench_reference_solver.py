@@ -1,4 +1,4 @@
-"""The reference solver without Ipopt: same energy, similar minima, records that are true."""
+"""The reference solver without Ipopt: same energy, similar minima, correct records."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def lm(case: Case) -> ReferenceSolve:
 
 
 def check(case: Case, y: ReferenceSolve) -> None:
-    """What holds for every record."""
+    """Assertions for every record."""
     exact = oracle.energy(y.soup, case.data, case.weights)
     assert dict(y.energy) == pytest.approx(exact, rel=1e-12)
     assert exact["total"] == pytest.approx(y.history[:, 1].min(), rel=1e-12)

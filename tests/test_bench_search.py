@@ -1,4 +1,4 @@
-"""Analyses and the search for defaults, on rows that a formula makes."""
+"""Analyses and the search for defaults on rows from a formula."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 
 from soup_nlp.bench import analyses
 from soup_nlp.bench import tuning as search_module
-from soup_nlp.bench.accuracy import head, pair_job
+from soup_nlp.bench.accuracy import pair_job, row_identity
 from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
 from soup_nlp.bench.analyses_measures import measure_energy
@@ -30,7 +30,7 @@ from soup_nlp.bench.suites import list_suite
 from soup_nlp.bench.tables import reason
 from soup_nlp.bench.tuning import (
     DEFAULT_SPACE,
-    FAILED,
+    FAILED_LOSS,
     Found,
     Parameter,
     Trial,
@@ -70,7 +70,7 @@ def fake(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> dict
     k = float(given.get("segmentation.neighbours", "20"))
     mre = 0.02 * (1 + abs(math.log10(cont) + 3) + 0.1 * abs(k - 12))
     return {
-        **head(item, overrides, variant),
+        **row_identity(item, overrides, variant),
         **{"ok": True, "error": None, "seconds": 0.0, "cpu_seconds": 0.0},
         "metrics": {
             "paper": {
@@ -146,7 +146,7 @@ def test_search_finds_the_minimum_and_can_be_continued(tmp_path):
 
 
 def test_steps_beyond_the_end_of_a_range_turn_back():
-    """A best trial at an end is varied inside the range, not tried at the end again and again."""
+    """A best trial at an end of the range is varied within the range."""
     best = Trial("t001", (), np.array([0.01, 0.99]), (fake(items(0)[0]),))
     units = np.array(
         [search_module._next(k, 24, np.zeros((12, 2)), [best], 0) for k in range(13, 25)]
@@ -187,9 +187,9 @@ def test_loss_charges_failures_and_a_minimum_far_from_the_truth():
     plain = loss(row)
     far = {**row, "energy": {"solution": {"total": 10.0}, "truth": {"total": 22.0}}}
     assert loss(far) == pytest.approx(plain + math.log(2.0))
-    assert loss({**row, "ok": False}) == FAILED
+    assert loss({**row, "ok": False}) == FAILED_LOSS
     worse = fake(items(0)[0], ("segmentation.neighbours=400",))
-    assert plain < loss(worse) <= FAILED
+    assert plain < loss(worse) <= FAILED_LOSS
     assert Trial("t", (), np.zeros(1)).loss == math.inf
 
 
@@ -301,7 +301,7 @@ def test_conventions_and_folders_of_an_analysis_are_not_ignored(tmp_path, monkey
 def test_tables_list_failed_rows(tmp_path):
     jobs = [(i, (f"segmentation.neighbours={k}",), str(k)) for i in items(0)[:2] for k in (4, 8)]
     rows = [{**fake(*j), "code": "c"} for j in jobs]
-    rows[1] = {**head(*jobs[1]), "ok": False, "error": "out of luck", "code": "c"}
+    rows[1] = {**row_identity(*jobs[1]), "ok": False, "error": "out of luck", "code": "c"}
     text = text_variants("ablation", "what", rows)
     assert "out of luck" in text
     assert "alley_1 (published)" in text
@@ -383,7 +383,7 @@ def test_errors_of_flow_sources(tmp_path):
 
 
 def broken(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> dict:
-    """No row for want of a file."""
+    """No pair is measured without its files."""
     raise DataError("image is missing", where="a/0.png", found="nothing", expected="a file")
 
 

@@ -1,20 +1,20 @@
-"""bench speed: plan, store, fit, table, gate on made records; and one tiny real run."""
+"""bench speed: plan, store, fit, table and gate on artificial records; one tiny real run."""
 
 from __future__ import annotations
 
 import copy
 import json
+from functools import partial
 
 import numpy as np
 import pytest
 from scipy.stats import linregress
 
 from soup_nlp.bench import speed, speed_gate, speed_report
-from soup_nlp.bench.processes import machine
+from soup_nlp.bench.processes import alone, machine
 from soup_nlp.bench.rows import read_rows
 from soup_nlp.bench.speed import problem_of, schedule
 from soup_nlp.bench.speed_report import SPEED
-from soup_nlp.bench.studies import run_alone
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.solve.solver_options import SolverOptions
@@ -29,7 +29,7 @@ def run_settings(scene: str, superpixels: int, neighbours: int) -> dict:
 
 
 def made(settings: dict, **changes) -> dict:
-    """A record as `speed.measure` writes it, its costs a power of N."""
+    """A record like that of `speed.measure`, with costs that are powers of N."""
     n = settings["superpixels"]
     cost = 1e-3 * n**EXPONENT
     y = {
@@ -92,11 +92,11 @@ def test_the_plan_has_every_run_once_small_ones_first():
 
 
 def test_a_run_that_fails_says_why(monkeypatch):
-    record = run_alone(SPEED, run_settings("nowhere", 100, 8))
+    record = alone(partial(SPEED.measure, **run_settings("nowhere", 100, 8)))
     assert "nowhere" in record["error"]
     assert "street" in record["error"]
     monkeypatch.setattr("soup_nlp.bench.processes.GRACE", 0.0)
-    late = run_alone(SPEED, run_settings("street", 60, 8), seconds=0.2)
+    late = alone(partial(SPEED.measure, **run_settings("street", 60, 8)), seconds=0.2)
     assert late["error"] == "no answer after 0.2 s"
 
 
@@ -137,7 +137,7 @@ def test_growth_is_by_scene_and_neighbours():
 
 
 def test_growth_of_all_scenes_has_a_factor_for_each():
-    """One exponent, as by least squares with an indicator of every scene."""
+    """One common exponent, equal to least squares with an indicator for every scene."""
     rng = np.random.default_rng(2)
     scene = np.array(["a", "a", "a", "b", "b", "b", "b"])
     n = np.array([500, 1000, 2000, 500, 700, 1000, 2000])

@@ -1,4 +1,4 @@
-"""Studies of parts: rows in processes of their own, resumable; the list of all commands."""
+"""Studies of parts: rows in separate processes, resuming; the list of all commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Suites: what is listed, what is there, and where to get the rest."""
+"""Suites: lists of pairs, available pairs, and messages on the source of missing ones."""
 
 from __future__ import annotations
 

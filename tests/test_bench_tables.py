@@ -1,4 +1,4 @@
-"""Tables of accuracy: what is beside every number."""
+"""Tables of accuracy: the information beside every number."""
 
 from __future__ import annotations
 

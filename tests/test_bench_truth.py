@@ -1,4 +1,4 @@
-"""Floors and truths by construction: planes of the truth, its soup, baselines without assembly."""
+"""Superpixel floor, true soup and unorganised baseline on constructed examples."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_true_soup_is_the_truth_but_for_mixed_superpixels(street):
 
 
 def test_a_true_plane_seen_from_behind_somewhere_faces_the_camera():
-    """Its depth is known on the left only; drawn out to the right the plane passes the camera."""
+    """The depth is known on the left only; further right the plane is behind the camera."""
     height, width = 24, 48
     u = np.arange(width) * np.ones((height, 1))
     labels = (u >= 24).astype(np.int32)
@@ -156,7 +156,7 @@ def test_components_are_rescaled_to_where_the_energy_likes_them(street):
     target = np.log(wanted)[true.component]
 
     def energy(soup):
-        """How far log distances are from the wanted ones, with one scale free."""
+        """Deviation of log distances from the expected ones after one scale."""
         gap = np.log(soup.lam / true.soup.lam) - target
         return float(np.abs(gap - np.median(gap)).sum())
 

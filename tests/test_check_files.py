@@ -1,4 +1,4 @@
-"""The check notices every changed file and entry, and refuses damaged ones without a crash."""
+"""The check detects every changed file and entry, and rejects damaged ones without a crash."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_changed_file_is_noticed(change, folder):
 
 
 def repaired(folder: Path) -> list[str]:
-    """Failing claims after the record was made again: what is recomputed, not compared."""
+    """Failing claims after the record was renewed: only recomputed claims remain."""
     with h5py.File(folder / "result.h5", "a") as file:
         del file[RECORD]
         store._write_group(file, {RECORD: record_of(folder)})
@@ -197,7 +197,7 @@ def change(folder: Path, edit: Callable[[dict], object]) -> None:
 
 
 def test_what_a_good_result_claims_is_what_is_found(solved, pair):
-    """A row that claims another number than the one that it allows would mislead."""
+    """A row must not show a claimed number that differs from the tested one."""
     bounds = "energy falls", "no round raises E", "no choice below its bound"
     for row in check_folder(solved, images(pair)).rows:
         if row.name in bounds:
@@ -216,7 +216,7 @@ def test_rounds_that_raise_the_energy_are_noticed(folder):
 @pytest.mark.parametrize("key", ["status", "delivered", "problem_hash", "seed"])
 @pytest.mark.parametrize("smaller", [False, True])
 def test_labels_are_those_of_the_arrays(key, smaller, folder):
-    """Either neighbour of the right word in the order of words is wrong."""
+    """Both neighbours of the right word in the list are wrong."""
     with h5py.File(folder / "result.h5", "a") as file:
         value = file.attrs[key]
         if key == "seed":
@@ -245,7 +245,7 @@ def test_the_delivered_answer_is_ipopt_s(folder):
     ["depth/sigma_ref", "iterations/00_presolve_0.3/obj", "truth/flow", "@name", "@machine"],
 )
 def test_contents_of_the_arrays_are_as_written(place, folder):
-    """What HDF5 itself changes has right checksums."""
+    """Changes made with HDF5 itself have valid checksums."""
     with h5py.File(folder / "result.h5", "a") as file:
         if place.startswith("@"):
             file.attrs[place[1:]] = "other"

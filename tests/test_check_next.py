@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def run() -> Run:
-    """Components that move: occlusions, and cracks where the camera comes nearer."""
+    """Moving components, which cause occlusions and, with an approaching camera, gaps."""
     return solve_pair(
         render_scene("street", 0, 192, 128),
         segmentation={"superpixels": 60, "neighbours": 6},
@@ -44,7 +44,7 @@ def test_the_recomputed_depth_is_that_of_the_reconstruction(run):
 
 @pytest.mark.parametrize("shift", [0.5, 1.0])
 def test_targets_on_a_pixel_border_are_left_out(run, shift):
-    """Half a pixel on, every target may be rounded to either side; a whole one on, none."""
+    """With a shift of half a pixel every target may be rounded either way, else none."""
     labels, K = np.zeros((20, 30), np.int32), np.diag([25.0, 25.0, 1.0])
     one = Soup(
         np.ones(1), np.array([[0, 0, -1.0]]), np.ones(1), np.eye(3)[None],

@@ -25,7 +25,7 @@ OPTIONS = {"segmentation": {"superpixels": 50, "neighbours": 8}, "refine": {"pho
 
 
 def one_plane() -> Pair:
-    """A plane and a motion whose flow is exact: E can be brought down to rounding."""
+    """A plane and a motion with an exact flow, so that E is zero up to rounding."""
     shot = render_scene("orbit", 0, 320, 160)
     uv = pixel_grid(*shot.size)
     ray = rays(shot.K_ref, uv)

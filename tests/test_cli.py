@@ -1,4 +1,4 @@
-"""The command line: exit codes, messages, files; bad input never gets far."""
+"""The command line: exit codes, messages, files, rejection of bad input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ctrl-C in every stage of `solve`: said, obeyed, and never half a folder."""
+"""Ctrl-C in every stage of `solve`: message, exit code, and no incomplete folder."""
 
 from __future__ import annotations
 

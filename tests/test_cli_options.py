@@ -1,4 +1,4 @@
-"""Options of `solve` that go, or do not go, with a problem file."""
+"""Options of `solve` that can, or cannot, be combined with a problem file."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_flow_goes_with_a_problem_file(tmp_path, monkeypatch):
 
 
 def foreign(folder: Path) -> list[str]:
-    """A folder with the inputs of a pair, under names that results have too."""
+    """A folder with the inputs of a pair under names of result files."""
     pair = render_scene("orbit", 0, 112, 84)
     folder.mkdir()
     for name, image in (("frame_0", pair.image_ref), ("frame_1", pair.image_next)):

@@ -1,4 +1,4 @@
-"""Comparing solvers: isolation, verification, resuming, profiles; real solvers on a tiny soup."""
+"""Comparison of solvers: isolation, verification, resuming, profiles; real solvers, tiny soup."""
 
 from __future__ import annotations
 

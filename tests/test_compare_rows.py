@@ -1,4 +1,4 @@
-"""Rows of the comparison: what is no answer, what is late, and which problem a row is of."""
+"""Rows of the comparison: missing answers, late answers, identity of the problem."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def program(folder: Path, text: str) -> Path:
 
 def test_the_start_is_not_the_answer_of_a_solver_that_gave_none(task, tmp_path, monkeypatch):
     # a program that waits uses no CPU time, so that wall time ends it
-    monkeypatch.setattr("soup_nlp.bench.solvers.registry.WALL", 1.0)
+    monkeypatch.setattr("soup_nlp.bench.solvers.registry.WALL_PER_CPU", 1.0)
     mine = program(tmp_path, "exec sleep 30")
     (found,) = run(replace(task, limits=replace(task.limits, seconds=1.0)), [str(mine)], tmp_path)
     assert found["status"] == "Time_Limit"

@@ -17,7 +17,13 @@ from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.reweighting import across_components, at_occlusions, contacts, in_pixels
+from soup_nlp.model.reweighting import (
+    across_components,
+    at_occlusions,
+    contacts,
+    in_pixels,
+    over_ground,
+)
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.start import components as components_module
 from soup_nlp.start.components import contact_scales, depth_from_inside
@@ -61,6 +67,26 @@ def test_edges_of_two_components_weigh_less(world):
     np.testing.assert_array_equal(
         across_components(data, 0 * component, 0.1).edge_weight, seg.edge_weight
     )
+
+
+def test_the_prior_holds_the_relief_over_the_ground(world):
+    _, soup, _, data = world
+    grounded = np.arange(8) < 4
+    both = grounded[data.edges].all(axis=1)
+    assert both.any()
+    assert not both.all()
+    rng = np.random.default_rng(0)
+    rough = replace(soup, d=soup.d * rng.uniform(0.5, 2, 8))
+    held = over_ground(data, rough, grounded, 5 * data.prior_weight)
+    expected = np.where(both, 5.0, 1.0) * data.prior_weight
+    np.testing.assert_allclose(held.prior_weight, expected, rtol=1e-15)
+    np.testing.assert_allclose(oracle.prior(rough, held)[both], 0.0, atol=1e-12)
+    np.testing.assert_array_equal(
+        oracle.prior(rough, held)[~both], oracle.prior(rough, data)[~both]
+    )
+    # in another unit of length the same relief costs nothing either
+    far = replace(rough, d=3.0 * rough.d)
+    np.testing.assert_allclose(oracle.prior(far, held)[both], 0.0, atol=1e-12)
 
 
 def test_the_prior_holds_a_component_on_what_it_stands_on(world):

@@ -1,4 +1,4 @@
-"""Dataset layouts, written small into a temporary folder, and the real pairs where present."""
+"""Dataset layouts as tiny files in a temporary folder, and real pairs if available."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from soup_nlp.export import verify
 from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.nl import write_sx_nl
-from soup_nlp.export.program import take_apart
+from soup_nlp.export.program import make_program
 from soup_nlp.export.residuals import kind
 from soup_nlp.export.sol import Sol
 from soup_nlp.model.energy_options import BendingOptions
@@ -205,7 +205,7 @@ def test_groups_without_elements_are_passed_over():
         kernel = Kernel(name, x, none, ca.SX.sym("theta", 0), objective=ca.sqrt(x))
         table = Table(np.array(index, int).reshape(-1, 1), np.zeros((len(index), 0)))
         groups.append(Group(kernel, table))
-    program = take_apart(groups, 2, 0, np.zeros(0))
+    program = make_program(groups, 2, 0, np.zeros(0))
     assert program.in_objective.tolist() == [True, True]
     assert len(program.stamped) == 2
 

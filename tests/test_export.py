@@ -1,4 +1,4 @@
-"""Commands export, import and check: exported files, and foreign answers as results."""
+"""Commands export, import and check: exported files, and answers of other solvers."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_casadi_and_hdf5_agree_with_the_nlp(exported):
 
 
 def answer(folder: Path, name: str, move: float = 0.0, code: int = 0) -> Path:
-    """A .sol whose point is the start, moved."""
+    """A .sol with a perturbed start as its point."""
     _, nlp, _, (v, r), _ = problem_of(folder)
     x = nlp.x0 + move * np.random.default_rng(1).normal(size=nlp.nx)
     write_sol(folder / name, x, None, v, r, "hand made", code)

@@ -1,4 +1,4 @@
-"""Solvers on the SOUP family: rows by start and size, neutral results, a solver of one's own."""
+"""Solvers on the SOUP family: rows by start and size, results, a solver of the user."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Superpixels that end where the flow breaks: borders found, nothing else touched."""
+"""Superpixel borders move to flow discontinuities, and nothing else changes."""
 
 from __future__ import annotations
 

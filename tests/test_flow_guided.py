@@ -40,7 +40,7 @@ def test_homographies_are_recovered_one_after_the_other():
 
 
 def test_a_first_flow_that_is_half_wrong_is_completed():
-    """The first flow knows the motion on the left only; under its homography all is found."""
+    """The first flow is right on the left only; under its homography it is right everywhere."""
     first, second = images(ROAD)
     true = truth(ROAD)
     ref, nxt = first[..., 0], second[..., 0]

@@ -1,4 +1,4 @@
-"""What the choice between flows and the re-weighting of one do by construction."""
+"""Choice between flows and reweighting of a flow on constructed examples."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from soup_nlp.data.pair import Flow
 
 @pytest.mark.parametrize(("error", "taken"), [(0.2, False), (0.8, True)])
 def test_a_guided_flow_must_be_better_by_a_margin(monkeypatch, error, taken):
-    """Images without contrast: the round trip alone decides, and the new one's is exact."""
+    """Images without contrast: only the round trip counts, and that of the new flow is exact."""
     shape = (60, 80)
     grey = np.full(shape, 128, np.uint8)
 
@@ -33,7 +33,7 @@ def test_a_guided_flow_must_be_better_by_a_margin(monkeypatch, error, taken):
 
 
 def test_where_all_pixels_scatter_none_of_them_is_suspected():
-    """A superpixel's own spread is the scale, if it is above the one that is given."""
+    """The spread of a superpixel is the scale if it exceeds the given one."""
     v, u = np.mgrid[0:40, 0:80].astype(float)
     labels = (u >= 40).astype(np.int32)
     uv = np.stack([0.1 * u, 0.05 * v], axis=-1)

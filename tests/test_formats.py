@@ -1,4 +1,4 @@
-"""Flow and depth files: golden bytes, round trips, and every way a file can be wrong."""
+"""Flow and depth files: golden bytes, round trips, malformed files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Camera files and images: golden bytes, round trips, and every way a file can be wrong."""
+"""Camera files and images: golden bytes, round trips, malformed files."""
 
 from __future__ import annotations
 

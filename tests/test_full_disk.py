@@ -1,4 +1,4 @@
-"""A full disk: an error, no crash, no temporary file, and the earlier result stays whole."""
+"""A full disk causes an error without a crash or temporary files; the earlier result is kept."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.folders import staged
-from soup_nlp.storage.mark import digest_of, made
+from soup_nlp.storage.mark import digest_of, made_files
 from soup_nlp.storage.store import Array, write_h5, write_json
 
 
@@ -35,7 +35,7 @@ def small_disk(tmp_path) -> Iterator[Path]:
 
 
 def write(folder: Path, size: int) -> None:
-    """A result with an array of so many bytes that do not compress."""
+    """Write a result with an incompressible array of `size` bytes."""
     with staged(folder, whole=True) as new:
         write_json(new / "summary.json", {"size": size})
         values = np.random.default_rng(0).integers(0, 255, size, np.uint8)
@@ -43,7 +43,7 @@ def write(folder: Path, size: int) -> None:
 
 
 def whole(folder: Path) -> bool:
-    listed = made(folder)
+    listed = made_files(folder)
     return bool(listed) and all(digest_of(folder / n) == d for n, d in listed.items())
 
 
@@ -52,7 +52,11 @@ def test_an_earlier_result_outlives_a_full_disk(below, small_disk):
     """At the root of the file system, where folders cannot be exchanged, and below it."""
     target = small_disk / below
     for size, fits in ((300_000, True), (900_000, False), (400_000, True), (5_000_000, False)):
-        before = (target / "summary.json").read_bytes() if target.is_dir() and made(target) else b""
+        before = (
+            (target / "summary.json").read_bytes()
+            if target.is_dir() and made_files(target)
+            else b""
+        )
         if fits:
             write(target, size)
         else:

@@ -18,7 +18,7 @@ K = intrinsics(100.0, 100.0, 39.5, 29.5)
 CAMERA = RigidMotion(exp([0.0, 0.02, 0.0]), np.array([0.05, 0.0, -0.1]))
 CAR = RigidMotion(exp([0.0, -0.05, 0.0]), np.array([-0.2, 0.0, 0.1]))
 ROUNDING = 1e-9
-"""Of some thousand float64 operations on numbers of the order of 1."""
+"""Rounding error of some thousand float64 operations on numbers of the order of 1."""
 
 
 def tiles():

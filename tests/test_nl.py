@@ -38,7 +38,7 @@ FORMS = [
         else (("smooth", "smooth"), ("epigraph", "lifted"))
     )
 ]
-"""Every two of gauge, norm and truncation together: 6 of 12."""
+"""Every pair of values of gauge, norm and truncation: 6 of 12 formulations."""
 
 
 def form_id(form: Formulation) -> str:

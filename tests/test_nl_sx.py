@@ -28,7 +28,7 @@ def rosenbrock() -> dict:
 
 
 def classes() -> dict:
-    """A variable of every class, a row of every bound, a constant in a linear row."""
+    """A variable of every class, a row with every kind of bound, a constant in a linear row."""
     x = ca.SX.sym("x", 4)
     a, b, c, d = ca.vertsplit(x)
     g = ca.vertcat(a + d + 0.1, ca.sqrt(b + 2) * b - d, c - 2 * d, a - b, ca.exp(a) / 3 + c)
@@ -46,7 +46,7 @@ def classes() -> dict:
 
 
 def shared() -> dict:
-    """One part that everything uses, one for rows, one for a row, one for the objective."""
+    """Shared parts: used by all, by several rows, by one row, by the objective."""
     x = ca.SX.sym("x", 3)
     every = ca.sqrt(x[0] ** 2 + x[1] + 1)
     rows = ca.exp(x[2] - x[0]) * 2
@@ -130,7 +130,7 @@ BINARY = (
 
 @st.composite
 def programs(draw):
-    """Expressions grown from variables and numbers; every one may be used again."""
+    """Random expressions of variables and numbers, which may be used repeatedly."""
     n, m = draw(st.integers(1, 4)), draw(st.integers(0, 3))
     x = ca.SX.sym("x", n)
     pool = [x[k] for k in range(n)]

@@ -1,4 +1,4 @@
-"""Output folders: whole or not at all, and never over a file of the user."""
+"""Output folders are written whole or not at all, and never overwrite files of the user."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.storage import folders
 from soup_nlp.storage.folders import claim, recover, scratch, staged
-from soup_nlp.storage.mark import MARK, digest_of, files_in, made
+from soup_nlp.storage.mark import MARK, digest_of, files_in, made_files
 from soup_nlp.storage.system import deferred_signals, exchange
 
 
@@ -33,7 +33,7 @@ def content(folder: Path) -> dict[str, str]:
 
 @pytest.fixture(params=["exchanged", "moved"])
 def way(request, monkeypatch) -> str:
-    """Both ways in which new files take their places."""
+    """Both ways of moving new files to their places."""
     if request.param == "moved":
         monkeypatch.setattr(folders, "exchange", lambda a, b: False)
     return str(request.param)
@@ -44,7 +44,7 @@ def test_a_new_result_replaces_the_old_one_whole(tmp_path, way):
     write(target, a="1", b="1")
     write(target, a="2", c="2")
     assert content(target) == {"a": "2", "c": "2"}
-    assert made(target).keys() == {"a", "c"}
+    assert made_files(target).keys() == {"a", "c"}
     assert os.listdir(tmp_path) == ["out"]
 
 
@@ -66,7 +66,7 @@ def test_pages_of_several_commands_share_a_folder(tmp_path, way):
     for name in ("x", "y", "x"):
         write(tmp_path, False, **{f"{name}.md": name})
     assert content(tmp_path) == {"x.md": "x", "y.md": "y"}
-    assert made(tmp_path).keys() == {"x.md", "y.md"}
+    assert made_files(tmp_path).keys() == {"x.md", "y.md"}
 
 
 def test_a_failure_leaves_the_old_result(tmp_path, way):
@@ -103,7 +103,7 @@ def foreign(folder: Path, kind: str) -> Path:
 
 
 def identity(path: Path) -> tuple[int, ...]:
-    """Which file it is and when it was written; not when it was read."""
+    """Identity and modification time of a file, without its access time."""
     state = os.lstat(path)
     return state.st_ino, state.st_mode, state.st_size, state.st_mtime_ns
 
@@ -141,7 +141,7 @@ def test_a_symbolic_mark_is_not_followed(tmp_path):
     write(target, a="1")
     assert victim.read_text() == "{}"
     assert not (target / MARK).is_symlink()
-    assert made(target).keys() == {"a"}
+    assert made_files(target).keys() == {"a"}
     (target / MARK).unlink()
     (target / MARK).symlink_to("nowhere")
     write(target, False, b="1")
@@ -277,7 +277,7 @@ def test_a_move_that_was_killed_is_finished(moves, tmp_path):
     killed(target, "moved", str(moves))
     recover(target)
     assert content(target) == {"a": "2", "c": "2", "d": "2"}
-    assert made(target).keys() == {"a", "c", "d"}
+    assert made_files(target).keys() == {"a", "c", "d"}
     write(target, a="3")
     assert content(target) == {"a": "3"}
 

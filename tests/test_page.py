@@ -1,4 +1,4 @@
-"""report.html: what it holds, and that it is made of any result folder."""
+"""report.html: its contents, and that any result folder can make it."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_the_page_has_every_part(text):
 
 
 def test_planes_and_motions_rebuild_both_frames(text, small_run):
-    """What the browser computes from the page is the reconstruction."""
+    """The data of the page reproduce the reconstruction."""
     s, run = data_of(text)["scene"], small_run
     scale, n = run.metrics["solution"].scale, len(run.soup)
     labels = unpack(s["labels"], "<u2", run.segmentation.labels.shape)
@@ -118,7 +118,7 @@ def test_the_next_camera_is_where_the_background_says(text, small_run):
 
 
 def test_curtains_are_cut(shown, small_run):
-    """Cells whose corners all lie in one superpixel stay; those across components go."""
+    """Cells within one superpixel are kept; cells across components are removed."""
     scene, labels = make_scene(shown), small_run.segmentation.labels
     part = small_run.components.of_pixel
 
@@ -166,7 +166,7 @@ def test_a_folder_makes_the_same_page_again(folder, capsys):
 
 @pytest.mark.parametrize("input_there", [True, False])
 def test_a_folder_of_an_earlier_version(folder, input_there):
-    """It has no images and no unit; the images come from its input, where that is there."""
+    """A result without images and unit; the images come from its input if it is available."""
     with h5py.File(folder / "result.h5", "a") as file:
         del file["input/image_ref"], file["input/image_next"], file.attrs["truth_unit"]
     (folder / "report.html").unlink()
@@ -227,7 +227,7 @@ def test_problem_files_know_the_switch():
 
 
 def test_sparse_truth_is_drawn_larger():
-    """Points of a laser on a tenth of the pixels; a dense map stays as it is."""
+    """Laser points on a tenth of the pixels are enlarged; a dense map does not change."""
     sparse = np.full((9, 9), np.nan)
     sparse[4, 4] = 2.0
     grown = _enlarged(sparse)

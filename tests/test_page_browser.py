@@ -33,7 +33,7 @@ def browser(small_run, tmp_path_factory):
 
 
 def canvas(browser):
-    """What the 3D view shows, without what lies over it, as floats."""
+    """Pixels of the 3D view without overlays, as floats."""
     browser.value("document.querySelector('.hint').style.visibility = 'hidden'")
     box = browser.value(
         "(() => { const r = document.getElementById('canvas').getBoundingClientRect();"

@@ -1,4 +1,4 @@
-"""What a pair and its flow refuse."""
+"""Input checks of a pair and its flow."""
 
 from __future__ import annotations
 

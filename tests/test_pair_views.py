@@ -1,4 +1,4 @@
-"""A mirrored or cropped pair is the same world: its truth explains its own pixels."""
+"""Mirrored and cropped pairs: their truth is consistent with their pixels."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_the_truth_explains_the_flow(view, pair):
 
 
 def test_backwards_the_truth_explains_the_true_points(pair):
-    """Every motion brings back the points of the next frame to where the reference saw them."""
+    """The motions map points of the next frame to their pixels in the reference frame."""
     seen = backwards(pair)
     t = seen.truth
     np.testing.assert_array_equal(seen.image_ref, pair.image_next)
@@ -69,7 +69,7 @@ def test_backwards_the_truth_explains_the_true_points(pair):
 
 @pytest.mark.parametrize("view", CHANGED)
 def test_points_stay_with_their_pixels(view, pair):
-    """A crop takes points away with their pixels and no others."""
+    """A crop removes exactly the points of the removed pixels."""
     number = np.arange(96 * 128, dtype=np.int32).reshape(96, 128)
     points = pair.truth.points
     seen = view(replace(pair, truth=Truth(components=number, points=points))).truth
@@ -161,7 +161,7 @@ def test_margins_that_leave_nothing_are_rejected(pair):
 
 
 def test_views_are_measured_with_their_own_flow(tmp_path):
-    """A view of a pair with true flow scores as the pair does; so does a flow of a file."""
+    """A view of a pair has the same score as the pair, with true flow and with a flow file."""
     listed = list_suite("rendered", options=Options(("truth",), width=160, only=("orbit",)))
     over = ("segmentation.superpixels=24", "segmentation.neighbours=6", "refine.enabled=false")
     path = tmp_path / "flow.flo"

@@ -357,7 +357,7 @@ def test_few_particles_and_a_superpixel_without_edges_are_no_special_case(partic
         tiny.data,
         **{
             k: getattr(tiny.data, k)[:0]
-            for k in ("edges", "edge_weight", "edge_unit", "prior_weight")
+            for k in ("edges", "edge_weight", "edge_unit", "prior_weight", "prior_relief")
         },
         **{
             k: getattr(tiny.data, k)[:0]

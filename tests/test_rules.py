@@ -2,7 +2,7 @@
 
 import pytest
 
-from soup_nlp.bench.analyses import ANALYSES, _chosen
+from soup_nlp.bench.analyses import ANALYSES, _restricted
 from soup_nlp.bench.rules import SHIPPED, plot_rules, text_rules
 
 
@@ -56,4 +56,4 @@ def test_a_rule_is_judged_by_family(rows, tmp_path):
 
 
 def test_a_rule_that_is_asked_for_alone_is_compared_with_everything():
-    assert list(_chosen(ANALYSES["rules"], ["ground"]).variants) == [SHIPPED, "ground"]
+    assert list(_restricted(ANALYSES["rules"], ["ground"]).variants) == [SHIPPED, "ground"]

@@ -1,4 +1,4 @@
-"""Rendered scenes: the truth is exact, and the images carry it."""
+"""Rendered scenes: the truth is exact and consistent with the images."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Pairs of a sequence on one scale."""
+"""Common scale of the pairs of a sequence."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_components_are_followed_by_overlap():
 
 
 def scaled(result, factor):
-    """The same result in another unit: its lengths times a factor."""
+    """The same result in another unit of length."""
     rec = result.reconstruction
     changes = {k: factor * getattr(rec, k) for k in ("depth_ref", "depth_next")}
     changes |= {k: factor * getattr(rec, k) for k in ("points_ref", "points_next")}
@@ -316,7 +316,7 @@ def test_files_of_the_user_are_left_alone(tmp_path, capsys):
 
 
 def moved_images(folder, steps):
-    """Pictures of two textured layers before a camera that moves sideways; nearest depth 2."""
+    """Images of two textured layers by a camera that moves sideways; nearest depth 2."""
     rng = np.random.default_rng(0)
     far, near = (cv2.resize(rng.integers(0, 256, (40, 60), np.uint8), (600, 400)) for _ in range(2))
     for k, x in enumerate(steps):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.bench.confidence import left_out, text_confidence
+from soup_nlp.bench.confidence import left_out_factors, text_confidence
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import POWER
 from soup_nlp.evaluate.sparsification import LAST, STEPS, coverage, sparsification
@@ -102,7 +102,7 @@ def row(family: str, pair: str, scale: float, bending: bool = False) -> dict:
 
 def test_the_factor_of_a_family_is_chosen_on_the_others():
     """Errors of 1 and of 2 thousandths: each family is judged by the other's factor."""
-    told = left_out([row("one", "a", 1.0), row("two", "b", 2.0)])
+    told = left_out_factors([row("one", "a", 1.0), row("two", "b", 2.0)])
     # 76 % of a Gaussian lie within 1.175 standard deviations
     assert told["one"][0] == pytest.approx(2.35e-3, rel=0.05)
     assert told["two"][0] == pytest.approx(1.175e-3, rel=0.05)
@@ -112,8 +112,8 @@ def test_the_factor_of_a_family_is_chosen_on_the_others():
 
 def test_pairs_that_bend_are_judged_by_others_that_bend():
     rows = [row("one", "a", 1.0), row("two", "b", 9.0, bending=True)]
-    assert left_out(rows) == {}
-    told = left_out([*rows, row("three", "c", 2.0, bending=True)])
+    assert left_out_factors(rows) == {}
+    told = left_out_factors([*rows, row("three", "c", 2.0, bending=True)])
     assert set(told) == {"two", "three"}
     assert told["three"][0] == pytest.approx(9 * 1.175e-3, rel=0.05)
 

@@ -1,4 +1,4 @@
-"""A layer that stands still before a moving scene: the scene's flow is found behind it."""
+"""The flow of a moving scene is found behind a static layer."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from soup_nlp.pipeline.still_layer import see_through
 
 WIDTH, HEIGHT = 512, 218
 BEHIND = np.s_[130:205, 150:400]
-"""Part of the image, mostly road, that the layer covers."""
+"""Part of the image, mostly road, that the static layer covers."""
 
 
 def with_flow(pair: Pair, still: bool, source: str = "dis") -> Pair:
-    """The true flow as if it had been computed, zero at full confidence behind the layer."""
+    """The true flow, but zero with full confidence behind the layer."""
     assert pair.truth is not None
     assert pair.truth.flow is not None
     uv = np.nan_to_num(pair.truth.flow).astype(np.float32)
@@ -86,7 +86,7 @@ def test_images_without_a_layer_are_left_alone(street: Pair):
 
 @pytest.mark.slow
 def test_true_flow_is_believed(reflecting: Pair):
-    """The correction is for flow that was computed, and can be turned off."""
+    """The correction applies to computed flow only, and an option disables it."""
     small = {"input": {"kind": "memory", "hash": "0"}, "segmentation": {"superpixels": 60}}
     for source, flow in (("truth", {}), ("dis", {"see_through": False})):
         given = with_flow(reflecting, still=True, source=source)
