@@ -20,7 +20,6 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import (
     across_components,
     at_occlusions,
-    contacts,
     in_pixels,
     over_ground,
 )
@@ -87,31 +86,6 @@ def test_the_prior_holds_the_relief_over_the_ground(world):
     # in another unit of length the same relief costs nothing either
     far = replace(rough, d=3.0 * rough.d)
     np.testing.assert_allclose(oracle.prior(far, held)[both], 0.0, atol=1e-12)
-
-
-def test_the_prior_holds_a_component_on_what_it_stands_on(world):
-    """The upper left square is a component; it touches the one below it, and its right neighbour
-    lies beside it."""
-    seg, soup, _, data = world
-    component = np.zeros(8, np.int64)
-    component[0] = 1
-    i, k = seg.edges.T
-    across = component[i] != component[k]
-    stands = contacts(data, soup, component, seg.anchors)
-    below = across & (np.abs(seg.anchors[i, 1] - seg.anchors[k, 1]) == 8)
-    beside = across & (seg.anchors[i, 1] == seg.anchors[k, 1])
-    assert below.any()
-    assert beside.any()
-    np.testing.assert_array_equal(stands[below & (seg.anchors[k, 0] == seg.anchors[i, 0])], True)
-    assert not stands[beside | ~across].any()
-    held = across_components(data, component, 0.1, stands, 3.0)
-    factor = np.where(stands, 3.0, np.where(across, 0.1, 1.0))
-    np.testing.assert_allclose(held.prior_weight, factor * data.prior_weight, rtol=1e-15)
-    np.testing.assert_allclose(
-        held.edge_weight, np.where(across, 0.1, 1.0) * data.edge_weight, rtol=1e-15
-    )
-    away = replace(soup, d=np.where(component == 1, 1.3, 1.0) * soup.d)
-    assert not contacts(data, away, component, seg.anchors).any()
 
 
 @pytest.mark.parametrize("factor", [10.0, 1e4])

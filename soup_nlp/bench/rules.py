@@ -39,14 +39,13 @@ RULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "camera at rest": ("start.at_rest=1",),
         "E_prior": in_both("prior", "0"),
         "E_prior holds what is over the ground": ("energy.prior_ground=null",),
-        "E_prior holds contacts": ("energy.prior_contact=0.03",),
         "E_arap weak across components": ("energy.arap_across=1",),
         "E_arap truncated": in_both("sigma_arap", ".inf"),
         "E_cont weak at occlusions": ("energy.cont_occluded=1",),
         "contact below": ("start.upright=false",),
         "ground": ("start.ground=false",),
         "flow behind a still layer": ("flow.see_through=false",),
-        "second way of the presolve": ("energy.bending.untruncated=false",),
+        "second strategy of the presolve": ("energy.bending.untruncated=false",),
         "borders follow the flow": ("segmentation.follow_flow_px=null",),
     }
 )

@@ -269,8 +269,7 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
     if tree["start"]["bending"]:
         # that of affine flows, which is not recomputed; older results held the prior in pixels
         noise = float(tree["start"].get("noise", 1.0))
-    held_prior = np.where(_contact(tree, settings), settings["energy"]["prior_contact"], across)
-    prior = noise * held_prior * seg["edge_multiplicity"] / max(1, seg["knn"].shape[1])
+    prior = noise * across * seg["edge_multiplicity"] / max(1, seg["knn"].shape[1])
     free = _grounded(tree, settings)
     prior[free] = noise * (seg["edge_multiplicity"] / max(1, seg["knn"].shape[1]))[free]
     prior[free] *= float(settings["energy"].get("prior_ground") or 0.0)
@@ -323,21 +322,6 @@ def _relief(tree: Mapping[str, Any], free: NDArray[np.bool_]) -> Float:
     rho = -(start["n"] * tree["energy"]["anchor_ray"]).sum(1) / (start["lam"] * start["d"])
     a, b = rho[tree["energy"]["edges"].T]
     return np.where(free, (a - b) / np.sqrt(np.sqrt((a**4 + b**4) / 2)), 0.0)
-
-
-def _contact(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> NDArray[np.bool_]:
-    """K-NN edges where a component stands on what lies below it in an upright image."""
-    start, anchors = tree["start"], tree["segmentation"]["anchors"]
-    component, ends = start["component"], tree["energy"]["edges"]
-    # each edge from its upper to its lower end
-    order = np.argsort(anchors[ends, 1], axis=1, kind="stable")
-    top, low = np.take_along_axis(ends, order, axis=1).T
-    fall = anchors[low] - anchors[top]
-    steep = fall[:, 1] > 0.5 * np.sqrt((fall**2).sum(1))
-    apart = (component[top] != component[low]) & (component[top] != np.bincount(component).argmax())
-    depth = start["lam"] * start["d"] / -(start["n"] * tree["energy"]["anchor_ray"]).sum(1)
-    touch = np.maximum(depth[top], depth[low]) < 1.25 * np.minimum(depth[top], depth[low])
-    return np.asarray(steep & apart & touch & bool(settings["start"]["upright"]))
 
 
 def _discontinuous(

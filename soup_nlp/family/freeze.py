@@ -10,7 +10,7 @@ import numpy as np
 
 from soup_nlp.config.problem import Problem, dump_problem, make_problem
 from soup_nlp.family.frozen import Frozen, encoded, save_frozen
-from soup_nlp.family.instances import case_of
+from soup_nlp.family.instances import case_of, rounded
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.solve.stages import solve_soup
 
@@ -59,6 +59,7 @@ def record_of(case: Case) -> Frozen:
         error=start.error.astype(np.float32).astype(float),
         bending=start.bending,
         pair_weight=case.segmentation.pair_weight,
+        prior_weight=rounded(case.data.prior_weight),
         proposal=proposal,
         minimum=proposal,
     )

@@ -41,6 +41,8 @@ class Frozen:
         pair_weight: (P,) colour weight w4 of every pair of neighbours. It is stored, since a few
             pixels of the rendered image lie between two grey levels, and the processor's rounding
             decides which one they take.
+        prior_weight: (E,) weight of E_prior of every edge. It is stored, so that the rules for it
+            can change without a new version of the family.
         proposal: (N, 10) the proposal.
         minimum: (N, 10) the best known point of the smooth truncation.
     """
@@ -52,6 +54,7 @@ class Frozen:
     error: Float
     bending: bool
     pair_weight: Float
+    prior_weight: Float
     proposal: Float
     minimum: Float
 
@@ -59,8 +62,8 @@ class Frozen:
     def problem(self) -> Problem:
         """The merged problem."""
         raw = yaml.safe_load(self.text)
-        # an option that the first records do not have
-        raw["energy"].setdefault("prior_contact", raw["energy"]["arap_across"])
+        # an option of earlier code; the record has the weights that it gave
+        raw["energy"].pop("prior_contact", None)
         return make_problem(raw)
 
     @property
@@ -113,6 +116,7 @@ def save_frozen(path: Path, record: Frozen) -> None:
         "error": record.error.astype(np.float32),
         "bending": np.array(record.bending),
         "pair_weight": record.pair_weight.astype(np.float64),
+        "prior_weight": record.prior_weight.astype(np.float64),
         "proposal": record.proposal.astype(np.float32),
         "minimum": record.minimum.astype(np.float64),
     }
@@ -150,6 +154,7 @@ def read_frozen(path: Path) -> Frozen:
                 error=a["error"].astype(np.float64),
                 bending=bool(a["bending"]),
                 pair_weight=a["pair_weight"],
+                prior_weight=a["prior_weight"],
                 proposal=a["proposal"].astype(np.float64),
                 minimum=a["minimum"],
             )

@@ -104,9 +104,6 @@ class EnergyOptions(Section):
     arap_across: Share = 0.03
     """Factor of E_arap and E_prior between superpixels of different components; 1 is the
     paper's."""
-    prior_contact: NonNegative = 3.0
-    """Factor of E_prior where, in an upright image, one of these components stands on what lies
-    below it: contact gives it its scale."""
     prior_ground: NonNegative | None = 10.0
     """Factor of E_prior between two superpixels without depth of their own where the start knows
     the ground: it holds the relief that the start gave them; null for E_prior as elsewhere."""

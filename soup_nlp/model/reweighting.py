@@ -15,61 +15,22 @@ from soup_nlp.model.oracle import relief
 Float = NDArray[np.float64]
 
 
-def across_components(
-    data: EnergyData,
-    component: NDArray[np.int64],
-    factor: float,
-    contact: NDArray[np.bool_] | None = None,
-    hold: float = 1.0,
-) -> EnergyData:
+def across_components(data: EnergyData, component: NDArray[np.int64], factor: float) -> EnergyData:
     """The same data with E_arap and E_prior times `factor` on edges between two components.
 
     As-rigid-as-possible holds inside a component. Across components it pulls a component that the
     camera's motion explains at a wrong depth to that depth: with equal motions such an edge costs
     nothing. The prior would pull a component to its background, against the contact that fixes its
-    scale. Where a component stands on another the prior holds it there instead.
+    scale.
 
     Args:
         data: Data of the pair.
         component: (N,) group of every superpixel, as the start finds them.
         factor: 1 is the paper's energy.
-        contact: (E,) edges where a component stands on another (`contacts`); None for none.
-        hold: Factor of E_prior on them.
     """
     i, k = data.edges.T
     held = np.where(component[i] == component[k], 1.0, factor)
-    prior = held if contact is None else np.where(contact, hold, held)
-    return replace(
-        data, edge_weight=held * data.edge_weight, prior_weight=prior * data.prior_weight
-    )
-
-
-DOWN, TOUCH = 0.5, 1.25
-"""Cosine of the angle to the vertical up to which a neighbour lies below, and the largest ratio of
-the depths of two superpixels that touch."""
-
-
-def contacts(
-    data: EnergyData, soup: Soup, component: NDArray[np.int64], anchors: Float
-) -> NDArray[np.bool_]:
-    """(E,) edges where the start lets a component stand on what lies below it in the image.
-
-    The largest component is the scene, which stands on nothing.
-
-    Args:
-        data: Data of the pair.
-        soup: Start, its components scaled to where they touch.
-        component: (N,) group of every superpixel, as the start finds them.
-        anchors: (N, 2) centroids of the superpixels, pixels.
-    """
-    i, k = data.edges.T
-    z = soup.depth_at(data.anchor_ray)
-    own = component != np.argmax(np.bincount(component))
-    way = anchors[k] - anchors[i]
-    down = way[:, 1] / np.linalg.norm(way, axis=1)
-    stands = ((down > DOWN) & own[i]) | ((down < -DOWN) & own[k])
-    touch = np.abs(np.log(z[i] / z[k])) < np.log(TOUCH)
-    return np.asarray((component[i] != component[k]) & stands & touch)
+    return replace(data, edge_weight=held * data.edge_weight, prior_weight=held * data.prior_weight)
 
 
 def over_ground(

@@ -24,7 +24,6 @@ from soup_nlp.model.reweighting import (
     across_components,
     across_discontinuities,
     at_occlusions,
-    contacts,
     in_length,
     in_noise,
     in_pixels,
@@ -209,10 +208,8 @@ def build_energy(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, bends or e.arap_at_anchors
     )
     data = in_noise(data, start.noise)
-    free, stands = data.prior_weight, None
-    if problem.start.upright:
-        stands = contacts(data, start.soup, start.component, seg.anchors)
-    data = across_components(data, start.component, e.arap_across, stands, e.prior_contact)
+    free = data.prior_weight
+    data = across_components(data, start.component, e.arap_across)
     if e.prior_ground is not None:
         data = over_ground(data, start.soup, start.grounded, e.prior_ground * free)
     data = at_occlusions(data, start.soup, start.component, e.occlusion_gap, e.cont_occluded)

@@ -35,8 +35,8 @@ class SolverOptions(Section):
     stagnation: NonNegative = 1e-3
     """They end at this relative change of f, twice in a row; the last at a hundredth."""
     untruncated: bool = False
-    """The reweighted phases go a second way, which truncates E_arap only at its end, and the way to
-    the lower energy is taken; on where surfaces bend."""
+    """The reweighted phases also run with a second strategy, which truncates E_arap only at its
+    end, and the result with the lower energy is taken; always on where surfaces bend."""
     polish_iterations: Count = 100
     """Limit of the phase with the exact Hessian, at `eps`; 0 leaves it out."""
     presolve_tol: Tolerance = 1e-6

@@ -254,7 +254,7 @@ class _Solve:
         )
 
     def _untruncated(self) -> Descent:
-        """The second way: without the truncation of E_arap first, then with it."""
+        """The second strategy: without the truncation of E_arap first, then with it."""
         whole = self.weights.replace(sigma_arap=np.inf)
         problem = TangentProblem(self.start, self.data, whole, self.form, exact=False)
         first = Descent(problem, watch=self.watch, deadline=self.early())
