@@ -1,4 +1,4 @@
-"""A superpixel about its anchor, who its neighbours are, and the motion of given points."""
+"""States of superpixels about their anchors, their neighbours, and motions fitted to points."""
 
 from __future__ import annotations
 
@@ -76,19 +76,19 @@ def neighbours(edges: Int, anchor_ray: Float) -> Int:
 def fit_motion(
     R: Float, T: Float, X: Float, target: Float, weight: Float, focal: float, rounds: int = 5
 ) -> tuple[Float, Float]:
-    """The motion near a given one that brings points to their targets: reweighted Gauss-Newton.
+    """Motion near a given one that maps points to their targets, by re-weighted Gauss-Newton.
 
     Args:
         R: (3, 3) rotation to start from.
         T: (3,) translation to start from.
         X: (M, 3) reference-frame points.
         target: (M, 3) rays of their targets in the next camera.
-        weight: (M,) of the un-squared distances.
+        weight: (M,) weights of the un-squared distances.
         focal: Pixels per ray unit.
         rounds: Steps.
 
     Returns:
-        Rotation and translation; those given where a step goes wrong.
+        Rotation and translation; the given ones where a step fails.
     """
     best, found = np.inf, (R, T)
     for _ in range(rounds + 1):

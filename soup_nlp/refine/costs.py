@@ -52,14 +52,14 @@ class Particles:
         return cls(soup.n[:, None], soup.distance[:, None], soup.R[:, None], T)
 
     def joined(self, *others: Particles) -> Particles:
-        """The particles of several sets, one behind the other."""
+        """The particles of several sets, concatenated."""
         every = (self, *others)
         return Particles(
             *(np.concatenate([getattr(p, k) for p in every], axis=1) for k in ("n", "D", "R", "T"))
         )
 
     def take(self, which: Int) -> Particles:
-        """Particles (N, C) by their numbers, chosen by superpixel."""
+        """Particles (N, C) by their numbers for each superpixel."""
         rows = np.arange(len(self.D))[:, None]
         return Particles(*(a[rows, which] for a in (self.n, self.D, self.R, self.T)))
 

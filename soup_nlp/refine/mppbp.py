@@ -10,7 +10,7 @@ With one global length unit (`local_units` off) the unit `u = sum_i c_i D_i` cou
 The MRF then has u fixed and its first-order change in the unary costs; the comparison of rounds
 is with the exact energy, at sum(lam) = 1.
 
-TRW-S starts every round with messages of zero: nearly all of its labels are new ones.
+TRW-S starts every round with messages of zero, because nearly all of its labels are new.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def _draw(
     o: RefineOptions,
     shares: Mapping[str, float],
 ) -> Proposals:
-    """The current belief, what was kept, and new proposals: `o.particles` in all."""
+    """The current belief, the kept particles and new proposals, `o.particles` in all."""
     n = len(best)
     current = Particles.of(best)
     fixed = current if kept is None else current.joined(kept)
@@ -211,7 +211,7 @@ class _Rounds:
     Attributes:
         best: Soup of the lowest energy so far.
         energy: Its energy by term, see `objective`.
-        kept: Particles that the next round has besides its proposals.
+        kept: Particles that the next round uses besides its proposals.
         done: Rounds that have ended.
     """
 
@@ -328,7 +328,7 @@ def _learn(
     labels: Int,
     done: Round,
 ) -> None:
-    """Steps and shares of the kinds follow what was accepted."""
+    """Adapt steps and shares of the kinds to the accepted proposals."""
     own = np.arange(len(labels))
     kind, step = drawn.kind[labels], drawn.step[own, labels]
     for name in (*WALKS, *COMMON):

@@ -86,10 +86,10 @@ class Proposer:
     # --- walks: what one pixel of re-projection error means for each coordinate ---------------
 
     def _units(self, now: Local) -> tuple[Float, Float, Float]:
-        """Change by one pixel: of log Z with its motion fixed, of g x radius, of T.
+        """Changes of log Z (motion fixed), g x radius and T that move the image by one pixel.
 
-        The parallax of a superpixel is what its translation moves it by, at least half a pixel:
-        without it nothing but the other terms limits its depth.
+        The parallax of a superpixel is the image motion by its translation, at least half a pixel,
+        because without parallax only the other terms limit its depth.
         """
         Y = np.einsum("ncij,nj->nci", now.R, self.data.anchor_ray) * now.Z[..., None] + now.T
         z = np.maximum(Y[..., 2], 1e-9)
@@ -137,9 +137,9 @@ class Proposer:
     def _common_motion(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, Float]:
         """Motions that many share, fitted again to the flow of their superpixels' present planes.
 
-        A superpixel alone cannot leave a motion that it shares with others without paying for
-        the difference; together they can. Every third one is the fit itself, the others are steps
-        around it.
+        A superpixel alone pays for a motion that differs from the one it shares with others;
+        together they do not. Every third candidate is the fit itself, the others are steps around
+        it.
         """
         step = self.spread.draw(kind, (count,), self.rng)
         step[::3] = 0.0
@@ -156,7 +156,7 @@ class Proposer:
         return Local(base.Z, base.g, R, T), np.broadcast_to(step, base.Z.shape)
 
     def _shared(self, soup: Soup, now: Local, count: int) -> tuple[Float, Float]:
-        """At most `count` motions (C, 3, 3), (C, 3), each fitted to those that follow it now."""
+        """At most `count` motions (C, 3, 3), (C, 3), each fitted to the superpixels that have it."""
         R, T, error = self._explaining(soup, now, count)
         member = error.argmin(axis=1)
         X = soup.points(self.data.pixel_ray)
@@ -185,7 +185,7 @@ class Proposer:
         return np.take_along_axis(self.near, order, axis=1)
 
     def _extrapolated(self, soup: Soup, who: Int, own: Local) -> tuple[Float, Float]:
-        """Depth and slope at the own anchor of the planes of others (N, C)."""
+        """Depth and slope of the planes of others (N, C) at the own anchor."""
         m = inverse_depth(soup.n, soup.distance)[who]
         inverse = np.einsum("ncj,nj->nc", m, self.data.anchor_ray)
         # a plane that does not meet the anchor's ray in front: its depth is borrowed instead
@@ -235,7 +235,7 @@ class Proposer:
         return R, T
 
     def _explaining(self, soup: Soup, now: Local, count: int) -> tuple[Float, Float, Float]:
-        """Few present motions that bring most anchors where their own do.
+        """Few present motions that move most anchors as their own motions do.
 
         Returns:
             (C, 3, 3), (C, 3), and (N, C) by how many pixels each misses.
@@ -258,7 +258,7 @@ class Proposer:
         return R[kept], T[kept], error[:, kept]
 
     def _mean(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, None]:
-        """Means of a few neighbours and the own state, which the smoothness terms favour."""
+        """Means of the own state and a few neighbours, which the smoothness terms favour."""
         parts = []
         for c in range(count):
             who = self._some(3 + 2 * (c % 3))

@@ -1,9 +1,8 @@
-"""Surfaces that bend: how to tell them from components that move apart, and where to start with
-them.
+"""Bending surfaces: their detection, and their initialisation.
 
 The flow is discontinuous along the outline of a rigid component that moves independently. On a
-bending surface it is continuous, and yet no single rigid motion explains it. Cut into rigid pieces,
-each with its own parallax, such a surface gets depths that have nothing to do with its shape.
+bending surface it is continuous, but no single rigid motion explains it. If such a surface is cut
+into rigid pieces, each with its own parallax, the depths do not follow its shape.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ Int = NDArray[np.int64]
 
 
 def bending_share(surface: Int, component: Int) -> float:
-    """Share of the superpixels that move otherwise than most of the surface they belong to.
+    """Share of the superpixels that move differently from most of their surface.
 
-    It is near 0 where every surface is one rigid component, near 1 where surfaces need many.
+    It is near 0 if every surface is one rigid component, near 1 if surfaces consist of many.
 
     Args:
         surface: (N,) surface of every superpixel.
@@ -38,18 +37,18 @@ def bending_share(surface: Int, component: Int) -> float:
 
 
 STILL_PX = 0.5
-"""Parallax up to which a pixel has none, pixels."""
+"""Parallax, in pixels, below which a pixel counts as having none."""
 
 
 def at_rest(views: Views, rotations: Sequence[Float] = ()) -> tuple[float, Float]:
-    """Largest share of the usable samples that a rotation of the camera explains, and the rotation.
+    """Largest share of the usable samples that a rotation alone explains, and the rotation.
 
-    A small motion before a far background explains these as well, and gives depth to what moves
-    before it; but it is a freer motion, and the background's depth is then arbitrary.
+    A small translation explains these samples as well and would give depth to moving objects in
+    front of them, but the depth of the background would then be arbitrary.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
-        rotations: (3, 3) each, to be tried beside none.
+        rotations: (3, 3) rotations to try in addition to the identity.
 
     Returns:
         The share, and the (3, 3) rotation.
@@ -66,21 +65,21 @@ def at_rest(views: Views, rotations: Sequence[Float] = ()) -> tuple[float, Float
 
 
 ABOVE_NOISE, LEAST_SHARE = 10.0, 0.25
-"""A flow discontinuity is at least this many times the median jump between neighbours (noise and
-bending), and at least this share of `discontinuity_px`."""
+"""Least jump of a flow discontinuity: multiple of the median jump between neighbours (which noise
+and bending cause), and share of `discontinuity_px`."""
 
 
 def surfaces(jump: Float, seg: Segmentation, discontinuity_px: float) -> Int:
-    """(N,) surface of every superpixel; along most of their outlines the flow is discontinuous.
+    """(N,) index of the surface of every superpixel; flow discontinuities separate them.
 
-    Jumps vary along an outline, and a single gap in it would join both sides. Therefore surfaces
-    are first separated along smaller jumps; two of them are joined again where the flow is
-    continuous along most of their common outline, the longest outline first.
+    The size of the jumps varies along an outline, and one small jump would join both sides.
+    Surfaces are therefore first separated along smaller jumps. Two of them are joined again if the
+    flow is continuous along most of their common outline, longest outline first.
 
     Args:
         jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
         seg: Superpixels and graphs.
-        discontinuity_px: A jump that is a discontinuity for certain, pixels.
+        discontinuity_px: Jump that certainly is a discontinuity, pixels.
     """
     least = np.clip(ABOVE_NOISE * np.median(jump), LEAST_SHARE * discontinuity_px, discontinuity_px)
     surface = connected_labels(jump < least, seg)
@@ -102,7 +101,7 @@ def surfaces(jump: Float, seg: Segmentation, discontinuity_px: float) -> Int:
 
 
 def flow_jump(fit: Float, views: Views, pairs: Int, boundary_ray: Float) -> Float:
-    """(P,) pixels by which the affine flows of two neighbours differ on their boundary, mean.
+    """(P,) mean difference of the affine flows of two neighbours on their boundary, pixels.
 
     Args:
         fit: (N, 3, 2) affine flow of every superpixel, see `affine_flow`.
@@ -124,12 +123,12 @@ def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Floa
 
     Args:
         views: Rays, targets and confidence of every superpixel.
-        noise: Residual, pixels, below which errors count in squares.
-        rounds: Re-weighted fits.
+        noise: Residual, pixels, below which errors are squared.
+        rounds: Number of re-weighted fits.
 
     Returns:
-        (N, 3, 2) maps from offsets in radii to targets in pixels, and (N,) their mean error,
-        pixels: what the flow's noise leaves, whether surfaces bend or not.
+        (N, 3, 2) maps from offsets in radii to targets in pixels, and (N,) their mean error in
+        pixels, which measures the flow's noise whether surfaces bend or not.
     """
     off = (views.ray - views.anchor[:, None])[..., :2] / views.radius[:, None, None]
     basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
@@ -147,14 +146,14 @@ def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Floa
 
 
 def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float]:
-    """Every superpixel at depth 1 in both frames, facing the camera, turned in the image plane.
+    """Fronto-parallel superpixels at depth 1 in both frames, rotated in the image plane.
 
-    Two views of a bending surface leave its relief to be found by the energy: a start without
-    relief favours none.
+    Two views of a bending surface do not determine its relief. An initialisation without relief
+    favours none, and the energy determines it.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
-        turn: (3, 3) rotation of the camera, which is applied last; None for none.
+        turn: (3, 3) rotation of the camera, applied last; None for the identity.
 
     Returns:
         The soup, mean plane distance 1, and (N,) its mean re-projection error in pixels.

@@ -1,4 +1,4 @@
-"""Which motion each superpixel takes: candidates, fewest that explain the flow, smoothness."""
+"""Choice of a motion for every superpixel: candidates, smallest sufficient set, smoothness."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ Int = NDArray[np.int64]
 
 
 CLIP = 3.0
-"""Errors count at most this many pixels where motions are compared."""
+"""Errors are clipped at this many pixels where motions are compared."""
 
 
 def least_gain(noise: float, o: SeededStart) -> float:
-    """Pixels of error that another motion has to be better by, given the noise of the flow."""
+    """Least gain in error (pixels) for which a superpixel changes its motion, for a flow noise."""
     return max(2 * noise, o.unexplained_px)
 
 
 def dominant(views: Views, o: SeededStart) -> list[Motion]:
-    """Motions that many pixels share, the commonest first; at least one.
+    """Motions that many pixels share, the most frequent first; at least one.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
@@ -73,18 +73,18 @@ def of_pieces(
     noise: float,
     o: SeededStart,
 ) -> list[Motion]:
-    """Motions of the connected pieces that the motions so far do not explain.
+    """Motions of the connected pieces whose flow the present motions do not explain.
 
-    A piece gets the motion of its own essential matrix and the one that shares the main
-    rotation: a small patch determines a translation better than both.
+    A piece gets two candidates: the motion of its own essential matrix, and a translation with the
+    main rotation, because a small patch determines a translation better than a whole motion.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
         seg: Superpixels and graphs.
-        motions: M motions so far; the first has the main rotation.
+        motions: The present M motions; the first has the main rotation.
         cost: (N, M) penalised error under them, pixels.
         noise: Flow noise, pixels.
-        o: Which pieces are looked at.
+        o: Number and least size of the pieces.
     """
     bad = cost.min(axis=1) > max(3 * noise, o.unexplained_px)
     bad &= views.weight.mean(axis=1) > 0.3
@@ -107,7 +107,9 @@ def of_pieces(
 
 
 def select(cost: Float, noise: float, o: SeededStart) -> list[int]:
-    """Fewest motions that explain the flow: greedy, each must gain on enough superpixels.
+    """Smallest set of motions that explains the flow, found greedily.
+
+    Each motion must lower the error of enough superpixels by the least gain.
 
     Args:
         cost: (N, M) penalised error of each superpixel under each motion, pixels.
@@ -115,7 +117,7 @@ def select(cost: Float, noise: float, o: SeededStart) -> list[int]:
         o: Least gain and least number of superpixels.
 
     Returns:
-        Columns that are kept, the best motion first.
+        Kept columns, the best motion first.
     """
     clipped = np.minimum(cost, CLIP)
     gain = least_gain(noise, o)
@@ -132,16 +134,16 @@ def select(cost: Float, noise: float, o: SeededStart) -> list[int]:
 
 
 def smooth_choice(cost: Float, near: Float, seg: Segmentation, price: float) -> Int:
-    """Label of every superpixel: its cost, plus `price` where neighbours differ; by TRW-S.
+    """Labels that minimise the costs plus `price` where neighbours differ, by TRW-S.
 
-    A superpixel unlike all its neighbours pays about twice the price, one neighbour counts by its
-    share of the outlines and by how near it is.
+    A superpixel that differs from all its neighbours pays about twice the price. The weight of a
+    neighbour is its share of the outlines times its affinity.
 
     Args:
         cost: (N, M) cost of each superpixel under each label, pixels; +inf forbids one.
-        near: (P,) how much two neighbours should be alike, 0 to 1.
+        near: (P,) affinity of two neighbours, 0 to 1.
         seg: Superpixels and graphs.
-        price: Pixels.
+        price: Price of two different labels, pixels.
 
     Returns:
         (N,) label of every superpixel.
@@ -162,21 +164,21 @@ def flow_affinity(jump: Float, o: SeededStart) -> Float:
 
     Args:
         jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
-        o: Where a surface ends.
+        o: Jump at which a surface ends.
     """
     return np.exp(-2 * jump / o.discontinuity_px)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Motion and plane that every superpixel has taken.
+    """Chosen motion and plane of every superpixel.
 
     Attributes:
         R: (N, 3, 3) rotations.
         t: (N, 3) unit translations.
-        fit: Planes (N, 1) under them.
-        label: (N,) index of each motion, -1 for one of the superpixel's own. Superpixels of one
-            index have the same R and t.
+        fit: Planes (N, 1) under these motions.
+        label: (N,) index of each motion, -1 where the superpixel has its own. Superpixels with the
+            same index have the same R and t.
     """
 
     R: Float
@@ -195,7 +197,7 @@ class Choice:
         return self.fit.parallax[:, 0] * np.abs(self.fit.inverse_depth[:, 0])
 
     def taking(self, at: Int, R: Float, t: Float, fit: PlaneFit, label: Int | int) -> Choice:
-        """With superpixels `at` (K,) having other motions, planes (K, 1) and indices."""
+        """A copy in which superpixels `at` (K,) have other motions, planes (K, 1) and indices."""
 
         def put(old: Any, new: Any) -> Any:
             out = old.copy()
@@ -206,7 +208,7 @@ class Choice:
         return Choice(put(self.R, R), put(self.t, t), PlaneFit(*planes), put(self.label, label))
 
     def renumbered(self) -> tuple[Choice, list[Motion]]:
-        """The motions that are shared, the commonest first, and the choice with their indices."""
+        """The choice with indices by frequency, and the shared motions in the same order."""
         shared, first, inverse, count = np.unique(
             self.label, return_index=True, return_inverse=True, return_counts=True
         )
@@ -221,17 +223,19 @@ class Choice:
 def of_neighbourhoods(
     views: Views, seg: Segmentation, choice: Choice, noise: float, o: SeededStart
 ) -> Choice:
-    """Motions of every superpixel's own neighbourhood and its neighbours', where they fit better.
+    """Adopt motions fitted to the neighbourhoods of superpixels where they fit better.
+
+    Candidates of a superpixel are the motion of its own neighbourhood and those of its neighbours.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
         seg: Superpixels and graphs.
-        choice: What they have so far.
+        choice: Present choice.
         noise: Flow noise, pixels.
         o: Least gain and rounds.
 
     Returns:
-        The choice with what was adopted.
+        The choice with the adopted motions.
     """
     n, k = seg.knn.shape
     if k == 0:

@@ -1,4 +1,4 @@
-"""Components, groups of superpixels that move as one: pieces, borrowed depths, contact scales."""
+"""Rigid components of superpixels: connected pieces, borrowed depths, scales by contact."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def connected_pieces(mask: NDArray[np.bool_], seg: Segmentation) -> Int:
 
 
 def connected_labels(hold: NDArray[np.bool_], seg: Segmentation) -> Int:
-    """(N,) component of every superpixel where only the neighbour pairs (P,) of `hold` count."""
+    """(N,) connected component of every superpixel, joined by the pairs that `hold` (P,) marks."""
     return _connected(seg.pairs[hold], len(seg))
 
 
@@ -36,10 +36,10 @@ def _connected(links: Int, count: int) -> Int:
 
 
 def rigid_components(label: Int, seg: Segmentation) -> Int:
-    """Groups that share one scale: a dominant motion, or a piece of superpixels of their own.
+    """Groups that share one scale: all of one dominant motion, or a connected piece without one.
 
     Args:
-        label: (N,) index of the dominant motion, -1 for a motion of the superpixel's own.
+        label: (N,) index of the dominant motion, -1 where the superpixel has its own motion.
         seg: Superpixels and graphs.
 
     Returns:
@@ -53,7 +53,7 @@ def rigid_components(label: Int, seg: Segmentation) -> Int:
 
 
 SHORTEST = 1e-4
-"""Least length of a translation, relative to the one that a motion's borrowed depths ask for."""
+"""Smallest factor by which `borrow` shortens a translation."""
 
 
 def borrow(
@@ -61,19 +61,19 @@ def borrow(
 ) -> tuple[Float, Float, Float]:
     """Weak superpixels take the median inverse depth of strong neighbours of their motion.
 
-    A motion without any strong superpixel (of what a camera at rest sees at rest) borrows from
-    those of others. Its translation is shortened then, by as much as its own inverse depths are
-    smaller: at the borrowed depths it would move what stands still.
+    A motion without any strong superpixel (for example the static background of a camera at rest)
+    borrows from the strong superpixels of other motions. Its translation is then shortened by the
+    ratio of its own to the borrowed inverse depths, so that it explains the same flow.
 
     Args:
         mu: (N,) inverse depth at the anchor, in units of |t|.
-        slope: (N, 2) relative change of it at the superpixel's radius; 0 where borrowed.
+        slope: (N, 2) relative change of mu at the superpixel's radius; 0 where borrowed.
         label: (N,) index of the motion.
-        weak: (N,) whose depth is not to be trusted.
+        weak: (N,) True where the depth is not reliable.
         seg: Superpixels and graphs.
 
     Returns:
-        mu and slope with what was borrowed, and (N,) the length of each translation.
+        mu and slope after borrowing, and (N,) the length of each translation.
     """
     from scipy.spatial import cKDTree
 
@@ -96,31 +96,32 @@ def borrow(
 
 
 OUTLINE, GROUND, MOST = 0.2, 0.4, 0.6
-"""Quantiles of the depth ratios along a component's outline, along what lies below it, and the one
-of the outline that the latter's may reach."""
+"""Quantiles of the depth ratios: along the outline of a component, along its contact with what lies
+below it, and along the outline as the upper limit of a scale by contact below."""
 BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 UNKNOWN = np.log(100.0)
-"""Contact and pace that differ by more, in logarithms, say nothing: the camera is at rest."""
+"""If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
 TIES = ("reference", "contact below", "outline", "cut off below", "nothing", "ground")
-"""What gives a component its scale: it is the largest one, which has the scene's; it stands on what
-is below it; it touches what is around it; the lower border hides what it stands on; nothing; or
-the ground bounds it, where it would be below."""
+"""What gives a component its scale. reference: it is the largest component and defines the scale.
+contact below: it stands on its lower neighbours. outline: it touches its neighbours. cut off below:
+the lower image border hides what it stands on. nothing: it has no neighbour with a scale. ground:
+it was lifted to the ground."""
 UNSUPPORTED = 1e-6
-"""Added to the share of a component's support that is placed: without any, longer contacts
-first."""
+"""Added to the placed share of a component's support, so that the longest contact goes first where
+no support is placed."""
 
 
 class Outlines(NamedTuple):
-    """Where components touch: every neighbour pair that joins two, in both directions (2 B).
+    """The B neighbour pairs that join two components, in both directions (2 B entries).
 
     Attributes:
-        component: The one component.
-        other: The other.
+        component: First component of the pair.
+        other: Second component of the pair.
         contact: Length of their boundary, pixels.
-        below: Whether the other lies below it.
-        weight: Contact times the square of how low it is in the component: a car has room between
-            its wheels.
+        below: Whether the second lies below the first in the image.
+        weight: Contact times the squared height difference to the top of the first component, since
+            a car touches the road at its wheels only.
         top: (C,) row of the highest anchor of every component.
     """
 
@@ -133,7 +134,7 @@ class Outlines(NamedTuple):
 
 
 def outlines(label: Int, seg: Segmentation) -> Outlines:
-    """Contacts of components, of which superpixels have labels (N,)."""
+    """Contacts between the components that `label` (N,) gives the superpixels."""
     ends = label[seg.pairs]
     across = ends[:, 0] != ends[:, 1]
     component, other = np.concatenate([ends[across], ends[across, ::-1]]).T
@@ -152,27 +153,26 @@ def contact_scales(
 ) -> tuple[Float, Int]:
     """Relative scale of every component, such that components touch what is around them.
 
-    A component stands on what is below it: in an upright image its scale is the middle of the depth
-    ratios where a neighbour lies below, which count by the square of how low they are in the
-    component. A component hides what is behind it, so its depth is at most its
-    neighbours': the scale is bounded by what most of the outline allows, should the superpixels
-    below be wrong ones. Where none are seen (less than a tenth of the outline), or nothing is known
-    of the vertical, a component touches what it touches first: a low quantile of the depth ratios
-    all around.
+    In an upright image a component stands on its lower neighbours. Its scale is then the quantile
+    GROUND of the depth ratios to them, weighted by `Outlines.weight`. A component occludes what is
+    behind it, so its depth is at most that of its neighbours; therefore the scale is at most the
+    quantile MOST of the depth ratios along the whole outline. If the lower neighbours make up less
+    than a tenth of the contact, or if the image is not upright, the scale is the quantile OUTLINE
+    of the depth ratios along the whole outline.
 
-    Components are joined to the placed ones in the order of their contact length times the share of
-    what lies below them that is placed (1 where nothing does): the roof of a car in pieces waits
-    for its wheels, instead of being put where the mountain behind it stands.
+    Components are placed one after the other, in the order of their contact length with placed
+    components times the placed share of their lower neighbours (1 where there are none). The roof
+    of a car that is cut into pieces is thus placed after its wheels, and not on the background.
 
     Args:
         soup: Planes, every motion in its own scale.
         label: (N,) index of the component.
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
-        upright: Whether the image's columns run down.
+        upright: Whether the image is upright.
 
     Returns:
-        (N,) scale of every superpixel's component, and (N,) what gave it, an index of `TIES`.
+        (N,) scale of every superpixel's component, and (N,) its origin, an index of `TIES`.
     """
     count = int(label.max()) + 1
     log_scale = np.zeros(count)
@@ -220,12 +220,13 @@ def contact_scales(
 def nearer_where_cut_off(
     soup: Soup, label: Int, log_scale: Float, seg: Segmentation, K_ref: Float
 ) -> Float:
-    """(C,) by how much components that the image's lower border cuts off are nearer, in logarithms.
+    """(C,) log factor by which components cut off by the lower image border come nearer.
 
-    What they stand on is not seen, and what they touch is behind them: contact is the farthest
-    that they can be. Where they would move as far, seen from the camera, as the scene does is as
-    near as anything makes likely. Half way between, in logarithms, the error is at most the root
-    of their ratio. Components that touch are one here: a person is in pieces.
+    What such a component stands on is not visible, and its visible neighbours are behind it, so
+    contact gives its largest depth. Its smallest plausible depth is the one at which it moves as
+    far relative to the camera as the scene does. The middle of both, in logarithms, has an error of
+    at most the square root of their ratio. Components that touch are treated as one group, since a
+    person may be cut into pieces.
 
     Args:
         soup: Planes, every motion in its own scale.
@@ -239,13 +240,13 @@ def nearer_where_cut_off(
     ends = label[seg.pairs]
     group_of = _connected(ends[(ends != scene).all(axis=1)], count)
     group, groups = group_of[label], int(group_of.max()) + 1
-    # what carries a group, seen and beyond the border, by the square of how low it is
+    # support of a group, visible and beyond the border, weighted by the squared height difference
     around = outlines(group, seg)
     on = around.below
     seen = np.bincount(around.component[on], around.weight[on], minlength=groups)
     last = group[seg.labels[-1]]
     hidden = np.bincount(last, (len(seg.labels) - around.top[last]) ** 2, minlength=groups)
-    # displacements seen from the camera: it turns as the scene does
+    # displacements relative to the camera, which rotates as the scene does
     point = soup.points(rays(K_ref, seg.anchors))
     moved = np.einsum("nij,nj->ni", soup.R, point) + soup.translation
     moved -= point @ soup.R[label == scene][0].T
@@ -260,12 +261,11 @@ def nearer_where_cut_off(
 
 
 def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -> Float:
-    """(2, B) depth of both components at each of the B pairs that join two, by planes further
-    inside.
+    """(2, B) depths of both components at the B pairs that join two, from planes further inside.
 
-    Flow is blurred across an outline, and so are the planes of the superpixels along it. Those
-    behind them know better: the median of their planes, drawn out to the boundary. Where there are
-    none, the superpixel's own.
+    The flow is blurred across an outline, which falsifies the planes of the superpixels along it.
+    The depth is therefore the median over their inner neighbours, whose planes are extended to the
+    boundary; without inner neighbours the superpixel's own plane is used.
 
     Args:
         soup: Planes.
@@ -294,5 +294,5 @@ def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -
 
 
 def quantile(value: Float, weight: Float, share: float) -> float:
-    """The value that a share of the weight lies below."""
+    """Weighted quantile: the value below which a share of the weight lies."""
     return float(np.quantile(value, share, weights=weight, method="inverted_cdf"))

@@ -15,7 +15,7 @@ Float = NDArray[np.float64]
 
 
 REFINEMENTS = 5
-"""Robust fits of one motion at most, each with the noise that the one before has left."""
+"""Largest number of robust fits of a motion, each with the noise estimated by the last."""
 
 LEAST_NOISE = 0.01
 """Smallest scale of the robust loss, pixels."""
@@ -39,13 +39,13 @@ class Motion:
 
 
 def sampson(E: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
-    """Sampson distance (...) of rays r, q (..., 3) to E (3, 3), times focal (pixels)."""
+    """Sampson distance (...) of rays r, q (..., 3) under E (3, 3), times focal: pixels."""
     top, root, _, _ = _sampson_parts(E, np.swapaxes(r, -1, -2), np.swapaxes(q, -1, -2))
     return focal * top / root
 
 
 def _sampson_parts(E: Float, r: Float, q: Float) -> tuple[Float, Float, Float, Float]:
-    """Of columns r, q (..., 3, M): q'E r, the root of its squared slopes, the slopes by q and r."""
+    """q'E r of columns r, q (..., 3, M), the norm of its gradient, and the gradients by q and r."""
     by_q, by_r = E[:2] @ r, E[:, :2].T @ q
     squared = np.sum(by_q**2, axis=-2) + np.sum(by_r**2, axis=-2)
     return np.sum(q * (E @ r), axis=-2), np.sqrt(np.maximum(squared, 1e-24)), by_q, by_r
@@ -65,7 +65,7 @@ def sampson_slopes(E: Float, directions: Float, r: Float, q: Float, focal: float
 def estimate(
     r: Float, q: Float, weight: Float, focal: float, threshold: float = 1.0, seed: int = 0
 ) -> Motion | None:
-    """Motion of most correspondences, or None where they do not determine one.
+    """Motion with the most inliers, or None if the correspondences do not determine one.
 
     Args:
         r: (M, 3) reference rays, third component 1.
@@ -73,7 +73,7 @@ def estimate(
         weight: (M,) confidence.
         focal: Pixels per ray unit, so that the threshold is in pixels.
         threshold: Inlier distance, pixels.
-        seed: Of RANSAC.
+        seed: Seed of RANSAC.
     """
     motion = essential_motion(r, q, focal, threshold, seed)
     return None if motion is None else refine(motion, r, q, weight, focal, threshold)
@@ -82,7 +82,7 @@ def estimate(
 def essential_motion(
     r: Float, q: Float, focal: float, threshold: float, seed: int = 0
 ) -> Motion | None:
-    """Motion by essential matrix and cheirality as RANSAC finds it, or None; see `estimate`."""
+    """Motion by RANSAC on the essential matrix and cheirality, or None; see `estimate`."""
     if len(r) < 8:
         return None
     cv2.setRNGSeed(seed)
@@ -104,7 +104,7 @@ def essential_motion(
 
 
 def _decompose(E: Float, r: Float, q: Float) -> Motion | None:
-    """The (R, t) of E that puts most points in front of both cameras."""
+    """Decomposition (R, t) of E with the most points in front of both cameras."""
     R1, R2, t = cv2.decomposeEssentialMat(E)
     t = t.ravel()
     best, most = None, -1
@@ -177,16 +177,16 @@ def repeated(
     min_share: float = 0.03,
     seed: int = 0,
 ) -> list[Motion]:
-    """Dominant motions by repeated robust fits, each to what the earlier ones leave over.
+    """Dominant motions by repeated robust fits, each to the outliers of the earlier ones.
 
     Args:
         r: (M, 3) reference rays.
         q: (M, 3) next rays.
         weight: (M,) confidence.
         focal: Pixels per ray unit.
-        count: At most this many.
+        count: Largest number of motions.
         threshold: Inlier distance, pixels.
-        min_share: A motion needs this share of all correspondences.
+        min_share: Least share of all correspondences that a motion explains.
         seed: Of RANSAC.
     """
     left = np.ones(len(r), bool)
@@ -208,11 +208,11 @@ def repeated(
 def motion_of_points(
     points: Float, target: Float, K_next: Float, threshold: float = 1.0
 ) -> Float | None:
-    """(4, 4) rigid motion next_from_ref of known points, by robust PnP; None where none fits.
+    """(4, 4) rigid motion next_from_ref of known points by robust PnP; None if none fits.
 
     Args:
         points: (M, 3) in the reference frame.
-        target: (M, 2) where the next frame sees them, pixels.
+        target: (M, 2) their projections in the next frame, pixels.
         K_next: (3, 3) its intrinsics.
         threshold: Inlier distance, pixels.
     """

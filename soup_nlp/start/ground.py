@@ -1,12 +1,13 @@
-"""Nothing that is seen lies below the ground, and nothing floats above it.
+"""Ground plane: raises what lies below it, and lowers what floats above it.
 
-A thing without usable flow (it leaves the image, it is dark, it moves too fast) takes its depth
-from whatever is beside it, and a component that touches nothing known from its outline: both may
-end far below the road. In an upright image a level plane that much of the scene lies on, and next
-to nothing below, bounds the depth of all that is seen below the horizon.
+A superpixel without usable flow (it leaves the image, is dark or moves too fast) borrows its depth
+from its neighbours, and a component without a known support is scaled by its outline. Both may come
+out far below the road. In an upright image, a level plane on which much of the scene lies and below
+which almost nothing lies bounds the depth of everything seen below the horizon.
 
-What moves along the epipolar lines, as an oncoming car, is explained by the camera's motion at a
-wrong depth, too near. It then floats: its lower border is seen against the ground, far behind it.
+The camera's motion also explains an object that moves along the epipolar lines, such as an oncoming
+car, but at a depth that is too small. Such an object floats: the ground that is visible along its
+lower border is far behind it.
 """
 
 from __future__ import annotations
@@ -25,23 +26,23 @@ Int = NDArray[np.int64]
 LEVEL = 0.92
 """Least cosine between the normal of the ground and the vertical of the image."""
 ON, BELOW = 0.05, 0.2
-"""Relative gap of inverse depth up to which a superpixel lies on the ground, and from which on it
-lies below."""
+"""Relative differences of inverse depth: up to the first a superpixel lies on the ground, from the
+second on it lies below."""
 LEAST_ON, MOST_BELOW = 0.1, 0.05
-"""Shares of what is well known that lie on the ground at least, and below it at most."""
+"""Of the area with known depth, the least share on the ground and the largest share below it."""
 STANDS = 1.35
-"""Inverse depth over that of the ground from which on a superpixel stands above it: superpixels on
-an outline hold some of both sides."""
+"""Ratio to the inverse depth of the ground from which on a superpixel stands above it; superpixels
+on an outline contain pixels of both sides."""
 WHOLE = 1.15
-"""Ratio of depths on a boundary up to which both sides are one surface."""
+"""Largest ratio of depths on a boundary for which both sides are one surface."""
 FLOATS, GAP = 1.25, 1.1
-"""By how much the ground, and what is seen below the region, are farther than its lower border."""
+"""Least ratios to the depth of a region's lower border: of the ground, and of what is below it."""
 FEWEST, MOST_AREA = 3, 0.15
-"""Superpixels of a region that floats, and its share of the image."""
+"""Least number of superpixels and least share of the image of a region that floats."""
 IN_FRONT = 0.6
-"""Share of its outline, and of what lies below it, that has to be behind it and ground."""
+"""Least share of its outline behind the region, and least share of ground below it."""
 TRIALS = 500
-"""Planes through three superpixels that are tried."""
+"""Number of planes through three superpixels that are tried."""
 
 
 def ground(mu: Float, ray: Float, weight: Float, known: NDArray[np.bool_], seed: int) -> Float:
@@ -51,8 +52,8 @@ def ground(mu: Float, ray: Float, weight: Float, known: NDArray[np.bool_], seed:
         mu: (N,) inverse depth at the anchors.
         ray: (N, 3) their rays.
         weight: (N,) area of every superpixel.
-        known: (N,) which depths are known well.
-        seed: Of the planes that are tried.
+        known: (N,) True where the depth is reliable.
+        seed: Seed of the random planes.
     """
     none = np.zeros(len(mu))
     at = np.flatnonzero(known)
@@ -96,21 +97,21 @@ def above_ground(
     component: Int,
     floor: Float,
 ) -> tuple[Soup, NDArray[np.bool_]]:
-    """The soup with what is not known well, or moves independently, lifted to the ground.
+    """The soup with unreliable or independently moving parts lifted to the ground.
 
-    A component that lies below with most of its area becomes nearer as a whole, with its
-    translation. Other superpixels of the scene itself keep their translation, which they share.
+    A component with most of its area below the ground comes nearer as a whole, and its translation
+    becomes shorter. Single superpixels of the largest component keep the translation they share.
 
     Args:
         soup: Start, its components scaled.
         ray: (N, 3) rays of the anchors.
         weight: (N,) area of every superpixel.
-        known: (N,) which depths are known well, of the largest component.
+        known: (N,) True where the depth is reliable and belongs to the largest component.
         component: (N,) group that moves as one.
         floor: (N,) inverse depth of the ground (`ground`).
 
     Returns:
-        The soup, and (N,) which belong to a component that was lifted as a whole.
+        The soup, and (N,) True in components that were lifted as a whole.
     """
     mu = 1 / soup.depth_at(ray)
     scene = component == np.argmax(np.bincount(component))
@@ -136,10 +137,10 @@ def above_ground(
 def floating(
     soup: Soup, seg: Segmentation, ray: Float, boundary_ray: Float, floor: Float, component: Int
 ) -> list[tuple[NDArray[np.bool_], float]]:
-    """Regions that float above the ground: (N,) superpixels of each, and how much farther it is.
+    """Masks (N,) of the regions that float above the ground, and their depth ratios to it.
 
     A region stands above the ground, is continuous in depth, and is in front of most of its
-    surroundings. It floats where the ground is seen along its lower border, clearly farther.
+    surroundings. It floats if the ground visible along its lower border is clearly farther.
 
     Args:
         soup: Start, its components scaled.

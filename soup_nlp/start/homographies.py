@@ -2,14 +2,13 @@
 
 The motion (R, t) of a superpixel comes from the flow of itself and of its nearest neighbours, by
 essential matrix and cheirality; its plane then follows from `q ~ (R - t n^T / d) r`, which is
-linear in n / d. Without neighbours the homography of the superpixel alone is decomposed: up to
-four (R, t, n) explain it, cheirality leaves those under which the superpixel lies before both
-cameras, mostly two, and that one is taken whose epipolar geometry explains the flow of the
-neighbours better.
+linear in n / d. Without neighbours the homography of the superpixel alone is decomposed. Up to
+four (R, t, n) explain it. Cheirality leaves those with the superpixel in front of both cameras,
+mostly two, and the one whose epipolar geometry explains the flow of the neighbours better is taken.
 
-A superpixel for which this fails takes the answer of the nearest one for which it does not. All
-scales are alike and all anchors lie at one depth, which the paper takes as a positive constant: the
-unorganised soup.
+A superpixel for which this fails takes the result of the nearest one for which it succeeds. All
+scales are equal and all anchors have the same depth, which the paper takes as a positive constant.
+The result is the unorganised soup.
 """
 
 from __future__ import annotations
@@ -33,15 +32,15 @@ Int = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 LEAST_PIXELS = 8
-"""Fewest correspondences of a homography."""
+"""Least number of correspondences of a homography."""
 MOST_PIXELS = 400
-"""A motion is fitted to at most this many correspondences."""
+"""Largest number of correspondences to which a motion is fitted."""
 JUDGES = 6
-"""Neighbours whose flow decides between two decompositions."""
+"""Number of neighbours whose flow decides between two decompositions."""
 LEAST_MOTION = 1e-6
-"""Smallest |t| / d of a decomposition that has a direction and a depth."""
+"""Smallest |t| / d at which a decomposition determines a direction and a depth."""
 CLIP = 5.0
-"""Sampson distances count at most this many pixels."""
+"""Sampson distances are clipped at this many pixels."""
 
 
 class Matches(NamedTuple):
@@ -53,14 +52,14 @@ class Matches(NamedTuple):
 
 
 class Patch(NamedTuple):
-    """What is known of a superpixel: its motion, and m = -n / d with |t| = 1 as the length unit."""
+    """Motion of a superpixel, and m = -n / d with |t| = 1 as the length unit."""
 
     motion: Motion
     m: Float
 
 
 def unorganised(views: Views, seg: Segmentation, o: SeededStart) -> tuple[Soup, Bools]:
-    """The soup of single superpixels, all scales alike, and who borrowed.
+    """The soup of independent superpixels with equal scales, and which of them borrowed.
 
     Args:
         views: Rays and targets of every superpixel.
@@ -68,7 +67,7 @@ def unorganised(views: Views, seg: Segmentation, o: SeededStart) -> tuple[Soup, 
         o: Neighbours of a motion, inlier distance, seed.
 
     Returns:
-        The soup, not normalised, and (N,) True where another's answer was taken.
+        The soup, not normalised, and (N,) True where the result of another superpixel was taken.
     """
     found = [_patch(views, seg, i, o) for i in range(len(seg))]
     fails = np.array([p is None for p in found])
@@ -86,7 +85,7 @@ def unorganised(views: Views, seg: Segmentation, o: SeededStart) -> tuple[Soup, 
 
 
 def _patch(views: Views, seg: Segmentation, i: int, o: SeededStart) -> Patch | None:
-    """Motion and plane of a superpixel; None where its flow does not give them."""
+    """Motion and plane of a superpixel; None if its flow does not determine them."""
     own = matches(views, np.array([i]))
     if len(own.ray) < LEAST_PIXELS:
         return None
@@ -107,7 +106,7 @@ def _patch(views: Views, seg: Segmentation, i: int, o: SeededStart) -> Patch | N
 
 
 def matches(views: Views, members: Int) -> Matches:
-    """Correspondences of some superpixels (M,), evenly thinned out where they are many."""
+    """Correspondences of superpixels (M,), evenly subsampled if there are many."""
     ray, target, weight = (
         v[members].reshape(-1, *v.shape[2:]) for v in (views.ray, views.target, views.weight)
     )
@@ -117,7 +116,7 @@ def matches(views: Views, members: Int) -> Matches:
 
 
 def plane_of(motion: Motion, own: Matches) -> Float:
-    """m (3,) of least squares in `q ~ R r + t (m . r)`, errors across the ray of the target."""
+    """Least-squares m (3,) in `q ~ R r + t (m . r)`, errors perpendicular to the target ray."""
     y, q, t = own.ray @ motion.R.T, own.target, motion.t
     root = np.sqrt(own.weight)[:, None]
     a = (y[:, :2] - q[:, :2] * y[:, 2:]) * root
@@ -127,7 +126,7 @@ def plane_of(motion: Motion, own: Matches) -> Float:
 
 
 def fit_homography(own: Matches) -> Float | None:
-    """Least-squares homography (3, 3) of rays, signed so that they stay ahead; None for none."""
+    """Least-squares homography (3, 3) of rays, with the sign of positive depths, or None."""
     if len(own.ray) < LEAST_PIXELS:
         return None
     a, b = (np.ascontiguousarray(v[:, :2]) for v in (own.ray, own.target))
@@ -144,10 +143,10 @@ def fit_homography(own: Matches) -> Float | None:
 
 
 def in_front(H: Float, ray: Float) -> list[Patch]:
-    """The decompositions of H under which every ray (M, 3) meets the plane before both cameras.
+    """The decompositions of H with the plane in front of both cameras on every ray (M, 3).
 
     With `1 / Z(r) = m . r > 0` in the reference frame, the depth in the next one is `Z (H r)_z`,
-    positive by the sign of H.
+    which the sign of H makes positive.
     """
     try:
         _, Rs, ts, ns = cv2.decomposeHomographyMat(H, np.eye(3))

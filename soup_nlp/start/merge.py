@@ -1,8 +1,8 @@
 """Each independently moving, connected region gets one rigid motion if one fits.
 
-A few pixels do not determine a motion: several motions, the camera's among them, explain the flow
-of a small region equally well, each with other depths. If its superpixels choose independently,
-the region falls apart. The flow shows the regions better: it is discontinuous along their outlines.
+A few pixels do not determine a motion: several motions, including the camera's, explain the flow of
+a small region equally well with different depths. If its superpixels choose independently, the
+region falls apart. Flow discontinuities show the outlines of regions more reliably.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 PIXELS = 1500
-"""A motion is fitted to at most this many pixels of a component."""
+"""Largest number of pixels of a component to which a motion is fitted."""
 AGREE = 0.7
-"""Share of a component's superpixels that its motion has to explain."""
+"""Least share of a component's superpixels that its motion explains."""
 DISCONTINUITIES = (1.0, 0.5, 0.25)
-"""Flow discontinuities that separate two regions, relative to `discontinuity_px`. A smaller one is
-tried where no single motion explains the regions that a larger one leaves."""
+"""Jumps of the flow that separate two regions, relative to `discontinuity_px`. The smaller one is
+tried where no single motion explains a region that the larger one gives."""
 
 
 def gather(
     views: Views, seg: Segmentation, jump: Float, choice: Choice, noise: float, o: SeededStart
 ) -> Choice:
-    """Each region takes one motion, and then the neighbouring superpixels that it explains.
+    """Give each region one motion and then add neighbouring superpixels that this motion explains.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
         seg: Superpixels and graphs.
         jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
-        choice: What the superpixels have so far.
+        choice: Present choice.
         noise: Flow noise, pixels.
         o: Least gain and size of a component, price of differing neighbours, where a surface ends.
 
     Returns:
-        The choice with what was adopted; its indices are no longer those of a list of motions.
+        The choice with the adopted motions; its indices no longer refer to a list of motions.
     """
     if not (choice.label >= 0).any():
         return choice
@@ -69,7 +69,7 @@ def _one_motion_each(
     gain: float,
     o: SeededStart,
 ) -> Choice:
-    """Pieces beside the main motion, joined where `whole` (P,), take the motion that fits best."""
+    """Give each piece without the main motion, joined by the pairs `whole` (P,), one motion."""
     main = _main(choice.label)
     R_main = choice.R[np.argmax(choice.label == main)]
     mover = choice.label != main
@@ -98,10 +98,10 @@ def _one_motion_each(
 def _candidates(
     views: Views, choice: Choice, at: Int, R_main: Float, noise: float, o: SeededStart
 ) -> tuple[Float, Float]:
-    """(C, 3, 3), (C, 3) motions that superpixels `at` may share, fitted to all their pixels.
+    """(C, 3, 3), (C, 3) candidate motions for superpixels `at`, fitted to all their pixels.
 
-    A translation beside the main rotation, as it is and refined; the motions that some of them
-    have, refined; the motion of their own essential matrix.
+    These are a translation with the main rotation, before and after refinement, the refined present
+    motions of these superpixels, and the motion of their own essential matrix.
     """
     step = max(1, len(at) * views.ray.shape[1] // PIXELS)
     r, q = (v[at].reshape(-1, 3)[::step] for v in (views.ray, views.target))
@@ -129,10 +129,10 @@ def _candidates(
 def _spread(
     views: Views, seg: Segmentation, jump: Float, choice: Choice, gain: float, o: SeededStart
 ) -> Choice:
-    """Superpixels choose among the motions of whole regions, the same where the flow is continuous.
+    """Choose among the motions of whole regions, alike for neighbours with continuous flow.
 
-    Those with a motion of their own may keep it. TRW-S solves this, because many superpixels have
-    to change together: half of a region may have taken the camera's motion.
+    Superpixels with their own motion may keep it. TRW-S is used because many superpixels have to
+    change together, for example where half of a region has the camera's motion.
     """
     label = choice.label
     count = np.bincount(label[label >= 0])

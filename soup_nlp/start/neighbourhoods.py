@@ -1,4 +1,4 @@
-"""Motions of small neighbourhoods, all superpixels at once: translation alone, then both."""
+"""Motions of the neighbourhoods of all superpixels: translation alone, then rotation as well."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def neighbourhood(values: Float, members: Int) -> Float:
 
     Args:
         values: (N, S, ...) per superpixel and pixel.
-        members: (N, M) superpixels that make up each neighbourhood.
+        members: (N, M) superpixels of each neighbourhood.
     """
     picked = values[members]
     return picked.reshape(len(members), -1, *values.shape[2:])
@@ -25,10 +25,10 @@ def neighbourhood(values: Float, members: Int) -> Float:
 def fit_translation(
     R: Float, r: Float, q: Float, weight: Float, focal: float, noise: float, rounds: int = 6
 ) -> Float:
-    """Translation direction of every neighbourhood with its rotation given.
+    """Translation direction of every neighbourhood for a given rotation.
 
-    The epipolar constraint `t . (R r x q) = 0` is linear in t: smallest eigenvector of the
-    reweighted scatter matrix.
+    The epipolar constraint `t . (R r x q) = 0` is linear in t, which is the eigenvector of the
+    re-weighted scatter matrix with the smallest eigenvalue.
 
     Args:
         R: (N, 3, 3) rotations.
@@ -59,7 +59,7 @@ def fit_translation(
 
 
 def _rows(v: Float) -> Float:
-    """(N, 3, M) of (N, M, 3): a coordinate of all points lies together, which is fast."""
+    """(N, 3, M) from (N, M, 3): contiguous coordinates, which is faster."""
     return np.ascontiguousarray(v.transpose(0, 2, 1))
 
 
@@ -79,12 +79,12 @@ def _square(x: Float, y: Float) -> Float:
 
 
 def face_forward(R: Float, t: Float, r: Float, q: Float, weight: Float) -> Float:
-    """The sign of t (N, 3) under which most depths are positive."""
+    """t (N, 3) with the sign that makes most depths positive."""
     return _facing(t, R @ _rows(r), _rows(q), weight)
 
 
 def _facing(t: Float, y: Float, q: Float, weight: Float) -> Float:
-    """`face_forward` of turned rays y and next rays q, both (N, 3, M)."""
+    """`face_forward` for rotated rays y and next rays q, both (N, 3, M)."""
     s = t[..., None]
     dot = (y[:, 0] - q[:, 0] * y[:, 2]) * (s[:, 0] - q[:, 0] * s[:, 2])
     dot += (y[:, 1] - q[:, 1] * y[:, 2]) * (s[:, 1] - q[:, 1] * s[:, 2])
@@ -106,8 +106,8 @@ def refine_motion(
 ) -> tuple[Float, Float]:
     """Rotation and translation direction of every neighbourhood near a given motion.
 
-    Reweighted Gauss-Newton on the Sampson distance; priors keep what a small patch does not
-    determine.
+    Re-weighted Gauss-Newton steps on the Sampson distance. Priors hold the directions that a small
+    patch does not determine.
 
     Args:
         R: (N, 3, 3) rotations to start from.

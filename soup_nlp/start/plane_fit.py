@@ -13,7 +13,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 ROUNDING_PX = 1e-3
-"""Parallax in pixels that is none: the flow is not known better."""
+"""Parallax, in pixels, that counts as none, because the flow is not more accurate."""
 
 
 @dataclass(frozen=True)
@@ -33,17 +33,17 @@ class PlaneFit:
     parallax: Float
 
     def pick(self, take: tuple[Int, Int]) -> PlaneFit:
-        """One candidate of each superpixel, (N, 1), from index arrays (N,) of both axes."""
+        """One candidate of each superpixel, (N, 1), by index arrays (N,) of both axes."""
         return PlaneFit(*(v[take][:, None] for v in self.__dict__.values()))
 
     def columns(self, kept: list[int]) -> PlaneFit:
-        """The candidates of these columns."""
+        """The candidates in some columns."""
         return PlaneFit(*(v[:, kept] for v in self.__dict__.values()))
 
     def penalised(self) -> Float:
-        """(N, C) cost in pixels, raised where the plane lies behind the camera.
+        """(N, C) cost in pixels, increased where the plane lies behind the camera.
 
-        What stands still is at infinity, on either side of it by rounding.
+        A point without parallax is at infinity, and rounding decides its sign.
         """
         shift = self.parallax * self.inverse_depth
         return self.cost + np.where(shift < -ROUNDING_PX, 1.0 - 0.5 * shift, 0.0)
@@ -79,7 +79,7 @@ def fit_planes(
         noise: Flow noise in pixels that the slope prior is weighed against.
         slope_prior: Standard deviation of the slopes g / mu_a.
         max_slope: Slopes are clipped to this.
-        clip: Errors count at most this many pixels.
+        clip: Errors are clipped at this many pixels.
         rounds: Reweighting rounds.
     """
     # coordinates apart, all pixels of one together: (N, C, S) each
@@ -130,7 +130,7 @@ def fit_planes(
 
 @dataclass(frozen=True)
 class Views:
-    """What the fits need of every superpixel.
+    """Sampled rays, flow targets and extent of every superpixel.
 
     Attributes:
         ray: (N, S, 3) rays of sampled pixels.
@@ -162,6 +162,6 @@ class Views:
         )
 
     def some(self, at: Int) -> Views:
-        """Those of superpixels `at`."""
+        """The entries of superpixels `at`."""
         ray, target, weight = self.ray[at], self.target[at], self.weight[at]
         return Views(ray, target, weight, self.anchor[at], self.radius[at], self.focal)

@@ -55,26 +55,26 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """The unorganised soup with what is known about its making.
+    """The initial soup, and how it was made.
 
     Attributes:
         soup: Start of the optimisation, mean plane distance 1.
         error: (N,) mean re-projection error of every superpixel, pixels.
-        parallax: (N,) pixels that its translation moves the anchor.
+        parallax: (N,) pixels by which its translation moves the anchor.
         borrowed: (N,) True where plane or motion come from neighbours.
-        motion: (N,) index of its motion among `motions`, -1 for one of its own.
-        component: (N,) group that seems to move as one and shares one scale: a dominant motion, or
-            a connected piece of superpixels with motions of their own.
+        motion: (N,) index of its motion in `motions`, -1 where it has its own.
+        component: (N,) index of the rigid component, which shares one scale: the superpixels of a
+            dominant motion, or a connected piece of superpixels with their own motions.
         motions: The dominant motions.
-        surface: (N,) connected group within which the flow has no discontinuity; where surfaces
-            bend, the flow is discontinuous along most of its outline.
+        surface: (N,) index of the surface: a connected group without flow discontinuities inside;
+            where surfaces bend, discontinuities make up most of its outline.
         tie: (N,) what gives the component of every superpixel its scale, an index of `TIES`.
         grounded: (N,) True where the depth is borrowed and the ground is known below the horizon.
-        bending_share: Share of the superpixels that move otherwise than most of their surface.
-        bending: Whether the energy for surfaces that bend is in force: all are one component at a
-            constant depth.
+        bending_share: Share of the superpixels that move differently from most of their surface.
+        bending: Whether the energy for bending surfaces is used; all superpixels are then one
+            component at a constant depth.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
-        noise: Of the flow, pixels, see `limited_noise`.
+        noise: Noise of the flow, pixels, see `limited_noise`.
     """
 
     soup: Soup
@@ -189,7 +189,7 @@ def propose(
 
 
 def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
-    """The paper's start: nothing is known of components, so all superpixels are one."""
+    """The paper's initialisation, which has no components: all superpixels are one."""
     soup, borrowed = unorganised(views, seg, o)
     soup = soup.normalised()
     gap = soup.moved(soup.points(views.ray))
@@ -213,9 +213,9 @@ def _on_ground(
     tie: Int,
     o: SeededStart,
 ) -> tuple[Soup, Int, Int, Float]:
-    """Soup, components, ties and (N,) inverse depth of the ground.
+    """Soup, components, ties and (N,) inverse depth of the ground, see `ground`.
 
-    Nothing lies below the ground, and nothing floats above it.
+    What lies below the ground is lifted, and what floats above it is lowered.
     """
     known = known & (component == np.argmax(np.bincount(component)))
     area = np.bincount(seg.labels.ravel()).astype(float)
@@ -237,7 +237,7 @@ def _on_ground(
 def look(
     seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: SeededStart
 ) -> tuple[Views, NDArray[np.bool_]]:
-    """Rays and targets of sampled pixels, and (N,) which superpixels took a neighbour's.
+    """Rays and targets of sampled pixels, and (N,) True where they are those of a neighbour.
 
     Args:
         seg: Superpixels and graphs.
@@ -275,7 +275,7 @@ def look(
 def _fill_poor(
     seg: Segmentation, index: Int, there: NDArray[np.bool_], least: int = 8
 ) -> tuple[Int, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Superpixels with few usable pixels take those of their nearest rich neighbour."""
+    """Replace the samples of superpixels with few usable pixels by their nearest neighbour's."""
     count = there.sum(axis=1)
     poor = count < least
     if not poor.any() or poor.all():
@@ -290,7 +290,7 @@ def _fill_poor(
 
 
 def _parallax(soup: Soup, views: Views) -> Float:
-    """(N,) pixels between where every anchor moves and where its rotation alone brings it."""
+    """(N,) distance in pixels between the moved and the merely rotated anchor."""
     return np.linalg.norm(soup.parallax(views.anchor) * np.asarray(views.focal), axis=1)
 
 

@@ -1,4 +1,4 @@
-"""What a problem file says about the initialisation."""
+"""Options of the initialisation in a problem file."""
 
 from __future__ import annotations
 
@@ -11,47 +11,47 @@ class StartOptions(Section):
     """How the initialisation is made."""
 
     method: Literal["shared", "homography"] = "shared"
-    """shared (motions of the whole image, one of them for every superpixel) or homography (the
-    paper's: epipolar geometry and homography of every superpixel, all scales alike)."""
+    """shared (every superpixel takes one of the motions of the whole image) or homography (the
+    paper's: epipolar geometry and homography of every superpixel, equal scales)."""
     motion_neighbours: Count = 15
-    """With homography: nearest neighbours whose flow helps to find the motion of a superpixel, as
-    the paper has it for small ones; with 0 its own homography is decomposed."""
+    """With homography: number of nearest neighbours whose flow is used for the motion of a
+    superpixel, as in the paper for small ones; with 0 its own homography is decomposed."""
     samples: Samples = 40
-    """Pixels per superpixel."""
+    """Sampled pixels per superpixel."""
     dominant: Whole = 5
-    """Dominant motions looked for."""
+    """Largest number of dominant motions."""
     threshold_px: NonNegative = 1.0
     """Inlier distance of a motion, pixels."""
     smoothness: NonNegative = 0.5
-    """Pixels that a border between motions must gain, where the flow does not jump."""
+    """Price of different motions of two neighbours with continuous flow, pixels."""
     min_parallax_px: NonNegative = 0.25
-    """Below this the depth of a superpixel is borrowed from its neighbours."""
+    """Parallax below which the depth of a superpixel is borrowed from its neighbours, pixels."""
     rounds: Count = 3
-    """Rounds of proposals from unexplained pieces, and from neighbours."""
+    """Rounds of candidate motions from unexplained pieces and from neighbours."""
     unexplained_px: NonNegative = 0.1
-    """A superpixel whose error is below this has no need of another motion."""
+    """Error below which a superpixel does not look for another motion, pixels."""
     pieces: Whole = 6
-    """At most this many unexplained pieces are looked at in a round."""
+    """Largest number of unexplained pieces that get candidate motions in a round."""
     piece_size: Whole = 4
-    """A piece has at least this many superpixels."""
+    """Least number of superpixels of a piece."""
     bending: NonNegative = 0.18
-    """Surfaces are taken to bend where more than this share of the superpixels moves otherwise
-    than most of its own surface; 1 for never."""
+    """Surfaces are taken to bend if more than this share of the superpixels moves differently from
+    most of their surface; 1 for never."""
     at_rest: NonNegative = 0.7
-    """The camera is taken to be at rest, or to turn only, where more than this share of the usable
-    pixels has no parallax: depth starts constant, as where surfaces bend; 1 for never."""
+    """The camera is taken to be at rest, or to rotate only, if more than this share of the usable
+    pixels has no parallax; depth then starts constant, as for bending surfaces; 1 for never."""
     discontinuity_px: NonNegative = 1.0
-    """Where the flow of two neighbours differs by more, a surface ends."""
+    """Jump of the flow between two neighbours at which a surface ends, pixels."""
     upright: bool = True
-    """The image's columns run down: components stand on what is below them. Off, a component is
-    scaled to touch whatever it touches first."""
+    """Whether the image is upright, so that components stand on what is below them. If false, a
+    component is scaled by its whole outline."""
     ground: bool = True
-    """In an upright image nothing lies below a level plane that much of the scene lies on: what has
-    no depth of its own, and components, are lifted to it; what floats above it comes down."""
+    """Use the ground of an upright image, a level plane on which much of the scene lies: unreliable
+    depths and components below it are lifted, and regions that float above it are lowered."""
 
 
 class SeededStart(StartOptions):
-    """The same with the seed, which a problem has once for all its stages."""
+    """StartOptions with the seed, which a problem has once for all its stages."""
 
     seed: Seed = 0
-    """Of sampling and RANSAC."""
+    """Seed of sampling and RANSAC."""
