@@ -156,7 +156,7 @@ class Proposer:
         return Local(base.Z, base.g, R, T), np.broadcast_to(step, base.Z.shape)
 
     def _shared(self, soup: Soup, now: Local, count: int) -> tuple[Float, Float]:
-        """At most `count` motions (C, 3, 3), (C, 3), each fitted to the superpixels that have it."""
+        """At most `count` motions (C, 3, 3), (C, 3), each fitted to its superpixels."""
         R, T, error = self._explaining(soup, now, count)
         member = error.argmin(axis=1)
         X = soup.points(self.data.pixel_ray)
