@@ -117,7 +117,7 @@ def _constant(index: Int) -> list[int]:
 
 
 def hessian_pattern(groups: Sequence[Group], nx: int, hessian: str) -> Pattern:
-    """Of the upper triangle of the Lagrangian's Hessian; places for every group."""
+    """Pattern of the upper triangle of the Lagrangian's Hessian, with places for every group."""
     local = [g.kernel.hessian_pattern(hessian) for g in groups]
     return Pattern.of((nx, nx), [hessian_entries(g, own) for g, own in zip(groups, local)])
 

@@ -13,10 +13,10 @@ from soup_nlp.schema.section import NonNegative, Positive, Samples, Section, Sha
 class Weights(Section):
     """Constants of E = E_arap + alpha1 E_proj + alpha2 E_cont + alpha3 E_orient + alpha4 E_prior.
 
-    E_prior is not in the paper. It draws depth that the flow leaves undetermined (little parallax,
-    a camera at rest, a motion of few superpixels) to that of the neighbours. It is the un-squared
-    slope of the inverse depth relative to the nearer of the two, so that its gradient is bounded
-    and it does not draw a far background to the foreground.
+    E_prior is not in the paper. Where the flow leaves the depth undetermined (little parallax, a
+    camera at rest, a motion of few superpixels), it pulls the depth to that of the neighbours. It
+    is the un-squared slope of the inverse depth relative to the nearer superpixel. Its gradient is
+    therefore bounded, and it does not pull a far background to the foreground.
 
     The defaults belong to `in_pixels`, where every term is measured in pixels; in the paper's
     units (lengths with sum_i c_i D_i = 1) other values are needed. beta and w1 to w4 are options of
@@ -37,27 +37,27 @@ class Weights(Section):
     sigma_cont: Truncation = 1.0
     """Truncation of E_cont's second-frame gap (rho), length."""
     sigma_cont_ref: Truncation = np.inf
-    """Truncation of its reference-frame gap; inf is the paper's form."""
+    """Truncation of E_cont's reference-frame gap; inf is the paper's form."""
     sigma_orient: Truncation = 0.5
     """Truncation n of rho_n."""
     sigma_arap: Truncation = 0.5
     """Truncation of every ARAP norm; inf is the paper's form."""
     leak_arap: Share = 0.01
     """Share of an ARAP norm that is not truncated: it pulls a motion that no other term determines
-    towards its neighbours'."""
+    towards the motions of its neighbours."""
     sigma_proj: Truncation = np.inf
     """Truncation of a pixel's re-projection error, pixels; inf is the paper's form."""
 
 
 class BendingWeights(Weights):
-    """Weights where surfaces bend; `orient` is that of 1,000 superpixels, see `BendingOptions`."""
+    """Weights for bending surfaces; `orient` is the value at N = 1,000, see `BendingOptions`."""
 
     cont: NonNegative = 0.05
     """alpha2."""
     orient: NonNegative = 4.0
-    """alpha3, of 1,000 superpixels; it grows with their number."""
+    """alpha3 at N = 1,000; it grows in proportion to N."""
     prior: NonNegative = 4.0
-    """alpha4, in units of the flow's noise, here that of the superpixels' affine flow."""
+    """alpha4, in units of the flow's noise, here the residual of the superpixels' affine flows."""
     sigma_arap: Truncation = 1.0
     """Truncation of every ARAP norm; inf is the paper's form."""
     leak_arap: Share = 0.05
@@ -65,53 +65,51 @@ class BendingWeights(Weights):
 
 
 class BendingOptions(Section):
-    """The energy where the start finds that surfaces bend, always in pixels.
+    """The energy for pairs whose surfaces bend, always in pixels.
 
-    Bending is a difference of rotations that keeps lengths: E_arap compares motions at the
-    anchors, where a bending surface is connected, and its rotations count for next to
-    nothing. The relief is then held by lengths, continuity and orientation.
+    Bending changes rotations but preserves lengths. E_arap therefore compares motions at the
+    anchors, where a bending surface is connected, and gives rotations almost no weight. Lengths,
+    continuity and orientation then hold the relief.
     """
 
     widest_eps: Positive = 0.1
-    """Widest smoothing of the presolve, pixels: wider ones of solver.presolve_eps become this.
-    Relief shows as a fraction of a pixel of flow; a wider smoothing flattens it."""
+    """Upper limit of solver.presolve_eps, pixels. Relief changes the flow by a fraction of a pixel,
+    so a wider smoothing would flatten it."""
     untruncated: bool = True
-    """Switches solver.untruncated on: truncated from the start, E_arap tears surfaces that bend."""
+    """Sets solver.untruncated: E_arap truncated from the beginning tears bending surfaces."""
     rotation_px: Positive = 1e-3
     """Pixels per radian of rotation difference."""
     arap_across: Share = 0.3
-    """Factor of E_arap across a discontinuity of the flow; 1 is the paper's, as of the others."""
+    """Factor of E_arap across a flow discontinuity; 1 is the paper's, here and below."""
     cont_across: Share = 0.01
-    """Factor of E_cont there."""
+    """Factor of E_cont across a flow discontinuity."""
     orient_across: Share = 0.3
-    """Factor of E_orient there."""
+    """Factor of E_orient across a flow discontinuity."""
     weights: BendingWeights = BendingWeights()
-    """Factors of the terms and their truncations; orient is that of 1,000 superpixels and grows
-    with their number."""
+    """Factors of the terms and their truncations; orient is the value at N = 1,000 and grows in
+    proportion to N."""
 
 
 class EnergyOptions(Section):
-    """The energy."""
+    """Options of the energy."""
 
     units: Literal["pixel", "paper"] = "pixel"
     """pixel (every term in pixels, free of scale) or paper (one length unit)."""
     length: Literal["depth", "translation", "scales"] = "depth"
     """Unit of length with units: paper. depth: the mean plane distance is 1. translation: the
-    translations add up to 1, at the lengths that the start gives them. scales: the plane distances
-    add up to 1."""
+    lengths of the initial translations add up to 1. scales: the plane distances add up to 1."""
     arap_at_anchors: bool = False
-    """Motion difference at the anchors instead of the camera's origin."""
+    """Compare motions at the anchors instead of the camera's origin."""
     arap_across: Share = 0.03
     """Factor of E_arap and E_prior between superpixels of different components; 1 is the
     paper's."""
     prior_ground: NonNegative | None = 10.0
-    """Factor of E_prior between two superpixels without depth of their own where the start knows
-    the ground: it holds the relief that the start gave them; null for E_prior as elsewhere."""
+    """Factor of E_prior between two superpixels with borrowed depth over a known ground, where it
+    holds the relief of the initialisation; null treats these superpixels like all others."""
     cont_occluded: Share = 0.03
-    """Factor of E_cont where one of these components hides another; 1 is the paper's."""
+    """Factor of E_cont where one component occludes another; 1 is the paper's."""
     occlusion_gap: Annotated[float, Field(ge=0, lt=1)] = 0.1
-    """It does where the start leaves a larger gap in depth between them, relative to the farther
-    side."""
+    """Relative gap in depth, in the initialisation, from which one component occludes another."""
     rotation_px: Positive | None = None
     """Pixels per radian of rotation difference; null for the focal length."""
     pixel_samples: Samples | Literal["all"] = 16
@@ -119,5 +117,5 @@ class EnergyOptions(Section):
     weights: Weights = Weights()
     """Factors of the terms and their truncations."""
     bending: BendingOptions = BendingOptions()
-    """What replaces rotation_px, arap_at_anchors, weights and the solver's wide smoothing where
+    """Replaces rotation_px, arap_at_anchors, weights and the solver's widest smoothing where
     surfaces bend."""

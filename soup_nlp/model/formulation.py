@@ -14,14 +14,14 @@ from soup_nlp.schema.section import NonNegative, Section, Share
 
 
 class FormulationOptions(Section):
-    """How the energy is written for a solver."""
+    """Formulation of the NLP for a solver."""
 
     gauge: Gauge = "unit-offset"
     """unit-offset, unit-translation or free."""
     norm: NormForm = "smooth"
-    """smooth (sqrt(|v|^2 + eps^2) - eps) or epigraph (slack s in the objective as s - eps,
-    |v|^2 + eps^2 <= s^2): one minimum; with eps = 0 the latter is the exact norm, but has no
-    independent gradients where a norm is 0."""
+    """smooth (sqrt(|v|^2 + eps^2) - eps) or epigraph (s - eps in the objective with a slack variable
+    s, |v|^2 + eps^2 <= s^2). Both have the same minimum. With eps = 0 the epigraph is the exact
+    norm, but its constraint gradients vanish where the norm is 0."""
     truncation: TruncationForm = "smooth"
     """smooth or lifted (z in [0, 1], exact)."""
     hessian: Hessian = "exact"

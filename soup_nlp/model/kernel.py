@@ -1,4 +1,4 @@
-"""Kernel and table, of which every nonlinear program of this package is made.
+"""Kernel and table, the parts of every nonlinear program of this package.
 
 A kernel is the symbolic objective and constraints of ONE element; a table says, for every element,
 which variables it reads, which rows of g it adds to, and its data. Nothing here knows the soup.

@@ -1,8 +1,8 @@
-"""Ipopt alone: the smoothing narrowed from stage to stage, then the exact Hessian.
+"""Ipopt alone: stages of decreasing smoothing, then the exact Hessian.
 
-The program is the presolve's, in nine coordinates per superpixel with SO(3) and unit normals by
-construction; every step is Ipopt's. The majorant Hessian (theta = 0) comes first: it lies above
-every norm, so that full steps descend and no inertia has to be corrected.
+The program is that of the presolve, in nine coordinates per superpixel with SO(3) and unit normals
+by construction, but Ipopt takes every step. The first stages use the majorant Hessian (theta = 0),
+whose model lies above every norm: full steps descend, and no inertia has to be corrected.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ KEEP: Mapping[str, Any] = {
     "warm_start_slack_bound_frac": PUSH,
     "warm_start_mult_bound_push": PUSH,
 }
-"""Options by which Ipopt goes on from a point and its multipliers."""
+"""Ipopt options for a warm start from a point and its multipliers."""
 LAST: Mapping[str, Any] = {"mu_init": 1e-6, "mu_target": 1e-10}
 """Options of the stage with the exact Hessian: its barrier ends where the constrained NLP's is."""
 

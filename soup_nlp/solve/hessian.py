@@ -1,4 +1,4 @@
-"""The Lagrangian's Hessian as Ipopt takes it, made when it is first asked for."""
+"""The Lagrangian's Hessian for Ipopt, compiled when it is first evaluated."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from soup_nlp.model.sums import Sums
 class LagrangianHessian(ca.Callback):
     """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian.
 
-    Of p it reads the leading parameters theta; the data are those of the NLP's tables. It is
-    compiled by the first call: a start at a KKT point needs no Hessian.
+    It reads the leading parameters theta of p; the data come from the NLP's tables. The first call
+    compiles it, because a start at a KKT point needs no Hessian.
     """
 
     def __init__(self, nlp: NLP) -> None:

@@ -1,10 +1,10 @@
-"""Line search of the presolve, with a step length of every superpixel's own.
+"""Line search of the presolve with a separate step length for every superpixel.
 
-A step that is too long for a few superpixels is shortened for those alone; where that fails, for
-all alike, and at last to the share that the bounds leave to every superpixel. A step that still
-descends at its end is doubled, for all and then for those that still descend: an energy costs a
-tenth of an iteration. A step that leaves the floor of a curved valley is corrected by further
-Newton steps with the same matrix.
+A step that is too long for a few superpixels is first shortened for these alone, then for all by
+the same factor, and finally to the length that the bounds allow for every superpixel. A step that
+still descends at its end is doubled, first for all and then for the superpixels that still descend,
+since an evaluation of the energy costs a tenth of an iteration. A step that leaves the floor of a curved
+valley is corrected by further Newton steps with the same matrix.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ TO_BOUNDARY = 0.99
 LEAST_SLACK = 1e-3
 """A slack keeps at least this share of itself."""
 TRIES = 4
-"""Shorter steps that are tried after the full one."""
+"""Largest number of shorter steps that are tried after the full one."""
 SHORTER = 0.25
-"""Factor that shortens a step that was too long."""
+"""Factor by which a step is shortened."""
 BACK = 3
 """Most corrections that bring a superpixel back inside curved bounds."""
 CORRECTIONS = 6

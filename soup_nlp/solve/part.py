@@ -1,9 +1,9 @@
-"""Newton steps of a few superpixels, the others held.
+"""Newton steps of a few superpixels while the others are fixed.
 
-On a large pair the exact Hessian has most superpixels at rest after a few steps, while some are on
-their way to another minimum: they make the matrix indefinite, and a step of all costs several
-factorisations. A step of those and their neighbours costs a hundredth. (Nonlinear elimination:
-Cai and Keyes 2002.)
+On a large pair most superpixels have converged after a few steps with the exact Hessian, while some
+still move to another minimum. These make the matrix indefinite, so that a step of all superpixels
+costs several factorisations. A step of these and their neighbours costs a hundredth of that.
+(Nonlinear elimination: Cai and Keyes 2002.)
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ Bool = NDArray[np.bool_]
 WORST = 0.01
 """Superpixels whose residual is above this share of the largest are moved, and their neighbours."""
 MOST = 0.3
-"""Largest share of the superpixels that is a part; more of them move with all."""
+"""Largest share of the superpixels that forms a part; otherwise all superpixels move."""
 STEPS = 15
-"""Most steps of one part."""
+"""Largest number of steps of one part."""
 
 
 class Part:
     """Which superpixels move: all, or those that the dual infeasibility comes from.
 
     Attributes:
-        some: (N,) those that move, None for all.
-        factorise: As `Factorise`, for those that move; the step of the others is zero.
+        some: (N,) the superpixels that move, None for all.
+        factorise: As `Factorise`, for the superpixels that move; the step of the others is zero.
     """
 
     factorise: Factorise

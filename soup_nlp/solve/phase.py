@@ -17,7 +17,7 @@ Float = NDArray[np.float64]
 POLISH = "presolve polish"
 """Name of the phase with the exact Hessian."""
 FASTER = 0.3
-"""Steps beyond the tolerance go on while dual infeasibility or gap fall to this share."""
+"""Steps beyond the tolerance continue while dual infeasibility or gap fall to this share."""
 FAR_BELOW = 0.03
 """Share of the tolerance at which the dual infeasibility need not fall further."""
 
@@ -33,7 +33,7 @@ class Phase:
         barrier: b of `f - b sum log c`.
         iterations: Limit.
         stagnation: Ends when the merit falls by less than this share of f, twice in a row.
-        tol: Ends when dual infeasibility is below; "Solve_Succeeded".
+        tol: Ends when the dual infeasibility is below; the status is "Solve_Succeeded".
         beyond: Whether steps go on after that while each makes the dual infeasibility or the gap
             FASTER times as large.
         highest: Barrier far from the solution, where superpixels need room to slide along a curved

@@ -19,9 +19,9 @@ Float = NDArray[np.float64]
 Times = Callable[[Float], Float]
 
 LIMIT = 15
-"""Most iterations; then factorising anew is cheaper."""
+"""Largest number of iterations; beyond it a new factorisation is cheaper."""
 WORN = 8
-"""After a solve of more iterations the next matrix is factorised."""
+"""Number of iterations of a solve after which the next matrix is factorised."""
 
 
 class Solved(NamedTuple):

@@ -12,42 +12,43 @@ from soup_nlp.schema.section import Count, NonNegative, Positive, Section, Toler
 class SolverOptions(Section):
     """Stages of a solve; eps are smoothing widths in the energy's units (pixels by default).
 
-    The presolve descends on the tangent (`solve.descent`): reweighted with smaller and smaller
-    smoothing until the energy stagnates, since that quadratic model lies above every norm and
-    full steps descend; then with the exact Hessian, which converges quadratically. Ipopt takes
-    the constrained NLP from there, its multipliers included.
+    The presolve is a descent in tangent coordinates (`solve.descent`). Its reweighted phases narrow
+    the smoothing until the energy stagnates: their quadratic model lies above every norm, so that
+    full steps descend. Its last phase uses the exact Hessian and converges quadratically. Ipopt
+    then solves the constrained NLP from this point and its multipliers.
     """
 
     presolve: bool = True
-    """Run the tangent presolve; off, Ipopt alone solves the problem, see `continuation`."""
+    """Run the tangent presolve. Without it Ipopt alone solves the problem, see `continuation`."""
     continuation: bool = True
-    """Without the presolve: Ipopt narrows the smoothing by `presolve_eps` with the majorant Hessian
-    before it takes the exact one, in the presolve's coordinates; off, it starts with the
-    constrained NLP at the final smoothing."""
+    """Without the presolve: Ipopt first narrows the smoothing as in `presolve_eps`, in the
+    coordinates of the presolve, with the majorant and then the exact Hessian. If false, it solves
+    the constrained NLP at the final smoothing at once."""
     presolve_eps: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)] = (
         0.3,
         0.03,
         0.01,
     )
-    """Continuation of the reweighted phases, large to small."""
+    """Smoothing widths of the reweighted phases, decreasing."""
     presolve_iterations: Whole = 60
-    """Limit of each of them."""
+    """Iteration limit of each reweighted phase."""
     stagnation: NonNegative = 1e-3
-    """They end at this relative change of f, twice in a row; the last at a hundredth."""
+    """Relative change of f that ends a reweighted phase if it occurs twice in a row; for the last
+    phase a hundredth of it."""
     untruncated: bool = False
     """The reweighted phases also run with a second strategy, which truncates E_arap only at its
     end, and the result with the lower energy is taken; always on where surfaces bend."""
     polish_iterations: Count = 100
-    """Limit of the phase with the exact Hessian, at `eps`; 0 leaves it out."""
+    """Iteration limit of the phase with the exact Hessian, at `eps`; 0 omits the phase."""
     presolve_tol: Tolerance = 1e-6
     """Dual infeasibility that ends the presolve."""
     eps: Tolerance = 0.01
     """Smoothing of the constrained NLP."""
     max_iter: Count = 30
-    """Iteration limit of the constrained NLP; 0 leaves Ipopt's continuation out as well."""
+    """Iteration limit of the constrained NLP; 0 omits Ipopt's continuation as well."""
     far_iterations: Count = 5
-    """Its limit as well where the polish ended far from a minimum: from there Ipopt finds none
-    either, and its iterations, of several factorisations each, take seconds."""
+    """Iteration limit of the constrained NLP if the presolve ended far from a minimum: Ipopt does
+    not find one from there either, and each of its iterations takes seconds."""
     tol: Tolerance = 1e-6
     """Tolerance of the constrained NLP."""
     max_seconds: Tolerance = 600.0

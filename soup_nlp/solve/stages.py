@@ -1,4 +1,4 @@
-"""From a start to a solution: tangent presolve with continuation, then the constrained NLP."""
+"""Solve from an initialisation: tangent presolve with continuation, then the constrained NLP."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Float = NDArray[np.float64]
 
 _ENDS = ("start", "presolve", "constrained NLP")
 STOPPED = ("Interrupted", "Time_Limit")
-"""Status of a stage after which no other begins."""
+"""Statuses of a stage after which no further stage begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class Solution:
 
     @property
     def found_by(self) -> str:
-        """Who found the minimum: "presolve", "Ipopt", or "nobody" where none was reached."""
+        """What found the minimum: "presolve", "Ipopt", or "nobody" if none was reached."""
         if not self.converged:
             return "nobody"
         # without an iteration Ipopt has confirmed the presolve's point
