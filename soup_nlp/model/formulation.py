@@ -19,9 +19,9 @@ class FormulationOptions(Section):
     gauge: Gauge = "unit-offset"
     """unit-offset, unit-translation or free."""
     norm: NormForm = "smooth"
-    """smooth (sqrt(|v|^2 + eps^2) - eps) or epigraph (s - eps in the objective with a slack variable
-    s, |v|^2 + eps^2 <= s^2). Both have the same minimum. With eps = 0 the epigraph is the exact
-    norm, but its constraint gradients vanish where the norm is 0."""
+    """smooth (sqrt(|v|^2 + eps^2) - eps) or epigraph (s - eps in the objective, with a slack
+    variable s and |v|^2 + eps^2 <= s^2). Both have the same minimum. With eps = 0 the epigraph is
+    the exact norm, but its constraint gradients vanish where the norm is 0."""
     truncation: TruncationForm = "smooth"
     """smooth or lifted (z in [0, 1], exact)."""
     hessian: Hessian = "exact"

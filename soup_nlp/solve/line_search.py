@@ -3,8 +3,8 @@
 A step that is too long for a few superpixels is first shortened for these alone, then for all by
 the same factor, and finally to the length that the bounds allow for every superpixel. A step that
 still descends at its end is doubled, first for all and then for the superpixels that still descend,
-since an evaluation of the energy costs a tenth of an iteration. A step that leaves the floor of a curved
-valley is corrected by further Newton steps with the same matrix.
+since an evaluation of the energy costs a tenth of an iteration. A step that leaves the floor of a
+curved valley is corrected by further Newton steps with the same matrix.
 """
 
 from __future__ import annotations
