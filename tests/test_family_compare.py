@@ -6,6 +6,7 @@ import json
 import sys
 from dataclasses import asdict
 
+import numpy as np
 import pytest
 
 from soup_nlp.bench.solvers import family_runs
@@ -17,6 +18,7 @@ from soup_nlp.bench.solvers.family_runs import (
     reached,
     summary,
 )
+from soup_nlp.bench.solvers.profiles import draw_curves
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.export.verify import Limits
@@ -110,3 +112,22 @@ def test_a_solver_of_ones_own_is_a_command_line(tmp_path, monkeypatch, capsys):
     assert result["dual"] > 1e-2
     for name in ("README.md", "profiles.png", "reached.json", "runs.jsonl"):
         assert (out / name).stat().st_size > 0
+
+
+def test_curves_of_equal_times_are_drawn(tmp_path):
+    """Two times that differ by rounding only leave no room for automatic limits."""
+    for times in ([0.1, np.nextafter(0.1, 1)], [0.0, 0.0], [2.0]):
+        row = {
+            "problem": "room hard",
+            "problem_hash": "0",
+            "superpixels": 100,
+            "formulation": "unit-offset/smooth/smooth",
+            "solver": "mine",
+            "energy_start": 2.0,
+            "energy": 1.0,
+            "seconds": times[-1],
+            "verified": False,
+            "curve": [[t, 1.5] for t in times],
+        }
+        draw_curves(tmp_path / "curves.png", [row])
+        assert (tmp_path / "curves.png").stat().st_size

@@ -37,7 +37,7 @@ class StartOptions(Section):
     bending: NonNegative = 0.18
     """Surfaces are taken to bend if more than this share of the superpixels moves differently from
     most of their surface; 1 for never."""
-    at_rest: NonNegative = 0.5
+    at_rest: NonNegative = 0.6
     """The camera is taken to be at rest, or to rotate only, if more than this share of the usable
     pixels has no parallax; depth then starts constant, as for bending surfaces; 1 for never."""
     discontinuity_px: NonNegative = 1.0

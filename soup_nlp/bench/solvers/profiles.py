@@ -141,6 +141,7 @@ def draw_curves(path: Path, rows: Sequence[Row]) -> None:
     for problem, axes in zip(problems, panels, strict=True):
         here = [r for r in rows if problem_key(r) == problem]
         start = min(r["energy_start"] for r in here)
+        times: list[float] = []
         for row in sorted(here, key=lambda r: str(r["solver"])):
             # a run without stored iterates has its end only
             end = [[row["seconds"], row["energy"]]] if row.get("energy") is not None else []
@@ -152,7 +153,10 @@ def draw_curves(path: Path, rows: Sequence[Row]) -> None:
                 style = _style(solvers.index(str(row["solver"])))
                 axes.plot(*curve.T, lw=1, label=row["solver"], **style)
                 axes.plot(*curve[-1], "o", color=style["color"], fillstyle=filled, ms=5)
+                times += [t for t in curve[:, 0] if t > 0]
         axes.axhline(start, color="0.6", lw=0.8, ls=":")
+        # automatic limits fail where all times are equal up to rounding
+        axes.set_xlim(min(times, default=1e-3) / 1.5, max(times, default=1.0) * 1.5)
         axes.set_xscale("log")
         axes.set_title(str(problem), fontsize=8)
         axes.set(xlabel="seconds", ylabel="exact energy")
