@@ -9,7 +9,7 @@ from pathlib import Path
 from helpers_odd_run import Case
 from helpers_odd_world import ODD, World, problem_case, solve
 
-from soup_nlp.bench.rows import append_row, read_rows
+from soup_nlp.storage.rows import append_row, read_rows
 
 TEXTS: dict[str, str | bytes] = {
     "deep JSON": "[" * 100_000,

@@ -16,7 +16,6 @@ from helpers_rows import fake_row
 from soup_nlp.bench.accuracy import input_hash, moving, pair_job, row_identity, settings_hash
 from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.depth_maps import METHODS
-from soup_nlp.bench.rows import Job, Row, append_row, attempt, measure_all, read_rows
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.cli.main import main
@@ -24,6 +23,7 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.protocols import preset
+from soup_nlp.storage.rows import Job, Row, append_row, attempt, measure_all, read_rows
 from soup_nlp.storage.versions import code_version
 
 pytestmark = pytest.mark.slow

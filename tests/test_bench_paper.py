@@ -22,13 +22,13 @@ from soup_nlp.bench.paper_scale import (
     with_motions,
 )
 from soup_nlp.bench.paper_sections import TEXTS
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.cli.main import main
 from soup_nlp.config.presets import PRESETS, leaves
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.inputs import SceneInput
 from soup_nlp.errors import DataError
+from soup_nlp.storage.rows import Row
 
 pytestmark = pytest.mark.slow
 

@@ -24,7 +24,6 @@ from soup_nlp.bench.analyses_report import (
     text_flow,
     text_variants,
 )
-from soup_nlp.bench.rows import attempt
 from soup_nlp.bench.suite_pairs import Item, Options
 from soup_nlp.bench.suites import list_suite
 from soup_nlp.bench.tables import reason
@@ -45,6 +44,7 @@ from soup_nlp.bench.tuning_report import text_search
 from soup_nlp.cli.main import main
 from soup_nlp.cli.options import Progress
 from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.storage.rows import attempt
 
 pytestmark = pytest.mark.slow
 

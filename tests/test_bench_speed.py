@@ -12,12 +12,12 @@ from scipy.stats import linregress
 
 from soup_nlp.bench import speed, speed_gate, speed_report
 from soup_nlp.bench.processes import alone, machine
-from soup_nlp.bench.rows import read_rows
 from soup_nlp.bench.speed import problem_of, schedule
 from soup_nlp.bench.speed_report import SPEED
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.storage.rows import read_rows
 
 pytestmark = pytest.mark.slow
 

@@ -9,11 +9,11 @@ import pytest
 from helpers_rows import square
 from typer.main import get_command
 
-from soup_nlp.bench.rows import read_rows
 from soup_nlp.bench.studies import Study, grid, number, run_study, setting
 from soup_nlp.bench.study_parts import CUT_OFF
 from soup_nlp.cli.bench_all import COMMANDS
 from soup_nlp.cli.main import app, main
+from soup_nlp.storage.rows import read_rows
 
 pytestmark = pytest.mark.slow
 

@@ -13,12 +13,12 @@ import pytest
 from helpers_chromium import Chromium, find_chromium
 from helpers_result import CAMERA, small_result
 
-from soup_nlp.bench.rows import Job, measure_all, read_rows
+from soup_nlp.bench import study_chain
 from soup_nlp.cli.main import main
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.figures import write_png
-from soup_nlp.sequence import pairs, study
+from soup_nlp.sequence import pairs
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import (
     FileFrames,
@@ -33,6 +33,7 @@ from soup_nlp.sequence.scales import Link, link, solve_scales
 from soup_nlp.sequence.score import aligned
 from soup_nlp.sequence.tracks import carried, follow, number
 from soup_nlp.sequence.write import chain_files, write_chain
+from soup_nlp.storage.rows import Job, measure_all, read_rows
 
 pytestmark = pytest.mark.slow
 
@@ -277,13 +278,13 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     assert main(call) == 0
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
     # the table of chains has the same numbers
-    monkeypatch.setattr(study, "scratch", lambda: nullcontext(tmp_path / "out"))
-    row = study.measure_chain("street", 3, None, SMALL)
+    monkeypatch.setattr(study_chain, "scratch", lambda: nullcontext(tmp_path / "out"))
+    row = study_chain.measure_chain("street", 3, None, SMALL)
     assert row["cost"] == told["score"]["cost"]
     assert row["path"] == told["score"]["path"]["share"]
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
     settings = {"sequence": "street", "frames": 3, "data": None, "overrides": SMALL}
-    study.CHAIN.write(tmp_path, [{**row, "settings": settings}])
+    study_chain.CHAIN.write(tmp_path, [{**row, "settings": settings}])
     assert "| street | 3 |" in (tmp_path / "chain.md").read_text()
     # a file of the user is not overwritten
     (tmp_path / "out" / "chain.json").write_text("mine")

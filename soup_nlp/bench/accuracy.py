@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.bench.depth_maps import depth_maps
-from soup_nlp.bench.rows import Job, Row, attempt
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.bench.truth import moves_by_itself, true_soup
@@ -32,6 +31,7 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.storage.folders import scratch
+from soup_nlp.storage.rows import Job, Row, attempt
 
 Float = NDArray[np.float64]
 Measure = Callable[[Item, tuple[str, ...], str], Row]

@@ -8,7 +8,6 @@ import numpy as np
 
 from soup_nlp.bench.depth_maps import BASELINES, METHODS
 from soup_nlp.bench.published import PROTOCOL, SOURCE, published
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import (
     energy_ratio,
     failures,
@@ -21,6 +20,7 @@ from soup_nlp.bench.tables import (
 )
 from soup_nlp.evaluate.metrics import ERRORS
 from soup_nlp.evaluate.protocols import preset
+from soup_nlp.storage.rows import Row
 
 Group = tuple[str, str, list[Row]]
 """Name, flow, and the rows of both."""

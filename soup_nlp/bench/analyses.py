@@ -11,13 +11,13 @@ from soup_nlp.bench import analyses_report as reports
 from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
 from soup_nlp.bench.analyses_measures import VIEWS, measure_energy, measure_flow, measure_view
 from soup_nlp.bench.confidence import measure_confidence, plot_confidence, text_confidence
-from soup_nlp.bench.rows import MeasureRows, Row, measure_all
 from soup_nlp.bench.rules import RULES, SHIPPED, in_both, plot_rules, text_rules
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import Listing
 from soup_nlp.errors import ConfigError
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import claim, staged
+from soup_nlp.storage.rows import MeasureRows, Row, measure_all
 
 Overrides = tuple[str, ...]
 

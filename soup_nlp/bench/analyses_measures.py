@@ -10,7 +10,6 @@ import numpy as np
 
 from soup_nlp.bench.accuracy import flow_error, measure_pair
 from soup_nlp.bench.pair_views import backwards, cropped, mirrored
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.truth import moves_by_itself, rescaled, true_soup
 from soup_nlp.config.problem import Problem
@@ -29,6 +28,7 @@ from soup_nlp.pipeline.run import run
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.records import Refined
 from soup_nlp.solve.stages import solve_soup
+from soup_nlp.storage.rows import Row
 
 VIEWS: Mapping[str, Callable[[Pair], Pair] | None] = MappingProxyType(
     {

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC, SOURCE
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import (
     code_versions,
     energy_ratio,
@@ -28,6 +27,7 @@ from soup_nlp.bench.tables import (
 )
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.model.energy_data import TERMS
+from soup_nlp.storage.rows import Row
 
 MAX_LOSS = 0.01
 """Largest increase of the median relative error by a solve that starts from the truth."""

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import (
     code_versions,
@@ -42,6 +41,7 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
 from soup_nlp.refine.costs import Particles
 from soup_nlp.refine.photometric import photometric_term
+from soup_nlp.storage.rows import Row
 
 Float = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from soup_nlp.bench.paper_measures import read_maps
 from soup_nlp.bench.paper_scale import SCALES
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import figure, grid_of_panels, save
+from soup_nlp.storage.rows import Row
 
 Number = float | None
 Lines = Mapping[str, Mapping[str, Mapping[str, Number]]]

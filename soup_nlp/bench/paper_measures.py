@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.bench.accuracy import scores
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.pair import Pair
@@ -21,6 +20,7 @@ from soup_nlp.evaluate.metrics import depth_metrics, sample_at_points
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
 from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.storage.rows import Row
 
 MAP_WIDTH = 240
 """Columns of a small map, at most."""

@@ -19,12 +19,12 @@ from soup_nlp.bench.paper_plan import (
 from soup_nlp.bench.paper_sections import Number, Results, compared_cells, figure
 from soup_nlp.bench.processes import processor
 from soup_nlp.bench.published import COMPARISON, DATA, SOURCE
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import failures, mean, metric, page_text, provenance, show, table
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.solve.ipopt import GOOD
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import staged
+from soup_nlp.storage.rows import Row
 
 PAGE = "README.md"
 FIGURES = ("comparison", "depth_maps", "convergence", "departures", "scale", *SECTIONS)

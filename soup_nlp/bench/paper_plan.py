@@ -13,11 +13,11 @@ from soup_nlp.bench.analyses import ANALYSES, NOISE_PX
 from soup_nlp.bench.departures import DEPARTURES, PAPER
 from soup_nlp.bench.paper_measures import has_truth, measure
 from soup_nlp.bench.paper_scale import measure_scale
-from soup_nlp.bench.rows import Job, attempt
 from soup_nlp.bench.suite_pairs import Item, Options, spread
 from soup_nlp.bench.suites import SUITES, list_suite
 from soup_nlp.config.presets import overrides_of
 from soup_nlp.errors import DataError
+from soup_nlp.storage.rows import Job, attempt
 
 Overrides = tuple[str, ...]
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from soup_nlp.bench.paper_measures import loaded
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.truth import TrueSoup, moves_by_itself, true_soup
 from soup_nlp.config.problem import make_problem
@@ -28,6 +27,7 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import across_components, at_occlusions, in_length, in_pixels
 from soup_nlp.pipeline.case import superpixels
 from soup_nlp.start.epipolar import motion_of_points
+from soup_nlp.storage.rows import Row
 
 Float = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from soup_nlp.bench.departures import DEPARTURES
 from soup_nlp.bench.paper_plan import METHODS, SECTIONS, Cell, Plan, title
 from soup_nlp.bench.paper_scale import KINDS, scale_of_least_energy
 from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import mean, metric, show, table
+from soup_nlp.storage.rows import Row
 
 Number = float | None
 TEXTS: Mapping[str, str] = {

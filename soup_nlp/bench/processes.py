@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from soup_nlp.bench.rows import ONE_THREAD, Row, attempt, failure
 from soup_nlp.errors import SolverError, SoupError
 from soup_nlp.storage.folders import scratch
+from soup_nlp.storage.rows import ONE_THREAD, Row, attempt, failure
 from soup_nlp.storage.system import end_with_parent
 from soup_nlp.storage.versions import code_version, versions
 

@@ -9,7 +9,6 @@ from types import MappingProxyType
 import numpy as np
 
 from soup_nlp.bench.analyses_report import by_pair, lines_by_pair, page_head
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import (
     failures,
     figure,
@@ -20,6 +19,7 @@ from soup_nlp.bench.tables import (
     table,
     titles,
 )
+from soup_nlp.storage.rows import Row
 
 SHIPPED = "shipped"
 """Name of the variant with all rules."""

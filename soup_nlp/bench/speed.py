@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.bench.reference_solver import levenberg_marquardt
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.studies import Settings, grid
 from soup_nlp.config.problem import Problem, dump_problem, make_problem
 from soup_nlp.evaluate.scoring import score_depths
@@ -23,6 +22,7 @@ from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.storage.folders import scratch
+from soup_nlp.storage.rows import Row
 
 Float = NDArray[np.float64]
 

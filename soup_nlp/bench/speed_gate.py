@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from soup_nlp.bench.rows import failed
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import read_json
+from soup_nlp.storage.rows import failed
 
 Row = Mapping[str, Any]
 

@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from soup_nlp.bench.processes import machine
-from soup_nlp.bench.rows import failed
 from soup_nlp.bench.speed import measure
 from soup_nlp.bench.studies import Study
 from soup_nlp.bench.tables import (
@@ -27,6 +26,7 @@ from soup_nlp.bench.tables import (
 )
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import staged
+from soup_nlp.storage.rows import failed
 
 Row = Mapping[str, Any]
 Cell = Callable[[Row], str]

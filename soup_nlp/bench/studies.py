@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from soup_nlp.bench.processes import alone
-from soup_nlp.bench.rows import Job, Row, Say, failed, measure_all
 from soup_nlp.bench.tables import columns, failures, page_text
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import claim, staged
+from soup_nlp.storage.rows import Job, Row, Say, failed, measure_all
 
 Settings = Mapping[str, Any]
 Cells = Mapping[str, Callable[[Row], str]]

@@ -11,7 +11,6 @@ from dataclasses import replace
 from soup_nlp.bench.accuracy import scores
 from soup_nlp.bench.analyses_measures import refined
 from soup_nlp.bench.reference_solver import EPS, levenberg_marquardt
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.speed import REFERENCE_ITERATIONS, problem_of
 from soup_nlp.bench.studies import Cells, Study, number, setting
 from soup_nlp.bench.suite_pairs import RENDERED
@@ -20,6 +19,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.solve.stages import solve_soup
+from soup_nlp.storage.rows import Row
 
 
 def measure_refine(scene: str, superpixels: int) -> Row:

@@ -11,12 +11,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from soup_nlp.bench.pair_views import cropped
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.studies import Study, number, setting
 from soup_nlp.config.problem import make_problem
 from soup_nlp.mrf.levels import colours
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.pipeline.run import run
+from soup_nlp.storage.rows import Row
 
 CROPPED = 0.3
 """Share of the rows that the study of components crops at the bottom."""

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from soup_nlp.bench.rows import Row, failed
 from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.storage.rows import Row, failed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
-from soup_nlp.bench.rows import MeasureRows, Row, measure_all
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import energy_ratio, main_metric
 from soup_nlp.errors import ConfigError
+from soup_nlp.storage.rows import MeasureRows, Row, measure_all
 
 Float = NDArray[np.float64]
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from soup_nlp.bench.rows import Row
 from soup_nlp.bench.tables import (
     columns,
     energy_ratio,
@@ -30,6 +29,7 @@ from soup_nlp.bench.tuning import (
     leave_one_family_out,
     loss,
 )
+from soup_nlp.storage.rows import Row
 
 TOP = 10
 """Number of trials in the table."""

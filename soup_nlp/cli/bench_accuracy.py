@@ -14,7 +14,6 @@ from soup_nlp.bench import tuning
 from soup_nlp.bench.accuracy import pair_job
 from soup_nlp.bench.accuracy_table import report
 from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
-from soup_nlp.bench.rows import MeasureRows, Row, measure_all
 from soup_nlp.bench.suite_pairs import Options
 from soup_nlp.bench.suites import SUITES, Listing, list_suite
 from soup_nlp.bench.tables import main_metric, show
@@ -25,6 +24,7 @@ from soup_nlp.errors import ConfigError
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import claim, staged
+from soup_nlp.storage.rows import MeasureRows, Row, measure_all
 
 
 def mre_of(row: Row) -> str:

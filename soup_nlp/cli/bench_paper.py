@@ -11,13 +11,13 @@ import typer
 
 from soup_nlp.bench.paper_page import FILES, Results, write_page
 from soup_nlp.bench.paper_plan import ALL_SECTIONS, DATASETS, Sizes, make_plan
-from soup_nlp.bench.rows import failed, measure_all
 from soup_nlp.bench.suite_pairs import RENDERED
 from soup_nlp.cli import options
 from soup_nlp.cli.bench_accuracy import mre_of
 from soup_nlp.cli.options import Progress, numbers, words
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
 from soup_nlp.storage.folders import claim
+from soup_nlp.storage.rows import failed, measure_all
 
 FAMILIES = [*RENDERED, "motorcycle", *(d.name for d in DATASETS)]
 

@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 
 from soup_nlp.bench.processes import machine
-from soup_nlp.bench.rows import Row, failed
 from soup_nlp.bench.speed import plan, problem_of
 from soup_nlp.bench.speed_gate import baseline, check, read_baseline
 from soup_nlp.bench.speed_report import SPEED
@@ -20,6 +19,7 @@ from soup_nlp.cli.options import Out, Overwrite, Progress, Quiet, Set, Width, nu
 from soup_nlp.data.scenes.catalogue import SCENES
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SIDE, MAX_SUPERPIXELS
 from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.rows import Row, failed
 
 
 def speed(

@@ -9,9 +9,10 @@ from typing import Annotated
 import typer
 
 from soup_nlp.bench import study_energy, study_parts
-from soup_nlp.bench.rows import failed
 from soup_nlp.bench.speed import plan
 from soup_nlp.bench.studies import Settings, Study, grid, run_study
+from soup_nlp.bench.study_chain import CHAIN, TRACKING
+from soup_nlp.bench.study_chain import RENDERED as RENDERED_SEQUENCES
 from soup_nlp.bench.suite_pairs import RENDERED
 from soup_nlp.cli.options import (
     Data,
@@ -29,8 +30,7 @@ from soup_nlp.cli.options import (
 from soup_nlp.errors import ConfigError
 from soup_nlp.model.layout import GAUGES
 from soup_nlp.schema.limits import MAX_SUPERPIXELS
-from soup_nlp.sequence.study import CHAIN, TRACKING
-from soup_nlp.sequence.study import RENDERED as RENDERED_SEQUENCES
+from soup_nlp.storage.rows import failed
 
 SCENES = [*RENDERED, "motorcycle"]
 SPEED = Path("out/bench/speed")

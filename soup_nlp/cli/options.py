@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.bench.rows import Row, failed
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.bench.tables import reason
 from soup_nlp.config.presets import PRESETS
@@ -18,6 +17,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, SoupError
 from soup_nlp.schema.limits import MAX_SEED, MAX_SIDE, MAX_SUPERPIXELS
 from soup_nlp.storage.files import as_path, is_file
+from soup_nlp.storage.rows import Row, failed
 
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
 PresetName = Annotated[

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from soup_nlp.bench.rows import Job, Row, attempt, failed, measure_all, read_rows
 from soup_nlp.config.problem import make_problem
 from soup_nlp.errors import SolverError
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.result import Result, read_result
 from soup_nlp.sequence.frames import Frames, Raw
 from soup_nlp.storage.h5_files import read_h5
+from soup_nlp.storage.rows import Job, Row, attempt, failed, measure_all, read_rows
 
 ROWS = "pairs.jsonl"
 """File with a row for each pair of a sequence."""

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.bench.processes import isolated, processor
-from soup_nlp.bench.rows import Job, Row, measure_all
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import WALL_PER_CPU, Answer, Task, Trace
 from soup_nlp.bench.tables import show
@@ -25,6 +24,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.case import Case
+from soup_nlp.storage.rows import Job, Row, measure_all
 from soup_nlp.storage.versions import versions
 
 Float = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Rows of benchmarks, measured here or by worker processes and stored as JSON lines."""
+"""Rows of numbers, measured here or by worker processes and stored as JSON lines."""
 
 from __future__ import annotations
 

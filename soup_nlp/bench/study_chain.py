@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from soup_nlp.bench.rows import Row, read_rows
 from soup_nlp.bench.studies import Study, number
 from soup_nlp.errors import DataError
 from soup_nlp.sequence.chain import make_chain
@@ -15,6 +14,7 @@ from soup_nlp.sequence.frames import FileFrames, Frames, SceneFrames, find_depth
 from soup_nlp.sequence.pairs import ROWS, solve_pairs
 from soup_nlp.sequence.score import score
 from soup_nlp.storage.folders import scratch
+from soup_nlp.storage.rows import Row, read_rows
 
 RENDERED = "street", "room", "orbit"
 TRACKING = "kitti_tracking"
