@@ -17,11 +17,12 @@ from soup_nlp.solve import descent as descent_module
 from soup_nlp.solve import newton
 from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.factor import superlu
-from soup_nlp.solve.ipopt import Ipopt, Watch
+from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.kkt import optimality
 from soup_nlp.solve.line_search import Search, along, evaluate, reach
 from soup_nlp.solve.phase import Phase
 from soup_nlp.solve.tangent_problem import TangentProblem
+from soup_nlp.storage.progress import Watch
 
 pytestmark = pytest.mark.slow
 

@@ -15,7 +15,7 @@ ALLOWED = {
     # validated options; files that appear whole, HDF5, versions, rows of worker processes
     "schema": {"errors"},
     "storage": {"errors"},
-    # rays, rotations and graphs: nothing but numbers
+    # rays, rotations, planes and graphs: nothing but numbers
     "geometry": {"errors"},
     # labels and costs
     "mrf": {"errors"},
@@ -23,8 +23,8 @@ ALLOWED = {
     "data": {"errors", "schema", "storage", "geometry"},
     "model": {"errors", "schema", "data", "geometry"},
     "start": {"errors", "schema", "data", "geometry", "mrf", "model"},
-    "solve": {"errors", "schema", "data", "geometry", "model"},
-    "refine": {"errors", "schema", "data", "geometry", "mrf", "model", "start", "solve"},
+    "solve": {"errors", "schema", "storage", "data", "geometry", "model"},
+    "refine": {"errors", "schema", "storage", "data", "geometry", "mrf", "model"},
     # metrics, baselines, confidence, and the referee that recomputes stored results
     "evaluate": {"errors", "storage", "data", "geometry", "model", "start", "solve"},
     # the whole problem file

@@ -31,11 +31,12 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.reweighting import in_pixels
-from soup_nlp.solve.ipopt import Ipopt, Progress
+from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.kkt import constraint_residuals, optimality
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.propose import propose
+from soup_nlp.storage.progress import Progress
 
 pytestmark = pytest.mark.slow
 

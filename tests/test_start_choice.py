@@ -12,6 +12,7 @@ from helpers_model import motion, plane_pose, plane_world
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.plane_fit import PlaneFit
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.start import choice as choosing
@@ -20,7 +21,6 @@ from soup_nlp.start import propose as proposing
 from soup_nlp.start.choice import Choice, of_neighbourhoods, of_pieces, select
 from soup_nlp.start.components import TIES, borrow, contact_scales, depth_from_inside
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.plane_fit import PlaneFit
 from soup_nlp.start.propose import propose
 from soup_nlp.start.start_options import SeededStart
 

@@ -13,7 +13,7 @@ from rich.progress import Progress as Bars
 
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.formats.images import DataWarning
-from soup_nlp.solve.ipopt import Progress
+from soup_nlp.storage.progress import Progress
 
 PACKAGE = "soup_nlp"
 """Logger whose messages are printed."""

@@ -28,10 +28,10 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.refine.mppbp import objective, refine_soup
 from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.refine.records import Refined
-from soup_nlp.solve.ipopt import Listener
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.propose import Start
+from soup_nlp.storage.progress import Listener
 
 Float = NDArray[np.float64]
 

@@ -38,7 +38,7 @@ from soup_nlp.refine.photometric import Photometric
 from soup_nlp.refine.records import Refined, RefineOptions, Round
 from soup_nlp.refine.select import conditional_costs, diverse, spread_of, within_reach
 from soup_nlp.refine.sweep import swept
-from soup_nlp.solve.ipopt import Listener, Progress, Watch
+from soup_nlp.storage.progress import Listener, Progress, Watch
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

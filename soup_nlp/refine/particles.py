@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.plane import inverse_depth
+from soup_nlp.geometry.plane_fit import PlaneFit, fit_planes
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.refine.anchored import Local, fit_motion
 from soup_nlp.refine.costs import Particles
 from soup_nlp.refine.kinds import KINDS, WALKS, Spread
-from soup_nlp.start.plane_fit import PlaneFit, fit_planes
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -22,8 +22,9 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant, polish_chart
-from soup_nlp.solve.ipopt import Ipopt, Stage, Watch
+from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.storage.progress import Watch
 
 Float = NDArray[np.float64]
 

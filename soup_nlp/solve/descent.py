@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.solve.ipopt import Progress, Stage, Watch
+from soup_nlp.solve.ipopt import Stage
 from soup_nlp.solve.line_search import (
     TO_BOUNDARY,
     Move,
@@ -42,6 +42,7 @@ from soup_nlp.solve.line_search import (
 from soup_nlp.solve.newton import Newton
 from soup_nlp.solve.phase import Convergence, Phase
 from soup_nlp.solve.tangent_problem import HessianKind, TangentProblem
+from soup_nlp.storage.progress import Progress, Watch
 
 Float = NDArray[np.float64]
 

@@ -24,12 +24,13 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import polish_chart
 from soup_nlp.solve.continuation import Continuation
 from soup_nlp.solve.descent import Descent
-from soup_nlp.solve.ipopt import Ipopt, Listener, Stage, Watch
+from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import UNMET, feasible, residuals
 from soup_nlp.solve.phase import POLISH, Phase, polish, reweighted
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.tangent_problem import TangentProblem
 from soup_nlp.solve.warm import WARM, warm_start
+from soup_nlp.storage.progress import Listener, Watch
 
 Float = NDArray[np.float64]
 

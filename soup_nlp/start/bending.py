@@ -16,7 +16,7 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import connected_labels
-from soup_nlp.start.plane_fit import Views
+from soup_nlp.start.views import Views
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

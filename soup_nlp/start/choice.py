@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.plane_fit import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.start.components import connected_pieces
 from soup_nlp.start.epipolar import Motion, estimate, repeated
 from soup_nlp.start.neighbourhoods import fit_translation, neighbourhood, refine_motion
-from soup_nlp.start.plane_fit import PlaneFit, Views
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import Views
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

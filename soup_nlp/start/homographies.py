@@ -24,8 +24,8 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import about_anchor, at_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.epipolar import Motion, essential_motion, sampson
-from soup_nlp.start.plane_fit import Views
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import Views
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

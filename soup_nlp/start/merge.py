@@ -15,8 +15,8 @@ from soup_nlp.start.choice import CLIP, Choice, flow_affinity, least_gain, smoot
 from soup_nlp.start.components import connected_labels
 from soup_nlp.start.epipolar import Motion, estimate
 from soup_nlp.start.neighbourhoods import fit_translation, refine_motion
-from soup_nlp.start.plane_fit import Views
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import Views
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -44,8 +44,8 @@ from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import above_ground, floating, ground
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import gather
-from soup_nlp.start.plane_fit import Views
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import Views
 
 __all__ = ["SeededStart", "Start", "propose"]
 

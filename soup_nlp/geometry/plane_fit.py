@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.start.epipolar import Motion
-
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
@@ -126,42 +124,3 @@ def fit_planes(
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = np.where(mu[..., :1] != 0, mu[..., 1:] / mu[..., :1], 0.0)
     return PlaneFit(mu[..., 0], np.clip(slope, -max_slope, max_slope), cost, parallax)
-
-
-@dataclass(frozen=True)
-class Views:
-    """Sampled rays, flow targets and extent of every superpixel.
-
-    Attributes:
-        ray: (N, S, 3) rays of sampled pixels.
-        target: (N, S, 3) rays of their flow targets (next camera).
-        weight: (N, S) confidence.
-        anchor: (N, 3) anchor rays.
-        radius: (N,) reach in ray units.
-        focal: (fx, fy) of the next camera, pixels.
-    """
-
-    ray: Float
-    target: Float
-    weight: Float
-    anchor: Float
-    radius: Float
-    focal: tuple[float, float]
-
-    def fit(self, motions: list[Motion]) -> PlaneFit:
-        """Planes of every superpixel under each of M motions."""
-        shape = (len(self.ray), len(motions))
-        R = np.broadcast_to(np.stack([m.R for m in motions]), (*shape, 3, 3))
-        t = np.broadcast_to(np.stack([m.t for m in motions]), (*shape, 3))
-        return self.fit_own(R, t)
-
-    def fit_own(self, R: Float, t: Float) -> PlaneFit:
-        """Planes under own motions R (N, C, 3, 3), t (N, C, 3)."""
-        return fit_planes(
-            R, t, self.ray, self.target, self.weight, self.anchor, self.radius, self.focal
-        )
-
-    def some(self, at: Int) -> Views:
-        """The entries of superpixels `at`."""
-        ray, target, weight = self.ray[at], self.target[at], self.weight[at]
-        return Views(ray, target, weight, self.anchor[at], self.radius[at], self.focal)
