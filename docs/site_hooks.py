@@ -22,7 +22,7 @@ NAME = re.compile(r"`([A-Za-z_][\w.]*)`")
 def rooms() -> list[str]:
     """Folders of the package, and the modules beside them."""
     found = sorted(p.parent.name for p in PACKAGE.glob("*/__init__.py"))
-    return [*found, "errors"]
+    return [*found, "arrays", "errors"]
 
 
 def on_config(config: Any) -> Any:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.bench.depth_maps import depth_maps
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import SUITES
@@ -33,7 +33,6 @@ from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.storage.folders import scratch
 from soup_nlp.storage.rows import Job, Row, attempt
 
-Float = NDArray[np.float64]
 Measure = Callable[[Item, tuple[str, ...], str], Row]
 
 KEPT_METRICS = (*ERRORS, "scale", "coverage", "n_pixels")

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import (
     code_versions,
@@ -42,8 +42,6 @@ from soup_nlp.pipeline.run import run
 from soup_nlp.refine.costs import Particles
 from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.storage.rows import Row
-
-Float = NDArray[np.float64]
 
 CUES = {
     "sigma": "sigma as delivered",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.baselines import fill_nearest
 from soup_nlp.geometry.camera import pixel_grid, rays
@@ -20,7 +21,6 @@ from soup_nlp.geometry.soup import Soup, reconstruct
 if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run
 
-Float = NDArray[np.float64]
 Labels = NDArray[np.integer]
 
 METHODS: Mapping[str, str] = MappingProxyType(

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 
-Float = NDArray[np.float64]
 Change = Callable[[NDArray[Any]], NDArray[Any]]
 
 IMAGES = ("depth_ref", "depth_next", "flow", "occluded", "components", "scene_flow")

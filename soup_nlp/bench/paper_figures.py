@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.bench.paper_measures import read_maps
 from soup_nlp.bench.paper_scale import SCALES
 from soup_nlp.bench.tables import figure, grid_of_panels, save
@@ -225,13 +225,13 @@ def plot_maps(path: Path, files: Mapping[str, tuple[Path, Path]]) -> None:
     save(picture, path)
 
 
-def _limits(z: NDArray[np.float64]) -> tuple[float, float]:
+def _limits(z: Float) -> tuple[float, float]:
     good = z[np.isfinite(z) & (z > 0)]
     low, high = np.percentile(good, [2, 98]) if good.size else (1.0, 2.0)
     return float(np.log(low)), float(np.log(max(high, 1.01 * low)))
 
 
-def _scaled_to(z: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np.float64]:
+def _scaled_to(z: Float, known: Float) -> Float:
     """z times the median of known / z; NaN where it is not positive."""
     z = np.where(z > 0, z, np.nan)
     ratio = known / z

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from soup_nlp.arrays import Mask
 from soup_nlp.bench.paper_measures import loaded
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.truth import TrueSoup, moves_by_itself, true_soup
@@ -28,8 +28,6 @@ from soup_nlp.model.reweighting import across_components, at_occlusions, in_leng
 from soup_nlp.pipeline.case import superpixels
 from soup_nlp.start.epipolar import motion_of_points
 from soup_nlp.storage.rows import Row
-
-Float = NDArray[np.float64]
 
 SCALES = np.geomspace(0.25, 4.0, 49)
 """Factors of the true scale; the middle one is 1."""
@@ -97,7 +95,7 @@ def _energies(pair: Pair, seg: Segmentation, true: TrueSoup, seed: int) -> Energ
     }
 
 
-def curves(true: TrueSoup, own: NDArray[np.bool_], energies: Energies) -> dict[str, list[float]]:
+def curves(true: TrueSoup, own: Mask, energies: Energies) -> dict[str, list[float]]:
     """Every kind of energy over SCALES, factors of the scale of the superpixels `own` (N,)."""
     out: dict[str, list[float]] = {}
     for kind, (data, weights) in energies.items():

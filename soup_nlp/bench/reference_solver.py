@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
@@ -25,8 +25,6 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.nlp import to_scipy
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.solve.factor import diagonal_places, factorisation, numbered
-
-Float = NDArray[np.float64]
 
 EPS = (1.0, 0.3, 0.1, 0.03, 0.01)
 """Smoothing widths of the continuation, in the units of the energy (pixels)."""

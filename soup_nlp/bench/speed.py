@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from soup_nlp.bench.reference_solver import levenberg_marquardt
 from soup_nlp.bench.studies import Settings, grid
@@ -23,8 +22,6 @@ from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.storage.folders import scratch
 from soup_nlp.storage.rows import Row
-
-Float = NDArray[np.float64]
 
 REFERENCE_ITERATIONS = 100
 """Limit of the steps of Levenberg-Marquardt for every smoothing width."""

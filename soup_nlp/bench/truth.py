@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.bench.depth_maps import fit_planes
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
@@ -20,9 +20,6 @@ from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.rotation import nearest
 from soup_nlp.geometry.soup import Soup
-
-Float = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 MIN_PIXELS = 6
 """True pixels that the fit of plane and motion of a superpixel needs."""
@@ -42,8 +39,8 @@ class TrueSoup:
     """
 
     soup: Soup
-    component: NDArray[np.int64]
-    known: Bools
+    component: Int
+    known: Mask
     purity: Float
 
 
@@ -91,7 +88,7 @@ def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
     return TrueSoup(soup.normalised(), component, known, purity)
 
 
-def moves_by_itself(truth: Truth) -> Bools:
+def moves_by_itself(truth: Truth) -> Mask:
     """(B,) bool, True for components that move differently from component 0, the static scene.
 
     Without known motions it is True for all components but 0.
@@ -118,7 +115,7 @@ def rescaled(true: TrueSoup, energy: Callable[[Soup], float]) -> Soup:
     return soup
 
 
-def _majority(truth: Truth, seg: Segmentation) -> tuple[NDArray[np.int64], Float]:
+def _majority(truth: Truth, seg: Segmentation) -> tuple[Int, Float]:
     n = len(seg)
     if truth.components is None:
         return np.zeros(n, np.int64), np.ones(n)
@@ -141,11 +138,11 @@ def _facing(m: Float, seg: Segmentation, K: Float, depth: Float) -> Float:
 def _motions(
     truth: Truth,
     seg: Segmentation,
-    component: NDArray[np.int64],
-    mine: Bools,
+    component: Int,
+    mine: Mask,
     depth: Float,
     K: Float,
-) -> tuple[Float, Float, Bools]:
+) -> tuple[Float, Float, Mask]:
     """(N, 3, 3) rotations, (N, 3) translations, (N,) whether they are known."""
     n = len(seg)
     R, T, known = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.zeros(n, bool)

@@ -17,16 +17,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import qmc
 
+from soup_nlp.arrays import Float
 from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.tables import energy_ratio, main_metric
 from soup_nlp.errors import ConfigError
 from soup_nlp.storage.rows import MeasureRows, Row, measure_all
-
-Float = NDArray[np.float64]
 
 FAILED_LOSS = math.log(3.0)
 """Loss of a failed pair: that of an error three times that of a constant depth."""

@@ -9,14 +9,13 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.formats.camera_files import check_intrinsics, read_intrinsics
 from soup_nlp.data.formats.images import read_image
 from soup_nlp.data.formats.map_files import read_flow
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.limits import check_image_size
-
-Float = NDArray[np.float64]
 
 ImageLike: TypeAlias = Any
 """An 8-bit array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4), a file, or a PIL image."""
@@ -34,7 +33,7 @@ def is_path(given: object) -> bool:
     return isinstance(given, str | os.PathLike)
 
 
-def image_of(given: ImageLike, where: str) -> NDArray[np.uint8]:
+def image_of(given: ImageLike, where: str) -> Image:
     """(H, W, 3) uint8 RGB of an array, a file or a PIL image; grey is repeated, alpha dropped.
 
     Raises:
@@ -80,9 +79,7 @@ def camera_of(given: CameraLike, where: str) -> Float:
     return check_intrinsics(intrinsics(*four) if four.shape == (4,) else given, where)
 
 
-def flow_of(
-    given: FlowLike, confidence: object, source: str
-) -> tuple[NDArray[Any], NDArray[np.float32], str]:
+def flow_of(given: FlowLike, confidence: object, source: str) -> tuple[NDArray[Any], FloatMap, str]:
     """Displacements (H, W, 2), confidence (H, W) and source of a flow.
 
     An array is interpreted as (2, H, W) if only its first axis has length 2.

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Image
 from soup_nlp.data.flow.consistency import FloatMap
 
 SOFT_GREY = 10.0
@@ -21,7 +22,7 @@ NEIGHBOURS = ((-2, -2), (-2, 0), (-2, 2), (0, -2), (0, 2), (2, -2), (2, 0), (2, 
 """(dv, du) of the neighbours, pixels."""
 
 
-def census(image: NDArray[np.uint8]) -> FloatMap:
+def census(image: Image) -> FloatMap:
     """(2, H, W, 4) soft census of an image (H, W, 3) or (H, W), in two layers for OpenCV."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SIGMA_PX)

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, FloatMap, Image, Mask
 from soup_nlp.data.accept import CameraLike, FlowLike, ImageLike, camera_of, flow_of, image_of
 from soup_nlp.errors import DataError, expect, printable, repr_of
-
-Float = NDArray[np.float64]
 
 SHORTEST = 0.05
 """Smallest focal length relative to the side of the image (168 degrees of view)."""
@@ -57,8 +56,8 @@ class Flow:
         DataError: the array is no flow, or the confidence has a wrong size or range.
     """
 
-    uv: NDArray[np.float32]
-    confidence: NDArray[np.float32] = None  # type: ignore[assignment]
+    uv: FloatMap
+    confidence: FloatMap = None  # type: ignore[assignment]
     source: str = "unknown"
 
     if TYPE_CHECKING:
@@ -139,7 +138,7 @@ class Truth:
     depth_ref: Float | None = None
     depth_next: Float | None = None
     flow: Float | None = None
-    occluded: NDArray[np.bool_] | None = None
+    occluded: Mask | None = None
     components: NDArray[np.int32] | None = None
     motions: Float | None = None
     points: Float | None = None
@@ -210,8 +209,8 @@ class Pair:
         DataError: an image has a wrong shape or type, a camera is invalid, or sizes differ.
     """
 
-    image_ref: NDArray[np.uint8]
-    image_next: NDArray[np.uint8]
+    image_ref: Image
+    image_next: Image
     K_ref: Float
     K_next: Float = None  # type: ignore[assignment]
     flow: Flow | None = None
@@ -278,7 +277,7 @@ class Pair:
     __repr__ = __str__
 
 
-def _check_focal(K: Float, image: NDArray[np.uint8], where: str) -> None:
+def _check_focal(K: Float, image: Image, where: str) -> None:
     """Raise DataError for a focal length that is too short for the size of the image."""
     for focal, side, name in ((K[0, 0], image.shape[1], "fx"), (K[1, 1], image.shape[0], "fy")):
         if focal < SHORTEST * side:

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Flow, Pair, Truth
 
-Float = NDArray[np.float64]
 Size = tuple[int, int]
 
 

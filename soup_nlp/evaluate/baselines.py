@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.start import epipolar
-
-Float = NDArray[np.float64]
 
 MIN_CORRESPONDENCES = 8
 """Fewest pixels with flow for which a motion is looked for."""

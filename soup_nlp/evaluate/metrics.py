@@ -12,12 +12,11 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError, repr_of
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Scale = Literal["median", "mre", "lsq", "none"]
 ERRORS = "mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3"
 """Names of the errors of a depth map."""

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from soup_nlp.arrays import Mask
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import DepthMetrics, Scale, depth_metrics
 
@@ -48,7 +49,7 @@ class Preset:
             more += f", estimates clamped to [{self.clamp[0]:g}, {self.clamp[1]:g}]"
         return f"{self.name}: {rule} per image, {cap}{more}"
 
-    def mask(self, truth: ArrayLike) -> NDArray[np.bool_]:
+    def mask(self, truth: ArrayLike) -> Mask:
         """Where a truth (H, W) or (M,) counts; a crop needs the image."""
         gt = np.asarray(truth, np.float64)
         keep = (gt > self.low) & (gt <= (np.inf if self.cap is None else self.cap))

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+from soup_nlp.arrays import Float, Int, Mask
+
 NOISE = (0.05, 0.6)
 """Limits of the flow's noise that E_prior is measured in, pixels."""
 DOUBT = 1e-6
@@ -132,7 +132,7 @@ def depth_map(s: State, labels: Int, K: Float) -> Float:
 
 def next_depth_map(
     s: State, labels: Int, K_ref: Float, K_next: Float, size: tuple[int, int]
-) -> tuple[Float, NDArray[np.bool_]]:
+) -> tuple[Float, Mask]:
     """Depth of the next frame, and where rounding decides it.
 
     Every reference pixel is moved to the pixel nearest to its target, and the nearest surface is
@@ -160,7 +160,7 @@ def next_depth_map(
     image = Y @ K_next.T
     at = image[:, :2] / image[:, 2:]
 
-    def inside(column: Float, row: Float) -> NDArray[np.bool_]:
+    def inside(column: Float, row: Float) -> Mask:
         return np.asarray((column >= 0) & (row >= 0) & (column < size[1]) & (row < size[0]))
 
     def put(out: NDArray[Any], uv: Float, value: Any) -> None:
@@ -307,7 +307,7 @@ def _pair_weights(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Float:
     return np.asarray(weight)
 
 
-def _grounded(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> NDArray[np.bool_]:
+def _grounded(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> Mask:
     """K-NN edges along which E_prior holds the relief of the initialisation."""
     ends = tree["energy"]["edges"]
     if settings["energy"].get("prior_ground") is None:
@@ -316,7 +316,7 @@ def _grounded(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> NDArray[n
     return np.asarray(one & other)
 
 
-def _relief(tree: Mapping[str, Any], free: NDArray[np.bool_]) -> Float:
+def _relief(tree: Mapping[str, Any], free: Mask) -> Float:
     """(E,) relative difference of inverse depth that the initialisation has along these edges."""
     start = tree["start"]
     rho = -(start["n"] * tree["energy"]["anchor_ray"]).sum(1) / (start["lam"] * start["d"])
@@ -324,9 +324,7 @@ def _relief(tree: Mapping[str, Any], free: NDArray[np.bool_]) -> Float:
     return np.where(free, (a - b) / np.sqrt(np.sqrt((a**4 + b**4) / 2)), 0.0)
 
 
-def _discontinuous(
-    tree: Mapping[str, Any], form: Mapping[str, Any], graph: str
-) -> NDArray[np.bool_]:
+def _discontinuous(tree: Mapping[str, Any], form: Mapping[str, Any], graph: str) -> Mask:
     """Edges of a graph between two surfaces, if surfaces are taken to bend."""
     surface = tree["start"]["surface"]
     i, k = tree["energy"][graph].T

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from soup_nlp.evaluate.recompute import Float, Int, State, next_depth_map
+from soup_nlp.arrays import Float, Int
+from soup_nlp.evaluate.recompute import State, next_depth_map
 
 SAMPLES, TAU, UNSEEN, BEHIND = 24, 0.35, 0.25, 1.1
 """Constants of E_photo, see docs/formulation.md."""
@@ -27,7 +27,7 @@ def png_scale(depth: Float) -> float:
     return float(2.0 ** np.floor(np.log2(65535.0 / far)))
 
 
-def png_values(depth: Float, scale: float) -> NDArray[np.int64]:
+def png_values(depth: Float, scale: float) -> Int:
     """Values of a 16-bit depth map; 0 where unknown."""
     known = np.isfinite(depth) & (depth > 0)
     value = np.minimum(np.maximum(np.rint(np.where(known, depth, 1.0) * scale), 1), 65535)

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Truth
 from soup_nlp.errors import DataError, repr_of
@@ -23,8 +23,6 @@ from soup_nlp.evaluate.metrics import (
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.h5_files import read_h5
 from soup_nlp.storage.store import require
-
-Float = NDArray[np.float64]
 
 DEPTHS = {"solution": "ref", "nlp": "nlp_ref", "start": "start_ref", "rigid": "rigid_ref"}
 """Depth maps of the reference frame that a result stores, by the name of their metrics."""
@@ -88,7 +86,7 @@ def at_truth(truth: Truth, image: Float) -> tuple[Float, Float]:
     return sample_at_points(image, truth.points)
 
 
-def most_certain(gt: Float, sigma: Float, share: float) -> NDArray[np.bool_]:
+def most_certain(gt: Float, sigma: Float, share: float) -> Mask:
     """The share of the true pixels where sigma is least."""
     true = true_pixels(gt, None) & np.isfinite(sigma)
     limit = np.quantile(sigma[true], share) if true.any() else 0.0

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
-
-Float = NDArray[np.float64]
 
 STEPS = 50
 """Points of a sparsification curve."""

@@ -8,7 +8,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from soup_nlp.config.problem import dump_problem
@@ -34,8 +33,6 @@ from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.store import Array, Tree, write_h5, write_json
 from soup_nlp.storage.versions import versions
-
-Float = NDArray[np.float64]
 
 FORMATS = ("nl", "casadi", "h5")
 INFORMATION = (

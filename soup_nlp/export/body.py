@@ -6,13 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Int, Mask
 from soup_nlp.export.opcodes import PLUS, SUM, number
 from soup_nlp.export.program import OBJECTIVE, Program
 from soup_nlp.export.template import DEFINED, NUMBER, VARIABLE, Template, Text
-
-Int = NDArray[np.int64]
 
 NO_ROW = np.iinfo(np.int64).max
 """Row of a defined variable that no constraint uses."""
@@ -120,7 +118,7 @@ class Body:
         new, first = np.unique(identity, return_index=True)
         self._nodes.append((part, node, text, first[new >= begin]))
 
-    def _users(self) -> tuple[Int, Int, NDArray[np.bool_]]:
+    def _users(self) -> tuple[Int, Int, Mask]:
         """Smallest and largest row and use in the objective of each defined variable.
 
         Indirect uses count too. Without a row the smallest is NO_ROW and the largest -1.

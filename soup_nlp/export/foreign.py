@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ExportError
 from soup_nlp.export.artefact import CHOICES, fingerprint
@@ -29,8 +29,6 @@ from soup_nlp.solve.stages import Solution
 from soup_nlp.storage.files import as_path, read_text
 from soup_nlp.storage.folders import claim, recover, staged
 from soup_nlp.storage.store import write_json
-
-Float = NDArray[np.float64]
 
 SAME = 1e-7
 """Largest relative difference of the fingerprints of an export and of the present problem."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Int
 from soup_nlp.errors import ExportError
 from soup_nlp.model.kernel import Group
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
-
-Int = NDArray[np.int64]
 
 
 def readable_names(nlp: NLP, layout: MatrixLayout) -> tuple[list[str], list[str]]:

@@ -17,8 +17,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ExportError
 from soup_nlp.export.body import Body
 from soup_nlp.export.program import make_program, orders
@@ -34,9 +34,6 @@ from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP
 from soup_nlp.storage.atomic import write_bytes, write_text
 from soup_nlp.storage.files import as_path
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -6,17 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.errors import ExportError
 from soup_nlp.export.split import split
 from soup_nlp.export.template import Template, make_template
 from soup_nlp.model.kernel import Group
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 OBJECTIVE = -1
 """Row number of the objective."""

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.evaluate import recompute
-
-Float = NDArray[np.float64]
 
 WORST = 3
 """Number of superpixels that are listed for a kind."""

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from soup_nlp.arrays import Float
 from soup_nlp.export.opcodes import number
 from soup_nlp.export.program import Program
-
-Float = NDArray[np.float64]
 
 
 def header(

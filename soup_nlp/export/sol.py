@@ -7,15 +7,13 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ExportError, printable
 from soup_nlp.export.opcodes import number
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.files import as_path, read_bytes
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 N = TypeVar("N", int, float)
 
 OPTIONS = "Options"

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.export.template import trace
 from soup_nlp.model.kernel import Group, Kernel
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -30,7 +27,7 @@ class Split:
     nonlinear: ca.SX
     row: Int
     column: Int
-    is_linear: NDArray[np.bool_]
+    is_linear: Mask
     coefficient: Float
     objective: bool
 

@@ -13,12 +13,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ExportError
 from soup_nlp.export.opcodes import COMMUTATIVE, NAMES, OPS, PLUS, SUM, number
 from soup_nlp.model.kernel import Group
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 WORTH_NAMING = 4
 """Smallest number of operations and leaves of a defined variable."""

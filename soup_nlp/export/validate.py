@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.errors import ExportError
-
-Float = NDArray[np.float64]
 
 
 def plain_problem(problem: Mapping[str, object], where: object) -> tuple[ca.SX, ca.SX, ca.SX]:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from soup_nlp.arrays import Float
 from soup_nlp.model.nlp import NLP, to_scipy
 from soup_nlp.solve.kkt import optimality
-
-Float = NDArray[np.float64]
 
 SLACK = 10.0
 """Allowed factor of unscaled residuals over the tolerance, since solvers scale theirs."""

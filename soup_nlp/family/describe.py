@@ -6,15 +6,13 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from soup_nlp.arrays import Float
 from soup_nlp.export.nl import NLFile
 from soup_nlp.export.verify import ACTIVE
 from soup_nlp.model.nlp import NLP, to_scipy
-
-Float = NDArray[np.float64]
 
 CLASSES = {0: "constant", 1: "linear", 2: "quadratic", 3: "general"}
 LETTERS = {0: "C", 1: "L", 2: "Q", 3: "O"}

@@ -14,13 +14,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.storage.atomic import write_bytes
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

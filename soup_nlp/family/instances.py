@@ -14,8 +14,8 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import CHOICES, form_label, parse_formulation
@@ -29,8 +29,6 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.case import Case, build_energy, solver_options
 from soup_nlp.start.choice import limited_noise
 from soup_nlp.start.propose import Start
-
-Float = NDArray[np.float64]
 
 VERSION = 3
 """Version of the family; instances of one version have the same bytes everywhere."""

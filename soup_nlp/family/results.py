@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from soup_nlp.export.program import make_program, orders
 from soup_nlp.export.residuals import Kind, kind
@@ -16,8 +15,6 @@ from soup_nlp.export.verify import Limits, Residuals, examine, violations
 from soup_nlp.family.frozen import load_frozen
 from soup_nlp.family.instances import VERSION, build_instance, case_of, parse_name
 from soup_nlp.storage.store import write_json
-
-Float = NDArray[np.float64]
 
 FEASIBLE = 1e-6
 """Largest violation of a verified point."""

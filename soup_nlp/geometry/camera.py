@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
+from soup_nlp.arrays import Float
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float:

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.motion import RigidMotion, fit_motion
 from soup_nlp.geometry.soup import Soup
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 SAME_PX = 0.5
 """Motions that bring a component's points to within this of each other are one, pixels."""
@@ -118,7 +116,7 @@ def find_components(
     group: Int,
     K_ref: Float,
     K_next: Float,
-    borrowed: NDArray[np.bool_] | None = None,
+    borrowed: Mask | None = None,
 ) -> Components:
     """One rigid motion for every group of superpixels, groups of one motion joined.
 
@@ -200,7 +198,7 @@ def _fit(x: Float, y: Float, size: Float, K: Float) -> RigidMotion:
     return motion
 
 
-def _first(soup: Soup, own: NDArray[np.bool_]) -> RigidMotion:
+def _first(soup: Soup, own: Mask) -> RigidMotion:
     """The motion of a group's first superpixel, for one that has no point in front."""
     i = int(np.argmax(own))
     return RigidMotion(soup.R[i], soup.translation[i])

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, FloatMap, Image, Int, Labels, Mask
 from soup_nlp.geometry.camera import rays
-
-Float = NDArray[np.float64]
-Labels = NDArray[np.int32]
 
 COLOUR = 0.1
 """Standard deviation of colour differences, colours in [0, 1], of the weights of neighbours."""
@@ -18,7 +15,7 @@ ROWS = 128
 """Rows that are computed at a time."""
 
 
-def grown_labels(labels: Labels, small: NDArray[np.uint8], image: NDArray[np.uint8]) -> Labels:
+def grown_labels(labels: Labels, small: Image, image: Image) -> Labels:
     """Superpixels of a small image at the size of the large one, borders along its edges.
 
     Joint bilateral upsampling (Kopf et al., 2007) of labels: near a border the 3 x 3 nearest pixels
@@ -50,7 +47,7 @@ def grown_labels(labels: Labels, small: NDArray[np.uint8], image: NDArray[np.uin
     return out
 
 
-def plane_depth(labels: Labels, normal: Float, offset: Float, K: Float) -> NDArray[np.float32]:
+def plane_depth(labels: Labels, normal: Float, offset: Float, K: Float) -> FloatMap:
     """(H, W) z of planes `normal . X + offset = 0`; NaN where a label is -1 or a plane turns away.
 
     Args:
@@ -71,7 +68,7 @@ def plane_depth(labels: Labels, normal: Float, offset: Float, K: Float) -> NDArr
     return out
 
 
-def _borders(labels: Labels) -> NDArray[np.bool_]:
+def _borders(labels: Labels) -> Mask:
     """(h, w) whether another label is among the 3 x 3 pixels around a pixel."""
     out = np.zeros(labels.shape, bool)
     padded = np.pad(labels, 1, mode="edge")
@@ -84,11 +81,11 @@ def _borders(labels: Labels) -> NDArray[np.bool_]:
 
 def _voted(
     labels: Labels,
-    small: NDArray[np.uint8],
-    colour: NDArray[np.uint8],
+    small: Image,
+    colour: Image,
     place: Float,
-    row: NDArray[np.int64],
-    column: NDArray[np.int64],
+    row: Int,
+    column: Int,
 ) -> Labels:
     """(P,) label with the most votes for pixels of a colour (P, 3) at places (2, P) (y, x)."""
     h, w = labels.shape

@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from soup_nlp.arrays import Float, Image, Int
 from soup_nlp.errors import DataError
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 RIM = 8
 """Directions in which a superpixel has an extreme pixel."""
@@ -66,7 +64,7 @@ class Segmentation:
 
 def build_segmentation(
     labels: NDArray[np.int32],
-    image: NDArray[np.uint8],
+    image: Image,
     neighbours: int = 15,
     beta: float = 0.02,
     beta_colour: float = 1.0,
@@ -145,7 +143,7 @@ def _fold(knn: Int) -> tuple[Int, Int]:
 
 def _shared_boundaries(
     labels: NDArray[np.int32],
-    image: NDArray[np.uint8],
+    image: Image,
     beta_colour: float,
     samples: int | None,
 ) -> tuple[Int, Float, Int, Float]:
@@ -177,9 +175,7 @@ def _shared_boundaries(
     return pairs, _sample_along(middle, which, count, samples), count, weight
 
 
-def _colour_weight(
-    image: NDArray[np.uint8], pixel: Int, which: Int, n_pairs: int, beta: float
-) -> Float:
+def _colour_weight(image: Image, pixel: Int, which: Int, n_pairs: int, beta: float) -> Float:
     """Sum over the four neighbours of `exp(-beta |I(X_b) - I(zeta_j)|_F)`, paper Eq. 5."""
     height, width = image.shape[:2]
     # a pixel that touches the other superpixel twice counts once

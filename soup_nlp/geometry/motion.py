@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry import rotation
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,9 @@ depth: `1 / Z(r) = (1 + g . (r - a)) / Z`. Leading axes are free.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
-
-Float = NDArray[np.float64]
 
 TOLERANCE = 1e-7
 """Violation of visibility that `tilt_to_camera` leaves alone: that of an NLP's answer."""

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+from soup_nlp.arrays import Float, Int
 
 ROUNDING_PX = 1e-3
 """Parallax, in pixels, that counts as none, because the flow is not more accurate."""

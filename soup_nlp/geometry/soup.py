@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.camera import pixel_grid, project, rays
 from soup_nlp.geometry.rotation import nearest
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 LEAST_FACING = 1e-6
 """A pixel with `-n . ray` below this has no depth."""

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from soup_nlp.arrays import Image, Labels
 from soup_nlp.errors import DataError
-
-Labels = NDArray[np.int32]
 
 LEAST_PIECE = 0.25
 """Pieces smaller than this share of the mean area join a neighbour."""
@@ -19,7 +18,7 @@ ENOUGH = 0.5
 
 
 def segment(
-    image: NDArray[np.uint8],
+    image: Image,
     count: int,
     method: Literal["slic", "grid"] = "slic",
     compactness: float = 10.0,

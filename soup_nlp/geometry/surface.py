@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.soup import Reconstruction
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 BEHIND = 0.05
 """Share of its depth by which a hidden point lies behind the nearest surface."""
@@ -78,7 +76,7 @@ def at_jumps(right: Mask, below: Mask) -> Mask:
     return out
 
 
-def triangles(right: Mask, below: Mask, keep: Mask, step: int = 1) -> NDArray[np.int64]:
+def triangles(right: Mask, below: Mask, keep: Mask, step: int = 1) -> Int:
     """(M, 3) triangles of pixels v W + u, counter-clockwise as the camera sees them.
 
     Every cell of `step` pixels that no break of the surface crosses has two.

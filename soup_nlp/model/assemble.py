@@ -9,10 +9,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Int
 from soup_nlp.model.compile import compile_functions
 from soup_nlp.model.kernel import Group
-
-Int = NDArray[np.int64]
 
 
 class Entries(NamedTuple):

@@ -9,17 +9,14 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.model.elements import Element, Norms
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP, assemble
 from soup_nlp.model.norms import NormForm, TruncationForm, solver_form
 from soup_nlp.model.superpixel import View
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 THETA = ("eps", "eps_pixel", "theta", "ridge")
 """Names of the numbers that an NLP lets change without a new build."""

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.model import terms
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
@@ -17,8 +17,6 @@ from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.norms import Norm
 from soup_nlp.model.superpixel import View
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Layout = TangentLayout | MatrixLayout
 
 

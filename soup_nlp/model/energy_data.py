@@ -7,12 +7,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 TERMS = ("arap", "proj", "cont", "orient", "prior")
 
@@ -104,7 +102,7 @@ class EnergyData:
 
 def sample_pixels(
     labels: NDArray[np.int32], flow: Flow, samples: int | None, seed: int
-) -> tuple[Int, NDArray[np.bool_]]:
+) -> tuple[Int, Mask]:
     """A random sample of every superpixel's pixels of nonzero confidence.
 
     Args:

@@ -12,8 +12,8 @@ from typing import Literal, get_args
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ModelError
 
 Hessian = Literal["exact", "gauss-newton", "gauss-newton+constraints"]
@@ -124,12 +124,12 @@ class Kernel:
         return ca.Function(name, args, ca.cse([_nonzeros(H)]))
 
     @_once
-    def jacobian_pattern(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def jacobian_pattern(self) -> tuple[Int, Int]:
         """(row, column) of every nonzero of the local Jacobian, in storage order."""
         return _triplet(ca.jacobian(self.constraints, self.x).sparsity())
 
     @_once
-    def hessian_pattern(self, hessian: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def hessian_pattern(self, hessian: str) -> tuple[Int, Int]:
         """(row, column) of every nonzero of the local triu-Hessian, in storage order."""
         lam_f, lam_c = ca.SX.sym("lam_f"), ca.SX.sym("lam_c", self.nc)
         return _triplet(self._hessian(hessian, lam_f, lam_c).sparsity())
@@ -140,7 +140,7 @@ def _nonzeros(matrix: ca.SX) -> ca.SX:
     return ca.vertcat(*nz) if nz else ca.SX(0, 1)
 
 
-def _triplet(sparsity: ca.Sparsity) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _triplet(sparsity: ca.Sparsity) -> tuple[Int, Int]:
     row, column = sparsity.get_triplet()
     return np.asarray(row, np.int64), np.asarray(column, np.int64)
 
@@ -155,9 +155,9 @@ class Table:
         rows: (E, nc) global constraint row of every local one; rows may repeat (sums).
     """
 
-    index: NDArray[np.int64]
-    data: NDArray[np.float64]
-    rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    index: Int
+    data: Float
+    rows: Int = field(default_factory=lambda: np.zeros((0, 0), np.int64))
 
     def __len__(self) -> int:
         return len(self.index)

@@ -18,10 +18,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.model.compile import shared_library
 from soup_nlp.model.kernel import Table
-
-Float = NDArray[np.float64]
 
 LANES = 8
 

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.plane import about_anchor, at_anchor, inverse_depth, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Gauge = Literal["unit-offset", "unit-translation", "free"]
 GAUGES: tuple[Gauge, ...] = get_args(Gauge)
 Chart = Literal["depth", "inverse-depth"]

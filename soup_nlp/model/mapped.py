@@ -9,9 +9,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.model.kernel import Table
-
-Float = NDArray[np.float64]
 
 
 class Mapped:

@@ -7,8 +7,8 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import terms
 from soup_nlp.model.builder import Builder
@@ -19,8 +19,6 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Gauge, MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.superpixel import View, matrix_view
-
-Float = NDArray[np.float64]
 
 MIN_SCALE = 1e-4
 """Lower bound of scales and offsets."""

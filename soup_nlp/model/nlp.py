@@ -8,9 +8,9 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from soup_nlp.arrays import Float
 from soup_nlp.errors import ModelError
 from soup_nlp.model.assemble import (
     Functions,
@@ -20,8 +20,6 @@ from soup_nlp.model.assemble import (
     hessian_pattern,
 )
 from soup_nlp.model.kernel import Group, Hessian
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

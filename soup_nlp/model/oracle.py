@@ -8,13 +8,11 @@ of the free global scale.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-
-Float = NDArray[np.float64]
 
 
 def energy(soup: Soup, data: EnergyData, weights: Weights) -> dict[str, float]:
@@ -38,7 +36,7 @@ def energy(soup: Soup, data: EnergyData, weights: Weights) -> dict[str, float]:
     return {"total": sum(terms.values()), **terms}
 
 
-def _unit(soup: Soup, data: EnergyData, pairs: NDArray[np.int64]) -> Float | float:
+def _unit(soup: Soup, data: EnergyData, pairs: Int) -> Float | float:
     """Length unit: a mean of the depths of two anchors near the smaller, or the scene's own."""
     if data.local_units:
         Z = soup.depth_at(data.anchor_ray)

@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.oracle import relief
 
-Float = NDArray[np.float64]
 
-
-def across_components(data: EnergyData, component: NDArray[np.int64], factor: float) -> EnergyData:
+def across_components(data: EnergyData, component: Int, factor: float) -> EnergyData:
     """The same data with E_arap and E_prior times `factor` on edges between two components.
 
     As-rigid-as-possible holds inside a component. Across components it pulls a component that the
@@ -33,9 +31,7 @@ def across_components(data: EnergyData, component: NDArray[np.int64], factor: fl
     return replace(data, edge_weight=held * data.edge_weight, prior_weight=held * data.prior_weight)
 
 
-def over_ground(
-    data: EnergyData, soup: Soup, grounded: NDArray[np.bool_], weight: Float
-) -> EnergyData:
+def over_ground(data: EnergyData, soup: Soup, grounded: Mask, weight: Float) -> EnergyData:
     """The same data with E_prior holding the initialisation's relief over a known ground.
 
     Without usable flow only the terms that flatten act on the depth: what is seen below the
@@ -68,7 +64,7 @@ def in_noise(data: EnergyData, noise: float) -> EnergyData:
 
 
 def at_occlusions(
-    data: EnergyData, soup: Soup, component: NDArray[np.int64], gap: float, factor: float
+    data: EnergyData, soup: Soup, component: Int, gap: float, factor: float
 ) -> EnergyData:
     """The same data with E_cont's weights times `factor` where one component hides another.
 
@@ -91,7 +87,7 @@ def at_occlusions(
 
 def across_discontinuities(
     data: EnergyData,
-    surface: NDArray[np.int64],
+    surface: Int,
     *,
     arap: float = 1.0,
     cont: float = 1.0,

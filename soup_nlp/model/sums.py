@@ -17,15 +17,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.model.assemble import Entries, Pattern, hessian_entries, jacobian_entries
 from soup_nlp.model.kernel import Group, Table
 from soup_nlp.model.lanes import Lanes, NoLanesError, Summed, compile_lanes
 from soup_nlp.model.mapped import Mapped
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.vectors import Vectors
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 log = logging.getLogger(__name__)
 

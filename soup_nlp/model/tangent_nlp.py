@@ -7,8 +7,8 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.builder import Builder
 from soup_nlp.model.elements import elements
@@ -18,8 +18,6 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Chart, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.superpixel import View, tangent_view
-
-Float = NDArray[np.float64]
 
 
 @cache

@@ -15,10 +15,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.model.kernel import Table
 from soup_nlp.model.lanes import NoLanesError, instructions
-
-Float = NDArray[np.float64]
 
 BLOCK = 2048
 """Elements of a block: more cost fewer calls, fewer fit into the cache."""

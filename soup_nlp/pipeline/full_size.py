@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import FloatMap
 from soup_nlp.config.problem import Expected
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.full_size import Labels, grown_labels, plane_depth
 from soup_nlp.geometry.soup import Reconstruction
-
-Map = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +26,8 @@ class FullSize:
         metrics: Score of `depth_ref`; None without truth.
     """
 
-    depth_ref: Map
-    depth_next: Map
+    depth_ref: FloatMap
+    depth_next: FloatMap
     labels: Labels
     metrics: DepthMetrics | None = None
 

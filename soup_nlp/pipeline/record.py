@@ -9,9 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from soup_nlp.arrays import Float
 from soup_nlp.config.problem import Problem, dump_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.confidence import Confidence
@@ -29,8 +27,6 @@ from soup_nlp.refine.records import Refined
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.stages import Solution
 from soup_nlp.start.propose import Start
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ from types import FunctionType, NoneType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from soup_nlp.config.problem import Problem, make_problem, title
 from soup_nlp.data.inputs import pair_hash
@@ -32,8 +31,6 @@ from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.propose import Start
 from soup_nlp.storage.progress import Listener
-
-Float = NDArray[np.float64]
 
 EXACT, EXACT_PARALLAX = 0.015, 1.0
 """Flow is exact below this median re-projection error of the start, with more parallax than this,

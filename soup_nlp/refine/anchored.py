@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.plane import (
     about_anchor,
@@ -16,9 +16,6 @@ from soup_nlp.geometry.plane import (
 )
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.refine.costs import Particles
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

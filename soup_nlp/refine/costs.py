@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 BLOCK_BYTES = 1 << 18  # one of the half dozen buffers of a block of edges
 UNARY_BYTES = 1 << 23  # one of the arrays of a block of superpixels
@@ -75,7 +73,7 @@ def anchor_depth(p: Particles, anchor_ray: Float) -> Float:
     return -p.D / np.einsum("nlc,nc->nl", p.n, anchor_ray)
 
 
-def feasible(p: Particles, visibility_ray: Float, min_facing: float) -> NDArray[np.bool_]:
+def feasible(p: Particles, visibility_ray: Float, min_facing: float) -> Mask:
     """(N, L) whether `-n . v >= min_facing` on every row of `EnergyData.visibility_ray`.
 
     SO(3), unit normals and positive scales hold for every particle by construction.
@@ -84,9 +82,7 @@ def feasible(p: Particles, visibility_ray: Float, min_facing: float) -> NDArray[
     return np.asarray((facing.min(axis=2) >= min_facing) & (p.D > 0))
 
 
-def unary_costs(
-    p: Particles, data: EnergyData, weights: Weights
-) -> tuple[Float, NDArray[np.bool_]]:
+def unary_costs(p: Particles, data: EnergyData, weights: Weights) -> tuple[Float, Mask]:
     """alpha1 E_proj of every particle, and whether it keeps its pixels in front of the camera.
 
     Args:

@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.refine.records import Round
-
-Float = NDArray[np.float64]
 
 WALKS = ("walk_plane", "walk_motion", "walk_pivot", "walk_scale", "walk_all")
 COMMON = ("common_motion",)

@@ -24,6 +24,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
@@ -39,9 +40,6 @@ from soup_nlp.refine.records import Refined, RefineOptions, Round
 from soup_nlp.refine.select import conditional_costs, diverse, spread_of, within_reach
 from soup_nlp.refine.sweep import swept
 from soup_nlp.storage.progress import Listener, Progress, Watch
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 CURRENT, KEPT = KINDS.index("current"), KINDS.index("kept")
 

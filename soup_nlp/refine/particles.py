@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.plane_fit import PlaneFit, fit_planes
@@ -23,9 +23,6 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.refine.anchored import Local, fit_motion
 from soup_nlp.refine.costs import Particles
 from soup_nlp.refine.kinds import KINDS, WALKS, Spread
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.schema.limits import MAX_PARTICLES, MOST
 from soup_nlp.schema.section import (
@@ -21,8 +21,6 @@ from soup_nlp.schema.section import (
     Truncation,
     Whole,
 )
-
-Float = NDArray[np.float64]
 
 
 class RefineOptions(Section):

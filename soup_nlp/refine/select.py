@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.refine.costs import Particles, anchor_depth
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 def conditional_costs(
@@ -95,9 +93,7 @@ def spread_of(p: Particles, min_marginals: Float, anchor_ray: Float) -> Float:
     return np.asarray(np.sqrt(np.sum(weight * (log - mean) ** 2, axis=1)))
 
 
-def within_reach(
-    p: Particles, soup: Soup, near: Int, anchor_ray: Float, reach: float
-) -> NDArray[np.bool_]:
+def within_reach(p: Particles, soup: Soup, near: Int, anchor_ray: Float, reach: float) -> Mask:
     """(N, L) whether the depth of a particle is within reach of its neighbours' depths.
 
     Lengths are measured in the depth of their anchors, so a superpixel at a thousand times the

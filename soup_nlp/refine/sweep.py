@@ -8,14 +8,12 @@ similar colour, because a small patch is ambiguous.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.refine.costs import Particles
 from soup_nlp.refine.photometric import Photometric
-
-Float = NDArray[np.float64]
 
 LEVELS = 64
 """Depths that are tried."""

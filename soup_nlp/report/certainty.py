@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Mask
 from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.start.components import TIES
@@ -45,7 +45,7 @@ def certainty(run: Run) -> dict[str, float]:
     unseen = (run.pair.flow.confidence <= 0) | hidden(run.reconstruction)
     still = (start.parallax < LITTLE)[labels]
 
-    def share(mask: NDArray[np.bool_]) -> float:
+    def share(mask: Mask) -> float:
         return float(mask.mean())
 
     return {

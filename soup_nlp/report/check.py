@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Image, Mask
 from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.evaluate import recompute, recompute_files
 from soup_nlp.evaluate.scoring import DEPTHS, SURE
@@ -24,7 +24,7 @@ from soup_nlp.storage.h5_files import DIGEST, read_attrs, read_digest, read_h5
 from soup_nlp.storage.store import require
 
 Entries: TypeAlias = Mapping[str, Any]
-Images: TypeAlias = tuple[NDArray[np.uint8], NDArray[np.uint8]]
+Images: TypeAlias = tuple[Image, Image]
 TERMS = ("arap", "proj", "cont", "orient", "prior")
 ROUNDINGS = 16
 """Error of a pixel coordinate after projection into both frames, in units of machine precision."""
@@ -295,9 +295,7 @@ def _depths(tree: Entries) -> Iterator[Claim]:
     yield _same_depth("next", depth, z, doubt)
 
 
-def _same_depth(
-    which: str, depth: recompute.Float, z: recompute.Float, doubt: NDArray[np.bool_]
-) -> Claim:
+def _same_depth(which: str, depth: recompute.Float, z: recompute.Float, doubt: Mask) -> Claim:
     """Claim that a stored depth map equals the recomputed one, except at the pixels `doubt`."""
     # a pixel exactly at the horizon may fall on either side
     one = (np.isfinite(depth) != np.isfinite(z)) & ~doubt

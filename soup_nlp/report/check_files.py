@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate import recompute, recompute_files
 from soup_nlp.report.claim import HASHED, Claim, same
@@ -20,7 +21,6 @@ from soup_nlp.storage.mark import digest_of
 from soup_nlp.storage.store import require
 
 Entries: TypeAlias = Mapping[str, Any]
-Float = NDArray[np.float64]
 
 COLUMNS = ("x", "y", "z", "nx", "ny", "nz")
 """First properties of a point cloud."""

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.figures import write_png
@@ -70,7 +71,7 @@ def _cameras(result: Result) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _images(result: Result, pixels: tuple[NDArray[np.float64], NDArray[np.float64]]) -> str:
+def _images(result: Result, pixels: tuple[Float, Float]) -> str:
     lines = [
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME (cam_from_world)",
         "# POINTS2D[] as (X, Y, POINT3D_ID)",
@@ -84,9 +85,7 @@ def _images(result: Result, pixels: tuple[NDArray[np.float64], NDArray[np.float6
     return "\n".join(lines) + "\n"
 
 
-def _points(
-    result: Result, still: NDArray[np.bool_]
-) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64], NDArray[np.uint8]]:
+def _points(result: Result, still: Mask) -> tuple[tuple[Float, Float], Float, NDArray[np.uint8]]:
     """Pixels (P, 2) in both images, points (P, 3) and colours (P, 3) on an even grid."""
     keep = still & result.sure
     step = max(1, int(np.ceil(np.sqrt(keep.sum() / POINTS))))
@@ -98,7 +97,7 @@ def _points(
     return (uv, uv + rec.flow[v, u]), rec.points_ref[v, u], result.images[0][v, u]
 
 
-def _moved(result: Result, moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _moved(result: Result, moving: Mask) -> Mask:
     """(H', W') pixels of the next image that show independently moving parts, gaps closed."""
     rec = result.reconstruction
     height, width = rec.depth_next.shape

@@ -9,9 +9,9 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Image, Mask
+
 Float = NDArray[np.floating]
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 ERROR_LIMIT = 0.2
 """Relative depth error at the upper end of the colours."""

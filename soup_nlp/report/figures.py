@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image as Pil
 from PIL import ImageDraw, ImageFont
 
+from soup_nlp.arrays import Image
 from soup_nlp.errors import DataError
-from soup_nlp.report.colour import Image
 from soup_nlp.report.pictures import Bar, Legend, Picture, Swatches, Wheel
 from soup_nlp.storage.atomic import PathLike, write_bytes
 

@@ -6,15 +6,14 @@ import io
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.surface import triangles
 from soup_nlp.storage.atomic import PathLike, write_bytes
 
 if TYPE_CHECKING:
     from soup_nlp.report.result import Result
 
-Float = NDArray[np.float64]
 
 CELLS = 250_000
 """Largest number of cells of a mesh; larger images are subsampled."""
@@ -24,7 +23,7 @@ GLTF = np.diag([1.0, -1.0, -1.0])
 """glTF has y up and looks along -z: half a turn about x from a camera's axes."""
 
 
-def surface_mesh(result: Result, frame: int) -> tuple[Float, NDArray[np.int64], Float]:
+def surface_mesh(result: Result, frame: int) -> tuple[Float, Int, Float]:
     """The surface of the reference image in frame 0 (reference) or 1 (next).
 
     It is cut at jumps of the depth, between components, and where depth is unknown.

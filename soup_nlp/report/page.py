@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Image
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import skill
-from soup_nlp.report.colour import Image, component_colours
+from soup_nlp.report.colour import component_colours
 from soup_nlp.report.limits import limits
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.report.scene3d import Scene, make_scene

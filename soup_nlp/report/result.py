@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, SIGMA_PRIOR
 from soup_nlp.geometry.components import Components, find_components
@@ -26,9 +27,6 @@ from soup_nlp.storage.store import require
 if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run
 
-Float = NDArray[np.float64]
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 UNIT = "soup unit (free scale: the mean distance of the planes is 1)"
 """Unit of lengths in files."""

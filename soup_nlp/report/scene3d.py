@@ -7,15 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, joined, triangles
 from soup_nlp.report.shown import Shown
 
-Float = NDArray[np.float64]
 Int = NDArray[np.integer]
-Mask = NDArray[np.bool_]
 
 MOST_PIXELS = 600_000
 """Larger images are subsampled for the view."""

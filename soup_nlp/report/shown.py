@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Image
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError, printable
 from soup_nlp.geometry.components import Components
@@ -23,8 +24,6 @@ from soup_nlp.storage.store import Array, Tree, plain
 if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run
 
-Float = NDArray[np.float64]
-Image = NDArray[np.uint8]
 PAGE = "report.html"
 """Name of the page in a result folder."""
 

@@ -7,16 +7,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError, expect
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.sequence.pairs import SolvedPair
 from soup_nlp.sequence.scales import Link, link, solve_scales
 from soup_nlp.sequence.tracks import carried, follow, number
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

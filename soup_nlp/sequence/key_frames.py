@@ -8,14 +8,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from soup_nlp.arrays import Float, Image
 from soup_nlp.data.formats.images import read_image
 from soup_nlp.geometry.rotation import exp
-
-Float = NDArray[np.float64]
-Grey = NDArray[np.uint8]
 
 KEY_PARALLAX = 0.01
 """Median parallax of consecutive key frames, relative to the larger side of the image."""
@@ -58,7 +55,7 @@ def key_frames(images: Sequence[Path], K: Float, most: int | None = None) -> lis
     return chosen
 
 
-def parallax(one: Grey, other: Grey, K: Float) -> float | None:
+def parallax(one: Image, other: Image, K: Float) -> float | None:
     """Median displacement of two grey images (H, W) after removal of a camera rotation.
 
     It is relative to the larger side of the image; None if too few points can be tracked. K (3, 3)
@@ -85,7 +82,7 @@ def parallax(one: Grey, other: Grey, K: Float) -> float | None:
     return float(np.median(np.linalg.norm(left(turn), axis=1))) / max(one.shape)
 
 
-def _small(path: Path) -> tuple[Grey, float]:
+def _small(path: Path) -> tuple[Image, float]:
     """An image in grey, reduced to `SIDE`, and its scale."""
     image = cv2.cvtColor(read_image(path, turn=True), cv2.COLOR_RGB2GRAY)
     scale = min(1.0, SIDE / max(image.shape))

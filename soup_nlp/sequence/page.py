@@ -10,9 +10,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from soup_nlp.report.colour import Image, colourise_depth
+from soup_nlp.arrays import Float, Image
+from soup_nlp.report.colour import colourise_depth
 from soup_nlp.report.page import colour_bar, encoded, table
 from soup_nlp.report.pictures import Bar
 from soup_nlp.sequence.chain import Chain
@@ -83,11 +83,11 @@ def _plan(chain: Chain) -> str:
     size = float(max((high - low).max(), 1e-9))
     middle = (low + high) / 2
 
-    def place(p: NDArray[np.float64]) -> str:
+    def place(p: Float) -> str:
         xy = ((p[:, [0, 2]] - middle) / size * 0.86 + 0.5) * PLAN
         return " ".join(f"{x:.1f},{PLAN - y:.1f}" for x, y in xy)
 
-    def line(p: NDArray[np.float64], colour: str, text: str) -> str:
+    def line(p: Float, colour: str, text: str) -> str:
         spots = place(p)
         x, y = spots.split()[-1].split(",")
         dots = "".join(

@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MIN_PIXELS = 200
 """Links with fewer pixels are flagged."""

@@ -6,12 +6,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.evaluate.metrics import depth_metrics, true_pixels
 from soup_nlp.sequence.chain import Chain
-
-Float = NDArray[np.float64]
 
 
 def true_depth(chain: Chain, frame: int) -> Float | None:

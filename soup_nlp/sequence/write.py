@@ -8,9 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from soup_nlp.report.colour import Image, colourise_depth, depth_range
+from soup_nlp.arrays import Image
+from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.figures import depth_png_scale, write_clipped_depth_png16
 from soup_nlp.report.pointcloud import AXES, write_ply
 from soup_nlp.sequence.chain import Chain
@@ -19,8 +19,6 @@ from soup_nlp.sequence.score import score
 from soup_nlp.storage.atomic import write_bytes, write_text
 from soup_nlp.storage.folders import scratch
 from soup_nlp.storage.store import write_json
-
-Float = NDArray[np.float64]
 
 SINGLE = "chain.json", "trajectory.tum", "depth.mp4", "chain.html"
 """Files of a chain that are not made for each frame."""

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
@@ -25,8 +25,6 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant, polish_chart
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.storage.progress import Watch
-
-Float = NDArray[np.float64]
 
 PUSH = 1e-8
 KEEP: Mapping[str, Any] = {

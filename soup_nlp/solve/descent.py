@@ -23,8 +23,8 @@ from collections.abc import Mapping
 from contextlib import suppress
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.solve.ipopt import Stage
 from soup_nlp.solve.line_search import (
@@ -43,8 +43,6 @@ from soup_nlp.solve.newton import Newton
 from soup_nlp.solve.phase import Convergence, Phase
 from soup_nlp.solve.tangent_problem import HessianKind, TangentProblem
 from soup_nlp.storage.progress import Progress, Watch
-
-Float = NDArray[np.float64]
 
 DAMPING = (1e-7, 1e6)
 """Least and most damping mu of a superpixel."""

@@ -10,16 +10,14 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.callback import IterationCallback
 from soup_nlp.solve.hessian import LagrangianHessian
 from soup_nlp.solve.interrupt import raised_at_the_end
 from soup_nlp.storage.progress import Listener, Progress
-
-Float = NDArray[np.float64]
 
 # few bounds are active, so mu starts near its end (docs/solving.md)
 DEFAULTS: Mapping[str, Any] = {

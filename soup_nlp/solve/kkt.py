@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.nlp import NLP, to_scipy
 from soup_nlp.solve.ipopt import Stage
-
-Float = NDArray[np.float64]
-
 
 LIMITS = {
     "so3": 1e-8,

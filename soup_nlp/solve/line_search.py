@@ -13,12 +13,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.solve.tangent_problem import TangentProblem
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 TO_BOUNDARY = 0.99
 """Fraction-to-the-boundary rule: share of the step to a vanishing slack that is taken."""
@@ -67,9 +64,9 @@ class Move(NamedTuple):
 
     point: Point | None
     length: Float
-    far: Bool
-    calm: Bool
-    eager: Bool
+    far: Mask
+    calm: Mask
+    eager: Mask
 
 
 def own(h: Float, other: Float) -> Float:
@@ -288,7 +285,7 @@ class Search:
         return self.at, np.zeros_like(length)
 
     def _longer(
-        self, moved: Point, length: Float, eager: Bool, before: Float, rounding: float
+        self, moved: Point, length: Float, eager: Mask, before: Float, rounding: float
     ) -> Point:
         """Double the step while the merit falls: of all, then of those that still descend.
 

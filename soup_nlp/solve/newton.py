@@ -6,16 +6,14 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from soup_nlp.arrays import Float
 from soup_nlp.solve.factor import Back, Factorise, diagonal_places, factorisation, same_pattern
 from soup_nlp.solve.line_search import Point, merit_gradient
 from soup_nlp.solve.part import Part
 from soup_nlp.solve.reuse import held, preconditioned
 from soup_nlp.solve.tangent_problem import HessianKind, TangentProblem
-
-Float = NDArray[np.float64]
 
 BLENDS = (0.0, 0.1, 0.3, 1.0)
 """Shares of the majorant in the exact Hessian, tried until the step is a descent direction."""

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.solve.line_search import Point
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.tangent_problem import HessianKind
-
-Float = NDArray[np.float64]
 
 POLISH = "presolve polish"
 """Name of the phase with the exact Hessian."""

@@ -12,12 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+from soup_nlp.arrays import Float, Int
 
 PIECE = 24
 """Largest number of superpixels that are not cut any further."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
@@ -31,8 +31,6 @@ from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.tangent_problem import TangentProblem
 from soup_nlp.solve.warm import WARM, warm_start
 from soup_nlp.storage.progress import Listener, Watch
-
-Float = NDArray[np.float64]
 
 _ENDS = ("start", "presolve", "constrained NLP")
 STOPPED = ("Interrupted", "Time_Limit")

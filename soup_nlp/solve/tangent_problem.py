@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
@@ -17,8 +17,6 @@ from soup_nlp.model.sums import Sums
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
 from soup_nlp.solve.factor import numbered
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 HessianKind = Literal["gauss-newton", "exact"]
 
 

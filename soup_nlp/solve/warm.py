@@ -10,15 +10,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.nlp import NLP, to_scipy
-
-Float = NDArray[np.float64]
 
 WARM: Mapping[str, Any] = {
     "warm_start_init_point": "yes",

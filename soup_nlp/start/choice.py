@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane_fit import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
@@ -16,10 +16,6 @@ from soup_nlp.start.epipolar import Motion, estimate, repeated
 from soup_nlp.start.neighbourhoods import fit_translation, neighbourhood, refine_motion
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-
 
 CLIP = 3.0
 """Errors are clipped at this many pixels where motions are compared."""

@@ -5,23 +5,20 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
-
-def connected_pieces(mask: NDArray[np.bool_], seg: Segmentation) -> Int:
+def connected_pieces(mask: Mask, seg: Segmentation) -> Int:
     """(N,) component of every superpixel of a mask over the neighbour pairs, -1 outside."""
     i, k = seg.pairs.T
     return np.where(mask, connected_labels(mask[i] & mask[k], seg), -1)
 
 
-def connected_labels(hold: NDArray[np.bool_], seg: Segmentation) -> Int:
+def connected_labels(hold: Mask, seg: Segmentation) -> Int:
     """(N,) connected component of every superpixel, joined by the pairs that `hold` (P,) marks."""
     return _connected(seg.pairs[hold], len(seg))
 
@@ -57,7 +54,7 @@ SHORTEST = 1e-4
 
 
 def borrow(
-    mu: Float, slope: Float, label: Int, weak: NDArray[np.bool_], seg: Segmentation
+    mu: Float, slope: Float, label: Int, weak: Mask, seg: Segmentation
 ) -> tuple[Float, Float, Float]:
     """Weak superpixels take the median inverse depth of strong neighbours of their motion.
 
@@ -128,7 +125,7 @@ class Outlines(NamedTuple):
     component: Int
     other: Int
     contact: Float
-    below: NDArray[np.bool_]
+    below: Mask
     weight: Float
     top: Float
 

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from soup_nlp.arrays import Float
 from soup_nlp.geometry import rotation
-
-Float = NDArray[np.float64]
-
 
 REFINEMENTS = 5
 """Largest number of robust fits of a motion, each with the noise estimated by the last."""

@@ -13,15 +13,12 @@ lower border is far behind it.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import BELOW as DOWN
 from soup_nlp.start.components import GROUND, connected_labels, quantile
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 LEVEL = 0.92
 """Least cosine between the normal of the ground and the vertical of the image."""
@@ -45,7 +42,7 @@ TRIALS = 500
 """Number of planes through three superpixels that are tried."""
 
 
-def ground(mu: Float, ray: Float, weight: Float, known: NDArray[np.bool_], seed: int) -> Float:
+def ground(mu: Float, ray: Float, weight: Float, known: Mask, seed: int) -> Float:
     """(N,) inverse depth of the ground on every ray; 0 above the horizon and where there is none.
 
     Args:
@@ -70,7 +67,7 @@ def ground(mu: Float, ray: Float, weight: Float, known: NDArray[np.bool_], seed:
     if not len(planes):
         return none
 
-    def on(planes: Float) -> NDArray[np.bool_]:
+    def on(planes: Float) -> Mask:
         there = planes @ ray[at].T
         return np.asarray((there > 0) & (np.abs(mu[at] - there) < ON * np.abs(there)))
 
@@ -93,10 +90,10 @@ def above_ground(
     soup: Soup,
     ray: Float,
     weight: Float,
-    known: NDArray[np.bool_],
+    known: Mask,
     component: Int,
     floor: Float,
-) -> tuple[Soup, NDArray[np.bool_]]:
+) -> tuple[Soup, Mask]:
     """The soup with unreliable or independently moving parts lifted to the ground.
 
     A component with most of its area below the ground comes nearer as a whole, and its translation
@@ -118,7 +115,7 @@ def above_ground(
     lam, t = soup.lam.copy(), soup.t.copy()
     lifted = np.zeros(len(mu), bool)
 
-    def below() -> NDArray[np.bool_]:
+    def below() -> Mask:
         return np.asarray(mu * soup.lam / lam < (1 - BELOW) * floor)
 
     for c in np.unique(component[below() & ~scene]):
@@ -136,7 +133,7 @@ def above_ground(
 
 def floating(
     soup: Soup, seg: Segmentation, ray: Float, boundary_ray: Float, floor: Float, component: Int
-) -> list[tuple[NDArray[np.bool_], float]]:
+) -> list[tuple[Mask, float]]:
     """Masks (N,) of the regions that float above the ground, and their depth ratios to it.
 
     A region stands above the ground, is continuous in depth, and is in front of most of its

@@ -17,19 +17,15 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import about_anchor, at_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.epipolar import Motion, essential_motion, sampson
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 LEAST_PIXELS = 8
 """Least number of correspondences of a homography."""
@@ -58,7 +54,7 @@ class Patch(NamedTuple):
     m: Float
 
 
-def unorganised(views: Views, seg: Segmentation, o: SeededStart) -> tuple[Soup, Bools]:
+def unorganised(views: Views, seg: Segmentation, o: SeededStart) -> tuple[Soup, Mask]:
     """The soup of independent superpixels with equal scales, and which of them borrowed.
 
     Args:

@@ -8,8 +8,8 @@ region falls apart. Flow discontinuities show the outlines of regions more relia
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.start.choice import CLIP, Choice, flow_affinity, least_gain, smooth_choice
 from soup_nlp.start.components import connected_labels
@@ -17,9 +17,6 @@ from soup_nlp.start.epipolar import Motion, estimate
 from soup_nlp.start.neighbourhoods import fit_translation, refine_motion
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 PIXELS = 1500
 """Largest number of pixels of a component to which a motion is fitted."""
@@ -63,7 +60,7 @@ def _main(label: Int) -> int:
 def _one_motion_each(
     views: Views,
     seg: Segmentation,
-    whole: NDArray[np.bool_],
+    whole: Mask,
     choice: Choice,
     noise: float,
     gain: float,

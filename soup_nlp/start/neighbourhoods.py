@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry import rotation
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 def neighbourhood(values: Float, members: Int) -> Float:

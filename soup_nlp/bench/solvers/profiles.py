@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.bench.tables import figure, grid_of_panels, save
 
-Float = NDArray[np.float64]
 Row = Mapping[str, Any]
 
 MIN_SECONDS = 0.01

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.bench.processes import isolated, processor
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import WALL_PER_CPU, Answer, Task, Trace
@@ -27,7 +27,6 @@ from soup_nlp.pipeline.case import Case
 from soup_nlp.storage.rows import Job, Row, measure_all
 from soup_nlp.storage.versions import versions
 
-Float = NDArray[np.float64]
 Label = Mapping[str, Any]
 Maker = Callable[[Path], Task]
 Programs = tuple[NLP, NLP, MatrixLayout, Formulation]

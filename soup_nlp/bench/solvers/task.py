@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.export.verify import Limits
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
@@ -17,8 +17,6 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Mask
 from soup_nlp.data.datasets.layout import make_pair, need, need_folder, read_if, training_folder
 from soup_nlp.data.formats.camera_files import read_kitti_projections, read_vkitti2_intrinsics
 from soup_nlp.data.formats.images import decode
@@ -136,9 +136,7 @@ def _baseline(left: Float, right: Float, path: Path) -> float:
     return baseline
 
 
-def _kitti_flow(
-    base: Path, name: str, suffix: str
-) -> tuple[Float | None, NDArray[np.bool_] | None]:
+def _kitti_flow(base: Path, name: str, suffix: str) -> tuple[Float | None, Mask | None]:
     """True flow, and where it is known but not in the non-occluded version."""
     flow = read_if(read_kitti_flow, base / f"flow_{suffix}" / name)
     visible_file = base / "flow_noc" / name

@@ -6,8 +6,8 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Mask
 from soup_nlp.data.datasets.layout import make_pair, need, read_if, training_folder
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_cam
@@ -65,7 +65,7 @@ def load_sintel(
     )
 
 
-def _flow_truth(base: Path, name: str) -> tuple[Float | None, NDArray[np.bool_] | None]:
+def _flow_truth(base: Path, name: str) -> tuple[Float | None, Mask | None]:
     """True flow and occlusion of a frame; None without their files."""
     flow = read_if(read_flo, base / "flow" / f"{name}.flo")
     files = [base / kind / f"{name}.png" for kind in ("occlusions", "invalid")]

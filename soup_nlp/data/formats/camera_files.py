@@ -9,15 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.data.formats.images import check_body
 from soup_nlp.data.formats.map_files import check_magic
 from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.storage.files import PathLike, read_bytes, read_text
-
-Float = NDArray[np.float64]
 
 _CAM_BYTES = 8 * (9 + 12)  # intrinsics (3, 3) and extrinsics (3, 4)
 _VKITTI2_COLUMNS = ("frame", "cameraID", "K[0,0]", "K[1,1]", "K[0,2]", "K[1,2]")

@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 import warnings
 
-import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from soup_nlp.arrays import Float
 from soup_nlp.data.formats.images import SHOWN, DataWarning, PathLike, decode
 from soup_nlp.errors import ConfigError
 from soup_nlp.geometry.camera import intrinsics
-
-Float = NDArray[np.float64]
 
 GUESS = 1.2
 """Default focal length relative to the larger side of the image (45 degrees of view)."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from soup_nlp.arrays import Mask
 from soup_nlp.errors import DataError
 from soup_nlp.schema.limits import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, read_bytes
@@ -194,6 +195,6 @@ def _to_8_bit(image: NDArray[np.uint16], white: int | None, path: PathLike) -> N
     return np.minimum(np.rint(image * (255.0 / (white or 65535))), 255).astype(np.uint8)
 
 
-def read_mask(path: PathLike) -> NDArray[np.bool_]:
+def read_mask(path: PathLike) -> Mask:
     """Read a black-and-white picture as (H, W) bool, True above half of the range."""
     return np.asarray(read_image(path, white=65535)[:, :, 0] > 127)

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, FloatMap
 from soup_nlp.data.formats.images import check_body, decode, decode_png16
 from soup_nlp.data.formats.npy_files import read_npy
 from soup_nlp.errors import DataError, repr_of
 from soup_nlp.schema.limits import check_image_size
 from soup_nlp.storage.files import PathLike, as_path, read_bytes
 
-Float = NDArray[np.float64]
 Reader = Callable[[PathLike], Float]
 
 MAGIC = b"PIEH"
@@ -57,7 +57,7 @@ def check_magic(content: bytes, path: PathLike, what: str) -> None:
 
 def _raster(
     content: bytes, start: int, size: tuple[int, ...], order: str, path: PathLike, what: str
-) -> NDArray[np.float32]:
+) -> FloatMap:
     """The float32 numbers of byte order `order` after a header of `start` bytes, as an array.
 
     Raises:
@@ -69,7 +69,7 @@ def _raster(
     return values.astype(np.float32)
 
 
-def _read_pieh(path: PathLike, channels: tuple[int, ...], what: str) -> NDArray[np.float32]:
+def _read_pieh(path: PathLike, channels: tuple[int, ...], what: str) -> FloatMap:
     """The numbers of a .flo or .dpt file: magic, int32 width and height, float32 by rows."""
     content = read_bytes(path, what)
     check_magic(content, path, what)
@@ -154,7 +154,7 @@ def read_flow(path: PathLike) -> Float:
     return _by_suffix(path, readers, "flow")
 
 
-def read_confidence(path: PathLike) -> NDArray[np.float32]:
+def read_confidence(path: PathLike) -> FloatMap:
     """(H, W) confidence in [0, 1] of a .npy file or a grey image of 8 or 16 bits (black is 0)."""
     if Path(path).suffix == ".npy":
         found = read_npy(path, "confidence file")

@@ -13,14 +13,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, FloatMap, Image, Int, Mask
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.data.scenes.shapes import NEAR, Shape
 from soup_nlp.data.scenes.texture import Texture
 from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 SAME_DEPTH = 1e-6
 """Largest relative difference of depth of two hits of the same point."""
@@ -59,7 +57,7 @@ class Part:
     texture: Texture
     glow: float = 0.45
 
-    def colour(self, points: Float, footprint: Float, frame: int) -> NDArray[np.float32]:
+    def colour(self, points: Float, footprint: Float, frame: int) -> FloatMap:
         """Colours (N, 3) of points (N, 3) in part coordinates; shading moves with the surface."""
         material = self.shape.material(points, frame)
         normals = self.shape.normals(self.shape.place(material, 0), 0)
@@ -246,7 +244,7 @@ def _move(scene: Scene, X: Float, part: Int) -> Float:
 
 def _paint(
     scene: Scene, K: Float, depth: Float, part: Int, shape: tuple[int, int], frame: int
-) -> NDArray[np.uint8]:
+) -> Image:
     """The image (H, W, 3); pixels on edges are averages of TAPS x TAPS traced samples."""
     uv = camera.pixel_grid(*shape).reshape(-1, 2)
     colour, normals = _shade(scene, K, uv, depth, part, frame, TAPS)
@@ -260,7 +258,7 @@ def _paint(
     return np.round(255 * np.clip(colour, 0, 1)).astype(np.uint8).reshape(*shape, 3)
 
 
-def _on_edge(part: Int, normals: Float) -> NDArray[np.bool_]:
+def _on_edge(part: Int, normals: Float) -> Mask:
     """Pixels (H, W) whose 4-neighbours show another part or another face."""
     edge = np.zeros(part.shape, bool)
     for first, second in (np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:]):
@@ -273,7 +271,7 @@ def _on_edge(part: Int, normals: Float) -> NDArray[np.bool_]:
 
 def _shade(
     scene: Scene, K: Float, uv: Float, depth: Float, part: Int, frame: int, taps: int
-) -> tuple[NDArray[np.float32], Float]:
+) -> tuple[FloatMap, Float]:
     """Colours and normals of hits.
 
     A tilted surface is foreshortened in one image direction only. Its texture has the finer

@@ -10,10 +10,8 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+from soup_nlp.arrays import Float, Int
 
 NEAR = 1e-6
 """Smallest depth of a hit, unit of length."""

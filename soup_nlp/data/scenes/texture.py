@@ -13,7 +13,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from soup_nlp.arrays import Float
+
 Float32 = NDArray[np.float32]
 Colour = tuple[float, float, float]
 

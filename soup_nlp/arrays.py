@@ -1,0 +1,15 @@
+"""Types of arrays that many rooms use."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+FloatMap = NDArray[np.float32]
+Int = NDArray[np.int64]
+Labels = NDArray[np.int32]
+"""(H, W) superpixel of every pixel."""
+Mask = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+"""(H, W, 3) RGB, or (H, W) grey."""
