@@ -17,7 +17,7 @@ from soup_nlp.model.nlp import NLP, assemble
 from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import optimality
-from soup_nlp.storage.progress import Progress
+from soup_nlp.storage.progress import Progress, Watch
 
 # --- textbook problems as kernels and tables -----------------------------------------------------
 
@@ -179,7 +179,7 @@ def test_an_infeasible_problem_is_a_result_with_its_status():
 
 def test_history_counts_and_call_times_are_kept():
     seen: list[Progress] = []
-    stage = solve(hs071(), stage="textbook", listener=seen.append)
+    stage = solve(hs071(), stage="textbook", watch=Watch(seen.append))
     assert [p.iteration for p in seen] == list(range(stage.iterations + 1))
     assert {p.stage for p in seen} == {"textbook"}
     assert (np.diff([p.seconds for p in seen]) >= 0).all()
@@ -205,7 +205,7 @@ def test_a_wrong_ipopt_option_is_a_solver_error(options):
 
 def test_options_reach_ipopt(tmp_path):
     nlp, log = hs071(), tmp_path / "ipopt.log"
-    Ipopt(nlp, {"mu_init": 0.123})(x0=nlp.x0, log_file=str(log))
+    Ipopt(nlp, {"mu_init": 0.123})(x0=nlp.x0, watch=Watch(log_file=str(log)))
     text = log.read_text()
     assert "Number of nonzeros" in text
     assert "lg(mu)" in text
@@ -246,7 +246,7 @@ def test_an_event_stops_and_keeps_the_best_iterate():
         if p.iteration == 3:
             stop.set()
 
-    stage = solve(nlp, listener=listen, stop=stop)
+    stage = solve(nlp, watch=Watch(listen, stop))
     assert stage.status == "Interrupted"
     assert len(seen) == 4
     assert stage.objective == min(seen)
@@ -257,7 +257,7 @@ def test_a_listener_that_fails_ends_the_solve_with_its_message():
     def listen(p: Progress) -> None:
         raise ValueError("no more paper")
 
-    stage = solve(rosenbrock(10), listener=listen)
+    stage = solve(rosenbrock(10), watch=Watch(listen))
     assert "no more paper" in stage.status
     assert not stage.converged
     assert np.isfinite(stage.x).all()
@@ -284,7 +284,7 @@ def test_control_c_ends_a_solve_at_the_next_iteration_and_is_raised(number):
     old = signal.signal(number, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            solve(rosenbrock(10), listener=listen)
+            solve(rosenbrock(10), watch=Watch(listen))
         assert signal.getsignal(number) is signal.default_int_handler
     finally:
         signal.signal(number, old)

@@ -26,6 +26,7 @@ from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.particles import Proposer
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.solve.kkt import constraint_residuals
+from soup_nlp.storage.progress import Watch
 
 FEW = RefineOptions(rounds=3, particles=16, trws_iterations=15)
 NEW = (*WALKS, *COMMON, *BORROWED)
@@ -259,7 +260,7 @@ def test_interruption_and_time_limit_keep_the_best():
     weights = weights_for("pixels")
     stop = threading.Event()
     stop.set()
-    done = refine_soup(tiny.soup, tiny.data, weights, FEW, stop=stop)
+    done = refine_soup(tiny.soup, tiny.data, weights, FEW, watch=Watch(stop=stop))
     assert done.status == "interrupted"
     assert not done.rounds
     assert done.energy["total"] == pytest.approx(
@@ -272,7 +273,7 @@ def test_interruption_and_time_limit_keep_the_best():
         lines.append(line)
         stop.set()
 
-    done = refine_soup(tiny.soup, tiny.data, weights, FEW, stop=stop, say=say)
+    done = refine_soup(tiny.soup, tiny.data, weights, FEW, watch=Watch(stop=stop, say=say))
     assert done.status == "interrupted"
     assert len(done.rounds) == len(lines) == 1
     assert done.energy["total"] < done.energy_begin["total"]
@@ -297,8 +298,7 @@ def test_a_listener_hears_every_iteration_and_can_stop_within_a_round():
         weights_for("pixels"),
         FEW.replace(trws_gap=-1.0),
         seed=1,
-        stop=stop,
-        listener=listener,
+        watch=Watch(listener, stop),
     )
     assert done.status == "interrupted"
     assert len(heard) == 2
@@ -319,7 +319,7 @@ def test_an_interrupt_within_a_round_ends_the_refinement():
 
     # no round ends by its gap before the second iteration
     o, stop = FEW.replace(trws_gap=-1.0), threading.Event()
-    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, stop=stop, listener=listener)
+    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, watch=Watch(listener, stop))
     assert done.status == "interrupted"
     assert len(heard) == 2
     assert [r.status for r in done.rounds] == ["interrupted"]
@@ -334,7 +334,7 @@ def test_a_time_limit_within_a_round_is_no_interruption():
     def listener(progress: object) -> None:
         time.sleep(0.55)
 
-    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, listener=listener)
+    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, watch=Watch(listener))
     assert done.status == "time limit"
     assert [r.status for r in done.rounds] == ["interrupted"]
 

@@ -36,7 +36,7 @@ from soup_nlp.solve.kkt import constraint_residuals, optimality
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.propose import propose
-from soup_nlp.storage.progress import Progress
+from soup_nlp.storage.progress import Progress, Watch
 
 pytestmark = pytest.mark.slow
 
@@ -299,7 +299,7 @@ def test_far_from_a_minimum_ipopt_has_few_iterations(room, few, spent):
 def test_a_stop_that_is_set_before_the_start_gives_the_start(room):
     stop = threading.Event()
     stop.set()
-    solution = room.solve(stop=stop)
+    solution = room.solve(watch=Watch(stop=stop))
     assert solution.status == "Interrupted"
     assert not solution.converged
     assert_whole(solution, room)
@@ -315,7 +315,7 @@ def test_a_stop_in_any_stage_keeps_what_was_reached(room, stage):
         if p.stage == stage:
             stop.set()
 
-    solution = room.solve(OPTIONS.replace(tol=1e-10), listener=listen, stop=stop)
+    solution = room.solve(OPTIONS.replace(tol=1e-10), watch=Watch(listen, stop))
     assert solution.status == "Interrupted"
     assert_whole(solution, room)
     assert seen.count(stage) == 1
@@ -331,7 +331,7 @@ def test_progress_and_sentences_are_delivered(room, solved, tmp_path):
     seen: list[Progress] = []
     said: list[str] = []
     log = tmp_path / "ipopt.log"
-    solution = room.solve(listener=seen.append, say=said.append, log_file=str(log))
+    solution = room.solve(watch=Watch(seen.append, say=said.append, log_file=str(log)))
     stages = list(dict.fromkeys(p.stage for p in seen))
     assert stages == [s.name for s in solution.stages]
     for stage in solution.stages:

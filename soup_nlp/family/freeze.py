@@ -13,6 +13,7 @@ from soup_nlp.family.frozen import Frozen, encoded, save_frozen
 from soup_nlp.family.instances import case_of, rounded
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.solve.stages import solve_soup
+from soup_nlp.storage.progress import Watch
 
 
 def family_problem(scene: str, size: int) -> Problem:
@@ -42,7 +43,7 @@ def freeze(scene: str, size: int, path: Path, say: Callable[[str], None]) -> Non
     # beside it gives the minimum of the smoothed energy, which the record needs
     noise = np.random.default_rng(0).standard_normal(len(case.soup))
     beside = replace(case.soup, lam=case.soup.lam * np.exp(0.01 * noise))
-    answer = solve_soup(beside, *own, say=say)
+    answer = solve_soup(beside, *own, watch=Watch(say=say))
     say(str(answer))
     save_frozen(path, replace(proposed, minimum=encoded(answer.soup)))
 

@@ -35,6 +35,7 @@ from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.storage.progress import Watch
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +137,8 @@ def prepare(
         return case
     # one iteration of the constrained NLP is the smallest number that a solve has
     once = stages.replace(presolve=True, max_iter=1)
-    answer = solve_soup(start.soup, data, weights, case.formulation(), once, say=log)
+    watch = Watch(say=log) if log else None
+    answer = solve_soup(start.soup, data, weights, case.formulation(), once, watch=watch)
     return replace(case, soup=answer.soup)
 
 

@@ -30,7 +30,7 @@ from soup_nlp.refine.records import Refined
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.propose import Start
-from soup_nlp.storage.progress import Listener
+from soup_nlp.storage.progress import Listener, Watch
 
 EXACT, EXACT_PARALLAX = 0.015, 1.0
 """Flow is exact below this median re-projection error of the start, with more parallax than this,
@@ -103,11 +103,12 @@ def run(
     expect(stop, (threading.Event, NoneType), "stop", "threading.Event(), or None")
     expect(ipopt_log, (str, NoneType), "ipopt_log", "the name of a file, or None")
     clock = _Clock(stop, on_stage)
+    watch = Watch(listener, stop or threading.Event(), log or (lambda line: None), ipopt_log)
     case = prepare(problem, pair=pair, log=log, on_stage=clock)
 
     def nlp(soup: Soup) -> Solution:
         own = soup, case.data, case.weights, case.formulation(), case.options
-        return solve_soup(*own, listener=listener, stop=stop, say=log, log_file=ipopt_log)
+        return solve_soup(*own, watch=watch)
 
     if problem.refine.enabled and problem.refine.from_start:
         solution = skipped(case)
@@ -116,7 +117,7 @@ def run(
         clock("nlp")
     refined = None
     if problem.refine.enabled:
-        refined = _refined(case, solution.soup, nlp, listener=listener, stop=stop, say=log)
+        refined = _refined(case, solution.soup, nlp, watch)
         if log:
             log(str(refined))
         clock("refine")
@@ -126,14 +127,14 @@ def run(
     return replace(done, seconds={**clock.seconds, **parts})
 
 
-def _refined(case: Case, soup: Soup, nlp: Callable[[Soup], Solution], **watched: Any) -> Refined:
+def _refined(case: Case, soup: Soup, nlp: Callable[[Soup], Solution], watch: Watch) -> Refined:
     """The refinement of a soup, and the NLP's answer from it where the problem asks for one.
 
     Args:
         case: The problem before the solve.
         soup: The NLP's solution, or the start.
         nlp: Solves the constrained NLP from a soup.
-        watched: Listener, stop event and log of `refine_soup`.
+        watch: See `refine_soup`.
     """
     problem, photo = case.problem, None
     if not flow_is_exact(case.start):
@@ -147,7 +148,7 @@ def _refined(case: Case, soup: Soup, nlp: Callable[[Soup], Solution], **watched:
         seed=problem.seed,
         min_facing=problem.formulation.min_facing,
         depth_ratio=problem.formulation.depth_ratio,
-        **watched,
+        watch=watch,
     )
     if not problem.refine.polish or refined.status == "interrupted":
         return refined

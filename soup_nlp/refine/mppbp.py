@@ -15,9 +15,8 @@ TRW-S starts every round with messages of zero, because nearly all of its labels
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -39,7 +38,7 @@ from soup_nlp.refine.photometric import Photometric
 from soup_nlp.refine.records import Refined, RefineOptions, Round
 from soup_nlp.refine.select import conditional_costs, diverse, spread_of, within_reach
 from soup_nlp.refine.sweep import swept
-from soup_nlp.storage.progress import Listener, Progress, Watch
+from soup_nlp.storage.progress import Progress, Watch
 
 CURRENT, KEPT = KINDS.index("current"), KINDS.index("kept")
 
@@ -54,9 +53,7 @@ def refine_soup(
     seed: int = 0,
     min_facing: float = 1e-3,
     depth_ratio: float = 5.0,
-    listener: Listener | None = None,
-    stop: threading.Event | None = None,
-    say: Callable[[str], None] | None = None,
+    watch: Watch | None = None,
 ) -> Refined:
     """Lower the exact energy of a soup by particles; see the module.
 
@@ -72,9 +69,7 @@ def refine_soup(
         seed: Of every draw.
         min_facing: Visibility, as in the constrained NLP.
         depth_ratio: The same.
-        listener: Called at every iteration of TRW-S.
-        stop: Set it to end with the best soup so far.
-        say: Called with a line after every round.
+        watch: Listener of the iterations of TRW-S, stop event and log; a stop keeps the best soup.
 
     Returns:
         The best soup, normalised to sum(lam) = 1, and what happened.
@@ -90,8 +85,7 @@ def refine_soup(
     pair_costs = PairCosts(data, beside)
     proposer = Proposer(data, neighbours(pair_costs.edges, data.anchor_ray), seed)
     costs = _Costs(data, beside, photo, o, rays, min_facing, pair_costs, proposer.near)
-    watch = Watch(listener, stop or threading.Event(), say or (lambda line: None))
-    rounds = _Rounds(costs, proposer, watch, best, energy, begin + o.max_seconds)
+    rounds = _Rounds(costs, proposer, watch or Watch(), best, energy, begin + o.max_seconds)
     if photo is not None and o.sweep:
         rounds.kept = swept(best, *proposer.commonest(best, 2), data, photo, o.sweep)
     status, done = rounds.run(), tuple(rounds.done)

@@ -103,17 +103,14 @@ class Continuation:
         self.soup, self.rim = layout.unpack(stage.x), _rim(nlp, layout, stage)
 
     def _stage(self, nlp: NLP, options: Mapping[str, Any], **given: Any) -> Stage:
-        watch = self.watch
         stage = Ipopt(nlp, options)(
             **given,
             tol=self.o.presolve_tol,
             seconds=max(1.0, self.deadline - time.perf_counter()),
-            listener=watch.listener,
-            stop=watch.stop,
-            log_file=watch.log_file,
+            watch=self.watch,
         )
         self.stages.append(stage)
-        watch.say(str(stage))
+        self.watch.say(str(stage))
         return stage
 
 

@@ -17,7 +17,7 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.callback import IterationCallback
 from soup_nlp.solve.hessian import LagrangianHessian
 from soup_nlp.solve.interrupt import raised_at_the_end
-from soup_nlp.storage.progress import Listener, Progress
+from soup_nlp.storage.progress import Progress, Watch
 
 # few bounds are active, so mu starts near its end (docs/solving.md)
 DEFAULTS: Mapping[str, Any] = {
@@ -89,15 +89,14 @@ class _Iterations(IterationCallback):
         nlp: NLP,
         x0: Float,
         stage: str,
-        listener: Listener | None,
+        watch: Watch,
         seconds: float,
-        stop: threading.Event,
         stagnation: float,
     ) -> None:
         super().__init__()
         self.stagnation, self.last_f, self.still = stagnation, np.inf, 0
-        self.nlp, self.stage, self.listener = nlp, stage, listener
-        self.stop, self.signalled = stop, threading.Event()
+        self.nlp, self.stage, self.watch = nlp, stage, watch
+        self.signalled = threading.Event()
         self.begin = time.perf_counter()
         self.deadline = self.begin + seconds
         self.count = 0
@@ -126,15 +125,15 @@ class _Iterations(IterationCallback):
             self.best, self.best_x, self.best_f = rank, x, f
             self.best_lam = np.asarray(arg[3]).ravel(), np.asarray(arg[4]).ravel()
         now = time.perf_counter()
-        if self.listener:
-            self.listener(Progress(self.stage, self.count, f, infeasible, now - self.begin))
+        if self.watch.listener:
+            self.watch.listener(Progress(self.stage, self.count, f, infeasible, now - self.begin))
         self.count += 1
         if self.stagnation:
             self.still = self.still + 1 if abs(self.last_f - f) <= self.stagnation * abs(f) else 0
             self.last_f = f
         if self.still >= STILL:
             self.reason = "Stagnated"
-        if self.stop.is_set() or self.signalled.is_set():
+        if self.watch.stop.is_set() or self.signalled.is_set():
             self.reason = "Interrupted"
         elif now > self.deadline:
             self.reason = "Time_Limit"
@@ -181,8 +180,8 @@ class Ipopt:
         # CasADi does not keep a callback alive
         self.hess_lag = LagrangianHessian(nlp)
 
-    def _solver(self, watch: _Iterations, max_iter: int, tol: float, log_file: str | None) -> Any:
-        nlp = self.nlp
+    def _solver(self, callback: _Iterations, max_iter: int, tol: float) -> Any:
+        nlp, log_file = self.nlp, callback.watch.log_file
         x, p = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", len(nlp.p))
         f, g = nlp.oracle(x, p)
         ipopt: dict[str, Any] = {
@@ -201,7 +200,7 @@ class Ipopt:
             "grad_f": nlp.grad_f,
             "jac_g": nlp.jac_g,
             "hess_lag": self.hess_lag,
-            "iteration_callback": watch,
+            "iteration_callback": callback,
             "print_time": False,
             "calc_lam_p": False,
             "calc_multipliers": False,
@@ -230,9 +229,7 @@ class Ipopt:
         seconds: float = np.inf,
         stagnation: float = 0.0,
         stage: str = "solve",
-        listener: Listener | None = None,
-        stop: threading.Event | None = None,
-        log_file: str | None = None,
+        watch: Watch | None = None,
     ) -> Stage:
         """Solve from x0.
 
@@ -247,19 +244,16 @@ class Ipopt:
             stagnation: Relative change of f that ends the solve when it was smaller twice in a
                 row; 0 for none.
             stage: Name for progress.
-            listener: Called at every iteration.
-            stop: Event that ends the solve at the next iteration.
-            log_file: Ipopt's own log is appended here.
+            watch: Listener, stop event and log, to which Ipopt's own is appended.
 
         Raises:
             KeyboardInterrupt: Ctrl-C, which ends the solve at the next iteration.
         """
         nlp = self.nlp
-        stop = stop or threading.Event()
-        watch = _Iterations(nlp, x0, stage, listener, seconds, stop, stagnation)
-        solver = self._solver(watch, max_iter, tol, log_file)
+        callback = _Iterations(nlp, x0, stage, watch or Watch(), seconds, stagnation)
+        solver = self._solver(callback, max_iter, tol)
         given = {"p": nlp.p if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
         bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}
-        with raised_at_the_end(watch.signalled):
+        with raised_at_the_end(callback.signalled):
             out = solver(x0=x0, **bounds, **{k: v for k, v in given.items() if v is not None})
-        return watch.ended(solver.stats(), {k: np.asarray(v).ravel() for k, v in out.items()})
+        return callback.ended(solver.stats(), {k: np.asarray(v).ravel() for k, v in out.items()})

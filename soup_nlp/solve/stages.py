@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -30,7 +29,7 @@ from soup_nlp.solve.phase import POLISH, Phase, polish, reweighted
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.tangent_problem import TangentProblem
 from soup_nlp.solve.warm import WARM, warm_start
-from soup_nlp.storage.progress import Listener, Watch
+from soup_nlp.storage.progress import Watch
 
 _ENDS = ("start", "presolve", "constrained NLP")
 STOPPED = ("Interrupted", "Time_Limit")
@@ -104,10 +103,7 @@ def solve_soup(
     form: Formulation | None = None,
     options: SolverOptions | None = None,
     *,
-    listener: Listener | None = None,
-    stop: threading.Event | None = None,
-    say: Callable[[str], None] | None = None,
-    log_file: str | None = None,
+    watch: Watch | None = None,
 ) -> Solution:
     """Minimise E from a start.
 
@@ -117,17 +113,13 @@ def solve_soup(
         weights: Constants of the energy.
         form: Formulation of the constrained NLP.
         options: Stages and limits.
-        listener: Called at every iteration.
-        stop: Set it to end at the next iteration with the best iterate.
-        say: Called with a line after every stage.
-        log_file: Ipopt's own log is appended here.
+        watch: Listeners, stop event and log; a stop keeps the best iterate.
 
     Returns:
         The solution; a solve that fails is a Solution with its status, not an exception.
     """
-    watch = Watch(listener, stop or threading.Event(), say or (lambda line: None), log_file)
-    own = form or Formulation(), options or SolverOptions()
-    return _Solve(start, data, weights, *own, watch).run()
+    own = form or Formulation(), options or SolverOptions(), watch or Watch()
+    return _Solve(start, data, weights, *own).run()
 
 
 class _Laps:
@@ -301,9 +293,7 @@ class _Solve:
             tol=o.tol,
             seconds=max(1.0, self.laps.begin + o.max_seconds - time.perf_counter()),
             stage="constrained NLP",
-            listener=self.watch.listener,
-            stop=self.watch.stop,
-            log_file=self.watch.log_file,
+            watch=self.watch,
         )
         self.laps.end("solve")
         self._ended(stage)
