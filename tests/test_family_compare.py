@@ -23,7 +23,6 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.export.verify import Limits
 from soup_nlp.family.freeze import record_of
-from soup_nlp.family.results import FIELDS
 from soup_nlp.pipeline.case import prepare
 
 STUB = "SOUP-room-unit-offset-smooth-smooth-N100"
@@ -65,7 +64,8 @@ def test_rows_belong_to_a_start_and_a_size(tmp_path):
     draw_family(tmp_path / "p.png", ROWS)
     assert (tmp_path / "p.png").stat().st_size > 5000
     plain = neutral(ROWS[0])
-    assert all(field in plain for field in FIELDS)
+    # what the README of the set asks for
+    assert {"solver", "name", "n", "m", "status", "objective", "iterations", "time"} <= plain.keys()
     assert (plain["time"], plain["wall_time"], plain["reached"]) == (1.0, 9.0, True)
 
 

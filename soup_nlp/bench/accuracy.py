@@ -25,7 +25,7 @@ from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import ERRORS, depth_metrics, scene_flow_epe, skill
 from soup_nlp.evaluate.protocols import Preset, preset
-from soup_nlp.evaluate.scoring import SURE, at_truth, most_certain
+from soup_nlp.evaluate.scoring import at_truth, surest
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
@@ -219,9 +219,7 @@ def _metrics(
     scored = {method: at_truth(truth, depth) for method, depth in maps.items()}
     if sigma is not None:
         estimate, gt = scored["solution"]
-        unsure, _ = at_truth(truth, sigma)
-        for name, share in SURE.items():
-            kept = np.where(most_certain(gt, unsure, share), gt, np.nan)
+        for name, kept in surest(gt, at_truth(truth, sigma)[0]).items():
             if convention.counts(kept):
                 scored[name] = estimate, kept
     out: dict[str, dict[str, float]] = {}

@@ -105,10 +105,6 @@ def text_variants(name: str, text: str, rows: Sequence[Row], note: str = "") -> 
     return page_text([*lines, *failures(rows)])
 
 
-def _yes(holds: bool) -> str:
-    return "yes" if holds else "no"
-
-
 def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
     """Page of the analysis `energy`: two claims for each pair, and energies by term and soup."""
     lines = page_head(name, text, rows, note)
@@ -124,17 +120,10 @@ def text_energy(name: str, text: str, rows: Sequence[Row], note: str = "") -> st
         nearest = energy_ratio(row, "truth rescaled") or ratio
         last = list(scores)[-1]
         worse = scores[last]["median_relative"] - scores["truth"]["median_relative"]
-        summary.append(
-            [
-                *[
-                    title,
-                    f"{ratio:.3f}",
-                    "yes" if ratio <= MAX_ENERGY_RATIO else "no",
-                    f"{nearest:.3f}",
-                ],
-                *[f"{worse:+.4f}", "yes" if worse <= MAX_LOSS else "no", f"{row['mixed']:.1%}"],
-            ]
-        )
+        claims = ratio <= MAX_ENERGY_RATIO, worse <= MAX_LOSS
+        low, kept = ("yes" if claim else "no" for claim in claims)
+        own = [title, f"{ratio:.3f}", low, f"{nearest:.3f}", f"{worse:+.4f}", kept]
+        summary.append([*own, f"{row['mixed']:.1%}"])
     head = ["pair, flow", "E truth / E solution", f"<= {MAX_ENERGY_RATIO:g}", "components rescaled"]
     head += ["median error from truth", f"<= {MAX_LOSS:g}", "mixed superpixels"]
     about = "Components rescaled: E of the truth, each component at its scale of lowest E, instead."

@@ -18,7 +18,7 @@ from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.rotation import nearest
+from soup_nlp.geometry.motion import fit_motion
 from soup_nlp.geometry.soup import Soup
 
 MIN_PIXELS = 6
@@ -160,9 +160,6 @@ def _motions(
     labels, first = np.unique(which[order], return_index=True)
     for i, pixels in zip(labels, np.split(use[order], first[1:]), strict=True):
         if len(pixels) >= MIN_PIXELS:
-            a, b = X[pixels].mean(axis=0), Y[pixels].mean(axis=0)
-            # for coplanar points the sign of the determinant decides the third direction
-            R[i] = nearest((Y[pixels] - b).T @ (X[pixels] - a))
-            T[i] = b - R[i] @ a
-            known[i] = True
+            moved = fit_motion(X[pixels], Y[pixels], np.ones(len(pixels)))
+            R[i], T[i], known[i] = moved.R, moved.t, True
     return R, T, known

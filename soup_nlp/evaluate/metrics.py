@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError, repr_of
@@ -310,10 +310,14 @@ def component_overlaps(found: ArrayLike, true: ArrayLike) -> dict[int, tuple[int
     known = b >= 0
     if not known.any():
         return {}
-    a, b = a[known].astype(np.int64), b[known].astype(np.int64)
-    count = int(a.max()) + 1
-    both = np.bincount(b * count + a, minlength=count * (int(b.max()) + 1)).reshape(-1, count)
+    share = overlap_shares(b[known], a[known])
+    return {int(k): (int(share[k].argmax()), float(share[k].max())) for k in np.unique(b[known])}
+
+
+def overlap_shares(one: NDArray[np.integer], other: NDArray[np.integer]) -> Float:
+    """(A, B) intersection over union of the labels 0..A-1 and 0..B-1 of the same pixels (M,)."""
+    count = int(other.max()) + 1
+    flat, size = one.astype(np.int64) * count + other, count * (int(one.max()) + 1)
+    both = np.bincount(flat, minlength=size).reshape(-1, count)
     union = both.sum(axis=0) + both.sum(axis=1, keepdims=True) - both
-    share = both / np.maximum(union, 1)
-    there = np.flatnonzero(both.sum(axis=1))
-    return {int(k): (int(share[k].argmax()), float(share[k].max())) for k in there}
+    return np.asarray(both / np.maximum(union, 1))

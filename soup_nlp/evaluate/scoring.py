@@ -8,7 +8,7 @@ from typing import get_args
 
 import numpy as np
 
-from soup_nlp.arrays import Float, Mask
+from soup_nlp.arrays import Float
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Truth
 from soup_nlp.errors import DataError, repr_of
@@ -67,10 +67,8 @@ def score_depths(
         if "constant" not in out:
             out["constant"] = depth_metrics(np.ones(gt.shape), gt, scale=scale, cap=cap)
     if sigma is not None and "solution" in out:
-        for name, share in SURE.items():
-            estimate, gt = at_truth(truth, depths["solution"])
-            unsure = at_truth(truth, sigma)[0]
-            kept = np.where(most_certain(gt, unsure, share), gt, np.nan)
+        estimate, gt = at_truth(truth, depths["solution"])
+        for name, kept in surest(gt, at_truth(truth, sigma)[0]).items():
             out[name] = depth_metrics(estimate, kept, scale=scale, cap=cap)
     gt_next = truth.depth_next
     if depth_next is not None and gt_next is not None and true_pixels(gt_next, cap).any():
@@ -86,11 +84,11 @@ def at_truth(truth: Truth, image: Float) -> tuple[Float, Float]:
     return sample_at_points(image, truth.points)
 
 
-def most_certain(gt: Float, sigma: Float, share: float) -> Mask:
-    """The share of the true pixels where sigma is least."""
+def surest(gt: Float, sigma: Float) -> dict[str, Float]:
+    """True depths by the names of `SURE`: NaN but for the share of them where sigma is least."""
     true = true_pixels(gt, None) & np.isfinite(sigma)
-    limit = np.quantile(sigma[true], share) if true.any() else 0.0
-    return np.asarray(true & (sigma <= limit))
+    limits = {k: np.quantile(sigma[true], v) if true.any() else 0.0 for k, v in SURE.items()}
+    return {k: np.where(true & (sigma <= limit), gt, np.nan) for k, limit in limits.items()}
 
 
 def evaluate(

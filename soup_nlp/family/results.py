@@ -20,8 +20,6 @@ FEASIBLE = 1e-6
 """Largest violation of a verified point."""
 TOLERANCE = 1e-4
 """Dual infeasibility and complementarity that `compare` asks for; ten times that is verified."""
-FIELDS = ("solver", "name", "n", "m", "status", "objective", "iterations", "time")
-"""Entries that a result must have; others are allowed."""
 
 
 @dataclass(frozen=True)

@@ -208,6 +208,15 @@ def _sample_along(points: Float, which: Int, count: Int, samples: int | None) ->
     return points[order[start[:, None] + inside]].reshape(n_pairs, b, 2)
 
 
+def connected(links: Int, count: int) -> Int:
+    """(count,) component of every node of a graph with these links (L, 2)."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(len(links)), tuple(links.T)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
 def _rim(labels: NDArray[np.int32], u: Float, v: Float, n: int) -> Float:
     """(N, RIM, 2) extreme pixels of every superpixel by direction."""
     order = np.argsort(labels.ravel(), kind="stable")

@@ -74,7 +74,7 @@ class Run:
     def __str__(self) -> str:
         h, w = self.pair.size
         s, energy = self.solution, self.energy["total"]
-        parts = self.components
+        parts, source = self.components, "the refinement" if self.refined else self.delivered
         scores = "no truth"
         if "solution" in self.metrics:
             m = self.metrics["solution"]
@@ -84,7 +84,7 @@ class Run:
                 f"Run({self.problem.name}, {w}x{h}, {len(self.segmentation)} superpixels,"
                 f" {sum(v for k, v in self.seconds.items() if not k.startswith('nlp_')):.1f} s)",
                 f"  {'good' if self.good else 'not good'}: {s.status}, E"
-                f" {s.energy_start['total']:.5g} -> {energy:.5g}, delivered by {self._source}",
+                f" {s.energy_start['total']:.5g} -> {energy:.5g}, delivered by {source}",
                 f"  {self.reconstruction}",
                 f"  camera {parts.camera}; {len(parts) - 1} components beside the background",
                 f"  {scores}",
@@ -92,10 +92,6 @@ class Run:
         )
 
     __repr__ = __str__
-
-    @property
-    def _source(self) -> str:
-        return "the refinement" if self.refined else self.delivered
 
     @cached_property
     def components(self) -> Components:

@@ -66,17 +66,12 @@ def colourise_error(relative_error: Float) -> Image:
     Args:
         relative_error: (H, W) |z_gt - z| / z_gt; grey where not finite.
     """
-    error = np.abs(relative_error)
-    known = np.isfinite(error)
-    level = np.minimum(np.where(known, error, 0.0) / ERROR_LIMIT, 1.0)
-    return _paint(level, known, "inferno")
+    return _paint_up_to(ERROR_LIMIT, np.abs(relative_error), "inferno")
 
 
 def colourise_sigma(sigma: Float) -> Image:
     """Standard deviation of log depth (H, W) in colour, from 0 (dark) to `SIGMA_LIMIT` (bright)."""
-    known = np.isfinite(sigma)
-    level = np.clip(np.where(known, sigma, 0.0) / SIGMA_LIMIT, 0.0, 1.0)
-    return _paint(level, known, "viridis")
+    return _paint_up_to(SIGMA_LIMIT, sigma, "viridis")
 
 
 def component_colours(count: int) -> Image:
@@ -98,6 +93,12 @@ def wheel_key(size: int = 64) -> Image:
     out = colourise_flow(np.stack([u, v], axis=2), 1.0)
     out[np.hypot(u, v) > 1] = 255
     return out
+
+
+def _paint_up_to(limit: float, value: Float, name: str) -> Image:
+    """(H, W, 3) colours of values (H, W) from 0 to a limit, grey where not finite."""
+    known = np.isfinite(value)
+    return _paint(np.clip(np.where(known, value, 0.0) / limit, 0.0, 1.0), known, name)
 
 
 def _paint(level: NDArray[np.float64], known: Mask, name: str) -> Image:

@@ -30,15 +30,13 @@ def _convergence(shown: Shown) -> list[str]:
 
 def _flow(shown: Shown) -> list[str]:
     """Unusable flow, and pixels that leave the image."""
-    confidence = shown.array("input/confidence")
-    share = float((np.asarray(confidence) > 0).mean())
-    out = []
-    if share < USABLE:
-        out.append(
-            f"The flow is usable at {share:.0%} of the pixels; the rest takes its depth from its"
-            " surroundings. Try a better flow (flow.source), or frames closer in time."
-        )
-    return out
+    share = float((np.asarray(shown.array("input/confidence")) > 0).mean())
+    if share >= USABLE:
+        return []
+    return [
+        f"The flow is usable at {share:.0%} of the pixels; the rest takes its depth from its"
+        " surroundings. Try a better flow (flow.source), or frames closer in time."
+    ]
 
 
 def _parallax(shown: Shown) -> list[str]:

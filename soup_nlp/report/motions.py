@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -73,9 +74,16 @@ def trajectory(result: Result) -> str:
         " reference frame's camera coordinates",
         f"# axes: {AXES}; timestamp: frame number; unit: {result.unit}",
     ]
-    for k, pose in enumerate((still, result.components.camera.inverse)):
-        lines.append(f"{k} " + " ".join(f"{x:.9g}" for x in (*pose.t, *pose.quaternion)))
-    return "\n".join(lines) + "\n"
+    return tum_text(lines, (still, result.components.camera.inverse))
+
+
+def tum_text(comments: Sequence[str], poses: Sequence[RigidMotion]) -> str:
+    """Poses in the format of the TUM benchmark, below some comments."""
+    lines = [
+        f"{k} " + " ".join(f"{x:.9g}" for x in (*pose.t, *pose.quaternion))
+        for k, pose in enumerate(poses)
+    ]
+    return "\n".join([*comments, *lines]) + "\n"
 
 
 def _motion(motion: RigidMotion) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -205,13 +206,18 @@ def relative_error(shown: Shown) -> Float | None:
     return error
 
 
+def _share_bar(colourise: Callable[[Float], Image], limit: float, steps: int) -> Bar:
+    """Legend of shares from 0 to a limit and above, with values at some steps."""
+    texts = [f"{100 * x:.0f} %" for x in np.linspace(0, limit, steps)]
+    texts[-1] = f"\u2265 {texts[-1]}"
+    return Bar(colourise(np.linspace(0, limit, 128)[None]), tuple(texts))
+
+
 def _error(shown: Shown) -> list[Picture]:
     error = relative_error(shown)
     if error is None:
         return []
-    colours = colourise_error(np.linspace(0, ERROR_LIMIT, 128)[None])
-    texts = tuple(f"{100 * x:.0f} %" for x in np.linspace(0, ERROR_LIMIT, 5))
-    bar = Bar(colours, (*texts[:-1], f"\u2265 {texts[-1]}"))
+    bar = _share_bar(colourise_error, ERROR_LIMIT, 5)
     title = "depth error relative to the truth; grey = no truth"
     return [Picture("error", title, colourise_error(_enlarged(error)), bar)]
 
@@ -220,9 +226,7 @@ def _sigma(shown: Shown) -> list[Picture]:
     sigma = shown.array("depth/sigma_ref")
     if sigma is None:
         return []
-    colours = colourise_sigma(np.linspace(0, SIGMA_LIMIT, 128)[None])
-    texts = tuple(f"{100 * x:.0f} %" for x in np.linspace(0, SIGMA_LIMIT, 4))
-    bar = Bar(colours, (*texts[:-1], f"\u2265 {texts[-1]}"))
+    bar = _share_bar(colourise_sigma, SIGMA_LIMIT, 4)
     title = "expected depth error (1 sigma); bright = a guess"
     return [Picture("confidence", title, colourise_sigma(sigma), bar)]
 

@@ -31,7 +31,6 @@ class Scene:
         motion: (N, 9) motion of every superpixel relative to the background: rotation vector w,
             pivot p and shift s; at time t a point X is at exp(t w) (X - p) + p + t s.
         motion_camera: (N, 9) the same relative to the camera.
-        component: (N,) rigid component.
         guess: (N,) the depth comes from neighbours.
         seen: (h, w) pixels that are visible in the next frame.
         surface: (h - 1, w - 1) cells of four pixels without a jump of the depth.
@@ -46,7 +45,6 @@ class Scene:
     planes: Float
     motion: Float
     motion_camera: Float
-    component: Int
     guess: Mask
     surface: Mask
     seen: Mask
@@ -58,7 +56,7 @@ class Scene:
 
 def make_scene(shown: Shown) -> Scene:
     """The 3D view of a result."""
-    rec, component = shown.reconstruction, shown.components.of_superpixel
+    rec = shown.reconstruction
     step = int(np.ceil(np.sqrt(max(rec.labels.size / MOST_PIXELS, 1.0))))
     every = slice(None, None, step)
     n, lam, scale = shown.soup("n"), shown.soup("lam"), shown.scale
@@ -76,7 +74,6 @@ def make_scene(shown: Shown) -> Scene:
         planes=inverse_depth(n, scale * lam * shown.soup("d")),
         motion=_motion(camera.R @ R, camera(T), pivot),
         motion_camera=_motion(R, T, pivot),
-        component=component,
         guess=np.asarray(shown.tree["start"]["borrowed"], bool) & (not shown.bending),
         surface=_surface(shown, step),
         seen=~hidden(rec)[every, every],

@@ -9,6 +9,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError
+from soup_nlp.geometry.graph import connected
 
 MIN_PIXELS = 200
 """Links with fewer pixels are flagged."""
@@ -73,14 +74,11 @@ def solve_scales(count: int, links: Sequence[Link]) -> Float:
         DataError: a pair is linked to no other.
     """
     from scipy.optimize import least_squares
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
 
     ends = np.array([(k.first, k.second) for k in links], np.int64).reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    parts, part = connected_components(graph, directed=False)
-    if parts > 1:
-        alone = int(np.argmax(part != part[0]))
+    part = connected(ends, count)
+    if part.any():
+        alone = int(np.argmax(part > 0))
         raise DataError("a pair shares no pixel with the others", where=f"pair {alone}")
     if count == 1:
         return np.ones(1)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.evaluate.metrics import overlap_shares
 from soup_nlp.geometry.soup import Reconstruction
 
 Labels = NDArray[np.integer]
@@ -32,12 +33,7 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
         Label after by label before, matched greedily by overlap.
     """
     known = before >= 0
-    old, new = before[known].astype(np.int64), after[known].astype(np.int64)
-    count = int(after.max()) + 1
-    both = np.bincount(old * count + new, minlength=(int(before.max()) + 1) * count)
-    both = both.reshape(-1, count)
-    union = both.sum(axis=0) + both.sum(axis=1, keepdims=True) - both
-    share = both / np.maximum(union, 1)
+    share = overlap_shares(before[known], after[known])
     # the background has no track
     share[0], share[:, 0] = 0, 0
     out: dict[int, int] = {}

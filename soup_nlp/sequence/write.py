@@ -12,6 +12,7 @@ import numpy as np
 from soup_nlp.arrays import Image
 from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.figures import depth_png_scale, write_clipped_depth_png16
+from soup_nlp.report.motions import tum_text
 from soup_nlp.report.pointcloud import AXES, write_ply
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.page import chain_page
@@ -95,10 +96,8 @@ def pixels(chain: Chain, track: int) -> dict[int, int]:
 
 def trajectory(chain: Chain) -> str:
     """Poses of the camera in the format of the TUM benchmark, world_from_camera."""
-    lines = [f"# timestamp tx ty tz qx qy qz qw; timestamp: frame number; unit: {UNIT}"]
-    for k, pose in enumerate(chain.world_from_camera):
-        lines.append(f"{k} " + " ".join(f"{x:.9g}" for x in (*pose.t, *pose.quaternion)))
-    return "\n".join(lines) + "\n"
+    head = f"# timestamp tx ty tz qx qy qz qw; timestamp: frame number; unit: {UNIT}"
+    return tum_text([head], chain.world_from_camera)
 
 
 def images(chain: Chain) -> list[Image]:

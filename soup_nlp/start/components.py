@@ -8,7 +8,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.camera import rays
-from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.graph import Segmentation, connected
 from soup_nlp.geometry.soup import Soup
 
 
@@ -20,16 +20,7 @@ def connected_pieces(mask: Mask, seg: Segmentation) -> Int:
 
 def connected_labels(hold: Mask, seg: Segmentation) -> Int:
     """(N,) connected component of every superpixel, joined by the pairs that `hold` (P,) marks."""
-    return _connected(seg.pairs[hold], len(seg))
-
-
-def _connected(links: Int, count: int) -> Int:
-    """(count,) component of every node of a graph with these links (L, 2)."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_matrix((np.ones(len(links)), tuple(links.T)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    return connected(seg.pairs[hold], len(seg))
 
 
 def rigid_components(label: Int, seg: Segmentation) -> Int:
@@ -235,7 +226,7 @@ def nearer_where_cut_off(
     count = len(log_scale)
     scene = int(np.argmax(np.bincount(label, minlength=count)))
     ends = label[seg.pairs]
-    group_of = _connected(ends[(ends != scene).all(axis=1)], count)
+    group_of = connected(ends[(ends != scene).all(axis=1)], count)
     group, groups = group_of[label], int(group_of.max()) + 1
     # support of a group, visible and beyond the border, weighted by the squared height difference
     around = outlines(group, seg)

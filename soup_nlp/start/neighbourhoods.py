@@ -75,13 +75,8 @@ def _square(x: Float, y: Float) -> Float:
     return x * x + y * y
 
 
-def face_forward(R: Float, t: Float, r: Float, q: Float, weight: Float) -> Float:
-    """t (N, 3) with the sign that makes most depths positive."""
-    return _facing(t, R @ _rows(r), _rows(q), weight)
-
-
 def _facing(t: Float, y: Float, q: Float, weight: Float) -> Float:
-    """`face_forward` for rotated rays y and next rays q, both (N, 3, M)."""
+    """t (N, 3) with the sign that makes most depths positive, of rays y (turned), q (N, 3, M)."""
     s = t[..., None]
     dot = (y[:, 0] - q[:, 0] * y[:, 2]) * (s[:, 0] - q[:, 0] * s[:, 2])
     dot += (y[:, 1] - q[:, 1] * y[:, 2]) * (s[:, 1] - q[:, 1] * s[:, 2])
