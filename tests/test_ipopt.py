@@ -13,7 +13,7 @@ from helpers_model import hessian, value
 
 from soup_nlp.errors import SolverError
 from soup_nlp.model.kernel import Group, Kernel, Table
-from soup_nlp.model.nlp import NLP, assemble
+from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import optimality
@@ -26,7 +26,7 @@ def make_nlp(
     groups: list[Group], x0: list[float], lbx, ubx, lbg, ubg, hessian: str = "exact"
 ) -> NLP:
     n, m = len(x0), len(lbg)
-    return assemble(
+    return NLP(
         "textbook",
         tuple(groups),
         x0=np.array(x0, float),

@@ -81,7 +81,8 @@ def test_casadi_reads_back_every_formulation(form, tmp_path):
 def test_parameters_and_start_are_written(tmp_path):
     nlp, _ = Tiny().nlp(PAPER, FORMS[0])
     p = nlp.with_theta(eps=0.5)
-    back = ReadBack(write_nl(tmp_path / "a.nl", replace(nlp, p=p, x0=nlp.x0 + 0.25)).path)
+    other = replace(nlp, theta={**nlp.theta, "eps": 0.5}, x0=nlp.x0 + 0.25)
+    back = ReadBack(write_nl(tmp_path / "a.nl", other).path)
     file = write_nl(tmp_path / "b.nl", nlp)
     assert np.array_equal(back.x0, (nlp.x0 + 0.25)[file.variables])
     f = float(back.values(nlp.x0[file.variables])[0])

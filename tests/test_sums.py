@@ -19,7 +19,7 @@ from soup_nlp.model.lanes import LANES, NoLanesError, compile_lanes, in_lanes
 from soup_nlp.model.layout import Chart
 from soup_nlp.model.mapped import Mapped
 from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.nlp import NLP, assemble
+from soup_nlp.model.nlp import NLP
 from soup_nlp.model.sums import Sums, interpreted
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import Case
@@ -64,7 +64,7 @@ def squares(elements: int, compiled: bool = True) -> NLP:
         np.column_stack([e + 1, 0 * e]), np.linspace(1.0, 2.0, elements)[:, None], e[:, None]
     )
     n = elements + 1
-    return assemble(
+    return NLP(
         "squares",
         (Group(kernel, table),),
         x0=np.linspace(0.5, 1.5, n),

@@ -14,7 +14,7 @@ from soup_nlp.arrays import Float, Int
 from soup_nlp.model.elements import Element, Norms
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
-from soup_nlp.model.nlp import NLP, assemble
+from soup_nlp.model.nlp import NLP
 from soup_nlp.model.norms import NormForm, TruncationForm, solver_form
 from soup_nlp.model.superpixel import View
 
@@ -157,9 +157,9 @@ class Builder:
         lbx, ubx = np.concatenate([lbx, lower]), np.concatenate([ubx, upper])
         lbg, ubg = _bounds(self.rows)
         f = self.form
-        nlp = assemble(
+        nlp = NLP(
             name,
-            tuple(self.groups),
+            tuple(g for g in self.groups if g.size),
             x0=np.clip(np.concatenate([x0, 0.0 * lower]), lbx, ubx),
             lbx=lbx,
             ubx=ubx,

@@ -28,11 +28,10 @@ class NLP:
 
     Attributes:
         name: For reports.
-        groups: Kernels and tables that f and g are the sums of.
+        groups: Kernels and tables that f and g are the sums of, none of them empty.
         x0, lbx, ubx: (nx,) start and bounds.
         lbg, ubg: (ng,) constraint bounds.
-        p: (np,) parameter values: theta, then the data of every group, element by element.
-        theta: Names of the leading entries of p.
+        theta: Values of the parameters that all kernels share, by name in the kernels' order.
         hessian: Kind of the Hessian (kernel.HESSIANS).
         x_names, g_names: Functions that make the readable names, on demand.
         compiled: Use the C compiler where there is one.
@@ -45,12 +44,17 @@ class NLP:
     ubx: Float
     lbg: Float
     ubg: Float
-    p: Float
-    theta: tuple[str, ...]
+    theta: Mapping[str, float]
     hessian: Hessian
     x_names: Callable[[], list[str]]
     g_names: Callable[[], list[str]]
     compiled: bool = True
+
+    @cached_property
+    def p(self) -> Float:
+        """(np,) parameter values: theta, then the data of every group, element by element."""
+        data = [g.table.data.ravel() for g in self.groups]
+        return np.concatenate([np.array(list(self.theta.values()), float), *data])
 
     @cached_property
     def functions(self) -> Functions:
@@ -116,7 +120,7 @@ class NLP:
         for name, value in values.items():
             if name not in self.theta:
                 raise ModelError("unknown parameter", found=name, expected=", ".join(self.theta))
-            p[self.theta.index(name)] = value
+            p[list(self.theta).index(name)] = value
         return p
 
     def sizes(self) -> dict[str, int]:
@@ -162,56 +166,6 @@ def _bound_bars(label: str, lower: Float, upper: Float) -> list[str]:
     counts = {kind: int(mask.sum()) for kind, mask in kinds.items() if mask.any()}
     bars = {kind: "#" * max(1, round(20 * c / len(lower))) for kind, c in counts.items()}
     return [f"  {label:<11} {kind:<6} {bars[kind]:<20} {c}" for kind, c in counts.items()]
-
-
-def assemble(
-    name: str,
-    groups: tuple[Group, ...],
-    *,
-    x0: Float,
-    lbx: Float,
-    ubx: Float,
-    lbg: Float,
-    ubg: Float,
-    theta: Mapping[str, float],
-    hessian: Hessian,
-    x_names: Callable[[], list[str]],
-    g_names: Callable[[], list[str]],
-    compiled: bool = True,
-) -> NLP:
-    """The NLP of kernels and tables, empty tables left out.
-
-    Args:
-        name: As of `NLP`, like all that are not named here.
-        groups: Kernels and tables.
-        x0: Start.
-        lbx: Lower bounds of x.
-        ubx: Upper bounds of x.
-        lbg: Lower bounds of g.
-        ubg: Upper bounds of g.
-        theta: Values of the shared parameters, in the kernels' order.
-        hessian: Kind of the Hessian.
-        x_names: Makes the variables' names.
-        g_names: Makes the constraints' names.
-        compiled: Use the C compiler where there is one.
-    """
-    groups = tuple(g for g in groups if g.size)
-    data = [g.table.data.ravel() for g in groups]
-    return NLP(
-        name=name,
-        groups=groups,
-        x0=x0,
-        lbx=lbx,
-        ubx=ubx,
-        lbg=lbg,
-        ubg=ubg,
-        p=np.concatenate([np.array(list(theta.values()), float), *data]),
-        theta=tuple(theta),
-        hessian=hessian,
-        x_names=x_names,
-        g_names=g_names,
-        compiled=compiled,
-    )
 
 
 def to_scipy(matrix: ca.DM) -> sparse.csc_matrix:

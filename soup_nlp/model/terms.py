@@ -86,21 +86,11 @@ def continuity(
         f = f * _nearness(a.anchor(row["ray_i"]), b.anchor(row["ray_k"]))
     else:
         eps = eps * row["pixel"]
+    sigma_ref = row["sigma_ref"] if ref_truncated else None
+    sigma = row["sigma"] if truncated else None
     return [
-        Norm(
-            "gap_ref",
-            row["weight"],
-            f * ca.vertcat(*before),
-            eps,
-            row["sigma_ref"] if ref_truncated else None,
-        ),
-        Norm(
-            "gap_next",
-            row["weight"],
-            f * ca.vertcat(*after),
-            eps,
-            row["sigma"] if truncated else None,
-        ),
+        Norm("gap_ref", row["weight"], f * ca.vertcat(*before), eps, sigma_ref),
+        Norm("gap_next", row["weight"], f * ca.vertcat(*after), eps, sigma),
     ]
 
 
