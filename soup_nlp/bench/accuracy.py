@@ -208,10 +208,7 @@ def _applies(truth: Truth | None, convention: Preset) -> bool:
 
 
 def _metrics(
-    truth: Truth | None,
-    maps: Mapping[str, Float],
-    convention: Preset,
-    sigma: Float | None = None,
+    truth: Truth | None, maps: Mapping[str, Float], convention: Preset, sigma: Float | None = None
 ) -> dict[str, dict[str, float]]:
     """Metrics of every method under one convention; {} where it does not apply."""
     if truth is None or "constant" not in maps or not _applies(truth, convention):

@@ -271,11 +271,7 @@ def _changes(section: str, method: str, s: Sizes) -> dict[str, Overrides]:
         return {str(k): (f"segmentation.neighbours={k}",) for k in s.neighbours}
     if section == "pattern":
         return {m: (f"segmentation.method={m}",) for m in ("slic", "grid")}
-    return {
-        "NLP": ("refine.enabled=false",),
-        "refinement": ("refine.from_start=true",),
-        "both": (),
-    }
+    return {"NLP": ("refine.enabled=false",), "refinement": ("refine.from_start=true",), "both": ()}
 
 
 def make_plan(data: Path | None, sizes: Sizes) -> Plan:

@@ -165,11 +165,7 @@ class _Descent:
 
 
 def _descend(
-    descent: _Descent,
-    eps: Sequence[float],
-    iterations: int,
-    end: float,
-    note: Callable[[], None],
+    descent: _Descent, eps: Sequence[float], iterations: int, end: float, note: Callable[[], None]
 ) -> tuple[int, str]:
     """Descend with every smoothing width in turn until the time `end`; steps and status."""
     count, status = 0, "Converged"

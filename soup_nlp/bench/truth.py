@@ -136,12 +136,7 @@ def _facing(m: Float, seg: Segmentation, K: Float, depth: Float) -> Float:
 
 
 def _motions(
-    truth: Truth,
-    seg: Segmentation,
-    component: Int,
-    mine: Mask,
-    depth: Float,
-    K: Float,
+    truth: Truth, seg: Segmentation, component: Int, mine: Mask, depth: Float, K: Float
 ) -> tuple[Float, Float, Mask]:
     """(N, 3, 3) rotations, (N, 3) translations, (N,) whether they are known."""
     n = len(seg)

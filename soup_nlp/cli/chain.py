@@ -37,8 +37,7 @@ AUTO = "auto"
 
 def chain(
     source: Annotated[
-        list[str],
-        typer.Argument(help="Folder, images, 'pattern/*.jpg', video, or scene:NAME."),
+        list[str], typer.Argument(help="Folder, images, 'pattern/*.jpg', video, or scene:NAME.")
     ],
     out: options.Out = Path("out/chain"),
     intrinsics: Annotated[

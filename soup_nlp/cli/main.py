@@ -223,8 +223,7 @@ def _version(asked: bool) -> None:
 
 
 app = _group(
-    "Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.",
-    COMMANDS,
+    "Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.", COMMANDS
 )
 app.add_typer(_group("Measure over many runs; tables, plots and gates.", BENCH), name="bench")
 
@@ -232,8 +231,7 @@ app.add_typer(_group("Measure over many runs; tables, plots and gates.", BENCH),
 @app.callback()
 def every(
     version: Annotated[
-        bool,
-        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program."""

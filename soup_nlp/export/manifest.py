@@ -36,10 +36,7 @@ _Best = _record("Best", exact_energy=FiniteFloat, found_by=str)
 _Manifest = _record(
     "Manifest",
     formulation=_record(
-        "Formulation",
-        gauge=Literal[GAUGES],
-        norm=Literal[NORMS],
-        truncation=Literal[TRUNCATIONS],
+        "Formulation", gauge=Literal[GAUGES], norm=Literal[NORMS], truncation=Literal[TRUNCATIONS]
     ),
     smoothing=_record("Smoothing", eps=FiniteFloat, eps_pixel=FiniteFloat),
     fingerprint=_record("Fingerprint", objective=FiniteFloat, constraints=FiniteFloat),

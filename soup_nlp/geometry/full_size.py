@@ -80,12 +80,7 @@ def _borders(labels: Labels) -> Mask:
 
 
 def _voted(
-    labels: Labels,
-    small: Image,
-    colour: Image,
-    place: Float,
-    row: Int,
-    column: Int,
+    labels: Labels, small: Image, colour: Image, place: Float, row: Int, column: Int
 ) -> Labels:
     """(P,) label with the most votes for pixels of a colour (P, 3) at places (2, P) (y, x)."""
     h, w = labels.shape

@@ -142,19 +142,13 @@ def _fold(knn: Int) -> tuple[Int, Int]:
 
 
 def _shared_boundaries(
-    labels: NDArray[np.int32],
-    image: Image,
-    beta_colour: float,
-    samples: int | None,
+    labels: NDArray[np.int32], image: Image, beta_colour: float, samples: int | None
 ) -> tuple[Int, Float, Int, Float]:
     width = labels.shape[1]
     n = int(labels.max()) + 1
     index = np.arange(labels.size).reshape(labels.shape)
     first, second = [], []
-    for a, b in (
-        (index[:, :-1], index[:, 1:]),
-        (index[:-1], index[1:]),
-    ):
+    for a, b in ((index[:, :-1], index[:, 1:]), (index[:-1], index[1:])):
         differ = labels.ravel()[a] != labels.ravel()[b]
         first.append(a[differ])
         second.append(b[differ])

@@ -71,11 +71,7 @@ def _corner(eps: ca.SX, sigma: ca.SX) -> ca.SX:
 
 
 def solver_form(
-    norm: Norm,
-    x: ca.SX,
-    theta: ca.SX,
-    slack: ca.SX | None,
-    switch: ca.SX | None,
+    norm: Norm, x: ca.SX, theta: ca.SX, slack: ca.SX | None, switch: ca.SX | None
 ) -> Form:
     """The norm as a solver sees it.
 

@@ -86,12 +86,7 @@ def at_occlusions(
 
 
 def across_discontinuities(
-    data: EnergyData,
-    surface: Int,
-    *,
-    arap: float = 1.0,
-    cont: float = 1.0,
-    orient: float = 1.0,
+    data: EnergyData, surface: Int, *, arap: float = 1.0, cont: float = 1.0, orient: float = 1.0
 ) -> EnergyData:
     """The same data with terms times a factor each from one surface to another.
 
@@ -169,8 +164,5 @@ def in_length(data: EnergyData, soup: Soup, length: str) -> EnergyData:
     # lengths have sum_i c_i D_i = 1, shares c add up to 1; the unit is that of sum_i s_i D_i = 1
     unit = float(share.sum())
     return replace(
-        data,
-        share=share / unit,
-        edge_unit=unit * data.edge_unit,
-        pair_unit=unit * data.pair_unit,
+        data, share=share / unit, edge_unit=unit * data.edge_unit, pair_unit=unit * data.pair_unit
     )

@@ -99,13 +99,7 @@ def matrix_view(x: ca.SX, gauge: str, offset: ca.SX) -> View:
 
 
 def tangent_view(
-    x: ca.SX,
-    anchor: ca.SX,
-    radius: ca.SX,
-    depth: ca.SX,
-    R0: ca.SX,
-    t0: ca.SX,
-    chart: str = "depth",
+    x: ca.SX, anchor: ca.SX, radius: ca.SX, depth: ca.SX, R0: ca.SX, t0: ca.SX, chart: str = "depth"
 ) -> View:
     """View of the presolve's variables of one superpixel.
 

@@ -134,14 +134,5 @@ class Vectors:
 
 
 _UNARY = frozenset(
-    (
-        ca.OP_ASSIGN,
-        ca.OP_NEG,
-        ca.OP_SQ,
-        ca.OP_TWICE,
-        ca.OP_INV,
-        ca.OP_SQRT,
-        ca.OP_FABS,
-        ca.OP_NOT,
-    )
+    (ca.OP_ASSIGN, ca.OP_NEG, ca.OP_SQ, ca.OP_TWICE, ca.OP_INV, ca.OP_SQRT, ca.OP_FABS, ca.OP_NOT)
 )

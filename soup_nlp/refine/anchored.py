@@ -8,12 +8,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.plane import (
-    about_anchor,
-    at_anchor,
-    inverse_depth,
-    normal_and_distance,
-)
+from soup_nlp.geometry.plane import about_anchor, at_anchor, inverse_depth, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.refine.costs import Particles
 

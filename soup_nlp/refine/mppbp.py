@@ -314,11 +314,7 @@ def _record(
 
 
 def _learn(
-    proposer: Proposer,
-    shares: dict[str, float],
-    drawn: Proposals,
-    labels: Int,
-    done: Round,
+    proposer: Proposer, shares: dict[str, float], drawn: Proposals, labels: Int, done: Round
 ) -> None:
     """Adapt steps and shares of the kinds to the accepted proposals."""
     own = np.arange(len(labels))

@@ -84,14 +84,8 @@ FORMATS: Mapping[str, tuple[Writer, str]] = {
     ),
     "glb": (_both_frames("mesh_{}.glb", write_glb), "textured meshes, glTF 2.0"),
     "colmap": (_colmap, "COLMAP's text model with images and masks of what moves"),
-    "npy": (
-        _both_frames("depth_{}.npy", _write_npy),
-        "depth as float32 arrays",
-    ),
-    "pfm": (
-        _both_frames("depth_{}.pfm", _write_pfm),
-        "depth as portable float maps",
-    ),
+    "npy": (_both_frames("depth_{}.npy", _write_npy), "depth as float32 arrays"),
+    "pfm": (_both_frames("depth_{}.pfm", _write_pfm), "depth as portable float maps"),
     "png": (_png, "depth as 16-bit PNG"),
     "rrd": (_rrd, "a recording for the Rerun viewer (extra: rerun)"),
     "motions": (_motions, "motions.json and the camera's trajectory (TUM)"),

@@ -22,11 +22,7 @@ if TYPE_CHECKING:
 
 
 def save(
-    run: Run,
-    folder: str | Path,
-    config: str,
-    formats: Sequence[str] = (),
-    overwrite: bool = False,
+    run: Run, folder: str | Path, config: str, formats: Sequence[str] = (), overwrite: bool = False
 ) -> list[str]:
     """Write the result folder of a run, see `Run.save`; `config` is its merged problem as YAML."""
     none = formats is None or (isinstance(formats, list | tuple) and not formats)

@@ -58,11 +58,7 @@ _ENERGY: Table = {
     "pair_weight": ("1", "P", "w4, both directions folded, less where one component hides another"),
     "pair_factor": ("1", "P", "sqrt(boundary length / B): stands for the whole boundary"),
     "pair_unit": ("1", "P", "length unit of a pair, see local_units"),
-    "orient_weight": (
-        "1",
-        "P",
-        "weight of E_orient: 2 directions, less across discontinuities",
-    ),
+    "orient_weight": ("1", "P", "weight of E_orient: 2 directions, less across discontinuities"),
     "rim_ray": ("1", "N,V,3", "rays where visibility is imposed, the anchor first"),
     "share": ("1", "N", "weights c of the length unit sum_i c_i D_i = 1"),
     "local_units": ("1", "", "units are shares of the depths of two anchors, power mean -4"),

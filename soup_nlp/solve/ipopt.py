@@ -85,13 +85,7 @@ class _Iterations(IterationCallback):
     """CasADi's iteration callback: progress, limits, the best iterate."""
 
     def __init__(
-        self,
-        nlp: NLP,
-        x0: Float,
-        stage: str,
-        watch: Watch,
-        seconds: float,
-        stagnation: float,
+        self, nlp: NLP, x0: Float, stage: str, watch: Watch, seconds: float, stagnation: float
     ) -> None:
         super().__init__()
         self.stagnation, self.last_f, self.still = stagnation, np.inf, 0

@@ -78,10 +78,7 @@ def optimality(nlp: NLP, x: Float, lam_x: Float, lam_g: Float) -> dict[str, floa
             # the multiplier of an infinite bound does not count
             absent = mult[~np.isfinite(gap) & (mult > 0)]
             products.append(float(absent.max(initial=0.0)))
-    return {
-        "dual_infeasibility": float(np.abs(dual).max()),
-        "complementarity": max(products),
-    }
+    return {"dual_infeasibility": float(np.abs(dual).max()), "complementarity": max(products)}
 
 
 def residuals(

@@ -87,12 +87,7 @@ def ground(mu: Float, ray: Float, weight: Float, known: Mask, seed: int) -> Floa
 
 
 def above_ground(
-    soup: Soup,
-    ray: Float,
-    weight: Float,
-    known: Mask,
-    component: Int,
-    floor: Float,
+    soup: Soup, ray: Float, weight: Float, known: Mask, component: Int, floor: Float
 ) -> tuple[Soup, Mask]:
     """The soup with unreliable or independently moving parts lifted to the ground.
 

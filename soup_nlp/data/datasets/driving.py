@@ -162,12 +162,7 @@ def _scene_flow(
 
 
 def load_vkitti(
-    benchmark: str,
-    root: PathLike,
-    scene: str,
-    frame: int,
-    variation: str = "clone",
-    step: int = 1,
+    benchmark: str, root: PathLike, scene: str, frame: int, variation: str = "clone", step: int = 1
 ) -> Pair:
     """Load a pair of Virtual KITTI.
 
