@@ -16,7 +16,7 @@ from soup_nlp.bench.paper_plan import (
     source_of,
     title,
 )
-from soup_nlp.bench.paper_sections import Number, Results, compared_cells, figure
+from soup_nlp.bench.paper_sections import Number, Results, figure
 from soup_nlp.bench.processes import processor
 from soup_nlp.bench.published import COMPARISON, DATA, SOURCE
 from soup_nlp.bench.tables import failures, mean, metric, page_text, provenance, show, table
@@ -85,11 +85,11 @@ def _comparison(out: Path, r: Results) -> list[str]:
         own: dict[str, Number] = {"published": known["Superpixel Soup"]}
         cells = []
         for method in METHODS:
-            here = compared_cells(r, items, method)
+            here = [r.compared(i, method) for i in items]
             own[method] = mean(r.mre(c) for c in here)
             capped = mean(r.mre(c, d.cap) for c in here) if d.cap else None
             cells += [show(own[method]), show(mean(r.mre(c, "best") for c in here)), show(capped)]
-        first = compared_cells(r, items, "defaults")
+        first = [r.compared(i, "defaults") for i in items]
         own["constant depth"] = mean(r.mre(c, "paper", "constant") for c in first)
         rigid = mean(r.mre(c, "paper", "rigid") for c in first)
         if own["defaults"] is not None:
@@ -105,8 +105,8 @@ def _comparison(out: Path, r: Results) -> list[str]:
     lines += _by_pair(r)
     known_pairs = {i.key for group in r.plan.datasets.values() for i in group}
     for item in (i for i in r.plan.analyses if i.key not in known_pairs):
-        by = {m: r.mre(compared_cells(r, [item], m)[0]) for m in METHODS}
-        flat = r.mre(compared_cells(r, [item], "defaults")[0], "paper", "constant")
+        by = {m: r.mre(r.compared(item, m)) for m in METHODS}
+        flat = r.mre(r.compared(item, "defaults"), "paper", "constant")
         bars[title(item)] = {"published": None, **by, "constant depth": flat}
     figures.plot_comparison(out / "comparison.png", bars, "MRE by dataset or pair")
     return [*lines, *figure("comparison", "MRE by dataset")]
@@ -133,7 +133,7 @@ def _by_pair(r: Results) -> list[str]:
     for item in items.values():
         cells = [title(item)]
         for method in METHODS:
-            (cell,) = compared_cells(r, [item], method)
+            cell = r.compared(item, method)
             row = r.row(cell)
             median = metric(row, "paper", "solution", "median_relative")
             start, nlp = r.mre(cell, "paper", "start"), r.mre(cell, "paper", "nlp")
@@ -161,7 +161,7 @@ def _pictures(out: Path, r: Results, stored: Path) -> list[str]:
     items |= {i.key: i for group in r.plan.datasets.values() for i in group[:2]}
     files = {}
     for item in items.values():
-        a, b = (compared_cells(r, [item], m)[0].maps(stored) for m in METHODS)
+        a, b = (r.compared(item, m).maps(stored) for m in METHODS)
         if a.is_file() and b.is_file():
             files[title(item)] = a, b
     text = "Depth maps: image, truth, unorganised soup, preset, defaults"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,15 +50,22 @@ class Results:
         """MRE of a cell."""
         return metric(self.row(cell), convention, method)
 
+    def compared(self, item: Item, method: str) -> Cell:
+        """The cell of a pair by one method in the comparison of both methods."""
+        return self.plan.cell(item, method, superpixels=self.plan.sizes.superpixels)
+
+    def analysed(self) -> Iterator[tuple[str, str, Row]]:
+        """Title, method and row of every measured pair of the analyses."""
+        for item in self.plan.analyses:
+            for method in METHODS:
+                row = self.row(self.compared(item, method))
+                if row.get("ok"):
+                    yield title(item), method, row
+
 
 def figure(name: str, text: str) -> list[str]:
     """Lines that show a figure of the page."""
     return ["", f"![{text}]({name}.png)", ""]
-
-
-def compared_cells(r: Results, items: Sequence[Item], method: str) -> list[Cell]:
-    """The cells of some pairs by one method in the comparison of both methods."""
-    return [r.plan.cell(i, method, superpixels=r.plan.sizes.superpixels) for i in items]
 
 
 def section(out: Path, r: Results, name: str) -> list[str]:
@@ -123,22 +130,13 @@ def convergence(out: Path, r: Results) -> list[str]:
     """Table and figure of the energy over iterations and rounds."""
     curves: dict[str, dict[str, Row]] = {}
     entries = []
-    for item in r.plan.analyses:
-        for method in METHODS:
-            (cell,) = compared_cells(r, [item], method)
-            row = r.row(cell)
-            if not row.get("ok"):
-                continue
-            curves.setdefault(title(item), {})[method] = row["curve"]
-            exact, rounds = row["curve"]["exact"], row["curve"]["rounds"]
-            fall = f"{1 - rounds[-1] / rounds[0]:.1%}" if rounds and rounds[0] else "-"
-            entries.append(
-                [
-                    *[title(item), method, str(row["status"]).replace("_", " ")],
-                    *[str(row["iterations"]), f"{exact[0]:.5g}", f"{exact[1]:.5g}"],
-                    *[str(max(0, len(rounds) - 1)), fall],
-                ]
-            )
+    for pair, method, row in r.analysed():
+        curves.setdefault(pair, {})[method] = row["curve"]
+        exact, rounds = row["curve"]["exact"], row["curve"]["rounds"]
+        fall = f"{1 - rounds[-1] / rounds[0]:.1%}" if rounds and rounds[0] else "-"
+        solve = [str(row["iterations"]), f"{exact[0]:.5g}", f"{exact[1]:.5g}"]
+        status = str(row["status"]).replace("_", " ")
+        entries.append([pair, method, status, *solve, str(max(0, len(rounds) - 1)), fall])
     figures.plot_curves(out / "convergence.png", curves)
     head = ["pair", "method", "constrained NLP", "iterations", "E start", "E NLP", "rounds"]
     text = "Energy over iterations of the solver and rounds of the refinement"
@@ -155,14 +153,10 @@ def time(r: Results) -> list[str]:
     """Table of seconds by stage."""
     stages = ("flow", "segmentation", "start", "nlp", "refine")
     entries = []
-    for item in r.plan.analyses:
-        for method in METHODS:
-            (cell,) = compared_cells(r, [item], method)
-            row = r.row(cell)
-            if row.get("ok"):
-                seconds = [f"{row['stages'].get(s, 0.0):.1f}" for s in stages]
-                size = "x".join(str(v) for v in reversed(row["size"]))
-                entries.append([title(item), method, size, *seconds, f"{row['cpu_seconds']:.1f}"])
+    for pair, method, row in r.analysed():
+        seconds = [f"{row['stages'].get(s, 0.0):.1f}" for s in stages]
+        size = "x".join(str(v) for v in reversed(row["size"]))
+        entries.append([pair, method, size, *seconds, f"{row['cpu_seconds']:.1f}"])
     return [
         *["## Time", ""],
         "Wall seconds by stage, the machine shared with other work, and CPU seconds of all but the"
@@ -244,12 +238,8 @@ def scale(out: Path, r: Results) -> list[str]:
     figures.plot_scale(out / "scale.png", bodies)
     text = "Energy over the scale of one moving body about the truth"
     return [
-        *[
-            "## Does ARAP alone find the scale of what moves?",
-            "",
-            verdict if n else "No bodies.",
-            "",
-        ],
+        "## Does ARAP alone find the scale of what moves?",
+        *["", verdict if n else "No bodies.", ""],
         "The scale (1 is the truth) at which each energy is lowest, planes and motions being true"
         " (rendered scenes: exact; KITTI 2015: PnP on true depth and flow):",
         *["", *table(["body", "superpixels", *heads], entries)],

@@ -86,18 +86,17 @@ def import_(
 ) -> None:
     """Make a result folder of a foreign solver's answer: depth maps, points, residuals."""
     imported = import_sol(folder, sol)
-    run, message = imported.run, imported.sol.message
-    s = run.solution
+    run, s = imported.run, imported.run.solution
     if not np.isfinite([*s.energy.values(), *s.residuals.values()]).all():
         raise ExportError(
             "the answer is no soup: its energy or residuals are not finite",
             where=sol,
-            found=message.splitlines()[0] if message else None,
+            found=imported.sol.headline or None,
             hint=f"soup-nlp check {sol} says what is wrong with it",
         )
     target = prepare_folder(out or folder / "result", run.problem.input_paths(), overwrite)
     text = foreign_verdict(imported)
-    write_folder(target, run, dump_problem(run.problem), f"{message}\n{text}\n", text)
+    write_folder(target, run, dump_problem(run.problem), f"{imported.sol.message}\n{text}\n", text)
     print(text)
     print(f"files       {target}/")
     print(f"next        soup-nlp check {target}")
@@ -109,7 +108,7 @@ def foreign_verdict(imported: Imported) -> str:
     s, sol = imported.run.solution, imported.sol
     word = "verified" if s.converged else "not verified" if sol.solved else "no success claimed"
     start = imported.manifest["exact_energy_at_start"]["total"]
-    said = sol.message.splitlines()[0] if sol.message else "no message"
+    said = sol.headline or "no message"
     lines = [
         f"solver      {said} ({sol.status}, code {sol.code}): {word}",
         # start of the solver, which after a presolve is not the proposal

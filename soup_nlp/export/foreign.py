@@ -83,11 +83,10 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
     best = manifest["best_known"]
     energy = run.solution.energy["total"]
     if renew and run.solution.converged and (best is None or energy < best["exact_energy"]):
-        message = answer.message.splitlines()[0] if answer.message else Path(sol).name
         manifest["best_known"] = {
             "objective": run.solution.stages[-1].objective,
             "exact_energy": energy,
-            "found_by": message,
+            "found_by": answer.headline or Path(sol).name,
         }
         # only this entry of the manifest changes
         with staged(claim(folder, [MANIFEST], overwrite=True)) as new:

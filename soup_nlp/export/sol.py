@@ -40,6 +40,11 @@ class Sol:
     lam_g: Float | None = field(repr=False)
 
     @property
+    def headline(self) -> str:
+        """First line of the message, or ""."""
+        return next(iter(self.message.splitlines()), "")
+
+    @property
     def solved(self) -> bool:
         """Whether the solver claims success."""
         return 0 <= self.code < 100

@@ -52,7 +52,7 @@ class Verdict:
 
     def __str__(self) -> str:
         r, gap = self.residuals, (self.objective - self.best) / abs(self.best)
-        said = self.sol.message.splitlines()[0] if self.sol.message else "no message"
+        said = self.sol.headline or "no message"
         word = "verified" if self.verified else "not verified"
         return "\n".join(
             [
