@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -188,7 +189,7 @@ def test_a_second_step_leads_back_into_a_bent_valley(problem):
     problem.smoothing(LAST.eps)
     at = evaluate(problem, runner.x, 1e-8)
     gradient = problem.gradient(at.x)
-    curvature = runner._curvature(at, "exact")
+    curvature = partial(runner._curvature, at, 0.0)
     runner.newton.begin()
     step = runner.newton.step(at, curvature, gradient, 1e-8, "exact", runner.damping)
     search = Search(problem, at, step.h, 1e-8, step.newton)
@@ -408,12 +409,30 @@ def test_the_energy_never_rises_within_a_phase(solved):
 
 @pytest.mark.parametrize("problem", ["inverse-depth"], indirect=True)
 def test_superlu_ends_at_the_same_point(problem, solved, monkeypatch):
-    monkeypatch.setattr(newton, "factorisation", lambda upper: ("SuperLU", superlu(upper)))
+    monkeypatch.setattr(newton, "factorisation", lambda upper, _: ("SuperLU", superlu(upper)))
     runner = Descent(problem)
     last = [runner.run(p) for p in (*PHASES, LAST)][-1]
     assert runner.newton.library == "SuperLU"
     assert last.converged
     assert last.objective == pytest.approx(solved[1][-1].objective, rel=1e-3)
+
+
+@pytest.mark.parametrize("problem", ["inverse-depth"], indirect=True)
+@pytest.mark.parametrize("stagnation", [0.0, 1e-12])
+def test_a_merit_that_falls_by_less_than_its_rounding_does_not_end_the_polish(
+    problem, monkeypatch, stagnation
+):
+    runner = Descent(problem)
+    runner.run(PHASES[0])
+    run = Search.run
+
+    def rounded(search, *given):
+        move = run(search, *given)
+        return move._replace(point=move.point._replace(merit=search.at.merit))
+
+    monkeypatch.setattr(Search, "run", rounded)
+    last = runner.run(replace(LAST, tol=1e-8, stagnation=stagnation))
+    assert last.converged == (not stagnation)
 
 
 def test_limits_and_interruption_keep_the_iterate(problem, tmp_path):

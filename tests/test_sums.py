@@ -211,6 +211,48 @@ def test_an_operation_without_a_twin_goes_to_casadi():
 
 
 @needs_compiler
+def test_sums_over_the_elements_of_some_variables_change_as_the_whole_does():
+    count = 5 * LANES + 3
+    nlp = squares(count)
+    sums = Sums(nlp, ["exact"])
+    x, y, lam = nlp.x0, nlp.x0.copy(), np.linspace(0, 1, count)
+    moved = np.zeros(nlp.nx, bool)
+    # element e has the variables e + 1 and 0
+    moved[[1 + LANES, count]] = True
+    y[moved] += 0.1
+    change = sums.value(y) - sums.value(x), sums.gradient(y) - sums.gradient(x)
+    whole, g = sums.hessian("exact", y, lam), sums.constraints(y)[0]
+    sums.only(moved)
+    assert 0 < sums.value(x) < 0.6 * float(nlp.oracle(x, nlp.p)[0])
+    close(sums.value(y) - sums.value(x), change[0])
+    close(sums.gradient(y) - sums.gradient(x), change[1])
+    of_moved = moved[sums.upper.rows] & moved[sums.upper.columns]
+    close(sums.hessian("exact", y, lam)[of_moved], whole[of_moved])
+    close(sums.constraints(y)[0], g)
+    sums.only(None)
+    close(sums.hessian("exact", y, lam), whole, 0)
+
+
+@needs_compiler
+@pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
+def test_superpixels_that_are_held_count_as_where_they_are(case, chart: Chart):
+    problem = TangentProblem(case.soup, case.data, case.weights, Formulation(), chart=chart)
+    x, some = problem.normalise(problem.nlp.x0), np.arange(len(case.data)) == 3
+    y = x.copy()
+    y.reshape(-1, 9)[some] += 0.02
+    # also those that are held are scaled
+    y = problem.normalise(y)
+    assert y[0] != x[0]
+    value, gradient = problem.value(y), problem.gradient(y)
+    assert problem.move(some, x)
+    assert not problem.move(some, y)
+    assert problem.value(y) == pytest.approx(value, rel=1e-12)
+    close(problem.gradient(y), gradient)
+    assert problem.move(None, y)
+    assert problem.value(y) == value
+
+
+@needs_compiler
 def test_every_operation_has_casadis_value(every):
     f = every
     library = compile_lanes([f])
@@ -221,7 +263,7 @@ def test_every_operation_has_casadis_value(every):
     out, none, lanes = np.zeros(LANES * 10), np.zeros(1), in_lanes(data)
     pointers = [ctypes.c_void_p(q.ctypes.data) for q in (x, index, lanes, none)]
     rest = [ctypes.c_void_p(q.ctypes.data) for q in (none, index, places, out)]
-    library.every_sum(ctypes.c_long(1), *pointers, ctypes.c_double(1.0), *rest)
+    library.every_sum(ctypes.c_long(1), None, *pointers, ctypes.c_double(1.0), *rest)
     expected = [np.asarray(f(*pair, [])).ravel() for pair in zip(x.ravel(), data.ravel())]
     np.testing.assert_allclose(out.reshape(LANES, 10), expected, rtol=1e-14)
 

@@ -11,13 +11,14 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, Int
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.model.assemble import Entries, Pattern, hessian_entries, jacobian_entries
 from soup_nlp.model.kernel import Group, Table
 from soup_nlp.model.lanes import Lanes, NoLanesError, Summed, compile_lanes
@@ -93,6 +94,7 @@ class Sums:
             self.upper = Pattern.of((nlp.nx, nlp.nx), [*every, Entries(*(besides or _NOTHING))])
         jacobian_places = iter(self.jacobian.places)
         self._terms: dict[str, list[Summed | Vectors | Mapped]] = {}
+        self._some: dict[str, list[Summed | Vectors | Mapped]] = {}
         self.vectorised = nlp.compiled
         for group, functions, union, upper in zip(nlp.groups, made, unions, self.upper.places):
             size = group.size
@@ -136,6 +138,28 @@ class Sums:
                 )
         return {key: interpreted(f, table, place[key]) for key, f in functions.items()}
 
+    def only(self, some: Mask | None) -> None:
+        """Sum f, its gradient and Hessians only over the elements that some variables are in.
+
+        Kernels that run without machine code are still summed over all their elements.
+
+        Args:
+            some: (nx,) these variables; None for all.
+        """
+        self._some = {}
+        if some is None:
+            return
+        touched: dict[int, NDArray[np.int32]] = {}
+        for key in self._terms.keys() - {"con", "jac"}:
+            self._some[key] = own = []
+            for term in self._terms[key]:
+                if isinstance(term, Summed):
+                    lanes = term.lanes
+                    if id(lanes) not in touched:
+                        touched[id(lanes)] = lanes.touched(some)
+                    term = replace(term, which=touched[id(lanes)])
+                own.append(term)
+
     def _size(self, key: str) -> int:
         nx, ng, _ = self._sizes
         sizes = {"f": 1, "grad": nx, "con": ng, "jac": len(self.jacobian.rows)}
@@ -147,7 +171,7 @@ class Sums:
         theta = _vector("theta", self.theta, thetas)
         # one entry more, for what fills the last block of lanes
         out = np.zeros(self._size(key) + 1)
-        for term in self._terms.get(key, []):
+        for term in self._some.get(key, self._terms.get(key, [])):
             term.add(out, x, theta, lam_f, lam)
         return out[:-1]
 

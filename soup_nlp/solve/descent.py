@@ -21,6 +21,7 @@ import itertools
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cache, partial
 
 import numpy as np
 
@@ -39,7 +40,7 @@ from soup_nlp.solve.line_search import (
     merit,
     reach,
 )
-from soup_nlp.solve.newton import Newton
+from soup_nlp.solve.newton import Curvature, Newton
 from soup_nlp.solve.phase import Convergence, Phase
 from soup_nlp.solve.tangent_problem import HessianKind, TangentProblem
 from soup_nlp.storage.progress import Progress, Watch
@@ -105,8 +106,8 @@ class Descent:
         calls = problem.calls()
         at, gradient = self._begin(phase)
         assert self.z is not None
-        curvature: tuple[Float, Float] | None = None
-        small, patient, slow = 0, PATIENCE, False
+        curvature: Curvature | None = None
+        small, patient, slow, least = 0, PATIENCE, False, np.inf
         barrier = max(phase.highest, phase.barrier)
         history: list[tuple[float, ...]] = []
         convergence = Convergence(phase)
@@ -117,14 +118,21 @@ class Descent:
             self._tell(phase, iteration, history[-1], begin)
             if convergence.met(at, self.z, history[-1]):
                 break
+            if not phase.stagnation and dual < least:
+                # near the solution the merit's decrease is below its rounding, the gradient's not
+                small = 0
+            least = min(least, dual)
             status = self._stopped(phase, iteration, small)
             if status:
                 break
             barrier = max(phase.barrier, min(barrier, 1e-6 * dual))
-            at = at._replace(merit=merit(at.f, at.slack, barrier))
             newton.choose(residual, slow)
+            if problem.move(newton.moving, at.x):
+                # the same f but for its rounding, which can exceed a step's decrease
+                at, curvature = at._replace(f=problem.value(at.x)), None
+            at = at._replace(merit=merit(at.f, at.slack, barrier))
             if curvature is None:
-                curvature = self._curvature(at, phase.hessian, nu)
+                curvature = cache(partial(self._curvature, at, nu))
             step = newton.step(at, curvature, gradient, barrier, phase.hessian, self.damping)
             search = Search(problem, at, step.h, barrier, step.newton)
             move = search.run(gradient, step.bent)
@@ -146,6 +154,7 @@ class Descent:
             self._step_multipliers(at, step.h, barrier, move.point)
             at, self.x, curvature = move.point, move.point.x, None
             gradient = search.gradient(at.x)
+        problem.move(None, at.x)
         if convergence.reached:
             status = "Solve_Succeeded"
             # the last step may have made the residual larger
@@ -158,6 +167,7 @@ class Descent:
     def _begin(self, phase: Phase) -> tuple[Point, Float]:
         """Set the problem, multipliers and damping for a phase; the iterate and its gradient."""
         self.problem.smoothing(phase.eps)
+        self.problem.move(None, self.x)
         at = evaluate(self.problem, self.x, phase.barrier)
         assert at is not None, "the iterate is inside its bounds"
         if self.z is None:
@@ -229,19 +239,15 @@ class Descent:
         whole = np.abs(rest + nu * self.problem.length(self.x))
         return nu, whole.reshape(-1, 9).max(axis=1)
 
-    def _curvature(self, at: Point, kind: HessianKind, nu: float = 0.0) -> tuple[Float, Float]:
-        """Hessian to use and the majorant, both with the condensed slacks."""
+    def _curvature(self, at: Point, nu: float, kind: HessianKind) -> Float:
+        """Nonzeros of a Hessian with the condensed slacks."""
         assert self.z is not None
         inner = np.einsum("nrc,nr,nrd->ncd", at.jacobian, self.z / at.slack, at.jacobian)
         condensed = np.zeros((len(inner), 9, 9))
         condensed[:, :3, :3] = inner
-        own = condensed[:, self.problem.triangle[0], self.problem.triangle[1]]
-        out = []
-        for each in dict.fromkeys((kind, "gauss-newton")):
-            H = self.problem.hessian(at.x, self.z, each, nu)
-            H[self.problem.block] += own
-            out.append(H)
-        return out[0], out[-1]
+        H = self.problem.hessian(at.x, self.z, kind, nu)
+        H[self.problem.block] += condensed[:, self.problem.triangle[0], self.problem.triangle[1]]
+        return H
 
     def _adapt(self, move: Move) -> None:
         """Change the damping of every superpixel according to its step."""

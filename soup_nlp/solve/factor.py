@@ -48,8 +48,12 @@ def same_pattern(one: sparse.csc_matrix, other: sparse.csc_matrix) -> bool:
     return np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices)
 
 
-def cholmod(upper: sparse.csc_matrix) -> Factorise:
+def cholmod(upper: sparse.csc_matrix, order: Callable[[], Int] | None = None) -> Factorise:
     """CHOLMOD of cvxopt (an extra); the symbolic analysis is made once.
+
+    Args:
+        upper: (n, n) upper triangle whose values number its nonzeros in storage order.
+        order: Makes the order of elimination (n,); default CHOLMOD's own, by minimum degree.
 
     Raises:
         ImportError: cvxopt is not installed.
@@ -58,17 +62,15 @@ def cholmod(upper: sparse.csc_matrix) -> Factorise:
     from cvxopt import cholmod as library
 
     n = upper.shape[0]
-    # cvxopt reads the lower triangle by columns: where each of its nonzeros stands in ours
-    lower = sparse.csc_matrix((upper.data + 1, upper.indices, upper.indptr), (n, n)).T.tocsc()
-    lower.sort_indices()
-    place = lower.data.astype(np.int64) - 1
-    column = np.repeat(np.arange(n), np.diff(lower.indptr))
-    places = (cvxopt.matrix(i.astype(np.int64)) for i in (lower.indices, column))
+    column = np.repeat(np.arange(n), np.diff(upper.indptr))
+    places = (cvxopt.matrix(i.astype(np.int64)) for i in (upper.indices, column))
     A = cvxopt.spmatrix(1.0, *places, (n, n))
-    factor = library.symbolic(A)
+    # CHOLMOD would transpose a lower triangle once more for every factorisation
+    given = {"p": cvxopt.matrix(order().astype(np.int64))} if order else {}
+    factor = library.symbolic(A, **given, uplo="U")
 
     def factorise(nonzeros: Float) -> Back:
-        A.V = cvxopt.matrix(nonzeros[place])
+        A.V = cvxopt.matrix(nonzeros)
         library.numeric(A, factor)
 
         def back(b: Float) -> Float:
@@ -97,18 +99,21 @@ def superlu(upper: sparse.csc_matrix) -> Factorise:
     return factorise
 
 
-def factorisation(upper: sparse.csc_matrix) -> tuple[str, Factorise]:
+def factorisation(
+    upper: sparse.csc_matrix, order: Callable[[], Int] | None = None
+) -> tuple[str, Factorise]:
     """CHOLMOD where cvxopt is installed (the extra "fast"), else SuperLU, five times slower.
 
     CasADi's MUMPS, twice as slow as CHOLMOD, is not used: it prints when it is destroyed.
 
     Args:
         upper: (n, n) upper triangle whose values number its nonzeros in storage order.
+        order: Makes an order of elimination (n,) for CHOLMOD.
 
     Returns:
         Its name, and the function that factorises.
     """
     try:
-        return "CHOLMOD", cholmod(upper)
+        return "CHOLMOD", cholmod(upper, order)
     except ImportError:
         return "SuperLU", superlu(upper)

@@ -8,18 +8,21 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.solve.dissection import dissected
 from soup_nlp.solve.factor import Back, Factorise, diagonal_places, factorisation, same_pattern
 from soup_nlp.solve.line_search import Point, merit_gradient
 from soup_nlp.solve.part import Part
 from soup_nlp.solve.reuse import held, preconditioned
 from soup_nlp.solve.tangent_problem import HessianKind, TangentProblem
 
+Curvature = Callable[[HessianKind], Float]
+
 BLENDS = (0.0, 0.1, 0.3, 1.0)
 """Shares of the majorant in the exact Hessian, tried until the step is a descent direction."""
 REUSE = 4000
-"""Least number of superpixels for which a factor serves several iterations and a part of them may
-move alone; with fewer, a factorisation costs little."""
+"""Least number of superpixels for which a factor serves several iterations, a part of them may move
+alone and the image is dissected; with fewer, a factorisation costs little."""
 INEXACT: Mapping[HessianKind, float] = {"gauss-newton": 0.2, "exact": 0.03}
 """Accuracy of steps with an earlier factor; at 0.3 the majorant stagnates early (N = 8,000)."""
 
@@ -61,7 +64,10 @@ class Newton:
         if after and same_pattern(problem.upper, after.problem.upper):
             self.library, self._factorise = after.library, after._factorise
         else:
-            self.library, self._factorise = factorisation(problem.upper)
+            large = problem.layout.count >= REUSE
+            self.library, self._factorise = factorisation(
+                problem.upper, self._order if large else None
+            )
         self._diagonal = diagonal_places(problem.upper)
         self.begin()
 
@@ -73,10 +79,18 @@ class Newton:
         # by `_parted`; on a large pair one trial costs too much to begin without the majorant
         self._blend = {False: BLENDS[2] if self._part else 0.0, True: 0.0}
 
+    def _order(self) -> Int:
+        """Order of elimination of a large problem."""
+        return dissected(self.problem.upper, self.problem.layout.anchor[:, :2])
+
+    @property
+    def moving(self) -> Mask | None:
+        """(N,) the superpixels that move, the others held; None for all."""
+        return self._part.some if self._part else None
+
     @property
     def _parted(self) -> bool:
-        """Whether a part of the superpixels moves, the others held."""
-        return self._part is not None and self._part.some is not None
+        return self.moving is not None
 
     def choose(self, residual: Float, slow: bool) -> None:
         """Choose which superpixels move next; see `Part.choose`."""
@@ -95,7 +109,7 @@ class Newton:
     def step(
         self,
         at: Point,
-        curvature: tuple[Float, Float],
+        curvature: Curvature,
         gradient: Float,
         barrier: float,
         kind: HessianKind,
@@ -105,13 +119,12 @@ class Newton:
 
         Args:
             at: Point.
-            curvature: Nonzeros of the Hessian and of the majorant.
+            curvature: Nonzeros of a Hessian by its kind, made when first asked for.
             gradient: Of f.
             barrier: b of the merit.
             kind: Of the Hessian.
             damping: (N,) of every superpixel.
         """
-        exact, majorant = curvature
         damping = np.repeat(damping, 9)
         blend, right = self._blend[self._parted], merit_gradient(at, gradient, barrier)
         a = self.problem.length(at.x)
@@ -119,7 +132,7 @@ class Newton:
         h, bent, newton = np.zeros_like(at.x), np.zeros_like(at.x), held(np.zeros_like, a)
         part = self._part if self._parted else None
         for share in shares:
-            H = _blended(exact, majorant, share)
+            H = _blended(curvature, share)
             times = self._times(H, damping)
             if self._last and not part:
                 newton = held(self._last, a)
@@ -155,8 +168,10 @@ class Newton:
         return lambda h: np.asarray(U @ h + lower @ h + twice * h)
 
 
-def _blended(exact: Float, majorant: Float, share: float) -> Float:
+def _blended(curvature: Curvature, share: float) -> Float:
     """Nonzeros of the Hessian with a share of the majorant."""
     if share in (0.0, 1.0):
-        return majorant if share else exact
-    return (1 - share) * exact + share * majorant
+        return curvature("gauss-newton" if share else "exact")
+    out = (1 - share) * curvature("exact")
+    out += share * curvature("gauss-newton")
+    return out

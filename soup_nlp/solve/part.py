@@ -9,13 +9,10 @@ costs several factorisations. A step of these and their neighbours costs a hundr
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.solve.factor import Back, Factorise, factorisation, numbered
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 WORST = 0.01
 """Superpixels whose residual is above this share of the largest are moved, and their neighbours."""
@@ -41,7 +38,7 @@ class Part:
         Args:
             upper: (9 N, 9 N) pattern of the upper triangle, its values number the nonzeros.
         """
-        self.some: Bool | None = None
+        self.some: Mask | None = None
         self._upper, self._steps = upper, 0
         self._columns = np.repeat(np.arange(upper.shape[0]), np.diff(upper.indptr))
         self._neighbours: sparse.csr_matrix | None = None
@@ -63,7 +60,7 @@ class Part:
         if some.mean() <= MOST:
             self.some, self._steps, self.factorise = some, 0, self._within(some)
 
-    def _with_neighbours(self, some: Bool) -> Bool:
+    def _with_neighbours(self, some: Mask) -> Mask:
         """Superpixels and those that share a nonzero of the Hessian with them."""
         if self._neighbours is None:
             n = len(some)
@@ -72,7 +69,7 @@ class Part:
             self._neighbours = one + one.T
         return np.asarray(self._neighbours @ some.astype(np.int32) > 0)
 
-    def _within(self, some: Bool) -> Factorise:
+    def _within(self, some: Mask) -> Factorise:
         """Factorisation of the block of some superpixels."""
         moves, rows, columns = np.repeat(some, 9), self._upper.indices, self._columns
         kept = np.flatnonzero(moves[rows] & moves[columns])

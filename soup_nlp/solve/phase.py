@@ -30,7 +30,8 @@ class Phase:
         eps: Smoothing width, pixels.
         barrier: b of `f - b sum log c`.
         iterations: Limit.
-        stagnation: Ends when the merit falls by less than this share of f, twice in a row.
+        stagnation: Ends when the merit falls by less than this share of f, twice in a row; where it
+            is 0, when the merit and the least dual infeasibility do not fall twice in a row.
         tol: Ends when the dual infeasibility is below; the status is "Solve_Succeeded".
         beyond: Whether steps go on after that while each makes the dual infeasibility or the gap
             FASTER times as large.

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy import sparse
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
@@ -59,6 +59,8 @@ class TangentProblem:
         """
         self.nlp, self.layout = build_tangent_nlp(start, data, weights, majorant(form), chart)
         nlp, n = self.nlp, self.layout.count
+        self._moving: Mask | None = None
+        self._rest: tuple[Float, float, Float] | None = None
         self._kinds = {"gauss-newton": nlp.hessian, **({"exact": "exact"} if exact else {})}
         self.triangle = np.array(np.triu_indices(9))
         own, (r, c) = 9 * np.arange(n)[:, None], self.triangle
@@ -85,13 +87,46 @@ class TangentProblem:
         theta = self.nlp.with_theta(eps=eps, eps_pixel=eps)
         self.sums.theta = theta[: len(self.nlp.theta)]
 
+    def move(self, some: Mask | None, x: Float) -> bool:
+        """Let some superpixels move; the others change only in `normalise`.
+
+        Where E does not depend on scale, only elements with one of these are summed from now on: f
+        and gradient have the others' part as it is at x, and Hessians lack it.
+
+        Args:
+            some: (N,) that move; None for all.
+            x: (9 N,) present point.
+
+        Returns:
+            Whether the choice differs from the last one.
+        """
+        if some is self._moving:
+            return False
+        self.sums.only(None)
+        self._moving, self._rest = some, None
+        if some is not None and self._slants is None:
+            f, gradient = self.value(x), self.gradient(x)
+            self.sums.only(np.repeat(some, 9))
+            self._rest = x, f - self.sums.value(x), gradient - self.sums.gradient(x)
+        return True
+
     def value(self, x: Float) -> float:
         """Smoothed energy."""
-        return self.sums.value(x)
+        f = self.sums.value(x)
+        return f if self._rest is None else f + self._rest[1]
 
     def gradient(self, x: Float) -> Float:
         """Gradient of the smoothed energy, (9 N,)."""
-        return self.sums.gradient(x)
+        out = self.sums.gradient(x)
+        if self._rest is None or self._moving is None:
+            return out
+        before, _, rest = self._rest
+        # `normalise` has scaled the variables of those that are held, which divides derivatives
+        held = 9 * int(np.argmin(self._moving))
+        scaled = 1 if self.layout.chart == "depth" else 3
+        rest = rest.reshape(-1, 9).copy()
+        rest[:, :scaled] *= before[held] / x[held]
+        return out + rest.ravel()
 
     def hessian(self, x: Float, z: Float, kind: HessianKind, nu: float = 0.0) -> Float:
         """Nonzeros (in the order of `upper`) of the Hessian of `f - z . c`.
