@@ -15,8 +15,8 @@ def test_suites_list_the_papers_pairs(tmp_path):
         *("kinect_paper", "kinect_tshirt"),
     }
     rendered = list_suite("rendered", None, Options(width=320, seeds=(0, 3), flows=("dis",)))
-    assert len(rendered.items) == 10
-    assert len({i.key for i in rendered.items}) == 10
+    assert len(rendered.items) == 12
+    assert len({i.key for i in rendered.items}) == 12
     problem = rendered.items[0].problem(["segmentation.superpixels=60"])
     assert (problem.input.width, problem.input.height) == (320, 136)
     for name, count in (("sintel", 120), ("vkitti", 120), ("kitti2012", 194), ("kitti2015", 200)):
@@ -46,7 +46,7 @@ def test_a_limit_counts_pairs_and_keeps_every_flow(tmp_path):
     listing = list_suite("rendered", None, Options(limit=2))
     assert len({i.name for i in listing.items}) == 2
     assert len(listing.items) == 4
-    assert str(listing) == "suite rendered: 2 pairs (4 rows), 3 left out by the limit"
+    assert str(listing) == "suite rendered: 2 pairs (4 rows), 4 left out by the limit"
     base = tmp_path / "image_0"
     base.mkdir()
     for index in range(4):

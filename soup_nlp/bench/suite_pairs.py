@@ -12,7 +12,7 @@ from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.datasets.sintel import DEFAULT_SCENE
 from soup_nlp.storage.files import is_folder
 
-RENDERED = ("street", "room", "sheet", "orbit", "still")
+RENDERED = ("street", "room", "sheet", "orbit", "still", "banner")
 KITTI_PRESETS = ("kitti", "eigen80", "best")
 SINTEL_FRAMES = MappingProxyType(
     {"alley_1": 50, "ambush_4": 33, "mountain_1": 50, "sleeping_1": 50, "temple_2": 50}

@@ -132,7 +132,7 @@ class SceneInput(PairInput):
 
     kind: Literal["scene"]
     """Kind of input."""
-    scene: Literal["street", "room", "sheet", "orbit", "still"]
+    scene: Literal["street", "room", "sheet", "orbit", "still", "banner"]
     """Which scene."""
     seed: Seed = 0
     """Changes layout, textures and motions."""

@@ -35,7 +35,7 @@ def render_scene(
 
     Returns:
         A `Pair` with full `Truth` in metres and no flow. Component 0 is the static background.
-        Motions are `next_from_ref` with the camera's motion included; NaN for the bending sheet.
+        Motions are `next_from_ref` with the camera's motion included; NaN for what bends.
     """
     check_image_size(width, height, "scene", name)
     layout, focal = _LAYOUTS[name]
@@ -328,14 +328,46 @@ def _still(rng: Random, half_width: float, half_height: float) -> Scene:
     return Scene(bodies, pose, pose)
 
 
+def _banner(rng: Random, half_width: float, half_height: float) -> Scene:
+    """a banner that bends, standing in a rigid room before a moving camera"""
+    m = _Materials(rng)
+    rest = [part for part, _ in _objects(rng, m, _BACK, half_width)]
+    bend, change = _sign(rng) * rng.uniform(0.5, 0.8), _sign(rng) * rng.uniform(0.12, 0.25)
+    axis = rng.uniform(-0.2, 0.2)
+    z, up = 3.5, 0.81  # its foot is on the floor, in the image
+    unit = z * half_width
+    shape = Sheet(
+        (0.4 * unit, up),
+        (bend, bend + change),
+        (axis, axis + _sign(rng) * rng.uniform(0.02, 0.05)),
+    )
+    dots = Panels((0.3, 0.3), (0.5, 0.5), (0.66, 0.64, 0.56), variation=0.3)
+    x = rng.uniform(-0.3, 0.3) * unit
+    pose = _pose(x, -up, z, yaw=rng.uniform(-10, 10))
+    cloth = Part(shape, pose, m.paint(0.25, dots), glow=0.4)
+    turn, shift = rng.uniform(-0.5, 0.5, 3), rng.uniform(-0.015, 0.015, 3)
+    bodies = (
+        Body((*_interior(rng, m, half_width), *rest)),
+        Body((cloth,), _about([x, 0, z], turn, shift)),
+    )
+    side = _sign(rng)
+    view = _views(
+        _pose(0, -1.35, 0, yaw=side, pitch=-9),
+        [side * rng.uniform(0.06, 0.085), rng.uniform(-0.01, 0.01), 0.04],
+        [0.1, -side * rng.uniform(0.2, 0.5), _sign(rng) * 0.2],
+    )
+    return Scene(bodies, *view)
+
+
 _LAYOUTS: dict[str, tuple[Callable[[Random, float, float], Scene], float]] = {
     "street": (_street, 0.9),
     "room": (_room, 0.8),
     "sheet": (_sheet, 0.9),
     "orbit": (_orbit, 0.8),
     "still": (_still, 0.8),
+    "banner": (_banner, 0.8),
 }
-"""Layout and focal length (in image widths) of each scene."""
+"""Layout and focal length (in image widths) of each scene. New ones go last: places are seeds."""
 
 SCENES = {name: str(layout.__doc__) for name, (layout, _) in _LAYOUTS.items()}
 """Description of every scene by name."""
