@@ -288,21 +288,22 @@ def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
 
 def test_where_surfaces_bend_a_misfit_counts_in_full_and_the_spread_by_its_root():
     spread, misfit = np.array([100 * LEAST_SPREAD]), 100 * LEAST_NOISE
-    base = calibrated(spread, 0.1, misfit, prior=np.inf, bending=True)
+    base = calibrated(spread, 0.1, misfit, prior=np.inf, bends=True)
     # what is added in squares is 1e-4 of either square
     assert base[0] == pytest.approx(BENDING_FACTOR * misfit * np.sqrt(spread[0]), rel=1e-4)
-    half = calibrated(0.25 * spread, 0.1, misfit, prior=np.inf, bending=True)
+    half = calibrated(0.25 * spread, 0.1, misfit, prior=np.inf, bends=True)
     assert half[0] == pytest.approx(0.5 * base[0], rel=1e-3)
     # small ones keep their order, and count for little
-    small = calibrated(LEAST_SPREAD * np.array([0.0, 0.1]), 0.1, LEAST_NOISE, bending=True)
+    small = calibrated(LEAST_SPREAD * np.array([0.0, 0.1]), 0.1, LEAST_NOISE, bends=True)
     assert small[0] < small[1] == pytest.approx(small[0], rel=0.01)
-    assert calibrated(spread, 0.6, misfit, prior=np.inf, bending=True) == base
-    assert calibrated(spread, 0.1, 0.0, bending=True)[0] > 0
-    assert calibrated(np.array([np.inf]), 0.1, bending=True)[0] == pytest.approx(SIGMA_PRIOR)
+    assert calibrated(spread, 0.6, misfit, prior=np.inf, bends=True) == base
+    assert calibrated(spread, 0.1, 0.0, bends=True)[0] > 0
+    assert calibrated(np.array([np.inf]), 0.1, bends=True)[0] == pytest.approx(SIGMA_PRIOR)
 
 
 def test_the_more_stands_still_where_surfaces_bend_the_less_sure_is_depth(small_room):
-    bends = replace(small_room, start=replace(small_room.start, bending=True))
+    every = np.ones(len(small_room.soup), bool)
+    bends = replace(small_room, start=replace(small_room.start, bends=every))
     assert sure_of(bends).still == 0.0
     labels, still = bends.segmentation.labels, np.arange(len(bends.soup)) % 3 > 0
     R = np.where(still[:, None, None], np.eye(3), bends.soup.R)

@@ -357,7 +357,14 @@ def test_few_particles_and_a_superpixel_without_edges_are_no_special_case(partic
         tiny.data,
         **{
             k: getattr(tiny.data, k)[:0]
-            for k in ("edges", "edge_weight", "edge_unit", "prior_weight", "prior_relief")
+            for k in (
+                "edges",
+                "edge_weight",
+                "edge_unit",
+                "rotation_scale",
+                "prior_weight",
+                "prior_relief",
+            )
         },
         **{
             k: getattr(tiny.data, k)[:0]

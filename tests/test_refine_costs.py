@@ -84,6 +84,9 @@ def test_every_entry_is_the_energy_of_its_pair_however_close_the_particles():
             edges=np.array([[i, k]]) if costs.arap_row[e] >= 0 else np.zeros((0, 2), int),
             edge_weight=tiny.data.edge_weight[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
             edge_unit=tiny.data.edge_unit[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
+            rotation_scale=tiny.data.rotation_scale[costs.arap_row[e]][None][
+                : costs.arap_row[e] + 1
+            ],
             prior_relief=tiny.data.prior_relief[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
             prior_weight=tiny.data.prior_weight[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
             pairs=np.array([[i, k]]) if costs.cont_row[e] >= 0 else np.zeros((0, 2), int),

@@ -17,7 +17,6 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.start import choice as choosing
 from soup_nlp.start import merge as gathering
-from soup_nlp.start import propose as proposing
 from soup_nlp.start.choice import Choice, of_neighbourhoods, of_pieces, select
 from soup_nlp.start.components import TIES, borrow, contact_scales, depth_from_inside
 from soup_nlp.start.epipolar import Motion
@@ -125,7 +124,7 @@ def across(seg: Segmentation, own: np.ndarray) -> np.ndarray:
 def offered(monkeypatch, *angles: float) -> None:
     """Let these motions be what superpixels may share."""
     R, t = turn(np.array(angles)), np.tile([1.0, 0.0, 0.0], (len(angles), 1))
-    monkeypatch.setattr(gathering, "_candidates", lambda *a: (R, t))
+    monkeypatch.setattr(gathering, "candidates", lambda *a: (R, t))
 
 
 @pytest.mark.parametrize("enough", [True, False])
@@ -278,10 +277,10 @@ def test_the_main_motion_is_preferred_where_another_is_not_clearly_better(monkey
     seg = build_segmentation(segment(pair.image_ref, 30, "grid"), pair.image_ref, neighbours=8)
     exact = Motion(move[:3, :3], move[:3, 3] / np.linalg.norm(move[:3, 3]))
     near = Motion(turn(4e-4) @ exact.R, exact.t)
-    monkeypatch.setattr(proposing, "of_pieces", lambda *a: [])
+    monkeypatch.setattr(choosing, "of_pieces", lambda *a: [])
 
     def first_of(*motions: Motion) -> np.ndarray:
-        monkeypatch.setattr(proposing, "dominant", lambda *a: list(motions))
+        monkeypatch.setattr(choosing, "dominant", lambda *a: list(motions))
         start = propose(seg, pair.flow, pair.K_ref, pair.K_next)
         return np.abs(start.soup.R - motions[0].R).max(axis=(1, 2)) < 1e-9
 

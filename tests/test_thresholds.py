@@ -153,7 +153,7 @@ def test_contact_is_weaker_where_a_component_hides_another(slant, gap):
     }  # fmt: skip
     form = {
         "occlusion_gap": 0.1, "cont_occluded": 0.25, "units": "pixel",
-        "bending": {"cont_across": 0.5},
+        "weights": {"cont": 1.0}, "bending": {"cont_across": 0.5, "weights": {"cont": 1.0}},
     }  # fmt: skip
     np.testing.assert_allclose(recompute._pair_weights(tree, form), [0.2 if gap else 0.8])
 

@@ -173,7 +173,7 @@ def scores(result: Run, presets: Sequence[str] = ("paper",), fitted: bool = True
         "stages": dict(result.seconds),
         "iterations": sum(stage.iterations for stage in result.solution.stages),
         "parallax_px": float(np.median(result.start.parallax)),
-        "bending_share": float(result.start.bending_share),
+        "bending_share": float(result.start.bends.mean()),
         "flow_error": flow_error(result.pair),
         "metrics": metrics,
         "energy": _energies(result),

@@ -35,7 +35,7 @@ def in_both(key: str, value: str) -> tuple[str, ...]:
 RULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         SHIPPED: (),
-        "energy of bending surfaces": ("start.bending=1",),
+        "energy of bending surfaces": ("start.bending_price=4",),
         "camera at rest": ("start.at_rest=1",),
         "E_prior": in_both("prior", "0"),
         "E_prior holds what is over the ground": ("energy.prior_ground=null",),

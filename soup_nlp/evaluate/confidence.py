@@ -11,9 +11,9 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from soup_nlp.arrays import Float, Int, Labels, Mask
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import ModelError
 from soup_nlp.geometry.camera import pixel_grid, rays
@@ -26,9 +26,6 @@ from soup_nlp.solve.selected_inverse import BlockCholesky
 from soup_nlp.solve.tangent_problem import TangentProblem
 from soup_nlp.start.choice import LEAST_NOISE, MOST_NOISE
 from soup_nlp.start.propose import Start
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 log = logging.getLogger(__name__)
 
@@ -140,9 +137,7 @@ def _mean_log_depth(info: Information, sizes: Int, component: Int) -> Float:
     return rows.reshape(-1, count)
 
 
-def spread_in_image(
-    info: Information, plane: Float, labels: NDArray[np.int32], K_ref: Float
-) -> Float:
+def spread_in_image(info: Information, plane: Float, labels: Labels, K_ref: Float) -> Float:
     """(H, W) standard deviation of log depth of every pixel, as the marginals have it.
 
     Args:
@@ -196,7 +191,8 @@ class Confidence:
         spread: (H, W) standard deviation of log depth by what the flow adds to the terms on shape.
         marginals: Of the planes and of the components' scales.
         noise: Of the flow, pixels.
-        bending: Whether surfaces are taken to bend.
+        bends: (H, W) True where a region bends.
+        bending_component: (C,) True for components that bend.
         still: Share of the image that stands still where surfaces bend.
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
     """
@@ -205,7 +201,8 @@ class Confidence:
     spread: Float
     marginals: Marginals
     noise: float
-    bending: bool
+    bends: Mask
+    bending_component: Mask
     still: float
     misfit: Float
 
@@ -217,19 +214,21 @@ class Confidence:
     @property
     def component_sigma(self) -> Float:
         """(C,) calibrated standard deviation of the components' log scale."""
-        return calibrated(np.sqrt(self.marginals.component), self.noise, bending=self.bending)
+        spread = np.sqrt(self.marginals.component)
+        return calibrated(spread, self.noise, bends=self.bending_component)
 
 
-def without_parallax(start: Start) -> NDArray[np.bool_]:
+def without_parallax(start: Start) -> Mask:
     """(N,) superpixels that the start gave the depth of others, where these are most of the image.
 
     The camera is at rest then. A few of them take their depth from a surface that is known.
     """
-    most = not start.bending and float(start.borrowed.mean()) >= MOST_BORROWED
-    return np.asarray(start.borrowed & most)
+    rest = ~start.bends
+    most = rest.any() and float(start.borrowed[rest].mean()) >= MOST_BORROWED
+    return np.asarray(start.borrowed & rest & most)
 
 
-def stands_still(soup: Soup, anchor_ray: Float, K_next: Float) -> NDArray[np.bool_]:
+def stands_still(soup: Soup, anchor_ray: Float, K_next: Float) -> Mask:
     """(N,) superpixels whose translation moves them by less than any flow's noise.
 
     Args:
@@ -242,13 +241,13 @@ def stands_still(soup: Soup, anchor_ray: Float, K_next: Float) -> NDArray[np.boo
     return np.asarray(moved < MOST_NOISE)
 
 
-def flow_misfit(rec: Reconstruction, flow: Flow, most: float = MOST_MISFIT) -> Float:
+def flow_misfit(rec: Reconstruction, flow: Flow, most: Float | float = MOST_MISFIT) -> Float:
     """(N,) mean distance of a flow from the one that a reconstruction induces, pixels.
 
     Args:
         rec: The answer.
         flow: The flow that it was solved with.
-        most: Larger distances, and those of what is not induced, count as this.
+        most: Larger distances, and those of what is not induced, count as this; (H, W) or one.
     """
     distance = np.linalg.norm(rec.flow - flow.uv, axis=-1)
     limited = np.where(np.isfinite(distance), np.minimum(distance, most), most)
@@ -261,7 +260,7 @@ def calibrated(
     noise: float,
     misfit: Float | float = 0.0,
     prior: float = SIGMA_PRIOR,
-    bending: bool = False,
+    bends: Mask | bool = False,
     still: float = 0.0,
 ) -> Float:
     """Standard deviation of log depth that errors keep to.
@@ -275,16 +274,15 @@ def calibrated(
         misfit: Of the same superpixel, pixels; where it is larger than the noise, their geometric
             mean is the noise.
         prior: Standard deviation before looking; its information is added.
-        bending: Whether surfaces are taken to bend.
+        bends: Where regions bend; of the same shape, or one for all.
         still: Share of the image that stands still. Nothing tells its depth, nor that of the rest
             beside it: so much of `SIGMA_PRIOR` is added everywhere, in squares.
     """
-    if bending:
-        # no limits: what is below them keeps its order
-        known = np.sqrt(np.hypot(LEAST_SPREAD, spread))
-        sigma = BENDING_FACTOR * np.hypot(LEAST_NOISE, misfit) * known
-    else:
-        sigma = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
+    # no limits where regions bend: what is below them keeps its order
+    known = np.sqrt(np.hypot(LEAST_SPREAD, spread))
+    bent = BENDING_FACTOR * np.hypot(LEAST_NOISE, misfit) * known
+    rigid = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
+    sigma = np.where(bends, bent, rigid)
     sigma = np.hypot(np.minimum(sigma, LARGEST), SIGMA_PRIOR * still)
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
@@ -350,11 +348,14 @@ def confidence(
             np.full(int(start.component.max()) + 1, np.inf),
         )
         spread = np.full(rec.labels.shape, np.inf)
-    most = BENDING_MISFIT if start.bending else MOST_MISFIT
+    bends = start.bends[rec.labels]
+    most = np.where(bends, BENDING_MISFIT, MOST_MISFIT)
     noise, misfit = start.noise, flow_misfit(rec, pair.flow, most)
-    stands = stands_still(rec.soup, data.anchor_ray, pair.K_next) & start.bending
+    stands = stands_still(rec.soup, data.anchor_ray, pair.K_next) & start.bends
     # the answer may explain a part of the camera's turn by translations
     stands |= start.at_rest & (start.parallax < MOST_NOISE)
     still = float(stands[rec.labels].mean())
-    sigma = calibrated(spread, noise, misfit[rec.labels], bending=start.bending, still=still)
-    return Confidence(sigma, spread, own, noise, start.bending, still, misfit)
+    sigma = calibrated(spread, noise, misfit[rec.labels], bends=bends, still=still)
+    parts = np.zeros(len(own.component), bool)
+    parts[start.component[start.bends]] = True
+    return Confidence(sigma, spread, own, noise, bends, parts, still, misfit)

@@ -61,7 +61,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
             shift = shift + np.einsum("eij,ej->ei", dR, (A[i] + A[k]) / 2)
         stretch = _length(A[i] - A[k]) - _length(B[i] - B[k])
         parts = (
-            float(e["rotation_scale"]) * np.sqrt((dR**2).sum((1, 2))),
+            e["rotation_scale"] * np.sqrt((dR**2).sum((1, 2))),
             _length(shift) / length,
             np.abs(stretch) / length,
         )
@@ -265,16 +265,21 @@ def data_errors(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
     weight *= across
     bending = settings["energy"]["bending"]
     weight[_discontinuous(tree, settings["energy"], "edges")] *= float(bending["arap_across"])
-    noise = float(np.clip(np.median(tree["start"]["error"]), *NOISE))
-    if tree["start"]["bending"]:
+    bends = bends_where(tree, {"units": "pixel"})
+    if bends.all():
         # that of affine flows, which is not recomputed; older results held the prior in pixels
         noise = float(tree["start"].get("noise", 1.0))
+    else:
+        noise = float(np.clip(np.median(tree["start"]["error"][~bends]), *NOISE))
     prior = noise * across * seg["edge_multiplicity"] / max(1, seg["knn"].shape[1])
     free = _grounded(tree, settings)
     prior[free] = noise * (seg["edge_multiplicity"] / max(1, seg["knn"].shape[1]))[free]
     prior[free] *= float(settings["energy"].get("prior_ground") or 0.0)
+    weight *= _within_bending(tree, settings["energy"], "edges", "arap")
+    prior *= _within_bending(tree, settings["energy"], "edges", "prior")
     held = np.full(len(e["pairs"]), 2.0)
     held[_discontinuous(tree, settings["energy"], "pairs")] *= float(bending["orient_across"])
+    held *= _within_bending(tree, settings["energy"], "pairs", "orient")
     return {
         "anchors": _gap(centre, seg["anchors"]),
         "anchor rays": _gap(rays(centre), e["anchor_ray"]),
@@ -304,7 +309,7 @@ def _pair_weights(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Float:
         form["cont_occluded"]
     )
     weight[_discontinuous(tree, form, "pairs")] *= float(form["bending"]["cont_across"])
-    return np.asarray(weight)
+    return np.asarray(weight * _within_bending(tree, form, "pairs", "cont"))
 
 
 def _grounded(tree: Mapping[str, Any], settings: Mapping[str, Any]) -> Mask:
@@ -325,15 +330,31 @@ def _relief(tree: Mapping[str, Any], free: Mask) -> Float:
 
 
 def _discontinuous(tree: Mapping[str, Any], form: Mapping[str, Any], graph: str) -> Mask:
-    """Edges of a graph between two surfaces, if surfaces are taken to bend."""
+    """Edges of a graph between two surfaces, if the whole image bends."""
     surface = tree["start"]["surface"]
     i, k = tree["energy"][graph].T
-    return np.asarray(_bends(tree, form) & (surface[i] != surface[k]))
+    return np.asarray(bends_where(tree, form).all() & (surface[i] != surface[k]))
 
 
-def _bends(tree: Mapping[str, Any], form: Mapping[str, Any]) -> bool:
-    """Whether the energy of bending surfaces is in force."""
-    return form["units"] == "pixel" and bool(tree["start"]["bending"])
+def bends_where(tree: Mapping[str, Any], form: Mapping[str, Any]) -> Mask:
+    """(N,) where the energy of bending surfaces is in force; older results have one answer."""
+    start = tree["start"]
+    bends = start.get("bends", np.full(len(start["component"]), bool(start.get("bending", False))))
+    return np.asarray(bends, bool) & (form["units"] == "pixel")
+
+
+def _within_bending(
+    tree: Mapping[str, Any], form: Mapping[str, Any], graph: str, term: str
+) -> Float:
+    """Ratio of the factors of a term between bending and rigid regions, on edges of a graph."""
+    bends = bends_where(tree, form)
+    own, bent = (float(w[term]) for w in (form["weights"], form["bending"]["weights"]))
+    if bends.all() or not own:
+        return np.ones(len(tree["energy"][graph]))
+    if term == "orient":
+        bent *= len(bends) / 1000
+    one, other = bends[tree["energy"][graph].T]
+    return np.where(one & other, bent / own, 1.0)
 
 
 def _gap(a: Float, b: Float) -> float:

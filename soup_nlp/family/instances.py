@@ -172,7 +172,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
         motions=[],
         surface=record.surface,
         tie=none,
-        bending=record.bending,
+        bends=np.full(len(seg), record.bending),
         # records of bending surfaces have their prior in pixels
         noise=1.0 if record.bending else limited_noise(record.error),
     )
@@ -188,7 +188,7 @@ def rounded_data(data: EnergyData) -> EnergyData:
     reals: dict[str, Any] = {
         k: rounded(v) for k, v in own.items() if np.asarray(v).dtype == np.float64
     }
-    return replace(data, **{**reals, "rotation_scale": float(reals["rotation_scale"])})
+    return replace(data, **reals)
 
 
 def build_instance(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, Int
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.camera import pixel_grid, project, rays
 from soup_nlp.geometry.rotation import nearest
 
@@ -57,6 +57,17 @@ class Soup:
     def translation(self) -> Float:
         """(N, 3) scaled translation, `lam t`."""
         return self.lam[:, None] * self.t
+
+    def taking(self, other: Soup, which: Mask) -> Soup:
+        """This soup with the superpixels `which` (N,) of another one."""
+
+        def put(own: Float, given: Float) -> Float:
+            out = own.copy()
+            out[which] = given[which]
+            return out
+
+        parts = ("lam", "n", "d", "R", "t")
+        return Soup(*(put(getattr(self, k), getattr(other, k)) for k in parts))
 
     def depth_at(self, ray: Float) -> Float:
         """z (N, ...) of rays (N, ..., 3) on their own superpixel's plane, docs/formulation.md 3."""

@@ -113,7 +113,7 @@ def _arap(data: EnergyData, w: Weights) -> Element:
     columns = {
         "weight": w.arap * data.edge_weight,
         "unit": data.edge_unit,
-        "turn": _full(len(e), data.rotation_scale),
+        "turn": data.rotation_scale,
         "sigma": _full(len(e), w.sigma_arap),
         "leak": _full(len(e), w.leak_arap),
         "ray_i": data.anchor_ray[e[:, 0]],

@@ -34,7 +34,7 @@ class EnergyData:
             that is known.
         prior_relief: (E,) relative difference of inverse depth along each edge that costs nothing
             in E_prior: the initialisation's where both ends borrow their depth, else 0.
-        rotation_scale: Factor of |R_i - R_k| (1 in the paper's units, focal in pixel units).
+        rotation_scale: (E,) factor of |R_i - R_k| (1 in the paper's units, focal in pixel units).
         pairs: (P, 2) neighbours i < k.
         boundary_ray: (P, B, 3) sampled shared boundary points.
         pair_weight: (P,) w4, both directions folded.
@@ -62,7 +62,7 @@ class EnergyData:
     edge_unit: Float
     prior_weight: Float
     prior_relief: Float
-    rotation_scale: float
+    rotation_scale: Float
     pairs: Int
     boundary_ray: Float
     pair_weight: Float
@@ -171,7 +171,7 @@ def build_energy_data(
         edge_unit=np.ones(len(seg.edges)),
         prior_weight=seg.edge_multiplicity / max(1, seg.knn.shape[1]),
         prior_relief=np.zeros(len(seg.edges)),
-        rotation_scale=1.0,
+        rotation_scale=np.ones(len(seg.edges)),
         pairs=seg.pairs,
         boundary_ray=rays(K_ref, seg.boundary),
         pair_weight=seg.pair_weight,

@@ -76,7 +76,8 @@ class BendingOptions(Section):
     """Upper limit of solver.presolve_eps, pixels. Relief changes the flow by a fraction of a pixel,
     so a wider smoothing would flatten it."""
     untruncated: bool = True
-    """Sets solver.untruncated: E_arap truncated from the beginning tears bending surfaces."""
+    """Sets solver.untruncated where the whole image bends: E_arap truncated from the beginning
+    tears bending surfaces."""
     rotation_px: Positive = 1e-3
     """Pixels per radian of rotation difference."""
     arap_across: Share = 0.3

@@ -51,8 +51,8 @@ def arap(soup: Soup, data: EnergyData, weights: Weights) -> Float:
     sigma, leak = weights.sigma_arap, weights.leak_arap
     X = soup.points(data.anchor_ray)
     moved = soup.moved(X)
-    turn = data.rotation_scale * (soup.R[i] - soup.R[k])
-    rotation = np.linalg.norm(turn.reshape(-1, 9), axis=1)
+    turn = (soup.R[i] - soup.R[k]).reshape(-1, 9)
+    rotation = data.rotation_scale * np.linalg.norm(turn, axis=1)
     if data.arap_at_anchors:
         # how far the two motions carry the anchors apart, mean of both anchors
         a = np.einsum("eij,ej->ei", soup.R[i] - soup.R[k], 0.5 * (X[i] + X[k]))

@@ -10,6 +10,7 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.oracle import relief
 
 
@@ -139,8 +140,39 @@ def in_pixels(
         data,
         local_units=True,
         edge_unit=np.full(len(data.edges), 1.0 / focal),
-        rotation_scale=rotation_px or focal,
+        rotation_scale=np.full(len(data.edges), rotation_px or focal),
         pair_unit=1.0 / (focal * np.sqrt(ri * rk)),
+    )
+
+
+def within_bending(
+    data: EnergyData, bends: Mask, rigid: Weights, bent: Weights, rotation_px: float
+) -> EnergyData:
+    """The same data with the weights for bending surfaces between superpixels that bend.
+
+    Where rigid and bending regions lie in one image, the factors of the terms are those of rigid
+    regions. The weights of single edges and pairs then make up the difference.
+
+    Args:
+        data: Data in pixels.
+        bends: (N,) True where the superpixel lies in a region that bends.
+        rigid: Factors of the terms elsewhere, which the energy has.
+        bent: Factors of the terms in regions that bend.
+        rotation_px: Pixels per radian of rotation difference on edges with an end there.
+    """
+    edges, pairs = (bends[ends[:, 0]] & bends[ends[:, 1]] for ends in (data.edges, data.pairs))
+
+    def more(inside: Mask, term: str) -> Float:
+        own = getattr(rigid, term)
+        return np.where(inside, getattr(bent, term) / own if own else 1.0, 1.0)
+
+    return replace(
+        data,
+        rotation_scale=np.where(bends[data.edges].any(axis=1), rotation_px, data.rotation_scale),
+        edge_weight=more(edges, "arap") * data.edge_weight,
+        prior_weight=more(edges, "prior") * data.prior_weight,
+        pair_weight=more(pairs, "cont") * data.pair_weight,
+        orient_weight=more(pairs, "orient") * data.orient_weight,
     )
 
 

@@ -28,6 +28,7 @@ from soup_nlp.model.reweighting import (
     in_noise,
     in_pixels,
     over_ground,
+    within_bending,
 )
 from soup_nlp.pipeline.memory import check_fits
 from soup_nlp.pipeline.still_layer import see_through
@@ -182,7 +183,7 @@ def superpixels(problem: Problem, pair: Pair) -> Labels:
 
 
 def _bends(problem: Problem, start: Start) -> bool:
-    """Whether the energy for surfaces that bend is in force."""
+    """Whether the energy for surfaces that bend is in force anywhere."""
     return start.bending and problem.energy.units == "pixel"
 
 
@@ -193,7 +194,8 @@ def solver_options(problem: Problem, start: Start) -> SolverOptions:
         return own
     # of several that become the widest one is enough
     eps = dict.fromkeys(min(e, bending.widest_eps) for e in own.presolve_eps)
-    both = own.untruncated or bending.untruncated
+    # beside rigid regions E_arap without truncation lets the scales of components slide
+    both = own.untruncated or (bending.untruncated and bool(start.bends.all()))
     return own.replace(presolve_eps=tuple(eps), untruncated=both)
 
 
@@ -204,10 +206,12 @@ def build_energy(
     assert pair.flow is not None
     e = problem.energy
     pixels = None if e.pixel_samples == "all" else e.pixel_samples
-    bends = _bends(problem, start)
-    form = e.bending if bends else e
+    bends = start.bends & (e.units == "pixel")
+    whole = bool(bends.all())
+    form = e.bending if whole else e
+    at_anchors = bool(bends.any()) or e.arap_at_anchors
     data = build_energy_data(
-        seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, bends or e.arap_at_anchors
+        seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, at_anchors
     )
     data = in_noise(data, start.noise)
     free = data.prior_weight
@@ -215,7 +219,7 @@ def build_energy(
     if e.prior_ground is not None:
         data = over_ground(data, start.soup, start.grounded, e.prior_ground * free)
     data = at_occlusions(data, start.soup, start.component, e.occlusion_gap, e.cont_occluded)
-    if bends:
+    if whole:
         b = e.bending
         held = {"arap": b.arap_across, "cont": b.cont_across, "orient": b.orient_across}
         data = across_discontinuities(data, start.surface, **held)
@@ -223,8 +227,10 @@ def build_energy(
         data = in_pixels(data, start.soup, seg, form.rotation_px)
     else:
         data = in_length(data, start.soup, e.length)
-    weights: Weights = form.weights
-    if bends:
-        # on the same relief 1 - cos between neighbours falls as 1 / N
-        weights = weights.replace(orient=weights.orient * len(seg) / 1000)
-    return data, weights
+    # on the same relief 1 - cos between neighbours falls as 1 / N
+    bent = e.bending.weights.replace(orient=e.bending.weights.orient * len(seg) / 1000)
+    if whole:
+        return data, bent
+    if bends.any():
+        data = within_bending(data, bends, e.weights, bent, e.bending.rotation_px)
+    return data, e.weights

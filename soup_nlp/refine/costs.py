@@ -172,7 +172,7 @@ class PairCosts:
         total *= x
         np.maximum(total, 0.0, out=total)
         np.sqrt(total, out=total)
-        total *= np.sqrt(2.0) * d.rotation_scale
+        total *= np.sqrt(2.0) * d.rotation_scale[rows][:, None, None]
         _leaky(total, sigma, w.leak_arap)
 
         per = self._unit(s, i, k, unit, scale) / d.edge_unit[rows][:, None, None]

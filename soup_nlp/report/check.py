@@ -145,7 +145,7 @@ def _rows(
 def _weights(tree: Entries, form: Entries, weights: Mapping[str, float]) -> Iterator[Claim]:
     """Claims that the stored weights are those of the problem."""
     own = form["weights"]
-    if form["units"] == "pixel" and bool(tree["start"].get("bending", False)):
+    if recompute.bends_where(tree, form).all():
         own = dict(form["bending"]["weights"])
         # given for 1,000 superpixels
         own["orient"] *= len(tree["start"]["component"]) / 1000

@@ -23,9 +23,12 @@ def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
     lines = [f"flow usable at {usable:.0%} of the pixels"]
     if run.start.at_rest:
         lines.append("the camera is at rest or turns only: depth is a guess")
-    elif run.start.bending:
+    elif run.start.bends.all():
         lines.append("surfaces bend: their relief is weakly determined")
     else:
+        if run.start.bending:
+            share = float(run.start.bends[run.segmentation.labels].mean())
+            lines.append(f"{share:.0%} of the image bends: its relief is weakly determined")
         pixels = np.sort(run.start.parallax[run.segmentation.labels].ravel())
         lines[0] += f", median parallax {pixels[len(pixels) // 2]:.3g} px"
     moving = [part.pixels / run.segmentation.labels.size for part in run.components.members[1:]]

@@ -55,11 +55,17 @@ def _parallax(shown: Shown) -> list[str]:
         ]
     pixels = np.asarray(shown.tree["segmentation"]["sizes"], float)
     pixels = pixels / pixels.sum()
+    bends = float(pixels[shown.bends].sum())
     parallax = np.asarray(start["parallax"], float)
     little = float(pixels[parallax < PARALLAX].sum())
     order = np.argsort(parallax)
     middle = float(parallax[order][np.searchsorted(np.cumsum(pixels[order]), 0.5)])
     out = []
+    if bends:
+        out.append(
+            f"{bends:.0%} of the image bends: its depth follows from the surface's own stretching,"
+            " and its scale from contact."
+        )
     shares = shown.summary.get("certainty", {})
     if shares.get("guess", 0.0) >= SHARE:
         guess = guess_words(shares, " of the image")

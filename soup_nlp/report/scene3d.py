@@ -74,7 +74,7 @@ def make_scene(shown: Shown) -> Scene:
         planes=inverse_depth(n, scale * lam * shown.soup("d")),
         motion=_motion(camera.R @ R, camera(T), pivot),
         motion_camera=_motion(R, T, pivot),
-        guess=np.asarray(shown.tree["start"]["borrowed"], bool) & (not shown.bending),
+        guess=np.asarray(shown.tree["start"]["borrowed"], bool) & ~shown.bends,
         surface=_surface(shown, step),
         seen=~hidden(rec)[every, every],
         camera=camera.matrix,
@@ -107,15 +107,14 @@ def _far(z: Float) -> tuple[float, float]:
 
 
 def _pivots(shown: Shown) -> Float:
-    """(N, 3) centre of the component of every superpixel, or of the superpixel if surfaces bend."""
+    """(N, 3) centre of the component of every superpixel, or of the superpixel if it bends."""
     parts, rec = shown.components, shown.reconstruction
-    if not shown.bending:
-        centre = np.stack([part.centre for part in parts])[parts.of_superpixel]
-    else:
-        known = np.isfinite(rec.depth_ref)
-        at, count = rec.labels[known], len(parts.of_superpixel)
-        sums = [np.bincount(at, x, count) for x in rec.points_ref[known].T]
-        centre = np.stack(sums, axis=1) / np.maximum(np.bincount(at, minlength=count), 1)[:, None]
+    known = np.isfinite(rec.depth_ref)
+    at, count = rec.labels[known], len(parts.of_superpixel)
+    sums = [np.bincount(at, x, count) for x in rec.points_ref[known].T]
+    own = np.stack(sums, axis=1) / np.maximum(np.bincount(at, minlength=count), 1)[:, None]
+    common = np.stack([part.centre for part in parts])[parts.of_superpixel]
+    centre = np.where(shown.bends[:, None], own, common)
     return np.asarray(shown.scale * np.nan_to_num(centre))
 
 

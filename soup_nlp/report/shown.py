@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, Image
+from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError, printable
 from soup_nlp.geometry.components import Components
@@ -60,9 +60,16 @@ class Shown:
         return np.asarray(self.tree["segmentation"]["labels"])
 
     @property
+    def bends(self) -> Mask:
+        """(N,) True in regions that bend, which are not rigid; older results have one answer."""
+        start = self.tree["start"]
+        own = start.get("bends", np.full(len(start["component"]), start.get("bending", False)))
+        return np.asarray(own, bool)
+
+    @property
     def bending(self) -> bool:
-        """Whether the initialisation treats surfaces as bending; then no component is rigid."""
-        return bool(self.tree["start"].get("bending", False))
+        """Whether the whole image bends; then no component is rigid."""
+        return bool(self.bends.all())
 
     @property
     def at_rest(self) -> bool:

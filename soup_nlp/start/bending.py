@@ -1,4 +1,4 @@
-"""Bending surfaces: their detection, and their initialisation.
+"""Bending surfaces: flow discontinuities, surfaces, and an initialisation without relief.
 
 The flow is discontinuous along the outline of a rigid component that moves independently. On a
 bending surface it is continuous, but no single rigid motion explains it. If such a surface is cut
@@ -20,20 +20,6 @@ from soup_nlp.start.views import Views
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
-
-def bending_share(surface: Int, component: Int) -> float:
-    """Share of the superpixels that move differently from most of their surface.
-
-    It is near 0 if every surface is one rigid component, near 1 if surfaces consist of many.
-
-    Args:
-        surface: (N,) surface of every superpixel.
-        component: (N,) group that moves as one rigid component.
-    """
-    count = np.zeros((int(surface.max()) + 1, int(component.max()) + 1))
-    np.add.at(count, (surface, component), 1.0)
-    return float(1.0 - count.max(axis=1).sum() / len(surface))
 
 
 STILL_PX = 0.5
@@ -81,7 +67,8 @@ def surfaces(jump: Float, seg: Segmentation, discontinuity_px: float) -> Int:
         seg: Superpixels and graphs.
         discontinuity_px: Jump that certainly is a discontinuity, pixels.
     """
-    least = np.clip(ABOVE_NOISE * np.median(jump), LEAST_SHARE * discontinuity_px, discontinuity_px)
+    usual = float(np.median(jump)) if len(jump) else 0.0
+    least = np.clip(ABOVE_NOISE * usual, LEAST_SHARE * discontinuity_px, discontinuity_px)
     surface = connected_labels(jump < least, seg)
     n, (i, k) = len(seg), seg.pairs.T
     while True:

@@ -271,3 +271,43 @@ def _adopt(
     take = at, c[at]
     taken = labels[take] if labels is not None else -1
     return choice.taking(at, Rs[take], ts[take], fit.pick(take), taken)
+
+
+def rigid_choice(
+    views: Views, seg: Segmentation, jump: Float, o: SeededStart
+) -> tuple[Choice, list[Motion], float]:
+    """One of few rigid motions of the whole image, or of a neighbourhood, for every superpixel.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        seg: Superpixels and graphs.
+        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
+        o: Numbers, prices and limits.
+
+    Returns:
+        The choice, the motions of the whole image, and the noise of the flow, pixels.
+    """
+    known = views.weight.any(axis=1)
+    motions = dominant(views, o)
+    fit = views.fit(motions)
+    cost = fit.penalised()
+    noise = limited_noise(cost.min(axis=1)[known])
+    # what no motion explains yet, piece by piece
+    for _ in range(o.rounds):
+        extra = of_pieces(views, seg, motions, cost, noise, o)
+        if not extra:
+            break
+        motions = motions + extra
+        fit = views.fit(motions)
+        cost = fit.penalised()
+        kept = select(cost, noise, o)
+        motions, fit, cost = [motions[c] for c in kept], fit.columns(kept), cost[:, kept]
+        noise = limited_noise(cost.min(axis=1)[known])
+    # the dominant motion is preferred where another is not clearly better
+    prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * o.unexplained_px))
+    # beyond 5 pixels one motion is as wrong as another
+    cost = np.minimum(cost + prefer, 5.0)
+    label = smooth_choice(cost, flow_affinity(jump, o), seg, o.smoothness)
+    R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
+    choice = Choice(R, t, fit.pick((np.arange(len(seg)), label)), label)
+    return of_neighbourhoods(views, seg, choice, noise, o), motions, noise

@@ -53,7 +53,8 @@ def gather(
     return _spread(views, seg, jump, choice, gain, o)
 
 
-def _main(label: Int) -> int:
+def main_motion(label: Int) -> int:
+    """The most frequent motion of indices (N,), one of which is not negative."""
     return int(np.argmax(np.bincount(label[label >= 0])))
 
 
@@ -67,7 +68,7 @@ def _one_motion_each(
     o: SeededStart,
 ) -> Choice:
     """Give each piece without the main motion, joined by the pairs `whole` (P,), one motion."""
-    main = _main(choice.label)
+    main = main_motion(choice.label)
     R_main = choice.R[np.argmax(choice.label == main)]
     mover = choice.label != main
     i, k = seg.pairs.T
@@ -78,7 +79,7 @@ def _one_motion_each(
         # one motion already, and what a few pixels would change in it is not to be trusted
         if len(at) < o.piece_size or (len(held) == 1 and held[0] >= 0):
             continue
-        R, t = _candidates(views, choice, at, R_main, noise, o)
+        R, t = candidates(views, choice, at, R_main, noise, o)
         shape = len(at), len(R)
         fit = views.some(at).fit_own(
             np.broadcast_to(R, (*shape, 3, 3)), np.broadcast_to(t, (*shape, 3))
@@ -92,7 +93,7 @@ def _one_motion_each(
     return choice
 
 
-def _candidates(
+def candidates(
     views: Views, choice: Choice, at: Int, R_main: Float, noise: float, o: SeededStart
 ) -> tuple[Float, Float]:
     """(C, 3, 3), (C, 3) candidate motions for superpixels `at`, fitted to all their pixels.
@@ -133,7 +134,7 @@ def _spread(
     """
     label = choice.label
     count = np.bincount(label[label >= 0])
-    main = _main(label)
+    main = main_motion(label)
     large = count >= o.piece_size
     large[main] = False
     kept = np.array([main, *np.flatnonzero(large)])

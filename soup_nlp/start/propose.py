@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
@@ -17,22 +17,11 @@ from soup_nlp.model.energy_data import sample_pixels
 from soup_nlp.start.bending import (
     affine_flow,
     at_rest,
-    bending_share,
     constant_depth,
     flow_jump,
     surfaces,
 )
-from soup_nlp.start.choice import (
-    LEAST_NOISE,
-    Choice,
-    dominant,
-    flow_affinity,
-    limited_noise,
-    of_neighbourhoods,
-    of_pieces,
-    select,
-    smooth_choice,
-)
+from soup_nlp.start.choice import LEAST_NOISE, limited_noise, rigid_choice
 from soup_nlp.start.components import (
     TIES,
     borrow,
@@ -44,13 +33,11 @@ from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import above_ground, floating, ground
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import gather
+from soup_nlp.start.regions import LEAST_REGION, bending_regions
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
 
 __all__ = ["SeededStart", "Start", "propose"]
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +54,13 @@ class Start:
             dominant motion, or a connected piece of superpixels with their own motions.
         motions: The dominant motions.
         surface: (N,) index of the surface: a connected group without flow discontinuities inside;
-            where surfaces bend, discontinuities make up most of its outline.
+            where a region bends, discontinuities make up most of its outline.
         tie: (N,) what gives the component of every superpixel its scale, an index of `TIES`.
         grounded: (N,) True where the depth is borrowed and the ground is known below the horizon.
-        bending_share: Share of the superpixels that move differently from most of their surface.
-        bending: Whether the energy for bending surfaces is used; all superpixels are then one
-            component at a constant depth.
+        bends: (N,) True where the energy for bending surfaces is used. Its connected regions are
+            components that start at a constant depth, each superpixel with a motion of its own. If
+            the rest is small or has no parallax, or the camera is at rest, it is the whole image
+            and one component.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
         noise: Noise of the flow, pixels, see `limited_noise`.
     """
@@ -80,15 +68,14 @@ class Start:
     soup: Soup
     error: Float
     parallax: Float
-    borrowed: NDArray[np.bool_]
+    borrowed: Mask
     motion: Int
     component: Int
     motions: list[Motion]
     surface: Int
     tie: Int
-    grounded: NDArray[np.bool_]
-    bending_share: float = 0.0
-    bending: bool = False
+    grounded: Mask
+    bends: Mask
     at_rest: bool = False
     noise: float = LEAST_NOISE
 
@@ -96,10 +83,15 @@ class Start:
         return (
             f"Start({len(self.soup)} superpixels, {len(self.motions)} dominant motions, median"
             f" error {np.median(self.error):.2f} px, {int(self.borrowed.sum())} borrowed"
-            + (f", {self.bending_share:.0%} bending)" if self.bending else ")")
+            + (f", {self.bends.mean():.0%} bending)" if self.bending else ")")
         )
 
     __repr__ = __str__
+
+    @property
+    def bending(self) -> bool:
+        """Whether a region bends."""
+        return bool(self.bends.any())
 
 
 def propose(
@@ -121,42 +113,24 @@ def propose(
     views, poor = look(seg, flow, K_ref, K_next, o)
     if o.method == "homography":
         return _of_homographies(views, seg, o)
-    motions = dominant(views, o)
-    fit = views.fit(motions)
-    cost = fit.penalised()
-    noise = limited_noise(cost.min(axis=1))
-    # what no motion explains yet, piece by piece
-    for _ in range(o.rounds):
-        extra = of_pieces(views, seg, motions, cost, noise, o)
-        if not extra:
-            break
-        motions = motions + extra
-        fit = views.fit(motions)
-        cost = fit.penalised()
-        kept = select(cost, noise, o)
-        motions, fit, cost = [motions[c] for c in kept], fit.columns(kept), cost[:, kept]
-        noise = limited_noise(cost.min(axis=1))
-    # the dominant motion is preferred where another is not clearly better
-    prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * o.unexplained_px))
     affine, residual = affine_flow(views)
     jump = flow_jump(affine, views, seg.pairs, rays(K_ref, seg.boundary))
-    # beyond 5 pixels one motion is as wrong as another
-    cost = np.minimum(cost + prefer, 5.0)
-    label = smooth_choice(cost, flow_affinity(jump, o), seg, o.smoothness)
-    R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
-    choice = Choice(R, t, fit.pick((np.arange(len(seg)), label)), label)
-    choice = of_neighbourhoods(views, seg, choice, noise, o)
-    surface = connected_labels(jump < o.discontinuity_px, seg)
-    share = bending_share(surface, rigid_components(choice.label, seg))
-    still, turn = at_rest(views, [m.R for m in motions])
+    choice, motions, noise = rigid_choice(views, seg, jump, o)
+    surface = surfaces(jump, seg, o.discontinuity_px)
+    bends = bending_regions(views, seg, surface, jump, residual, choice, o)
+    turns = [m.R for m in motions]
+    still, turn = at_rest(views, turns)
     rests = still > o.at_rest
-    if share > o.bending or rests:
-        soup, error = constant_depth(views, turn if rests else None)
-        none, every = np.full(len(seg), -1), np.ones(len(seg), bool)
-        parallax, surface = _parallax(soup, views), surfaces(jump, seg, o.discontinuity_px)
-        zero, noise = none + 1, limited_noise(residual)
-        found = soup, error, parallax, every, none, zero, motions, surface, zero, ~every, share
-        return Start(*found, bending=True, at_rest=rests, noise=noise)
+    if rests or (bends.any() and _nothing_else(views, np.flatnonzero(~bends), turns, o)):
+        noise = limited_noise(residual)
+        return _constant(views, surface, motions, noise, turn if rests else None)
+    free = constant_depth(views) if bends.any() else None
+    if free is not None:
+        # what bends says nothing about the motions of the rest
+        views, poor = views.without(bends), poor | bends
+        choice, motions, noise = rigid_choice(views, seg, jump, o)
+    else:
+        surface = connected_labels(jump < o.discontinuity_px, seg)
     choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
     own, label, parallax = choice.fit, choice.label, choice.parallax
     mu, slope = own.inverse_depth[:, 0], own.slope[:, 0]
@@ -173,7 +147,12 @@ def propose(
         mu, slope, length = borrow(mu, slope, label, weak, seg)
     t = choice.t * length[:, None]
     soup = _soup(mu, slope, choice.R, t, views.anchor, views.radius)
-    component = rigid_components(label, seg)
+    component, error = rigid_components(label, seg), own.cost[:, 0]
+    if free is not None:
+        soup, error = soup.taking(free[0], bends), np.where(bends, free[1], error)
+        parallax = np.where(bends, _parallax(free[0], views), parallax)
+        label = np.where(bends, -1, label)
+        component = _with_bending(component, bends, seg)
     scale, tie = contact_scales(soup, component, seg, K_ref, o.upright)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t)
     grounded = np.zeros(len(seg), bool)
@@ -183,9 +162,32 @@ def propose(
         soup, component, tie, floor = _on_ground(soup, *own_ground)
         grounded = weak & (floor > 0)
     soup = soup.normalised()
-    error = own.cost[:, 0]
-    found = soup, error, parallax, weak, label, component, motions, surface, tie, grounded, share
-    return Start(*found, noise=limited_noise(error))
+    found = soup, error, parallax, weak, label, component, motions, surface, tie, grounded, bends
+    return Start(*found, noise=limited_noise(error[~bends]))
+
+
+def _nothing_else(views: Views, rest: Int, turns: list[Float], o: SeededStart) -> bool:
+    """Whether superpixels `rest` (K,), which do not bend, are too few for a motion or at rest."""
+    few = len(rest) < LEAST_REGION * len(views.ray)
+    return few or at_rest(views.some(rest), turns)[0] > o.at_rest
+
+
+def _constant(
+    views: Views, surface: Int, motions: list[Motion], noise: float, turn: Float | None
+) -> Start:
+    """Start without relief, where everything bends or the camera is at rest (`turn` is given)."""
+    soup, error = constant_depth(views, turn)
+    zero, every = np.zeros(len(surface), np.int64), np.ones(len(surface), bool)
+    own = soup, error, _parallax(soup, views), every, zero - 1, zero
+    found = *own, motions, surface, zero, ~every, every
+    return Start(*found, at_rest=turn is not None, noise=noise)
+
+
+def _with_bending(component: Int, bends: Mask, seg: Segmentation) -> Int:
+    """(N,) components without gaps in their numbers; each connected region that bends is one."""
+    region = connected_labels(bends[seg.pairs[:, 0]] & bends[seg.pairs[:, 1]], seg)
+    component = np.where(bends, component.max() + 1 + region, component)
+    return np.unique(component, return_inverse=True)[1].ravel()
 
 
 def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
@@ -200,7 +202,7 @@ def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
     noise = limited_noise(error)
     none = np.zeros(len(seg), bool)
     own = soup, error, parallax, borrowed, whole - 1, whole
-    return Start(*own, [], whole, whole, none, noise=noise)
+    return Start(*own, [], whole, whole, none, none, noise=noise)
 
 
 def _on_ground(
@@ -208,7 +210,7 @@ def _on_ground(
     anchor: Float,
     seg: Segmentation,
     K_ref: Float,
-    known: NDArray[np.bool_],
+    known: Mask,
     component: Int,
     tie: Int,
     o: SeededStart,
@@ -236,7 +238,7 @@ def _on_ground(
 
 def look(
     seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: SeededStart
-) -> tuple[Views, NDArray[np.bool_]]:
+) -> tuple[Views, Mask]:
     """Rays and targets of sampled pixels, and (N,) True where they are those of a neighbour.
 
     Args:
@@ -273,8 +275,8 @@ def look(
 
 
 def _fill_poor(
-    seg: Segmentation, index: Int, there: NDArray[np.bool_], least: int = 8
-) -> tuple[Int, NDArray[np.bool_], NDArray[np.bool_]]:
+    seg: Segmentation, index: Int, there: Mask, least: int = 8
+) -> tuple[Int, Mask, Mask]:
     """Replace the samples of superpixels with few usable pixels by their nearest neighbour's."""
     count = there.sum(axis=1)
     poor = count < least

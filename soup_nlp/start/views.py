@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from soup_nlp.arrays import Float, Int
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.plane_fit import PlaneFit, fit_planes
 from soup_nlp.start.epipolar import Motion
 
@@ -43,6 +43,10 @@ class Views:
         return fit_planes(
             R, t, self.ray, self.target, self.weight, self.anchor, self.radius, self.focal
         )
+
+    def without(self, mask: Mask) -> Views:
+        """The same with confidence 0 in the superpixels of a mask (N,)."""
+        return replace(self, weight=np.where(mask[:, None], 0.0, self.weight))
 
     def some(self, at: Int) -> Views:
         """The entries of superpixels `at`."""
