@@ -10,6 +10,7 @@ from types import MappingProxyType
 from soup_nlp.bench import analyses_report as reports
 from soup_nlp.bench.accuracy import Measure, measure_pair, pair_job
 from soup_nlp.bench.analyses_measures import VIEWS, measure_energy, measure_flow, measure_view
+from soup_nlp.bench.causes import measure_causes, plot_causes, text_causes
 from soup_nlp.bench.confidence import measure_confidence, plot_confidence, text_confidence
 from soup_nlp.bench.rules import RULES, SHIPPED, in_both, plot_rules, text_rules
 from soup_nlp.bench.suite_pairs import Item
@@ -126,6 +127,15 @@ _ALL = (
         function=measure_flow,
         page=reports.text_flow,
         plot=reports.plot_flow,
+    ),
+    Analysis(
+        "causes",
+        "where the depth error with DIS sits, and what the true motion makes of the same flow",
+        {"dis": ("flow.source=dis",)},
+        true_flow_only=True,
+        function=measure_causes,
+        page=text_causes,
+        plot=plot_causes,
     ),
     Analysis(
         "views",
