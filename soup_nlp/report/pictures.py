@@ -112,7 +112,8 @@ def _parts(shown: Shown) -> list[Picture]:
         ((int(c[0]), int(c[1]), int(c[2])), f"{k}: {share:.1%}")
         for k, (c, share) in enumerate(zip(colours, pixels, strict=True))
     ][:6]
-    word = "one rigid component" if count == 1 else f"{count} rigid components, share of the image"
+    kind = "component" if shown.bends.any() else "rigid component"
+    word = f"one {kind}" if count == 1 else f"{count} {kind}s, share of the image"
     grey = back.astype(float).mean(axis=2, keepdims=True)
     shaded = colours[component[labels]] * (0.6 + 0.4 * grey / 255)
     return [
