@@ -31,12 +31,15 @@ COMMANDS = (
     f"{ANALYSIS} flows --suite rendered --suite shared --data {{data}} --flow truth",
     f"{ANALYSIS} views --suite shared --data {{data}} --flow dis {NLP}",
     f"{ANALYSIS} confidence --suite rendered --suite shared --data {{data}} --flow dis",
+    f"{ANALYSIS} causes --suite rendered --suite shared --data {{data}} --flow truth",
     f"{ANALYSIS} rules --suite rendered --suite shared --data {{data}} --flow dis --width 512"
     f" {TERSE} {NLP}",
     f"bench search -o {{out}}/accuracy {THREE} --flow dis --trials 8 --seeds 0"
     f" --validation-seeds 1,2 --width 512 --set segmentation.superpixels=300 {NLP}",
     "bench accuracy -o {out}/accuracy --name sheets --suite rendered --only sheet"
     f" --seeds 0,1,2,3,4,5 --flow truth --flow dis {NLP}",
+    "bench accuracy -o {out}/accuracy --name banner --suite rendered --only banner"
+    " --seeds 0,1,2,3,4,5 --flow truth --flow dis",
     "bench accuracy -o {out}/accuracy --name components --suite rendered --only street --only room"
     " --seeds 1,2,3,4,5,6,10,11,12,13,14,15,16,17,18 --flow truth --flow dis"
     f" {NLP}",
