@@ -24,7 +24,7 @@ from soup_nlp.bench.analyses_report import (
     text_flow,
     text_variants,
 )
-from soup_nlp.bench.suite_pairs import Item, Options
+from soup_nlp.bench.suite_pairs import RENDERED, Item, Options
 from soup_nlp.bench.suites import list_suite
 from soup_nlp.bench.tables import reason
 from soup_nlp.bench.tuning import (
@@ -225,7 +225,7 @@ def test_split_keeps_scenes_apart():
         Item("shared", n, n, f, {"kind": "motorcycle"}) for n in "abcd" for f in ("truth", "dis")
     ]
     train, validation = split([*items(0, 1, 2), *real], (0, 1), (2,))
-    assert len(train) + len(validation) == 30 + 8
+    assert len(train) + len(validation) == 2 * 3 * len(RENDERED) + 8
     assert {i.input["seed"] for i in validation if "seed" in i.input} == {2}
     assert {i.name for i in validation if "seed" not in i.input} == {"b", "d"}
     assert not {i.name for i in train} & {i.name for i in validation}

@@ -60,8 +60,9 @@ class Frozen:
     def problem(self) -> Problem:
         """The merged problem."""
         raw = yaml.safe_load(self.text)
-        # an option of earlier code; the record has the weights that it gave
+        # options of earlier code; the record has the weights and the start that they gave
         raw["energy"].pop("prior_contact", None)
+        raw["start"].pop("bending", None)
         return make_problem(raw)
 
     @property

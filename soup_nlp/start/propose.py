@@ -40,6 +40,10 @@ from soup_nlp.start.views import Views
 __all__ = ["SeededStart", "Start", "propose"]
 
 
+LITTLE_PARALLAX = 0.5
+"""Share of `at_rest` from which a scene that bends has no rigid rest with a depth of its own."""
+
+
 @dataclass(frozen=True, eq=False)
 class Start:
     """The initial soup, and how it was made.
@@ -121,7 +125,7 @@ def propose(
     turns = [m.R for m in motions]
     still, turn = at_rest(views, turns)
     rests = still > o.at_rest
-    if rests or (bends.any() and _nothing_else(views, np.flatnonzero(~bends), turns, o)):
+    if rests or (bends.any() and _nothing_else(views, bends, turns, still, o)):
         noise = limited_noise(residual)
         return _constant(views, surface, motions, noise, turn if rests else None)
     free = constant_depth(views) if bends.any() else None
@@ -166,10 +170,22 @@ def propose(
     return Start(*found, noise=limited_noise(error[~bends]))
 
 
-def _nothing_else(views: Views, rest: Int, turns: list[Float], o: SeededStart) -> bool:
-    """Whether superpixels `rest` (K,), which do not bend, are too few for a motion or at rest."""
-    few = len(rest) < LEAST_REGION * len(views.ray)
-    return few or at_rest(views.some(rest), turns)[0] > o.at_rest
+def _nothing_else(
+    views: Views, bends: Mask, turns: list[Float], still: float, o: SeededStart
+) -> bool:
+    """Whether the superpixels that do not bend are too few, or have too little parallax, for depth.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        bends: (N,) True where a region bends.
+        turns: (3, 3) rotations to try, see `at_rest`.
+        still: Share of the usable pixels without parallax.
+        o: Share of them at which the camera is taken to be at rest.
+    """
+    rest = np.flatnonzero(~bends)
+    if len(rest) < LEAST_REGION * len(bends):
+        return True
+    return max(still, at_rest(views.some(rest), turns)[0]) > LITTLE_PARALLAX * o.at_rest
 
 
 def _constant(
