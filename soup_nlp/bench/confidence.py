@@ -92,8 +92,9 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
     found = {name: sparsification(relative, cue) for name, cue in cues.items()}
     sure = result.confidence
     misfit = sure.misfit[rec.labels]
-    whole = calibrated(sure.spread, sure.noise, misfit, np.inf, sure.bends)
-    unit = chosen(whole / np.where(sure.bends, BENDING_FACTOR, FACTOR))
+    bends = result.start.bends[rec.labels]
+    whole = calibrated(sure.spread, sure.noise, misfit, np.inf, bends)
+    unit = chosen(whole / np.where(bends, BENDING_FACTOR, FACTOR))
     still = np.full(len(log), sure.still)
     picked = np.linspace(0, len(log) - 1, min(SAMPLE_PIXELS, len(log))).astype(int)
     own = found["sigma"]
@@ -108,7 +109,7 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
             "within": coverage(log, cues["sigma"]),
             "guess": sure.guessed,
             "noise": sure.noise,
-            "bending": bool(sure.bends.any()),
+            "bending": result.start.bending,
             "seconds": seconds,
             "curve": [own.kept.tolist(), own.error.tolist(), own.oracle.tolist()],
             "sample": np.stack([log[picked], unit[picked], still[picked]]).round(6).tolist(),

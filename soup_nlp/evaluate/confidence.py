@@ -191,8 +191,7 @@ class Confidence:
         spread: (H, W) standard deviation of log depth by what the flow adds to the terms on shape.
         marginals: Of the planes and of the components' scales.
         noise: Of the flow, pixels.
-        bends: (H, W) True where a region bends.
-        bending_component: (C,) True for components that bend.
+        component_sigma: (C,) calibrated standard deviation of the components' log scale.
         still: Share of the image that stands still where surfaces bend.
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
     """
@@ -201,8 +200,7 @@ class Confidence:
     spread: Float
     marginals: Marginals
     noise: float
-    bends: Mask
-    bending_component: Mask
+    component_sigma: Float
     still: float
     misfit: Float
 
@@ -210,12 +208,6 @@ class Confidence:
     def guessed(self) -> float:
         """Share of the pixels whose depth is a guess."""
         return float(np.mean(self.sigma > MOST_SIGMA))
-
-    @property
-    def component_sigma(self) -> Float:
-        """(C,) calibrated standard deviation of the components' log scale."""
-        spread = np.sqrt(self.marginals.component)
-        return calibrated(spread, self.noise, bends=self.bending_component)
 
 
 def without_parallax(start: Start) -> Mask:
@@ -356,6 +348,6 @@ def confidence(
     stands |= start.at_rest & (start.parallax < MOST_NOISE)
     still = float(stands[rec.labels].mean())
     sigma = calibrated(spread, noise, misfit[rec.labels], bends=bends, still=still)
-    parts = np.zeros(len(own.component), bool)
-    parts[start.component[start.bends]] = True
-    return Confidence(sigma, spread, own, noise, bends, parts, still, misfit)
+    bending = np.isin(np.arange(len(own.component)), start.component[start.bends])
+    scales = calibrated(np.sqrt(own.component), noise, bends=bending)
+    return Confidence(sigma, spread, own, noise, scales, still, misfit)

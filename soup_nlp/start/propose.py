@@ -21,7 +21,7 @@ from soup_nlp.start.bending import (
     flow_jump,
     surfaces,
 )
-from soup_nlp.start.choice import LEAST_NOISE, limited_noise, rigid_choice
+from soup_nlp.start.choice import LEAST_NOISE, Choice, limited_noise, rigid_choice
 from soup_nlp.start.components import (
     TIES,
     borrow,
@@ -136,22 +136,9 @@ def propose(
     else:
         surface = connected_labels(jump < o.discontinuity_px, seg)
     choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
-    own, label, parallax = choice.fit, choice.label, choice.parallax
-    mu, slope = own.inverse_depth[:, 0], own.slope[:, 0]
-    weak = (mu <= 0) | (parallax < o.min_parallax_px) | (own.cost[:, 0] > 3.0) | poor
-    weak |= views.weight.sum(axis=1) < 2.0
-    if weak.all():
-        # little parallax everywhere is still some, until it is the rounding of the flow
-        weak = ~np.isfinite(mu) | (mu <= 0) | (parallax < 0.02)
-    if weak.all():
-        # no depth is known: all are at one, where translations move the image as they did
-        length = np.where(mu > 0, mu, 0.0)
-        mu, slope = np.ones(len(seg)), np.zeros((len(seg), 2))
-    else:
-        mu, slope, length = borrow(mu, slope, label, weak, seg)
-    t = choice.t * length[:, None]
-    soup = _soup(mu, slope, choice.R, t, views.anchor, views.radius)
-    component, error = rigid_components(label, seg), own.cost[:, 0]
+    soup, weak = _with_depth(choice, views, poor, seg, o)
+    label, parallax = choice.label, choice.parallax
+    component, error = rigid_components(label, seg), choice.fit.cost[:, 0]
     if free is not None:
         soup, error = soup.taking(free[0], bends), np.where(bends, free[1], error)
         parallax = np.where(bends, _parallax(free[0], views), parallax)
@@ -168,6 +155,35 @@ def propose(
     soup = soup.normalised()
     found = soup, error, parallax, weak, label, component, motions, surface, tie, grounded, bends
     return Start(*found, noise=limited_noise(error[~bends]))
+
+
+def _with_depth(
+    choice: Choice, views: Views, poor: Mask, seg: Segmentation, o: SeededStart
+) -> tuple[Soup, Mask]:
+    """Planes under the chosen motions, and (N,) True where they are borrowed from neighbours.
+
+    Args:
+        choice: Motion and plane of every superpixel.
+        views: Rays, targets and confidence of every superpixel.
+        poor: (N,) True where these are a neighbour's or have no confidence.
+        seg: Superpixels and graphs.
+        o: Least parallax.
+    """
+    own, parallax = choice.fit, choice.parallax
+    mu, slope = own.inverse_depth[:, 0], own.slope[:, 0]
+    weak = (mu <= 0) | (parallax < o.min_parallax_px) | (own.cost[:, 0] > 3.0) | poor
+    weak |= views.weight.sum(axis=1) < 2.0
+    if weak.all():
+        # little parallax everywhere is still some, until it is the rounding of the flow
+        weak = ~np.isfinite(mu) | (mu <= 0) | (parallax < 0.02)
+    if weak.all():
+        # no depth is known: all are at one, where translations move the image as they did
+        length = np.where(mu > 0, mu, 0.0)
+        mu, slope = np.ones(len(seg)), np.zeros((len(seg), 2))
+    else:
+        mu, slope, length = borrow(mu, slope, choice.label, weak, seg)
+    t = choice.t * length[:, None]
+    return _soup(mu, slope, choice.R, t, views.anchor, views.radius), weak
 
 
 def _nothing_else(
