@@ -12,7 +12,7 @@ from helpers_model import PAPER, Tiny, weights_for
 
 from soup_nlp.bench.solvers import runner
 from soup_nlp.bench.solvers.page import conclusion
-from soup_nlp.evaluate import recompute
+from soup_nlp.evaluate import recompute_data
 from soup_nlp.export import verify
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, Residuals
 from soup_nlp.model import oracle
@@ -155,7 +155,7 @@ def test_contact_is_weaker_where_a_component_hides_another(slant, gap):
         "occlusion_gap": 0.1, "cont_occluded": 0.25, "units": "pixel",
         "weights": {"cont": 1.0}, "bending": {"cont_across": 0.5, "weights": {"cont": 1.0}},
     }  # fmt: skip
-    np.testing.assert_allclose(recompute._pair_weights(tree, form), [0.2 if gap else 0.8])
+    np.testing.assert_allclose(recompute_data._pair_weights(tree, form), [0.2 if gap else 0.8])
 
 
 def test_a_bound_s_multiplier_shares_what_is_left_of_the_gradient_with_its_gap(monkeypatch):

@@ -11,7 +11,7 @@ import numpy as np
 
 from soup_nlp.arrays import Image, Mask
 from soup_nlp.errors import DataError, printable, repr_of
-from soup_nlp.evaluate import recompute, recompute_files
+from soup_nlp.evaluate import recompute, recompute_data, recompute_files
 from soup_nlp.evaluate.scoring import DEPTHS, SURE
 from soup_nlp.report.check_arrays import require_layout
 from soup_nlp.report.check_files import file_claims
@@ -117,7 +117,7 @@ def _rows(
     yield from _labels(claims, attrs, config)
     weights = {k: float(v) for k, v in tree["weights"].items()}
     yield from _weights(tree, settings["energy"], weights)
-    for name, gap in recompute.data_errors(tree, settings).items():
+    for name, gap in recompute_data.data_errors(tree, settings).items():
         yield Claim(f"data {name}", 0.0, gap, RELATIVE, gap <= RELATIVE)
     slack = _rounding(tree, weights)
     for which in ("start", "nlp", "solution"):
@@ -145,7 +145,7 @@ def _rows(
 def _weights(tree: Entries, form: Entries, weights: Mapping[str, float]) -> Iterator[Claim]:
     """Claims that the stored weights are those of the problem."""
     own = form["weights"]
-    if recompute.bends_where(tree, form).all():
+    if recompute_data.bends_where(tree, form).all():
         own = dict(form["bending"]["weights"])
         # given for 1,000 superpixels
         own["orient"] *= len(tree["start"]["component"]) / 1000

@@ -130,7 +130,7 @@ def propose(
         return _constant(views, surface, motions, noise, turn if rests else None)
     free = constant_depth(views) if bends.any() else None
     if free is not None:
-        # what bends says nothing about the motions of the rest
+        # the flow of bending regions says nothing about the motions of the rest
         views, poor = views.without(bends), poor | bends
         choice, motions, noise = rigid_choice(views, seg, jump, o)
     else:
