@@ -9,16 +9,26 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from soup_nlp.data.pair import Pair
+from soup_nlp.data.scenes.materials import (
+    ASPHALT,
+    GLASS,
+    SKY,
+    Materials,
+    Random,
+    about,
+    backdrop,
+    floor,
+    placed,
+    sign,
+    views,
+)
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, advanced, inverse, render
 from soup_nlp.data.scenes.shapes import Box, Float, Plane, Shape, Sheet, Sphere
-from soup_nlp.data.scenes.texture import Colour, Panels, Texture
+from soup_nlp.data.scenes.texture import Panels, Texture
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.schema.limits import check_image_size
-
-Random = np.random.Generator
 
 
 def render_scene(
@@ -48,121 +58,33 @@ def render_scene(
     return render(advanced(scene, frame), K, height, width, name=own)
 
 
-# --- poses -----------------------------------------------------------------------------------
+# layouts: (rng, half width / f, half height / f) -> Scene
 
 
-def _pose(x: float, y: float, z: float, yaw: float = 0.0, pitch: float = 0.0) -> Float:
-    """(4, 4) pose at a position (m), turned by `yaw` about y after `pitch` about x (degrees)."""
-    out = np.eye(4)
-    turns = [rotation.exp(np.radians(w)) for w in ([0.0, yaw, 0.0], [pitch, 0.0, 0.0])]
-    out[:3, :3], out[:3, 3] = turns[0] @ turns[1], (x, y, z)
-    return out
-
-
-def _about(pivot: ArrayLike, turn: ArrayLike, shift: ArrayLike) -> Float:
-    """(4, 4) motion: turn by a rotation vector (degrees) about a pivot (3,), then shift (3,) m."""
-    out, centre = np.eye(4), np.array(pivot, float)
-    out[:3, :3] = rotation.exp(np.radians(turn))
-    out[:3, 3] = centre - out[:3, :3] @ centre + np.asarray(shift)
-    return out
-
-
-def _views(pose: Float, shift: ArrayLike, turn: ArrayLike) -> tuple[Float, Float]:
-    """(ref_from_scene, next_from_scene) of a camera at `pose` that moves in its own frame."""
-    return inverse(pose), inverse(pose @ _about([0, 0, 0], turn, shift))
-
-
-def _sign(rng: Random) -> float:
-    return float(rng.choice([-1.0, 1.0]))
-
-
-# --- materials -------------------------------------------------------------------------------
-
-_PAINTS: tuple[tuple[Colour, Colour], ...] = (
-    ((0.72, 0.20, 0.14), (0.50, 0.12, 0.10)),
-    ((0.16, 0.36, 0.68), (0.10, 0.22, 0.46)),
-    ((0.82, 0.66, 0.18), (0.66, 0.46, 0.10)),
-    ((0.18, 0.52, 0.30), (0.34, 0.62, 0.26)),
-    ((0.62, 0.58, 0.56), (0.40, 0.40, 0.44)),
-    ((0.52, 0.26, 0.56), (0.68, 0.40, 0.62)),
-    ((0.20, 0.58, 0.60), (0.12, 0.40, 0.46)),
-    ((0.80, 0.44, 0.20), (0.62, 0.30, 0.14)),
-)
-_WALLS: tuple[tuple[Colour, Colour], ...] = (
-    ((0.70, 0.62, 0.50), (0.58, 0.50, 0.42)),
-    ((0.62, 0.38, 0.30), (0.50, 0.32, 0.27)),
-    ((0.60, 0.62, 0.64), (0.48, 0.50, 0.54)),
-    ((0.74, 0.70, 0.62), (0.62, 0.60, 0.56)),
-)
-_ASPHALT: tuple[Colour, Colour] = ((0.42, 0.42, 0.43), (0.32, 0.32, 0.34))
-_SKY: tuple[Colour, Colour] = ((0.52, 0.68, 0.88), (0.84, 0.88, 0.92))
-_GLASS: Colour = (0.16, 0.20, 0.26)
-
-
-class _Materials:
-    """Textures with a new noise for each surface."""
-
-    def __init__(self, rng: Random) -> None:
-        self.rng = rng
-        self.paints = [_PAINTS[i] for i in rng.permutation(len(_PAINTS))]
-
-    def plain(
-        self,
-        colours: tuple[Colour, Colour],
-        cell: float,
-        panels: Panels | None = None,
-        contrast: float = 0.45,
-    ) -> Texture:
-        """A given pair of colours."""
-        return Texture(colours, cell, contrast, int(self.rng.integers(2**31)), panels)
-
-    def paint(self, cell: float, panels: Panels | None = None) -> Texture:
-        """The next colour of the palette."""
-        self.paints.append(self.paints.pop(0))
-        return self.plain(self.paints[-1], cell, panels, contrast=0.5)
-
-    def wall(self, cell: float, panels: Panels | None = None) -> Texture:
-        """One of the wall colours."""
-        return self.plain(_WALLS[self.rng.integers(len(_WALLS))], cell, panels)
-
-
-def _floor(texture: Texture) -> Part:
-    """The infinite ground y = 0."""
-    return Part(Plane(), _pose(0, 0, 0, pitch=-90), texture)
-
-
-def _backdrop(z: float, texture: Texture, glow: float = 0.45) -> Part:
-    """An infinite upright wall at a distance."""
-    return Part(Plane(), _pose(0, 0, z), texture, glow)
-
-
-# --- layouts: (rng, half width / f, half height / f) -> Scene ----------------------------------
-
-
-def _car(m: _Materials, x: float, z: float, yaw: float) -> tuple[Part, ...]:
+def _car(m: Materials, x: float, z: float, yaw: float) -> tuple[Part, ...]:
     """A car of three boxes that stands on the ground, nose along +z at yaw 0."""
-    at = _pose(x, 0, z, yaw=yaw)
+    at = placed(x, 0, z, yaw=yaw)
     body = m.paint(0.7)
     sizes: list[tuple[tuple[float, float, float], tuple[float, float], Texture]] = [
         # half size, (bottom above ground, offset along the car), texture
         ((0.86, 0.12, 2.02), (0.0, 0.0), m.plain(((0.12, 0.12, 0.13), (0.2, 0.2, 0.21)), 0.4)),
         ((0.92, 0.33, 2.15), (0.24, 0.0), body),
-        ((0.78, 0.24, 1.1), (0.9, -0.3), m.plain((_GLASS, (0.3, 0.36, 0.42)), 0.5)),
+        ((0.78, 0.24, 1.1), (0.9, -0.3), m.plain((GLASS, (0.3, 0.36, 0.42)), 0.5)),
         ((0.76, 0.03, 1.0), (1.38, -0.3), body),
     ]
     return tuple(
-        Part(Box(half), at @ _pose(0, -(bottom + half[1]), along), texture)
+        Part(Box(half), at @ placed(0, -(bottom + half[1]), along), texture)
         for half, (bottom, along), texture in sizes
     )
 
 
 def _street(rng: Random, half_width: float, half_height: float) -> Scene:
     """driving camera, two moving cars on a street between houses; depth to 80 m"""
-    m = _Materials(rng)
+    m = Materials(rng)
     lanes = Panels((3.6, 5.0), (0.035, 0.5), (0.78, 0.78, 0.74), (-0.06, rng.uniform(0, 5)))
     parts = [
-        _floor(m.plain(_ASPHALT, 2.5, lanes, contrast=0.5)),
-        _backdrop(78, m.plain(_SKY, 9.0, contrast=0.16), glow=1.0),
+        floor(m.plain(ASPHALT, 2.5, lanes, contrast=0.5)),
+        backdrop(78, m.plain(SKY, 9.0, contrast=0.16), glow=1.0),
     ]
     for side in (-1.0, 1.0):
         z = rng.uniform(-4, 0)
@@ -172,12 +94,12 @@ def _street(rng: Random, half_width: float, half_height: float) -> Scene:
             windows = Panels(
                 (rng.uniform(2.2, 3.2), rng.uniform(2.6, 3.4)),
                 (0.45, 0.55),
-                _GLASS,
+                GLASS,
                 (rng.uniform(0, 3), rng.uniform(0, 3)),
                 variation=0.5,
             )
             half = (3.0, height / 2, min(length, 76 - z) / 2)
-            pose = _pose(side * (front + 3.0), -height / 2, z + half[2])
+            pose = placed(side * (front + 3.0), -height / 2, z + half[2])
             parts.append(Part(Box(half), pose, m.wall(3.0, windows)))
             z += length + rng.choice([0.0, 0.0, 3.0])
     drive = rng.uniform(0.5, 0.6)
@@ -187,18 +109,18 @@ def _street(rng: Random, half_width: float, half_height: float) -> Scene:
     speeds = rng.uniform(0.3, 0.6, 2) * drive
     if rng.random() < 0.5:
         same = _car(m, lane, ahead, 0.0)
-        move = _about([lane, 0, ahead], [0, _sign(rng), 0], [0, 0, speeds[0]])
+        move = about([lane, 0, ahead], [0, sign(rng), 0], [0, 0, speeds[0]])
     else:
         yaw = -rng.uniform(50, 75)
         same = _car(m, lane, ahead, yaw)
         nose = rotation.exp(np.radians([0, yaw, 0])) @ [0, 0, speeds[0]]
-        move = _about([lane, 0, ahead], [0, 0, 0], nose)
+        move = about([lane, 0, ahead], [0, 0, 0], nose)
     bodies.append(Body(same, move))
     shift = [0, 0, -speeds[1]]
-    bodies.append(Body(_car(m, -lane, coming, 180.0), _about([0, 0, 0], [0, 0, 0], shift)))
-    turn = [rng.uniform(-0.1, 0.1), _sign(rng) * rng.uniform(0.2, 0.4), 0.1]
-    pose = _pose(rng.uniform(-0.4, 0.4), -rng.uniform(2.1, 2.4), 0, yaw=rng.uniform(-2, 2))
-    view = _views(pose, [rng.uniform(-0.03, 0.03), 0, drive], turn)
+    bodies.append(Body(_car(m, -lane, coming, 180.0), about([0, 0, 0], [0, 0, 0], shift)))
+    turn = [rng.uniform(-0.1, 0.1), sign(rng) * rng.uniform(0.2, 0.4), 0.1]
+    pose = placed(rng.uniform(-0.4, 0.4), -rng.uniform(2.1, 2.4), 0, yaw=rng.uniform(-2, 2))
+    view = views(pose, [rng.uniform(-0.03, 0.03), 0, drive], turn)
     return Scene(tuple(bodies), *view)
 
 
@@ -212,7 +134,7 @@ _WALL = 6.4
 
 
 def _objects(
-    rng: Random, m: _Materials, spots: tuple[tuple[float, float], ...], half_width: float
+    rng: Random, m: Materials, spots: tuple[tuple[float, float], ...], half_width: float
 ) -> list[tuple[Part, Float]]:
     """Alternating boxes and spheres, one on each spot, with their foot points (3,)."""
     out = []
@@ -228,73 +150,71 @@ def _objects(
         else:
             half = size * rng.uniform([0.75, 0.75, 0.75], [1.0, 1.4, 1.0])
             shape, up, yaw = Box((half[0], half[1], half[2])), half[1], rng.uniform(20, 70)
-        pose = _pose(foot[0], -up, z, yaw=yaw)
+        pose = placed(foot[0], -up, z, yaw=yaw)
         out.append((Part(shape, pose, m.paint(0.8 * size)), foot))
     return out
 
 
-def _interior(rng: Random, m: _Materials, half_width: float) -> list[Part]:
+def _interior(rng: Random, m: Materials, half_width: float) -> list[Part]:
     """Floor with tiles, papered back wall with a picture, and two side walls."""
     tiles = Panels((0.6, 0.6), (0.965, 0.965), (0.60, 0.50, 0.40), variation=0.25)
     paper = Panels((0.5, 9.0), (0.5, 1.0), (0.62, 0.64, 0.56))
     side = 0.94 * half_width * _WALL
-    picture = _pose(rng.uniform(-0.5, 0.5) * side, -1.65, _WALL - 0.02)
+    picture = placed(rng.uniform(-0.5, 0.5) * side, -1.65, _WALL - 0.02)
     return [
-        _floor(m.plain(((0.36, 0.30, 0.25), (0.30, 0.26, 0.22)), 0.7, tiles)),
-        _backdrop(_WALL, m.wall(0.9, paper)),
-        Part(Plane(), _pose(-side, 0, 0, yaw=-90), m.wall(0.9)),
-        Part(Plane(), _pose(side, 0, 0, yaw=90), m.wall(0.9)),
+        floor(m.plain(((0.36, 0.30, 0.25), (0.30, 0.26, 0.22)), 0.7, tiles)),
+        backdrop(_WALL, m.wall(0.9, paper)),
+        Part(Plane(), placed(-side, 0, 0, yaw=-90), m.wall(0.9)),
+        Part(Plane(), placed(side, 0, 0, yaw=90), m.wall(0.9)),
         Part(Box((0.55, 0.4, 0.02)), picture, m.paint(0.3)),
     ]
 
 
 def _room(rng: Random, half_width: float, half_height: float) -> Scene:
     """camera moving sideways, three independently moving objects among furniture"""
-    m = _Materials(rng)
+    m = Materials(rng)
     objects = _objects(rng, m, _FRONT + _BACK, half_width)
     moving = [rng.integers(3), *(3 + rng.permutation(4)[:2])]
     rest = [part for k, (part, _) in enumerate(objects) if k not in moving]
     bodies = [Body((*_interior(rng, m, half_width), *rest))]
     for rank, k in enumerate(moving):
         part, foot = objects[k]
-        shift = np.array([_sign(rng), 0, _sign(rng)]) * rng.uniform(
-            [0.03, 0, 0.01], [0.06, 0, 0.06]
-        )
+        shift = np.array([sign(rng), 0, sign(rng)]) * rng.uniform([0.03, 0, 0.01], [0.06, 0, 0.06])
         if rank == 2:
             shift[1] = -rng.uniform(0.02, 0.05)  # lifted off the floor
-        turn = [0, _sign(rng) * rng.uniform(2, 4), 0]
-        bodies.append(Body((part,), _about(foot, turn, shift)))
-    side = _sign(rng)
-    view = _views(
-        _pose(0, -1.35, 0, yaw=side, pitch=-9),
+        turn = [0, sign(rng) * rng.uniform(2, 4), 0]
+        bodies.append(Body((part,), about(foot, turn, shift)))
+    side = sign(rng)
+    view = views(
+        placed(0, -1.35, 0, yaw=side, pitch=-9),
         [side * rng.uniform(0.06, 0.085), rng.uniform(-0.01, 0.01), 0.04],
-        [0.1, -side * rng.uniform(0.2, 0.5), _sign(rng) * 0.2],
+        [0.1, -side * rng.uniform(0.2, 0.5), sign(rng) * 0.2],
     )
     return Scene(tuple(bodies), *view)
 
 
 def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
     """a bending, non-rigid sheet at about 1 m before a wall"""
-    m = _Materials(rng)
-    bend, change = _sign(rng) * rng.uniform(0.7, 1.0), _sign(rng) * rng.uniform(0.15, 0.25)
+    m = Materials(rng)
+    bend, change = sign(rng) * rng.uniform(0.7, 1.0), sign(rng) * rng.uniform(0.15, 0.25)
     axis = rng.uniform(-0.25, 0.25)
     # sides that bend away from the camera look smaller
     room = 1.06 if bend > 0 else 0.93
     shape = Sheet(
         (room * half_width, room * half_height),
         (bend, bend + change),
-        (axis, axis + _sign(rng) * rng.uniform(0.02, 0.06)),
+        (axis, axis + sign(rng) * rng.uniform(0.02, 0.06)),
     )
     dots = Panels((0.16, 0.16), (0.5, 0.5), (0.66, 0.64, 0.56), variation=0.3)
-    cloth = Part(shape, _pose(0, 0, 1.0, yaw=rng.uniform(-8, 8)), m.paint(0.12, dots), glow=0.6)
+    cloth = Part(shape, placed(0, 0, 1.0, yaw=rng.uniform(-8, 8)), m.paint(0.12, dots), glow=0.6)
     shift = rng.uniform([-0.003, -0.003, -0.01], [0.003, 0.003, 0.01])
     bodies = (
-        Body((_backdrop(1.7, m.wall(0.3)),)),
-        Body((cloth,), _about([0, 0, 1], rng.uniform(-0.4, 0.4, 3), shift)),
+        Body((backdrop(1.7, m.wall(0.3)),)),
+        Body((cloth,), about([0, 0, 1], rng.uniform(-0.4, 0.4, 3), shift)),
     )
-    view = _views(
+    view = views(
         np.eye(4),
-        [_sign(rng) * rng.uniform(0.008, 0.013), rng.uniform(-0.004, 0.004), 0.004],
+        [sign(rng) * rng.uniform(0.008, 0.013), rng.uniform(-0.004, 0.004), 0.004],
         rng.uniform(-0.15, 0.15, 3),
     )
     return Scene(bodies, *view)
@@ -302,59 +222,59 @@ def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
 
 def _orbit(rng: Random, half_width: float, half_height: float) -> Scene:
     """camera orbiting a still life; one rigid motion"""
-    m = _Materials(rng)
+    m = Materials(rng)
     objects = _objects(rng, m, _FRONT + _BACK, half_width)
     bodies = [Body(tuple(_interior(rng, m, half_width)))]
     bodies += [Body((part,)) for k, (part, _) in enumerate(objects)]
-    pose = _pose(0, -1.45, 0, pitch=-9)
-    turn = [0, _sign(rng) * rng.uniform(1.2, 2.0), 0]
-    around = _about([0, 0, 4.2], turn, [0, rng.uniform(-0.03, 0.03), rng.uniform(-0.03, 0.06)])
+    pose = placed(0, -1.45, 0, pitch=-9)
+    turn = [0, sign(rng) * rng.uniform(1.2, 2.0), 0]
+    around = about([0, 0, 4.2], turn, [0, rng.uniform(-0.03, 0.03), rng.uniform(-0.03, 0.06)])
     return Scene(tuple(bodies), inverse(pose), inverse(around @ pose))
 
 
 def _still(rng: Random, half_width: float, half_height: float) -> Scene:
     """camera at rest, one moving object"""
-    m = _Materials(rng)
+    m = Materials(rng)
     objects = _objects(rng, m, _FRONT + _BACK, half_width)
     mover = int(rng.integers(3))
     part, foot = objects.pop(mover)
-    turn = [0, _sign(rng) * rng.uniform(3, 6), 0]
-    shift = [_sign(rng) * rng.uniform(0.05, 0.09), 0, rng.uniform(-0.08, 0.08)]
+    turn = [0, sign(rng) * rng.uniform(3, 6), 0]
+    shift = [sign(rng) * rng.uniform(0.05, 0.09), 0, rng.uniform(-0.08, 0.08)]
     bodies = (
         Body((*_interior(rng, m, half_width), *(p for p, _ in objects))),
-        Body((part,), _about(foot, turn, shift)),
+        Body((part,), about(foot, turn, shift)),
     )
-    pose = inverse(_pose(0, -1.35, 0, pitch=-9))
+    pose = inverse(placed(0, -1.35, 0, pitch=-9))
     return Scene(bodies, pose, pose)
 
 
 def _banner(rng: Random, half_width: float, half_height: float) -> Scene:
     """a banner that bends, standing in a rigid room before a moving camera"""
-    m = _Materials(rng)
+    m = Materials(rng)
     rest = [part for part, _ in _objects(rng, m, _BACK, half_width)]
-    bend, change = _sign(rng) * rng.uniform(0.5, 0.8), _sign(rng) * rng.uniform(0.12, 0.25)
+    bend, change = sign(rng) * rng.uniform(0.5, 0.8), sign(rng) * rng.uniform(0.12, 0.25)
     axis = rng.uniform(-0.2, 0.2)
     z, up = 3.5, 0.81  # its foot is on the floor, in the image
     unit = z * half_width
     shape = Sheet(
         (0.4 * unit, up),
         (bend, bend + change),
-        (axis, axis + _sign(rng) * rng.uniform(0.02, 0.05)),
+        (axis, axis + sign(rng) * rng.uniform(0.02, 0.05)),
     )
     dots = Panels((0.3, 0.3), (0.5, 0.5), (0.66, 0.64, 0.56), variation=0.3)
     x = rng.uniform(-0.3, 0.3) * unit
-    pose = _pose(x, -up, z, yaw=rng.uniform(-10, 10))
+    pose = placed(x, -up, z, yaw=rng.uniform(-10, 10))
     cloth = Part(shape, pose, m.paint(0.25, dots), glow=0.4)
     turn, shift = rng.uniform(-0.5, 0.5, 3), rng.uniform(-0.015, 0.015, 3)
     bodies = (
         Body((*_interior(rng, m, half_width), *rest)),
-        Body((cloth,), _about([x, 0, z], turn, shift)),
+        Body((cloth,), about([x, 0, z], turn, shift)),
     )
-    side = _sign(rng)
-    view = _views(
-        _pose(0, -1.35, 0, yaw=side, pitch=-9),
+    side = sign(rng)
+    view = views(
+        placed(0, -1.35, 0, yaw=side, pitch=-9),
         [side * rng.uniform(0.06, 0.085), rng.uniform(-0.01, 0.01), 0.04],
-        [0.1, -side * rng.uniform(0.2, 0.5), _sign(rng) * 0.2],
+        [0.1, -side * rng.uniform(0.2, 0.5), sign(rng) * 0.2],
     )
     return Scene(bodies, *view)
 
