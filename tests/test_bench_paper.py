@@ -125,12 +125,15 @@ def test_a_tiny_dataset_gives_all_sections(dataset, tmp_path, monkeypatch, capsy
     out = tmp_path / "out"
     words = ["bench", "paper", "--data", str(dataset), "-o", str(out), "-q", "--width", "128"]
     words += ["--families", "street,kinect_paper,motorcycle", "--seeds", "0"]
+    words += ["--departures", "street,rgbd,sheet"]
     assert main([*words, "--numbers", "50,100"]) == 1
     text = (out / "README.md").read_text()
     for section in [*TEXTS.values(), "Mean relative error per dataset", "Depth maps", "Time"]:
         assert f"## {section}" in text
     for section in ("Convergence of E", "Departures, one at a time", "Does ARAP alone"):
         assert f"## {section}" in text
+    # a family without data has no column
+    assert "| departure | ratio | worse / better | street-s0-128x54 | sheet-s0-128x54 |" in text
     pictures = {*SECTIONS, "comparison", "depth_maps", "convergence", "departures", "scale"}
     assert {p.stem for p in out.glob("*.png")} == pictures
     assert all(f"]({name}.png)" in text for name in pictures)

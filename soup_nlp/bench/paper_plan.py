@@ -13,7 +13,7 @@ from soup_nlp.bench.analyses import ANALYSES, NOISE_PX
 from soup_nlp.bench.departures import DEPARTURES, PAPER
 from soup_nlp.bench.paper_measures import has_truth, measure
 from soup_nlp.bench.paper_scale import measure_scale
-from soup_nlp.bench.suite_pairs import Item, Options, spread
+from soup_nlp.bench.suite_pairs import RENDERED, Item, Options, spread
 from soup_nlp.bench.suites import SUITES, list_suite
 from soup_nlp.config.presets import overrides_of
 from soup_nlp.errors import DataError
@@ -60,6 +60,18 @@ DATASETS = (
     Dataset("kinect_paper", "kinect_paper", ("kinect_paper",), "", ("kinect_paper",)),
     Dataset("kinect_tshirt", "kinect_tshirt", ("kinect_tshirt",)),
 )
+SHARED = (
+    "motorcycle",
+    "driving_synthetic",
+    "tum_fr1",
+    "kitti2015",
+    "kitti_tracking",
+    "rgbd",
+    "deepdeform",
+)
+"""Families of the suite `shared` that no dataset of the paper has, and KITTI 2015 by itself."""
+FAMILIES = (*RENDERED, *SHARED, *(d.name for d in DATASETS))
+"""Every family that the analyses can have; one without data is left out."""
 WITHOUT_TRUTH = {
     "Back sequence": "no true depth is published with it, nor its intrinsics (Garg et al., CVPR"
     " 2013); the paper shows pictures only",
@@ -99,7 +111,9 @@ class Sizes:
         neighbours: Values of K that are compared.
         width: Columns of rendered scenes.
         seeds: Seeds of rendered scenes for the scales of bodies.
-        families: Pairs of the analyses: names of rendered scenes, of datasets, or motorcycle.
+        families: Pairs of the analyses: names of rendered scenes, of datasets, or of families of
+            the suite `shared`.
+        departures: Pairs of the departures, by the same names.
         overrides: Overrides of every problem.
         sections: Sections of ALL_SECTIONS that are measured beside the comparison.
     """
@@ -112,6 +126,7 @@ class Sizes:
     width: int = 1024
     seeds: tuple[int, ...] = (0, 1, 2)
     families: tuple[str, ...] = ("street", "room", "motorcycle", "kitti", "kinect_paper")
+    departures: tuple[str, ...] = FAMILIES
     overrides: Overrides = ()
     sections: tuple[str, ...] = ALL_SECTIONS
 
@@ -149,12 +164,14 @@ class Plan:
         sizes: See Sizes.
         datasets: Available pairs with truth by dataset.
         analyses: Pairs of the analyses.
+        departing: Pairs of the departures.
         scenes: Rendered scenes and pairs with masks of what moves, for the scales of bodies.
     """
 
     sizes: Sizes
     datasets: Mapping[str, tuple[Item, ...]]
     analyses: tuple[Item, ...]
+    departing: tuple[Item, ...]
     scenes: tuple[Item, ...]
 
     def cell(self, item: Item, method: str, *overrides: str, superpixels: int = 0) -> Cell:
@@ -210,7 +227,9 @@ class Plan:
                 for method in METHODS:
                     for cell in self.variants(section, item, method).values():
                         cells.setdefault(cell.key, cell)
-        for item in self.analyses if "departures" in wanted else ():
+        for item in self.departing if "departures" in wanted else ():
+            for cell in (self.cell(item, m) for m in METHODS):
+                cells.setdefault(cell.key, cell)
             for pair in self.departures(item).values():
                 cells.update({c.key: c for c in pair if c is not None and c.key not in cells})
         place: dict[str, int] = {}
@@ -277,20 +296,32 @@ def _changes(section: str, method: str, s: Sizes) -> dict[str, Overrides]:
 def make_plan(data: Path | None, sizes: Sizes) -> Plan:
     """The plan of the pairs that are available in the folder `data`."""
     found = {d.name: _pairs(d, data, sizes) for d in DATASETS}
-    wanted = []
-    for family in sizes.families:
-        if family in found:
-            wanted += [*found[family][:1]]
-        elif family == "motorcycle":
-            wanted.append(
-                Item("shared", family, family, "dis", {"kind": family}, ("paper", "best"))
-            )
-        else:
-            o = Options(("dis",), sizes.width, (0,), None, (family,))
-            wanted += list_suite("rendered", None, o).items
+    analyses = _families(sizes.families, found, data, sizes)
+    departing = _families(sizes.departures, found, data, sizes)
     scenes = list(list_suite("rendered", None, _scenes(sizes)).items)
     scenes += _masked(data)
-    return Plan(sizes, found, tuple(wanted), tuple(scenes))
+    return Plan(sizes, found, analyses, departing, tuple(scenes))
+
+
+def _families(
+    names: Iterable[str],
+    found: Mapping[str, tuple[Item, ...]],
+    data: Path | None,
+    sizes: Sizes,
+) -> tuple[Item, ...]:
+    """The first pair of each family that has one; motorcycle needs no data."""
+    own: list[Item] = []
+    for name in names:
+        if name in found:
+            own += found[name][:1]
+        elif name == "motorcycle":
+            own.append(Item("shared", name, name, "dis", {"kind": name}, ("paper", "best")))
+        elif name in SHARED:
+            own += [i for i in _listed("shared", data) if i.sequence == name and has_truth(i)][:1]
+        else:
+            o = Options(("dis",), sizes.width, (0,), None, (name,))
+            own += list_suite("rendered", None, o).items
+    return tuple(own)
 
 
 def _scenes(sizes: Sizes) -> Options:

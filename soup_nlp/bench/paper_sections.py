@@ -166,34 +166,52 @@ def time(r: Results) -> list[str]:
 
 
 def departures(out: Path, r: Results) -> list[str]:
-    """Table and figure of the departures, each undone or made alone."""
-    cells = {i.key: r.plan.departures(i) for i in r.plan.analyses}
-    items = [i for i in r.plan.analyses if _any_measured(r, cells[i.key].values())]
-    lines = ["## Departures, one at a time", ""]
-    lines += [
-        "MRE of the defaults with one departure undone (*off alone*) and of the preset with one"
-        " departure made (*on alone*), by pair; first the defaults and the preset as they are. The"
-        " figure has the geometric mean of the ratios to these.",
-        "",
-    ]
+    """Tables and figure of the departures, each undone or made alone."""
+    cells = {i.key: r.plan.departures(i) for i in r.plan.departing}
+    items = [i for i in r.plan.departing if _any_measured(r, cells[i.key].values())]
     base = {m: [r.mre(r.plan.cell(i, m)) for i in items] for m in METHODS}
-    entries = [["as they are", *map(show, base["defaults"]), *map(show, base["preset: paper"]), ""]]
+    off, on = (
+        [["as they are", "", "", *map(show, base[m])]] for m in ("defaults", "preset: paper")
+    )
     bars = {}
     for d in DEPARTURES:
         both = [cells[i.key][d.name] for i in items]
-        off = [r.mre(a) for a, _ in both]
-        on = [None if b is None else r.mre(b) for _, b in both]
-        entries.append([d.name, *map(show, off), *map(show, on), d.needs])
+        changes = {}
+        for rows, method, own in (
+            (off, "defaults", [r.mre(a) for a, _ in both]),
+            (on, "preset: paper", [None if b is None else r.mre(b) for _, b in both]),
+        ):
+            ratios = _ratios(own, base[method])
+            changes[method] = _geometric(ratios)
+            above, below = (sum(q > 1.01 for q in ratios), sum(q < 0.99 for q in ratios))
+            count = f"{above} / {below}" if ratios else show(None)
+            rows.append([d.name, show(changes[method]), count, *map(show, own)])
         bars[d.name] = {
-            "defaults, off alone": _ratio(off, base["defaults"]),
-            "preset, on alone": _ratio(on, base["preset: paper"]),
+            "defaults, off alone": changes["defaults"],
+            "preset, on alone": changes["preset: paper"],
         }
-    names = [title(i) for i in items]
-    head = ["departure", *(f"off: {n}" for n in names), *(f"on: {n}" for n in names), "note"]
+    head = ["departure", "ratio", "worse / better", *(title(i) for i in items)]
     text = "Departures one at a time"
     label = "MRE relative to all others as they are (geometric mean of the pairs)"
     figures.plot_bars(out / "departures.png", bars, text, label)
-    return [*lines, *table(head, entries), *figure("departures", text)]
+    notes = [f"- {d.name}: {d.needs}." for d in DEPARTURES if d.needs]
+    return [
+        "## Departures, one at a time",
+        "",
+        "MRE, one pair of each family. *Ratio* is the geometric mean of the ratios to the first"
+        " line; *worse / better* counts the pairs that change by more than 1 %. Defaults with one"
+        " departure undone (*off alone*; a ratio above 1 says that the departure pays):",
+        "",
+        *table(head, off),
+        "",
+        "The preset with one departure made (*on alone*; a ratio below 1 says that it pays):",
+        "",
+        *table(head, on),
+        "",
+        *notes,
+        "",
+        *figure("departures", text),
+    ]
 
 
 def _any_measured(r: Results, pairs: Iterable[tuple[Cell, Cell | None]]) -> bool:
@@ -201,10 +219,14 @@ def _any_measured(r: Results, pairs: Iterable[tuple[Cell, Cell | None]]) -> bool
     return any(r.row(c).get("ok") for both in pairs for c in both if c is not None)
 
 
-def _ratio(own: Sequence[Number], base: Sequence[Number]) -> Number:
-    """Geometric mean of the known ratios; None where there is none."""
-    logs = [np.log(a / b) for a, b in zip(own, base, strict=True) if a and b]
-    return float(np.exp(np.mean(logs))) if logs else None
+def _ratios(own: Sequence[Number], base: Sequence[Number]) -> list[float]:
+    """The known ratios."""
+    return [a / b for a, b in zip(own, base, strict=True) if a and b]
+
+
+def _geometric(ratios: Sequence[float]) -> Number:
+    """Geometric mean; None where there is none."""
+    return float(np.exp(np.mean(np.log(ratios)))) if ratios else None
 
 
 def scale(out: Path, r: Results) -> list[str]:

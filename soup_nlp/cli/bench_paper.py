@@ -10,16 +10,13 @@ from typing import Annotated
 import typer
 
 from soup_nlp.bench.paper_page import FILES, Results, write_page
-from soup_nlp.bench.paper_plan import ALL_SECTIONS, DATASETS, Sizes, make_plan
-from soup_nlp.bench.suite_pairs import RENDERED
+from soup_nlp.bench.paper_plan import ALL_SECTIONS, FAMILIES, Sizes, make_plan
 from soup_nlp.cli import options
 from soup_nlp.cli.bench_accuracy import mre_of
 from soup_nlp.cli.options import Progress, numbers, words
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
 from soup_nlp.storage.folders import claim
 from soup_nlp.storage.rows import failed, measure_all
-
-FAMILIES = [*RENDERED, "motorcycle", *(d.name for d in DATASETS)]
 
 
 def paper(
@@ -37,6 +34,9 @@ def paper(
     families: Annotated[
         str, typer.Option(help=f"Pairs of the analyses: {', '.join(FAMILIES)}.")
     ] = ",".join(Sizes.families),
+    departures: Annotated[
+        str, typer.Option(help="Pairs of the departures, by the same names.")
+    ] = ",".join(Sizes.departures),
     sizes: Annotated[
         str, typer.Option("--numbers", help="Numbers of superpixels that are compared.")
     ] = ",".join(map(str, Sizes.numbers)),
@@ -66,13 +66,15 @@ def paper(
         neighbours=tuple(numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS)),
         width=width,
         seeds=tuple(numbers(seeds, "--seeds")),
-        families=tuple(words(families, "--families", FAMILIES)),
+        families=tuple(words(families, "--families", list(FAMILIES))),
+        departures=tuple(words(departures, "--departures", list(FAMILIES))),
         overrides=tuple(overrides or ()),
         sections=tuple(words(sections, "--sections", list(ALL_SECTIONS))),
     )
     said = [f"--superpixels {superpixels} --analysis {analysis} --families {families}"]
     said += [f"--numbers {sizes} --neighbours {neighbours} --width {width} --seeds {seeds}"]
     said += [f"--sections {sections}"] * (sections != ",".join(ALL_SECTIONS))
+    said += [f"--departures {departures}"] * (departures != ",".join(FAMILIES))
     said += [f"--limit {limit}"] * (limit is not None) + ["--data DIR"] * (data is not None)
     said += [f"--set {shlex.quote(o)}" for o in chosen.overrides]
     claim(out, FILES, overwrite)
