@@ -91,14 +91,16 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
 
 
 def clip(root: Path) -> Path:
-    """A folder of three frames of noise that moves."""
+    """A folder of three frames of noise: a wall, and a box in front that moves twice as far."""
     folder = root / "clip"
     if not folder.is_dir():
         folder.mkdir()
-        noise = np.random.default_rng(0).integers(0, 255, (64, 96, 3)).astype(np.uint8)
-        texture = cv2.GaussianBlur(noise, (0, 0), 1.0)
+        noise = np.random.default_rng(0).integers(0, 255, (2, 64, 96, 3)).astype(np.uint8)
+        wall, box = (cv2.GaussianBlur(n, (0, 0), 1.5) for n in noise)
         for k in range(3):
-            cv2.imwrite(str(folder / f"{k}.png"), texture[8:56, 8 + 2 * k : 72 + 2 * k])
+            frame = wall[8:56, 8 + 2 * k : 72 + 2 * k].copy()
+            frame[12:36, 20:44] = box[12:36, 20 + 4 * k : 44 + 4 * k]
+            cv2.imwrite(str(folder / f"{k}.png"), frame)
     return folder
 
 
@@ -173,7 +175,7 @@ def broken(folder: Path) -> list[str]:
     wrong = [
         n for n, d in listed.items() if not (folder / n).is_file() or digest_of(folder / n) != d
     ]
-    inner = [p for p in (folder / "pairs").glob("*") if p.is_dir()]
+    inner = [p for p in (folder / "pairs").glob("[!.]*") if p.is_dir()]
     wrong += [f"pairs/{p.name}/{name}" for p in inner for name in broken(p)]
     there = (p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
     own = {str(p) for p in there if p.parts[0] != "pairs" and p.suffix != ".jsonl"}
@@ -206,7 +208,8 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> list[dict[str, obj
                     rows.append(row | {"broken": broken(command.folder)})
                     print(json.dumps(rows[-1]), flush=True)
                 code, _ = run(command.words)
-                names_left = [n for p in (root, command.folder) for n in os.listdir(p)]
+                places = [p for p in (root, command.folder, command.folder / "pairs") if p.is_dir()]
+                names_left = [n for p in places for n in os.listdir(p)]
                 names_left = [n for n in names_left if ".soup_nlp-" in n] + os.listdir(root / "tmp")
                 row = {
                     "command": command.name,
