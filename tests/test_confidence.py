@@ -19,11 +19,8 @@ from soup_nlp.evaluate.confidence import (
     calibrated,
     confidence,
     flow_misfit,
-    information,
-    learned,
-    marginals,
-    spread_in_image,
 )
+from soup_nlp.evaluate.information import information, learned, marginals, spread_in_image
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import prepare

@@ -28,12 +28,10 @@ from soup_nlp.evaluate.confidence import (
     BENDING_FACTOR,
     FACTOR,
     SIGMA_PRIOR,
-    Information,
     calibrated,
     confidence,
-    information,
-    spread_in_image,
 )
+from soup_nlp.evaluate.information import Information, information, spread_in_image
 from soup_nlp.evaluate.metrics import true_pixels
 from soup_nlp.evaluate.scoring import at_truth
 from soup_nlp.evaluate.sparsification import coverage, sparsification

@@ -66,7 +66,7 @@ def _overrides(values: Mapping[str, Any]) -> tuple[str, ...]:
 
 _WEIGHTS = tuple(f"energy.weights.{w}" for w in ("arap", "proj", "cont", "orient", "sigma_cont"))
 _PIXELS = {key: default(key) for key in ("energy.units", "energy.rotation_px", *_WEIGHTS)}
-_MORE = {"energy.pixel_samples": 64, "segmentation.boundary_samples": "all"}
+_MORE = {"energy.pixel_samples": 64, "segmentation.boundary_samples": 12}
 _SMALL = {"max_size": 0.05}
 _SHARED = {"start.method": "shared"}
 
@@ -122,7 +122,7 @@ DEPARTURES = (
         (),
         with_off=_MORE,
         with_on=_MORE,
-        needs="off in both: 64 pixels a superpixel, whole boundaries",
+        needs="off in both: 64 pixels a superpixel, 12 points a boundary (default 16 and 3)",
     ),
     Departure("gauge: d constant", ("formulation.gauge",)),
     Departure("visibility", ("formulation.min_facing", "formulation.depth_ratio")),

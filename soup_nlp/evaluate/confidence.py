@@ -1,8 +1,6 @@
 """How sure depth is: marginal variances of the whole assembly, calibrated against true depth.
 
-See docs/confidence.md. The information is that of the energy at the answer, in nine coordinates per
-superpixel. Of its inverse the blocks of the planes are kept: marginal variances, which know that
-a neighbour is as unsure, not the conditional ones of a superpixel whose neighbours are held.
+See docs/confidence.md.
 """
 
 from __future__ import annotations
@@ -11,149 +9,25 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import sparse
 
-from soup_nlp.arrays import Float, Int, Labels, Mask
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import ModelError
-from soup_nlp.geometry.camera import pixel_grid, rays
+from soup_nlp.evaluate.information import (
+    Marginals,
+    information,
+    learned,
+    marginals,
+    spread_in_image,
+)
 from soup_nlp.geometry.soup import Reconstruction, Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.formulation import Formulation, FormulationOptions
-from soup_nlp.model.layout import TangentLayout
-from soup_nlp.solve.selected_inverse import BlockCholesky
-from soup_nlp.solve.tangent_problem import TangentProblem
+from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.start.choice import LEAST_NOISE, MOST_NOISE
 from soup_nlp.start.propose import Start
 
 log = logging.getLogger(__name__)
-
-SMOOTHING = 0.03
-"""Width in pixels within which a norm is taken for its square: no flow is more exact."""
-
-
-@dataclass(frozen=True, eq=False)
-class Information:
-    """Gauss-Newton information of the energy at a soup.
-
-    Attributes:
-        matrix: (9 N, 9 N) `sum c J^T J` over all norms, c their weight over their smoothed length,
-            both triangles. Coordinates of a superpixel: relative inverse depth at the anchor and
-            its two slopes, rotation (3), shift of the moved anchor over depth (3).
-        growth: (9 N,) direction in which all depths grow alike; the information has none there.
-        plane: (N, 3) relative inverse depth and slopes at the soup.
-        layout: Anchors and radii that these refer to.
-    """
-
-    matrix: sparse.csr_matrix
-    growth: Float
-    plane: Float
-    layout: TangentLayout
-
-
-def information(
-    soup: Soup,
-    data: EnergyData,
-    weights: Weights,
-    form: FormulationOptions,
-    smoothing: float = SMOOTHING,
-) -> Information:
-    """The information of the energy at a soup.
-
-    Args:
-        soup: The answer.
-        data: Pixels, graphs and weights of the pair.
-        weights: Constants of the energy.
-        form: Visibility and whether kernels are compiled; constraints carry no information.
-        smoothing: Width of all norms, pixels.
-    """
-    whole = Formulation.make(dict(form))
-    problem = TangentProblem(soup, data, weights, whole, exact=False, chart="inverse-depth")
-    problem.smoothing(smoothing)
-    x = problem.nlp.x0
-    slacks = np.zeros((problem.layout.count, problem.rims + 5))
-    upper = problem.upper.copy()
-    upper.data = problem.hessian(x, slacks, "gauss-newton")
-    matrix = (upper + sparse.triu(upper, 1).T).tocsr()
-    return Information(matrix, problem.growth(x), x.reshape(-1, 9)[:, :3], problem.layout)
-
-
-@dataclass(frozen=True, eq=False)
-class Marginals:
-    """Marginal covariances of the planes, the global scale left out.
-
-    Attributes:
-        plane: (N, 3, 3) covariance of a superpixel's relative inverse depth and slopes.
-        component: (C,) variance of the mean log depth of every component.
-    """
-
-    plane: Float
-    component: Float
-
-
-def marginals(info: Information, sizes: Int, component: Int) -> Marginals:
-    """Marginal covariances where the mean log depth of all pixels is held.
-
-    Args:
-        info: Information at the soup.
-        sizes: (N,) pixels of every superpixel.
-        component: (N,) rigid component of every superpixel, 0 to C - 1.
-
-    Raises:
-        ArithmeticError: the information is no positive semidefinite matrix.
-    """
-    n, g = len(sizes), info.growth
-    diagonal = info.matrix.diagonal()
-    # what no term sees gets next to no information, so that nothing is known of it
-    least = 1e-12 * float(diagonal.max()) or 1.0
-    weight = np.where(diagonal > least, 0.0, least)
-    # any weight on the global scale makes the matrix definite; what it is cancels below
-    largest = 9 * int(np.argmax(sizes))
-    weight[largest] += max(diagonal[largest], least)
-    solver = BlockCholesky(info.matrix + sparse.diags(weight), info.layout.anchor[:, :2])
-    mean = _mean_log_depth(info, sizes, np.zeros(n, np.int64))[:, 0]
-    mean /= mean @ g
-    h = solver.solve(mean)
-    # covariance of P x, with P = I - g mean^T: depths relative to their mean
-    own = solver.inverse_blocks()[:, :3, :3]
-    g3, h3 = (v.reshape(n, -1)[:, :3] for v in (g, h))
-    cross = g3[:, :, None] * h3[:, None]
-    both = g3[:, :, None] * g3[:, None] * (mean @ h)
-    plane = own - cross - cross.transpose(0, 2, 1) + both
-    rows = _mean_log_depth(info, sizes, component)
-    solved = solver.solve(rows)
-    along = g @ rows
-    spread = np.einsum("xc,xc->c", rows, solved) - 2 * along * (h @ rows) + along**2 * (mean @ h)
-    return Marginals(plane, np.maximum(spread, 0.0))
-
-
-def _mean_log_depth(info: Information, sizes: Int, component: Int) -> Float:
-    """(9 N, C) derivatives of the components' mean log depth, by pixels."""
-    count = int(component.max()) + 1
-    share = sizes / np.bincount(component, sizes, minlength=count)[component]
-    rows = np.zeros((len(sizes), 9, count))
-    rows[np.arange(len(sizes)), 0, component] = -share / info.plane[:, 0]
-    return rows.reshape(-1, count)
-
-
-def spread_in_image(info: Information, plane: Float, labels: Labels, K_ref: Float) -> Float:
-    """(H, W) standard deviation of log depth of every pixel, as the marginals have it.
-
-    Args:
-        info: Where the planes are.
-        plane: (N, 3, 3) marginal covariances.
-        labels: (H, W) superpixel of every pixel.
-        K_ref: (3, 3) intrinsics of the reference frame.
-    """
-    ray = rays(K_ref, pixel_grid(*labels.shape))[..., :2]
-    layout = info.layout
-    off = (ray - layout.anchor[labels][..., :2]) / layout.radius[labels][..., None]
-    # log depth is -log(rho + slope . off)
-    a = np.concatenate([np.ones((*labels.shape, 1)), off], axis=-1)
-    a /= np.einsum("hwc,hwc->hw", a, info.plane[labels])[..., None]
-    return np.asarray(np.sqrt(np.maximum(np.einsum("hwi,hwij,hwj->hw", a, plane[labels], a), 0.0)))
-
 
 SIGMA_PRIOR = 0.5
 """Standard deviation of log depth where the pair says nothing: scenes vary by about that much."""
@@ -161,8 +35,6 @@ PRIOR_SHARE = 0.001
 """Factor of E_prior in the information: it holds depth where nothing else does, knowing little."""
 FLOW_SHARE = 0.01
 """Factor of E_proj in the information without the flow; without any, motions would be free."""
-LEAST_LEARNED = 1e-4
-"""Least share of the information that is counted as the flow's."""
 MOST_BORROWED = 0.5
 """Share of superpixels without a depth of their own from which the camera is at rest."""
 FACTOR, POWER = 7.0, 1.25
@@ -277,17 +149,6 @@ def calibrated(
     sigma = np.where(bends, bent, rigid)
     sigma = np.hypot(np.minimum(sigma, LARGEST), SIGMA_PRIOR * still)
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
-
-
-def learned(variance: Float, without: Float) -> Float:
-    """Variance by what the flow adds to the terms on shape alone.
-
-    Information adds up: `1 / v - 1 / v0` is that of the flow, with the variance v of everything and
-    v0 without the flow. Where both are equal, nothing was learned.
-    """
-    # one component alone has the mean that is held: neither varies
-    share = np.divide(variance, without, out=np.zeros_like(variance), where=without > 0)
-    return np.asarray(variance / np.clip(1 - share, LEAST_LEARNED, 1.0))
 
 
 def _spread(

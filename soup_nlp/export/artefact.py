@@ -12,7 +12,7 @@ from scipy import sparse
 
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import ConfigError
-from soup_nlp.evaluate.confidence import Information, information
+from soup_nlp.evaluate.information import Information, information
 from soup_nlp.export.manifest import (
     EXPORT_FILES,
     FUNCTIONS,
