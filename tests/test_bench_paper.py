@@ -13,7 +13,8 @@ import pytest
 from soup_nlp.bench import paper_plan
 from soup_nlp.bench.departures import DEPARTURES, PAPER, default
 from soup_nlp.bench.paper_measures import measure, read_maps
-from soup_nlp.bench.paper_plan import DATASETS, METHODS, SECTIONS, Sizes, make_plan
+from soup_nlp.bench.paper_pairs import DATASETS
+from soup_nlp.bench.paper_plan import METHODS, SECTIONS, Sizes, make_plan
 from soup_nlp.bench.paper_scale import (
     KINDS,
     SCALES,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.bench.depth_maps import fit_planes, plane_depth, points_as_map, unorganised
+from soup_nlp.bench.depth_maps import least_error_planes, plane_depth, points_as_map, unorganised
 from soup_nlp.bench.truth import rescaled, true_soup
 from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Pair, Truth
@@ -32,14 +32,14 @@ def labelled_planes():
 
 def test_planes_come_back_and_outliers_do_not_pull_them():
     labels, m, depth = labelled_planes()
-    np.testing.assert_allclose(fit_planes(labels, depth, K), m, atol=1e-6)
+    np.testing.assert_allclose(least_error_planes(labels, depth, K), m, atol=1e-6)
     holes = depth.copy()
     holes[::2] = np.nan
     holes[1, :20] *= 7.0
-    np.testing.assert_allclose(fit_planes(labels, holes, K), m, atol=1e-3)
+    np.testing.assert_allclose(least_error_planes(labels, holes, K), m, atol=1e-3)
     # no plane is worse than the constant it may always choose
     rough = depth * np.exp(np.random.default_rng(0).normal(0, 0.5, depth.shape))
-    fit = plane_depth(fit_planes(labels, rough, K), labels, K)
+    fit = plane_depth(least_error_planes(labels, rough, K), labels, K)
     for i in (0, 1):
         z = rough[labels == i]
         constant = min(np.mean(np.abs(z - c) / z) for c in z)
@@ -50,7 +50,7 @@ def test_a_few_rows_of_sky_do_not_cost_the_plane():
     labels, _, depth = labelled_planes()
     sky = depth.copy()
     sky[:5] = 1e3
-    fit = plane_depth(fit_planes(labels, sky, K), labels, K)
+    fit = plane_depth(least_error_planes(labels, sky, K), labels, K)
     for i in (0, 1):
         own = labels == i
         true = np.mean(np.abs(sky - depth)[own] / sky[own])
@@ -61,13 +61,13 @@ def test_planes_of_little_truth():
     labels, _, depth = labelled_planes()
     few = np.full(depth.shape, np.nan)
     few[3, 3] = 2.0
-    m = fit_planes(labels, few, K)
+    m = least_error_planes(labels, few, K)
     assert m[0].tolist() == [0, 0, 0.5]
     assert np.isnan(m[1]).all()
     with pytest.raises(DataError, match="no true depth"):
-        fit_planes(labels, np.full(depth.shape, np.nan), K)
+        least_error_planes(labels, np.full(depth.shape, np.nan), K)
     with pytest.raises(DataError, match="differ in size"):
-        fit_planes(labels[1:], depth, K)
+        least_error_planes(labels[1:], depth, K)
     sparse = points_as_map(np.array([[1.4, 2.6, 5.0], [99.0, 0.0, 1.0]]), (4, 4))
     assert sparse[3, 1] == 5.0
     assert np.isfinite(sparse).sum() == 1

@@ -91,9 +91,11 @@ def depth_maps(run: Run, fitted: bool = True) -> dict[str, Float]:
     if not fitted:
         return out
     whole = np.zeros(labels.shape, np.int32)
-    out["plane"] = plane_depth(fit_planes(whole, truth, pair.K_ref), whole, pair.K_ref)
+    out["plane"] = plane_depth(least_error_planes(whole, truth, pair.K_ref), whole, pair.K_ref)
     if np.count_nonzero(np.isfinite(truth)) >= MIN_DENSITY * len(seg):
-        out["floor"] = plane_depth(fit_planes(labels, truth, pair.K_ref), labels, pair.K_ref)
+        out["floor"] = plane_depth(
+            least_error_planes(labels, truth, pair.K_ref), labels, pair.K_ref
+        )
     return out
 
 
@@ -111,7 +113,7 @@ def true_depth(run: Run) -> Float | None:
     return sparse if np.isfinite(sparse).any() else None
 
 
-def fit_planes(
+def least_error_planes(
     labels: Labels, depth: Float, K: Float, rounds: int = 20, softening: float = 1e-4
 ) -> Float:
     """Inverse-depth planes m, 1 / z = m . ray, with the least mean relative error per label.

@@ -7,15 +7,8 @@ from pathlib import Path
 
 from soup_nlp.bench import paper_figures as figures
 from soup_nlp.bench import paper_sections as sections
-from soup_nlp.bench.paper_plan import (
-    ALL_SECTIONS,
-    DATASETS,
-    METHODS,
-    SECTIONS,
-    WITHOUT_TRUTH,
-    source_of,
-    title,
-)
+from soup_nlp.bench.paper_pairs import DATASETS, WITHOUT_TRUTH, source_of, title
+from soup_nlp.bench.paper_plan import ALL_SECTIONS, METHODS, SECTIONS
 from soup_nlp.bench.paper_sections import Number, Results, figure
 from soup_nlp.bench.processes import processor
 from soup_nlp.bench.published import COMPARISON, DATA, SOURCE

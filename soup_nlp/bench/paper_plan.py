@@ -1,8 +1,8 @@
-"""The plan of `bench paper`: pairs of the paper's datasets, and the rows of every section."""
+"""The plan of `bench paper`: the rows of every section."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,12 +11,12 @@ from types import MappingProxyType
 from soup_nlp.bench.accuracy import row_identity
 from soup_nlp.bench.analyses import ANALYSES, NOISE_PX
 from soup_nlp.bench.departures import DEPARTURES, PAPER
-from soup_nlp.bench.paper_measures import has_truth, measure
+from soup_nlp.bench.paper_measures import measure
+from soup_nlp.bench.paper_pairs import DATASETS, FAMILIES, masked_pairs, pairs_of, pairs_of_families
 from soup_nlp.bench.paper_scale import measure_scale
-from soup_nlp.bench.suite_pairs import RENDERED, Item, Options, spread
-from soup_nlp.bench.suites import SUITES, list_suite
+from soup_nlp.bench.suite_pairs import Item, Options
+from soup_nlp.bench.suites import list_suite
 from soup_nlp.config.presets import overrides_of
-from soup_nlp.errors import DataError
 from soup_nlp.storage.rows import Job, attempt
 
 Overrides = tuple[str, ...]
@@ -32,56 +32,6 @@ PRINTED_SUPERPIXELS = 1000
 """Number of superpixels for which the preset gives its weights."""
 _LENGTHS = tuple(f"energy.weights.{term}" for term in ("arap", "cont"))
 _PRINTED: Overrides = tuple(o for o in overrides_of("paper") if o.partition("=")[0] in _LENGTHS)
-
-
-@dataclass(frozen=True)
-class Dataset:
-    """A dataset of the paper.
-
-    Attributes:
-        name: Name in `bench.published`.
-        title: Title in tables.
-        suites: Suites of its pairs; `shared` is used if none of them has a pair.
-        cap: Metric convention with a depth cap, "" if none is in use.
-        sequences: Families of the suite `shared` that belong to this dataset.
-    """
-
-    name: str
-    title: str
-    suites: tuple[str, ...]
-    cap: str = ""
-    sequences: tuple[str, ...] = ()
-
-
-DATASETS = (
-    Dataset("sintel", "MPI Sintel", ("sintel",), "sintel70", ("sintel",)),
-    Dataset("vkitti", "Virtual KITTI", ("vkitti",), "eigen80"),
-    Dataset("kitti", "KITTI", ("kitti2012", "kitti2015"), "eigen80", ("kitti2012", "kitti2015")),
-    Dataset("kinect_paper", "kinect_paper", ("kinect_paper",), "", ("kinect_paper",)),
-    Dataset("kinect_tshirt", "kinect_tshirt", ("kinect_tshirt",)),
-)
-SHARED = (
-    "motorcycle",
-    "driving_synthetic",
-    "tum_fr1",
-    "kitti2015",
-    "kitti_tracking",
-    "rgbd",
-    "deepdeform",
-)
-"""Families of the suite `shared` that no dataset of the paper has, and KITTI 2015 by itself."""
-FAMILIES = (*RENDERED, *SHARED, *(d.name for d in DATASETS))
-"""Every family that the analyses can have; one without data is left out."""
-WITHOUT_TRUTH = {
-    "Back sequence": "no true depth is published with it, nor its intrinsics (Garg et al., CVPR"
-    " 2013); the paper shows pictures only",
-    "YouTube-Objects": "no true depth (Prest et al., CVPR 2012); the paper shows pictures only",
-    "KITTI odometry 00-09": "the published KITTI rows are of this set with LiDAR truth,"
-    " https://www.cvlibs.net/datasets/kitti/eval_odometry.php; the rows here are of the stereo and"
-    " flow sets",
-    "ULDEMV": "the paper draws its errors on KITTI and prints no number",
-}
-"""Data of the paper without a row here, and the reason."""
 
 
 SECTIONS: Mapping[str, str] = MappingProxyType(
@@ -295,80 +245,9 @@ def _changes(section: str, method: str, s: Sizes) -> dict[str, Overrides]:
 
 def make_plan(data: Path | None, sizes: Sizes) -> Plan:
     """The plan of the pairs that are available in the folder `data`."""
-    found = {d.name: _pairs(d, data, sizes) for d in DATASETS}
-    analyses = _families(sizes.families, found, data, sizes)
-    departing = _families(sizes.departures, found, data, sizes)
-    scenes = list(list_suite("rendered", None, _scenes(sizes)).items)
-    scenes += _masked(data)
+    found = {d.name: pairs_of(d, data, sizes.limit) for d in DATASETS}
+    analyses = pairs_of_families(sizes.families, found, data, sizes.width)
+    departing = pairs_of_families(sizes.departures, found, data, sizes.width)
+    moving = Options(("truth",), sizes.width, sizes.seeds, None, ("street", "room"))
+    scenes = [*list_suite("rendered", None, moving).items, *masked_pairs(data)]
     return Plan(sizes, found, analyses, departing, tuple(scenes))
-
-
-def _families(
-    names: Iterable[str],
-    found: Mapping[str, tuple[Item, ...]],
-    data: Path | None,
-    sizes: Sizes,
-) -> tuple[Item, ...]:
-    """The first pair of each family that has one; motorcycle needs no data."""
-    own: list[Item] = []
-    for name in names:
-        if name in found:
-            own += found[name][:1]
-        elif name == "motorcycle":
-            own.append(Item("shared", name, name, "dis", {"kind": name}, ("paper", "best")))
-        elif name in SHARED:
-            own += [i for i in _listed("shared", data) if i.sequence == name and has_truth(i)][:1]
-        else:
-            o = Options(("dis",), sizes.width, (0,), None, (name,))
-            own += list_suite("rendered", None, o).items
-    return tuple(own)
-
-
-def _scenes(sizes: Sizes) -> Options:
-    return Options(("truth",), sizes.width, sizes.seeds, None, ("street", "room"))
-
-
-def _masked(data: Path | None) -> list[Item]:
-    """Real pairs with a mask of what moves, a true depth and a true flow."""
-    out = []
-    for name in ("kitti2015", "shared"):
-        try:
-            listed = list_suite(name, data, Options(("truth",))).items
-        except DataError:
-            continue
-        out += [i for i in listed if i.sequence == "kitti2015"]
-    return list({str(dict(i.input)): i for i in out}.values())
-
-
-def _pairs(dataset: Dataset, data: Path | None, sizes: Sizes) -> tuple[Item, ...]:
-    """Pairs of a dataset that have a truth, from its suites or else from the suite `shared`."""
-    listed: list[Item] = []
-    for name in dataset.suites:
-        listed += [i for i in _listed(name, data) if has_truth(i)]
-    if not listed:
-        listed = [i for i in _listed("shared", data) if i.sequence in dataset.sequences]
-        listed = [i for i in listed if has_truth(i)]
-    if sizes.limit is not None:
-        listed = [listed[k] for k in spread(len(listed), sizes.limit)] if listed else []
-    presets = ("paper", "best", *([dataset.cap] if dataset.cap else []))
-    return tuple(i.scored_by(presets) for i in listed)
-
-
-def _listed(name: str, data: Path | None) -> Iterable[Item]:
-    if data is None:
-        return ()
-    try:
-        return list_suite(name, data, Options(("dis",))).items
-    except DataError:
-        return ()
-
-
-def source_of(dataset: Dataset) -> str:
-    """Text on the source and the folder layout of a dataset without pairs."""
-    suite = SUITES[dataset.suites[0]]
-    return f"no pair was given; from {suite.source}, laid out as {suite.layout}"
-
-
-def title(item: Item) -> str:
-    """Name of a pair for tables."""
-    return item.name if item.suite in ("rendered", "shared") else f"{item.suite} {item.name}"

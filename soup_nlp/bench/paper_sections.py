@@ -10,7 +10,8 @@ import numpy as np
 
 from soup_nlp.bench import paper_figures as figures
 from soup_nlp.bench.departures import DEPARTURES
-from soup_nlp.bench.paper_plan import METHODS, SECTIONS, Cell, Plan, title
+from soup_nlp.bench.paper_pairs import title
+from soup_nlp.bench.paper_plan import METHODS, SECTIONS, Cell, Plan
 from soup_nlp.bench.paper_scale import KINDS, scale_of_least_energy
 from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC
 from soup_nlp.bench.suite_pairs import Item

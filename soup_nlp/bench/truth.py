@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.bench.depth_maps import fit_planes
+from soup_nlp.bench.depth_maps import least_error_planes
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import pixel_grid, rays
@@ -76,7 +76,7 @@ def true_soup(pair: Pair, seg: Segmentation) -> TrueSoup:
             "too few superpixels have a truth", where=pair.name, found=int(known.sum()), expected=n
         )
     depth = np.where(mine, truth.depth_ref, np.nan)
-    m = fit_planes(seg.labels, depth, pair.K_ref)
+    m = least_error_planes(seg.labels, depth, pair.K_ref)
     m = _facing(m, seg, pair.K_ref, depth)
     R, T, moved = _motions(truth, seg, component, mine, depth, pair.K_ref)
     known &= moved

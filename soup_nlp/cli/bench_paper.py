@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 
 from soup_nlp.bench.paper_page import FILES, Results, write_page
-from soup_nlp.bench.paper_plan import ALL_SECTIONS, FAMILIES, Sizes, make_plan
+from soup_nlp.bench.paper_pairs import FAMILIES
+from soup_nlp.bench.paper_plan import ALL_SECTIONS, Sizes, make_plan
 from soup_nlp.cli import options
 from soup_nlp.cli.bench_accuracy import mre_of
 from soup_nlp.cli.options import Progress, numbers, words
