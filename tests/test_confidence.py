@@ -15,10 +15,12 @@ from soup_nlp.evaluate.confidence import (
     LEAST_SPREAD,
     MOST_SIGMA,
     POWER,
+    SCALE_FACTOR,
     SIGMA_PRIOR,
     calibrated,
     confidence,
     flow_misfit,
+    scale_by_contact,
 )
 from soup_nlp.evaluate.information import information, learned, marginals, spread_in_image
 from soup_nlp.geometry.soup import Soup, reconstruct
@@ -28,6 +30,7 @@ from soup_nlp.solve import selected_inverse
 from soup_nlp.solve.selected_inverse import BlockCholesky, dissect
 from soup_nlp.solve.tangent_problem import TangentProblem
 from soup_nlp.start.choice import LEAST_NOISE
+from soup_nlp.start.components import TIES
 
 FORM = Formulation(compiled=False)
 
@@ -296,6 +299,34 @@ def test_where_surfaces_bend_a_misfit_counts_in_full_and_the_spread_by_its_root(
     assert calibrated(spread, 0.6, misfit, prior=np.inf, bends=True) == base
     assert calibrated(spread, 0.1, 0.0, bends=True)[0] > 0
     assert calibrated(np.array([np.inf]), 0.1, bends=True)[0] == pytest.approx(SIGMA_PRIOR)
+
+
+@pytest.mark.parametrize("bends", [False, True])
+def test_the_variance_of_a_scale_by_contact_is_added_whatever_the_noise_is(bends):
+    spread = np.array([0.01])
+    for noise in (0.05, 0.6):
+        alone, both = (
+            calibrated(spread, noise, 0.1, prior=np.inf, bends=bends, scale=scale)[0]
+            for scale in (0.0, 0.2)
+        )
+        assert both**2 == pytest.approx(alone**2 + (SCALE_FACTOR * 0.2) ** 2)
+    assert calibrated(spread, 0.1, scale=np.inf)[0] == pytest.approx(SIGMA_PRIOR)
+
+
+def test_the_reference_component_defines_the_scale_and_the_others_are_less_sure(small_room):
+    sure, start = sure_of(small_room), small_room.start
+    scale = scale_by_contact(sure.marginals, start)
+    reference = start.tie == TIES.index("reference")
+    assert 0 < reference.sum() < len(reference)
+    assert (scale[reference] == 0).all()
+    assert (scale[~reference] > 0).all()
+    labels = small_room.segmentation.labels
+    without = calibrated(sure.spread, sure.noise, sure.misfit[labels])
+    np.testing.assert_array_equal(sure.sigma > without, ~reference[labels])
+    # no component is less sure than a pair that says nothing
+    raw = np.sqrt(sure.marginals.component)
+    expected = 1 / np.sqrt(1 / (SCALE_FACTOR * raw) ** 2 + 1 / SIGMA_PRIOR**2)
+    np.testing.assert_allclose(sure.component_sigma, expected)
 
 
 def test_the_more_stands_still_where_surfaces_bend_the_less_sure_is_depth(small_room):

@@ -88,13 +88,13 @@ def row(family: str, pair: str, scale: float, bending: bool = False) -> dict:
             "within": [0.7, 0.9],
             "guess": 0.1,
             "noise": 0.1,
-            "bending": bending,
             "seconds": 0.5,
             "curve": [[1.0, 0.5], [0.05, 0.02], [0.05, 0.01]],
             "sample": [
                 (scale * unit * np.abs(rng.normal(size=2000)) * 1e-3).tolist(),
                 unit.tolist(),
                 [0.0] * 2000,
+                [float(bending)] * 2000,
             ],
         },
     }
@@ -104,8 +104,8 @@ def test_the_factor_of_a_family_is_chosen_on_the_others():
     """Errors of 1 and of 2 thousandths: each family is judged by the other's factor."""
     told = left_out_factors([row("one", "a", 1.0), row("two", "b", 2.0)])
     # 76 % of a Gaussian lie within 1.175 standard deviations
-    assert told["one"][0] == pytest.approx(2.35e-3, rel=0.05)
-    assert told["two"][0] == pytest.approx(1.175e-3, rel=0.05)
+    assert told["one"][0][0] == pytest.approx(2.35e-3, rel=0.05)
+    assert told["two"][0][0] == pytest.approx(1.175e-3, rel=0.05)
     assert told["one"][1] == pytest.approx(0.98, abs=0.02)
     assert told["two"][1] == pytest.approx(0.44, abs=0.03)
 
@@ -115,7 +115,28 @@ def test_pairs_that_bend_are_judged_by_others_that_bend():
     assert left_out_factors(rows) == {}
     told = left_out_factors([*rows, row("three", "c", 2.0, bending=True)])
     assert set(told) == {"two", "three"}
-    assert told["three"][0] == pytest.approx(9 * 1.175e-3, rel=0.05)
+    assert told["three"][0][0] == pytest.approx(9 * 1.175e-3, rel=0.05)
+
+
+def test_what_is_added_in_squares_needs_no_factor():
+    """Errors of a thousandth of the unit, with 0.04 added in squares, as sigma has it."""
+    rows = [row("one", "a", 1.0), row("two", "b", 1.0)]
+    for own in rows:
+        log = own["confidence"]["sample"][0]
+        own["confidence"]["sample"][0] = np.hypot(np.array(log), 0.04).tolist()
+        own["confidence"]["sample"][2] = [0.04] * len(log)
+    told = left_out_factors(rows)
+    assert told["one"][0][0] == pytest.approx(1.175e-3, rel=0.05)
+
+
+def test_a_pair_of_both_kinds_has_a_factor_for_each():
+    both = row("both", "c", 1.0)
+    both["confidence"]["sample"][3] = [float(k % 2) for k in range(2000)]
+    rows = [row("one", "a", 1.0), row("two", "b", 9.0, bending=True), both]
+    factors, one, _ = left_out_factors(rows)["both"]
+    assert factors == pytest.approx((1.175e-3, 9 * 1.175e-3), rel=0.05)
+    # rigid pixels lie within as many as they should, bending ones nearly all
+    assert one == pytest.approx((0.76 + 1.0) / 2, abs=0.03)
 
 
 def test_the_page_has_pairs_and_families():

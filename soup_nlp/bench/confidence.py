@@ -27,9 +27,13 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import (
     BENDING_FACTOR,
     FACTOR,
+    LARGEST,
+    SCALE_FACTOR,
     SIGMA_PRIOR,
     calibrated,
     confidence,
+    scale_by_contact,
+    with_prior,
 )
 from soup_nlp.evaluate.information import Information, information, spread_in_image
 from soup_nlp.evaluate.metrics import true_pixels
@@ -56,8 +60,8 @@ SAMPLE_PIXELS = 400
 """Number of pixels of a pair that the calibration of other families uses."""
 SHARE_WITHIN = 0.76
 """Share of the pixels whose error is within one sigma after calibration."""
-MAX_STILL = 0.1
-"""Pairs of which a larger share stands still are not used for the calibration."""
+MAX_ADDED = 0.05
+"""Pixels of which more is added in squares are not used for the calibration."""
 MIN_PARALLAX = 0.1
 """Smallest parallax that the cue "parallax" divides by, pixels."""
 
@@ -93,7 +97,10 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
     bends = result.start.bends[rec.labels]
     whole = calibrated(sure.spread, sure.noise, misfit, np.inf, bends)
     unit = chosen(whole / np.where(bends, BENDING_FACTOR, FACTOR))
-    still = np.full(len(log), sure.still)
+    scale = SCALE_FACTOR * chosen(scale_by_contact(sure.marginals, result.start)[rec.labels])
+    # what is added in squares to the factor times the unit
+    added = np.minimum(np.hypot(SIGMA_PRIOR * sure.still, scale), LARGEST)
+    sample = log, unit, added, chosen(bends.astype(float))
     picked = np.linspace(0, len(log) - 1, min(SAMPLE_PIXELS, len(log))).astype(int)
     own = found["sigma"]
     return {
@@ -107,10 +114,9 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
             "within": coverage(log, cues["sigma"]),
             "guess": sure.guessed,
             "noise": sure.noise,
-            "bending": result.start.bending,
             "seconds": seconds,
             "curve": [own.kept.tolist(), own.error.tolist(), own.oracle.tolist()],
-            "sample": np.stack([log[picked], unit[picked], still[picked]]).round(6).tolist(),
+            "sample": np.stack(sample)[:, picked].round(6).tolist(),
         },
     }
 
@@ -148,28 +154,44 @@ def _own_block(result: Run) -> Float:
     return spread_in_image(info, plane, result.segmentation.labels, result.pair.K_ref)
 
 
-def left_out_factors(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
-    """Calibration factor of every family from all others, and the coverage of 1 and 2 sigma.
+def left_out_factors(rows: Sequence[Row]) -> dict[str, tuple[tuple[float, ...], float, float]]:
+    """Calibration factors of every family from all others, and the coverage of 1 and 2 sigma.
 
-    Pairs with bending surfaces are calibrated on such pairs only, the other pairs on the rest.
+    Bending regions have a factor of their own, from bending regions of the others. A family is left
+    out for whose regions the others have none.
     """
-    samples = [(r["sequence"], r["confidence"]["bending"], r["confidence"]["sample"]) for r in rows]
-    by_family: dict[str, list[tuple[float, float, float]]] = {}
-    for family, bends, own in samples:
-        others = [np.array(s) for name, b, s in samples if name != family and b == bends]
-        # sigma of mostly static images does not depend on the factor
-        ratios = [(log / unit)[still < MAX_STILL] for log, unit, still in others]
-        # quantiles, so that every pair has the same weight
-        alike = [np.quantile(r, np.linspace(0, 1, 101)) for r in ratios if len(r)]
-        if not alike:
+    samples = [(r["sequence"], np.array(r["confidence"]["sample"])) for r in rows]
+    by_family: dict[str, list[tuple[float, float]]] = {}
+    factors: dict[str, dict[bool, float]] = {}
+    for family, (log, unit, added, bends) in samples:
+        others = [sample for name, sample in samples if name != family]
+        own = factors.setdefault(family, {})
+        for kind in (False, True):
+            if (bends > 0.5).any() if kind else (bends < 0.5).any():
+                found = _factor(others, kind)
+                own |= {} if found is None else {kind: found}
+        if not all(bool(kind) in own for kind in np.unique(bends > 0.5)):
             continue
-        factor = float(np.quantile(np.concatenate(alike), SHARE_WITHIN))
-        log, unit, still = np.array(own)
-        sigma = np.hypot(factor * unit, SIGMA_PRIOR * still)
-        one, two = coverage(log, sigma / np.hypot(1, sigma / SIGMA_PRIOR))
-        by_family.setdefault(family, []).append((factor, one, two))
-    mean_of = {name: np.mean(several, axis=0) for name, several in by_family.items()}
-    return {name: (float(f), float(one), float(two)) for name, (f, one, two) in mean_of.items()}
+        factor = np.where(bends > 0.5, own.get(True, 0.0), own.get(False, 0.0))
+        one, two = coverage(log, with_prior(np.hypot(factor * unit, added)))
+        by_family.setdefault(family, []).append((one, two))
+    return {
+        name: (tuple(factors[name].values()), *np.mean(several, axis=0).tolist())
+        for name, several in by_family.items()
+    }
+
+
+def _factor(samples: Sequence[Float], bending: bool) -> float | None:
+    """The factor with which SHARE_WITHIN of the pixels lie within one sigma; None without any."""
+    alike = []
+    for log, unit, added, bends in samples:
+        # sigma of mostly static images does not depend on the factor
+        use = ((bends > 0.5) == bending) & (added < MAX_ADDED)
+        if use.any():
+            needed = np.sqrt(np.maximum(log**2 - added**2, 0.0))[use] / unit[use]
+            # quantiles, so that every pair has the same weight
+            alike.append(np.quantile(needed, np.linspace(0, 1, 101)))
+    return float(np.quantile(np.concatenate(alike), SHARE_WITHIN)) if alike else None
 
 
 def text_confidence(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
@@ -196,8 +218,8 @@ def text_confidence(name: str, text: str, rows: Sequence[Row], note: str = "") -
     lines += ["", *(f"- {c}: {CUES[c]}" for c in used), "", "## By family", ""]
     lines += [
         f"The factor of sigma, shipped as {FACTOR:g} ({BENDING_FACTOR:g} where surfaces bend), is"
-        f" chosen for each family on all others of its kind, so that {SHARE_WITHIN:.0%} of their"
-        " pixels lie within one sigma; every pair counts alike.",
+        f" chosen for each family on regions of the same kind of all others, so that"
+        f" {SHARE_WITHIN:.0%} of their pixels lie within one sigma; every pair counts alike.",
         "",
     ]
     lines += table(*_families(good, used))
@@ -224,15 +246,14 @@ def _families(good: Sequence[Row], used: Sequence[str]) -> tuple[list[str], list
         own = [r["confidence"] for r in good if r["sequence"] == family]
         area = [mean([c["ause"].get(k) for c in own]) for k in used]
         within = [float(np.mean([c["within"][k] for c in own])) for k in (0, 1)]
-        factor, *left = factors.get(family, (None, None, None))
+        chosen, *left = factors.get(family, ((), None, None))
         numbers.append([*area, *within, *left])
-        lines.append(
-            [f"{family} ({len(own)})", *_shown(numbers[-1], len(used)), show(factor, ".1f")]
-        )
+        shown = ", ".join(show(f, ".1f") for f in chosen) or show(None)
+        lines.append([f"{family} ({len(own)})", *_shown(numbers[-1], len(used)), shown])
     last = [mean(column) for column in zip(*numbers)]
     lines.append([f"mean of {len(numbers)} families", *_shown(last, len(used)), ""])
     head = ["family (pairs)", *(f"AUSE {c}" for c in used), "within 1", "within 2"]
-    return [*head, "left out: within 1", "left out: within 2", "factor of the others"], lines
+    return [*head, "left out: within 1", "left out: within 2", "factors of the others"], lines
 
 
 def _shown(numbers: Sequence[Any], areas: int) -> list[str]:

@@ -25,6 +25,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.start.choice import LEAST_NOISE, MOST_NOISE
+from soup_nlp.start.components import TIES
 from soup_nlp.start.propose import Start
 
 log = logging.getLogger(__name__)
@@ -46,6 +47,8 @@ LEAST_SPREAD = 0.1
 MOST_MISFIT, BENDING_MISFIT = 5.0, 100.0
 """Pixels beyond which a flow that the answer contradicts is as wrong as any; the latter where
 surfaces bend: what an answer with a motion for every superpixel cannot follow is far off."""
+SCALE_FACTOR = 1.0
+"""Standard deviation of a log scale by contact, over the one that the marginals have."""
 LARGEST = 1e6
 """Of what is calibrated: anything above is as little."""
 MIN_CONFIDENCE = 0.5
@@ -126,6 +129,7 @@ def calibrated(
     prior: float = SIGMA_PRIOR,
     bends: Mask | bool = False,
     still: float = 0.0,
+    scale: Float | float = 0.0,
 ) -> Float:
     """Standard deviation of log depth that errors keep to.
 
@@ -141,14 +145,32 @@ def calibrated(
         bends: Where regions bend; of the same shape, or one for all.
         still: Share of the image that stands still. Nothing tells its depth, nor that of the rest
             beside it: so much of `SIGMA_PRIOR` is added everywhere, in squares.
+        scale: Standard deviation of the log scale of its component by the marginals, 0 for the
+            reference component. The other components have their scale from contact and not from
+            the flow, so it counts whatever the flow's noise is; added in squares.
     """
     # no limits where regions bend: what is below them keeps its order
     known = np.sqrt(np.hypot(LEAST_SPREAD, spread))
     bent = BENDING_FACTOR * np.hypot(LEAST_NOISE, misfit) * known
     rigid = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
     sigma = np.where(bends, bent, rigid)
-    sigma = np.hypot(np.minimum(sigma, LARGEST), SIGMA_PRIOR * still)
+    sigma = np.hypot(np.minimum(sigma, LARGEST), np.minimum(SCALE_FACTOR * scale, LARGEST))
+    return with_prior(np.hypot(sigma, SIGMA_PRIOR * still), prior)
+
+
+def with_prior(sigma: Float, prior: float = SIGMA_PRIOR) -> Float:
+    """Standard deviation where the information of the prior is added."""
+    sigma = np.minimum(sigma, LARGEST)
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
+
+
+def scale_by_contact(own: Marginals, start: Start) -> Float:
+    """(N,) standard deviation of the log scale of a superpixel's component, by the marginals.
+
+    It is 0 for the reference component, which defines the scale.
+    """
+    reference = start.tie == TIES.index("reference")
+    return np.where(reference, 0.0, np.sqrt(own.component)[start.component])
 
 
 def _spread(
@@ -208,7 +230,9 @@ def confidence(
     # the answer may explain a part of the camera's turn by translations
     stands |= start.at_rest & (start.parallax < MOST_NOISE)
     still = float(stands[rec.labels].mean())
-    sigma = calibrated(spread, noise, misfit[rec.labels], bends=bends, still=still)
-    bending = np.isin(np.arange(len(own.component)), start.component[start.bends])
-    scales = calibrated(np.sqrt(own.component), noise, bends=bending)
-    return Confidence(sigma, spread, own, noise, scales, still, misfit)
+    scale = scale_by_contact(own, start)
+    sigma = calibrated(
+        spread, noise, misfit[rec.labels], bends=bends, still=still, scale=scale[rec.labels]
+    )
+    component_sigma = with_prior(SCALE_FACTOR * np.sqrt(own.component))
+    return Confidence(sigma, spread, own, noise, component_sigma, still, misfit)
