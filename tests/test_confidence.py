@@ -15,7 +15,6 @@ from soup_nlp.evaluate.confidence import (
     LEAST_SPREAD,
     MOST_SIGMA,
     POWER,
-    SCALE_FACTOR,
     SIGMA_PRIOR,
     calibrated,
     confidence,
@@ -309,7 +308,7 @@ def test_the_variance_of_a_scale_by_contact_is_added_whatever_the_noise_is(bends
             calibrated(spread, noise, 0.1, prior=np.inf, bends=bends, scale=scale)[0]
             for scale in (0.0, 0.2)
         )
-        assert both**2 == pytest.approx(alone**2 + (SCALE_FACTOR * 0.2) ** 2)
+        assert both**2 == pytest.approx(alone**2 + 0.2**2)
     assert calibrated(spread, 0.1, scale=np.inf)[0] == pytest.approx(SIGMA_PRIOR)
 
 
@@ -325,7 +324,7 @@ def test_the_reference_component_defines_the_scale_and_the_others_are_less_sure(
     np.testing.assert_array_equal(sure.sigma > without, ~reference[labels])
     # no component is less sure than a pair that says nothing
     raw = np.sqrt(sure.marginals.component)
-    expected = 1 / np.sqrt(1 / (SCALE_FACTOR * raw) ** 2 + 1 / SIGMA_PRIOR**2)
+    expected = 1 / np.sqrt(1 / raw**2 + 1 / SIGMA_PRIOR**2)
     np.testing.assert_allclose(sure.component_sigma, expected)
 
 

@@ -28,7 +28,6 @@ from soup_nlp.evaluate.confidence import (
     BENDING_FACTOR,
     FACTOR,
     LARGEST,
-    SCALE_FACTOR,
     SIGMA_PRIOR,
     calibrated,
     confidence,
@@ -97,7 +96,7 @@ def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str
     bends = result.start.bends[rec.labels]
     whole = calibrated(sure.spread, sure.noise, misfit, np.inf, bends)
     unit = chosen(whole / np.where(bends, BENDING_FACTOR, FACTOR))
-    scale = SCALE_FACTOR * chosen(scale_by_contact(sure.marginals, result.start)[rec.labels])
+    scale = chosen(scale_by_contact(sure.marginals, result.start)[rec.labels])
     # what is added in squares to the factor times the unit
     added = np.minimum(np.hypot(SIGMA_PRIOR * sure.still, scale), LARGEST)
     sample = log, unit, added, chosen(bends.astype(float))

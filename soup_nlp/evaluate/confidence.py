@@ -47,8 +47,6 @@ LEAST_SPREAD = 0.1
 MOST_MISFIT, BENDING_MISFIT = 5.0, 100.0
 """Pixels beyond which a flow that the answer contradicts is as wrong as any; the latter where
 surfaces bend: what an answer with a motion for every superpixel cannot follow is far off."""
-SCALE_FACTOR = 1.0
-"""Standard deviation of a log scale by contact, over the one that the marginals have."""
 LARGEST = 1e6
 """Of what is calibrated: anything above is as little."""
 MIN_CONFIDENCE = 0.5
@@ -66,7 +64,7 @@ class Confidence:
         spread: (H, W) standard deviation of log depth by what the flow adds to the terms on shape.
         marginals: Of the planes and of the components' scales.
         noise: Of the flow, pixels.
-        component_sigma: (C,) calibrated standard deviation of the components' log scale.
+        component_sigma: (C,) standard deviation of the components' log scale.
         still: Share of the image that stands still where surfaces bend.
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
     """
@@ -146,15 +144,15 @@ def calibrated(
         still: Share of the image that stands still. Nothing tells its depth, nor that of the rest
             beside it: so much of `SIGMA_PRIOR` is added everywhere, in squares.
         scale: Standard deviation of the log scale of its component by the marginals, 0 for the
-            reference component. The other components have their scale from contact and not from
-            the flow, so it counts whatever the flow's noise is; added in squares.
+            reference component. The others have their scale from contact and not from the flow,
+            so it counts whatever the flow's noise is; added in squares.
     """
     # no limits where regions bend: what is below them keeps its order
     known = np.sqrt(np.hypot(LEAST_SPREAD, spread))
     bent = BENDING_FACTOR * np.hypot(LEAST_NOISE, misfit) * known
     rigid = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
     sigma = np.where(bends, bent, rigid)
-    sigma = np.hypot(np.minimum(sigma, LARGEST), np.minimum(SCALE_FACTOR * scale, LARGEST))
+    sigma = np.hypot(np.minimum(sigma, LARGEST), np.minimum(scale, LARGEST))
     return with_prior(np.hypot(sigma, SIGMA_PRIOR * still), prior)
 
 
@@ -234,5 +232,5 @@ def confidence(
     sigma = calibrated(
         spread, noise, misfit[rec.labels], bends=bends, still=still, scale=scale[rec.labels]
     )
-    component_sigma = with_prior(SCALE_FACTOR * np.sqrt(own.component))
+    component_sigma = with_prior(np.sqrt(own.component))
     return Confidence(sigma, spread, own, noise, component_sigma, still, misfit)
