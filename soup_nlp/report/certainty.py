@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from soup_nlp.arrays import Mask
-from soup_nlp.evaluate.confidence import MOST_SIGMA
+from soup_nlp.evaluate.confidence import MOST_SIGMA, scale_by_contact, with_prior
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.start.components import TIES
 
@@ -23,6 +23,7 @@ WORDS = {
     "outline": "with the scale of an outline",
     "unseen": "no usable flow",
     "still": "hardly any parallax",
+    "scale": "with a scale that contact hardly determines",
     "weak": "little information",
 }
 
@@ -34,8 +35,9 @@ def certainty(run: Run) -> dict[str, float]:
         "determined": share with a sigma of log depth of at most `MOST_SIGMA`; the sum of "flow"
         (pixels of the largest component), "contact" and "outline" (pixels of other components, by
         the source of their scale). "guess": the rest; the sum of "unseen" (no usable flow, or
-        hidden in the next frame), "still" (parallax below a pixel) and "weak". "median_sigma":
-        median over the determined pixels.
+        hidden in the next frame), "still" (parallax below a pixel), "scale" (of a component whose
+        scale alone is that uncertain) and "weak". "median_sigma": median over the determined
+        pixels.
     """
     sigma = run.confidence.sigma
     labels, start = run.segmentation.labels, run.start
@@ -44,6 +46,7 @@ def certainty(run: Run) -> dict[str, float]:
     assert run.pair.flow is not None
     unseen = (run.pair.flow.confidence <= 0) | hidden(run.reconstruction)
     still = (start.parallax < LITTLE)[labels]
+    scale = with_prior(scale_by_contact(run.confidence.marginals, start))[labels] > MOST_SIGMA
 
     def share(mask: Mask) -> float:
         return float(mask.mean())
@@ -56,7 +59,8 @@ def certainty(run: Run) -> dict[str, float]:
         "guess": share(~sure),
         "unseen": share(~sure & unseen),
         "still": share(~sure & ~unseen & still),
-        "weak": share(~sure & ~unseen & ~still),
+        "scale": share(~sure & ~unseen & ~still & scale),
+        "weak": share(~sure & ~unseen & ~still & ~scale),
         "median_sigma": float(np.median(sigma[sure])) if sure.any() else float("nan"),
     }
 
@@ -79,9 +83,10 @@ def guess_words(found: Mapping[str, float], of: str = "") -> str:
     """Sentence on the share that is a guess and the reasons."""
     return (
         f"{found['guess']:.0%}{of} is a guess (sigma above {MOST_SIGMA:.0%}):"
-        f" {_parts(found, ('unseen', 'still', 'weak'))}"
+        f" {_parts(found, ('unseen', 'still', 'scale', 'weak'))}"
     )
 
 
 def _parts(found: Mapping[str, float], names: tuple[str, ...]) -> str:
-    return ", ".join(f"{found[k]:.0%} {WORDS[k]}" for k in names if found[k] >= 0.005)
+    # results of earlier versions have fewer parts
+    return ", ".join(f"{found[k]:.0%} {WORDS[k]}" for k in names if found.get(k, 0.0) >= 0.005)

@@ -1,0 +1,53 @@
+"""Shares of the image whose depth is determined, and the reasons of the rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR
+from soup_nlp.report.certainty import certainty, certainty_lines
+from soup_nlp.start.components import TIES
+
+REASONS = ("unseen", "still", "scale", "weak")
+
+
+def unsure(run, component_variance=None):
+    """The same run where every pixel is a guess."""
+    sure = run.confidence
+    own = sure.marginals
+    if component_variance is not None:
+        own = replace(own, component=np.full_like(own.component, component_variance))
+    sigma = np.full_like(sure.sigma, SIGMA_PRIOR)
+    return replace(run, confidence=replace(sure, sigma=sigma, marginals=own))
+
+
+def test_shares_add_up(small_run):
+    found = certainty(small_run)
+    assert found["determined"] + found["guess"] == pytest.approx(1.0)
+    assert sum(found[k] for k in ("flow", "contact", "outline")) == pytest.approx(
+        found["determined"]
+    )
+    assert sum(found[k] for k in REASONS) == pytest.approx(found["guess"])
+    assert found["median_sigma"] < MOST_SIGMA
+
+
+def test_every_guess_has_one_reason(small_run):
+    found = certainty(unsure(small_run))
+    assert found["determined"] == 0
+    assert np.isnan(found["median_sigma"])
+    assert sum(found[k] for k in REASONS) == pytest.approx(1.0)
+
+
+def test_a_scale_that_contact_hardly_determines_is_named(small_run):
+    start, labels = small_run.start, small_run.segmentation.labels
+    loose = certainty(unsure(small_run, 1.0))
+    firm = certainty(unsure(small_run, 1e-6))
+    others = (start.tie != TIES.index("reference"))[labels].mean()
+    assert firm["scale"] == 0
+    assert 0 < loose["scale"] <= others
+    assert loose["scale"] + loose["weak"] == pytest.approx(firm["weak"])
+    (line,) = certainty_lines(loose)
+    assert "with a scale that contact hardly determines" in line
