@@ -23,7 +23,7 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.model.sums import Sums, interpreted
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import Case
-from soup_nlp.solve.hessian import LagrangianHessian
+from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.tangent_problem import TangentProblem
 
@@ -273,9 +273,10 @@ def test_the_hessian_that_ipopt_takes_is_the_programs(case, compiled):
     form = Formulation(compiled=compiled)
     nlp, _ = build_matrix_nlp(case.soup, case.data, case.weights, form)
     rng = np.random.default_rng(3)
-    args = nlp.x0, nlp.with_theta(eps=0.05), 0.7, rng.normal(size=nlp.ng)
-    fast = LagrangianHessian(nlp)
-    one, two = fast(*args), nlp.hess_lag(*args)
+    x, lam_f, lam_g = nlp.x0, 0.7, rng.normal(size=nlp.ng)
+    fast = Functions(nlp).hess_lag
+    one = fast(x, nlp.thetas(eps=0.05), lam_f, lam_g)
+    two = nlp.hess_lag(x, nlp.with_theta(eps=0.05), lam_f, lam_g)
     assert one.sparsity() == two.sparsity()
     close(one.nonzeros(), two.nonzeros())
     assert fast.nnz_out(0) == nlp.nnzh

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
-from soup_nlp.arrays import Int
+from soup_nlp.arrays import Float, Int
 from soup_nlp.model.compile import compile_functions
 from soup_nlp.model.kernel import Group
 
@@ -63,8 +64,15 @@ class Pattern(NamedTuple):
 
     def sparsity(self) -> ca.Sparsity:
         """For CasADi."""
-        start = np.searchsorted(self.columns, np.arange(self.shape[1] + 1))
-        return ca.Sparsity(*self.shape, start.tolist(), self.rows.tolist(), True)
+        return ca.Sparsity(*self.shape, self._start().tolist(), self.rows.tolist(), True)
+
+    def filled(self, nonzeros: Float) -> sparse.csc_matrix:
+        """The matrix with these nonzeros."""
+        return sparse.csc_matrix((nonzeros, self.rows, self._start()), self.shape)
+
+    def _start(self) -> Int:
+        """First nonzero of every column, and their number."""
+        return np.searchsorted(self.columns, np.arange(self.shape[1] + 1))
 
 
 def _ranked(keys: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.int32]]:

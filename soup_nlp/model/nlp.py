@@ -18,8 +18,10 @@ from soup_nlp.model.assemble import (
     assemble_functions,
     assemble_hessian,
     hessian_pattern,
+    jacobian_entries,
 )
 from soup_nlp.model.kernel import Group, Hessian
+from soup_nlp.model.sums import Sums
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,17 @@ class NLP:
     def functions(self) -> Functions:
         """What a solver calls but the Hessian; assembled (a second) by the first access."""
         return assemble_functions(self.groups, self.nx, self.ng, len(self.theta), self.compiled)
+
+    @cached_property
+    def sums(self) -> Sums:
+        """f, g and their first derivatives as numpy arrays, at the NLP's own theta."""
+        return Sums(self, [])
+
+    @cached_property
+    def jacobian_pattern(self) -> Pattern:
+        """Of g's Jacobian; places for every group with constraints."""
+        with_rows = [jacobian_entries(g) for g in self.groups if g.kernel.nc]
+        return Pattern.of((self.ng, self.nx), with_rows)
 
     @cached_property
     def hessian_pattern(self) -> Pattern:
@@ -107,7 +120,7 @@ class NLP:
     @property
     def nnzj(self) -> int:
         """Nonzeros of the Jacobian."""
-        return int(self.jac_g.nnz_out(1))
+        return len(self.jacobian_pattern.rows)
 
     @property
     def nnzh(self) -> int:
@@ -117,11 +130,14 @@ class NLP:
     def with_theta(self, **values: float) -> Float:
         """p with other theta entries."""
         p = self.p.copy()
-        for name, value in values.items():
-            if name not in self.theta:
-                raise ModelError("unknown parameter", found=name, expected=", ".join(self.theta))
-            p[list(self.theta).index(name)] = value
+        p[: len(self.theta)] = self.thetas(**values)
         return p
+
+    def thetas(self, **values: float) -> Float:
+        """(nt,) values of theta, with other ones for some of its entries."""
+        for name in values.keys() - self.theta.keys():
+            raise ModelError("unknown parameter", found=name, expected=", ".join(self.theta))
+        return np.array(list({**self.theta, **values}.values()), float)
 
     def sizes(self) -> dict[str, int]:
         """Sizes with stable keys."""

@@ -12,19 +12,21 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.model.assemble import Entries, Pattern, hessian_entries, jacobian_entries
+from soup_nlp.model.assemble import Entries, Pattern, hessian_entries
 from soup_nlp.model.kernel import Group, Table
 from soup_nlp.model.lanes import Lanes, NoLanesError, Summed, compile_lanes
 from soup_nlp.model.mapped import Mapped
-from soup_nlp.model.nlp import NLP
 from soup_nlp.model.vectors import Vectors
+
+if TYPE_CHECKING:
+    from soup_nlp.model.nlp import NLP
 
 log = logging.getLogger(__name__)
 
@@ -68,11 +70,11 @@ class Sums:
 
         Args:
             nlp: The NLP.
-            hessians: Kinds of Hessian (kernel.HESSIANS); not empty.
+            hessians: Kinds of Hessian (kernel.HESSIANS).
             besides: Rows and columns of further nonzeros of the upper triangle.
             first_order: False where Hessians alone are wanted.
         """
-        self.theta, self.seconds = nlp.p[: len(nlp.theta)], Timer()
+        self.theta, self.seconds = nlp.thetas(), Timer()
         self._sizes = nlp.nx, nlp.ng, len(nlp.theta)
         made: list[dict[str, ca.Function]] = []
         for group in nlp.groups:
@@ -85,8 +87,7 @@ class Sums:
             _union(group, [k for k in hessians if k in functions])
             for group, functions in zip(nlp.groups, made)
         ]
-        with_rows = [g for g, functions in zip(nlp.groups, made) if "jac" in functions]
-        self.jacobian = Pattern.of((nlp.ng, nlp.nx), [jacobian_entries(g) for g in with_rows])
+        self.jacobian = nlp.jacobian_pattern
         if list(hessians) == [nlp.hessian] and besides is None:
             self.upper = nlp.hessian_pattern
         else:

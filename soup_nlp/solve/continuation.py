@@ -77,7 +77,7 @@ class Continuation:
                 nlp,
                 {**(KEEP if k else {}), **o.ipopt},
                 **given,
-                p=nlp.with_theta(eps=eps, eps_pixel=eps),
+                p=nlp.thetas(eps=eps, eps_pixel=eps),
                 max_iter=o.presolve_iterations,
                 stagnation=o.stagnation * (0.01 if k == last else 1.0),
                 stage=f"continuation {eps:g}",
@@ -96,7 +96,7 @@ class Continuation:
             nlp,
             {**LAST, **o.ipopt},
             x0=nlp.x0,
-            p=nlp.with_theta(eps=o.eps, eps_pixel=o.eps),
+            p=nlp.thetas(eps=o.eps, eps_pixel=o.eps),
             max_iter=o.polish_iterations,
             stage="continuation exact",
         )

@@ -15,7 +15,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.callback import IterationCallback
-from soup_nlp.solve.hessian import LagrangianHessian
+from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.interrupt import raised_at_the_end
 from soup_nlp.storage.progress import Progress, Watch
 
@@ -98,7 +98,7 @@ class _Iterations(IterationCallback):
         self.x0 = self.best_x = x0
         self.best_lam: tuple[Float, Float] | None = None
         self.reason = ""
-        self.start(f"watch_{nlp.name}", nlp.nx, nlp.ng, len(nlp.p))
+        self.start(f"watch_{nlp.name}", nlp.nx, nlp.ng, len(nlp.theta))
 
     def eval(self, arg: list[ca.DM]) -> list[int]:
         try:
@@ -172,12 +172,10 @@ class Ipopt:
         self.nlp = nlp
         self.options = dict(options or {})
         # CasADi does not keep a callback alive
-        self.hess_lag = LagrangianHessian(nlp)
+        self.functions = Functions(nlp)
 
     def _solver(self, callback: _Iterations, max_iter: int, tol: float) -> Any:
-        nlp, log_file = self.nlp, callback.watch.log_file
-        x, p = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", len(nlp.p))
-        f, g = nlp.oracle(x, p)
+        functions, log_file = self.functions, callback.watch.log_file
         ipopt: dict[str, Any] = {
             **DEFAULTS,
             "max_iter": max_iter,
@@ -191,9 +189,9 @@ class Ipopt:
             ipopt |= {"output_file": log_file, "file_print_level": 5, "file_append": "yes"}
         options = {
             "ipopt": ipopt,
-            "grad_f": nlp.grad_f,
-            "jac_g": nlp.jac_g,
-            "hess_lag": self.hess_lag,
+            "grad_f": functions.grad_f,
+            "jac_g": functions.jac_g,
+            "hess_lag": functions.hess_lag,
             "iteration_callback": callback,
             "print_time": False,
             "calc_lam_p": False,
@@ -202,11 +200,11 @@ class Ipopt:
             "show_eval_warnings": False,
         }
         try:
-            return ca.nlpsol("solver", "ipopt", {"x": x, "p": p, "f": f, "g": g}, options)
+            return ca.nlpsol("solver", "ipopt", functions.oracle, options)
         except RuntimeError as error:
             raise SolverError(
                 "Ipopt could not be set up",
-                where=nlp.name,
+                where=self.nlp.name,
                 found=str(error).strip().splitlines()[-1],
                 hint="check the names of the options under solver",
             ) from error
@@ -229,7 +227,7 @@ class Ipopt:
 
         Args:
             x0: (nx,) start.
-            p: Parameters; default the NLP's.
+            p: (nt,) parameters theta; default the NLP's.
             lam_x0: (nx,) start of the bound multipliers.
             lam_g0: (ng,) start of the constraint multipliers.
             max_iter: Iteration limit.
@@ -246,7 +244,7 @@ class Ipopt:
         nlp = self.nlp
         callback = _Iterations(nlp, x0, stage, watch or Watch(), seconds, stagnation)
         solver = self._solver(callback, max_iter, tol)
-        given = {"p": nlp.p if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
+        given = {"p": nlp.thetas() if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
         bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}
         with raised_at_the_end(callback.signalled):
             out = solver(x0=x0, **bounds, **{k: v for k, v in given.items() if v is not None})

@@ -7,7 +7,7 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.model.nlp import NLP, to_scipy
+from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.ipopt import Stage
 
 LIMITS = {
@@ -65,10 +65,8 @@ def optimality(nlp: NLP, x: Float, lam_x: Float, lam_g: Float) -> dict[str, floa
         lam_x: (nx,) multipliers of the bounds (positive at upper bounds).
         lam_g: (ng,) multipliers of the constraints (positive at upper bounds).
     """
-    _, gradient = nlp.grad_f(x, nlp.p)
-    g, jacobian = nlp.jac_g(x, nlp.p)
-    dual = np.asarray(gradient).ravel() + to_scipy(jacobian).T @ lam_g + lam_x
-    g = np.asarray(g).ravel()
+    g, jacobian = nlp.sums.constraints(x)
+    dual = nlp.sums.gradient(x) + nlp.jacobian_pattern.filled(jacobian).T @ lam_g + lam_x
     products = [0.0]
     for value, lower, upper, lam in ((x, nlp.lbx, nlp.ubx, lam_x), (g, nlp.lbg, nlp.ubg, lam_g)):
         open_ = lower < upper
@@ -85,7 +83,7 @@ def residuals(
     nlp: NLP, soup: Soup, stage: Stage, data: EnergyData, min_facing: float
 ) -> dict[str, float]:
     """Constraint residuals of the delivered soup; violation and optimality of Ipopt's answer."""
-    g = np.asarray(nlp.oracle(stage.x, nlp.p)[1]).ravel()
+    g, _ = nlp.sums.constraints(stage.x)
     outside = np.maximum(nlp.lbg - g, g - nlp.ubg).max(initial=0.0)
     return {
         **constraint_residuals(soup, data.rim_ray, min_facing),

@@ -84,8 +84,7 @@ class TangentProblem:
 
     def smoothing(self, eps: float) -> None:
         """Set both smoothing widths, pixels."""
-        theta = self.nlp.with_theta(eps=eps, eps_pixel=eps)
-        self.sums.theta = theta[: len(self.nlp.theta)]
+        self.sums.theta = self.nlp.thetas(eps=eps, eps_pixel=eps)
 
     def move(self, some: Mask | None, x: Float) -> bool:
         """Let some superpixels move; the others change only in `normalise`.

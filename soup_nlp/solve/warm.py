@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.model.nlp import NLP, to_scipy
+from soup_nlp.model.nlp import NLP
 
 WARM: Mapping[str, Any] = {
     "warm_start_init_point": "yes",
@@ -47,15 +47,15 @@ def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, 
     facing = -np.einsum("nc,nc->n", soup.n, data.anchor_ray)
     visible = next(g for g in nlp.groups if g.kernel.name == "visible").table.rows
     lam_g[visible[:, 1:]] = -rim / facing[:, None]
-    _, gradient = nlp.grad_f(nlp.x0, nlp.p)
+    gradient = nlp.sums.gradient(nlp.x0)
     # an epigraph's slack s is in no other row than s^2 >= |v|^2 + eps^2
     for group in nlp.groups:
         slacks = [i for i in range(group.kernel.nx) if group.kernel.x[i].name().startswith("s_")]
         for slack, row in zip(slacks, group.table.rows.T):
             s = group.table.index[:, slack]
-            lam_g[row] = -np.asarray(gradient).ravel()[s] / (2 * nlp.x0[s])
-    J = to_scipy(nlp.jac_g(nlp.x0, nlp.p)[1]).tocsr()
-    force = np.asarray(gradient).ravel() + J.T @ lam_g
+            lam_g[row] = -gradient[s] / (2 * nlp.x0[s])
+    J = nlp.jacobian_pattern.filled(nlp.sums.constraints(nlp.x0)[1]).tocsr()
+    force = gradient + J.T @ lam_g
     equal = np.flatnonzero(nlp.lbg == nlp.ubg)
     A = J[equal]
     gram = (A @ A.T).tocsc()
