@@ -27,10 +27,10 @@ def test_a_part_is_the_worst_and_their_neighbours(chain):
     residual = np.full(COUNT, 1e-3)
     residual[4] = 1.0
     one.choose(residual, slow=True)
-    np.testing.assert_array_equal(np.flatnonzero(one.some), [3, 4, 5])
-    moves = np.repeat(one.some, 9)
+    np.testing.assert_array_equal(np.flatnonzero(one.block.some), [3, 4, 5])
+    moves = np.repeat(one.block.some, 9)
     b = np.random.default_rng(1).normal(size=9 * COUNT)
-    got = one.factorise(nonzeros)(b)
+    got = one.factorise(nonzeros[one.block.nonzeros])(b)
     expected = np.linalg.solve(full[np.ix_(moves, moves)], b[moves])
     np.testing.assert_allclose(got[moves], expected, rtol=1e-10)
     assert not got[~moves].any()
@@ -42,17 +42,17 @@ def test_a_part_ends_where_it_no_longer_pays(chain):
     residual[4] = 1.0
     for slow, after in ((True, residual), (False, np.ones(COUNT)), (False, np.roll(residual, 5))):
         one.choose(residual, slow=False)
-        assert one.some is not None
+        assert one.block is not None
         one.choose(after, slow)
-        assert one.some is None
+        assert one.block is None
     for _ in range(STEPS):
         one.choose(residual, slow=False)
-        assert one.some is not None
+        assert one.block is not None
     one.choose(residual, slow=False)
-    assert one.some is None
+    assert one.block is None
 
 
 def test_many_bad_superpixels_move_with_all(chain):
     one, _, _ = chain
     one.choose(np.ones(COUNT), slow=False)
-    assert one.some is None
+    assert one.block is None

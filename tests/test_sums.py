@@ -25,6 +25,7 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import Case
 from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.ipopt import Ipopt
+from soup_nlp.solve.part import Block
 from soup_nlp.solve.tangent_problem import TangentProblem
 
 pytestmark = pytest.mark.slow
@@ -91,7 +92,7 @@ def test_vectors_and_functions_give_the_same_presolve(case, chart: Chart):
     slow = TangentProblem(*args, Formulation(compiled=False), chart=chart)
     assert fast.sums.vectorised
     assert not slow.sums.vectorised
-    np.testing.assert_array_equal(fast.block, slow.block)
+    np.testing.assert_array_equal(fast.triangles, slow.triangles)
     np.testing.assert_array_equal(fast.upper.indices, slow.upper.indices)
     rng = np.random.default_rng(1)
     x = fast.nlp.x0 * (1 + 0.01 * rng.normal(size=fast.nlp.nx))
@@ -229,6 +230,10 @@ def test_sums_over_the_elements_of_some_variables_change_as_the_whole_does():
     of_moved = moved[sums.upper.rows] & moved[sums.upper.columns]
     close(sums.hessian("exact", y, lam)[of_moved], whole[of_moved])
     close(sums.constraints(y)[0], g)
+    kept = np.flatnonzero(of_moved)
+    for variables in (moved, None):
+        sums.only(variables, kept)
+        close(sums.hessian("exact", y, lam), whole[kept])
     sums.only(None)
     close(sums.hessian("exact", y, lam), whole, 0)
 
@@ -243,9 +248,14 @@ def test_superpixels_that_are_held_count_as_where_they_are(case, chart: Chart):
     # also those that are held are scaled
     y = problem.normalise(y)
     assert y[0] != x[0]
+    whole = problem.triangles
     value, gradient = problem.value(y), problem.gradient(y)
-    assert problem.move(some, x)
-    assert not problem.move(some, y)
+    z, block = np.ones_like(problem.slacks(y)[0]), Block.of(problem.upper, some)
+    H = problem.hessian(y, z, "exact")
+    assert problem.move(block, x)
+    assert not problem.move(block, y)
+    close(problem.hessian(y, z, "exact"), H[block.nonzeros])
+    np.testing.assert_array_equal(block.nonzeros[problem.triangles], whole[some])
     assert problem.value(y) == pytest.approx(value, rel=1e-12)
     close(problem.gradient(y), gradient)
     assert problem.move(None, y)
@@ -263,7 +273,7 @@ def test_every_operation_has_casadis_value(every):
     out, none, lanes = np.zeros(LANES * 10), np.zeros(1), in_lanes(data)
     pointers = [ctypes.c_void_p(q.ctypes.data) for q in (x, index, lanes, none)]
     rest = [ctypes.c_void_p(q.ctypes.data) for q in (none, index, places, out)]
-    library.every_sum(ctypes.c_long(1), None, *pointers, ctypes.c_double(1.0), *rest)
+    library.every_sum(ctypes.c_long(1), *pointers, ctypes.c_double(1.0), *rest)
     expected = [np.asarray(f(*pair, [])).ravel() for pair in zip(x.ravel(), data.ravel())]
     np.testing.assert_allclose(out.reshape(LANES, 10), expected, rtol=1e-14)
 

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, Mask
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.model.compile import shared_library
 from soup_nlp.model.kernel import Table
 
@@ -41,19 +41,15 @@ static inline real root(real a) {{
 }}
 """
 
-# x, row, theta, lam_f, lam_c -> entries, added up at their places; a block is L elements, and
-# `which` lists the blocks to sum, or is null for all
+# x, row, theta, lam_f, lam_c -> entries, added up at their places; a block is L elements
 _LOOP = """
-void {name}_sum(long blocks, const int *which, const double *x, const int *indices,
-                const double *table, const double *theta, double lam_f, const double *lam,
-                const int *all_rows, const int *places, double *sum) {{
+void {name}_sum(long blocks, const double *x, const int *index, const double *table,
+                const double *theta, double lam_f, const double *lam, const int *rows,
+                const int *place, double *sum) {{
   enum {{ NX = {nx}, NP = {np}, NT = {nt}, NC = {nc}, NO = {no} }};
   real X[NX + 1], P[NP + 1], T[NT + 1], F[1] = {{zero + lam_f}}, C[NC + 1], O[NO];
   for (int i = 0; i < NT; i++) T[i] = zero + theta[i];
-  for (long k = 0; k < blocks; k++) {{
-    const long b = which ? which[k] : k;
-    const int *index = indices + b * NX * L, *rows = all_rows + b * NC * L;
-    const int *place = places + b * NO * L;
+  for (long b = 0; b < blocks; b++) {{
     for (int i = 0; i < NX; i++, index += L)
       for (int l = 0; l < L; l++) X[i][l] = x[index[l]];
     for (int i = 0; i < NC; i++, rows += L)
@@ -204,9 +200,13 @@ class Lanes:
         rows = table.rows.reshape(len(table), table.rows.shape[1])
         return cls(in_lanes(table.index, np.int32), in_lanes(table.data), in_lanes(rows, np.int32))
 
-    def touched(self, some: Mask) -> NDArray[np.int32]:
+    def touched(self, some: Mask) -> Int:
         """Blocks with an element that one of these variables (nx,) is in."""
-        return np.flatnonzero(some[self.index].any(axis=(1, 2))).astype(np.int32)
+        return np.flatnonzero(some[self.index].any(axis=(1, 2)))
+
+    def taken(self, blocks: Int) -> Lanes:
+        """Some of the blocks alone."""
+        return Lanes(self.index[blocks], self.data[blocks], self.rows[blocks])
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,13 +218,11 @@ class Summed:
         lanes: The table.
         place: (B, entries, LANES) where each is added; what fills the last block belongs in an
             entry that is dropped.
-        which: Blocks that are summed; None for all.
     """
 
     call: Callable[..., None]
     lanes: Lanes
     place: NDArray[np.int32]
-    which: NDArray[np.int32] | None = None
 
     @classmethod
     def of(
@@ -258,10 +256,8 @@ class Summed:
         """
         index, data, rows, place = self._table
         lam = x if lam_g is None else lam_g
-        count = len(self.lanes.index if self.which is None else self.which)
-        which = None if self.which is None else _pointer(self.which)
-        blocks, factor = ctypes.c_long(count), ctypes.c_double(lam_f)
-        first = blocks, which, _pointer(x), index, data, _pointer(theta), factor
+        blocks, factor = ctypes.c_long(len(self.place)), ctypes.c_double(lam_f)
+        first = blocks, _pointer(x), index, data, _pointer(theta), factor
         self.call(*first, _pointer(lam), rows, place, _pointer(out))
 
 

@@ -11,7 +11,6 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import casadi as ca
@@ -95,7 +94,8 @@ class Sums:
             self.upper = Pattern.of((nlp.nx, nlp.nx), [*every, Entries(*(besides or _NOTHING))])
         jacobian_places = iter(self.jacobian.places)
         self._terms: dict[str, list[Summed | Vectors | Mapped]] = {}
-        self._some: dict[str, list[Summed | Vectors | Mapped]] = {}
+        self._some: dict[str, list[Summed]] = {}
+        self._kept: Int | None = None
         self.vectorised = nlp.compiled
         for group, functions, union, upper in zip(nlp.groups, made, unions, self.upper.places):
             size = group.size
@@ -139,32 +139,42 @@ class Sums:
                 )
         return {key: interpreted(f, table, place[key]) for key, f in functions.items()}
 
-    def only(self, some: Mask | None) -> None:
+    def only(self, some: Mask | None, kept: Int | None = None) -> None:
         """Sum f, its gradient and Hessians only over the elements that some variables are in.
 
-        Kernels that run without machine code are still summed over all their elements.
+        Without machine code they are still summed over all elements.
 
         Args:
             some: (nx,) these variables; None for all.
+            kept: The nonzeros of Hessians that are returned; None for all.
         """
-        self._some = {}
-        if some is None:
+        self._some, self._kept = {}, kept
+        if some is None or not self.vectorised:
             return
-        touched: dict[int, NDArray[np.int32]] = {}
+        new = np.arange(self._size("upper") + 1, dtype=np.int32)
+        if kept is not None:
+            new[:] = len(kept)
+            new[kept] = np.arange(len(kept))
+        # the functions of a kernel share its table
+        taken: dict[int, tuple[Int, Lanes]] = {}
         for key in self._terms.keys() - {"con", "jac"}:
-            self._some[key] = own = []
+            self._some[key] = []
             for term in self._terms[key]:
-                if isinstance(term, Summed):
-                    lanes = term.lanes
-                    if id(lanes) not in touched:
-                        touched[id(lanes)] = lanes.touched(some)
-                    term = replace(term, which=touched[id(lanes)])
-                own.append(term)
+                assert isinstance(term, Summed)
+                whole = term.lanes
+                if id(whole) not in taken:
+                    blocks = whole.touched(some)
+                    taken[id(whole)] = blocks, whole.taken(blocks)
+                blocks, lanes = taken[id(whole)]
+                place = term.place[blocks]
+                place = place if key in ("f", "grad") else new[place]
+                self._some[key].append(Summed(term.call, lanes, place))
 
     def _size(self, key: str) -> int:
         nx, ng, _ = self._sizes
         sizes = {"f": 1, "grad": nx, "con": ng, "jac": len(self.jacobian.rows)}
-        return sizes.get(key, len(self.upper.rows))
+        kept = self._kept if key in self._some else None
+        return sizes.get(key, len(self.upper.rows if kept is None else kept))
 
     def _sum(self, key: str, x: Float, lam_g: Float | None = None, lam_f: float = 1.0) -> Float:
         nx, ng, thetas = self._sizes
@@ -172,7 +182,7 @@ class Sums:
         theta = _vector("theta", self.theta, thetas)
         # one entry more, for what fills the last block of lanes
         out = np.zeros(self._size(key) + 1)
-        for term in self._some.get(key, self._terms.get(key, [])):
+        for term in self._some[key] if key in self._some else self._terms.get(key, []):
             term.add(out, x, theta, lam_f, lam)
         return out[:-1]
 
@@ -194,7 +204,8 @@ class Sums:
     def hessian(self, kind: str, x: Float, lam_g: Float, lam_f: float = 1.0) -> Float:
         """Nonzeros of the Hessian of `lam_f f + lam_g . g`, in the order of `upper`."""
         with self.seconds.of("hess_lag"):
-            return self._sum(kind, x, lam_g, lam_f)
+            out = self._sum(kind, x, lam_g, lam_f)
+            return out if self._kept is None or kind in self._some else out[self._kept]
 
 
 def interpreted(

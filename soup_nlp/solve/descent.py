@@ -240,13 +240,15 @@ class Descent:
         return nu, whole.reshape(-1, 9).max(axis=1)
 
     def _curvature(self, at: Point, nu: float, kind: HessianKind) -> Float:
-        """Nonzeros of a Hessian with the condensed slacks."""
+        """Nonzeros of a Hessian with the condensed slacks, of the superpixels that move."""
         assert self.z is not None
-        inner = np.einsum("nrc,nr,nrd->ncd", at.jacobian, self.z / at.slack, at.jacobian)
-        condensed = np.zeros((len(inner), 9, 9))
-        condensed[:, :3, :3] = inner
-        H = self.problem.hessian(at.x, self.z, kind, nu)
-        H[self.problem.block] += condensed[:, self.problem.triangle[0], self.problem.triangle[1]]
+        problem = self.problem
+        some = problem.moving
+        J, ratio = at.jacobian[some], (self.z / at.slack)[some]
+        condensed = np.zeros((len(J), 9, 9))
+        condensed[:, :3, :3] = np.einsum("nrc,nr,nrd->ncd", J, ratio, J)
+        H = problem.hessian(at.x, self.z, kind, nu)
+        H[problem.triangles] += condensed[:, problem.triangle[0], problem.triangle[1]]
         return H
 
     def _adapt(self, move: Move) -> None:

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.arrays import Float, Int
 from soup_nlp.solve.dissection import dissected
 from soup_nlp.solve.factor import Back, Factorise, diagonal_places, factorisation, same_pattern
 from soup_nlp.solve.line_search import Point, merit_gradient
-from soup_nlp.solve.part import Part
+from soup_nlp.solve.part import Block, Part
 from soup_nlp.solve.reuse import held, preconditioned
 from soup_nlp.solve.tangent_problem import HessianKind, TangentProblem
 
@@ -84,9 +84,9 @@ class Newton:
         return dissected(self.problem.upper, self.problem.layout.anchor[:, :2])
 
     @property
-    def moving(self) -> Mask | None:
-        """(N,) the superpixels that move, the others held; None for all."""
-        return self._part.some if self._part else None
+    def moving(self) -> Block | None:
+        """The superpixels that move, the others held; None for all."""
+        return self._part.block if self._part else None
 
     @property
     def _parted(self) -> bool:
@@ -119,7 +119,8 @@ class Newton:
 
         Args:
             at: Point.
-            curvature: Nonzeros of a Hessian by its kind, made when first asked for.
+            curvature: Nonzeros of a Hessian by its kind, of the superpixels that move; made when
+                first asked for.
             gradient: Of f.
             barrier: b of the merit.
             kind: Of the Hessian.
@@ -130,7 +131,9 @@ class Newton:
         a = self.problem.length(at.x)
         shares = [blend, *(s for s in BLENDS if s > blend)] if kind == "exact" else [1.0]
         h, bent, newton = np.zeros_like(at.x), np.zeros_like(at.x), held(np.zeros_like, a)
-        part = self._part if self._parted else None
+        part, block = self._part if self._parted else None, self.moving
+        diagonal = block.diagonal if block else self._diagonal
+        own = damping[block.unknowns] if block else damping
         for share in shares:
             H = _blended(curvature, share)
             times = self._times(H, damping)
@@ -142,7 +145,7 @@ class Newton:
                     self._last = None if near.worn else self._last
                     break
             damped = H.copy()
-            damped[self._diagonal] += damping
+            damped[diagonal] += own
             try:
                 back = (part.factorise if part else self._factorise)(damped)
             except ArithmeticError:
@@ -161,11 +164,21 @@ class Newton:
         return Step(h, bent - damping * h, share / 3 if share > 0.02 else 0.0, newton)
 
     def _times(self, H: Float, damping: Float) -> Callable[[Float], Float]:
-        """Product of a damped Hessian, given by its nonzeros, with a vector."""
-        pattern = self.problem.upper
+        """Product of a damped Hessian, given by its nonzeros, with a vector; zero for superpixels
+        that are held."""
+        block = self.moving
+        pattern = block.pattern if block else self.problem.upper
+        diagonal = block.diagonal if block else self._diagonal
+        own = block.unknowns if block else slice(None)
         U = sparse.csc_matrix((H, pattern.indices, pattern.indptr), pattern.shape)
-        lower, twice = U.T, damping - H[self._diagonal]
-        return lambda h: np.asarray(U @ h + lower @ h + twice * h)
+        lower, twice = U.T, damping[own] - H[diagonal]
+
+        def times(h: Float) -> Float:
+            out = np.zeros_like(h)
+            out[own] = U @ h[own] + lower @ h[own] + twice * h[own]
+            return out
+
+        return times
 
 
 def _blended(curvature: Curvature, share: float) -> Float:

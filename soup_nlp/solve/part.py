@@ -8,11 +8,13 @@ costs several factorisations. A step of these and their neighbours costs a hundr
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy import sparse
 
-from soup_nlp.arrays import Float, Mask
-from soup_nlp.solve.factor import Back, Factorise, factorisation, numbered
+from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.solve.factor import Back, Factorise, diagonal_places, factorisation, numbered
 
 WORST = 0.01
 """Superpixels whose residual is above this share of the largest are moved, and their neighbours."""
@@ -22,12 +24,41 @@ STEPS = 15
 """Largest number of steps of one part."""
 
 
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Superpixels, and the block of their unknowns in the Hessian.
+
+    Attributes:
+        some: (N,) the superpixels.
+        unknowns: (n,) their unknowns.
+        nonzeros: (k,) nonzeros of the whole upper triangle that are in the block.
+        pattern: (n, n) upper triangle of the block, its values number its nonzeros.
+        diagonal: (n,) where the diagonal stands among them.
+    """
+
+    some: Mask
+    unknowns: Int
+    nonzeros: Int
+    pattern: sparse.csc_matrix
+    diagonal: Int
+
+    @classmethod
+    def of(cls, upper: sparse.csc_matrix, some: Mask) -> Block:
+        """Some superpixels (N,) of a pattern (9 N, 9 N) as in `Part`."""
+        moves, rows = np.repeat(some, 9), upper.indices
+        columns = np.repeat(np.arange(len(moves)), np.diff(upper.indptr))
+        kept = np.flatnonzero(moves[rows] & moves[columns])
+        new, unknowns = np.cumsum(moves) - 1, np.flatnonzero(moves)
+        pattern = numbered(new[rows[kept]], new[columns[kept]], len(unknowns))
+        return cls(some, unknowns, kept, pattern, diagonal_places(pattern))
+
+
 class Part:
     """Which superpixels move: all, or those that the dual infeasibility comes from.
 
     Attributes:
-        some: (N,) the superpixels that move, None for all.
-        factorise: As `Factorise`, for the superpixels that move; the step of the others is zero.
+        block: The superpixels that move, None for all.
+        factorise: As `Factorise`, from the nonzeros of their block; the step of the others is zero.
     """
 
     factorise: Factorise
@@ -38,9 +69,8 @@ class Part:
         Args:
             upper: (9 N, 9 N) pattern of the upper triangle, its values number the nonzeros.
         """
-        self.some: Mask | None = None
+        self.block: Block | None = None
         self._upper, self._steps = upper, 0
-        self._columns = np.repeat(np.arange(upper.shape[0]), np.diff(upper.indptr))
         self._neighbours: sparse.csr_matrix | None = None
 
     def choose(self, residual: Float, slow: bool) -> None:
@@ -50,40 +80,41 @@ class Part:
             residual: (N,) largest component of the Lagrangian's gradient by superpixel.
             slow: Whether the last step hardly lowered the merit.
         """
-        if self.some is not None:
+        if self.block is not None:
             self._steps += 1
-            last = residual[self.some].max() <= residual[~self.some].max()
+            some = self.block.some
+            last = residual[some].max() <= residual[~some].max()
             if slow or last or self._steps >= STEPS:
-                self.some = None
+                self.block = None
             return
         some = self._with_neighbours(residual > WORST * residual.max())
         if some.mean() <= MOST:
-            self.some, self._steps, self.factorise = some, 0, self._within(some)
+            self.block, self._steps = Block.of(self._upper, some), 0
+            self.factorise = _within(self.block)
 
     def _with_neighbours(self, some: Mask) -> Mask:
         """Superpixels and those that share a nonzero of the Hessian with them."""
         if self._neighbours is None:
             n = len(some)
-            pairs = self._upper.indices // 9, self._columns // 9
+            columns = np.repeat(np.arange(9 * n), np.diff(self._upper.indptr))
+            pairs = self._upper.indices // 9, columns // 9
             one = sparse.coo_matrix((np.ones(len(pairs[0]), np.int32), pairs), (n, n)).tocsr()
             self._neighbours = one + one.T
         return np.asarray(self._neighbours @ some.astype(np.int32) > 0)
 
-    def _within(self, some: Mask) -> Factorise:
-        """Factorisation of the block of some superpixels."""
-        moves, rows, columns = np.repeat(some, 9), self._upper.indices, self._columns
-        kept = np.flatnonzero(moves[rows] & moves[columns])
-        new = np.cumsum(moves) - 1
-        _, block = factorisation(numbered(new[rows[kept]], new[columns[kept]], int(moves.sum())))
 
-        def factorise(nonzeros: Float) -> Back:
-            back = block(nonzeros[kept])
+def _within(block: Block) -> Factorise:
+    """Factorisation of a block; what it solves for is zero outside."""
+    _, own = factorisation(block.pattern)
 
-            def within(b: Float) -> Float:
-                out = np.zeros_like(b)
-                out[moves] = back(b[moves])
-                return out
+    def factorise(nonzeros: Float) -> Back:
+        back = own(nonzeros)
 
-            return within
+        def within(b: Float) -> Float:
+            out = np.zeros_like(b)
+            out[block.unknowns] = back(b[block.unknowns])
+            return out
 
-        return factorise
+        return within
+
+    return factorise

@@ -16,6 +16,7 @@ from soup_nlp.model.layout import Chart
 from soup_nlp.model.sums import Sums
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
 from soup_nlp.solve.factor import numbered
+from soup_nlp.solve.part import Block
 
 HessianKind = Literal["gauss-newton", "exact"]
 
@@ -34,8 +35,9 @@ class TangentProblem:
         rims: V, rim pixels of a superpixel.
         upper: (9 N, 9 N) pattern of Hessians, upper triangle, its values number the nonzeros.
         sums: Its values and derivatives.
-        block: (N, 45) nonzeros of every superpixel's own triangle, in the order of `triangle`.
-        triangle: (2, 45) rows and columns of that triangle.
+        triangles: (M, 45) nonzeros of the own triangle of every superpixel that moves, in the order
+            of `triangle`.
+        triangle: (2, 45) rows and columns of a superpixel's triangle.
     """
 
     def __init__(
@@ -59,14 +61,15 @@ class TangentProblem:
         """
         self.nlp, self.layout = build_tangent_nlp(start, data, weights, majorant(form), chart)
         nlp, n = self.nlp, self.layout.count
-        self._moving: Mask | None = None
+        self._moving: Block | None = None
         self._rest: tuple[Float, float, Float] | None = None
         self._kinds = {"gauss-newton": nlp.hessian, **({"exact": "exact"} if exact else {})}
         self.triangle = np.array(np.triu_indices(9))
         own, (r, c) = 9 * np.arange(n)[:, None], self.triangle
         self.sums = Sums(nlp, list(self._kinds.values()), (own + r, own + c))
         upper = self.sums.upper
-        self.block = upper.places[-1].reshape(n, -1)
+        self._triangles = upper.places[-1].reshape(n, -1)
+        self.triangles = self._triangles
         self.upper: sparse.csc_matrix = numbered(upper.rows, upper.columns, nlp.nx)
         tables = {g.kernel.name: g.table for g in nlp.groups}
         self._visible = tables["t_visible"].rows
@@ -86,27 +89,39 @@ class TangentProblem:
         """Set both smoothing widths, pixels."""
         self.sums.theta = self.nlp.thetas(eps=eps, eps_pixel=eps)
 
-    def move(self, some: Mask | None, x: Float) -> bool:
+    @property
+    def moving(self) -> Mask | slice:
+        """(N,) the superpixels that move."""
+        return self._moving.some if self._moving else slice(None)
+
+    def move(self, block: Block | None, x: Float) -> bool:
         """Let some superpixels move; the others change only in `normalise`.
 
-        Where E does not depend on scale, only elements with one of these are summed from now on: f
-        and gradient have the others' part as it is at x, and Hessians lack it.
+        Hessians are then of their block. Where E does not depend on scale, only elements with one
+        of these are summed from now on: f and gradient have the others' part as it is at x.
 
         Args:
-            some: (N,) that move; None for all.
+            block: Those that move; None for all.
             x: (9 N,) present point.
 
         Returns:
             Whether the choice differs from the last one.
         """
-        if some is self._moving:
+        if block is self._moving:
             return False
         self.sums.only(None)
-        self._moving, self._rest = some, None
-        if some is not None and self._slants is None:
+        self._moving, self._rest, self.triangles = block, None, self._triangles
+        if block is None:
+            return True
+        new = np.empty(self.upper.nnz, np.int64)
+        new[block.nonzeros] = np.arange(len(block.nonzeros))
+        self.triangles = new[self._triangles[block.some]]
+        if self._slants is None:
             f, gradient = self.value(x), self.gradient(x)
-            self.sums.only(np.repeat(some, 9))
+            self.sums.only(np.repeat(block.some, 9), block.nonzeros)
             self._rest = x, f - self.sums.value(x), gradient - self.sums.gradient(x)
+        else:
+            self.sums.only(None, block.nonzeros)
         return True
 
     def value(self, x: Float) -> float:
@@ -121,14 +136,14 @@ class TangentProblem:
             return out
         before, _, rest = self._rest
         # `normalise` has scaled the variables of those that are held, which divides derivatives
-        held = 9 * int(np.argmin(self._moving))
+        held = 9 * int(np.argmin(self._moving.some))
         scaled = 1 if self.layout.chart == "depth" else 3
         rest = rest.reshape(-1, 9).copy()
         rest[:, :scaled] *= before[held] / x[held]
         return out + rest.ravel()
 
     def hessian(self, x: Float, z: Float, kind: HessianKind, nu: float = 0.0) -> Float:
-        """Nonzeros (in the order of `upper`) of the Hessian of `f - z . c`.
+        """Nonzeros (in the order of `upper`) of the Hessian of `f - z . c`, of those that move.
 
         Args:
             x: (9 N,) point.
