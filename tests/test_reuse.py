@@ -47,12 +47,17 @@ def test_negative_curvature_and_a_poor_factor_are_told(matrices):
     newton = held(partial(np.linalg.solve, old), a)
     bent = preconditioned((new - 50 * np.eye(N)).__matmul__, newton, gradient, 1e-8)
     assert not bent.solved
+    assert bent.indefinite
     assert bent.iterations < LIMIT
     spread = np.diag(np.geomspace(1, 1e8, N))
     poor = preconditioned(spread.__matmul__, newton, gradient, 1e-8)
-    assert poor.iterations == LIMIT
-    assert poor.worn
+    assert poor.iterations == LIMIT // 2
     assert not poor.solved
+    assert not poor.indefinite
+    even = np.diag(np.geomspace(1, 10, N))
+    fair = preconditioned(even.__matmul__, held(lambda b: b, a), gradient, 1e-3)
+    assert fair.solved
+    assert fair.worn
 
 
 @pytest.mark.slow
@@ -65,8 +70,8 @@ def test_a_descent_with_fewer_factors_ends_at_a_minimum(problem, monkeypatch):
     # twelve superpixels have few that are nobody's neighbour, or much better than others
     monkeypatch.setattr(part, "WORST", 0.3)
     monkeypatch.setattr(Part, "_with_neighbours", lambda self, some: some)
-    begin = Part._within
-    monkeypatch.setattr(Part, "_within", lambda self, some: parts.append(1) or begin(self, some))
+    within = part._within
+    monkeypatch.setattr(part, "_within", lambda block: parts.append(1) or within(block))
     for least in (10**9, 0):
         monkeypatch.setattr(newton, "REUSE", least)
         runner, made = Descent(problem), []

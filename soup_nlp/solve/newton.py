@@ -144,6 +144,10 @@ class Newton:
                     h, bent = near.h, near.product
                     self._last = None if near.worn else self._last
                     break
+                if near.indefinite:
+                    # its factorisation would fail
+                    self._last = None
+                    continue
             damped = H.copy()
             damped[diagonal] += own
             try:

@@ -19,7 +19,8 @@ Float = NDArray[np.float64]
 Times = Callable[[Float], Float]
 
 LIMIT = 15
-"""Largest number of iterations; beyond it a new factorisation is cheaper."""
+"""Largest number of iterations; beyond it a new factorisation is cheaper. Half of them must reduce
+the residual half of the way, on a logarithmic scale."""
 WORN = 8
 """Number of iterations of a solve after which the next matrix is factorised."""
 
@@ -31,13 +32,15 @@ class Solved(NamedTuple):
         h: The step.
         product: Matrix times step.
         iterations: Made.
-        solved: Whether the tolerance was reached; not so where a direction has no curvature.
+        solved: Whether the tolerance was reached.
+        indefinite: Whether a direction has no curvature: the matrix is not positive definite.
     """
 
     h: Float
     product: Float
     iterations: int
     solved: bool = False
+    indefinite: bool = False
 
     @property
     def worn(self) -> bool:
@@ -67,12 +70,14 @@ def preconditioned(times: Times, newton: Times, gradient: Float, tol: float) -> 
     """
     out = Solved(np.zeros_like(gradient), np.zeros_like(gradient), 0)
     p = newton(gradient)
-    first = old = -float(gradient @ p)
+    first = old = least = -float(gradient @ p)
     while first > 0 and out.iterations < LIMIT:
+        if out.iterations == LIMIT // 2 and least > tol * first:
+            break
         Hp = times(p)
         curved = float(p @ Hp)
         if not curved > 0:
-            break
+            return out._replace(indefinite=True)
         ahead = old / curved
         out = Solved(out.h + ahead * p, out.product + ahead * Hp, out.iterations + 1)
         residual = gradient + out.product
@@ -80,5 +85,5 @@ def preconditioned(times: Times, newton: Times, gradient: Float, tol: float) -> 
         new = -float(residual @ step)
         if new <= tol**2 * first:
             return out._replace(solved=True)
-        p, old = step + new / old * p, new
+        p, old, least = step + new / old * p, new, min(least, new)
     return out
