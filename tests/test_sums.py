@@ -12,7 +12,7 @@ import pytest
 
 from soup_nlp.model import compile as compiling
 from soup_nlp.model import vectors
-from soup_nlp.model.assemble import Entries, Pattern
+from soup_nlp.model.blocks import Elements
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.lanes import LANES, NoLanesError, compile_lanes, in_lanes
@@ -125,28 +125,11 @@ def test_tables_of_every_size(elements):
 @needs_compiler
 def test_what_the_caller_wants_besides_stands_in_the_pattern():
     nlp = squares(5)
-    corner = np.array([2]), np.array([4])
+    corner = Elements(np.array([[2, 4]]), np.array([0]), np.array([1]))
     sums = Sums(nlp, ["exact"], corner)
     (place,) = sums.upper.places[-1]
     assert (sums.upper.rows[place], sums.upper.columns[place]) == (2, 4)
     assert sums.hessian("exact", nlp.x0, np.ones(5))[place] == 0
-
-
-@pytest.mark.parametrize("size", [40, 100_000])
-def test_a_pattern_is_the_union_of_its_sets(size):
-    """Also where keys need more than four bytes, and elements stand where the one before does."""
-    rng = np.random.default_rng(2)
-    whole = rng.integers(0, size, (2, 7, 5))
-    which = np.array([0, 0, 1, 2, 2, 2, 3, 4, 5, 6])
-    other = rng.integers(0, size, (2, 4, 3))
-    other[:, 1] = whole[:, 3, :3]
-    pattern = Pattern.of((size, size), [Entries(*whole, which), Entries(*other)])
-    keys = pattern.columns * size + pattern.rows
-    assert (np.diff(keys) > 0).all()
-    for (rows, columns), place in zip((whole[:, which], other), pattern.places):
-        np.testing.assert_array_equal(pattern.rows[place], rows.ravel())
-        np.testing.assert_array_equal(pattern.columns[place], columns.ravel())
-    assert len(keys) == len(set(np.concatenate(pattern.places).tolist()))
 
 
 @needs_compiler

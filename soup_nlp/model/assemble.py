@@ -19,17 +19,11 @@ class Entries(NamedTuple):
     """Where the nonzeros of a set of elements stand.
 
     Attributes:
-        rows, columns: (F, k) or (k,) of elements that differ.
-        which: (E,) number of the distinct element that every element equals; None where all differ.
+        rows, columns: (E, k) or (k,).
     """
 
     rows: NDArray[np.integer]
     columns: NDArray[np.integer]
-    which: Int | None = None
-
-    def of_all(self, values: NDArray[np.integer]) -> NDArray[np.integer]:
-        """(E k,) values of every element's nonzeros from those of the ones that differ (F k,)."""
-        return values if self.which is None else values.reshape(self.rows.shape)[self.which].ravel()
 
 
 class Pattern(NamedTuple):
@@ -49,7 +43,7 @@ class Pattern(NamedTuple):
     @classmethod
     def of(cls, shape: tuple[int, int], sets: Sequence[Entries]) -> Pattern:
         """Of the nonzeros of each set of elements."""
-        # ten million nonzeros are ranked: half as many bytes take half the time
+        # half as many bytes are ranked in half the time
         kind = np.int32 if shape[0] * shape[1] < 2**31 else np.int64
         sizes = [e.rows.size for e in sets]
         ends = np.cumsum(sizes[:-1], dtype=int)
@@ -57,10 +51,9 @@ class Pattern(NamedTuple):
         for own, e in zip(np.split(every, ends), sets):
             np.multiply(e.columns.ravel(), shape[0], dtype=kind, out=own)
             own += e.rows.ravel()
-        unique, place = _ranked(every)
-        each = np.split(place, ends)
+        unique, place = ranked(every)
         columns, rows = np.divmod(unique.astype(np.int64), shape[0])
-        return cls(shape, rows, columns, [e.of_all(own) for e, own in zip(sets, each)])
+        return cls(shape, rows, columns, np.split(place, ends))
 
     def sparsity(self) -> ca.Sparsity:
         """For CasADi."""
@@ -75,9 +68,9 @@ class Pattern(NamedTuple):
         return np.searchsorted(self.columns, np.arange(self.shape[1] + 1))
 
 
-def _ranked(keys: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.int32]]:
+def ranked(keys: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.int32]]:
     """`np.unique(keys, return_inverse=True)`, two to four times as fast on keys nearly in order;
-    overwrites the keys, since a third copy of them is the most memory that a solve takes."""
+    overwrites the keys."""
     order = np.argsort(keys, kind="stable")
     place = np.empty(len(keys), np.int32)
     keys[:] = keys[order]
@@ -93,22 +86,6 @@ def jacobian_entries(group: Group) -> Entries:
     return Entries(group.table.rows[:, r], group.table.index[:, c])
 
 
-def hessian_entries(group: Group, local: tuple[Int, Int]) -> Entries:
-    """Nonzeros of a group's elements in the upper triangle of the Hessian.
-
-    Args:
-        group: Kernel and table.
-        local: (k,) row and column of an element's nonzeros among its own variables.
-    """
-    index, (r, c) = group.table.index, local
-    # elements that follow each other with the same variables, as the pixels of a superpixel
-    first = np.ones(len(index), bool)
-    first[1:] = (index[1:] != index[:-1]).any(axis=1)
-    index = index[first].astype(np.int32)
-    a, b = index[:, r], index[:, c]
-    return Entries(np.minimum(a, b), np.maximum(a, b), np.cumsum(first) - 1)
-
-
 def _sum_into(size: int, index: Int, local: ca.MX) -> ca.MX:
     """(size,) sums of local entries at their places: out[index[j]] += local[j].
 
@@ -121,12 +98,6 @@ def _sum_into(size: int, index: Int, local: ca.MX) -> ca.MX:
 
 def _constant(index: Int) -> list[int]:
     return index.astype(np.int64).ravel().tolist()
-
-
-def hessian_pattern(groups: Sequence[Group], nx: int, hessian: str) -> Pattern:
-    """Pattern of the upper triangle of the Lagrangian's Hessian, with places for every group."""
-    local = [g.kernel.hessian_pattern(hessian) for g in groups]
-    return Pattern.of((nx, nx), [hessian_entries(g, own) for g, own in zip(groups, local)])
 
 
 class Functions(NamedTuple):

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.model.assemble import Entries, Pattern, hessian_entries
+from soup_nlp.model.assemble import Entries, Pattern
+from soup_nlp.model.blocks import Elements, pattern_of
 from soup_nlp.model.kernel import Group, Table
 from soup_nlp.model.lanes import Lanes, NoLanesError, Summed, compile_lanes
 from soup_nlp.model.mapped import Mapped
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from soup_nlp.model.nlp import NLP
 
 log = logging.getLogger(__name__)
-
-_NOTHING = np.zeros(0, np.int64), np.zeros(0, np.int64)
 
 
 class Timer(dict[str, float]):
@@ -62,7 +61,7 @@ class Sums:
         self,
         nlp: NLP,
         hessians: Sequence[str],
-        besides: tuple[Int, Int] | None = None,
+        besides: Elements | None = None,
         first_order: bool = True,
     ) -> None:
         """Compile the kernels, or take them from the cache.
@@ -70,7 +69,7 @@ class Sums:
         Args:
             nlp: The NLP.
             hessians: Kinds of Hessian (kernel.HESSIANS).
-            besides: Rows and columns of further nonzeros of the upper triangle.
+            besides: Elements with further nonzeros.
             first_order: False where Hessians alone are wanted.
         """
         self.theta, self.seconds = nlp.thetas(), Timer()
@@ -90,8 +89,8 @@ class Sums:
         if list(hessians) == [nlp.hessian] and besides is None:
             self.upper = nlp.hessian_pattern
         else:
-            every = [u.entries for u in unions]
-            self.upper = Pattern.of((nlp.nx, nlp.nx), [*every, Entries(*(besides or _NOTHING))])
+            every = [u.elements for u in unions]
+            self.upper = pattern_of(nlp.nx, [*every, besides] if besides else every)
         jacobian_places = iter(self.jacobian.places)
         self._terms: dict[str, list[Summed | Vectors | Mapped]] = {}
         self._some: dict[str, list[Summed]] = {}
@@ -233,19 +232,16 @@ class _Union(NamedTuple):
     """Nonzeros of an element's Hessians of several kinds.
 
     Attributes:
-        entries: Where they stand, k an element.
+        elements: The elements with k nonzeros each.
         parts: Which of the k are in each kind, in its storage order.
     """
 
-    entries: Entries
+    elements: Elements
     parts: dict[str, NDArray[np.integer]]
 
 
 def _union(group: Group, kinds: Sequence[str]) -> _Union:
     local = [group.kernel.hessian_pattern(kind) for kind in kinds]
-    if not local:
-        none = np.zeros((group.size, 0), np.int64)
-        return _Union(Entries(none, none), {})
     union = Pattern.of((group.kernel.nx, group.kernel.nx), [Entries(*own) for own in local])
-    entries = hessian_entries(group, (union.rows, union.columns))
-    return _Union(entries, dict(zip(kinds, union.places)))
+    elements = Elements(group.table.index, union.rows, union.columns)
+    return _Union(elements, dict(zip(kinds, union.places)))

@@ -119,7 +119,7 @@ class Functions:
         jacobian = Output(
             nlp.jacobian_pattern.sparsity(), lambda x, p: self._at(p).constraints(x)[1]
         )
-        hessian = Output(nlp.hessian_pattern.sparsity(), self._hessian)
+        hessian = Output(nlp.hessian_nonzeros.sparsity(), self._hessian)
         self.oracle = Buffered("nlp", at, {"f": f, "g": g})
         self.grad_f = Buffered("nlp_grad_f", at, {"f": f, "grad_f_x": gradient})
         self.jac_g = Buffered("nlp_jac_g", at, {"g": g, "jac_g_x": jacobian})

@@ -9,6 +9,7 @@ from scipy import sparse
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.blocks import Elements
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
@@ -65,8 +66,8 @@ class TangentProblem:
         self._rest: tuple[Float, float, Float] | None = None
         self._kinds = {"gauss-newton": nlp.hessian, **({"exact": "exact"} if exact else {})}
         self.triangle = np.array(np.triu_indices(9))
-        own, (r, c) = 9 * np.arange(n)[:, None], self.triangle
-        self.sums = Sums(nlp, list(self._kinds.values()), (own + r, own + c))
+        own = Elements(self.layout.of(np.arange(n)), *self.triangle)
+        self.sums = Sums(nlp, list(self._kinds.values()), own)
         upper = self.sums.upper
         self._triangles = upper.places[-1].reshape(n, -1)
         self.triangles = self._triangles
