@@ -262,17 +262,23 @@ def test_every_operation_has_casadis_value(every):
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_the_hessian_that_ipopt_takes_is_the_programs(case, compiled):
+def test_the_functions_that_ipopt_takes_are_the_programs(case, compiled):
     form = Formulation(compiled=compiled)
     nlp, _ = build_matrix_nlp(case.soup, case.data, case.weights, form)
     rng = np.random.default_rng(3)
     x, lam_f, lam_g = nlp.x0, 0.7, rng.normal(size=nlp.ng)
-    fast = Functions(nlp).hess_lag
-    one = fast(x, nlp.thetas(eps=0.05), lam_f, lam_g)
-    two = nlp.hess_lag(x, nlp.with_theta(eps=0.05), lam_f, lam_g)
-    assert one.sparsity() == two.sparsity()
-    close(one.nonzeros(), two.nonzeros())
-    assert fast.nnz_out(0) == nlp.nnzh
+    fast, theta, p = Functions(nlp), nlp.thetas(eps=0.05), nlp.with_theta(eps=0.05)
+    one = [fast.hess_lag(x, theta, lam_f, lam_g)]
+    two = [nlp.hess_lag(x, p, lam_f, lam_g)]
+    for name in ("oracle", "grad_f", "jac_g"):
+        one += getattr(fast, name)(x, theta)
+        two += getattr(nlp, name)(x, p)
+    for a, b in zip(one, two, strict=True):
+        assert a.sparsity() == b.sparsity()
+        close(a.nonzeros(), b.nonzeros())
+    assert fast.hess_lag.nnz_out(0) == nlp.nnzh
+    # another theta in Ipopt leaves that of the program
+    assert nlp.sums.value(x) == pytest.approx(float(nlp.oracle(x, nlp.p)[0]), rel=1e-12)
 
 
 @needs_compiler

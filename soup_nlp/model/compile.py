@@ -71,7 +71,7 @@ def compile_functions(
     plain = {f.name(): f for f in functions}
     compiler = compiler or find_compiler()
     if compiler is None:
-        log.debug("no C compiler found: Ipopt's kernels run in CasADi's virtual machine")
+        log.debug("no C compiler found: kernels run in CasADi's virtual machine")
         return plain
     generator = ca.CodeGenerator("kernels", {"with_header": False})
     for f in functions:

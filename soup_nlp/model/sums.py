@@ -1,8 +1,8 @@
 """An NLP's sums as numpy arrays: value, gradient, constraints and Hessians of several kinds.
 
 Every kernel is summed over its table: by vectorised machine code (`lanes`) where a C compiler is
-found, else by numpy (`vectors`). Ipopt and the exports take the functions of `assemble`; the
-presolve, which evaluates a hundred times as often, takes these.
+found, else by numpy (`vectors`). The presolve and Ipopt take these; the exports take the functions
+of `assemble`, which are CasADi's.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Sums:
             self.upper = nlp.hessian_pattern
         else:
             every = [u.elements for u in unions]
-            self.upper = pattern_of(nlp.nx, [*every, besides] if besides else every)
+            self.upper = pattern_of(nlp.nx, every if besides is None else [*every, besides])
         jacobian_places = iter(self.jacobian.places)
         self._terms: dict[str, list[Summed | Vectors | Mapped]] = {}
         self._some: dict[str, list[Summed]] = {}
@@ -150,11 +150,11 @@ class Sums:
         self._some, self._kept = {}, kept
         if some is None or not self.vectorised:
             return
-        new = np.arange(self._size("upper") + 1, dtype=np.int32)
+        new = np.arange(len(self.upper.rows) + 1, dtype=np.int32)
         if kept is not None:
             new[:] = len(kept)
             new[kept] = np.arange(len(kept))
-        # the functions of a kernel share its table
+        # the functions of a kernel share its table; what fills the last block remains dropped
         taken: dict[int, tuple[Int, Lanes]] = {}
         for key in self._terms.keys() - {"con", "jac"}:
             self._some[key] = []

@@ -92,6 +92,13 @@ class Newton:
     def _parted(self) -> bool:
         return self.moving is not None
 
+    def _where(self) -> tuple[sparse.csc_matrix, Int, Int | slice]:
+        """Upper triangle of the Hessian of what moves, its diagonal, and the unknowns it is of."""
+        block = self.moving
+        if block:
+            return block.pattern, block.diagonal, block.unknowns
+        return self.problem.upper, self._diagonal, slice(None)
+
     def choose(self, residual: Float, slow: bool) -> None:
         """Choose which superpixels move next; see `Part.choose`."""
         if self._part:
@@ -131,9 +138,8 @@ class Newton:
         a = self.problem.length(at.x)
         shares = [blend, *(s for s in BLENDS if s > blend)] if kind == "exact" else [1.0]
         h, bent, newton = np.zeros_like(at.x), np.zeros_like(at.x), held(np.zeros_like, a)
-        part, block = self._part if self._parted else None, self.moving
-        diagonal = block.diagonal if block else self._diagonal
-        own = damping[block.unknowns] if block else damping
+        part = self._part if self._parted else None
+        _, diagonal, own = self._where()
         for share in shares:
             H = _blended(curvature, share)
             times = self._times(H, damping)
@@ -144,12 +150,12 @@ class Newton:
                     h, bent = near.h, near.product
                     self._last = None if near.worn else self._last
                     break
-                if near.indefinite:
+                if near.indefinite and share < 1:
                     # its factorisation would fail
                     self._last = None
                     continue
             damped = H.copy()
-            damped[diagonal] += own
+            damped[diagonal] += damping[own]
             try:
                 back = (part.factorise if part else self._factorise)(damped)
             except ArithmeticError:
@@ -170,10 +176,7 @@ class Newton:
     def _times(self, H: Float, damping: Float) -> Callable[[Float], Float]:
         """Product of a damped Hessian, given by its nonzeros, with a vector; zero for superpixels
         that are held."""
-        block = self.moving
-        pattern = block.pattern if block else self.problem.upper
-        diagonal = block.diagonal if block else self._diagonal
-        own = block.unknowns if block else slice(None)
+        pattern, diagonal, own = self._where()
         U = sparse.csc_matrix((H, pattern.indices, pattern.indptr), pattern.shape)
         lower, twice = U.T, damping[own] - H[diagonal]
 
