@@ -19,8 +19,9 @@ Float = NDArray[np.float64]
 Times = Callable[[Float], Float]
 
 LIMIT = 15
-"""Largest number of iterations; beyond it a new factorisation is cheaper. Half of them must reduce
-the residual half of the way, on a logarithmic scale."""
+"""Largest number of iterations; beyond it a new factorisation is cheaper."""
+AHEAD = 0.4
+"""Share of the way, on a logarithmic scale, by which half of them must have reduced the residual."""
 WORN = 8
 """Number of iterations of a solve after which the next matrix is factorised."""
 
@@ -72,7 +73,7 @@ def preconditioned(times: Times, newton: Times, gradient: Float, tol: float) -> 
     p = newton(gradient)
     first = old = least = -float(gradient @ p)
     while first > 0 and out.iterations < LIMIT:
-        if out.iterations == LIMIT // 2 and least > tol * first:
+        if out.iterations == LIMIT // 2 and least > tol ** (2 * AHEAD) * first:
             break
         Hp = times(p)
         curved = float(p @ Hp)
