@@ -21,7 +21,7 @@ Times = Callable[[Float], Float]
 LIMIT = 15
 """Largest number of iterations; beyond it a new factorisation is cheaper."""
 AHEAD = 0.4
-"""Share of the way, on a logarithmic scale, by which half of them must have reduced the residual."""
+"""Share of the way, in logarithms, by which half of them must have reduced the residual."""
 WORN = 8
 """Number of iterations of a solve after which the next matrix is factorised."""
 
