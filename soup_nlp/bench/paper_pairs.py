@@ -83,7 +83,8 @@ def pairs_of_families(
         elif name == "motorcycle":
             own.append(Item("shared", name, name, "dis", {"kind": name}, ("paper", "best")))
         elif name in SHARED:
-            own += [i for i in _listed("shared", data) if i.sequence == name and has_truth(i)][:1]
+            listed = [i for i in _listed("shared", data) if i.sequence == name and has_truth(i)]
+            own += [i.scored_by(("paper", "best")) for i in listed[:1]]
         else:
             o = Options(("dis",), width, (0,), None, (name,))
             own += list_suite("rendered", None, o).items
