@@ -202,12 +202,12 @@ def departures(out: Path, r: Results) -> list[str]:
         "",
         "MRE, one pair of each family. *Mean* and *median* are of the ratios to the first line"
         " (the mean is geometric, a single diverging solve decides it); *worse / better* counts the"
-        " pairs that change by more than 1 %. Defaults with one departure undone (*off alone*; above"
-        " 1 the departure pays):",
+        " pairs that change by more than 1 %. Defaults with one departure undone (*off alone*):"
+        " above 1 the departure pays.",
         "",
         *table(head, off),
         "",
-        "The preset with one departure made (*on alone*; below 1 the departure pays):",
+        "The preset with one departure made (*on alone*): below 1 the departure pays.",
         "",
         *table(head, on),
         "",
