@@ -40,7 +40,7 @@ class SolverOptions(Section):
     end, and the result with the lower energy is taken; always on where surfaces bend."""
     polish_iterations: Count = 100
     """Iteration limit of the phase with the exact Hessian, at `eps`; 0 omits the phase."""
-    presolve_tol: Tolerance = 1e-6
+    presolve_tol: Tolerance = 1e-7
     """Dual infeasibility that ends the presolve."""
     eps: Tolerance = 0.01
     """Smoothing of the constrained NLP."""
