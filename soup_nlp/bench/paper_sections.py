@@ -51,6 +51,11 @@ class Results:
         """MRE of a cell."""
         return metric(self.row(cell), convention, method)
 
+    def shown(self, cell: Cell) -> str:
+        """MRE of a cell as text, with a star where the NLP did not converge."""
+        row = self.row(cell)
+        return show(self.mre(cell)) + "*" * (bool(row["ok"]) and not row.get("good"))
+
     def compared(self, item: Item, method: str) -> Cell:
         """The cell of a pair by one method in the comparison of both methods."""
         return self.plan.cell(item, method, superpixels=self.plan.sizes.superpixels)
@@ -170,28 +175,20 @@ def departures(out: Path, r: Results) -> list[str]:
     """Tables and figure of the departures, each undone or made alone."""
     cells = {i.key: r.plan.departures(i) for i in r.plan.departing}
     items = [i for i in r.plan.departing if _any_measured(r, cells[i.key].values())]
-    base = {m: [r.mre(r.plan.cell(i, m)) for i in items] for m in METHODS}
-    off, on = (
-        [["as they are", "", "", "", *map(show, base[m])]] for m in ("defaults", "preset: paper")
-    )
-    bars = {}
+    as_is = {m: [r.plan.cell(i, m) for i in items] for m in METHODS}
+    tables: dict[str, list[list[str]]] = {
+        m: [["as they are", "", "", "", *map(r.shown, own)]] for m, own in as_is.items()
+    }
+    bars: dict[str, dict[str, Number]] = {}
     for d in DEPARTURES:
-        both = [cells[i.key][d.name] for i in items]
-        changes = {}
-        for rows, method, own in (
-            (off, "defaults", [r.mre(a) for a, _ in both]),
-            (on, "preset: paper", [None if b is None else r.mre(b) for _, b in both]),
+        off, on = zip(*(cells[i.key][d.name] for i in items)) if items else ((), ())
+        bars[d.name] = {}
+        for method, own, name in (
+            ("defaults", off, "defaults, off alone"),
+            ("preset: paper", on, "preset, on alone"),
         ):
-            ratios = _ratios(own, base[method])
-            changes[method] = _geometric(ratios)
-            above, below = (sum(q > 1.01 for q in ratios), sum(q < 0.99 for q in ratios))
-            count = f"{above} / {below}" if ratios else show(None)
-            middle = float(np.median(ratios)) if ratios else None
-            rows.append([d.name, show(changes[method]), show(middle), count, *map(show, own)])
-        bars[d.name] = {
-            "defaults, off alone": changes["defaults"],
-            "preset, on alone": changes["preset: paper"],
-        }
+            bars[d.name][name], line = _beside(r, own, as_is[method])
+            tables[method].append([d.name, *line])
     head = ["departure", "mean", "median", "worse / better", *(title(i) for i in items)]
     text = "Departures one at a time"
     label = "MRE relative to all others as they are (geometric mean of the pairs)"
@@ -205,11 +202,11 @@ def departures(out: Path, r: Results) -> list[str]:
         " pairs that change by more than 1 %. Defaults with one departure undone (*off alone*):"
         " above 1 the departure pays.",
         "",
-        *table(head, off),
+        *table(head, tables["defaults"]),
         "",
         "The preset with one departure made (*on alone*): below 1 the departure pays.",
         "",
-        *table(head, on),
+        *table(head, tables["preset: paper"]),
         "",
         *notes,
         "",
@@ -217,19 +214,23 @@ def departures(out: Path, r: Results) -> list[str]:
     ]
 
 
+def _beside(
+    r: Results, cells: Sequence[Cell | None], base: Sequence[Cell]
+) -> tuple[Number, list[str]]:
+    """Geometric mean of the ratios to the base, and the texts of a line of the table."""
+    known = [(r.mre(a), r.mre(b)) for a, b in zip(cells, base, strict=True) if a is not None]
+    ratios = [a / b for a, b in known if a and b]
+    mean_ratio = float(np.exp(np.mean(np.log(ratios)))) if ratios else None
+    middle = float(np.median(ratios)) if ratios else None
+    above, below = (sum(q > 1.01 for q in ratios), sum(q < 0.99 for q in ratios))
+    count = f"{above} / {below}" if ratios else show(None)
+    numbers = [show(None) if c is None else r.shown(c) for c in cells]
+    return mean_ratio, [show(mean_ratio), show(middle), count, *numbers]
+
+
 def _any_measured(r: Results, pairs: Iterable[tuple[Cell, Cell | None]]) -> bool:
     """Whether any of the cells of a pair was measured."""
     return any(r.row(c).get("ok") for both in pairs for c in both if c is not None)
-
-
-def _ratios(own: Sequence[Number], base: Sequence[Number]) -> list[float]:
-    """The known ratios."""
-    return [a / b for a, b in zip(own, base, strict=True) if a and b]
-
-
-def _geometric(ratios: Sequence[float]) -> Number:
-    """Geometric mean; None where there is none."""
-    return float(np.exp(np.mean(np.log(ratios)))) if ratios else None
 
 
 def scale(out: Path, r: Results) -> list[str]:
