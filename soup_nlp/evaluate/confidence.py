@@ -152,8 +152,7 @@ def calibrated(
     bent = BENDING_FACTOR * np.hypot(LEAST_NOISE, misfit) * known
     rigid = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
     sigma = np.where(bends, bent, rigid)
-    sigma = np.hypot(np.minimum(sigma, LARGEST), np.minimum(scale, LARGEST))
-    return with_prior(np.hypot(sigma, SIGMA_PRIOR * still), prior)
+    return with_prior(np.hypot(np.hypot(sigma, scale), SIGMA_PRIOR * still), prior)
 
 
 def with_prior(sigma: Float, prior: float = SIGMA_PRIOR) -> Float:
