@@ -161,21 +161,19 @@ def left_out_factors(rows: Sequence[Row]) -> dict[str, tuple[tuple[float, ...], 
     """
     samples = [(r["sequence"], np.array(r["confidence"]["sample"])) for r in rows]
     by_family: dict[str, list[tuple[float, float]]] = {}
-    factors: dict[str, dict[bool, float]] = {}
+    factors: dict[str, tuple[float, ...]] = {}
     for family, (log, unit, added, bends) in samples:
         others = [sample for name, sample in samples if name != family]
-        own = factors.setdefault(family, {})
-        for kind in (False, True):
-            if (bends > 0.5).any() if kind else (bends < 0.5).any():
-                found = _factor(others, kind)
-                own |= {} if found is None else {kind: found}
-        if not all(bool(kind) in own for kind in np.unique(bends > 0.5)):
+        kinds, which = np.unique(bends > 0.5, return_inverse=True)
+        found = [_factor(others, bool(kind)) for kind in kinds]
+        known = tuple(f for f in found if f is not None)
+        if len(known) < len(found):
             continue
-        factor = np.where(bends > 0.5, own.get(True, 0.0), own.get(False, 0.0))
+        factors[family], factor = known, np.array(known)[which]
         one, two = coverage(log, with_prior(np.hypot(factor * unit, added)))
         by_family.setdefault(family, []).append((one, two))
     return {
-        name: (tuple(factors[name].values()), *np.mean(several, axis=0).tolist())
+        name: (factors[name], *np.mean(several, axis=0).tolist())
         for name, several in by_family.items()
     }
 
