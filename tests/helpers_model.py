@@ -76,6 +76,19 @@ def random_soup(seed: int, count: int, spread: float = 1.0) -> Soup:
     return Soup(lam, n, D / lam, R, T / lam[:, None])
 
 
+def disturbed(soup: Soup, size: float) -> Soup:
+    """The soup with normals, scales, rotations and translations changed by about `size`."""
+    rng = np.random.default_rng(3)
+    n = soup.n + rng.normal(0, size, soup.n.shape)
+    return Soup(
+        soup.lam * rng.uniform(1 - size, 1 + size, len(soup)),
+        n / np.linalg.norm(n, axis=1, keepdims=True),
+        soup.d,
+        rotation.exp(rng.normal(0, size / 10, soup.n.shape)) @ soup.R,
+        soup.t * rng.uniform(1 - size, 1 + size, soup.t.shape),
+    )
+
+
 class Tiny:
     """12 grid superpixels of a 64 x 48 image of noise, a random soup and a noisy flow."""
 

@@ -44,7 +44,7 @@ ROOMS = {
 }
 CHECK = "check_files check_next check_rounding damage"
 TESTS = {
-    "model": "energy model_faces formulation sums thresholds ipopt",
+    "model": "constraints energy model_faces formulation sums thresholds ipopt",
     "export": "export export_folder nl nl_sx sol solver_forms",
     "mrf": "trws trws_inputs",
     "compare": "compare compare_rows family_compare",

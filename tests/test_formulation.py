@@ -1,4 +1,4 @@
-"""One problem in every gauge: packing, names, sizes, feasibility, constraints, visibility."""
+"""One problem in every gauge: packing, names, sizes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from soup_nlp.errors import ConfigError, ModelError
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
-from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
 # --- layouts -------------------------------------------------------------------------------------
@@ -199,110 +198,3 @@ def test_the_presolve_has_the_same_objective_as_the_constrained_nlp(units):
     one, _ = problem.nlp(weights_for(units), form())
     two, _ = build_tangent_nlp(problem.soup, problem.data, weights_for(units), form())
     assert value(two, two.x0)[0] == pytest.approx(value(one, one.x0)[0], rel=1e-11)
-
-
-@pytest.mark.parametrize(("norm", "truncation"), FORMS)
-@pytest.mark.parametrize("gauge", GAUGES)
-def test_the_start_is_feasible(gauge, norm, truncation):
-    problem = tiny("pixels")
-    nlp, _ = problem.nlp(weights_for("pixels"), form(gauge=gauge, norm=norm, truncation=truncation))
-    g = value(nlp, nlp.x0)[1]
-    assert np.maximum(nlp.lbg - g, g - nlp.ubg).max() <= 1e-9
-    assert (nlp.lbx <= nlp.x0).all()
-    assert (nlp.x0 <= nlp.ubx).all()
-    assert np.isfinite(nlp.x0).all()
-
-
-def test_the_start_of_the_presolve_is_feasible():
-    problem = tiny("pixels")
-    nlp, _ = build_tangent_nlp(problem.soup, problem.data, weights_for("pixels"), form())
-    g = value(nlp, nlp.x0)[1]
-    assert g[nlp.g_names().index("simplex[0]")] == pytest.approx(1.0, abs=1e-12)
-    assert np.maximum(nlp.lbg - g, g - nlp.ubg).max() <= 1e-9
-    assert ((nlp.lbx <= nlp.x0) & (nlp.x0 <= nlp.ubx)).all()
-
-
-@pytest.mark.parametrize("gauge", GAUGES)
-def test_constraints_say_what_is_wrong_with_a_point(gauge):
-    """Each kind of constraint reacts to its own violation, by the amount of the formula."""
-    problem = tiny()
-    nlp, layout = problem.nlp(PAPER, form(gauge=gauge, depth_ratio=4.0))
-    names, x_names = nlp.g_names(), nlp.x_names()
-
-    def rows(kind: str, x: np.ndarray) -> np.ndarray:
-        g = value(nlp, x)[1]
-        return np.array([v for v, name in zip(g, names) if name.startswith(kind)])
-
-    x = nlp.x0.copy()
-    x[x_names.index("lam[4]")] += 0.12
-    assert rows("simplex", x)[0] == pytest.approx(1 + 0.12 / 12)
-    x = nlp.x0.copy()
-    x[[x_names.index(f"n[4,{c}]") for c in (1, 2, 3)]] *= 1.1
-    np.testing.assert_allclose(rows("normal", x)[4], 1.1**2 - 1)
-    x = nlp.x0.copy()
-    R = [x_names.index(f"R[4,{r},{c}]") for r in (1, 2, 3) for c in (1, 2, 3)]
-    x[R] *= 1.1
-    so3 = rows("so3", x).reshape(-1, 6)
-    np.testing.assert_allclose(so3[4], 0.21 * np.array([1, 0, 1, 0, 0, 1]), atol=1e-12)
-    np.testing.assert_allclose(np.delete(so3, 4, axis=0), 0, atol=1e-12)
-    # a shear breaks orthogonality alone
-    x = nlp.x0.copy()
-    x[R] = (x[R].reshape(3, 3) @ [[1, 0.1, 0], [0, 1, 0], [0, 0, 1]]).ravel()
-    np.testing.assert_allclose(
-        rows("so3", x).reshape(-1, 6)[4], [0, 0.1, 0.01, 0, 0, 0], atol=1e-12
-    )
-    x = nlp.x0.copy()
-    if gauge != "unit-offset":
-        # the length unit: the mean plane distance, N lam x d / N, is one
-        x[x_names.index("d[4]")] += 0.12
-        assert rows("unit", x)[0] == pytest.approx(1 + 0.12 * x[x_names.index("lam[4]")] / 12)
-    if gauge == "unit-translation":
-        t = [x_names.index(f"t[4,{c}]") for c in (1, 2, 3)]
-        x[t] *= 1.1
-        length = rows("translation", x)
-        np.testing.assert_allclose(length[4], 0.21 * x[layout.tau] ** 2)
-        np.testing.assert_allclose(np.delete(length, 4), 0, atol=1e-14)
-    # the anchor faces the camera, and no rim pixel is more than four times as deep
-    soup = layout.unpack(nlp.x0)
-    facing = -np.einsum("nc,nvc->nv", soup.n, problem.data.rim_ray)
-    facing[:, 1:] -= facing[:, :1] / 4.0
-    np.testing.assert_allclose(rows("visible", nlp.x0), facing.ravel(), atol=1e-14)
-    assert (nlp.lbg[[name.startswith("visible") for name in names]] > 0).all()
-
-
-@pytest.mark.parametrize("ratio", [2.0, 5.0])
-def test_visibility_bounds_the_depth_over_a_superpixel(ratio):
-    """A plane that the constrained NLP or the presolve admits is nowhere too steep."""
-    problem, rng = tiny(), np.random.default_rng(0)
-    f = form(depth_ratio=ratio)
-    nlp, layout = problem.nlp(PAPER, f)
-    pre, tangent = build_tangent_nlp(problem.soup, problem.data, PAPER, f)
-    rim = problem.data.rim_ray
-    admitted = 0
-    for _ in range(200):
-        n = rng.normal(0, 1, (12, 3)) * [4, 4, 1]
-        n /= -np.sign(n[:, 2:]) * np.linalg.norm(n, axis=1, keepdims=True)
-        soup = replace(problem.soup, n=n)
-        facing = -np.einsum("nc,nvc->nv", n, rim)
-        steep = (facing[:, 1:] <= facing[:, :1] / ratio).any(axis=1) | (facing <= 0).any(axis=1)
-        g = value(nlp, layout.pack(soup))[1]
-        bad = _violated(nlp, g)
-        assert (bad[facing[:, 0] > 0] >= steep[facing[:, 0] > 0]).all()
-        assert bad[facing[:, 0] <= 0].all()
-        admitted += int((~bad).sum())
-        # the presolve admits no more than the constrained NLP
-        sees = (facing > 0).all(axis=1)
-        other = _violated(pre, value(pre, tangent.pack(replace(soup, n=_facing(n, sees))))[1])
-        assert (other[sees] >= bad[sees]).all()
-    assert admitted > 100
-
-
-def _facing(n: np.ndarray, keep: np.ndarray) -> np.ndarray:
-    """Normals, those not kept replaced by the optical axis."""
-    return np.where(keep[:, None], n, [0.0, 0.0, -1.0])
-
-
-def _violated(nlp: NLP, g: np.ndarray) -> np.ndarray:
-    """(N,) whether any visibility row of a superpixel is violated."""
-    rows = np.array([name.startswith("visible") for name in nlp.g_names()])
-    return (g[rows] < nlp.lbg[rows]).reshape(12, -1).any(axis=1)

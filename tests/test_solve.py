@@ -10,6 +10,7 @@ import pytest
 from helpers_model import (
     GAUGES,
     PAPER,
+    disturbed,
     gradient,
     motion,
     plane_pose,
@@ -20,7 +21,6 @@ from helpers_model import (
 
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import SolverError
-from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
@@ -353,18 +353,6 @@ def test_a_wrong_option_of_the_soup_is_a_solver_error(room):
 
 
 # --- a world whose truth is the optimum ----------------------------------------------------------
-
-
-def disturbed(soup: Soup, size: float) -> Soup:
-    rng = np.random.default_rng(3)
-    n = soup.n + rng.normal(0, size, soup.n.shape)
-    return Soup(
-        soup.lam * rng.uniform(1 - size, 1 + size, len(soup)),
-        n / np.linalg.norm(n, axis=1, keepdims=True),
-        soup.d,
-        rotation.exp(rng.normal(0, size / 10, soup.n.shape)) @ soup.R,
-        soup.t * rng.uniform(1 - size, 1 + size, soup.t.shape),
-    )
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,125 @@
+"""Delete each constraint row and each bound of the NLP: `python tests/constraint_mutants.py`.
+
+A mutant is one change in a copy of the package. The fast tests of `test_constraints.py` have to
+fail; the table says which test saw it. The exit code is the number of mutants that survive.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class Mutant(NamedTuple):
+    """One change: `old` becomes `new` in a module of the package."""
+
+    what: str
+    module: str
+    old: str
+    new: str
+
+
+MATRIX, TANGENT, TERMS = "model/matrix.py", "model/tangent_nlp.py", "model/terms.py"
+BUILDER, IPOPT, NORMS = "model/builder.py", "solve/ipopt.py", "model/norms.py"
+FREE = "lower=-1e9, upper=1e9"
+ROWS = "for c in range(3) for r in range(c + 1)"
+MUTANTS = [
+    *[
+        Mutant(f"so3 without ({r}, {c})", TERMS, ROWS, f"{ROWS} if (r, c) != ({r}, {c})")
+        for c in range(3)
+        for r in range(c + 1)
+    ],
+    Mutant("so3 not held", MATRIX, "terms.so3(v), every, lower=0.0, upper=0.0",
+           f"terms.so3(v), every, {FREE}"),
+    Mutant("normal not held", MATRIX, "terms.unit_normal(v), every, lower=0.0, upper=0.0",
+           f"terms.unit_normal(v), every, {FREE}"),
+    Mutant("normal at most 1", MATRIX, "terms.unit_normal(v), every, lower=0.0",
+           "terms.unit_normal(v), every, lower=-1e9"),
+    Mutant("visible without the anchor", TERMS, "for j in range(count)])",
+           "for j in range(1, count)])"),
+    Mutant("visible without the last rim ray", TERMS, "for j in range(count)])",
+           "for j in range(count - 1)])"),
+    Mutant("visible down to 0", MATRIX, "lower=form.min_facing", "lower=0.0"),
+    Mutant("visible without depth_ratio", MATRIX, "data.visibility_ray(form.depth_ratio)",
+           "data.visibility_ray(1e9)"),
+    Mutant("simplex not held", MATRIX, "v.lam / n, every, lower=1.0, upper=1.0",
+           f"v.lam / n, every, {FREE}"),
+    Mutant("simplex at most 1", MATRIX, "v.lam / n, every, lower=1.0", "v.lam / n, every, lower=0"),
+    Mutant("unit not held", MATRIX, 'if form.gauge != "unit-offset":\n        # the length',
+           "if False:\n        # the length"),
+    Mutant("translation not held", MATRIX, "body, index, lower=0.0, upper=0.0",
+           f"body, index, {FREE}"),
+    Mutant("lam > 0", MATRIX, "lbx[np.arange(n) * own] = MIN_SCALE", "pass"),
+    Mutant("d > 0", MATRIX, "lbx[np.arange(n) * own + 4] = MIN_SCALE", "pass"),
+    Mutant("tau > 0", MATRIX, "lbx[layout.tau] = 1e-8", "pass"),
+    Mutant("epigraph rows not held", BUILDER, 'f"epigraph_{label}", size, 0.0)',
+           'f"epigraph_{label}", size, -1e9)'),
+    Mutant("epigraph without eps", NORMS, "slack**2 - square - norm.eps**2", "slack**2 - square"),
+    Mutant("slack >= 0", BUILDER, "Block(label, count, 0.0, upper)",
+           "Block(label, count, -np.inf, upper)"),
+    Mutant("switch <= 1", BUILDER, 'slacks.append((label, upper))',
+           "slacks.append((label, np.inf))"),
+    Mutant("presolve: simplex", TANGENT, "value, index, lower=1.0, upper=1.0",
+           f"value, index, {FREE}"),
+    Mutant("presolve: visible", TANGENT, "        lower=0.0,\n        upper=np.inf",
+           "        lower=-1e9,\n        upper=np.inf"),
+    Mutant("presolve: a rim ray", TANGENT, "for j in range(count)])",
+           "for j in range(count - 1)])"),
+    Mutant("presolve: lam > 0", TANGENT, "lower[:, 0] = 1e-3", "pass"),
+    Mutant("presolve: box of slopes", TANGENT, "lower[:, 1:3], upper[:, 1:3] =", "_ ="),
+    *[
+        Mutant(f"Ipopt without {name}", IPOPT, '("lbx", "ubx", "lbg", "ubg")',
+               str(tuple(b for b in ("lbx", "ubx", "lbg", "ubg") if b != name)))
+        for name in ("lbx", "ubx", "lbg", "ubg")
+    ],
+    Mutant("Ipopt stops at 1e-4", IPOPT, '"constr_viol_tol": 1e-9', '"constr_viol_tol": 1e-4'),
+]  # fmt: skip
+
+
+def killer(root: Path, mutant: Mutant) -> str:
+    """The first test that fails with a mutant; nothing if it survives."""
+    path = root / "soup_nlp" / mutant.module
+    text = path.read_text()
+    if text.count(mutant.old) != 1:
+        raise SystemExit(f"{mutant.what}: {mutant.module} has not one {mutant.old!r}")
+    path.write_text(text.replace(mutant.old, mutant.new))
+    words = ["-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider"]
+    done = subprocess.run(
+        [sys.executable, *words, "tests/test_constraints.py"],
+        cwd=root,
+        env=os.environ | {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    path.write_text(text)
+    found = re.search(r"^FAILED \S+::(\S+)", done.stdout, re.M)
+    return found[1] if found else "" if done.returncode == 0 else "does not run"
+
+
+def main() -> int:
+    """Print a row per mutant."""
+    alive = 0
+    with tempfile.TemporaryDirectory(prefix="soup_mutants_") as place:
+        root = Path(place)
+        for name in ("soup_nlp", "tests", "problems"):
+            shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copy(ROOT / "pyproject.toml", root)
+        for mutant in MUTANTS:
+            found = killer(root, mutant)
+            alive += not found
+            print(f"{mutant.what:<34} {found or 'SURVIVES'}", flush=True)
+    print(f"{len(MUTANTS) - alive} of {len(MUTANTS)} killed")
+    return alive
+
+
+if __name__ == "__main__":
+    sys.exit(main())

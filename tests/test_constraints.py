@@ -1,0 +1,394 @@
+"""The constraints of the NLP as a specification, and how far Ipopt's raw answer is from them.
+
+Everything is recomputed in plain numpy from the solver's vector by the names of its numbers. The
+vector counts scales as `N lam` and lengths in `1 / N`:
+
+    kind          rows                          gauges
+    so3           6 per superpixel, R'R = I     all
+    normal        1 per superpixel, |n|^2 = 1   all
+    visible       anchor and rim, -n . v >= c   all; v = r_a, then r_rim - r_a / depth_ratio
+    simplex       1, sum lam = 1                all
+    unit          1, sum c lam d = 1            all but unit-offset, where d = 1 / c is no variable
+    translation   1 per superpixel, |t| = tau   unit-translation
+    epigraph      1 per norm, s^2 >= |v|^2 + eps^2
+
+`tests/constraint_mutants.py` deletes each of these and each bound, and runs this file.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers_formulation import FORMS, UNITS, form, tiny, world
+from helpers_model import GAUGES, PAPER, disturbed, random_soup, value, weights_for, wiggle
+
+from soup_nlp.config.problem import load_problem
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.model.nlp import NLP
+from soup_nlp.model.tangent_nlp import build_tangent_nlp
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.run import run
+from soup_nlp.solve.ipopt import Ipopt
+
+ENTRIES = [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)]
+"""Of R'R, in the order of the rows."""
+BOUNDS = {
+    "lam": (1e-4, np.inf),
+    "d": (1e-4, np.inf),
+    "tau": (1e-8, np.inf),
+    "n": (-np.inf, np.inf),
+    "R": (-np.inf, np.inf),
+    "t": (-np.inf, np.inf),
+    "s": (0.0, np.inf),
+    "z": (0.0, 1.0),
+}
+"""Bounds of the variables; s are slack variables of norms, z switches of truncations."""
+RAW = 1e-8
+"""Largest violation of the raw answer, by any kind. Ipopt's own tolerance is 1e-9."""
+
+
+# --- the specification in numpy -----------------------------------------------------------------
+
+
+def kind_of(name: str) -> str:
+    """`so3[17]` -> so3, `s_rotation[3]` -> s, `epigraph_gap_ref[0]` -> epigraph."""
+    return re.split(r"[\[_]", name)[0]
+
+
+def numbers(nlp: NLP, x: np.ndarray) -> SimpleNamespace:
+    """The soup's variables by name: lam (N,), n (N, 3), R (N, 3, 3), t (N, 3); d, tau if any."""
+    at = dict(zip(nlp.x_names(), x))
+    count = sum(name.startswith("lam[") for name in at)
+    each = [(i, r) for i in range(count) for r in (1, 2, 3)]
+    return SimpleNamespace(
+        lam=np.array([at[f"lam[{i}]"] for i in range(count)]),
+        n=np.array([at[f"n[{i},{r}]"] for i, r in each]).reshape(-1, 3),
+        t=np.array([at[f"t[{i},{r}]"] for i, r in each]).reshape(-1, 3),
+        R=np.array([at[f"R[{i},{r},{c}]"] for i, r in each for c in (1, 2, 3)]).reshape(-1, 3, 3),
+        d=np.array([at[f"d[{i}]"] for i in range(count)]) if "d[0]" in at else None,
+        tau=at.get("tau"),
+    )
+
+
+def bodies(nlp: NLP, x: np.ndarray, data: EnergyData, depth_ratio: float) -> dict[str, np.ndarray]:
+    """What the rows of every kind but the epigraph have to be."""
+    v = numbers(nlp, x)
+    gram = np.einsum("nji,njk->nik", v.R, v.R) - np.eye(3)
+    anchor, rim = data.rim_ray[:, :1], data.rim_ray[:, 1:]
+    rays = np.concatenate([anchor, rim - anchor / depth_ratio], axis=1)
+    out = {
+        "so3": np.stack([gram[:, i, k] for i, k in ENTRIES], axis=1).ravel(),
+        "normal": np.sum(v.n**2, axis=1) - 1,
+        "visible": -np.einsum("nc,nvc->nv", v.n, rays).ravel(),
+        "simplex": np.array([v.lam.mean()]),
+    }
+    if v.d is not None:
+        out["unit"] = np.array([np.sum(data.share * v.lam * v.d)])
+    if v.tau is not None:
+        out["translation"] = np.sum(v.t**2, axis=1) - v.tau**2
+    return out
+
+
+def limits(kind: str, min_facing: float) -> tuple[float, float]:
+    """Bounds of the rows of a kind."""
+    return {
+        "visible": (min_facing, np.inf),
+        "epigraph": (0.0, np.inf),
+        "simplex": (1.0, 1.0),
+        "unit": (1.0, 1.0),
+    }.get(kind, (0.0, 0.0))
+
+
+def rows(nlp: NLP, kind: str) -> np.ndarray:
+    """(ng,) which rows are of a kind."""
+    return np.array([kind_of(name) == kind for name in nlp.g_names()])
+
+
+def violations(nlp: NLP, x: np.ndarray, data: EnergyData, f: Formulation) -> dict[str, float]:
+    """Largest violation by kind of a raw vector, bounds and the sign of det R among them."""
+    out = {"det": float(np.abs(np.linalg.det(numbers(nlp, x).R) - 1).max())}
+    found = bodies(nlp, x, data, f.depth_ratio)
+    found["epigraph"] = value(nlp, x)[1][rows(nlp, "epigraph")]
+    for kind, body in found.items():
+        lower, upper = limits(kind, f.min_facing)
+        out[kind] = float(np.maximum(lower - body, body - upper).max(initial=0.0))
+    for name, v in zip(nlp.x_names(), x):
+        lower, upper = BOUNDS[kind_of(name)]
+        key = f"bound of {kind_of(name)}"
+        out[key] = max(out.get(key, 0.0), lower - v, v - upper)
+    return out
+
+
+# --- every row and every bound, in every formulation --------------------------------------------
+
+
+@pytest.mark.parametrize(("norm", "truncation"), FORMS)
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_every_row_and_every_bound_is_the_specified_one(gauge, norm, truncation):
+    problem = tiny("pixels")
+    f = form(gauge=gauge, norm=norm, truncation=truncation, depth_ratio=4.0, min_facing=0.02)
+    nlp, layout = problem.nlp(weights_for("pixels"), f)
+    # off the manifold, where no entry of any row is 0
+    x = wiggle(nlp, layout.size, 1, 0.3)
+    spec, g = bodies(nlp, x, problem.data, 4.0), value(nlp, x)[1]
+    kinds = {kind_of(name) for name in nlp.g_names()}
+    assert kinds == spec.keys() | ({"epigraph"} if norm == "epigraph" else set())
+    for kind, body in spec.items():
+        np.testing.assert_allclose(g[rows(nlp, kind)], body, rtol=0, atol=1e-12, err_msg=kind)
+        assert np.abs(body - limits(kind, 0.02)[0]).min() > 1e-6, kind
+    for kind in kinds:
+        lower, upper = limits(kind, 0.02)
+        assert (nlp.lbg[rows(nlp, kind)] == lower).all(), kind
+        assert (nlp.ubg[rows(nlp, kind)] == upper).all(), kind
+    for name, lower, upper in zip(nlp.x_names(), nlp.lbx, nlp.ubx):
+        assert (lower, upper) == BOUNDS[kind_of(name)], name
+
+
+@pytest.mark.parametrize("entry", range(6))
+def test_each_row_of_so3_sees_its_own_entry(entry):
+    nlp, _ = tiny().nlp(PAPER, form())
+    i, k = ENTRIES[entry]
+    gram = np.eye(3)
+    gram[i, k] += 0.1
+    gram[k, i] = gram[i, k]
+    x, names = nlp.x0.copy(), nlp.x_names()
+    place = [names.index(f"R[4,{r},{c}]") for r in (1, 2, 3) for c in (1, 2, 3)]
+    x[place] = (x[place].reshape(3, 3) @ np.linalg.cholesky(gram).T).ravel()
+    expected = np.zeros((12, 6))
+    expected[4, entry] = 0.1
+    so3 = value(nlp, x)[1][rows(nlp, "so3")].reshape(12, 6)
+    np.testing.assert_allclose(so3, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("truncation", ["smooth", "lifted"])
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_slack_variables_on_their_epigraph_are_the_smooth_norms(gauge, truncation):
+    problem, w = tiny("pixels"), weights_for("pixels")
+    smooth, layout = problem.nlp(w, form(gauge=gauge, truncation=truncation))
+    epigraph, _ = problem.nlp(w, form(gauge=gauge, truncation=truncation, norm="epigraph"))
+    x = wiggle(epigraph, layout.size, 2, 0.1)
+    names = epigraph.x_names()
+    slack = np.array([kind_of(name) == "s" for name in names])
+    # every slack has the row of its name
+    own = [name for name in epigraph.g_names() if kind_of(name) == "epigraph"]
+    bound = [names.index(name.replace("epigraph_", "s_")) for name in own]
+    assert sorted(bound) == list(np.flatnonzero(slack))
+    row = value(epigraph, x)[1][rows(epigraph, "epigraph")]
+    x[bound] = np.sqrt(x[bound] ** 2 - row)
+    np.testing.assert_allclose(value(epigraph, x)[1][rows(epigraph, "epigraph")], 0, atol=1e-9)
+    assert value(epigraph, x)[0] == pytest.approx(value(smooth, x[~slack])[0], rel=1e-12)
+
+
+@pytest.mark.parametrize("units", UNITS)
+@pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
+def test_the_coordinates_of_the_presolve_leave_scale_and_visibility_to_constrain(chart, units):
+    problem = tiny(units)
+    f = form(depth_ratio=4.0, min_facing=0.02)
+    nlp, layout = build_tangent_nlp(problem.soup, problem.data, PAPER, f, chart)
+    assert {kind_of(name) for name in nlp.g_names()} == {"simplex", "visible"}
+    rng = np.random.default_rng(0)
+    x = (nlp.x0.reshape(-1, 9) * rng.uniform(0.9, 1.1, (12, 9))).ravel()
+    a, g = x.reshape(-1, 9), value(nlp, x)[1]
+    scale = a[:, 0] if chart == "depth" else 1 / a[:, 0]
+    # planes of the coordinates, and the visibility of the constrained NLP in units of the facing
+    m = np.column_stack([a[:, 1:3] / layout.radius[:, None], np.zeros(12)])
+    m[:, 2] = (1.0 if chart == "depth" else a[:, 0]) - np.sum(m * layout.anchor, axis=1)
+    rays = problem.data.visibility_ray(4.0)[:, 1:]
+    facing = np.einsum("nc,nvc->nv", m, rays) - 0.02 * np.linalg.norm(m, axis=1)[:, None]
+    np.testing.assert_allclose(g[rows(nlp, "visible")], facing.ravel(), atol=1e-12)
+    part = problem.soup.normalised(layout.share).lam
+    if units == "paper" and chart == "depth":
+        part = layout.share * layout.depth / np.linalg.norm(m, axis=1)
+    np.testing.assert_allclose(g[rows(nlp, "simplex")], [np.sum(part * scale)], atol=1e-12)
+    for kind, (lower, upper) in {"simplex": (1.0, 1.0), "visible": (0.0, np.inf)}.items():
+        assert (nlp.lbg[rows(nlp, kind)] == lower).all()
+        assert (nlp.ubg[rows(nlp, kind)] == upper).all()
+    lower, upper = nlp.lbx.reshape(-1, 9), nlp.ubx.reshape(-1, 9)
+    assert (lower[:, 0] == 1e-3).all()
+    assert (lower[:, 1:3] == -80).all()
+    assert (upper[:, 1:3] == 80).all()
+    free = np.concatenate([-lower[:, 3:].ravel(), upper[:, 3:].ravel(), upper[:, 0]])
+    assert np.isposinf(free).all()
+
+
+# --- what the constraints mean ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("norm", "truncation"), FORMS)
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_the_start_is_feasible(gauge, norm, truncation):
+    problem = tiny("pixels")
+    f = form(gauge=gauge, norm=norm, truncation=truncation)
+    nlp, _ = problem.nlp(weights_for("pixels"), f)
+    assert np.isfinite(nlp.x0).all()
+    found = violations(nlp, nlp.x0, problem.data, f)
+    assert max(found.values()) <= 1e-9, found
+
+
+def test_the_start_of_the_presolve_is_feasible():
+    problem = tiny("pixels")
+    nlp, _ = build_tangent_nlp(problem.soup, problem.data, weights_for("pixels"), form())
+    g = value(nlp, nlp.x0)[1]
+    assert g[nlp.g_names().index("simplex[0]")] == pytest.approx(1.0, abs=1e-12)
+    assert np.maximum(nlp.lbg - g, g - nlp.ubg).max() <= 1e-9
+    assert ((nlp.lbx <= nlp.x0) & (nlp.x0 <= nlp.ubx)).all()
+
+
+@pytest.mark.parametrize("ratio", [2.0, 5.0])
+def test_visibility_bounds_the_depth_over_a_superpixel(ratio):
+    """A plane that the constrained NLP or the presolve admits is nowhere too steep."""
+    problem, rng = tiny(), np.random.default_rng(0)
+    f = form(depth_ratio=ratio)
+    nlp, layout = problem.nlp(PAPER, f)
+    pre, tangent = build_tangent_nlp(problem.soup, problem.data, PAPER, f)
+    rim = problem.data.rim_ray
+    admitted = 0
+    for _ in range(200):
+        n = rng.normal(0, 1, (12, 3)) * [4, 4, 1]
+        n /= -np.sign(n[:, 2:]) * np.linalg.norm(n, axis=1, keepdims=True)
+        soup = replace(problem.soup, n=n)
+        facing = -np.einsum("nc,nvc->nv", n, rim)
+        steep = (facing[:, 1:] <= facing[:, :1] / ratio).any(axis=1) | (facing <= 0).any(axis=1)
+        bad = unseen(nlp, layout.pack(soup))
+        assert (bad[facing[:, 0] > 0] >= steep[facing[:, 0] > 0]).all()
+        assert bad[facing[:, 0] <= 0].all()
+        admitted += int((~bad).sum())
+        # the presolve admits no more than the constrained NLP
+        sees = (facing > 0).all(axis=1)
+        other = unseen(pre, tangent.pack(replace(soup, n=np.where(sees[:, None], n, [0, 0, -1.0]))))
+        assert (other[sees] >= bad[sees]).all()
+    assert admitted > 100
+
+
+def unseen(nlp: NLP, x: np.ndarray) -> np.ndarray:
+    """(N,) whether any visibility row of a superpixel is violated."""
+    visible = rows(nlp, "visible")
+    return (value(nlp, x)[1] < nlp.lbg)[visible].reshape(12, -1).any(axis=1)
+
+
+# --- the raw answer of Ipopt --------------------------------------------------------------------
+
+WEIGHTS = PAPER.replace(cont=0.05, prior=0.05, sigma_cont=6.0, sigma_orient=5.0, sigma_arap=12.0)
+WIDE = {"eps": 1.0, "eps_pixel": 1.0}
+"""Smoothing of a pixel: a few iterations from a disturbed start."""
+
+
+@cache
+def smooth_answer(name: str, gauge: str, ratio: float) -> tuple[NLP, MatrixLayout, np.ndarray]:
+    """NLP, layout and raw answer from a disturbed start."""
+    soup, data = world(name, "pixels", False)
+    f = form(gauge=gauge, depth_ratio=ratio, **WIDE)
+    nlp, layout = build_matrix_nlp(disturbed(soup, 0.02), data, WEIGHTS, f)
+    stage = Ipopt(nlp)(x0=nlp.x0, tol=1e-3)
+    assert stage.converged, stage
+    # it had something to do
+    assert stage.iterations >= 3
+    return nlp, layout, stage.x
+
+
+@pytest.mark.parametrize(
+    ("name", "gauge", "ratio"),
+    [
+        *[("slanted", gauge, 5.0) for gauge in GAUGES],
+        ("slanted", "unit-offset", 1.05),
+        ("fronto-parallel, turning", "unit-translation", 5.0),
+    ],
+)
+def test_the_raw_answer_keeps_every_constraint(gauge, name, ratio):
+    nlp, layout, x = smooth_answer(name, gauge, ratio)
+    _, data = world(name, "pixels", False)
+    f = form(gauge=gauge, depth_ratio=ratio)
+    found = violations(nlp, x, data, f)
+    assert max(found.values()) <= RAW, found
+    # so narrow a visibility holds planes back that slant
+    facing = value(nlp, x)[1][rows(nlp, "visible")] - f.min_facing
+    assert (facing.min() < 1e-4) == (ratio == 1.05)
+    # what is delivered is the answer itself: the retraction moves it by no more
+    soup = layout.unpack(x)
+    kept = soup.normalised(data.share).retracted()
+    np.testing.assert_allclose(kept.R, soup.R, atol=RAW)
+    np.testing.assert_allclose(kept.n, soup.n, atol=RAW)
+
+
+@pytest.mark.parametrize(
+    ("gauge", "norm", "truncation"),
+    [
+        ("unit-offset", "smooth", "lifted"),
+        ("free", "epigraph", "smooth"),
+        ("unit-translation", "epigraph", "lifted"),
+    ],
+)
+def test_so_it_does_with_slack_variables_and_switches(gauge, norm, truncation):
+    _, layout, x = smooth_answer("slanted", gauge, 5.0)
+    _, data = world("slanted", "pixels", False)
+    f = form(gauge=gauge, norm=norm, truncation=truncation, **WIDE)
+    near = layout.unpack(x).normalised(data.share).retracted()
+    nlp, _ = build_matrix_nlp(near, data, WEIGHTS, f)
+    stage = Ipopt(nlp)(x0=nlp.x0, tol=1e-3)
+    assert stage.converged, stage
+    found = violations(nlp, stage.x, data, f)
+    assert max(found.values()) <= RAW, found
+
+
+@pytest.mark.parametrize("side", ["lbx", "ubx", "lbg", "ubg"])
+def test_ipopt_gets_every_kind_of_bound(side):
+    """A bound that its own answer violates moves the answer to the bound."""
+    nlp, _, x = smooth_answer("slanted", "unit-offset", 5.0)
+    sign = 1 if side.startswith("l") else -1
+    if side.endswith("x"):
+        k = nlp.x_names().index("lam[3]")
+        free, rest = x[k], nlp
+    else:
+        k = int(np.flatnonzero(rows(nlp, "visible"))[10])
+        free, rest = (
+            value(nlp, x)[1][k],
+            replace(nlp, ubg=np.where(nlp.lbg < nlp.ubg, 2.0, nlp.ubg)),
+        )
+    bound = getattr(rest, side).copy()
+    bound[k] = free + sign * 0.01
+    stage = Ipopt(replace(rest, **{side: bound}))(x0=x, tol=1e-3)
+    found = stage.x[k] if side.endswith("x") else value(nlp, stage.x)[1][k]
+    assert stage.converged, stage
+    assert found == pytest.approx(bound[k], abs=1e-3)
+    assert sign * (found - bound[k]) >= -RAW
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "gauge"), [("orbit", "unit-offset"), ("room", "free"), ("street", "unit-translation")]
+)
+def test_the_raw_answer_of_a_default_solve_keeps_every_constraint(scene, gauge):
+    small = ["input.width=96", "input.height=72", "segmentation.superpixels=30"]
+    own = [f"formulation.gauge={gauge}", "flow.source=truth", "refine.enabled=false"]
+    problem = load_problem(scene, [*small, *own])
+    case = prepare(problem)
+    solution = run(problem).solution
+    assert solution.converged, solution.status
+    f = case.formulation()
+    nlp, _ = case.nlp(f)
+    found = violations(nlp, solution.stages[-1].x, case.data, f)
+    assert max(found.values()) <= RAW, found
+    assert solution.residuals["nlp_infeasibility"] <= RAW
+
+
+def test_a_random_soup_breaks_what_it_should():
+    """The measure itself: a violated kind is told by its size, the others stay at 0."""
+    problem = tiny("pixels")
+    nlp, layout = problem.nlp(PAPER, form())
+    soup = random_soup(7, 12)
+    x = layout.pack(replace(soup, n=1.1 * soup.n))
+    found = violations(nlp, x, problem.data, form())
+    assert found["normal"] == pytest.approx(0.21)
+    assert found["so3"] <= 1e-12
+    x = layout.pack(replace(soup, R=soup.R @ np.diag([1.0, 1.0, -1.0])))
+    found = violations(nlp, x, problem.data, form())
+    assert found["det"] == pytest.approx(2.0)
+    assert found["so3"] <= 1e-12
