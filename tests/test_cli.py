@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -282,9 +283,9 @@ def test_bad_input_is_refused_with_code_2(images, tmp_path, capsys, changes, par
     assert "Traceback" not in error
 
 
-def test_bad_input_leaves_its_log(images, tmp_path):
-    assert solve_files(images, tmp_path, flow="cut.flo") == 2
-    assert "failed" in (tmp_path / "failed.log").read_text()
+def test_bad_input_leaves_no_folder(images, tmp_path):
+    assert solve_files(images, tmp_path / "new" / "out", flow="cut.flo") == 2
+    assert not (tmp_path / "new").exists()
 
 
 def test_an_unwritable_output_is_refused(images, tmp_path, capsys):
@@ -337,3 +338,31 @@ def test_the_package_is_a_command():
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert "nothing.yaml" in done.stderr
+
+
+def test_frames_of_the_same_names_get_folders_of_their_own(tmp_path, monkeypatch, capsys):
+    """Results of two pairs frame_0, frame_1 do not replace each other, with and without --out."""
+    monkeypatch.chdir(tmp_path)
+    for seed, place in enumerate(("a/clip", "b/clip")):
+        (tmp_path / place).mkdir(parents=True)
+        pair = render_scene("orbit", seed, 64, 48)
+        for k, image in enumerate((pair.image_ref, pair.image_next)):
+            cv2.imwrite(f"{place}/frame_{k}.png", image)
+    small = ["--superpixels=6", "--neighbours=3", "--no-refine", "-q", "--fov=50"]
+    small += ["--set", "output.page=false"]
+
+    def solve(place: str, *more: str) -> int:
+        pair = ["--ref", f"{place}/frame_0.png", "--next", f"{place}/frame_1.png"]
+        return main(["solve", *pair, *small, *more])
+
+    assert solve("a/clip") in (0, 1)
+    assert solve("b/clip") in (0, 1)
+    assert solve("a/clip") in (0, 1)
+    assert sorted(os.listdir("out")) == ["clip-frame_0-frame_1", "clip-frame_0-frame_1-2"]
+    before = Path("out/clip-frame_0-frame_1/result.h5").read_bytes()
+    capsys.readouterr()
+    assert solve("b/clip", "--out", "out/clip-frame_0-frame_1") == 2
+    assert "something else" in capsys.readouterr().err
+    assert Path("out/clip-frame_0-frame_1/result.h5").read_bytes() == before
+    assert solve("b/clip", "--out", "out/clip-frame_0-frame_1", "--overwrite") in (0, 1)
+    assert Path("out/clip-frame_0-frame_1/result.h5").read_bytes() != before

@@ -108,6 +108,33 @@ def identity(path: Path) -> tuple[int, ...]:
     return state.st_ino, state.st_mode, state.st_size, state.st_mtime_ns
 
 
+def test_the_result_of_something_else_is_kept(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    target = folders.default_folder("a", "frames 0 and 1")
+    assert target == Path("out/a")
+    with staged(claim(target, ["x"], subject="frames 0 and 1"), subject="frames 0 and 1") as new:
+        (new / "x").write_text("1")
+    claim(target, ["x"], subject="frames 0 and 1")
+    with pytest.raises(
+        DataError, match=r"(?s)something else.*found: frames 0 and 1\n.*--overwrite"
+    ):
+        claim(target, ["x"], subject="frames 1 and 2")
+    # what other files say about the folder does not change it
+    write(target, whole=False, y="2")
+    assert folders.default_folder("a", "frames 0 and 1") == target
+    assert folders.default_folder("a", "frames 1 and 2") == Path("out/a-2")
+    claim(target, ["x"], overwrite=True, subject="frames 1 and 2")
+
+
+def test_a_claimed_folder_that_stays_empty_is_removed(tmp_path):
+    (tmp_path / "there").mkdir()
+    for name in ("there/a/b", "there/c"):
+        claim(tmp_path / name, ["x"])
+    write(tmp_path / "there" / "c", x="1")
+    folders.remove_empty()
+    assert os.listdir(tmp_path / "there") == ["c"]
+
+
 @pytest.mark.parametrize("kind", ["file", "changed", "folder", "link", "dangling link"])
 def test_what_was_not_made_here_is_refused(kind, tmp_path):
     target = tmp_path / "out"

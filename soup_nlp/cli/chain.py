@@ -11,6 +11,7 @@ import typer
 
 from soup_nlp.cli import options
 from soup_nlp.cli.options import Progress
+from soup_nlp.config.problem import title
 from soup_nlp.errors import ConfigError
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import (
@@ -27,7 +28,7 @@ from soup_nlp.sequence.pairs import solve_pairs
 from soup_nlp.sequence.report import table
 from soup_nlp.sequence.write import SINGLE, chain_files, write_chain
 from soup_nlp.storage.files import as_path
-from soup_nlp.storage.folders import claim, staged
+from soup_nlp.storage.folders import claim, default_folder, staged
 
 SCENE = "scene:"
 """Prefix of the name of a rendered scene."""
@@ -39,7 +40,9 @@ def chain(
     source: Annotated[
         list[str], typer.Argument(help="Folder, images, 'pattern/*.jpg', video, or scene:NAME.")
     ],
-    out: options.Out = Path("out/chain"),
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output folder; default out/chain-SOURCE.")
+    ] = None,
     intrinsics: Annotated[
         str | None,
         typer.Option(help="fx,fy,cx,cy in pixels, or a file; default K.txt beside the images."),
@@ -70,9 +73,11 @@ def chain(
     quiet: options.Quiet = False,
 ) -> None:
     """Solve the consecutive pairs of a sequence and put them on one scale."""
+    name, subject = _subject(source)
+    out = out or default_folder(f"chain-{name}", subject)
     sequence = _frames(source, out, intrinsics, fov, _step(stride), frames, depth_scale)
     count = len(sequence)
-    claim(out, chain_files(count), overwrite)
+    claim(out, chain_files(count), overwrite, subject)
     sources = [sequence.source(k) for k in range(count)]
     which = [(k, k + 1) for k in range(count - 1)]
     over = [(k, k + 2) for k in range(count - 2)] if two_frame else []
@@ -88,13 +93,21 @@ def chain(
     changes = ["output.page=false", *options.changed(preset, overrides, short)]
     pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet), dask)
     done = make_chain(pairs[: len(which)], pairs[len(which) :])
-    name = Path(source[0]).resolve().name if len(source) == 1 else f"{source[0]} ..."
-    if isinstance(sequence, SceneFrames):
-        name = sequence.scene
-    with staged(out, whole=True, overwrite=overwrite) as new:
+    with staged(out, whole=True, overwrite=overwrite, subject=subject) as new:
         write_chain(new, done, name, sources)
     print(table(done))
     print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "points/", "pairs/"]))
+
+
+def _subject(source: list[str]) -> tuple[str, str]:
+    """Name of the sequence, and what its folder is the result of."""
+    first = source[0]
+    if first.startswith(SCENE):
+        return title(first.removeprefix(SCENE)), first
+    path = as_path(first, "frames", home=True).absolute()
+    # several images, or a pattern, are named after their folder
+    place = path if len(source) == 1 and path.exists() else path.parent
+    return title(place.stem if place.is_file() else place.name), f"sequence {place}"
 
 
 def _step(stride: str) -> int | None:

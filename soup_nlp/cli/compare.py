@@ -22,15 +22,15 @@ from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
 from soup_nlp.bench.solvers.runner import make_tasks
-from soup_nlp.cli.options import Formulations, Out, Overwrite, Presolve, Set, Superpixels
-from soup_nlp.config.problem import load_problem
+from soup_nlp.cli.options import Formulations, Overwrite, Presolve, Set, Superpixels
+from soup_nlp.config.problem import load_problem, title
 from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.verify import Limits
 from soup_nlp.family.results import write_results
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.atomic import write_text
-from soup_nlp.storage.folders import claim, scratch, staged
+from soup_nlp.storage.folders import claim, default_folder, scratch, staged
 from soup_nlp.storage.store import write_json
 
 FILES = ("README.md", "profile.png", "curves.png")
@@ -53,7 +53,9 @@ def compare(
     tol: Annotated[float, typer.Option(help="Dual infeasibility; constraints get 1/100.")] = 1e-4,
     memory: Annotated[float, typer.Option(help="Memory limit of a run, GiB.")] = 4.0,
     presolve: Presolve = True,
-    out: Out = Path("out/solvers"),
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output folder; default out/solvers-NAMES.")
+    ] = None,
     overrides: Set = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -78,7 +80,11 @@ def compare(
     files = [path for path in problems if path not in sets]
     chosen = [load_problem(path, [*(overrides or []), *own]) for path in files for own in sizes]
     written = (*FILES, *(OF_FAMILY if sets else ()))
-    folder = claim(out, written, overwrite)
+    subjects = [f"family {path.absolute()}" for path in sets] + [p.subject for p in chosen]
+    subject = ", ".join(dict.fromkeys(subjects))
+    names_of = dict.fromkeys([*(path.name for path in sets), *(p.name for p in chosen)])
+    out = out or default_folder(title(f"solvers-{'-'.join(names_of)}"), subject)
+    folder = claim(out, written, overwrite, subject)
     rows: list[dict[str, Any]] = []
     of_family: list[dict[str, Any]] = []
     runs = folder / "runs.jsonl"
@@ -94,17 +100,21 @@ def compare(
         # write the page of the finished runs even after an error
         rows += of_family
         if rows:
-            _write(folder, rows, of_family, limits)
+            _write(folder, rows, of_family, limits, subject)
     print("\n".join(conclusion(rows)))
     print(f"files       {out}/: {', '.join(written)}, runs.jsonl")
     raise typer.Exit(0 if any(r["verified"] for r in rows) else 1)
 
 
 def _write(
-    folder: Path, rows: list[dict[str, Any]], of_family: list[dict[str, Any]], limits: Limits
+    folder: Path,
+    rows: list[dict[str, Any]],
+    of_family: list[dict[str, Any]],
+    limits: Limits,
+    subject: str,
 ) -> None:
     """Write FILES from all rows, and OF_FAMILY from the rows of the family."""
-    with staged(folder) as new:
+    with staged(folder, subject=subject) as new:
         write_text(new / "README.md", family_page(of_family) if of_family else page(rows))
         draw_profiles(new / "profile.png", rows)
         draw_curves(new / "curves.png", rows)

@@ -12,7 +12,6 @@ import typer
 from soup_nlp.cli.options import (
     PROBLEM,
     Formulations,
-    Out,
     Overwrite,
     PresetName,
     Presolve,
@@ -29,7 +28,7 @@ from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_for
 from soup_nlp.export.manifest import EXPORT_FILES
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.files import MOST_YAML, is_folder, read_text
-from soup_nlp.storage.folders import claim
+from soup_nlp.storage.folders import claim, default_folder
 
 
 def show(
@@ -79,7 +78,9 @@ def _first_line(path: Path) -> str:
 
 def export(
     problem: Problem,
-    out: Out = Path("out/export"),
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output folder; default out/export-NAME.")
+    ] = None,
     formulation: Formulations = None,
     superpixels: Superpixels = None,
     format_: Annotated[
@@ -101,9 +102,10 @@ def export(
         own = [] if size is None else [f"segmentation.superpixels={size}"]
         own += [f"formulation.{k}={v}" for k, v in form.items()]
         chosen = load_problem(problem, [*(overrides or []), *own])
+        out = out or default_folder(f"export-{chosen.name}", chosen.subject)
         if not several:
             # check the folder before the work
-            claim(out, EXPORT_FILES, overwrite)
+            claim(out, EXPORT_FILES, overwrite, chosen.subject)
         if form is forms[0]:
             case = prepare(chosen, presolve)
         # the same soup in another formulation

@@ -80,7 +80,8 @@ def import_(
     folder: Annotated[Path, typer.Argument(help="Exported folder.")],
     sol: Annotated[Path, typer.Argument(help="The solver's .sol file.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Result folder; default DIR/result.")
+        Path | None,
+        typer.Option("--out", "-o", help="Result folder; default DIR/result, or DIR/result-SOL."),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -94,7 +95,10 @@ def import_(
             found=imported.sol.headline or None,
             hint=f"soup-nlp check {sol} says what is wrong with it",
         )
-    target = prepare_folder(out or folder / "result", run.problem.input_paths(), overwrite)
+    # answers of several solvers do not replace each other
+    own = "result" if sol.stem == "soup" else f"result-{sol.stem}"
+    target = out or folder / own
+    prepare_folder(target, run.problem.input_paths(), overwrite, run.problem.subject)
     text = foreign_verdict(imported)
     write_folder(target, run, dump_problem(run.problem), f"{imported.sol.message}\n{text}\n", text)
     print(text)

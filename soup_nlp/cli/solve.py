@@ -26,19 +26,22 @@ from soup_nlp.cli.progress import SolveLog
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
-from soup_nlp.errors import ConfigError, SoupError
+from soup_nlp.errors import ConfigError, DataError, SoupError
 from soup_nlp.pipeline.run import run as run_problem
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.verdict import missed, verdict
 from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.storage.files import as_path
-from soup_nlp.storage.folders import scratch
+from soup_nlp.storage.folders import default_folder, scratch
 
 
 def solve(
     problem: Annotated[Path | None, typer.Argument(help=PROBLEM)] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; default out/NAME.")
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Output folder; default out/NAME, named after the frames."
+        ),
     ] = None,
     overrides: Set = None,
     preset: PresetName = None,
@@ -110,7 +113,8 @@ def solve(
         chosen = _from_file(problem, pair, flows, overrides)
     # the expected MRE is that of the problem file without overrides
     limit = None if overrides else chosen.expected.mre_at_most
-    log, folder = SolveLog(quiet, verbose, chosen), out or Path("out") / chosen.name
+    folder = out or default_folder(chosen.name, chosen.subject)
+    log = SolveLog(quiet, verbose, chosen)
     raise typer.Exit(solve_problem(chosen, folder, log, limit, json_, overwrite))
 
 
@@ -158,7 +162,9 @@ def _from_options(
         source["fov"] = float(fov)
     if depth:
         source["depth"] = depth
-    raw: dict[str, Any] = {"name": title(Path(ref).stem), "input": source, "base": str(Path.cwd())}
+    place = as_path(ref, "reference image", home=True).absolute()
+    name = title("-".join([place.parent.name, place.stem, Path(following).stem]).lstrip("-"))
+    raw: dict[str, Any] = {"name": name, "input": source, "base": str(Path.cwd())}
     raw["flow"] = {key: flow for key, flow in flows.items() if flow}
     return make_problem(raw, overrides, where="command line")
 
@@ -176,7 +182,7 @@ def solve_problem(
     Returns:
         0 for a good result that meets the expectation, else 1.
     """
-    folder = prepare_folder(out, chosen.input_paths(), overwrite)
+    folder = prepare_folder(out, chosen.input_paths(), overwrite, chosen.subject)
     interrupt = interruptible(log.interrupted)
     with interrupt as stop, warnings.catch_warnings(), log, scratch() as temporary:
         ipopt_log = temporary / "ipopt.log"
@@ -195,8 +201,10 @@ def solve_problem(
                 raise KeyboardInterrupt
         except BaseException as error:
             log.lines.append(f"failed: {str(error) or type(error).__name__}")
-            with suppress(SoupError):
-                write_failure(folder, "\n".join(log.lines) + "\n", ipopt_log)
+            # the message says everything about input that cannot be used
+            if not isinstance(error, ConfigError | DataError):
+                with suppress(SoupError):
+                    write_failure(folder, "\n".join(log.lines) + "\n", ipopt_log)
             raise
         # files are written completely even after an interruption
         interrupt.deferred = True

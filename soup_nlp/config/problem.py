@@ -139,6 +139,17 @@ class Problem(Section):
         tree = self.model_dump(mode="json", exclude={"name", "base", "preset", "output"})
         return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
 
+    @property
+    def subject(self) -> str:
+        """What is solved: the kind of input and what names its frames, without any option."""
+        own = self.input.model_dump()
+        found = [own.pop("kind")]
+        for key in ("root", "path", "ref", "next"):
+            if key in own:
+                found.append(str(self.path(own[key])))
+        keys = ("scene", "seed", "variation", "render", "index", "frame", "step", "hash")
+        return " ".join([*found, *(f"{key} {own[key]}" for key in keys if key in own)])
+
     def load_pair(self) -> Pair:
         """The frame pair, without its flow.
 

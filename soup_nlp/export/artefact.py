@@ -99,8 +99,8 @@ def export_case(
             )
     form = form.replace(hessian="exact", compiled=False)
     nlp, layout = case.nlp(form)
-    target = claim(folder, EXPORT_FILES, overwrite)
-    with staged(target, whole=True) as new:
+    target = claim(folder, EXPORT_FILES, overwrite, case.problem.subject)
+    with staged(target, whole=True, subject=case.problem.subject) as new:
         return _write_files(new, target, case, form, (nlp, layout), formats, presolved)
 
 

@@ -66,14 +66,18 @@ _ROUND = (
 
 
 def prepare_folder(
-    folder: str | Path, inputs: Iterable[Path] | None = None, overwrite: bool = False
+    folder: str | Path,
+    inputs: Iterable[Path] | None = None,
+    overwrite: bool = False,
+    subject: str = "",
 ) -> Path:
     """Make the folder of a result and check that it can be written.
 
     Args:
         folder: The folder.
         inputs: Input files and folders of the problem, which are never overwritten.
-        overwrite: Overwrite files that the program did not make.
+        overwrite: Overwrite files that the program did not make, and the result of another subject.
+        subject: `Problem.subject`.
 
     Raises:
         DataError: the folder cannot be written, or holds a file that must not be overwritten.
@@ -81,7 +85,7 @@ def prepare_folder(
     folder = as_path(folder, "output folder")
     if inputs is not None:
         _keep_inputs(folder, inputs)
-    return claim(folder, (*FILES, *FULL.values(), FAILED), overwrite)
+    return claim(folder, (*FILES, *FULL.values(), FAILED), overwrite, subject)
 
 
 def _keep_inputs(folder: Path, inputs: Iterable[Path]) -> None:
@@ -134,7 +138,7 @@ def write_folder(
     Raises:
         DataError: a file cannot be written.
     """
-    with staged(folder, whole=True) as new:
+    with staged(folder, whole=True, subject=run.problem.subject) as new:
         if ipopt_log is not None and ipopt_log.is_file():
             shutil.copy(ipopt_log, new / "ipopt.log")
         _write_files(new, run, config, verdict, formats)

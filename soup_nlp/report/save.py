@@ -29,7 +29,7 @@ def save(
     names = [] if none else check_formats(formats)
     in_memory = run.problem.input.kind == "memory"
     inputs = [] if in_memory else run.problem.input_paths()
-    target = prepare_folder(folder, inputs, overwrite)
+    target = prepare_folder(folder, inputs, overwrite, run.problem.subject)
     return write_folder(target, run, config, f"{run}\n", formats=names)
 
 

@@ -25,6 +25,7 @@ from soup_nlp.storage.mark import (
     files_in,
     is_foreign,
     made_files,
+    subject_of,
     write_mark,
 )
 from soup_nlp.storage.system import deferred_signals, exchange
@@ -35,7 +36,30 @@ _COMMIT = f"{_STAGE}commit"
 """Folder of complete new files that are being moved to their places."""
 
 
-def claim(folder: PathLike, names: Iterable[str], overwrite: bool = False) -> Path:
+_made: list[Path] = []
+"""Folders that `claim` has made in this process."""
+
+
+def default_folder(name: str, subject: str) -> Path:
+    """`out/NAME`, or the first of `out/NAME-2`, ... that holds no result of something else."""
+    k = 1
+    while True:
+        folder = Path("out") / (name if k == 1 else f"{name}-{k}")
+        if subject_of(folder) in ("", subject):
+            return folder
+        k += 1
+
+
+def remove_empty() -> None:
+    """Remove the folders that `claim` has made and into which nothing was written."""
+    while _made:
+        with suppress(OSError):
+            os.rmdir(_made.pop())
+
+
+def claim(
+    folder: PathLike, names: Iterable[str], overwrite: bool = False, subject: str = ""
+) -> Path:
     """Make an output folder, check that these files may be written into it, and return it.
 
     Moves that a killed process has begun are finished, and its temporary folders are removed.
@@ -43,15 +67,20 @@ def claim(folder: PathLike, names: Iterable[str], overwrite: bool = False) -> Pa
     Args:
         folder: The output folder.
         names: Files that will be written.
-        overwrite: Treat existing files of these names as files of the program.
+        overwrite: Treat existing files of these names as files of the program, and replace the
+            result of another subject.
+        subject: What the files will be the result of.
 
     Raises:
-        DataError: the folder cannot be written, or holds a file of the user with one of the names.
+        DataError: the folder cannot be written, holds a file of the user with one of the names, or
+            is the result of another subject.
     """
     try:
         target = Path(folder).resolve()
         with deferred_signals():
+            fresh = [p for p in (target, *target.parents) if not os.path.lexists(p)]
             target.mkdir(parents=True, exist_ok=True)
+            _made.extend(reversed(fresh))
             recover(target)
             _sweep(_left_behind(target))
             stage, lock = _new_stage(target)
@@ -62,6 +91,15 @@ def claim(folder: PathLike, names: Iterable[str], overwrite: bool = False) -> Pa
         foreign = [name for name in names if is_foreign(target, name)]
     except (OSError, RuntimeError, ValueError) as error:
         raise _unwritable(folder, error) from error
+    before = subject_of(target)
+    if subject and before not in ("", subject) and not overwrite:
+        raise DataError(
+            "output folder holds the result of something else",
+            where=folder,
+            found=before,
+            expected=subject,
+            hint="choose another --out, or --overwrite",
+        )
     if foreign and not overwrite:
         raise _clash(folder, foreign)
     if foreign:
@@ -70,7 +108,9 @@ def claim(folder: PathLike, names: Iterable[str], overwrite: bool = False) -> Pa
 
 
 @contextmanager
-def staged(folder: PathLike, whole: bool = False, overwrite: bool = False) -> Iterator[Path]:
+def staged(
+    folder: PathLike, whole: bool = False, overwrite: bool = False, subject: str = ""
+) -> Iterator[Path]:
     """An empty folder whose files are moved into `folder` when the block ends without exception.
 
     On an exception `folder` does not change. If it holds only files of the program and the file
@@ -81,6 +121,7 @@ def staged(folder: PathLike, whole: bool = False, overwrite: bool = False) -> It
         folder: The output folder.
         whole: The new files are a complete result: files of an earlier result are removed.
         overwrite: Overwrite files that the program did not make.
+        subject: What the files are the result of; nothing leaves what the folder says.
 
     Raises:
         DataError: a file cannot be written, or a file of the user has the name of a new one.
@@ -96,7 +137,7 @@ def staged(folder: PathLike, whole: bool = False, overwrite: bool = False) -> It
     try:
         yield stage
         with deferred_signals():
-            _commit(stage, target, whole, overwrite)
+            _commit(stage, target, whole, overwrite, subject)
     except DataError as error:
         # name the final path instead of the temporary one
         if not isinstance(error.where, Path) or not error.where.is_relative_to(stage):
@@ -238,7 +279,7 @@ def _sweep(paths: Iterable[Path]) -> None:
                 os.close(handle)
 
 
-def _commit(stage: Path, target: Path, whole: bool, overwrite: bool) -> None:
+def _commit(stage: Path, target: Path, whole: bool, overwrite: bool, subject: str) -> None:
     """Move the files of a temporary folder to their places."""
     new = {name: digest_of(stage / name) for name in files_in(stage)}
     clash = [name for name in new if is_foreign(target, name)]
@@ -251,7 +292,7 @@ def _commit(stage: Path, target: Path, whole: bool, overwrite: bool) -> None:
     there = {path.name for path in target.iterdir()} - {MARK, stage.name}
     here = {name for top in there & tops for name in _below(target, top)}
     old = {k: v for k, v in listed.items() if k in here and not is_foreign(target, k)}
-    write_mark(stage, new if whole else old | new)
+    write_mark(stage, new if whole else old | new, subject or subject_of(target))
     for name in here & new.keys():
         shutil.copymode(target / name, stage / name)
     _sync(stage)

@@ -1,6 +1,7 @@
 """The hidden file MARK: a list of the files in a folder that the program made, with their SHA-256.
 
-A file that is not listed, or that was changed, belongs to the user.
+A file that is not listed, or that was changed, belongs to the user. The mark also says what the
+folder is the result of.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ from soup_nlp.storage.atomic import write_text
 
 MARK = ".soup_nlp"
 """Hidden file of a folder with results: JSON, SHA-256 by name of every file that was made."""
+
+SUBJECT = "of"
+"""Key of the mark: what the folder is the result of."""
 
 
 def made_files(folder: Path) -> dict[str, str] | None:
@@ -36,6 +40,14 @@ def made_files(folder: Path) -> dict[str, str] | None:
         return {str(name): str(listed[name]) for name in inside}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return {}
+
+
+def subject_of(folder: Path) -> str:
+    """What a folder is the result of; nothing if its mark does not say it."""
+    if not made_files(folder):
+        return ""
+    own = json.loads((folder / MARK).read_text(encoding="utf-8")).get(SUBJECT)
+    return own if isinstance(own, str) else ""
 
 
 def files_in(folder: Path) -> list[str]:
@@ -77,6 +89,11 @@ def adopt(folder: Path, names: Iterable[str]) -> None:
     write_mark(folder, (made_files(folder) or {}) | digests)
 
 
-def write_mark(folder: Path, files: dict[str, str]) -> None:
-    """Write the mark of a folder: SHA-256 by name of the files that the program made."""
-    write_text(folder / MARK, json.dumps({"files": dict(sorted(files.items()))}, indent=1) + "\n")
+def write_mark(folder: Path, files: dict[str, str], subject: str = "") -> None:
+    """Write the mark of a folder: SHA-256 by name of the files that the program made.
+
+    A mark without a new `subject` keeps the earlier one.
+    """
+    subject = subject or subject_of(folder)
+    contents = ({SUBJECT: subject} if subject else {}) | {"files": dict(sorted(files.items()))}
+    write_text(folder / MARK, json.dumps(contents, indent=1) + "\n")
