@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import h5py
@@ -17,6 +18,7 @@ from helpers_files import write_flo
 from helpers_ply import read_ply
 
 from soup_nlp.cli.main import main
+from soup_nlp.cli.solve import exit_code
 from soup_nlp.config.problem import load_problem, make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError
@@ -75,6 +77,7 @@ def test_every_problem_file_loads_and_loads_again(path, tmp_path, capsys):
 def test_a_solve_writes_every_file(solved):
     for name in FILES:
         assert (solved / name).stat().st_size > 0, name
+    assert (solved / "log.txt").read_text().splitlines()[-1].startswith("exit code   0: ")
     summary = json.loads((solved / "summary.json").read_text())
     assert summary["converged"]
     assert summary["energy"]["nlp"]["total"] < summary["energy"]["start"]["total"]
@@ -312,6 +315,48 @@ def test_one_superpixel_is_one_plane(images, tmp_path):
     code = solve_files(images, tmp_path, flow="true.flo", sets="segmentation.superpixels=1")
     assert code in (0, 1)
     assert json.loads((tmp_path / "summary.json").read_text())["sizes"]["superpixels"] == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["a.png"], "a pair is two images"),
+        (["--ref", "a.png"], "solve REF NEXT"),
+        (["a.png", "b.png", "c.png"], "soup-nlp chain"),
+        (["a.png", "b.png", "--next", "c.png"], "--next c.png"),
+        ([], "nothing to solve"),
+    ],
+)
+def test_frames_that_are_no_pair_are_refused(words, part, capsys):
+    assert main(["solve", *words]) == 2
+    assert part in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "part"),
+    [
+        ({}, 0, "solved"),
+        ({"status": "Interrupted", "solved": False}, 1, "interrupted"),
+        ({"status": "Time_Limit", "solved": False}, 1, "did not converge (Time_Limit)"),
+        ({"guessed": 0.51}, 1, "51% of the image is a guess"),
+        ({"mre": 0.3}, 1, "above the expected 0.2"),
+    ],
+)
+def test_the_exit_code_has_a_reason(changes, code, part):
+    own = {"status": "Solve_Succeeded", "solved": True, "guessed": 0.1, "mre": 0.1} | changes
+    expected = SimpleNamespace(mre_at_most=0.2)
+    fake = SimpleNamespace(
+        refined=None,
+        solution=SimpleNamespace(status=own["status"]),
+        solved=own["solved"],
+        good=own["solved"] and own["guessed"] <= 0.5,
+        confidence=SimpleNamespace(guessed=own["guessed"]),
+        metrics={"solution": SimpleNamespace(mre=own["mre"])},
+        problem=SimpleNamespace(expected=expected),
+    )
+    found = exit_code(fake, 0.2)
+    assert found[0] == code
+    assert part in found[1]
 
 
 def test_nothing_to_solve(capsys):

@@ -12,7 +12,7 @@ import typer
 from soup_nlp.cli import options
 from soup_nlp.cli.options import Progress
 from soup_nlp.config.problem import title
-from soup_nlp.errors import ConfigError
+from soup_nlp.errors import ConfigError, StoppedError
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import (
     VIDEOS,
@@ -91,7 +91,14 @@ def chain(
         "max_size": max_size,
     }
     changes = ["output.page=false", *options.changed(preset, overrides, short)]
-    pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet), dask)
+    try:
+        pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet), dask)
+    except KeyboardInterrupt:
+        raise StoppedError(
+            "interrupted: the pairs that were finished are kept",
+            where=f"{out}/pairs",
+            hint="the same command goes on",
+        ) from None
     done = make_chain(pairs[: len(which)], pairs[len(which) :])
     with staged(out, whole=True, overwrite=overwrite, subject=subject) as new:
         write_chain(new, done, name, sources)

@@ -24,7 +24,7 @@ from soup_nlp.bench.solvers.runner import compare as run_all
 from soup_nlp.bench.solvers.runner import make_tasks
 from soup_nlp.cli.options import Formulations, Overwrite, Presolve, Set, Superpixels
 from soup_nlp.config.problem import load_problem, title
-from soup_nlp.errors import ConfigError
+from soup_nlp.errors import ConfigError, StoppedError
 from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.verify import Limits
 from soup_nlp.family.results import write_results
@@ -96,6 +96,12 @@ def compare(
             for problem in chosen:
                 tasks = list(make_tasks(prepare(problem, presolve), forms, limits, presolve))
                 rows += run_all(tasks, names, limits, runs, temporary, print)
+    except KeyboardInterrupt:
+        raise StoppedError(
+            "interrupted: the runs that were finished are kept, with a page of them",
+            where=folder,
+            hint="the same command goes on",
+        ) from None
     finally:
         # write the page of the finished runs even after an error
         rows += of_family
@@ -103,7 +109,9 @@ def compare(
             _write(folder, rows, of_family, limits, subject)
     print("\n".join(conclusion(rows)))
     print(f"files       {out}/: {', '.join(written)}, runs.jsonl")
-    raise typer.Exit(0 if any(r["verified"] for r in rows) else 1)
+    verified = sum(bool(r["verified"]) for r in rows)
+    print(f"exit code   {int(not verified)}: {verified} of {len(rows)} runs are verified")
+    raise typer.Exit(int(not verified))
 
 
 def _write(

@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from soup_nlp.cli.boundary import (
     BROKEN_PIPE,
@@ -160,9 +160,11 @@ def _run(argv: Sequence[str] | None) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return _aborted()
     except Exception as error:
-        # usage errors of the command line library have their own message
+        # usage errors of the command line library have their own message; a bare command has its
+        # help, which is printed
         if hasattr(error, "format_message"):
-            print(f"error: {printable(error.format_message())}", file=sys.stderr)
+            if said := error.format_message():
+                print(f"error: {printable(said)}", file=sys.stderr)
             return 2
         if isinstance(error, BrokenPipeError):
             raise
@@ -177,8 +179,28 @@ def _aborted() -> int:
     return ABORTED
 
 
+def _without_bool(params: list[Any]) -> list[Any]:
+    """Options whose flags show no type in the help."""
+    for param in params:
+        if getattr(param, "is_flag", False):
+            param.metavar = ""
+    return params
+
+
+class Command(TyperCommand):
+    """A command whose flags show no type in its help."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Options and arguments, with that of the help."""
+        return _without_bool(super().get_params(ctx))
+
+
 class LazyGroup(TyperGroup):
     """A group that imports a command only when it is called, which makes `--help` fast."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Options, with that of the help."""
+        return _without_bool(super().get_params(ctx))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Name, imported command and remaining arguments."""
@@ -201,14 +223,19 @@ def _load(name: str, home: str) -> Any:
     module, _, function = home.partition(":")
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     own = getattr(import_module(f"soup_nlp.cli.{module}"), function)
-    alone.command(name=name)(guarded(own))
+    alone.command(name=name, cls=Command)(guarded(own))
     return typer.main.get_command(alone)
 
 
 def _group(text: str, commands: Mapping[str, tuple[str, str]], **options: Any) -> typer.Typer:
     """A group of commands that are imported later."""
     group = typer.Typer(
-        cls=LazyGroup, no_args_is_help=True, pretty_exceptions_enable=False, help=text, **options
+        cls=LazyGroup,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        help=text,
+        context_settings={"help_option_names": ["-h", "--help"]},
+        **options,
     )
     for name, (_, line) in commands.items():
         group.command(name=name, help=line)(_placeholder)

@@ -52,8 +52,9 @@ def check(
         print(table_text(rows))
         print(foreign_verdict(imported))
         good, claim = all(r.ok for r in rows), "constraint"
-    print(f"every {claim} holds" if good else f"a {claim} does not hold")
-    raise typer.Exit(0 if good else 1)
+    said = f"every {claim} holds" if good else f"a {claim} does not hold"
+    print(f"exit code   {int(not good)}: {said}")
+    raise typer.Exit(int(not good))
 
 
 def evaluate(
@@ -104,7 +105,10 @@ def import_(
     print(text)
     print(f"files       {target}/")
     print(f"next        soup-nlp check {target}")
-    raise typer.Exit(0 if s.converged else 1)
+    print(
+        f"exit code   {int(not s.converged)}: the answer is {'' if s.converged else 'not '}verified"
+    )
+    raise typer.Exit(int(not s.converged))
 
 
 def foreign_verdict(imported: Imported) -> str:

@@ -11,77 +11,97 @@ from typing import Annotated, Any
 
 import typer
 
-from soup_nlp.cli.options import (
-    PROBLEM,
-    MaxSize,
-    Neighbours,
-    Overwrite,
-    PresetName,
-    Set,
-    Wanted,
-    camera,
-    changed,
-)
+from soup_nlp.cli.options import camera, changed
 from soup_nlp.cli.progress import SolveLog
+from soup_nlp.config.presets import PRESETS
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, DataError, SoupError
+from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run as run_problem
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.verdict import missed, verdict
+from soup_nlp.sequence.frames import IMAGES
 from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import default_folder, scratch
 
+SOURCE = "Two images, or a problem file or name (`soup-nlp list`)."
+INPUT: Mapping[str, Any] = {"rich_help_panel": "Input"}
+FLOW: Mapping[str, Any] = {"rich_help_panel": "Flow"}
+SIZE: Mapping[str, Any] = {"rich_help_panel": "Size"}
+METHOD: Mapping[str, Any] = {"rich_help_panel": "Method"}
+OUTPUT: Mapping[str, Any] = {"rich_help_panel": "Output"}
+
 
 def solve(
-    problem: Annotated[Path | None, typer.Argument(help=PROBLEM)] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", help="Output folder; default out/NAME, named after the frames."
-        ),
+    source: Annotated[
+        list[Path] | None, typer.Argument(metavar="PROBLEM | REF NEXT", help=SOURCE)
     ] = None,
-    overrides: Set = None,
-    preset: PresetName = None,
-    ref: Annotated[str | None, typer.Option(help="Reference image.")] = None,
-    next_: Annotated[str | None, typer.Option("--next", help="Next image.")] = None,
+    ref: Annotated[str | None, typer.Option(help="Reference image.", **INPUT)] = None,
+    next_: Annotated[str | None, typer.Option("--next", help="Next image.", **INPUT)] = None,
     intrinsics: Annotated[
         str | None,
-        typer.Option(help="fx,fy,cx,cy in pixels, or a file; default EXIF, else a guess."),
-    ] = None,
-    intrinsics_next: Annotated[
-        str | None, typer.Option(help="The same of the next frame, if it differs.")
+        typer.Option(help="fx,fy,cx,cy in pixels, or a file; default EXIF, else a guess.", **INPUT),
     ] = None,
     fov: Annotated[
-        float | None, typer.Option(help="Horizontal field of view, degrees, for --intrinsics.")
+        float | None, typer.Option(help="Horizontal field of view, degrees, instead.", **INPUT)
+    ] = None,
+    intrinsics_next: Annotated[
+        str | None, typer.Option(help="Camera of the next frame, if it differs.", **INPUT)
+    ] = None,
+    depth: Annotated[
+        str | None, typer.Option(help="True depth of the reference frame, to score.", **INPUT)
     ] = None,
     flow: Annotated[
-        str | None, typer.Option(help=".flo, KITTI .png, .npy, .onnx or a name; default DIS.")
+        str | None, typer.Option(help=".flo, KITTI .png, .npy, .onnx or a name; DIS.", **FLOW)
     ] = None,
     flow_backward: Annotated[
-        str | None, typer.Option(help="Flow from next to reference: its round trip is confidence.")
+        str | None,
+        typer.Option(help="From next to ref: the round trip is confidence.", **FLOW),
     ] = None,
     flow_confidence: Annotated[
-        str | None, typer.Option(help="Confidence of --flow: .npy in [0, 1], or a grey picture.")
+        str | None, typer.Option(help="Of --flow: .npy in [0, 1], or a grey picture.", **FLOW)
     ] = None,
-    depth: Annotated[str | None, typer.Option(help="True depth of the reference frame.")] = None,
-    superpixels: Wanted = None,
-    neighbours: Neighbours = None,
-    max_size: MaxSize = None,
+    superpixels: Annotated[
+        int | None, typer.Option(help="Wanted number N; default 1000.", **SIZE)
+    ] = None,
+    neighbours: Annotated[
+        int | None, typer.Option(help="K of the K-NN graph; default 15.", **SIZE)
+    ] = None,
+    max_size: Annotated[
+        float | None,
+        typer.Option(help="Megapixels for larger images; default 1.5.", **SIZE),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", help="Any key, e.g. solver.max_iter=200.", **METHOD)
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help=f"Options below the problem's own: {', '.join(PRESETS)}.", **METHOD),
+    ] = None,
     no_refine: Annotated[
-        bool, typer.Option("--no-refine", help="The NLP alone, as refine.enabled=false.")
+        bool,
+        typer.Option("--no-refine", help="The NLP alone, as refine.enabled=false.", **METHOD),
     ] = False,
     no_nlp: Annotated[
-        bool, typer.Option("--no-nlp", help="Refine the start, as refine.from_start=true.")
+        bool,
+        typer.Option("--no-nlp", help="Refine the start, as refine.from_start=true.", **METHOD),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Output folder; default out/NAME.", **OUTPUT),
+    ] = None,
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", help="Also over other files, or another result.", **OUTPUT),
     ] = False,
     json_: Annotated[
-        bool, typer.Option("--json", help="Print summary.json instead of the verdict.")
+        bool, typer.Option("--json", help="Print summary.json instead of the verdict.", **OUTPUT)
     ] = False,
-    overwrite: Overwrite = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Every phase.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Verdict only.", **OUTPUT)] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All phases.", **OUTPUT)] = False,
 ) -> None:
     """Solve a pair of frames and write a result folder."""
     if no_refine and no_nlp:
@@ -98,6 +118,7 @@ def solve(
         "refine.from_start": "true" if no_nlp else None,
     }
     overrides = changed(preset, overrides, short)
+    problem, ref, next_ = _sources(source or [], ref, next_)
     pair = {
         "--ref": ref,
         "--next": next_,
@@ -116,6 +137,31 @@ def solve(
     folder = out or default_folder(chosen.name, chosen.subject)
     log = SolveLog(quiet, verbose, chosen)
     raise typer.Exit(solve_problem(chosen, folder, log, limit, json_, overwrite))
+
+
+def _sources(
+    words: Sequence[Path], ref: str | None, following: str | None
+) -> tuple[Path | None, str | None, str | None]:
+    """Problem file, reference and next image of the arguments and of --ref and --next.
+
+    Raises:
+        ConfigError: they are neither a problem nor two images.
+    """
+    pictures = [str(word) for word in words if word.suffix.lower() in IMAGES]
+    if len(words) == 1 and not pictures:
+        return words[0], ref, following
+    named = [*pictures, *(f"--ref {ref}" for _ in [ref] if ref)]
+    named += [f"--next {following}" for _ in [following] if following]
+    if len(words) == 2 and not (ref or following):
+        return None, str(words[0]), str(words[1])
+    if words or bool(ref) != bool(following):
+        raise ConfigError(
+            "a pair is two images",
+            found=", ".join([*(str(w) for w in words if str(w) not in pictures), *named]),
+            expected="soup-nlp solve REF NEXT, or soup-nlp solve PROBLEM",
+            hint="soup-nlp chain solves more than two frames" if len(words) > 2 else None,
+        )
+    return None, ref, following
 
 
 def _from_file(
@@ -149,8 +195,8 @@ def _from_options(
     if not (ref and following):
         raise ConfigError(
             "nothing to solve",
-            found="no problem file",
-            expected="PROBLEM.yaml, the name of a problem, or --ref and --next",
+            found="no image and no problem",
+            expected="soup-nlp solve REF NEXT, or soup-nlp solve PROBLEM",
             hint="soup-nlp demo, or soup-nlp solve motorcycle --out out/motorcycle",
         )
     source: dict[str, Any] = {"kind": "files", "ref": ref, "next": following}
@@ -209,13 +255,29 @@ def solve_problem(
         # files are written completely even after an interruption
         interrupt.deferred = True
 
+        code, why = exit_code(run, mre_at_most)
+
         def log_text(files: list[str]) -> str:
             log.stage("files")
-            log.lines.append(verdict(run, folder, files, mre_at_most))
+            said = verdict(run, folder, files, mre_at_most)
+            log.lines.append(f"{said}\nexit code   {code}: {why}")
             return "\n".join(log.lines) + "\n"
 
         write_folder(folder, run, dump_problem(chosen), log_text, ipopt_log=ipopt_log)
     summary = folder / "summary.json"
     print(summary.read_text(encoding="utf-8") if as_json else log.lines[-1])
-    good = run.good and (mre_at_most is None or not missed(run))
-    return 0 if good else 1
+    return code
+
+
+def exit_code(run: Run, mre_at_most: float | None) -> tuple[int, str]:
+    """Exit code of a solve and its reason; `mre_at_most` is the largest MRE that is expected."""
+    refined = run.refined is not None and run.refined.status == "interrupted"
+    if refined or run.solution.status == "Interrupted":
+        return 1, "interrupted; the best iterate is written"
+    if not run.solved:
+        return 1, f"the NLP did not converge ({run.solution.status}); the best iterate is written"
+    if not run.good:
+        return 1, f"{run.confidence.guessed:.0%} of the image is a guess, more than half"
+    if mre_at_most is not None and missed(run):
+        return 1, f"the MRE is above the expected {mre_at_most:g}"
+    return 0, "solved, and at most half of the image is a guess"

@@ -103,9 +103,18 @@ def flow_of(given: FlowLike, confidence: object, source: str) -> tuple[NDArray[A
         )
     if uv.ndim == 3 and uv.shape[0] == 2 and uv.shape[2] != 2:
         uv = np.moveaxis(uv, 0, 2)
+    if uv.ndim != 3:
+        batch = uv.ndim == 4 and len(uv) == 1
+        raise DataError(
+            "flow has the wrong shape",
+            where=source,
+            found=uv.shape,
+            expected="(H, W, 2) or (2, H, W)",
+            hint="flow[0] takes it out of its batch" if batch else None,
+        )
     if not (uv.dtype.kind == "f" and uv.dtype.itemsize >= 4):
         uv = uv.astype(np.float32)
-    if confidence is None and uv.ndim == 3:
+    if confidence is None:
         # Middlebury's files mark unknown flow by 1e9 and more
         known = (np.abs(uv) < 1e9).all(axis=2)
         return np.where(known[..., None], uv, 0), known.astype(np.float32), source
