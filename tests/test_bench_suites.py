@@ -11,7 +11,7 @@ from soup_nlp.cli.main import main
 
 def test_suites_list_the_papers_pairs(tmp_path):
     assert set(SUITES) == {
-        *("rendered", "shared", "sintel", "kitti2012", "kitti2015", "vkitti"),
+        *("rendered", "everyday", "shared", "sintel", "kitti2012", "kitti2015", "vkitti"),
         *("kinect_paper", "kinect_tshirt"),
     }
     rendered = list_suite("rendered", None, Options(width=320, seeds=(0, 3), flows=("dis",)))
@@ -19,6 +19,10 @@ def test_suites_list_the_papers_pairs(tmp_path):
     assert len({i.key for i in rendered.items}) == 12
     problem = rendered.items[0].problem(["segmentation.superpixels=60"])
     assert (problem.input.width, problem.input.height) == (320, 136)
+    everyday = list_suite("everyday", None, Options(width=320, seeds=(0, 3)))
+    assert len({i.key for i in everyday.items}) == 14
+    problem = everyday.items[0].problem()
+    assert (problem.input.width, problem.input.height) == (200, 150)
     for name, count in (("sintel", 120), ("vkitti", 120), ("kitti2012", 194), ("kitti2015", 200)):
         suite = SUITES[name]
         items = list(suite.items(tmp_path, Options()))

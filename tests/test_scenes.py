@@ -11,13 +11,15 @@ from scipy.spatial.transform import Rotation
 from soup_nlp.data.inputs import SceneInput
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import SCENES, render_scene
+from soup_nlp.data.scenes.everyday import LAYOUTS
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
 from soup_nlp.data.scenes.shapes import Box, Plane, Sheet, Sphere
 from soup_nlp.data.scenes.texture import Texture, fractal_noise, pulse_coverage, value_noise
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry import camera, rotation
 
-ALL = list(SCENES)
+ALL = [name for name in SCENES if name not in LAYOUTS]
+"""`test_everyday_scenes.py` tests the others."""
 RIGID = {"sheet": (0.01, 0.5), "banner": (0.5, 0.9)}
 """Bounds of the share of pixels that move rigidly, of the scenes that bend."""
 WIDTH, HEIGHT = 240, 102

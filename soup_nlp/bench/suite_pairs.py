@@ -10,9 +10,11 @@ from typing import Any, NamedTuple
 
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.datasets.sintel import DEFAULT_SCENE
+from soup_nlp.data.scenes.everyday import LAYOUTS
 from soup_nlp.storage.files import is_folder
 
 RENDERED = ("street", "room", "sheet", "orbit", "still", "banner")
+EVERYDAY = tuple(LAYOUTS)
 KITTI_PRESETS = ("kitti", "eigen80", "best")
 SINTEL_FRAMES = MappingProxyType(
     {"alley_1": 50, "ambush_4": 33, "mountain_1": 50, "sleeping_1": 50, "temple_2": 50}
@@ -69,7 +71,7 @@ class Options:
 
     Attributes:
         flows: Flow sources; None for those of the suite.
-        width: Columns of rendered scenes; they have 436 rows per 1024 columns.
+        width: Columns of suite rendered, 436 rows per 1024; everyday is 640 x 480 at 1024.
         seeds: Seeds of rendered scenes.
         limit: Most pairs, evenly spaced, each with every flow; None for all.
         only: Keep pairs whose names contain one of these words; empty for all.
@@ -109,6 +111,15 @@ def rendered(root: Path, o: Options) -> Iterator[Entry]:
         for scene in RENDERED:
             name = f"{scene}-s{seed}-{size['width']}x{size['height']}"
             yield Entry(scene, name, {"kind": "scene", "scene": scene, "seed": seed, **size})
+
+
+def everyday(root: Path, o: Options) -> Iterator[Entry]:
+    """The everyday scenes with all seeds, 4:3 pictures."""
+    size = {"width": max(64, o.width * 5 // 8), "height": max(48, o.width * 15 // 32)}
+    for seed in o.seeds:
+        for scene in EVERYDAY:
+            raw = {"kind": "scene", "scene": scene, "seed": seed, **size}
+            yield Entry(scene, f"{scene}-s{seed}-{size['width']}x{size['height']}", raw)
 
 
 def shared(root: Path, o: Options) -> Iterator[Entry]:

@@ -61,6 +61,11 @@ class Suite:
 _ALL = (
     Suite("rendered", f"{len(RENDERED)} rendered dynamic scenes", pairs.rendered, ("truth", "dis")),
     Suite(
+        "everyday",
+        f"{len(pairs.EVERYDAY)} rendered scenes of everyday kinds, most with little or no parallax",
+        pairs.everyday,
+    ),
+    Suite(
         "shared",
         "the real pairs that development was done with",
         pairs.shared,

@@ -132,7 +132,21 @@ class SceneInput(PairInput):
 
     kind: Literal["scene"]
     """Kind of input."""
-    scene: Literal["street", "room", "sheet", "orbit", "still", "banner"]
+    scene: Literal[
+        "street",
+        "room",
+        "sheet",
+        "orbit",
+        "still",
+        "banner",
+        "pan",
+        "handheld",
+        "swing",
+        "jam",
+        "facade",
+        "corridor",
+        "standing",
+    ]
     """Which scene."""
     seed: Seed = 0
     """Changes layout, textures and motions."""

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from soup_nlp.data.pair import Pair
+from soup_nlp.data.scenes import everyday
 from soup_nlp.data.scenes.materials import (
     ASPHALT,
     GLASS,
@@ -25,8 +26,9 @@ from soup_nlp.data.scenes.materials import (
     views,
 )
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, advanced, inverse, render
-from soup_nlp.data.scenes.shapes import Box, Float, Plane, Shape, Sheet, Sphere
-from soup_nlp.data.scenes.texture import Panels, Texture
+from soup_nlp.data.scenes.shapes import Box, Sheet
+from soup_nlp.data.scenes.texture import Panels
+from soup_nlp.data.scenes.things import BACK, FRONT, car, furniture, interior
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.schema.limits import check_image_size
 
@@ -53,32 +55,15 @@ def render_scene(
     f = focal * max(width, 4 / 3 * height)
     K = camera.intrinsics(f, f, (width - 1) / 2, (height - 1) / 2)
     rng = np.random.default_rng([seed, list(_LAYOUTS).index(name)])
-    scene = layout(rng, width / (2 * f), height / (2 * f))
+    scene = layout(rng, width / (2 * f), height / (2 * f), seed)
     own = f"{name}-{seed}" + (f"-{frame}" if frame else "")
     return render(advanced(scene, frame), K, height, width, name=own)
 
 
-# layouts: (rng, half width / f, half height / f) -> Scene
+# layouts: (rng, half width / f, half height / f, seed) -> Scene
 
 
-def _car(m: Materials, x: float, z: float, yaw: float) -> tuple[Part, ...]:
-    """A car of three boxes that stands on the ground, nose along +z at yaw 0."""
-    at = placed(x, 0, z, yaw=yaw)
-    body = m.paint(0.7)
-    sizes: list[tuple[tuple[float, float, float], tuple[float, float], Texture]] = [
-        # half size, (bottom above ground, offset along the car), texture
-        ((0.86, 0.12, 2.02), (0.0, 0.0), m.plain(((0.12, 0.12, 0.13), (0.2, 0.2, 0.21)), 0.4)),
-        ((0.92, 0.33, 2.15), (0.24, 0.0), body),
-        ((0.78, 0.24, 1.1), (0.9, -0.3), m.plain((GLASS, (0.3, 0.36, 0.42)), 0.5)),
-        ((0.76, 0.03, 1.0), (1.38, -0.3), body),
-    ]
-    return tuple(
-        Part(Box(half), at @ placed(0, -(bottom + half[1]), along), texture)
-        for half, (bottom, along), texture in sizes
-    )
-
-
-def _street(rng: Random, half_width: float, half_height: float) -> Scene:
+def _street(rng: Random, half_width: float, half_height: float, seed: int) -> Scene:
     """driving camera, two moving cars on a street between houses; depth to 80 m"""
     m = Materials(rng)
     lanes = Panels((3.6, 5.0), (0.035, 0.5), (0.78, 0.78, 0.74), (-0.06, rng.uniform(0, 5)))
@@ -108,75 +93,29 @@ def _street(rng: Random, half_width: float, half_height: float) -> Scene:
     bodies = [Body(tuple(parts))]
     speeds = rng.uniform(0.3, 0.6, 2) * drive
     if rng.random() < 0.5:
-        same = _car(m, lane, ahead, 0.0)
+        same = car(m, lane, ahead, 0.0)
         move = about([lane, 0, ahead], [0, sign(rng), 0], [0, 0, speeds[0]])
     else:
         yaw = -rng.uniform(50, 75)
-        same = _car(m, lane, ahead, yaw)
+        same = car(m, lane, ahead, yaw)
         nose = rotation.exp(np.radians([0, yaw, 0])) @ [0, 0, speeds[0]]
         move = about([lane, 0, ahead], [0, 0, 0], nose)
     bodies.append(Body(same, move))
     shift = [0, 0, -speeds[1]]
-    bodies.append(Body(_car(m, -lane, coming, 180.0), about([0, 0, 0], [0, 0, 0], shift)))
+    bodies.append(Body(car(m, -lane, coming, 180.0), about([0, 0, 0], [0, 0, 0], shift)))
     turn = [rng.uniform(-0.1, 0.1), sign(rng) * rng.uniform(0.2, 0.4), 0.1]
     pose = placed(rng.uniform(-0.4, 0.4), -rng.uniform(2.1, 2.4), 0, yaw=rng.uniform(-2, 2))
     view = views(pose, [rng.uniform(-0.03, 0.03), 0, drive], turn)
     return Scene(tuple(bodies), *view)
 
 
-_FRONT = ((-0.62, 3.5), (0.0, 3.4), (0.62, 3.6))
-_BACK = ((-0.88, 4.9), (-0.3, 5.0), (0.31, 4.8), (0.88, 5.0))
-"""Spots on the floor: fraction of half the image's width, distance (m). The back row stands in the
-gaps of the front row."""
-
-_WALL = 6.4
-"""Distance of a room's back wall, m."""
-
-
-def _objects(
-    rng: Random, m: Materials, spots: tuple[tuple[float, float], ...], half_width: float
-) -> list[tuple[Part, Float]]:
-    """Alternating boxes and spheres, one on each spot, with their foot points (3,)."""
-    out = []
-    for k, (across, distance) in enumerate(spots):
-        z = distance + rng.uniform(-0.1, 0.1)
-        unit = z * half_width
-        size = 0.15 * unit
-        foot = np.array([(across + rng.uniform(-0.03, 0.03)) * unit, 0.0, z])
-        shape: Shape
-        if k % 2:
-            radius = size * rng.uniform(0.85, 1.05)
-            shape, up, yaw = Sphere(radius), radius, rng.uniform(0, 360)
-        else:
-            half = size * rng.uniform([0.75, 0.75, 0.75], [1.0, 1.4, 1.0])
-            shape, up, yaw = Box((half[0], half[1], half[2])), half[1], rng.uniform(20, 70)
-        pose = placed(foot[0], -up, z, yaw=yaw)
-        out.append((Part(shape, pose, m.paint(0.8 * size)), foot))
-    return out
-
-
-def _interior(rng: Random, m: Materials, half_width: float) -> list[Part]:
-    """Floor with tiles, papered back wall with a picture, and two side walls."""
-    tiles = Panels((0.6, 0.6), (0.965, 0.965), (0.60, 0.50, 0.40), variation=0.25)
-    paper = Panels((0.5, 9.0), (0.5, 1.0), (0.62, 0.64, 0.56))
-    side = 0.94 * half_width * _WALL
-    picture = placed(rng.uniform(-0.5, 0.5) * side, -1.65, _WALL - 0.02)
-    return [
-        floor(m.plain(((0.36, 0.30, 0.25), (0.30, 0.26, 0.22)), 0.7, tiles)),
-        backdrop(_WALL, m.wall(0.9, paper)),
-        Part(Plane(), placed(-side, 0, 0, yaw=-90), m.wall(0.9)),
-        Part(Plane(), placed(side, 0, 0, yaw=90), m.wall(0.9)),
-        Part(Box((0.55, 0.4, 0.02)), picture, m.paint(0.3)),
-    ]
-
-
-def _room(rng: Random, half_width: float, half_height: float) -> Scene:
+def _room(rng: Random, half_width: float, half_height: float, seed: int) -> Scene:
     """camera moving sideways, three independently moving objects among furniture"""
     m = Materials(rng)
-    objects = _objects(rng, m, _FRONT + _BACK, half_width)
+    objects = furniture(rng, m, FRONT + BACK, half_width)
     moving = [rng.integers(3), *(3 + rng.permutation(4)[:2])]
     rest = [part for k, (part, _) in enumerate(objects) if k not in moving]
-    bodies = [Body((*_interior(rng, m, half_width), *rest))]
+    bodies = [Body((*interior(rng, m, half_width), *rest))]
     for rank, k in enumerate(moving):
         part, foot = objects[k]
         shift = np.array([sign(rng), 0, sign(rng)]) * rng.uniform([0.03, 0, 0.01], [0.06, 0, 0.06])
@@ -193,7 +132,7 @@ def _room(rng: Random, half_width: float, half_height: float) -> Scene:
     return Scene(tuple(bodies), *view)
 
 
-def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
+def _sheet(rng: Random, half_width: float, half_height: float, seed: int) -> Scene:
     """a bending, non-rigid sheet at about 1 m before a wall"""
     m = Materials(rng)
     bend, change = sign(rng) * rng.uniform(0.7, 1.0), sign(rng) * rng.uniform(0.15, 0.25)
@@ -220,11 +159,11 @@ def _sheet(rng: Random, half_width: float, half_height: float) -> Scene:
     return Scene(bodies, *view)
 
 
-def _orbit(rng: Random, half_width: float, half_height: float) -> Scene:
+def _orbit(rng: Random, half_width: float, half_height: float, seed: int) -> Scene:
     """camera orbiting a still life; one rigid motion"""
     m = Materials(rng)
-    objects = _objects(rng, m, _FRONT + _BACK, half_width)
-    bodies = [Body(tuple(_interior(rng, m, half_width)))]
+    objects = furniture(rng, m, FRONT + BACK, half_width)
+    bodies = [Body(tuple(interior(rng, m, half_width)))]
     bodies += [Body((part,)) for k, (part, _) in enumerate(objects)]
     pose = placed(0, -1.45, 0, pitch=-9)
     turn = [0, sign(rng) * rng.uniform(1.2, 2.0), 0]
@@ -232,26 +171,26 @@ def _orbit(rng: Random, half_width: float, half_height: float) -> Scene:
     return Scene(tuple(bodies), inverse(pose), inverse(around @ pose))
 
 
-def _still(rng: Random, half_width: float, half_height: float) -> Scene:
+def _still(rng: Random, half_width: float, half_height: float, seed: int) -> Scene:
     """camera at rest, one moving object"""
     m = Materials(rng)
-    objects = _objects(rng, m, _FRONT + _BACK, half_width)
+    objects = furniture(rng, m, FRONT + BACK, half_width)
     mover = int(rng.integers(3))
     part, foot = objects.pop(mover)
     turn = [0, sign(rng) * rng.uniform(3, 6), 0]
     shift = [sign(rng) * rng.uniform(0.05, 0.09), 0, rng.uniform(-0.08, 0.08)]
     bodies = (
-        Body((*_interior(rng, m, half_width), *(p for p, _ in objects))),
+        Body((*interior(rng, m, half_width), *(p for p, _ in objects))),
         Body((part,), about(foot, turn, shift)),
     )
     pose = inverse(placed(0, -1.35, 0, pitch=-9))
     return Scene(bodies, pose, pose)
 
 
-def _banner(rng: Random, half_width: float, half_height: float) -> Scene:
+def _banner(rng: Random, half_width: float, half_height: float, seed: int) -> Scene:
     """a banner that bends, standing in a rigid room before a moving camera"""
     m = Materials(rng)
-    rest = [part for part, _ in _objects(rng, m, _BACK, half_width)]
+    rest = [part for part, _ in furniture(rng, m, BACK, half_width)]
     bend, change = sign(rng) * rng.uniform(0.5, 0.8), sign(rng) * rng.uniform(0.12, 0.25)
     axis = rng.uniform(-0.2, 0.2)
     z, up = 3.5, 0.81  # its foot is on the floor, in the image
@@ -267,7 +206,7 @@ def _banner(rng: Random, half_width: float, half_height: float) -> Scene:
     cloth = Part(shape, pose, m.paint(0.25, dots), glow=0.4)
     turn, shift = rng.uniform(-0.5, 0.5, 3), rng.uniform(-0.015, 0.015, 3)
     bodies = (
-        Body((*_interior(rng, m, half_width), *rest)),
+        Body((*interior(rng, m, half_width), *rest)),
         Body((cloth,), about([x, 0, z], turn, shift)),
     )
     side = sign(rng)
@@ -279,13 +218,14 @@ def _banner(rng: Random, half_width: float, half_height: float) -> Scene:
     return Scene(bodies, *view)
 
 
-_LAYOUTS: dict[str, tuple[Callable[[Random, float, float], Scene], float]] = {
+_LAYOUTS: dict[str, tuple[Callable[[Random, float, float, int], Scene], float]] = {
     "street": (_street, 0.9),
     "room": (_room, 0.8),
     "sheet": (_sheet, 0.9),
     "orbit": (_orbit, 0.8),
     "still": (_still, 0.8),
     "banner": (_banner, 0.8),
+    **everyday.LAYOUTS,
 }
 """Layout and focal length (in image widths) of each scene. New ones go last: places are seeds."""
 

@@ -61,10 +61,10 @@ GLASS: Colour = (0.16, 0.20, 0.26)
 
 
 class Materials:
-    """Textures with a new noise for each surface."""
+    """Textures with a new noise for each surface; `contrast` scales that of them all."""
 
-    def __init__(self, rng: Random) -> None:
-        self.rng = rng
+    def __init__(self, rng: Random, contrast: float = 1.0) -> None:
+        self.rng, self.contrast = rng, contrast
         self.paints = [PAINTS[i] for i in rng.permutation(len(PAINTS))]
 
     def plain(
@@ -75,7 +75,8 @@ class Materials:
         contrast: float = 0.45,
     ) -> Texture:
         """A given pair of colours."""
-        return Texture(colours, cell, contrast, int(self.rng.integers(2**31)), panels)
+        seed = int(self.rng.integers(2**31))
+        return Texture(colours, cell, self.contrast * contrast, seed, panels)
 
     def paint(self, cell: float, panels: Panels | None = None) -> Texture:
         """The next colour of the palette."""

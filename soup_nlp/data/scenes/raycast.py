@@ -50,12 +50,14 @@ class Part:
         scene_from_part: (4, 4) rigid pose at the reference time.
         texture: Colours by material coordinates.
         glow: Share of the colour that does not depend on the light; 1 for no shading (sky).
+        motion: (4, 4) motion of its own in scene coordinates, before that of its body (a limb).
     """
 
     shape: Shape
     scene_from_part: Float
     texture: Texture
     glow: float = 0.45
+    motion: Float = field(default_factory=lambda: np.eye(4))
 
     def colour(self, points: Float, footprint: Float, frame: int) -> FloatMap:
         """Colours (N, 3) of points (N, 3) in part coordinates; shading moves with the surface."""
@@ -78,6 +80,11 @@ class Body:
 
     parts: tuple[Part, ...]
     motion: Float = field(default_factory=lambda: np.eye(4))
+
+    @property
+    def bends(self) -> bool:
+        """Whether it has no rigid motion: a part bends, or its parts move differently."""
+        return any(not p.shape.rigid or (p.motion != np.eye(4)).any() for p in self.parts)
 
 
 @dataclass(frozen=True)
@@ -111,15 +118,16 @@ class Scene:
         poses = []
         for body in self.bodies:
             view = self.next_from_scene @ body.motion if frame else self.ref_from_scene
-            poses += [view @ part.scene_from_part for part in body.parts]
+            for part in body.parts:
+                own = view @ part.motion if frame else view
+                poses.append(own @ part.scene_from_part)
         return np.array(poses)
 
     def motions(self) -> Float:
         """(B, 4, 4) next_from_ref of each body, camera motion included; NaN where not rigid."""
         scene_from_ref = inverse(self.ref_from_scene)
         out = np.array([self.next_from_scene @ b.motion @ scene_from_ref for b in self.bodies])
-        bends = [not all(part.shape.rigid for part in body.parts) for body in self.bodies]
-        out[bends] = np.nan
+        out[[b.bends for b in self.bodies]] = np.nan
         return out
 
     def trace(self, K: Float, uv: Float, frame: int) -> tuple[Float, Int]:
@@ -150,9 +158,9 @@ def advanced(scene: Scene, steps: int) -> Scene:
     """The scene some frames later; camera and bodies repeat their motion between the first frames.
 
     Raises:
-        DataError: a shape bends; bending is defined for the first two frames only.
+        DataError: a body bends; bending is defined for the first two frames only.
     """
-    if steps and not all(part.shape.rigid for part in scene.parts):
+    if steps and any(body.bends for body in scene.bodies):
         raise DataError("a scene that bends has two frames", found=f"frame {steps}", expected="0")
     go_on = scene.next_from_scene @ inverse(scene.ref_from_scene)
     ref = np.linalg.matrix_power(go_on, steps) @ scene.ref_from_scene

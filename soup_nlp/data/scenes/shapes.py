@@ -151,6 +151,32 @@ class Sphere(Shape):
 
 
 @dataclass(frozen=True)
+class Ellipsoid(Shape):
+    """An ellipsoid around the origin.
+
+    Attributes:
+        half: Half axes along x, y and z, unit of length.
+    """
+
+    half: tuple[float, float, float]
+
+    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
+        """See `Shape`: a sphere in coordinates divided by the half axes."""
+        half = np.asarray(self.half)
+        return Sphere(1.0).intersect(origin / half, rays / half, frame)
+
+    def normals(self, points: Float, frame: int) -> Float:
+        """See `Shape`."""
+        n = points / np.square(self.half)
+        out: Float = n / np.linalg.norm(n, axis=1, keepdims=True)
+        return out
+
+    def corners(self) -> Float:
+        """See `Shape`."""
+        return _corner_points(self.half)
+
+
+@dataclass(frozen=True)
 class Sheet(Shape):
     """A rectangular sheet bent into a circular cylinder, differently in each frame, isometrically.
 
