@@ -1,4 +1,4 @@
-"""Accuracy of pairs: contents of rows, storage of rows, metric conventions."""
+"""Accuracy of pairs: contents of rows, storage of rows, metric conventions, the page."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from helpers_rows import fake_row
 
-from soup_nlp.bench.accuracy import input_hash, moving, pair_job, row_identity, settings_hash
-from soup_nlp.bench.accuracy_table import report
-from soup_nlp.bench.depth_maps import METHODS
+from soup_nlp.bench.accuracy import measure_pair, moving
+from soup_nlp.bench.accuracy_page import suite_page
+from soup_nlp.bench.depth_maps import BASELINES, METHODS
+from soup_nlp.bench.published import COMPARISON, published
+from soup_nlp.bench.study import Cell, frame_of, input_hash, settings_hash
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.cli.main import main
@@ -45,13 +47,18 @@ def item(scene: str = "orbit", flow: str = "truth", seed: int = 0) -> Item:
     return Item("rendered", scene, f"{scene}-{seed}", flow, raw, ("paper", "best"))
 
 
-def row_of(job: Job) -> Row:
-    return {**job.name, **job.work()}
+def row_of(item: Item, overrides: tuple[str, ...]) -> Row:
+    job = Cell(item, overrides).job(measure_pair)
+    return {**job.name, **job.work(), "code": "c"}
+
+
+def text_of(*rows: Row) -> str:
+    return suite_page("T", frame_of(rows))
 
 
 @pytest.fixture(scope="module")
 def orbit_row():
-    return row_of(pair_job(item(), QUICK))
+    return row_of(item(), QUICK)
 
 
 def test_a_row_has_every_number(orbit_row):
@@ -62,27 +69,26 @@ def test_a_row_has_every_number(orbit_row):
         table = row["metrics"][convention]
         assert set(table) == set(METHODS)
         assert table["constant"]["skill"] == 0.0
-        assert table["floor"]["mre"] <= table["plane"]["mre"] + 1e-9
         # one rigid motion with the true flow is exact on a scene of one component
         assert table["rigid"]["mre"] < 1e-3
-        assert table["floor"]["mre"] <= table["solution"]["mre"] + 1e-9
-        assert table["plane"]["mre"] <= table["constant"]["mre"] + 1e-9
-    for method in ("solution", "start", "plane"):
+    for method in ("solution", "start"):
         best = row["metrics"]["best"][method]["mre"]
         assert best <= row["metrics"]["paper"][method]["mre"] + 1e-12
     assert row["flow_error"]["mean"] < 1e-5
     assert row["scene_flow"]["coverage"] == 1.0
-    assert set(row["energy"]) == {"start", "nlp", "solution", "truth"}
+    assert set(row["energy"]) == {"start", "nlp", "solution"}
+    assert 0 <= row["guess"] <= 1
+    assert 0 <= row["within"][0] <= row["within"][1] <= 1
 
 
 def test_a_pair_that_fails_is_a_row():
-    row = row_of(pair_job(item(), (*QUICK, "segmentation.neighbours=99")))
+    row = row_of(item(), (*QUICK, "segmentation.neighbours=99"))
     assert not row["ok"]
     assert "K-NN" in row["error"]
-    wrong = row_of(pair_job(item(), ("segmentation.superpixel=3",)))
+    wrong = row_of(item(), ("segmentation.superpixel=3",))
     assert not wrong["ok"]
     assert wrong["settings"] == "wrong"
-    text = report("T", [{**row, "code": "c"}])
+    text = text_of(row)
     assert "0 of 1 pairs measured" in text
     assert "K-NN" in text
 
@@ -95,7 +101,7 @@ def test_a_pair_without_truth_is_a_row_that_failed(tmp_path):
     raw = {"kind": "folder", "path": str(tmp_path)}
     needs = (tmp_path / "frame_0.png",)
     pair = Item("kinect_paper", "s", "p", "dis", raw, ("eigen80", "paper"), needs)
-    row = row_of(pair_job(pair, QUICK))
+    row = row_of(pair, QUICK)
     assert not row["ok"]
     assert "pair has no true depth" in row["error"]
     assert SUITES["kinect_paper"].layout in row["error"]
@@ -113,7 +119,8 @@ def test_settings_hash_is_the_same_on_every_pair():
 def test_input_hash_is_of_the_frames_not_of_their_place():
     def head_at(root: str, *overrides: str) -> Row:
         raw = {"kind": "sintel", "root": root, "scene": "alley_1", "frame": 2}
-        return row_identity(Item("sintel", "alley_1", "alley_1-0002", "dis", raw), overrides)
+        pair = Item("sintel", "alley_1", "alley_1-0002", "dis", raw)
+        return Cell(pair, overrides).identity()
 
     here, final = head_at("/a"), head_at("/a", "input.render=final")
     assert here == head_at("/b")
@@ -193,10 +200,12 @@ def test_rows_are_kept_and_failed_ones_measured_again(tmp_path):
 
 
 def test_a_job_whose_folder_is_gone_is_stale(tmp_path):
-    assert pair_job(item(), folder=tmp_path).stale
-    (tmp_path / "summary.json").touch()
-    assert not pair_job(item(), folder=tmp_path).stale
-    assert not pair_job(item()).stale
+    def stale(keep: Path | None) -> bool:
+        return Cell(item(), keep=keep).job(measure_pair).stale
+
+    assert stale(tmp_path / "gone")
+    assert not stale(tmp_path)
+    assert not stale(None)
 
 
 def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
@@ -253,3 +262,54 @@ def test_command_line(tmp_path, capsys):
     assert main(["bench", "accuracy", "--suite", "imagenet"]) == 2
     assert main([*words, "--preset", "eigen"]) == 2
     assert main(["bench", "accuracy", "--suite", "rendered", "--seeds", "a"]) == 2
+
+
+def solved(suite: str, convention: str = "paper", pair: str = "p") -> Row:
+    """A row of one convention, without a solve."""
+    metrics = {
+        "solution": {"mre": 0.03, "skill": 0.25, "coverage": 1.0},
+        "constant": {"mre": 0.04, "coverage": 1.0},
+    }
+    return {
+        **{"key": pair, "ok": True, "good": True, "suite": suite, "pair": pair, "error": None},
+        **{"sequence": "s", "flow": "dis", "presets": [convention], "status": "x", "code": "c"},
+        **{"metrics": {convention: metrics}, "cpu_seconds": 1.0, "settings": "0"},
+        "energy": {"solution": {"total": 1.0}},
+    }
+
+
+def test_every_pair_is_in_the_details_of_its_own_convention():
+    text = text_of(solved("shared"), solved("shared", "kitti", "q"))
+    detail = text.split("## The solution, ")[1:]
+    assert [part.partition(":")[0] for part in detail] == ["paper", "kitti"]
+    assert "| p, dis |" in detail[0]
+    assert "| q, dis |" in detail[1]
+    assert "the scale is the median of z_gt / z" in text_of(solved("kitti2015", "eigen80"))
+
+
+def test_published_numbers_are_marked():
+    assert published("kitti2015")[0] == dict(COMPARISON["kitti"])
+    assert published("rendered") == ({}, "")
+    row = solved("kinect_paper")
+    text = text_of(row)
+    assert "| BMM (published) | 0.0322 |" in text
+    assert "(measured) | 0.0300 |" in text
+    assert "beats every baseline on 1 of 1" in text
+    # of the pairs that have a number, under the name of the convention, on what data
+    failed = {**solved("kitti2015", "kitti"), "metrics": {}, "ok": False, "error": "out of luck"}
+    text = text_of(solved("kitti2015", "kitti"), failed)
+    assert "| this program, flow dis, kitti, 1 pair (measured) | 0.0300 |" in text
+    assert "odometry set 00-09 with LiDAR truth" in text
+    assert "\n\n## Failed\n" in text
+
+
+def test_one_rigid_motion_is_compared_on_its_own_pixels():
+    row = solved("shared")
+    metrics = row["metrics"]["paper"]
+    metrics |= {"rigid": {"mre": 0.025, "coverage": 0.6}, "solution_rigid": {"mre": 0.02}}
+    assert "beats every baseline on 1 of 1" in text_of(row)
+    metrics["solution_rigid"]["mre"] = 0.026
+    text = text_of(row)
+    assert "beats every baseline on 0 of 1" in text
+    assert "| p, dis | paper | rigid | 0.0250 | 0.0260 | 60.0% | -0.0010 |" in text
+    assert set(BASELINES) <= set(METHODS)

@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from soup_nlp.bench import paper_plan
 from soup_nlp.bench.departures import DEPARTURES, PAPER, default
-from soup_nlp.bench.paper_measures import measure, read_maps
-from soup_nlp.bench.paper_pairs import DATASETS
-from soup_nlp.bench.paper_plan import METHODS, SECTIONS, Sizes, make_plan
-from soup_nlp.bench.paper_scale import (
-    KINDS,
-    SCALES,
-    measure_scale,
-    scale_of_least_energy,
-    with_motions,
-)
-from soup_nlp.bench.paper_sections import TEXTS
+from soup_nlp.bench.paper import DATASETS, METHODS, SECTIONS, Sizes, make_plan, measure_paper
+from soup_nlp.bench.paper_page import PICTURES
+from soup_nlp.bench.studies import STUDIES
 from soup_nlp.bench.suite_pairs import Item
+from soup_nlp.cli import bench_paper
 from soup_nlp.cli.main import main
 from soup_nlp.config.presets import PRESETS, leaves
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.inputs import SceneInput
 from soup_nlp.errors import DataError
 from soup_nlp.storage.rows import Row
 
@@ -72,7 +62,7 @@ def test_a_departure_changes_the_defaults_and_the_preset(departure):
             assert own == printed
 
 
-def fake(job: Item, overrides: tuple[str, ...] = (), variant: str = "", *, maps=None) -> Row:
+def fake(job: Item, overrides: tuple[str, ...] = (), maps: Path | None = None) -> Row:
     """A row whose numbers identify its cell."""
     if any("orient" in o for o in overrides) and job.suite == "shared":
         raise DataError("made to fail", where=job.key)
@@ -91,18 +81,12 @@ def fake(job: Item, overrides: tuple[str, ...] = (), variant: str = "", *, maps=
         "metrics": {p: dict.fromkeys(methods, told) for p in job.presets},
         "rmse": 3.0,
         "curve": {
-            "stages": [{"name": "presolve", "objective": [3.0, 2.0, 1.5]}],
+            "names": ["presolve"],
+            "values": [[3.0, 2.0, 1.5]],
             "exact": [4.0, 2.0],
             "rounds": [2.0, 1.0],
         },
     }
-
-
-def fake_scale(job: Item, overrides: tuple[str, ...] = (), variant: str = "") -> Row:
-    """One body whose E_arap is lowest at twice its scale, all other energies at the truth."""
-    curves = {kind: list(np.abs(np.log(SCALES))) for kind in KINDS}
-    curves["arap"] = list(np.abs(np.log(SCALES / 2)))
-    return {"metrics": {}, "bodies": [{"superpixels": 9, "curves": curves}], "superpixels": 40}
 
 
 @pytest.fixture
@@ -119,38 +103,34 @@ def dataset(tmp_path: Path) -> Path:
     return tmp_path / "data"
 
 
-@pytest.mark.slow
 def test_a_tiny_dataset_gives_all_sections(dataset, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(paper_plan, "measure", fake)
-    monkeypatch.setattr(paper_plan, "measure_scale", fake_scale)
+    monkeypatch.setattr(bench_paper, "measure_paper", fake)
     out = tmp_path / "out"
     words = ["bench", "paper", "--data", str(dataset), "-o", str(out), "-q", "--width", "128"]
-    words += ["--families", "street,kinect_paper,motorcycle", "--seeds", "0"]
+    words += ["--families", "street,kinect_paper,motorcycle"]
     words += ["--departures", "street,rgbd,sheet"]
-    assert main([*words, "--numbers", "50,100"]) == 1
+    assert main(words) == 1
     text = (out / "README.md").read_text()
-    for section in [*TEXTS.values(), "Mean relative error per dataset", "Depth maps", "Time"]:
-        assert f"## {section}" in text
-    for section in ("Convergence of E", "Departures, one at a time", "Does ARAP alone"):
+    for name in SECTIONS:
+        assert f"## {STUDIES[name].text[0].upper()}{STUDIES[name].text[1:]}" in text
+    for section in ("Mean relative error per dataset", "Depth maps", "Time", "Convergence of E"):
         assert f"## {section}" in text
     # a family without data has no column
     columns = "mean | median | worse / better | street-s0-128x54 | sheet-s0-128x54"
     assert f"| departure | {columns} |" in text
-    pictures = {*SECTIONS, "comparison", "depth_maps", "convergence", "departures", "scale"}
-    assert {p.stem for p in out.glob("*.png")} == pictures
-    assert all(f"]({name}.png)" in text for name in pictures)
+    assert {p.stem for p in out.glob("*.png")} == set(PICTURES)
+    assert all(f"]({name}.png)" in text for name in PICTURES)
     # the pair with a truth alone, beside the published row
-    assert "| kinect_paper | 0.2040 | 0.0920 | 0.0322 | 0.0520 | - | 0.0472 | 1 | 0.5000 |" in text
+    published = "0.2040 | 0.0920 | 0.0322 | 0.0520 | - | 0.0472 | - | 1 | 0.5000"
+    assert f"| kinect_paper | {published} |" in text
     # how each NLP ended stands beside its numbers
-    assert "| 0.5000 | 0.2500 | yes |" in text
+    assert "| preset: paper | 0.5000 | 0.5000 | 0.5000 | 0.5000 | Solve_Succeeded |" in text
     # datasets that are not there say where they come from
     missing = text[text.index("## What is not here") :]
-    for d in DATASETS:
-        assert (d.title in missing) == (d.name != "kinect_paper")
+    for name, (title, _, _) in DATASETS.items():
+        assert (f"| {title} |" in missing) == (name != "kinect_paper")
     assert "http://sintel.is.tue.mpg.de" in missing
     assert "Back sequence" in missing
-    # the honest sentence is counted from the rows: two scenes of one body each
-    assert "for 0 of 2 bodies (in pixels: 2); that of E_cont for 2" in text
     assert "made to fail" in text
     rows = [json.loads(line) for line in (out / "paper.jsonl").read_text().splitlines()]
     good = sum(row["ok"] for row in rows)
@@ -159,54 +139,23 @@ def test_a_tiny_dataset_gives_all_sections(dataset, tmp_path, monkeypatch, capsy
     capsys.readouterr()
 
 
-def test_a_plan_measures_nothing_twice():
-    plan = make_plan(None, Sizes(superpixels=60, analysis=60, families=("street",)))
-    names = [json.dumps(dict(job.name), sort_keys=True) for job in plan.jobs(Path("out"))]
+def test_a_plan_measures_nothing_twice(tmp_path):
+    plan = make_plan(None, Sizes(superpixels=60, analysis=60, families=("street",)), tmp_path)
+    names = [json.dumps(cell.identity(), sort_keys=True) for cell in plan.cells()]
     assert len(names) == len(set(names))
     assert all(not group for group in plan.datasets.values())
-    for method in METHODS:
-        for section in SECTIONS:
-            assert plan.variants(section, plan.analyses[0], method)
+    for section in SECTIONS:
+        assert {method for method, _, _ in plan.sections[section]} == set(METHODS)
 
 
-@pytest.mark.slow
 def test_a_row_has_energies_on_the_way_and_small_maps(tmp_path):
-    row = measure(item(), (*PAPER, *QUICK), maps=tmp_path / "maps" / "a.npz")
+    path = tmp_path / "maps" / "a.npz"
+    row = measure_paper(item(), (*PAPER, *QUICK), path)
     json.dumps(row["curve"], allow_nan=False)
     assert len(row["curve"]["rounds"]) == 2
     assert row["curve"]["rounds"][1] <= row["curve"]["rounds"][0]
-    assert all(stage["objective"] for stage in row["curve"]["stages"])
+    assert all(row["curve"]["values"])
     assert row["rmse"] > 0
-    maps = read_maps(tmp_path / "maps" / "a.npz")
-    assert set(maps) == {"image", "truth", "start", "solution"}
-    assert maps["image"].shape == (64, 128, 3)
-    assert read_maps(tmp_path / "none.npz") == {}
-
-
-def test_energies_over_the_scale_of_a_body():
-    """At scale 1 the energies are those of the truth, and E_cont of touching bodies is lowest."""
-    row = measure_scale(item("street", 256, 112), ("segmentation.superpixels=250",))
-    assert row["bodies"]
-    for body in row["bodies"]:
-        assert set(body["curves"]) == set(KINDS)
-        assert all(len(c) == len(SCALES) and np.isfinite(c).all() for c in body["curves"].values())
-        assert 0.25 <= scale_of_least_energy(body["curves"]["cont"]) <= 4.0
-    assert SCALES[len(SCALES) // 2] == pytest.approx(1.0)
-    with pytest.raises(DataError, match="no moving component"):
-        measure_scale(item("orbit"), ("segmentation.superpixels=40",))
-
-
-def test_motions_of_bodies_follow_from_true_depth_and_flow():
-    """PnP finds the motions of a rendered scene for every piece of the mask."""
-    pair = SceneInput(kind="scene", scene="street", width=256, height=112).load(Path)
-    with pytest.raises(DataError, match="mask of what moves"):
-        with_motions(replace(pair, truth=None))
-    assert with_motions(pair) is pair
-    found = with_motions(replace(pair, truth=replace(pair.truth, motions=None))).truth
-    counts = np.bincount(found.components[found.components >= 0])
-    large = np.flatnonzero(counts > 300)
-    assert len(large) > 2
-    for c in large:
-        own = np.unique(pair.truth.components[found.components == c])
-        assert len(own) == 1
-        assert np.allclose(found.motions[c], pair.truth.motions[own[0]], atol=0.02)
+    with np.load(path) as maps:
+        assert set(maps.files) == {"image", "truth", "start", "solution"}
+        assert maps["image"].shape == (64, 128, 3)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers_truth import majority
 
-from soup_nlp.bench.truth import true_soup
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.pair import Pair
@@ -74,7 +74,7 @@ def test_sheet_bends_and_can_be_told_not_to():
 
 def test_what_bends_is_found_beside_rigid_surfaces():
     c = case("banner")
-    start, true = c.start, true_soup(c.pair, c.segmentation).component
+    start, true = c.start, majority(c.pair.truth, c.segmentation)[0]
     assert 0.2 < start.bends.mean() < 0.5
     np.testing.assert_array_less(0.93, np.mean(start.bends == (true == 1)))
     # it is one component without shared motions; the rest has those of a rigid scene
@@ -234,7 +234,7 @@ def test_little_holds_surfaces_together_across_discontinuities(ratio, graph, col
     expected = np.where(apart, ratio, 1.0) * getattr(other.data, column)
     np.testing.assert_allclose(getattr(c.data, column), expected, rtol=1e-12)
     # the discontinuities are the outline of the sheet
-    component = true_soup(c.pair, c.segmentation).component
+    component = majority(c.pair.truth, c.segmentation)[0]
     assert (component[i] != component[k])[apart].mean() > 0.9
     rigid = [getattr(case("street", *over).data, column) for over in ((), ACROSS)]
     np.testing.assert_array_equal(*rigid)

@@ -15,7 +15,8 @@ import pytest
 from helpers_model import PAPER, Tiny
 
 from soup_nlp.bench.processes import isolated
-from soup_nlp.bench.solvers.page import page
+from soup_nlp.bench.solvers.page import frame_of_runs
+from soup_nlp.bench.solvers.page import page as page_of
 from soup_nlp.bench.solvers.plugins import PLUGINS
 from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profiles, profile
 from soup_nlp.bench.solvers.registry import available, find_solver
@@ -217,6 +218,10 @@ def row(problem: str, solver: str, seconds: float, energy: float, verified: bool
     }  # fmt: skip
 
 
+def page(rows: list[dict]) -> str:
+    return page_of(frame_of_runs(rows))
+
+
 ROWS = [
     row("a", "one", 1.0, 4.0), row("a", "two", 2.0, 3.0), row("a", "three", 0.1, 1.0, False),
     row("b", "one", 6.0, 4.0), row("b", "two", 3.0, 4.0),
@@ -224,22 +229,22 @@ ROWS = [
 
 
 def test_profiles_by_hand():
-    problems, solvers, cost = cost_table(ROWS, "time")
-    assert (len(problems), solvers) == (2, ["one", "three", "two"])
-    steps, share = profile(cost)
-    assert steps.tolist() == [1, 2]
+    cost = cost_table(frame_of_runs(ROWS), "seconds")
+    assert (len(cost), list(cost)) == (2, ["one", "three", "two"])
+    share = profile(cost)
+    assert share.index.tolist() == [1, 2]
     # each wins one problem; both solve all within twice the best; a false claim solves none
-    assert share.tolist() == [[0.5, 0, 0.5], [1, 0, 1]]
-    steps, share = profile(cost_table(ROWS, "energy")[2])
-    assert steps.tolist() == [1, 4 / 3]
-    assert share.tolist() == [[0.5, 0, 1], [1, 0, 1]]
+    assert share.to_numpy().tolist() == [[0.5, 0, 0.5], [1, 0, 1]]
+    share = profile(cost_table(frame_of_runs(ROWS), "energy"))
+    assert share.index.tolist() == [1, 4 / 3]
+    assert share.to_numpy().tolist() == [[0.5, 0, 1], [1, 0, 1]]
 
 
 def test_profile_of_nothing_solved():
     failed = [row("a", "one", 1.0, 2.0, False)]
-    steps, share = profile(cost_table(failed, "time")[2])
-    assert steps.tolist() == [1]
-    assert share.tolist() == [[0]]
+    share = profile(cost_table(frame_of_runs(failed), "seconds"))
+    assert share.index.tolist() == [1]
+    assert share.to_numpy().tolist() == [[0]]
     assert "none is verified" in page(failed)
 
 
@@ -247,8 +252,9 @@ def test_page_and_pictures(tmp_path):
     text = page(ROWS)
     assert text.index("**2 problems") < text.index("## By run") < text.index("## Limits")
     assert "a / b" in text
-    draw_profiles(tmp_path / "p.png", ROWS)
-    draw_curves(tmp_path / "c.png", ROWS)
+    frame = frame_of_runs(ROWS)
+    draw_profiles(tmp_path / "p.png", {"": frame}, ("seconds", "energy"))
+    draw_curves(tmp_path / "c.png", frame)
     assert (tmp_path / "p.png").stat().st_size > 5000
     assert (tmp_path / "c.png").stat().st_size > 5000
 

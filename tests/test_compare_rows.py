@@ -8,17 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from helpers_model import PAPER, Tiny
-from test_compare import LABEL, MANY, PROBLEMS, ROWS, row
+from test_compare import LABEL, MANY, PROBLEMS, ROWS, page, row
 
 from soup_nlp.bench.processes import isolated
-from soup_nlp.bench.solvers.page import conclusion, page
-from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profile, draw_profiles
+from soup_nlp.bench.solvers.page import conclusion, frame_of_runs
+from soup_nlp.bench.solvers.profiles import _draw_profile, cost_table, draw_curves, draw_profiles
 from soup_nlp.bench.solvers.registry import executable, find_solver, reference
 from soup_nlp.bench.solvers.runner import compare
 from soup_nlp.bench.solvers.task import Answer, Task
-from soup_nlp.bench.tables import figure
+from soup_nlp.bench.study import figure
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError, SolverError
@@ -73,7 +74,7 @@ def test_the_start_is_not_the_answer_of_a_solver_that_gave_none(task, tmp_path, 
     assert found["status"] == "Time_Limit"
     assert not found["claimed"]
     assert not {"energy", "primal", "dual", "complementarity"} & set(found)
-    assert not any("lowest exact energy" in line for line in conclusion([found]))
+    assert not any("lowest exact energy" in line for line in conclusion(frame_of_runs([found])))
     assert "| - | - | - | - |" in page([found]).replace(f"{found['energy_start']:.6g}", "-")
 
 
@@ -153,8 +154,8 @@ def test_the_reason_of_a_failure_is_kept(tmp_path):
 
 def test_problems_of_one_name_are_told_apart():
     rows = [*ROWS, row("b", "two", 9.0, 2.0) | {"problem_hash": "1"}]
-    problems, _, cost = cost_table(rows, "time")
-    assert [p.problem for p in problems] == ["a", "b", "b"]
+    cost = cost_table(frame_of_runs(rows), "seconds")
+    assert [key[0] for key in cost.index] == ["a", "b", "b"]
     assert np.isfinite(cost).sum(axis=1).tolist() == [2, 2, 1]
     assert "**3 problems" in page(rows)
 
@@ -163,14 +164,17 @@ def test_pictures_of_nothing_verified_say_nothing(tmp_path):
     failed = [row("a", "one", 1.0, 2.0, False) | {"curve": []}]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        draw_profiles(tmp_path / "p.png", failed)
-        draw_curves(tmp_path / "c.png", failed)
+        frame = frame_of_runs(failed)
+        draw_profiles(tmp_path / "p.png", {"": frame}, ("seconds", "energy"))
+        draw_curves(tmp_path / "c.png", frame)
 
 
 def test_a_profile_names_the_solvers_that_solve_nothing():
     axes = figure(4, 3).subplots()
-    share = np.array([[1.0, 0.0, 0.0], [1.0, 0.5, 0.0]])
-    draw_profile(axes, "time", 2, ["one", "two", "three"], np.array([1.0, 2.0]), share)
+    share = pd.DataFrame(
+        [[1.0, 0.0, 0.0], [1.0, 0.5, 0.0]], index=[1.0, 2.0], columns=["one", "two", "three"]
+    )
+    _draw_profile(axes, "seconds", 2, share)
     told = [text.get_text() for text in axes.get_legend().get_texts()]
     assert told == ["one", "two", "none by three"]
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_truth import cropped
 
-from soup_nlp.bench.pair_views import cropped
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera

@@ -10,15 +10,9 @@ import numpy as np
 import pytest
 
 from soup_nlp.bench.solvers import family_runs
-from soup_nlp.bench.solvers.family_runs import (
-    draw_family,
-    family_page,
-    groups,
-    neutral,
-    reached,
-    summary,
-)
-from soup_nlp.bench.solvers.profiles import draw_curves
+from soup_nlp.bench.solvers.family_runs import neutral, summary
+from soup_nlp.bench.solvers.page import by_start, frame_of_runs, page, reached
+from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.export.verify import Limits
@@ -47,23 +41,24 @@ ROWS = [
 
 
 def test_a_minimum_is_reached_when_it_is_verified_and_near():
-    assert [reached(r) for r in ROWS] == [True, True, False, False, True]
+    assert reached(frame_of_runs(ROWS)).tolist() == [True, True, False, False, True]
     # lower than what was known is reached as well
-    assert reached(row("one", "easy", 3.0))
-    assert summary(ROWS) == {
+    assert reached(frame_of_runs([row("one", "easy", 3.0)])).all()
+    assert summary(frame_of_runs(ROWS)) == {
         STUB: {"tried_by": ["one", "two", "three"], "reached_by": ["one", "two"]}
     }
 
 
 def test_rows_belong_to_a_start_and_a_size(tmp_path):
-    assert list(groups(ROWS)) == ["easy, N = 100", "hard, N = 100"]
-    text = family_page(ROWS)
+    frame = frame_of_runs(ROWS)
+    assert list(by_start(frame)) == ["easy, N = 100", "hard, N = 100"]
+    text = page(frame, family=True)
     assert "| one | 1 of 1 (1), 1.0 s | 1 of 1 (0), 1.0 s |" in text
     assert "| three | 0 of 1 (0) | - |" in text
     assert text.index("## By start and size") < text.index("## By run")
-    draw_family(tmp_path / "p.png", ROWS)
+    draw_profiles(tmp_path / "p.png", by_start(frame), ("cpu_seconds", "objective"))
     assert (tmp_path / "p.png").stat().st_size > 5000
-    plain = neutral(ROWS[0])
+    plain = neutral(frame)[0]
     # what the README of the set asks for
     assert {"solver", "name", "n", "m", "status", "objective", "iterations", "time"} <= plain.keys()
     assert (plain["time"], plain["wall_time"], plain["reached"]) == (1.0, 9.0, True)
@@ -124,10 +119,14 @@ def test_curves_of_equal_times_are_drawn(tmp_path):
             "formulation": "unit-offset/smooth/smooth",
             "solver": "mine",
             "energy_start": 2.0,
+            "claimed": False,
+            "status": "x",
+            "iterations": 1,
+            "peak_bytes": 0,
             "energy": 1.0,
             "seconds": times[-1],
             "verified": False,
             "curve": [[t, 1.5] for t in times],
         }
-        draw_curves(tmp_path / "curves.png", [row])
+        draw_curves(tmp_path / "curves.png", frame_of_runs([row]))
         assert (tmp_path / "curves.png").stat().st_size

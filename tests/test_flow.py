@@ -7,13 +7,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import cv2
+import helpers_truth
 import numpy as np
 import pytest
 from helpers_files import write_flo, write_kitti_flow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soup_nlp.bench import pair_views
 from soup_nlp.data.datasets.driving import load_kitti
 from soup_nlp.data.flow import sources as flow_module
 from soup_nlp.data.flow.consistency import leaves, round_trip_error
@@ -253,7 +253,7 @@ def test_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_dis_on_kitti(shared_data: Path) -> None:
     whole = load_kitti("kitti2012", shared_data / "kitti2012", 27)
     # the columns in the middle
-    pair = pair_views.cropped(whole, 350, 0, 350, 0)
+    pair = helpers_truth.cropped(whole, 350, 0, 350, 0)
     assert pair.truth is not None
     assert pair.truth.flow is not None
     flow = resolve_flow(pair, "dis")

@@ -13,7 +13,8 @@ import pytest
 from helpers_chromium import Chromium, find_chromium
 from helpers_result import CAMERA, small_result
 
-from soup_nlp.bench import study_chain
+from soup_nlp.bench import chain as chain_study
+from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.cli.main import main
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.rotation import exp
@@ -278,14 +279,14 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     assert main(call) == 0
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
     # the table of chains has the same numbers
-    monkeypatch.setattr(study_chain, "scratch", lambda: nullcontext(tmp_path / "out"))
-    row = study_chain.measure_chain("street", 3, None, SMALL)
+    monkeypatch.setattr(chain_study, "scratch", lambda: nullcontext(tmp_path / "out"))
+    item = chain_study.sequences(None)[0]
+    row = chain_study.measure_chain(item, SMALL, frames=3)
     assert row["cost"] == told["score"]["cost"]
     assert row["path"] == told["score"]["path"]["share"]
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
-    settings = {"sequence": "street", "frames": 3, "data": None, "overrides": SMALL}
-    study_chain.CHAIN.write(tmp_path, [{**row, "settings": settings}])
-    assert "| street | 3 |" in (tmp_path / "chain.md").read_text()
+    row = {**Cell(item).identity(), "ok": True, "cpu_seconds": 1.0, "code": "c", **row}
+    assert "| street | 3 |" in chain_study.chain_page(frame_of([row]))
     # a file of the user is not overwritten
     (tmp_path / "out" / "chain.json").write_text("mine")
     assert main(call) == 2

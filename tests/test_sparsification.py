@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.bench.confidence import left_out_factors, text_confidence
+from soup_nlp.bench.confidence import confidence_page, plot_confidence
+from soup_nlp.bench.confidence import left_out_factors as factors_of
+from soup_nlp.bench.studies import STUDIES
+from soup_nlp.bench.study import frame_of
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import POWER
 from soup_nlp.evaluate.sparsification import LAST, STEPS, coverage, sparsification
@@ -80,11 +83,12 @@ def row(family: str, pair: str, scale: float, bending: bool = False) -> dict:
         "flow": "dis",
         "variant": "",
         "presets": ["paper"],
+        **{"ok": True, "error": None, "code": "c", "cpu_seconds": 1.0, "key": pair},
         "confidence": {
             "mre": 0.05,
             "solution_90": 0.04,
             "solution_70": 0.03,
-            "ause": {"sigma": 0.2, "flow": 0.5},
+            "ause": {"sigma": 0.2},
             "within": [0.7, 0.9],
             "guess": 0.1,
             "noise": 0.1,
@@ -98,6 +102,10 @@ def row(family: str, pair: str, scale: float, bending: bool = False) -> dict:
             ],
         },
     }
+
+
+def left_out_factors(rows: list[dict]) -> dict:
+    return factors_of(frame_of(rows))
 
 
 def test_the_factor_of_a_family_is_chosen_on_the_others():
@@ -139,10 +147,14 @@ def test_a_pair_of_both_kinds_has_a_factor_for_each():
     assert one == pytest.approx((0.76 + 1.0) / 2, abs=0.03)
 
 
-def test_the_page_has_pairs_and_families():
-    text = text_confidence(
-        "confidence", "what it asks", [row("one", "a", 1.0), row("two", "b", 2.0)]
-    )
-    assert "| a" in text
-    assert "| two (1) |" in text
+def test_the_page_has_pairs_and_families(tmp_path):
+    frame = frame_of([row("one", "a", 1.0), row("two", "b", 2.0)])
+    text = confidence_page(STUDIES["confidence"], frame)
+    assert "| a, dis | 0.0500 | 0.0400 | 0.0300 | 0.20 | 0.70 | 0.90 | 0.10 | 0.50 |" in text
+    assert "| two | 0.0500" in text
     assert "mean of 2 families" in text
+    plot_confidence(tmp_path / "c.png", frame)
+    assert (tmp_path / "c.png").stat().st_size > 5000
+    failed = {**row("one", "a", 1.0), "ok": False, "error": "out of luck"}
+    del failed["confidence"]
+    assert "out of luck" in confidence_page(STUDIES["confidence"], frame_of([failed]))

@@ -11,7 +11,7 @@ from helpers_formulation import form, tiny
 from helpers_model import PAPER, Tiny, weights_for
 
 from soup_nlp.bench.solvers import runner
-from soup_nlp.bench.solvers.page import conclusion
+from soup_nlp.bench.solvers.page import conclusion, frame_of_runs
 from soup_nlp.evaluate import recompute_data
 from soup_nlp.export import verify
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, Residuals
@@ -122,7 +122,7 @@ def test_a_problem_s_lowest_energy_is_that_of_its_own_runs():
         point = {"energy": energy, "primal": 0.0, "seconds": 1.0, "verified": True}
         return {**label, **point, "claimed": True, "problem_hash": problem, "start": "presolve"}
 
-    text = "\n".join(conclusion([row("a", 1.0), row("b", 2.0)]))
+    text = "\n".join(conclusion(frame_of_runs([row("a", 1.0), row("b", 2.0)])))
     assert text.count("lowest exact energy of any run 1 by s") == 1
     assert text.count("lowest exact energy of any run 2 by s") == 1
 

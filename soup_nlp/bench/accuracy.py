@@ -2,38 +2,37 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.bench.depth_maps import depth_maps
+from soup_nlp.bench.study import Overrides
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.bench.suites import SUITES
-from soup_nlp.bench.truth import moves_by_itself, true_soup
-from soup_nlp.config.problem import Problem, dump_problem
-from soup_nlp.data.flow.sources import is_named, is_network
+from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import ERRORS, depth_metrics, scene_flow_epe, skill
+from soup_nlp.evaluate.metrics import (
+    ERRORS,
+    depth_metrics,
+    scene_flow_epe,
+    skill,
+    true_pixels,
+)
 from soup_nlp.evaluate.protocols import Preset, preset
 from soup_nlp.evaluate.scoring import at_truth, surest
-from soup_nlp.model import oracle
+from soup_nlp.evaluate.sparsification import coverage
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.storage.folders import scratch
-from soup_nlp.storage.rows import Job, Row, attempt
-
-Measure = Callable[[Item, tuple[str, ...], str], Row]
+from soup_nlp.storage.rows import Row
 
 KEPT_METRICS = (*ERRORS, "scale", "coverage", "n_pixels")
 """Depth metrics that a row has beside the skill."""
@@ -41,76 +40,17 @@ MIN_PIXELS = 50
 """Moving components with fewer true pixels have no scale in a row."""
 
 
-def pair_job(
-    item: Item,
-    overrides: Sequence[str] = (),
-    variant: str = "",
-    folder: Path | None = None,
-    measure: Measure | None = None,
-) -> Job:
-    """The job of one pair and flow; it can be sent to another process.
+def measure_pair(item: Item, overrides: Overrides = (), folder: Path | None = None) -> Row:
+    """Solve and score one pair; `folder` gets the result folder.
 
-    Args:
-        item: Pair and flow.
-        overrides: Overrides of the problem.
-        variant: Name of the overrides in an analysis; empty for the defaults.
-        folder: Where to write the result folder; a stored row without its folder is stale.
-        measure: Makes the row from (item, overrides, variant); default `measure_pair`.
+    Raises:
+        SoupError: the pair cannot be solved, or no convention has a true pixel.
     """
-    own = item, tuple(overrides), variant
-    work = partial(measure, *own) if measure else partial(measure_pair, *own, folder=folder)
-    stale = folder is not None and not (folder / "summary.json").is_file()
-    return Job(row_identity(*own), partial(attempt, work), stale)
+    return scores(solved(item, overrides, folder), item.presets)
 
 
-def settings_hash(problem: Problem) -> str:
-    """Hash of all options but the input: the same for every pair and folder."""
-    return _hash(problem, {"name", "base", "preset", "input", "expected"})
-
-
-def input_hash(problem: Problem) -> str:
-    """Hash of the input without its paths: the same for a pair in every folder."""
-    places = {"root", "path", "ref", "next", "depth", "depth_next", "intrinsics"}
-    return _hash(problem.input, places)
-
-
-def _hash(section: Any, exclude: set[str]) -> str:
-    tree = section.model_dump(mode="json", exclude=exclude)
-    return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
-
-
-def row_identity(item: Item, overrides: Sequence[str] = (), variant: str = "") -> Row:
-    """Entries that identify a row."""
-    try:
-        problem = item.problem(overrides)
-        settings, source = settings_hash(problem), input_hash(problem)
-    except Exception:
-        settings = source = "wrong"
-    return {
-        "key": f"{item.key} {variant}".strip(),
-        "suite": item.suite,
-        "sequence": item.sequence,
-        "pair": item.name,
-        "flow": item.flow,
-        "variant": variant,
-        "overrides": list(overrides),
-        "presets": list(item.presets),
-        "settings": settings,
-        "input": source,
-    }
-
-
-def measure_pair(
-    item: Item,
-    overrides: tuple[str, ...] = (),
-    variant: str = "",
-    *,
-    folder: Path | None = None,
-    change: Callable[[Pair], Pair] | None = None,
-) -> Row:
-    """Solve and score one pair.
-
-    `folder` gets the result folder, and `change` transforms the loaded pair before the solve.
+def solved(item: Item, overrides: Overrides = (), folder: Path | None = None) -> Run:
+    """The run of a pair that can be scored; `folder` gets the result folder.
 
     Raises:
         SoupError: the pair cannot be solved, or no convention has a true pixel.
@@ -119,15 +59,16 @@ def measure_pair(
     problem = item.problem(overrides)
     pair = problem.load_pair()
     loaded = time.perf_counter() - begin
-    if change is not None:
-        source = problem.flow.source
-        if not (is_named(source) or is_network(source)):
-            # a flow file fits the pair before the change
-            pair = pair.with_flow(problem.flow.load(pair, problem.path))
-        pair = change(pair)
     # do not solve a pair that cannot be scored
     if not any(_applies(pair.truth, preset(name)) for name in item.presets):
-        raise _no_truth(item)
+        suite = SUITES.get(item.suite)
+        raise DataError(
+            "pair has no true depth",
+            where=item.key,
+            found=f"no pixel that counts under {', '.join(item.presets)}",
+            expected=suite.layout or None if suite else None,
+            hint=f"get it from {suite.source}" if suite and suite.source else None,
+        )
     with scratch() as temporary:
         log = temporary / "ipopt.log"
         if folder is not None:
@@ -136,35 +77,22 @@ def measure_pair(
         result = replace(result, seconds={**result.seconds, "load": loaded})
         if folder is not None:
             write_folder(folder, result, dump_problem(problem), "", ipopt_log=log)
-    found = scores(result, item.presets)
-    if not found["metrics"]:
-        raise _no_truth(item)
-    return found
+    return result
 
 
-def _no_truth(item: Item) -> DataError:
-    """The error of a pair that no metric convention applies to."""
-    suite = SUITES.get(item.suite)
-    return DataError(
-        "pair has no true depth",
-        where=item.key,
-        found=f"no pixel that counts under {', '.join(item.presets)}",
-        expected=suite.layout or None if suite else None,
-        hint=f"get it from {suite.source}" if suite and suite.source else None,
-    )
-
-
-def scores(result: Run, presets: Sequence[str] = ("paper",), fitted: bool = True) -> Row:
-    """Metrics by convention and method, energies, flow error and scene flow of a run.
+def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
+    """Metrics by convention and method, energies, flow error, scene flow and sigma of a run.
 
     A convention is left out if no true pixel counts under it, or if it needs a depth map and the
-    truth has sparse points. Planes are fitted to the truth and scored if `fitted`.
+    truth has sparse points. "guess" is the share of the image that is marked as a guess, "within"
+    has the shares of the pixels whose log depth is within one and two sigma.
     """
-    maps = depth_maps(result, fitted)
+    maps = depth_maps(result)
     sigma = result.reconstruction.sigma_ref
     tables = {name: _metrics(result.pair.truth, maps, preset(name), sigma) for name in presets}
     metrics = {name: table for name, table in tables.items() if table}
     main = next(iter(metrics), "")
+    errors = pixel_errors(result)
     return {
         "status": result.solution.status,
         "good": result.solved,
@@ -174,6 +102,8 @@ def scores(result: Run, presets: Sequence[str] = ("paper",), fitted: bool = True
         "iterations": sum(stage.iterations for stage in result.solution.stages),
         "parallax_px": float(np.median(result.start.parallax)),
         "bending_share": float(result.start.bends.mean()),
+        "guess": result.confidence.guessed,
+        "within": None if errors is None else coverage(errors[1], errors[2]),
         "flow_error": flow_error(result.pair),
         "metrics": metrics,
         "energy": _energies(result),
@@ -182,17 +112,28 @@ def scores(result: Run, presets: Sequence[str] = ("paper",), fitted: bool = True
     }
 
 
+def pixel_errors(result: Run) -> tuple[Float, Float, Float] | None:
+    """Relative errors, errors of log depth and sigma of the true pixels (M,) after a median scale.
+
+    None without a true depth.
+    """
+    truth, sigma = result.pair.truth, result.reconstruction.sigma_ref
+    if truth is None or (truth.depth_ref is None and truth.points is None) or sigma is None:
+        return None
+    z, gt = at_truth(truth, result.reconstruction.depth_ref)
+    true = true_pixels(gt, None) & np.isfinite(z)
+    if not true.any():
+        return None
+    z, gt = z[true] * float(np.median(gt[true] / z[true])), gt[true]
+    return np.abs(z - gt) / gt, np.abs(np.log(z / gt)), at_truth(truth, sigma)[0][true]
+
+
 def _energies(result: Run) -> dict[str, dict[str, float]]:
     """Exact energies by soup and term."""
     energy: dict[str, Mapping[str, float]] = {"start": result.solution.energy_start}
     if result.refined is not None:
         energy["nlp"] = result.solution.energy
     energy["solution"] = result.energy
-    try:
-        true = true_soup(result.pair, result.segmentation)
-        energy["truth"] = oracle.energy(true.soup, result.data, result.weights)
-    except DataError:
-        pass  # most real pairs have no true motions
     return {name: dict(terms) for name, terms in energy.items()}
 
 
@@ -247,19 +188,32 @@ def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
     gt, label = truth.depth_ref, truth.components
     label = np.where((label > 0) & ~moves_by_itself(truth)[label], 0, label)
     counts = convention.mask(gt) & np.isfinite(gt) & (gt > 0)
-    own, rest = counts & (label > 0), counts & (label == 0)
-    if not own.any() or not rest.any():
+    moves, rest = counts & (label > 0), counts & (label == 0)
+    if not moves.any() or not rest.any():
         return None
     z = depth * convention.score(depth, gt).scale
-    mre = [depth_metrics(z, gt, scale="none", mask=mask).mre for mask in (own, rest)]
+    mre = [depth_metrics(z, gt, scale="none", mask=mask).mre for mask in (moves, rest)]
     components = []
-    for k in np.unique(label[own]):
-        ratio = (z / np.where(own, gt, np.nan))[own & (label == k)]
+    for k in np.unique(label[moves]):
+        ratio = (z / np.where(moves, gt, np.nan))[moves & (label == k)]
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
         if len(ratio) >= MIN_PIXELS:
             components.append({"pixels": len(ratio), "scale": float(np.median(ratio))})
-    share = float(own.sum() / counts.sum())
+    share = float(moves.sum() / counts.sum())
     return {"mre": mre[0], "rest": mre[1], "share": share, "components": components}
+
+
+def moves_by_itself(truth: Truth) -> Mask:
+    """(B,) bool, True for components that move differently from component 0, the static scene.
+
+    Without known motions it is True for all components but 0.
+    """
+    assert truth.components is not None
+    out = np.arange(int(truth.components.max()) + 1) > 0
+    if truth.motions is not None:
+        near = np.isclose(truth.motions, truth.motions[0], rtol=0, atol=1e-9).all(axis=(1, 2))
+        out[: len(near)] &= ~near[: len(out)]
+    return out
 
 
 def _scene_flow(result: Run, scale: float) -> dict[str, float | int] | None:

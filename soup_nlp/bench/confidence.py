@@ -1,28 +1,27 @@
-"""The analysis of confidence: sparsification against single cues, and calibration by family."""
+"""The study of confidence: sparsification by sigma, and calibration of sigma by family."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from soup_nlp.arrays import Float
-from soup_nlp.bench.suite_pairs import Item
-from soup_nlp.bench.tables import (
-    code_versions,
+from soup_nlp.bench.accuracy import pixel_errors, scores, solved
+from soup_nlp.bench.study import (
+    Overrides,
+    Study,
     failures,
-    figure,
-    mean,
+    markdown,
     page_text,
+    panels,
     provenance,
     save,
-    show,
-    table,
-    titles,
 )
+from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import (
     BENDING_FACTOR,
@@ -34,132 +33,79 @@ from soup_nlp.evaluate.confidence import (
     scale_by_contact,
     with_prior,
 )
-from soup_nlp.evaluate.information import Information, information, spread_in_image
 from soup_nlp.evaluate.metrics import true_pixels
 from soup_nlp.evaluate.scoring import at_truth
 from soup_nlp.evaluate.sparsification import coverage, sparsification
 from soup_nlp.pipeline.record import Run
-from soup_nlp.pipeline.run import run
-from soup_nlp.refine.costs import Particles
-from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.storage.rows import Row
 
-CUES = {
-    "sigma": "sigma as delivered",
-    "own": "the same information, but of each superpixel's own block alone",
-    "residual": "re-projection error of the start",
-    "misfit": "distance of the flow from the one that the solution induces",
-    "flow": "1 - flow confidence",
-    "parallax": "(1 - flow confidence) / parallax",
-    "photo": "photometric disagreement of the solution (census)",
-    "particles": "spread of the last particles by their min-marginals in TRW-S",
-}
-"""Descriptions of the uncertainties that are compared."""
 SAMPLE_PIXELS = 400
 """Number of pixels of a pair that the calibration of other families uses."""
 SHARE_WITHIN = 0.76
 """Share of the pixels whose error is within one sigma after calibration."""
 MAX_ADDED = 0.05
 """Pixels of which more is added in squares are not used for the calibration."""
-MIN_PARALLAX = 0.1
-"""Smallest parallax that the cue "parallax" divides by, pixels."""
 
 
-def measure_confidence(item: Item, overrides: tuple[str, ...] = (), variant: str = "") -> Row:
-    """Sparsification of every cue and coverage of sigma on one pair.
+def measure_confidence(item: Item, overrides: Overrides = (), folder: Path | None = None) -> Row:
+    """The row of `measure_pair` with the sparsification curve and a sample for the calibration.
 
     Raises:
         DataError: the pair has no true depth.
     """
-    result = run(item.problem(overrides))
-    truth = result.pair.truth
-    if truth is None or (truth.depth_ref is None and truth.points is None):
+    result = solved(item, overrides, folder)
+    errors = pixel_errors(result)
+    if errors is None:
         raise DataError("pair has no true depth", where=item.key)
+    relative, log, sigma = errors
     begin = time.process_time()
-    assert result.pair.flow is not None
     energy = result.data, result.weights, result.problem.formulation
-    rec = result.reconstruction
-    confidence(rec, result.pair, result.start, *energy)
+    confidence(result.reconstruction, result.pair, result.start, *energy)
     seconds = time.process_time() - begin
-    z, gt = at_truth(truth, rec.depth_ref)
-    true = true_pixels(gt, None) & np.isfinite(z)
-    scaled, gt = z[true] * float(np.median(gt[true] / z[true])), gt[true]
-
-    def chosen(image: Float) -> Float:
-        return at_truth(truth, image)[0][true]
-
-    relative, log = np.abs(scaled - gt) / gt, np.abs(np.log(scaled / gt))
-    cues = {name: chosen(image) for name, image in _cues(result).items()}
-    found = {name: sparsification(relative, cue) for name, cue in cues.items()}
-    sure = result.confidence
-    misfit = sure.misfit[rec.labels]
-    bends = result.start.bends[rec.labels]
-    whole = calibrated(sure.spread, sure.noise, misfit, np.inf, bends)
-    unit = chosen(whole / np.where(bends, BENDING_FACTOR, FACTOR))
-    scale = chosen(scale_by_contact(sure.marginals, result.start)[rec.labels])
-    # what is added in squares to the factor times the unit
-    added = np.minimum(np.hypot(SIGMA_PRIOR * sure.still, scale), LARGEST)
-    sample = log, unit, added, chosen(bends.astype(float))
+    curve = sparsification(relative, sigma)
+    sample = np.stack([log, *_calibration(result)])
     picked = np.linspace(0, len(log) - 1, min(SAMPLE_PIXELS, len(log))).astype(int)
-    own = found["sigma"]
-    return {
-        "status": result.solution.status,
-        "good": result.solved,
-        "metrics": {},
+    row = scores(result, item.presets)
+    return row | {
         "confidence": {
             "mre": float(relative.mean()),
             **{name: result.metrics[name].mre for name in ("solution_90", "solution_70")},
-            "ause": {name: one.ause for name, one in found.items()},
-            "within": coverage(log, cues["sigma"]),
-            "guess": sure.guessed,
-            "noise": sure.noise,
+            "ause": {"sigma": curve.ause},
+            "within": row["within"],
+            "guess": row["guess"],
+            "noise": result.confidence.noise,
             "seconds": seconds,
-            "curve": [own.kept.tolist(), own.error.tolist(), own.oracle.tolist()],
-            "sample": np.stack(sample)[:, picked].round(6).tolist(),
+            "curve": [curve.kept.tolist(), curve.error.tolist(), curve.oracle.tolist()],
+            "sample": sample[:, picked].round(6).tolist(),
         },
     }
 
 
-def _cues(result: Run) -> dict[str, Float]:
-    """(H, W) uncertainties by the names of CUES."""
-    labels, start, pair = result.segmentation.labels, result.start, result.pair
-    assert pair.flow is not None
-    doubt = 1.0 - pair.flow.confidence.astype(float)
-    out = {
-        "sigma": result.confidence.sigma,
-        "own": _own_block(result),
-        "residual": start.error[labels],
-        "misfit": result.confidence.misfit[labels],
-        "flow": doubt,
-        "parallax": (0.02 + doubt) / np.maximum(start.parallax, MIN_PARALLAX)[labels],
-    }
-    if result.refined and result.refined.rounds:
-        out["particles"] = result.refined.rounds[-1].spread[labels]
-    photo = photometric_term(pair, labels, result.soup, result.problem.refine)
-    if photo is not None:
-        out["photo"] = photo.costs(Particles.of(result.soup), photo.unit(result.soup))[:, 0][labels]
-    return out
+def _calibration(result: Run) -> tuple[Float, Float, Float]:
+    """(M,) sigma before its factor, what is added in squares, whether the surface bends."""
+    truth, rec, sure = result.pair.truth, result.reconstruction, result.confidence
+    assert truth is not None
+    z, gt = at_truth(truth, rec.depth_ref)
+    true = true_pixels(gt, None) & np.isfinite(z)
+    bends = result.start.bends[rec.labels]
+    whole = calibrated(sure.spread, sure.noise, sure.misfit[rec.labels], np.inf, bends)
+    scale = scale_by_contact(sure.marginals, result.start)[rec.labels]
+    added = np.minimum(np.hypot(SIGMA_PRIOR * sure.still, scale), LARGEST)
+    images = whole / np.where(bends, BENDING_FACTOR, FACTOR), added, bends.astype(float)
+    unit, added, bending = (at_truth(truth, image)[0][true] for image in images)
+    return unit, added, bending
 
 
-def _own_block(result: Run) -> Float:
-    """(H, W) conditional standard deviation of a superpixel while all others are fixed."""
-    info: Information = information(
-        result.soup, result.data, result.weights, result.problem.formulation
-    )
-    n = len(result.soup)
-    at = np.arange(9 * n).reshape(n, 9)
-    blocks = np.asarray(info.matrix[at.repeat(9), np.tile(at, 9).ravel()]).reshape(n, 9, 9)
-    plane = np.linalg.pinv(blocks, rcond=1e-12, hermitian=True)[:, :3, :3]
-    return spread_in_image(info, plane, result.segmentation.labels, result.pair.K_ref)
-
-
-def left_out_factors(rows: Sequence[Row]) -> dict[str, tuple[tuple[float, ...], float, float]]:
+def left_out_factors(
+    frame: pd.DataFrame,
+) -> dict[str, tuple[tuple[float, ...], float, float]]:
     """Calibration factors of every family from all others, and the coverage of 1 and 2 sigma.
 
     Bending regions have a factor of their own, from bending regions of the others. A family is left
     out for whose regions the others have none.
     """
-    samples = [(r["sequence"], np.array(r["confidence"]["sample"])) for r in rows]
+    both = zip(frame["sequence"], frame["confidence.sample"], strict=True)
+    samples = [(family, np.array(sample)) for family, sample in both]
     by_family: dict[str, list[tuple[float, float]]] = {}
     factors: dict[str, tuple[float, ...]] = {}
     for family, (log, unit, added, bends) in samples:
@@ -191,94 +137,85 @@ def _factor(samples: Sequence[Float], bending: bool) -> float | None:
     return float(np.quantile(np.concatenate(alike), SHARE_WITHIN)) if alike else None
 
 
-def text_confidence(name: str, text: str, rows: Sequence[Row], note: str = "") -> str:
-    """Page of the analysis: tables by pair and by family."""
-    good = [r for r in rows if r.get("confidence")]
-    lines = [
-        f"# Analysis: {name}",
-        "",
-        f"{text[0].upper()}{text[1:]}. {note}",
-        "",
-        provenance(rows),
-        "",
+COLUMNS = {
+    "confidence.mre": "MRE",
+    "confidence.solution_90": "surest 90 %",
+    "confidence.solution_70": "surest 70 %",
+    "confidence.ause.sigma": "AUSE",
+    "within 1": "within 1",
+    "within 2": "within 2",
+    "confidence.guess": "guess",
+    "confidence.seconds": "CPU s",
+}
+"""Titles of the columns of the page."""
+
+
+def confidence_page(study: Study, frame: pd.DataFrame, note: str = "") -> str:
+    """Page of the study: tables by pair and by family."""
+    good = _known(frame)
+    head = f"{study.text[0].upper()}{study.text[1:]}. {note} {provenance(frame)}."
+    if good.empty:
+        return page_text(["# Study: confidence", "", head, *failures(frame)])
+    table = good[list(COLUMNS)].astype(float).rename(columns=COLUMNS)
+    by_pair = table.set_axis(pd.Index(good["title"], name="pair, flow"))
+    by_family = table.assign(family=good["sequence"]).groupby("family", sort=False).mean()
+    factors = left_out_factors(good)
+    for k, name in enumerate(("left out: within 1", "left out: within 2")):
+        by_family[name] = [factors[f][k + 1] if f in factors else np.nan for f in by_family.index]
+    by_family.loc[f"mean of {len(by_family)} families"] = by_family.mean()
+    by_family["factors of the others"] = [
+        ", ".join(f"{v:.1f}" for v in factors[f][0]) if f in factors else "-"
+        for f in by_family.index
     ]
-    lines += [
-        "AUSE / MRE is the area between the sparsification curve and the oracle's, over the mean"
-        " relative error: 0 is perfect, 0.8 to 1 is chance. Within k: share of the pixels whose"
-        " log depth is within k sigma, one median scale a pair.",
-        "",
-    ]
-    used = [c for c in CUES if any(c in r["confidence"]["ause"] for r in good)]
-    head = ["pair", "flow", "MRE", "surest 90 %", "surest 70 %"]
-    head += [*(f"AUSE {c}" for c in used), "within 1", "within 2", "guess", "CPU s"]
-    lines += table(head, [_line(n, r, used) for n, r in zip(titles(good), good, strict=True)])
-    lines += ["", *(f"- {c}: {CUES[c]}" for c in used), "", "## By family", ""]
-    lines += [
-        f"The factor of sigma, shipped as {FACTOR:g} ({BENDING_FACTOR:g} where surfaces bend), is"
-        f" chosen for each family on regions of the same kind of all others, so that"
-        f" {SHARE_WITHIN:.0%} of their pixels lie within one sigma; every pair counts alike.",
-        "",
-    ]
-    lines += table(*_families(good, used))
-    return page_text([*lines, "", *failures(rows), code_versions(rows)])
+    forms = {c: ".4f" if c in ("MRE", "surest 90 %", "surest 70 %") else ".2f" for c in by_family}
+    return page_text(
+        [
+            "# Study: confidence",
+            "",
+            head,
+            "",
+            "AUSE is the area between the sparsification curve and the oracle's, over the mean"
+            " relative error: 0 is perfect, 0.8 to 1 is chance. Within k: share of the pixels whose"
+            " log depth is within k sigma, one median scale a pair.",
+            "",
+            *markdown(by_pair, forms),
+            "",
+            "## By family",
+            "",
+            f"The factor of sigma, shipped as {FACTOR:g} ({BENDING_FACTOR:g} where surfaces bend),"
+            " is chosen for each family on regions of the same kind of all others, so that"
+            f" {SHARE_WITHIN:.0%} of their pixels lie within one sigma; every pair counts alike.",
+            "",
+            *markdown(by_family, forms),
+            *failures(frame),
+        ]
+    )
 
 
-def _line(title: str, row: Row, used: Sequence[str]) -> list[str]:
-    c: Mapping[str, Any] = row["confidence"]
-    return [
-        title,
-        row["flow"],
-        *(show(c[k]) for k in ("mre", "solution_90", "solution_70")),
-        *(show(c["ause"].get(k), ".3f") for k in used),
-        *(show(k, ".2f") for k in c["within"]),
-        show(c["guess"], ".1%"),
-        show(c["seconds"], ".1f"),
-    ]
+def _known(frame: pd.DataFrame) -> pd.DataFrame:
+    """The rows that have a sparsification curve."""
+    if "confidence.within" not in frame:
+        return frame.iloc[:0]
+    good = frame[frame["confidence.within"].notna()].copy()
+    for k in (0, 1):
+        good[f"within {k + 1}"] = [v[k] for v in good["confidence.within"]]
+    return good
 
 
-def _families(good: Sequence[Row], used: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """Head and lines of the table by family; the last line has the means over the families."""
-    factors, lines, numbers = left_out_factors(good), [], []
-    for family in dict.fromkeys(r["sequence"] for r in good):
-        own = [r["confidence"] for r in good if r["sequence"] == family]
-        area = [mean([c["ause"].get(k) for c in own]) for k in used]
-        within = [float(np.mean([c["within"][k] for c in own])) for k in (0, 1)]
-        chosen, *left = factors.get(family, ((), None, None))
-        numbers.append([*area, *within, *left])
-        shown = ", ".join(show(f, ".1f") for f in chosen) or show(None)
-        lines.append([f"{family} ({len(own)})", *_shown(numbers[-1], len(used)), shown])
-    last = [mean(column) for column in zip(*numbers)]
-    lines.append([f"mean of {len(numbers)} families", *_shown(last, len(used)), ""])
-    head = ["family (pairs)", *(f"AUSE {c}" for c in used), "within 1", "within 2"]
-    return [*head, "left out: within 1", "left out: within 2", "factors of the others"], lines
-
-
-def _shown(numbers: Sequence[Any], areas: int) -> list[str]:
-    return [show(v, ".3f" if k < areas else ".2f") for k, v in enumerate(numbers)]
-
-
-def plot_confidence(path: Path, rows: Sequence[Row]) -> None:
+def plot_confidence(path: Path, frame: pd.DataFrame) -> None:
     """Sparsification curves of sigma and of the oracle, one panel for each family."""
-    good = [r for r in rows if r.get("confidence")]
-    families = list(dict.fromkeys(r["sequence"] for r in good))
-    across = min(4, max(1, len(families)))
-    down = -(-len(families) // across)
-    out = figure(3.0 * across, 2.4 * down)
-    axes = out.subplots(down, across, squeeze=False)
-    for ax in axes.ravel()[len(families) :]:
-        ax.set_visible(False)
-    for ax, family in zip(axes.ravel(), families):
-        for row in (r for r in good if r["sequence"] == family):
-            kept, own, best = np.array(row["confidence"]["curve"])
-            whole = row["confidence"]["mre"]
-            ax.plot(100 * (1 - kept), own / whole, color="#4477aa", lw=1)
-            ax.plot(100 * (1 - kept), best / whole, color="#bbbbbb", lw=1)
+    good = _known(frame)
+    families = good.groupby("sequence", sort=False)
+    out, axes = panels(families.ngroups, 4, 3.0, 2.4)
+    for ax, (family, group) in zip(axes, families, strict=True):
+        for curve, whole in zip(group["confidence.curve"], group["confidence.mre"], strict=True):
+            kept, by_sigma, oracle = np.array(curve)
+            ax.plot(100 * (1 - kept), by_sigma / whole, color="#4477aa", lw=1)
+            ax.plot(100 * (1 - kept), oracle / whole, color="#bbbbbb", lw=1)
         ax.axhline(1.0, color="#cc6677", lw=0.8, ls="--")
-        ax.set(title=family, ylim=(0, 1.3), xlim=(0, 100))
-        ax.title.set_fontsize(9)
-    for ax in axes[-1]:
-        ax.set_xlabel("most uncertain % removed")
-    for ax in axes[:, 0]:
-        ax.set_ylabel("MRE of the rest / MRE")
+        ax.set(ylim=(0, 1.3), xlim=(0, 100))
+        ax.set_title(str(family), fontsize=9)
+    out.supxlabel("most uncertain % removed")
+    out.supylabel("MRE of the rest / MRE")
     out.suptitle("Sparsification: sigma (blue), oracle (grey), chance (dashed)", fontsize=10)
     save(out, path)

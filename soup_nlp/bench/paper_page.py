@@ -3,173 +3,301 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from soup_nlp.bench import paper_figures as figures
-from soup_nlp.bench import paper_sections as sections
-from soup_nlp.bench.paper_pairs import DATASETS, WITHOUT_TRUTH, source_of, title
-from soup_nlp.bench.paper_plan import ALL_SECTIONS, METHODS, SECTIONS
-from soup_nlp.bench.paper_sections import Number, Results, figure
+import numpy as np
+import pandas as pd
+
+from soup_nlp.bench.accuracy_page import published_lines
+from soup_nlp.bench.departures import DEPARTURES
+from soup_nlp.bench.paper import ALL_SECTIONS, DATASETS, METHODS, Plan
 from soup_nlp.bench.processes import processor
 from soup_nlp.bench.published import COMPARISON, DATA, SOURCE
-from soup_nlp.bench.tables import failures, mean, metric, page_text, provenance, show, table
+from soup_nlp.bench.studies import STUDIES
+from soup_nlp.bench.study import (
+    failures,
+    figure,
+    markdown,
+    page_text,
+    plot_lines,
+    provenance,
+    save,
+    show,
+    table,
+)
+from soup_nlp.bench.suites import SUITES
 from soup_nlp.evaluate.protocols import preset
-from soup_nlp.solve.ipopt import GOOD
-from soup_nlp.storage.atomic import write_text
-from soup_nlp.storage.folders import staged
-from soup_nlp.storage.rows import Row
 
 PAGE = "README.md"
-FIGURES = ("comparison", "depth_maps", "convergence", "departures", "scale", *SECTIONS)
-FILES = (PAGE, *(f"{name}.png" for name in FIGURES))
+PICTURES = ("comparison", "depth_maps", "convergence", *ALL_SECTIONS)
+FILES = (PAGE, *(f"{name}.png" for name in PICTURES))
 """Names of all files that `write_page` may write."""
+WITHOUT_TRUTH = {
+    "Back sequence": "no true depth is published with it, nor its intrinsics (Garg et al., CVPR"
+    " 2013); the paper shows pictures only",
+    "YouTube-Objects": "no true depth (Prest et al., CVPR 2012); the paper shows pictures only",
+    "KITTI odometry 00-09": "the published KITTI rows are of this set with LiDAR truth,"
+    " https://www.cvlibs.net/datasets/kitti/eval_odometry.php; the rows here are of the stereo and"
+    " flow sets",
+    "ULDEMV": "the paper draws its errors on KITTI and prints no number",
+}
+"""Data of the paper without a row here, and the reason."""
+SAID = {
+    "superpixels": "Published as a figure: the error hardly falls beyond 1,000 superpixels.",
+    "neighbours": "Published as pictures of one pair (K = 4 and 20); K from 15 to 20 is used.",
+    "flow": "Published as a figure of RMSE in metres on Sintel.",
+}
+"""Sentences on the paper's results that have no printed numbers, by section."""
 
 
-def write_page(out: Path, results: Results, command: str) -> Path:
-    """Write OUT/README.md and its figures."""
-    chosen = results.plan.sizes.sections
-    with staged(out) as new:
-        parts = [
-            _head(results, command),
-            _comparison(new, results),
-            _pictures(new, results, out),
-            *(sections.section(new, results, name) for name in SECTIONS if name in chosen),
-            sections.convergence(new, results),
-            sections.time(results),
-            sections.departures(new, results) if "departures" in chosen else [],
-            sections.scale(new, results) if "scale" in chosen else [],
-            _missing(results),
-            failures([*results.rows, *results.scales]),
-        ]
-        write_text(new / PAGE, page_text([line for lines in parts for line in lines]))
-    return out / PAGE
+def write_page(folder: Path, plan: Plan, frame: pd.DataFrame, command: str) -> None:
+    """Write the page and its figures into a folder."""
+    sections = {name: _of_section(plan, frame, name) for name in plan.sections}
+    compared = sections.pop("comparison")
+    lines = [*_head(plan, frame, command), *_comparison(folder, plan, compared)]
+    lines += _pictures(folder, plan)
+    departures = sections.pop("departures", None)
+    for name, rows in sections.items():
+        lines += _study(folder, name, rows)
+    lines += [*_convergence(folder, compared), *_time(compared)]
+    if departures is not None:
+        lines += _departures(folder, departures)
+    text = page_text([*lines, *_missing(plan), *failures(frame)])
+    (folder / PAGE).write_text(text, encoding="utf-8")
 
 
-def _head(r: Results, command: str) -> list[str]:
-    s = r.plan.sizes
-    changed = ", ".join(f"`{o}`" for o in s.overrides)
-    there = [bool(r.row(cell).get("ok")) for cell in r.plan.cells()]
-    partial = "" if all(there) else f" {sum(there)} of the {len(there)} rows were measured."
+def _of_section(plan: Plan, frame: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Rows of a section with the columns method, change and name; NaN where not measured."""
+    cells = plan.sections[name]
+    rows = frame.drop_duplicates("key").set_index("key")
+    keys = [cell.identity()["key"] for cell in cells.values()]
+    out = rows.reindex(keys).reset_index()
+    out["method"], out["change"], out["name"] = zip(*cells, strict=True) if cells else ((), (), ())
+    return out
+
+
+def _figure(name: str, text: str) -> list[str]:
+    return ["", f"![{text}]({name}.png)", ""]
+
+
+def _mre(rows: pd.DataFrame, convention: str = "paper", method: str = "solution") -> pd.Series:
+    column = f"metrics.{convention}.{method}.mre"
+    return rows[column].astype(float) if column in rows else pd.Series(np.nan, index=rows.index)
+
+
+def _head(plan: Plan, frame: pd.DataFrame, command: str) -> list[str]:
+    sizes, good = plan.sizes, int(frame["ok"].eq(True).sum())
+    changed = ", ".join(f"`{o}`" for o in sizes.overrides)
     return [
         "# The paper, row by row",
         "",
-        f"Made by `{command}`. {provenance([*r.rows, *r.scales])}. Flow by OpenCV DIS unless named."
+        f"Made by `{command}`. {provenance(frame)}. Flow by OpenCV DIS unless named."
         f" Machine: {os.cpu_count()} cores of an {processor()}.",
-        f"Superpixels wanted: {s.superpixels} in the comparison, {s.analysis} elsewhere."
+        f"Superpixels wanted: {sizes.superpixels} in the comparison, {sizes.analysis} elsewhere."
         + (f" Overrides of every row: {changed}." if changed else "")
-        + partial,
+        + f" {good} of the {len(plan.cells())} rows were measured.",
         "",
         "`preset: paper` is the method as printed; *defaults* are those of this program. What both"
         " differ in is in [the table of departures](../../docs/formulation.md#the-preset-paper)."
         " MRE is the mean relative error of the reference frame's depth after one global scale per"
-        " image. Published numbers are copied, not measured:"
-        f" {SOURCE}; the paper names neither its scale rule nor a depth cap. A dash is a number"
-        " that is not published, or a row that was not measured in this run.",
+        f" image. Published numbers are copied, not measured: {SOURCE}; the paper names neither its"
+        " scale rule nor a depth cap. A dash is a number that is not published or not measured.",
         "",
     ]
 
 
-def _comparison(out: Path, r: Results) -> list[str]:
+def _comparison(folder: Path, plan: Plan, rows: pd.DataFrame) -> list[str]:
+    """Tables by dataset and by pair, and the figure of the errors."""
+    caps = dict.fromkeys(cap for _, _, cap in DATASETS.values() if cap)
     lines = ["## Mean relative error per dataset", ""]
-    rivals = [m for m in COMPARISON["sintel"] if m not in ("ULDEMV", "Superpixel Soup")]
-    entries, bars = [], {}
-    for d in DATASETS:
-        known, items = COMPARISON[d.name], r.plan.datasets[d.name]
-        own: dict[str, Number] = {"published": known["Superpixel Soup"]}
-        cells = []
+    entries: dict[str, dict[str, Any]] = {}
+    bars: dict[str, dict[str, Any]] = {}
+    for name, (title, _, cap) in DATASETS.items():
+        own = rows[rows["name"].isin([i.name for i in plan.datasets[name]])]
+        line: dict[str, Any] = {f"{m} (published)": v for m, v in COMPARISON[name].items()}
+        line["pairs here"] = str(own["name"].nunique())
+        bar = {"published": COMPARISON[name]["Superpixel Soup"]}
         for method in METHODS:
-            here = [r.compared(i, method) for i in items]
-            own[method] = mean(r.mre(c) for c in here)
-            capped = mean(r.mre(c, d.cap) for c in here) if d.cap else None
-            cells += [show(own[method]), show(mean(r.mre(c, "best") for c in here)), show(capped)]
-        first = [r.compared(i, "defaults") for i in items]
-        own["constant depth"] = mean(r.mre(c, "paper", "constant") for c in first)
-        rigid = mean(r.mre(c, "paper", "rigid") for c in first)
-        if own["defaults"] is not None:
-            bars[d.title] = own
-        published = [show(known[m]) for m in (*rivals, "Superpixel Soup")]
-        baselines = [show(own["constant depth"]), show(rigid)]
-        entries.append([d.title, *published, str(len(items)), *cells, *baselines])
-    head = ["dataset", *(f"{m} (published)" for m in rivals), "the paper (published)", "pairs here"]
-    for method in METHODS:
-        head += [f"{method}: median", "best", "cap"]
-    head += ["constant depth: median", "one rigid motion: median"]
-    lines += [*table(head, entries), "", *_protocols()]
-    lines += _by_pair(r)
-    known_pairs = {i.key for group in r.plan.datasets.values() for i in group}
-    for item in (i for i in r.plan.analyses if i.key not in known_pairs):
-        by = {m: r.mre(r.compared(item, m)) for m in METHODS}
-        flat = r.mre(r.compared(item, "defaults"), "paper", "constant")
-        bars[title(item)] = {"published": None, **by, "constant depth": flat}
-    figures.plot_comparison(out / "comparison.png", bars, "MRE by dataset or pair")
-    return [*lines, *figure("comparison", "MRE by dataset")]
-
-
-def _protocols() -> list[str]:
-    caps = dict.fromkeys(d.cap for d in DATASETS if d.cap)
-    names = ["paper", "best", *caps]
-    return [
-        "Columns: *median* and *best* are every true pixel without a cap, after the median scale"
-        " and after the scale of least MRE; *cap* is the convention with a depth cap that is in use"
-        " on the dataset. In full: " + "; ".join(str(preset(n)) for n in names) + ".",
-        "",
-        "On which pairs: " + "; ".join(f"{d.title}: {DATA[d.name]}" for d in DATASETS) + ".",
-        "",
-    ]
-
-
-def _by_pair(r: Results) -> list[str]:
-    """Table of every pair: MRE by stage and median error."""
-    items = {i.key: i for group in r.plan.datasets.values() for i in group}
-    items |= {i.key: i for i in r.plan.analyses}
-    entries = []
-    for item in items.values():
-        cells = [title(item)]
-        for method in METHODS:
-            cell = r.compared(item, method)
-            row = r.row(cell)
-            median = metric(row, "paper", "solution", "median_relative")
-            start, nlp = r.mre(cell, "paper", "start"), r.mre(cell, "paper", "nlp")
-            cells += [show(start), show(nlp), show(r.mre(cell)), show(median), _ended(row)]
-        cells.append(show(r.mre(cell, "paper", "constant")))
-        entries.append(cells)
-    head = ["pair"]
-    for method in METHODS:
-        head += [f"{method}: start", "NLP", "refined", "its median error", "converged"]
-    note = (
-        "Every pair, MRE after median scale, no cap; the median error of the refined depth; whether"
-        " the constrained NLP reached its tolerance:"
+            here = own[own["method"] == method]
+            bar[method] = line[f"{method}: median"] = _mre(here).mean()
+            line[f"{method}: best"] = _mre(here, "best").mean()
+            line[f"{method}: cap"] = _mre(here, cap).mean() if cap else np.nan
+        bar["constant depth"] = line["constant depth"] = _mre(here, "paper", "constant").mean()
+        line["one rigid motion"] = _mre(here, "paper", "rigid").mean()
+        entries[title] = line
+        if len(own):
+            bars[title] = bar
+    data = pd.DataFrame.from_dict(entries, orient="index").rename_axis("dataset")
+    lines += [*markdown(data), ""]
+    lines += ["Columns: " + "; ".join(str(preset(n)) for n in ("paper", "best", *caps)) + ".", ""]
+    lines += ["On which pairs: " + "; ".join(f"{n}: {t}" for n, t in DATA.items()) + ".", ""]
+    lines += ["Every pair, MRE after median scale, no cap; the constrained NLP's status:", ""]
+    by_pair = rows[["name", "method", "status"]].assign(
+        start=_mre(rows, "paper", "start"),
+        NLP=_mre(rows, "paper", "nlp"),
+        refined=_mre(rows),
+        constant=_mre(rows, "paper", "constant"),
     )
-    return [note, "", *table([*head, "constant depth"], entries), ""]
+    by_pair["status"] = by_pair.pop("status")
+    lines += [*markdown(by_pair.set_index(["name", "method"]))]
+    _plot_bars(folder / "comparison.png", pd.DataFrame(bars).T, "MRE by dataset")
+    return [*lines, *_figure("comparison", "MRE by dataset")]
 
 
-def _ended(row: Row) -> str:
-    """ "yes" if the NLP converged, else its status."""
-    status = str(row.get("status", "-"))
-    return "yes" if status in GOOD else status.replace("_", " ").lower()
+def _plot_bars(path: Path, bars: pd.DataFrame, text: str, log: bool = False) -> None:
+    """Groups of horizontal bars: a group for each row, a colour for each column."""
+    picture = figure(8, 0.4 * len(bars) + 1.5)
+    ax = picture.add_subplot()
+    height = 0.8 / max(1, bars.shape[1])
+    for k, column in enumerate(bars.columns):
+        y = np.arange(len(bars)) + (k - (bars.shape[1] - 1) / 2) * height
+        x = bars[column].to_numpy(float)
+        ax.barh(y, x - 1 if log else x, height, left=1 if log else 0, label=str(column))
+    if log:
+        ax.set_xscale("log")
+    ax.set_yticks(np.arange(len(bars)), [str(name) for name in bars.index], size=7)
+    ax.invert_yaxis()
+    ax.grid(alpha=0.3, axis="x")
+    if bars.shape[1]:
+        ax.legend(fontsize=7)
+    ax.set_title(text, fontsize=10)
+    save(picture, path)
 
 
-def _pictures(out: Path, r: Results, stored: Path) -> list[str]:
-    items = {i.key: i for i in r.plan.analyses}
-    items |= {i.key: i for group in r.plan.datasets.values() for i in group[:2]}
-    files = {}
-    for item in items.values():
-        a, b = (r.compared(item, m).maps(stored) for m in METHODS)
-        if a.is_file() and b.is_file():
-            files[title(item)] = a, b
+def _pictures(folder: Path, plan: Plan) -> list[str]:
+    """Figure of image, truth and depths of start, preset and defaults."""
+    maps: dict[str, dict[str, Mapping[str, np.ndarray]]] = {}
+    for (method, _, name), cell in plan.sections["comparison"].items():
+        if cell.keep is not None and cell.keep.is_file():
+            with np.load(cell.keep) as file:
+                maps.setdefault(name, {})[method] = {k: file[k] for k in file.files}
+    shown = {name: own for name, own in maps.items() if len(own) == len(METHODS)}
+    heads = ("image", "truth", "paper's start", "preset: paper", "defaults")
+    picture = figure(2.0 * len(heads), 1.15 * max(1, len(shown)) + 0.4)
+    axes = picture.subplots(max(1, len(shown)), len(heads), squeeze=False)
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for line, (name, own) in zip(axes, shown.items(), strict=False):
+        paper, ours = own["preset: paper"], own["defaults"]
+        truth = paper.get("truth", ours["solution"])
+        depths = [truth, paper["start"], paper["solution"], ours["solution"]]
+        line[0].imshow(paper["image"])
+        line[0].set_title(name, fontsize=6, loc="left")
+        logs = [np.log(np.where(z > 0, z, np.nan)) for z in depths]
+        logs = [z + np.nanmedian(logs[0] - z) for z in logs]
+        low, high = np.nanpercentile(logs[0], [2, 98])
+        for ax, head, z in zip(line[1:], heads[1:], logs, strict=True):
+            ax.imshow(z, cmap="viridis", vmin=low, vmax=high + 0.01)
+            ax.set_title(head, fontsize=7)
+    picture.suptitle("Depth: dark is near, bright is far; one logarithmic scale a line", fontsize=8)
+    save(picture, folder / "depth_maps.png")
     text = "Depth maps: image, truth, unorganised soup, preset, defaults"
-    figures.plot_maps(out / "depth_maps.png", files)
-    return [
-        "## Depth maps",
+    return ["## Depth maps", "", f"{text}.", *_figure("depth_maps", text)]
+
+
+def _study(folder: Path, name: str, rows: pd.DataFrame) -> list[str]:
+    """A study by both methods: a table for each, and a figure."""
+    text = STUDIES[name].text
+    lines = [f"## {text[0].upper()}{text[1:]}", ""]
+    drawn = {}
+    for method in METHODS:
+        own = rows[rows["method"] == method].assign(value=_mre(rows))
+        values = own.pivot(index="name", columns="change", values="value")
+        values = values.reindex(index=own["name"].unique(), columns=own["change"].unique())
+        whole = values.dropna()
+        if len(whole) > 1:
+            values.loc[f"mean of {len(whole)}"] = whole.mean()
+        drawn[method] = values.rename_axis(index="pair")
+        lines += [f"{method}, MRE after median scale, no cap:", "", *markdown(drawn[method]), ""]
+    lines += published_lines(name) + ([SAID[name], ""] if name in SAID else [])
+    plot_lines(folder / f"{name}.png", drawn, name, text)
+    return [*lines, *_figure(name, text)]
+
+
+def _convergence(folder: Path, rows: pd.DataFrame) -> list[str]:
+    """Table and figure of the energy over iterations and rounds."""
+    good = rows[rows["curve.exact"].notna()] if "curve.exact" in rows else rows.iloc[:0]
+    entries = []
+    picture = figure(9, 2.1 * max(1, len(good)) + 0.7)
+    axes = picture.subplots(max(1, len(good)), 2, squeeze=False)
+    for (left, right), row in zip(axes, good.to_dict("records"), strict=False):
+        begin = 0
+        for k, (stage, y) in enumerate(zip(row["curve.names"], row["curve.values"], strict=True)):
+            left.semilogy(begin + np.arange(len(y)), np.maximum(y, 1e-12), label=stage, c=f"C{k}")
+            begin += len(y)
+        start, end = row["curve.exact"]
+        rounds = row["curve.rounds"]
+        right.plot(np.arange(len(rounds)), rounds, "o-", ms=4)
+        left.set_title(f"{row['name']}, {row['method']}: solver", fontsize=7)
+        left.legend(fontsize=5)
+        right.set_title("refinement, exact objective by round", fontsize=7)
+        fall = f"{1 - rounds[-1] / rounds[0]:.1%}" if rounds and rounds[0] else "-"
+        numbers = [show(row["iterations"], ".0f"), f"{start:.5g}", f"{end:.5g}"]
+        status = str(row["status"]).replace("_", " ")
+        entries.append([row["name"], row["method"], status, *numbers, fall])
+    save(picture, folder / "convergence.png")
+    head = ["pair", "method", "constrained NLP", "iterations", "E start", "E NLP"]
+    lines = ["## Convergence of E over iterations and rounds", ""]
+    lines += ["The exact energy of start and NLP; the figure has the smoothed energy by stage.", ""]
+    lines += table([*head, "refinement lowers E by"], entries)
+    return [*lines, *_figure("convergence", "Energy over iterations and rounds")]
+
+
+def _time(rows: pd.DataFrame) -> list[str]:
+    """Table of seconds by stage."""
+    stages = [f"stages.{s}" for s in ("flow", "segmentation", "start", "nlp", "refine")]
+    seconds = rows.reindex(columns=[*stages, "cpu_seconds"]).astype(float)
+    seconds.columns = pd.Index([c.removeprefix("stages.") for c in seconds.columns])
+    index = pd.MultiIndex.from_frame(rows[["name", "method"]])
+    text = (
+        "Wall seconds by stage, the machine shared with other work, and CPU seconds of the whole"
+        " row. Published: 15 to 20 minutes for 1024 x 436 in MATLAB and C++ on an i7."
+    )
+    return ["## Time", "", text, "", *markdown(seconds.set_axis(index), ".1f"), ""]
+
+
+def _departures(folder: Path, rows: pd.DataFrame) -> list[str]:
+    """Tables and figure of the departures, each undone or made alone."""
+    titles = {
+        "defaults": "Defaults with one departure undone (*off alone*): above 1 it pays.",
+        "preset: paper": "The preset with one departure made (*on alone*): below 1 it pays.",
+    }
+    lines = ["## Departures, one at a time", ""]
+    lines += [
+        "MRE, one pair of each family. *Mean* and *median* are of the ratios to the first line (the"
+        " mean is geometric, a single diverging solve decides it); *worse / better* counts the"
+        " pairs that change by more than 1 %.",
         "",
-        f"{text}; logarithmic, one scale a map.",
-        *figure("depth_maps", text),
     ]
+    bars = {}
+    for method, text in titles.items():
+        own = rows[rows["method"] == method].assign(value=_mre(rows))
+        values = own.pivot(index="change", columns="name", values="value")
+        values = values.reindex(index=own["change"].unique(), columns=own["name"].unique())
+        values = values.dropna(axis=1, how="all")
+        ratios = values / values.loc["as they are"] if len(values) else values
+        mean = np.exp(np.log(ratios).mean(axis=1))
+        counts = zip((ratios > 1.01).sum(axis=1), (ratios < 0.99).sum(axis=1), strict=True)
+        values.insert(0, "worse / better", [f"{a} / {b}" for a, b in counts])
+        values.insert(0, "median", ratios.median(axis=1))
+        values.insert(0, "mean", mean)
+        bars[method] = mean.drop("as they are", errors="ignore")
+        lines += [text, "", *markdown(values.rename_axis("departure")), ""]
+    lines += [f"- {d.name}: {d.needs}." for d in DEPARTURES if d.needs]
+    text = "MRE relative to all others as they are (geometric mean of the pairs)"
+    _plot_bars(folder / "departures.png", pd.DataFrame(bars), text, log=True)
+    return [*lines, "", *_figure("departures", text)]
 
 
-def _missing(r: Results) -> list[str]:
-    entries = [[d.title, source_of(d)] for d in DATASETS if not r.plan.datasets[d.name]]
+def _missing(plan: Plan) -> list[str]:
+    entries = []
+    for name, (title, suites, _) in DATASETS.items():
+        if not plan.datasets[name]:
+            suite = SUITES[suites[0]]
+            entries.append([title, f"no pair was given; from {suite.source}, as {suite.layout}"])
     entries += [[name, text] for name, text in WITHOUT_TRUTH.items()]
-    left = [name for name in ALL_SECTIONS if name not in r.plan.sizes.sections]
+    left = [name for name in ALL_SECTIONS if name not in plan.sections]
     entries += [[f"section {name}", "left out of this run (`--sections`)"] for name in left]
     return ["## What is not here", "", *table(["data", "why, and where from"], entries), ""]

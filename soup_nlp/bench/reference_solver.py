@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
@@ -24,7 +26,6 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.nlp import to_scipy
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
-from soup_nlp.solve.factor import diagonal_places, factorisation, numbered
 
 EPS = (1.0, 0.3, 0.1, 0.03, 0.01)
 """Smoothing widths of the continuation, in the units of the energy (pixels)."""
@@ -80,8 +81,6 @@ class Tangent:
         self.rows, self.lower = A[rows], nlp.lbg[rows] - constant[rows]
         # a visibility row depends on the slopes of one superpixel only
         self.owner = self.rows.indices[self.rows.indptr[:-1]] // 9
-        places, columns = nlp.hess_lag.sparsity_out(0).get_triplet()
-        self.upper = numbered(np.asarray(places), np.asarray(columns), nlp.nx)
 
     def smoothing(self, eps: float) -> None:
         """Set both smoothing widths."""
@@ -96,10 +95,10 @@ class Tangent:
         f, gradient = self.nlp.grad_f(x, self.p)
         return float(f), np.asarray(gradient).ravel()
 
-    def normal_matrix(self, x: Float) -> Float:
-        """Nonzeros of the upper triangle, in the order of `upper`."""
-        H = self.nlp.hess_lag(x, self.p, 1.0, np.zeros(self.nlp.ng))
-        return np.array(H.nonzeros())
+    def normal_matrix(self, x: Float) -> sparse.csc_matrix:
+        """(9 N, 9 N) matrix of the reweighted least squares; CasADi gives its upper triangle."""
+        upper = to_scipy(self.nlp.hess_lag(x, self.p, 1.0, np.zeros(self.nlp.ng)))
+        return sparse.csc_matrix(upper + sparse.triu(upper, 1).T)
 
     def project(self, x: Float) -> Float:
         """The point clipped to the bounds, its slopes shrunk until every rim pixel is visible."""
@@ -119,8 +118,6 @@ class _Descent:
 
     def __init__(self, problem: Tangent) -> None:
         self.problem = problem
-        _, self.factorise = factorisation(problem.upper)
-        self.diagonal = diagonal_places(problem.upper)
         self.x = problem.project(problem.nlp.x0)
         self.damping, self.growth = FIRST_DAMPING, 2.0
 
@@ -136,17 +133,14 @@ class _Descent:
     def step(self) -> float | None:
         """Try a step; returns the relative decrease of f, or None if the step is rejected."""
         a, gradient = self.problem.simplex, self.gradient
-        damped = self.H.copy()
-        damped[self.diagonal] += self.damping
-        back = self.factorise(damped)
-        u, v = back(gradient), back(a)
+        damped = self.H + self.damping * sparse.eye(len(gradient), format="csc")
+        options = {"SymmetricMode": True}
+        factor = splu(damped, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        u, v = factor.solve(gradient), factor.solve(a)
         trial = self.problem.project(self.x - u + v * (a @ u) / (a @ v))
         h = trial - self.x
         fresh = self.problem.value(trial)
-        U = self.problem.upper.copy()
-        U.data = self.H
-        curved = 2 * (h @ (U @ h)) - np.sum(U.diagonal() * h**2)
-        promised = -(gradient @ h + 0.5 * curved)
+        promised = -(gradient @ h + 0.5 * h @ (self.H @ h))
         gain = (self.f - fresh) / promised if promised > 0 else -1.0
         if not (np.isfinite(fresh) and fresh < self.f and gain > 0):
             self.damping, self.growth = self.damping * self.growth, 2 * self.growth

@@ -1,4 +1,4 @@
-"""A timed run: seconds, energy and memory by stage, and the reference solver on the same pair."""
+"""A timed solve: seconds, energy and memory by stage, with the reference solver beside it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import product
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from soup_nlp.bench.reference_solver import levenberg_marquardt
-from soup_nlp.bench.studies import Settings, grid
-from soup_nlp.config.problem import Problem, dump_problem, make_problem
+from soup_nlp.bench.study import Cell, Overrides
+from soup_nlp.bench.suite_pairs import Item
+from soup_nlp.config.problem import dump_problem
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.pipeline import Case, make_run, prepare
@@ -25,23 +26,54 @@ from soup_nlp.storage.rows import Row
 
 REFERENCE_ITERATIONS = 100
 """Limit of the steps of Levenberg-Marquardt for every smoothing width."""
-HISTORY_POINTS = 60
-"""Points of the reference solver's history that a row stores for the plot."""
 
 
-def plan(
+def speed_cell(
+    scene: str,
+    superpixels: int,
+    neighbours: int,
+    seed: int = 0,
+    width: int = 1024,
+    height: int = 436,
+    overrides: Sequence[str] = (),
+) -> Cell:
+    """The cell of a timed run: DIS flow, the NLP without refinement.
+
+    Args:
+        scene: A rendered scene, or motorcycle.
+        superpixels: Wanted number N.
+        neighbours: K of the K-NN graph.
+        seed: Of the scene.
+        width: Columns of the rendered image.
+        height: Its rows.
+        overrides: Further overrides.
+
+    Raises:
+        ConfigError: an override is wrong.
+    """
+    source: dict[str, Any] = {"kind": "motorcycle"}
+    if scene != "motorcycle":
+        source = {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height}
+    item = Item("speed", scene, f"{scene}, seed {seed}", "dis", source)
+    size = f"segmentation.superpixels={superpixels}", f"segmentation.neighbours={neighbours}"
+    own = (*size, f"seed={seed}", "refine.enabled=false", *overrides)
+    item.problem(own)
+    return Cell(item, own, f"N {superpixels}, K {neighbours}")
+
+
+def speed_cells(
     scenes: Sequence[str],
     sizes: Sequence[int],
     neighbours: Sequence[int],
     seeds: Sequence[int],
     **others: Any,
-) -> list[Settings]:
-    """Settings of all runs, small sizes first; the motorcycle has one seed, as it is one pair."""
-    every = grid(superpixels=sorted(sizes), neighbours=sorted(neighbours), scene=scenes, seed=seeds)
+) -> list[dict[str, Any]]:
+    """Arguments of `speed_cell` for all runs, small sizes first; the motorcycle has one seed."""
+    every = product(sorted(sizes), sorted(neighbours), scenes, seeds)
     return [
-        {**own, **others}
-        for own in every
-        if own["scene"] != "motorcycle" or own["seed"] == seeds[0]
+        {"scene": scene, "superpixels": n, "neighbours": k, "seed": seed, **others}
+        for n, k, scene, seed in every
+        if scene != "motorcycle" or seed == seeds[0]
     ]
 
 
@@ -56,7 +88,7 @@ class Clocks:
     def lap(self, stage: str) -> None:
         """Add the time since the last call to a stage."""
         now = time.perf_counter(), time.process_time()
-        for clock, begin, end in zip((self.wall, self.cpu), self.last, now):
+        for clock, begin, end in zip((self.wall, self.cpu), self.last, now, strict=True):
             clock[stage] = clock.get(stage, 0.0) + end - begin
         self.last = now
 
@@ -68,47 +100,20 @@ class Clocks:
         self.lap(name)
 
 
-def problem_of(
-    scene: str,
-    superpixels: int,
-    neighbours: int,
-    seed: int = 0,
-    width: int = 1024,
-    height: int = 436,
-    overrides: Sequence[str] = (),
-) -> Problem:
-    """The merged problem of a run, with the NLP but without refinement.
-
-    Raises:
-        ConfigError: an override is wrong.
-    """
-    source: dict[str, Any] = {"kind": "motorcycle"}
-    if scene != "motorcycle":
-        source = {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height}
-    raw = {
-        "name": scene,
-        "seed": seed,
-        "input": source,
-        "segmentation": {"superpixels": superpixels, "neighbours": neighbours},
-        "refine": {"enabled": False},
-    }
-    return make_problem(raw, overrides, where="bench speed")
-
-
-def measure(**settings: Any) -> Row:
+def measure_speed(item: Item, overrides: Overrides = (), keep: Path | None = None) -> Row:
     """Solve a problem and measure the cost of every stage.
 
     Returns:
-        Plain numbers: "sizes"; "wall" and "cpu" (seconds by stage, where "build", "functions" and
-        "linear algebra" are parts of the wall time of "nlp", and "presolve", "build" and "solve"
-        parts of its CPU time); "iterations" in all; "status", "energy", "mre", "residuals";
-        "peak_bytes" before the reference solver runs; "reference" with the same of that solver.
+        "wall" and "cpu" seconds by stage ("build", "functions" and "linear algebra" are parts of
+        the wall time of "nlp"), "sizes", "iterations", "status", "energy", "error" (MRE by soup),
+        "residuals", "peak_bytes" before the reference solver runs, and "reference" with the
+        energy, iterations and CPU seconds of that solver.
 
     Raises:
         SoupError: the input cannot be used.
     """
     clocks = Clocks()
-    problem = problem_of(**settings)
+    problem = item.problem(overrides)
     case = prepare(problem, on_stage=clocks.lap)
     clocks.lap("weights")
     with clocks.stage("nlp"):
@@ -119,12 +124,9 @@ def measure(**settings: Any) -> Row:
     with clocks.stage("output"), scratch() as folder:
         write_folder(prepare_folder(folder / "result"), run, dump_problem(problem), "")
     return {
-        "sizes": {
-            "superpixels": len(case),
-            "knn_edges": len(case.segmentation.edges),
-            "pairs": len(case.segmentation.pairs),
-            **solution.nlp,
-        },
+        "n": len(case),
+        "k": problem.segmentation.neighbours,
+        "sizes": solution.nlp,
         "wall": {**clocks.wall, **_parts(clocks.wall["nlp"], solution)},
         "cpu": {**clocks.cpu, **solution.cpu_seconds, "compiler": solution.seconds["compile"]},
         "iterations": sum(s.iterations for s in solution.stages),
@@ -132,7 +134,7 @@ def measure(**settings: Any) -> Row:
         "converged": solution.converged,
         "energy": dict(solution.energy),
         "energy_start": dict(solution.energy_start),
-        "mre": {k: m.mre for k, m in run.metrics.items()},
+        "errors": {k: m.mre for k, m in run.metrics.items()},
         "residuals": dict(solution.residuals),
         "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
         "reference": _reference(case),
@@ -152,13 +154,13 @@ def _parts(wall: float, solution: Solution) -> dict[str, float]:
 
 def schedule(options: SolverOptions) -> tuple[float, ...]:
     """Smoothing widths of the reference solver: those of the presolve and of Ipopt."""
-    own = tuple(options.presolve_eps) if options.presolve else ()
-    return own if own and own[-1] <= options.eps else (*own, options.eps)
+    widths = tuple(options.presolve_eps) if options.presolve else ()
+    return widths if widths and widths[-1] <= options.eps else (*widths, options.eps)
 
 
-def _reference(case: Case) -> dict[str, Any]:
+def _reference(case: Case) -> Row:
     """Result of Levenberg-Marquardt from the same start on the same energy."""
-    y = levenberg_marquardt(
+    found = levenberg_marquardt(
         case.soup,
         case.data,
         case.weights,
@@ -167,21 +169,14 @@ def _reference(case: Case) -> dict[str, Any]:
         iterations=REFERENCE_ITERATIONS,
         seconds=case.options.max_seconds,
     )
-    mre = None
-    if case.pair.truth is not None:
-        pair, size = case.pair, (case.pair.image_next.shape[0], case.pair.image_next.shape[1])
-        dense = reconstruct(y.soup, case.segmentation.labels, pair.K_ref, pair.K_next, size)
-        expected = case.problem.expected
-        depths = {"y": dense.depth_ref}
-        scores = score_depths(case.pair.truth, depths, expected.scale, expected.cap)
-        mre = scores["y"].mre if scores else None
-    kept = np.linspace(0, len(y.history) - 1, min(HISTORY_POINTS, len(y.history)))
+    pair, expected = case.pair, case.problem.expected
+    dense = reconstruct(found.soup, case.segmentation.labels, pair.K_ref, pair.K_next)
+    depths = {"lm": dense.depth_ref}
+    scores = score_depths(pair.truth, depths, expected.scale, expected.cap)
     return {
-        "status": y.status,
-        "energy": dict(y.energy),
-        "iterations": y.iterations,
-        "seconds": y.seconds,
-        "cpu_seconds": y.cpu_seconds,
-        "mre": mre,
-        "history": np.round(y.history[kept.round().astype(int)], 6).tolist(),
+        "status": found.status,
+        "energy": dict(found.energy),
+        "iterations": found.iterations,
+        "cpu_seconds": found.cpu_seconds,
+        "mre": scores["lm"].mre if scores else None,
     }

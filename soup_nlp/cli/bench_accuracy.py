@@ -1,52 +1,66 @@
-"""Commands bench accuracy and bench search: suites, the paper's analyses, better defaults."""
+"""Commands bench accuracy and bench search: suites, declared studies, better defaults."""
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import pandas as pd
 import typer
 
-from soup_nlp.bench import tuning
-from soup_nlp.bench.accuracy import pair_job
-from soup_nlp.bench.accuracy_table import report
-from soup_nlp.bench.analyses import ANALYSES, run_analysis, split_values
+from soup_nlp.bench import search as searching
+from soup_nlp.bench.accuracy import measure_pair
+from soup_nlp.bench.accuracy_page import suite_page, write_study
+from soup_nlp.bench.confidence import confidence_page, measure_confidence, plot_confidence
+from soup_nlp.bench.studies import STUDIES
+from soup_nlp.bench.study import Cell, measure_cells
 from soup_nlp.bench.suite_pairs import Options
 from soup_nlp.bench.suites import SUITES, Listing, list_suite
-from soup_nlp.bench.tables import main_metric, show
-from soup_nlp.bench.tuning_report import text_search
 from soup_nlp.cli import options
-from soup_nlp.cli.options import Progress, numbers
+from soup_nlp.cli.options import Progress, numbers, words
 from soup_nlp.errors import ConfigError
 from soup_nlp.evaluate.protocols import preset
+from soup_nlp.schema.limits import MAX_SIDE
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.rows import MeasureRows, Row, measure_all
 
+SuiteName = Annotated[
+    list[str] | None, typer.Option("--suite", help=f"{', '.join(SUITES)}; may be repeated.")
+]
+Flow = Annotated[
+    list[str] | None, typer.Option(help="Flow source instead of the suite's own; may be repeated.")
+]
+Only = Annotated[list[str] | None, typer.Option(help="Only pairs whose name holds this word.")]
+Width = Annotated[int, typer.Option(help="Columns of rendered scenes.", min=64, max=MAX_SIDE)]
+Seeds = Annotated[str, typer.Option(help="Seeds of rendered scenes, such as 0,1,2.")]
+
 
 def mre_of(row: Row) -> str:
     """The main error of a row as text for the progress line."""
-    return f"MRE {show(main_metric(row))}"
+    own = row["metrics"].get(row["presets"][0], {}).get("solution", {}).get("mre")
+    return "MRE -" if own is None else f"MRE {own:.4f}"
 
 
 def accuracy(
-    suite: options.SuiteName = None,
+    suite: SuiteName = None,
     data: options.Data = None,
     out: options.Out = Path("out/bench/accuracy"),
     analysis: Annotated[
-        str | None, typer.Option(help="An analysis instead of the table; `list` names them.")
+        str | None, typer.Option(help="A declared study instead of the table; `list` names them.")
     ] = None,
     values: Annotated[
-        str | None, typer.Option(help="Variants of the analysis, such as 100, 250, 500.")
+        str | None, typer.Option(help="Variants of the study, such as 100,250,500.")
     ] = None,
     overrides: options.Set = None,
-    flow: options.Flow = None,
-    width: options.Width = 1024,
-    seeds: options.Seeds = "0",
-    only: options.Only = None,
+    flow: Flow = None,
+    width: Width = 1024,
+    seeds: Seeds = "0",
+    only: Only = None,
     limit: Annotated[
         int | None, typer.Option(help="At most this many pairs a suite.", min=1)
     ] = None,
@@ -62,43 +76,35 @@ def accuracy(
 ) -> None:
     """Depth against truth on a suite of pairs; interrupted runs can be continued."""
     if analysis == "list":
-        for known in ANALYSES.values():
-            print(f"{known.name:<12} {known.text}")
+        print("\n".join(f"{known:<12} {study.text}" for known, study in STUDIES.items()))
         return
     if not suite and not analysis:
-        for entry in SUITES.values():
-            print(f"{entry.name:<14} {entry.text}")
+        print("\n".join(f"{entry.name:<14} {entry.text}" for entry in SUITES.values()))
         raise ConfigError("no suite was named", where="--suite", expected=", ".join(SUITES))
     for convention in conventions or []:
         preset(convention)
+    _check_names(analysis, folders, name, suite or [])
     wanted = _wanted(flow, width, numbers(seeds, "--seeds"), only, limit)
+    listings = [list_suite(known, data, wanted) for known in suite or ["rendered"]]
     progress, changes = Progress(quiet, mre_of), tuple(overrides or ())
     measure_rows = partial(measure_all, workers=workers, say=progress, any_code=any_code)
-    listings = [list_suite(known, data, wanted) for known in suite or ["rendered"]]
-    _check_names(analysis, folders, name, suite or [])
     if analysis:
-        page = run_analysis(
-            analysis,
-            listings,
-            out,
-            changes,
-            measure_rows,
-            values=None if values is None else split_values(analysis, values),
-            presets=conventions or (),
-            overwrite=overwrite,
-        )
-        _print_page(page)
+        items = [i.scored_by(conventions) for listing in listings for i in listing.items]
+        chosen = words(analysis, "--analysis", list(STUDIES))[0]
+        wanted_values = None if values is None else [v.strip() for v in values.split(",")]
+        cells = STUDIES[chosen].cells(items, changes, wanted_values)
+        _study(chosen, cells, out, changes, measure_rows, overwrite)
     else:
         pages = [out / f"{name or listing.suite.name}.md" for listing in listings]
         claim(out, [page.name for page in pages], overwrite)
         for listing, page in zip(listings, pages, strict=True):
             if not quiet:
                 print(listing, file=sys.stderr)
-            _table(listing, page, changes, measure_rows, conventions, folders)
+            _suite(listing, page, changes, measure_rows, conventions, folders)
     raise typer.Exit(1 if progress.failed else 0)
 
 
-def _table(
+def _suite(
     listing: Listing,
     page: Path,
     changes: tuple[str, ...],
@@ -106,22 +112,46 @@ def _table(
     conventions: list[str] | None,
     folders: Path | None,
 ) -> None:
-    """Measure the pairs of a suite, and write and print their table."""
-    jobs = [
-        pair_job(
+    """Measure the pairs of a suite, and write and print their page."""
+    cells = [
+        Cell(
             item.scored_by(conventions),
             changes,
-            folder=folders / item.key.replace(" ", "_") if folders else None,
+            keep=folders / item.key.replace(" ", "_") if folders else None,
         )
         for item in listing.items
     ]
-    rows = measure_rows(jobs, page.with_suffix(".jsonl"))
-    note = f"Suite `{listing.suite.name}`: {listing.suite.text}."
-    if changes:
-        note += f" Overrides: {', '.join(f'`{o}`' for o in changes)}."
+    frame = measure_cells(cells, measure_pair, page.with_suffix(".jsonl"), measure_rows)
+    note = f"Suite `{listing.suite.name}`: {listing.suite.text}. {_note(changes)}"
     with staged(page.parent) as new:
-        write_text(new / page.name, report(f"Accuracy on {page.stem}", rows, note))
+        write_text(new / page.name, suite_page(f"Accuracy on {page.stem}", frame, note))
     _print_page(page)
+
+
+def _study(
+    name: str,
+    cells: Sequence[Cell],
+    out: Path,
+    changes: tuple[str, ...],
+    measure_rows: MeasureRows,
+    overwrite: bool,
+) -> None:
+    """Measure a study, and write and print its page and its picture."""
+    claim(out, (f"{name}.md", f"{name}.png"), overwrite)
+    study, special = STUDIES[name], name == "confidence"
+    measure = measure_confidence if special else measure_pair
+    frame = measure_cells(cells, measure, out / f"{name}.jsonl", measure_rows)
+    with staged(out) as new:
+        if special:
+            write_text(new / f"{name}.md", confidence_page(study, frame, _note(changes)))
+            plot_confidence(new / f"{name}.png", frame)
+        else:
+            write_study(new, name, study, frame, _note(changes))
+    _print_page(out / f"{name}.md")
+
+
+def _note(changes: tuple[str, ...]) -> str:
+    return f"Overrides of every pair: {', '.join(f'`{o}`' for o in changes) or 'none'}."
 
 
 def _check_names(
@@ -129,7 +159,7 @@ def _check_names(
 ) -> None:
     if analysis and (folders or name):
         raise ConfigError(
-            "result folders and names are of suites, not of analyses",
+            "result folders and names are of suites, not of studies",
             where="--folders" if folders else "--name",
             found=f"--analysis {analysis}",
             hint="give one without the other",
@@ -155,7 +185,7 @@ def _print_page(page: Path) -> None:
 
 
 def search(
-    suite: options.SuiteName = None,
+    suite: SuiteName = None,
     data: options.Data = None,
     out: options.Out = Path("out/bench/accuracy"),
     params: Annotated[
@@ -165,51 +195,46 @@ def search(
     trials: Annotated[int, typer.Option(help="Configurations beside the default.", min=1)] = 24,
     finalists: Annotated[int, typer.Option(help="Best trials that are validated.", min=1)] = 3,
     seed: Annotated[int, typer.Option(help="Of the trials.", min=0)] = 0,
-    seeds: options.Seeds = "0,1",
+    seeds: Seeds = "0,1",
     validation_seeds: Annotated[
         str, typer.Option(help="Seeds of rendered scenes that only validate.")
     ] = "2,3",
     overrides: options.Set = None,
-    flow: options.Flow = None,
-    width: options.Width = 512,
-    only: options.Only = None,
+    flow: Flow = None,
+    width: Width = 512,
+    only: Only = None,
     workers: options.Workers = 1,
     any_code: options.AnyCode = False,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Search for better defaults and check them on pairs and families that did not choose."""
-    ours, theirs = numbers(seeds, "--seeds"), numbers(validation_seeds, "--validation-seeds")
-    wanted = _wanted(flow, width, (*ours, *theirs), only)
-    space = tuple(tuning.parameter(p) for p in params) if params else tuning.DEFAULT_SPACE
+    train_seeds, others = numbers(seeds, "--seeds"), numbers(validation_seeds, "--validation-seeds")
+    wanted = _wanted(flow, width, (*train_seeds, *others), only)
+    texts = params or searching.DEFAULT_SPACE
+    space = searching.parse_space(texts)
     items = [i for name in suite or ["rendered"] for i in list_suite(name, data, wanted).items]
-    train, validation = tuning.split(items, ours, theirs)
-    if not quiet:
-        print(
-            f"{trials} trials of {len(space)} settings on {len(train)} pairs,"
-            f" {len(validation)} validate",
-            file=sys.stderr,
-        )
+    train, validation = searching.split(items, train_seeds, others)
     claim(out, ["search.md"], overwrite)
     progress = Progress(quiet, mre_of)
-    found = tuning.search(
+    frame: pd.DataFrame = searching.search(
         space,
         train,
         validation,
         out / "search.jsonl",
+        partial(measure_all, workers=workers, say=progress, any_code=any_code),
         trials=trials,
         finalists=finalists,
         seed=seed,
         overrides=tuple(overrides or ()),
-        measure_rows=partial(measure_all, workers=workers, say=progress, any_code=any_code),
     )
-    words = [f"--suite {s}" for s in suite or ["rendered"]] + (["--data DIR"] if data else [])
-    words += [f"--trials {trials} --seed {seed} --seeds {seeds}"]
-    words += [f"--validation-seeds {validation_seeds} --width {width}"]
-    words += [f"--flow {f}" for f in flow or []] + [f"--only '{o}'" for o in only or []]
-    words += [f"--set '{o}'" for o in overrides or []] + [f"--param '{p}'" for p in params or []]
-    page = out / "search.md"
+    said = [f"--suite {s}" for s in suite or ["rendered"]] + (["--data DIR"] if data else [])
+    said += [f"--trials {trials} --seed {seed} --seeds {seeds}"]
+    said += [f"--validation-seeds {validation_seeds} --width {width}"]
+    said += [f"--flow {f}" for f in flow or []] + [f"--only {shlex.quote(o)}" for o in only or []]
+    said += [f"--set {shlex.quote(o)}" for o in overrides or []]
+    command = f"soup-nlp bench search {' '.join(said)}"
     with staged(out) as new:
-        write_text(new / page.name, text_search(found, f"soup-nlp bench search {' '.join(words)}"))
-    _print_page(page)
+        write_text(new / "search.md", searching.search_page(frame, texts, command))
+    _print_page(out / "search.md")
     raise typer.Exit(1 if progress.failed else 0)

@@ -17,42 +17,24 @@ from soup_nlp.storage.folders import claim, staged
 TERSE = "--set segmentation.superpixels=500"
 THREE = "--suite rendered --only street --only room --only orbit"
 NLP = "--set refine.enabled=false"
-ANALYSIS = "bench accuracy -o {out}/accuracy --analysis"
+STUDY = "bench accuracy -o {out}/accuracy --analysis"
 COMMANDS = (
     "solve problems/motorcycle.yaml -o out/motorcycle",
     "bench accuracy -o {out}/accuracy --suite rendered --suite shared --data {data}",
-    f"{ANALYSIS} ablation {THREE} --flow dis {TERSE} {NLP}",
-    f"{ANALYSIS} superpixels {THREE} --flow dis {NLP}",
-    f"{ANALYSIS} neighbours {THREE} --flow dis {TERSE} {NLP}",
-    f"{ANALYSIS} pattern {THREE} --flow dis {TERSE} {NLP}",
-    f"{ANALYSIS} flow {THREE} {TERSE} {NLP}",
-    f"{ANALYSIS} stages {THREE} --flow dis {TERSE}",
-    f"{ANALYSIS} energy --suite rendered {TERSE} {NLP}",
-    f"{ANALYSIS} flows --suite rendered --suite shared --data {{data}} --flow truth",
-    f"{ANALYSIS} views --suite shared --data {{data}} --flow dis {NLP}",
-    f"{ANALYSIS} confidence --suite rendered --suite shared --data {{data}} --flow dis",
-    f"{ANALYSIS} causes --suite rendered --suite shared --data {{data}} --flow truth",
-    f"{ANALYSIS} rules --suite rendered --suite shared --data {{data}} --flow dis --width 512"
-    f" {TERSE} {NLP}",
+    *(
+        f"{STUDY} {name} {THREE} --flow dis {TERSE} {NLP}"
+        for name in ("ablation", "superpixels", "neighbours", "pattern")
+    ),
+    f"{STUDY} flow {THREE} {TERSE} {NLP}",
+    f"{STUDY} stages {THREE} --flow dis {TERSE}",
+    f"{STUDY} confidence --suite rendered --suite shared --data {{data}} --flow dis",
     f"bench search -o {{out}}/accuracy {THREE} --flow dis --trials 8 --seeds 0"
     f" --validation-seeds 1,2 --width 512 --set segmentation.superpixels=300 {NLP}",
-    "bench accuracy -o {out}/accuracy --name sheets --suite rendered --only sheet"
-    f" --seeds 0,1,2,3,4,5 --flow truth --flow dis {NLP}",
     "bench accuracy -o {out}/accuracy --name banner --suite rendered --only banner"
     " --seeds 0,1,2,3,4,5 --flow truth --flow dis",
-    "bench accuracy -o {out}/accuracy --name components --suite rendered --only street --only room"
-    " --seeds 1,2,3,4,5,6,10,11,12,13,14,15,16,17,18 --flow truth --flow dis"
-    f" {NLP}",
-    "bench cut-off -o {out}/accuracy",
     "bench chain -o {out}/accuracy --data {data}",
     "bench paper -o {out}/paper --data {data} --limit 2 --superpixels 500 --analysis 250",
-    "bench refine -o {out}/refine",
     "bench speed -o {out}/speed --superpixels 500,1000,2000 --neighbours 20",
-    "bench speed -o {out}/speed/neighbours --scenes street --superpixels 250,500,1000 --seeds 0",
-    "bench methods -o {out}/speed",
-    "bench methods -o {out}/speed --unrefined --seeds 0,1,2,3,4 --superpixels 1000,2000",
-    "bench formulations -o {out}/speed",
-    "bench trws -o {out}/speed",
     "compare problems/orbit.yaml problems/street.yaml -o {out}/solvers --superpixels 100"
     " --seconds 45 --set flow.source=truth",
 )

@@ -1,25 +1,28 @@
-"""Command bench speed: seconds, growth and energy, and the gate on their ratios."""
+"""Commands bench speed and bench chain: seconds and growth with a gate, one scale of a sequence."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import pandas as pd
 import typer
 
-from soup_nlp.bench.processes import machine
-from soup_nlp.bench.speed import plan, problem_of
-from soup_nlp.bench.speed_gate import baseline, check, read_baseline
-from soup_nlp.bench.speed_report import SPEED
-from soup_nlp.bench.studies import Settings, run_study
-from soup_nlp.cli.options import Out, Overwrite, Progress, Quiet, Set, Width, numbers, words
+from soup_nlp.bench import speed_page
+from soup_nlp.bench.chain import chain_page, measure_chain, sequences
+from soup_nlp.bench.speed import measure_speed, speed_cell, speed_cells
+from soup_nlp.bench.study import Cell, measure_cells, show
+from soup_nlp.cli.bench_accuracy import Only, Width
+from soup_nlp.cli.options import Data, Out, Overwrite, Progress, Quiet, Set, numbers, words
 from soup_nlp.data.scenes.catalogue import SCENES
+from soup_nlp.errors import ConfigError
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SIDE, MAX_SUPERPIXELS
 from soup_nlp.storage.atomic import write_text
-from soup_nlp.storage.rows import Row, failed
+from soup_nlp.storage.folders import claim, staged
+from soup_nlp.storage.rows import Row, measure_all
 
 
 def speed(
@@ -48,8 +51,8 @@ def speed(
     quiet: Quiet = False,
 ) -> None:
     """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
-    kept = [] if gate is None else read_baseline(gate)
-    settings: Sequence[Settings] = [run.settings for run in kept] or plan(
+    kept = [] if gate is None else speed_page.read_baseline(gate)
+    settings = [own for own, _ in kept] or speed_cells(
         words(scenes, "--scenes", [*SCENES, "motorcycle"]),
         numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS),
         numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS),
@@ -58,32 +61,66 @@ def speed(
         height=height,
         overrides=overrides or [],
     )
-    for own in settings:
-        # check the overrides now instead of after an hour
-        problem_of(**own)
+    cells = [speed_cell(**own) for own in settings]
     if write_baseline is not None and os.path.lexists(write_baseline) and not overwrite:
         # raises an error if the file is no baseline
-        read_baseline(write_baseline)
-    say = Progress(quiet, _result_of)
-    rows = run_study(SPEED, out, settings, say, page=not kept, overwrite=overwrite)
+        speed_page.read_baseline(write_baseline)
+    names = () if kept else ("table.md", "growth.png")
+    claim(out, names, overwrite)
+    run = partial(measure_all, say=Progress(quiet, _result_of))
+    frame = measure_cells(cells, measure_speed, out / "table.jsonl", run, own_process=True)
     if write_baseline is not None:
-        write_text(write_baseline, json.dumps(baseline(rows, machine()), indent=1) + "\n")
+        text = json.dumps(speed_page.baseline(frame, settings), indent=1) + "\n"
+        write_text(write_baseline, text)
     if kept:
-        findings = list(check(rows, kept))
-        print(*findings, sep="\n")
-        bad = sum(not f.ok for f in findings)
-        print(f"{bad} of {len(findings)} values are worse" if bad else "the gate holds")
+        found = speed_page.check(frame, kept)
+        print(found.to_string(index=False))
+        bad = int((~found["ok"].astype(bool)).sum())
+        print(f"{bad} of {len(found)} values are WORSE" if bad else "the gate holds")
     else:
-        bad = sum(map(failed, rows))
-        print(f"{len(rows)} runs, {bad} failed, in {out / SPEED.name}.md")
+        with staged(out) as new:
+            write_text(new / "table.md", speed_page.speed_page(frame))
+            speed_page.plot_growth(new / "growth.png", frame)
+        bad = _failed(frame)
+        print(f"{len(frame)} runs, {bad} failed, in {out / 'table.md'}")
     raise typer.Exit(1 if bad else 0)
 
 
-def _result_of(record: Row) -> str:
+def _failed(frame: pd.DataFrame) -> int:
+    return int(frame["ok"].ne(True).sum())
+
+
+def _result_of(row: Row) -> str:
     """The result of a run as text for the progress line."""
-    y = record["reference"]
+    reference = row["reference"]
     return (
-        f"{record['status']}, {record['cpu']['nlp']:.1f} CPU s, {record['iterations']}"
-        f" iterations, E {record['energy']['total']:.4g};"
-        f" LM {y['cpu_seconds']:.1f} CPU s, E {y['energy']['total']:.4g}"
+        f"{row['status']}, {row['cpu']['nlp']:.1f} CPU s, {row['iterations']} iterations,"
+        f" E {row['energy']['total']:.4g}; LM {reference['cpu_seconds']:.1f} CPU s,"
+        f" E {reference['energy']['total']:.4g}"
     )
+
+
+def chain(
+    data: Data = None,
+    only: Only = None,
+    frames: Annotated[int, typer.Option(help="Most frames of a sequence.", min=3)] = 10,
+    overrides: Set = None,
+    out: Out = Path("out/bench/accuracy"),
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """What one scale costs on rendered sequences, and on kitti_tracking in the --data folder."""
+    known = sequences(data)
+    chosen = [i for i in known if not only or any(word in i.name for word in only)]
+    if not chosen:
+        names = ", ".join(i.name for i in known)
+        raise ConfigError("no sequence is left", where="--only", expected=names)
+    claim(out, ("chain.md",), overwrite)
+    cells = [Cell(item, tuple(overrides or ()), f"{frames} frames") for item in chosen]
+    say = Progress(quiet, lambda row: f"cost of one scale {show(row['cost'], '+.2%')}")
+    measure, run = partial(measure_chain, frames=frames), partial(measure_all, say=say)
+    frame = measure_cells(cells, measure, out / "chain.jsonl", run, own_process=True)
+    with staged(out) as new:
+        write_text(new / "chain.md", chain_page(frame))
+    print((out / "chain.md").read_text(encoding="utf-8"))
+    raise typer.Exit(1 if _failed(frame) else 0)

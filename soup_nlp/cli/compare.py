@@ -9,15 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from soup_nlp.bench.processes import machine
-from soup_nlp.bench.solvers.family_runs import (
-    draw_family,
-    family_page,
-    family_tasks,
-    is_family,
-    neutral,
-    summary,
-)
-from soup_nlp.bench.solvers.page import conclusion, page
+from soup_nlp.bench.solvers.family_runs import family_tasks, is_family, neutral, summary
+from soup_nlp.bench.solvers.page import by_start, conclusion, frame_of_runs, page
 from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
@@ -107,7 +100,7 @@ def compare(
         rows += of_family
         if rows:
             _write(folder, rows, of_family, limits, subject)
-    print("\n".join(conclusion(rows)))
+    print("\n".join(conclusion(frame_of_runs(rows))))
     print(f"files       {out}/: {', '.join(written)}, runs.jsonl")
     verified = sum(bool(r["verified"]) for r in rows)
     print(f"exit code   {int(not verified)}: {verified} of {len(rows)} runs are verified")
@@ -122,12 +115,15 @@ def _write(
     subject: str,
 ) -> None:
     """Write FILES from all rows, and OF_FAMILY from the rows of the family."""
+    frame = frame_of_runs(rows)
     with staged(folder, subject=subject) as new:
-        write_text(new / "README.md", family_page(of_family) if of_family else page(rows))
-        draw_profiles(new / "profile.png", rows)
-        draw_curves(new / "curves.png", rows)
+        write_text(new / "README.md", page(frame, family=bool(of_family)))
+        draw_profiles(new / "profile.png", {"": frame}, ("seconds", "energy"))
+        draw_curves(new / "curves.png", frame)
         if of_family:
-            draw_family(new / "profiles.png", of_family)
+            family = frame_of_runs(of_family)
+            measures = "cpu_seconds", "objective"
+            draw_profiles(new / "profiles.png", by_start(family), measures)
             note = {"limits": asdict(limits), "machine": machine()}
-            write_results(new / "results.json", [neutral(r) for r in of_family], note)
-            write_json(new / "reached.json", summary(of_family))
+            write_results(new / "results.json", neutral(family), note)
+            write_json(new / "reached.json", summary(family))

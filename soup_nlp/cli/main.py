@@ -89,27 +89,10 @@ BENCH: Mapping[str, tuple[str, str]] = {
         "bench_paper:paper",
         "The paper's tables and figures by `preset: paper` and the defaults; can be continued.",
     ),
-    "refine": (
-        "bench_studies:refine",
-        "What NLP and refinement contribute: E and MRE of start, either alone and both.",
-    ),
-    "methods": (
-        "bench_studies:methods",
-        "How low every method ends on one energy, before and after refinement.",
-    ),
-    "formulations": (
-        "bench_studies:formulations",
-        "Every gauge, norm and truncation of the constrained NLP: which converge.",
-    ),
-    "cut-off": (
-        "bench_studies:cut_off",
-        "Depth of components that the lower border cuts off, by contact alone and as shipped.",
-    ),
     "chain": (
-        "bench_studies:chain",
+        "bench_speed:chain",
         "What one scale costs on rendered sequences, and on kitti_tracking in the --data folder.",
     ),
-    "trws": ("bench_studies:trws", "Time and memory of TRW-S at the size of a refinement."),
     "all": (
         "bench_all:everything",
         "Make every table and picture of results/ in a folder; a run that was stopped goes on.",

@@ -9,15 +9,13 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.bench.suites import SUITES
-from soup_nlp.bench.tables import reason
 from soup_nlp.config.presets import PRESETS
 from soup_nlp.config.problem import load_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, SoupError
-from soup_nlp.schema.limits import MAX_SEED, MAX_SIDE, MAX_SUPERPIXELS
+from soup_nlp.schema.limits import MAX_SEED
 from soup_nlp.storage.files import as_path, is_file
-from soup_nlp.storage.rows import Row, failed
+from soup_nlp.storage.rows import Row, failed, reason
 
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
 PresetName = Annotated[
@@ -48,17 +46,7 @@ Formulations = Annotated[
 Superpixels = Annotated[
     list[int] | None, typer.Option(help="Wanted number, 50 to 2000; may be repeated.")
 ]
-SuiteName = Annotated[
-    list[str] | None, typer.Option("--suite", help=f"{', '.join(SUITES)}; may be repeated.")
-]
 Data = Annotated[Path | None, typer.Option(help="Root folder of the dataset.")]
-Flow = Annotated[
-    list[str] | None, typer.Option(help="Flow source instead of the suite's own; may be repeated.")
-]
-Only = Annotated[list[str] | None, typer.Option(help="Only pairs whose name holds this word.")]
-Size = Annotated[int, typer.Option(help="Superpixels wanted.", min=2, max=MAX_SUPERPIXELS)]
-Width = Annotated[int, typer.Option(help="Columns of rendered scenes.", min=64, max=MAX_SIDE)]
-Seeds = Annotated[str, typer.Option(help="Seeds of rendered scenes, such as 0,1,2.")]
 Workers = Annotated[int, typer.Option(help="Processes of this machine (extra: bench).", min=1)]
 Dask = Annotated[
     str | None,

@@ -44,6 +44,13 @@ MeasureRows = Callable[[Sequence[Job], Path], list[Row]]
 """Type of `measure_all` with its options bound."""
 
 
+def reason(row: Mapping[str, Any]) -> str:
+    """Why a row failed, on one line: what was wrong, where, and what was found."""
+    first, *more = str(row.get("error")).splitlines() or ["no reason"]
+    details = (line.strip() for line in more)
+    return ", ".join([first, *(d for d in details if d.startswith(("where: ", "found: ")))])
+
+
 def failed(row: Mapping[str, Any]) -> bool:
     """Whether a row holds an error instead of numbers."""
     return bool(row.get("error"))

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from soup_nlp.bench.solvers.profiles import cost_table, problem_key
-from soup_nlp.bench.tables import code_versions, columns, page_text, show, table
+from soup_nlp.bench.solvers.profiles import PROBLEM, cost_table
+from soup_nlp.bench.study import markdown, page_text, show
 
 Row = Mapping[str, Any]
 
 FEASIBLE = 1e-5
 """Largest violation of a feasible point."""
+REACHED = 1e-4
+"""Relative distance up to which an objective has reached the best known one."""
 LIMITS = (
     "Times are CPU times of one run each, set-up included, on the machine named; so is the limit.",
-    "The presolve's answer is almost optimal: energies hardly move, and the comparison is of how "
-    "quickly a solver proves it. From the proposal it is harder.",
+    "From the presolve's answer, energies hardly move, and the comparison is of how quickly a "
+    "solver proves it. From the proposal it is harder.",
     "Local solvers end in local minima: an energy says where this start led, not what is best.",
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
     "Options are those of `soup_nlp/bench/solvers/plugins.py`, the package's own ones being tuned "
@@ -25,124 +28,167 @@ LIMITS = (
     "lm, the reference solver on the manifold, claims no optimum; its rows are for the energy.",
     "SCIP is a global solver: here it shows what its time limit allows from the same start.",
 )
+COLUMNS = {
+    "problem": ("problem", ""),
+    "superpixels": ("N", ""),
+    "formulation": ("formulation", ""),
+    "solver": ("solver", ""),
+    "word": ("verified", ""),
+    "energy": ("exact E", ".6g"),
+    "energy_start": ("start E", ".6g"),
+    "primal": ("primal", ".0e"),
+    "dual": ("dual", ".0e"),
+    "complementarity": ("compl.", ".0e"),
+    "iterations": ("iterations", ".0f"),
+    "seconds": ("seconds", ".2f"),
+    "MB": ("MB", ".0f"),
+    "ended": ("status", ""),
+}
+"""Title and format of every column of the table of runs."""
 
 
-def page(rows: Sequence[Row], each: bool = True) -> str:
-    """Markdown page of all rows; `each` adds lines on each problem to the conclusion."""
-    machine = sorted({str(r["machine"]) for r in rows})
-    packages = sorted({f"{k} {v}" for r in rows for k, v in r["versions"].items()})
+def frame_of_runs(rows: Sequence[Row]) -> pd.DataFrame:
+    """A line for each run, with every column that the page needs."""
+    frame = pd.DataFrame(list(rows))
+    frame = frame.reindex(
+        columns=list(dict.fromkeys([*frame.columns, *COLUMNS, "objective", "peak_bytes", "status"]))
+    )
+    frame["MB"] = frame["peak_bytes"].where(frame["peak_bytes"] > 0) / 2**20
+    frame["iterations"] = frame["iterations"].where(frame["iterations"] >= 0).astype(float)
+    frame["word"] = np.where(frame["verified"], "yes", np.where(frame["claimed"], "claimed", "no"))
+    frame["ended"] = [" ".join(str(s)[:50].replace("|", "/").split()) for s in frame["status"]]
+    return frame
+
+
+def page(frame: pd.DataFrame, family: bool = False) -> str:
+    """Markdown page of all runs; `family` adds a table by start and size of the SOUP family."""
+    packages = {f"{k} {v}" for versions in frame["versions"] for k, v in versions.items()}
+    code = ", ".join(sorted(frame["code"].astype(str).unique()))
     note = (
         "Verified: the solver claims an optimum, and the KKT residuals and the exact energy,"
         " recomputed from its point, agree."
     )
-    details = [*machine, ", ".join(packages), f"code {code_versions([dict(r) for r in rows])}"]
-    pictures = ["![performance profiles](profile.png)", "", "![energy against time](curves.png)"]
-    lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(rows, each), "", *pictures]
-    for title, body in {
-        "By solver": [note, "", *by_solver(rows)],
-        "By run": by_run(rows),
-        "Limits": [f"- {text}" for text in (_limits(rows), *LIMITS)],
-        "Machine and versions": [f"- {text}" for text in details],
-    }.items():
-        lines += ["", f"## {title}", "", *body]
+    facts = [*sorted(frame["machine"].unique()), ", ".join(sorted(packages)), f"code {code}"]
+    lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(frame, not family), ""]
+    lines += ["![performance profiles](profile.png)", "", "![energy against time](curves.png)"]
+    sections = {
+        "By start and size": _by_start(frame) if family else [],
+        "By solver": [note, "", *_by_solver(frame)],
+        "By run": _by_run(frame),
+        "Limits": [f"- {text}" for text in (_limits(frame), *LIMITS)],
+        "Machine and versions": [f"- {text}" for text in facts],
+    }
+    for title, body in sections.items():
+        lines += ["", f"## {title}", "", *body] if body else []
     return page_text(lines)
 
 
-def _limits(rows: Sequence[Row]) -> str:
+def _limits(frame: pd.DataFrame) -> str:
     """Sentence on the limits of the runs, whose time limits may differ."""
-    own = rows[0]["limits"]
-    seconds = " or ".join(f"{s:g}" for s in sorted({r["limits"]["seconds"] for r in rows}))
+    limits = frame["limits"].iloc[0]
+    seconds = " or ".join(f"{s:g}" for s in sorted({v["seconds"] for v in frame["limits"]}))
     return (
-        f"A run has {seconds} CPU seconds, {own['iterations']} iterations and"
-        f" {own['memory'] / 2**30:g} GiB, and is asked for a dual infeasibility of {own['tol']:g}."
+        f"A run has {seconds} CPU seconds, {limits['iterations']} iterations and"
+        f" {limits['memory'] / 2**30:g} GiB, and is asked for a dual infeasibility of"
+        f" {limits['tol']:g}."
     )
 
 
-def conclusion(rows: Sequence[Row], each: bool = True) -> list[str]:
+def conclusion(frame: pd.DataFrame, each: bool = True) -> list[str]:
     """Conclusion in sentences; `each` adds lines on each problem."""
-    problems, solvers, time = cost_table(rows, "time")
-    _, _, energy = cost_table(rows, "energy")
-    solved = np.isfinite(time).sum(axis=0)
-    some = [s for s, n in zip(solvers, solved) if n]
+    time, energy = cost_table(frame, "seconds"), cost_table(frame, "energy")
+    solved = np.isfinite(time).sum()
+    some = solved[solved > 0].index
     out = [
-        f"**{len(problems)} problems, {len(solvers)} solvers, {len(rows)} runs:"
-        f" {sum(bool(r['verified']) for r in rows)} verified, by {len(some)} solvers"
+        f"**{len(time)} problems, {len(solved)} solvers, {len(frame)} runs:"
+        f" {int(frame['verified'].sum())} verified, by {len(some)} solvers"
         f" ({', '.join(some) or 'none'}).**"
     ]
-    if some:
-        best = [s for s, n in zip(solvers, solved) if n == solved.max()]
+    if len(some):
+        best = solved[solved == solved.max()].index
         out[0] += f" Most problems ({solved.max()}): {', '.join(best)}."
-    for k, problem in enumerate(problems if each else ()):
-        energies = [
-            (float(r["energy"]), str(r["solver"]), float(r["seconds"]))
-            for r in rows
-            if problem_key(r) == problem and _feasible(r)
-        ]
-        if energies:
-            value, who, when = min(energies)
+    for key, group in frame.groupby(PROBLEM) if each else ():
+        name = "{}, N = {}, {}".format(*key[:3])
+        feasible = group[group["energy"].notna() & (group["primal"] <= FEASIBLE)]
+        if len(feasible):
+            low = feasible.loc[feasible["energy"].astype(float).idxmin()]
             out.append(
-                f"- {problem}: lowest exact energy of any run {value:.6g} by {who} ({when:.1f} s)."
+                f"- {name}: lowest exact energy of any run {low['energy']:.6g} by {low['solver']}"
+                f" ({low['seconds']:.1f} s)."
             )
-        if not np.isfinite(time[k]).any():
-            out.append(f"- {problem}: none is verified.")
+        if not np.isfinite(time.loc[key]).any():
+            out.append(f"- {name}: none is verified.")
             continue
-        quick, low = int(time[k].argmin()), int(energy[k].argmin())
+        quick, low = time.loc[key].idxmin(), energy.loc[key].idxmin()
         out.append(
-            f"- {problem}: quickest {solvers[quick]}"
-            f" ({time[k, quick]:.2f} s, E {energy[k, quick]:.6g}); lowest energy"
-            f" {solvers[low]} (E {energy[k, low]:.6g} in {time[k, low]:.2f} s)."
+            f"- {name}: quickest {quick} ({time.loc[key, quick]:.2f} s, E"
+            f" {energy.loc[key, quick]:.6g}); lowest energy {low} (E {energy.loc[key, low]:.6g} in"
+            f" {time.loc[key, low]:.2f} s)."
         )
-    claims = [r for r in rows if r["claimed"]]
-    if claims:
-        false = sorted({str(r["solver"]) for r in claims if not r["verified"]})
-        true = sum(bool(r["verified"]) for r in claims)
+    claims = frame[frame["claimed"].astype(bool)]
+    if len(claims):
+        false = sorted(claims.loc[~claims["verified"].astype(bool), "solver"].unique())
         more = f"; not always those of {', '.join(false)}" if false else ""
+        true = int(claims["verified"].sum())
         out.append(f"- Claims of an optimum that were true: {true} of {len(claims)}{more}.")
     return out
 
 
-def _feasible(row: Row) -> bool:
-    """Whether the point of a row is feasible and has an energy."""
-    primal = row.get("primal")
-    return row.get("energy") is not None and primal is not None and primal <= FEASIBLE
-
-
-def by_solver(rows: Sequence[Row]) -> list[str]:
+def _by_solver(frame: pd.DataFrame) -> list[str]:
     """Table of the numbers of runs, claims and verified claims of each solver."""
-    lines = []
-    for solver in sorted({str(r["solver"]) for r in rows}):
-        here = [r for r in rows if r["solver"] == solver]
-        claimed, verified = (sum(bool(r[k]) for r in here) for k in ("claimed", "verified"))
-        share = f"{verified} of {claimed}" if claimed else "-"
-        other = "; ".join(sorted({_status(r) for r in here if not r["claimed"]}))
-        lines.append([solver, str(len(here)), str(claimed), str(verified), share, other])
-    head = ["solver", "runs", "claimed", "verified", "claims that were true", "ended otherwise"]
-    return table(head, lines)
+    lines = {}
+    for solver, group in frame.groupby("solver"):
+        claimed, verified = int(group["claimed"].sum()), int(group["verified"].sum())
+        others = sorted(group.loc[~group["claimed"].astype(bool), "ended"].unique())
+        lines[solver] = {
+            "runs": str(len(group)),
+            "claimed": str(claimed),
+            "verified": str(verified),
+            "claims that were true": f"{verified} of {claimed}" if claimed else "-",
+            "ended otherwise": "; ".join(others),
+        }
+    return markdown(pd.DataFrame.from_dict(lines, orient="index").rename_axis("solver"))
 
 
-CELLS: dict[str, Callable[[Row], str]] = {
-    "problem": lambda r: str(r["problem"]),
-    "N": lambda r: str(r["superpixels"]),
-    "formulation": lambda r: str(r["formulation"]),
-    "solver": lambda r: str(r["solver"]),
-    "verified": lambda r: "yes" if r["verified"] else "claimed" if r["claimed"] else "no",
-    "exact E": lambda r: show(r.get("energy"), ".6g"),
-    "start E": lambda r: show(r.get("energy_start"), ".6g"),
-    "primal": lambda r: show(r.get("primal"), ".0e"),
-    "dual": lambda r: show(r.get("dual"), ".0e"),
-    "compl.": lambda r: show(r.get("complementarity"), ".0e"),
-    "iterations": lambda r: str(r["iterations"]) if r["iterations"] >= 0 else "-",
-    "seconds": lambda r: show(r.get("seconds"), ".2f"),
-    "MB": lambda r: str(r["peak_bytes"] >> 20) if r["peak_bytes"] else "-",
-    "status": lambda r: _status(r),
-}
-
-
-def by_run(rows: Sequence[Row]) -> list[str]:
+def _by_run(frame: pd.DataFrame) -> list[str]:
     """Table of every run."""
-    order = sorted(rows, key=lambda r: (problem_key(r), not r["verified"], r["seconds"]))
-    return columns(CELLS, order)
+    order = frame.assign(failed=~frame["verified"].astype(bool))
+    order = order.sort_values([*PROBLEM, "failed", "seconds"])[list(COLUMNS)]
+    order = order.rename(columns={c: title for c, (title, _) in COLUMNS.items()})
+    return markdown(order.set_index("problem"), dict(COLUMNS.values()))
 
 
-def _status(row: Row) -> str:
-    return " ".join(str(row["status"])[:50].replace("|", "/").split())
+def reached(frame: pd.DataFrame) -> pd.Series:
+    """Whether a run is verified and has reached the best known objective."""
+    best = frame["best_known"].astype(float)
+    near = frame["objective"].astype(float) <= best + REACHED * best.abs()
+    return frame["verified"].astype(bool) & near
+
+
+def by_start(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Runs of the family by start and size, "easy, N = 100" and so on."""
+    return {
+        f"{start}, N = {n}": group
+        for (start, n), group in frame.groupby(["start", "superpixels"], sort=False)
+    }
+
+
+def _by_start(frame: pd.DataFrame) -> list[str]:
+    """Table of the verified runs by start and size of the family."""
+
+    def cell(runs: pd.DataFrame) -> str:
+        good = runs[runs["verified"].astype(bool)]
+        time = f", {show(float(good['cpu_seconds'].median()), '.1f')} s" if len(good) else ""
+        return f"{len(good)} of {len(runs)} ({int(reached(runs).sum())}){time}"
+
+    text = (
+        "Verified runs of all, in brackets those at the best known objective (within"
+        f" {REACHED:g}); median CPU seconds of the verified ones."
+    )
+    cells = {
+        title: {solver: cell(runs) for solver, runs in group.groupby("solver")}
+        for title, group in by_start(frame).items()
+    }
+    table = pd.DataFrame(cells).sort_index().rename_axis("solver")
+    picture = ["", "![profiles by start and size](profiles.png)"]
+    return [text, "", *markdown(table), *picture]

@@ -16,7 +16,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.bench.processes import isolated, processor
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import WALL_PER_CPU, Answer, Task, Trace
-from soup_nlp.bench.tables import show
+from soup_nlp.bench.study import show
 from soup_nlp.export.artefact import form_label
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
 from soup_nlp.model import oracle

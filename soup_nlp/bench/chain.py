@@ -1,0 +1,98 @@
+"""The study of `soup-nlp bench chain`: error that one scale for a whole sequence causes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from soup_nlp.bench.study import Overrides, failures, markdown, page_text, provenance
+from soup_nlp.bench.suite_pairs import Item
+from soup_nlp.errors import DataError
+from soup_nlp.sequence.chain import make_chain
+from soup_nlp.sequence.frames import FileFrames, Frames, SceneFrames, find_depths, find_images
+from soup_nlp.sequence.pairs import ROWS, solve_pairs
+from soup_nlp.sequence.score import score
+from soup_nlp.storage.folders import scratch
+from soup_nlp.storage.rows import Row, read_rows
+
+NOTE = (
+    "MRE (no cap) of sequences whose pairs are put on one scale (`soup-nlp chain`), mean over the"
+    " frames: with a median scale for every frame, and with one for the sequence. A link is the"
+    " estimated ratio of the scales of two pairs over the true one. Error of the camera's path:"
+    " RMSE of its positions after the best similarity, over the path's length (no true path of"
+    " kitti_tracking is known). DIS flow, default options."
+)
+COLUMNS = {
+    "frames": ("frames", ".0f"),
+    "mre_own_scale": ("a scale for every frame", ".4f"),
+    "mre_one_scale": ("one scale", ".4f"),
+    "cost": ("cost", "+.2%"),
+    "worst_link": ("worst link off by", ".2%"),
+    "path": ("error of the path", ".2%"),
+    "flagged": ("links without parallax", ".0f"),
+    "pair_seconds": ("CPU s a pair", ".0f"),
+}
+"""Title and format of every column of the table."""
+
+
+def sequences(data: Path | None) -> list[Item]:
+    """Rendered sequences, and kitti_tracking where its folder is there; frames are in `needs`."""
+    out = [
+        Item("rendered", scene, scene, "dis", {"kind": "scene", "scene": scene})
+        for scene in ("street", "room", "orbit")
+    ]
+    folder = (data or Path()).resolve() / "kitti_tracking"
+    if data is not None and folder.is_dir():
+        images = tuple(find_images(folder))
+        files = {"ref": str(images[0]), "next": str(images[1]), "intrinsics": str(folder / "K.txt")}
+        source = {"kind": "files", **files}
+        out.append(Item("shared", folder.name, folder.name, "dis", source, needs=images))
+    return out
+
+
+def measure_chain(
+    item: Item, overrides: Overrides = (), keep: Path | None = None, *, frames: int = 10
+) -> Row:
+    """Errors of a sequence with a scale for every frame and with one for all.
+
+    Raises:
+        DataError: the sequence has no truth.
+    """
+    source: Frames = SceneFrames(item.sequence, frames)
+    if item.needs:
+        images = list(item.needs[:frames])
+        camera = {"intrinsics": item.input["intrinsics"]}
+        source = FileFrames(tuple(images), camera, tuple(find_depths(images)), 256.0)
+    with scratch() as folder:
+        which = [(k, k + 1) for k in range(len(source) - 1)]
+        chain = make_chain(solve_pairs(source, which, folder, ["output.page=false", *overrides]))
+        seconds = {row["key"]: row["cpu_seconds"] for row in read_rows(folder / ROWS)}
+    found = score(chain)
+    if found is None:
+        raise DataError("sequence has no truth", where=item.name)
+    errors = [abs(np.log(k["estimated"] / k["true"])) for k in found["links"]]
+    return {
+        "frames": len(source),
+        **{key: found[key] for key in ("mre_own_scale", "mre_one_scale", "cost")},
+        "worst_link": float(np.expm1(max(errors))),
+        "path": None if found["path"] is None else found["path"]["share"],
+        "flagged": sum(k.flagged for k in chain.links),
+        "pair_seconds": sum(seconds.values()) / len(seconds),
+    }
+
+
+def chain_page(frame: pd.DataFrame) -> str:
+    """The page of all rows."""
+    lines = [NOTE, "", f"{provenance(frame)}.", ""]
+    good = frame[frame["ok"].eq(True)]
+    if len(good):
+        shown = good[list(COLUMNS)].astype(float).set_axis(pd.Index(good["pair"], name="sequence"))
+        titles = {column: title for column, (title, _) in COLUMNS.items()}
+        lines += markdown(shown.rename(columns=titles), dict(COLUMNS.values()))
+        lines += [
+            "",
+            f"Mean cost of one scale: {good['cost'].astype(float).mean():+.2%} of the MRE.",
+        ]
+    return page_text([*lines, *failures(frame)])

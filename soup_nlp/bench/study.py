@@ -1,0 +1,310 @@
+"""The engine of all benchmarks: cells are measured as rows, rows become a data frame.
+
+A cell is a pair under overrides. `measure_cells` measures cells that the file of rows does not hold
+yet, so that an interrupted study can be continued. Nested entries of a row become columns with
+dotted names, such as `metrics.paper.solution.mre`. A table is a pivot of the frame.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import date
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from soup_nlp.bench.processes import alone
+from soup_nlp.bench.suite_pairs import Item
+from soup_nlp.config.problem import Problem
+from soup_nlp.errors import ConfigError
+from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.storage.rows import Job, MeasureRows, Row, attempt, reason
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Overrides = tuple[str, ...]
+Measure = Callable[[Item, Overrides, Path | None], Row]
+"""Makes the row of a pair under overrides; the path is that of `Cell.keep`."""
+Forms = str | Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A pair under overrides.
+
+    Attributes:
+        item: Pair and flow.
+        overrides: Overrides of the problem.
+        variant: Name of the overrides in a study; empty for the defaults.
+        keep: File or folder that the measurement writes; a stored row without it is stale.
+    """
+
+    item: Item
+    overrides: Overrides = ()
+    variant: str = ""
+    keep: Path | None = field(default=None, compare=False)
+
+    def identity(self) -> Row:
+        """Entries that identify the row together with the code version."""
+        try:
+            problem = self.item.problem(self.overrides)
+            settings, source = settings_hash(problem), input_hash(problem)
+        except Exception:
+            settings = source = "wrong"
+        return {
+            "key": f"{self.item.key} {self.variant}".strip(),
+            "suite": self.item.suite,
+            "sequence": self.item.sequence,
+            "pair": self.item.name,
+            "flow": self.item.flow,
+            "variant": self.variant,
+            "overrides": list(self.overrides),
+            "presets": list(self.item.presets),
+            "settings": settings,
+            "input": source,
+        }
+
+    def job(self, measure: Measure, own_process: bool = False) -> Job:
+        """The job of the cell; it can be sent to another process."""
+        work = partial(measure, self.item, self.overrides, self.keep)
+        stale = self.keep is not None and not self.keep.exists()
+        return Job(self.identity(), partial(alone if own_process else attempt, work), stale)
+
+
+def settings_hash(problem: Problem) -> str:
+    """Hash of all options but the input: the same for every pair and folder."""
+    return _hash(problem, {"name", "base", "preset", "input", "expected"})
+
+
+def input_hash(problem: Problem) -> str:
+    """Hash of the input without its paths: the same for a pair in every folder."""
+    places = {"root", "path", "ref", "next", "depth", "depth_next", "intrinsics"}
+    return _hash(problem.input, places)
+
+
+def _hash(section: Any, exclude: set[str]) -> str:
+    tree = section.model_dump(mode="json", exclude=exclude)
+    return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Variants of the options that are measured on the same pairs.
+
+    Attributes:
+        text: The question.
+        variants: Overrides by name of a variant, in the order of the tables.
+        key: Option of which the user may ask for other values; empty if there is none.
+        true_flow: Only pairs that are listed with their true flow are measured.
+    """
+
+    text: str
+    variants: Mapping[str, Overrides] = field(default_factory=lambda: {"": ()})
+    key: str = ""
+    true_flow: bool = False
+
+    def restricted(self, values: Sequence[str] | None) -> Mapping[str, Overrides]:
+        """The variants of these names, or of these values of the option `key`; all without names.
+
+        Raises:
+            ConfigError: a variant is unknown or empty.
+        """
+        if values is None:
+            return self.variants
+        known = over(self.key, values) if self.key else self.variants
+        wrong = [v for v in values if not v or v not in known]
+        if wrong:
+            raise ConfigError(
+                "unknown variant",
+                where="--values",
+                found=repr(wrong[0]),
+                expected=", ".join(self.variants),
+            )
+        return {v: known[v] for v in values}
+
+    def cells(
+        self, items: Sequence[Item], overrides: Overrides = (), values: Sequence[str] | None = None
+    ) -> list[Cell]:
+        """A cell for every pair and variant.
+
+        Raises:
+            ConfigError: no pair is left, a variant is unknown, or an override is wrong.
+        """
+        left = [i for i in items if i.flow == "truth" or not self.true_flow]
+        if not left:
+            hint = "give --flow truth" if items else None
+            raise ConfigError("no pair is left for the study", found=self.text, hint=hint)
+        variants = self.restricted(values)
+        for own in variants.values():
+            # report a wrong value now, not in the row of every pair
+            left[0].problem((*overrides, *own))
+        return [Cell(i, (*overrides, *own), v) for i in left for v, own in variants.items()]
+
+
+def over(key: str, values: Sequence[object]) -> dict[str, Overrides]:
+    """Variants of one option, named by its values."""
+    return {str(v): (f"{key}={v}",) for v in values}
+
+
+def measure_cells(
+    cells: Sequence[Cell],
+    measure: Measure,
+    path: Path,
+    measure_rows: MeasureRows,
+    own_process: bool = False,
+) -> pd.DataFrame:
+    """Measure cells and return the frame of their rows.
+
+    Args:
+        cells: Cells, without duplicates.
+        measure: Makes the row of a cell.
+        path: JSON-lines file of rows.
+        measure_rows: `storage.rows.measure_all` with its options.
+        own_process: Measure every row in a process of its own with one thread, so that times and
+            peak memory are those of the row alone.
+    """
+    return frame_of(measure_rows([cell.job(measure, own_process) for cell in cells], path))
+
+
+def frame_of(rows: Sequence[Row]) -> pd.DataFrame:
+    """A line for each row; dotted names for nested entries, `title` for the pair and its flow.
+
+    `main` is the metric convention of a row, and `mre` and `constant` are the mean relative errors
+    of the solution and of a constant depth under it.
+    """
+    frame = pd.json_normalize(list(rows)).reindex(columns=_columns(rows))
+    if "pair" not in frame:
+        return frame
+    frame["main"] = [presets[0] for presets in frame["presets"]]
+    suites = frame.groupby("pair")["suite"].transform("nunique")
+    name = np.where(suites > 1, frame["suite"] + " " + frame["pair"], frame["pair"])
+    frame["title"] = [f"{pair}, {flow}" for pair, flow in zip(name, frame["flow"], strict=True)]
+    frame["mre"], frame["constant"] = main_metric(frame), main_metric(frame, "constant")
+    return frame
+
+
+def _columns(rows: Sequence[Row]) -> list[str]:
+    """Columns of the frame of some rows; those that every reader expects are always there."""
+    found = list(pd.json_normalize(list(rows)).columns)
+    return list(dict.fromkeys(["ok", "error", "code", "cpu_seconds", *found]))
+
+
+def main_metric(frame: pd.DataFrame, method: str = "solution", name: str = "mre") -> pd.Series:
+    """A metric of every row under its own convention; NaN where it is not known."""
+    out = pd.Series(np.nan, index=frame.index, dtype=float)
+    for convention in frame["main"].unique():
+        column = f"metrics.{convention}.{method}.{name}"
+        if column in frame:
+            out = out.where(frame["main"] != convention, frame[column].astype(float))
+    return out
+
+
+def pivot(frame: pd.DataFrame, values: str = "mre", average: bool = True) -> pd.DataFrame:
+    """A line for each pair, a column for each variant; then the mean of the complete lines."""
+    table = frame.pivot(index="title", columns="variant", values=values)
+    table = table.reindex(index=frame["title"].unique(), columns=frame["variant"].unique())
+    table = table.astype(float)
+    whole = table.dropna()
+    if average and len(whole) > 1:
+        table.loc[f"mean of {len(whole)}"] = whole.mean()
+    return table.rename_axis(index="pair, flow")
+
+
+def show(value: Any, form: str = ".4f") -> str:
+    """A value as text: numbers in a format, a dash for what is not known."""
+    if value is None or (isinstance(value, float) and np.isnan(value)):
+        return "-"
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return format(value, form) if number else str(value)
+
+
+def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> list[str]:
+    """A Markdown table."""
+    rule = ["---"] + ["---:"] * (len(head) - 1)
+    return ["| " + " | ".join(cells) + " |" for cells in [head, rule, *lines]]
+
+
+def markdown(frame: pd.DataFrame, forms: Forms = ".4f") -> list[str]:
+    """A frame as a Markdown table, its index first; one format, or one for each column."""
+    flat = frame.reset_index()
+    form = {c: forms if isinstance(forms, str) else forms.get(c, "") for c in flat.columns}
+    columns = [[show(v, form[c]) for v in flat[c].tolist()] for c in flat.columns]
+    return table([str(c) for c in flat.columns], zip(*columns, strict=True))
+
+
+def provenance(frame: pd.DataFrame) -> str:
+    """Date, machine, CPU time and code versions of the rows, as one sentence."""
+    code = ", ".join(sorted(frame["code"].dropna().astype(str).unique()))
+    seconds = frame["cpu_seconds"].astype(float).sum()
+    where = f"{date.today()}, {platform.machine()}"
+    return f"{where}, {seconds:.0f} CPU seconds in all; code {code}"
+
+
+def failures(frame: pd.DataFrame) -> list[str]:
+    """A section that lists the failed rows; no lines if none failed."""
+    bad = frame[frame["ok"].ne(True)]
+    lines = [f"- {r['key']}: {reason(r)}" for r in bad.to_dict("records")]
+    return ["", "## Failed", "", *lines] if lines else []
+
+
+def page_text(lines: Sequence[str]) -> str:
+    """Text of a page from its lines."""
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def figure(width: float, height: float) -> Figure:
+    """A figure of some inches with constrained layout, which needs no display."""
+    # the import takes half a second, which commands without pictures do not need
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=120, layout="constrained")
+
+
+def panels(count: int, across: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure of `count` panels of some inches, at most `across` in a row, and its panels."""
+    columns = min(across, max(1, count))
+    rows = max(1, -(-count // columns))
+    out = figure(width * columns, height * rows + 0.4)
+    return out, [out.add_subplot(rows, columns, k + 1) for k in range(count)]
+
+
+def save(out: Figure, path: Path) -> None:
+    """Write a figure as PNG file, whole or not at all."""
+    with atomic_path(path) as temporary:
+        out.savefig(temporary, format="png", metadata={"Software": ""})
+
+
+def plot_lines(path: Path, tables: Mapping[str, pd.DataFrame], axis: str, text: str) -> None:
+    """Lines of tables over their columns: a panel for each table, the mean in black."""
+    picture = figure(4.5 * len(tables) + 1.5, 3.6)
+    axes = picture.subplots(1, len(tables), sharey=True, squeeze=False)[0]
+    for ax, (title, drawn) in zip(axes, tables.items(), strict=True):
+        for name, line in drawn.iterrows():
+            mean = str(name).startswith("mean of")
+            style = {"color": "black", "lw": 2.0} if mean else {"lw": 1.0}
+            ax.plot(range(len(line)), line.to_numpy(float), "o-", ms=3, label=name, **style)
+        names = [str(c) for c in drawn.columns]
+        slanted = {"rotation": 20, "ha": "right"} if len("".join(names)) > 36 else {}
+        ax.set_xticks(range(len(names)), names, size=8, **slanted)
+        ax.set(title=title, xlabel=axis)
+        ax.grid(alpha=0.3)
+    values = np.concatenate([t.to_numpy(float).ravel() for t in tables.values()])
+    values = values[np.isfinite(values)]
+    if values.size and values.min() > 0 and values.max() > 20 * values.min():
+        axes[0].set_yscale("log")
+    else:
+        axes[0].set_ylim(bottom=0)
+    axes[0].set_ylabel("MRE")
+    if values.size:
+        picture.legend(*axes[-1].get_legend_handles_labels(), loc="outside right upper", fontsize=6)
+    picture.suptitle(text, fontsize=10)
+    save(picture, path)
