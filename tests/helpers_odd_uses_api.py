@@ -31,7 +31,6 @@ CALLS: dict[str, Call] = {
     "save formats": lambda w, o, x: w.run.save(o / "out", formats=x),
     "save format": lambda w, o, x: w.run.save(o / "out", formats=[x]),
     "check_folder": lambda w, o, x: check_folder(x),
-    "check_folder images": lambda w, o, x: check_folder(w.result, x),
     "read_result": lambda w, o, x: read_result(x),
     "make_chain": lambda w, o, x: make_chain(x),
     "make_chain pair": lambda w, o, x: make_chain([x]),
@@ -64,7 +63,6 @@ CALLS: dict[str, Call] = {
 }
 FINE = {
     ("save formats", "None"),
-    ("check_folder images", "None"),
     ("make_problem preset", "None"),
     ("save formats", "list"),
     ("save formats", "dict"),

@@ -42,7 +42,7 @@ ROOMS = {
     "check": "soup_nlp/report/check*.py",
     "recompute": "soup_nlp/evaluate/recompute.py",
 }
-CHECK = "check_files check_next check_rounding damage"
+CHECK = "check_files check_rounding damage"
 TESTS = {
     "model": "constraints energy model_faces formulation sums thresholds ipopt",
     "export": "export export_folder nl nl_sx sol solver_forms",

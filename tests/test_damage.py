@@ -153,7 +153,7 @@ def test_settings_that_are_none_are_an_error_of_the_file(config, tmp_path, capsy
     assert capsys.readouterr().err.startswith("error: ")
 
 
-@pytest.mark.parametrize("name", ["config.yaml", "result.h5", "summary.json"])
+@pytest.mark.parametrize("name", ["result.h5", "summary.json"])
 @pytest.mark.parametrize("kind", ["missing", "folder", "dangling link"])
 def test_files_that_are_not_there(kind, name, tmp_path, capsys):
     small(tmp_path, "a: 1")

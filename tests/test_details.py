@@ -29,7 +29,6 @@ from soup_nlp.model.norms import Norm, smooth_min, solver_form
 from soup_nlp.model.reweighting import across_components, across_discontinuities
 from soup_nlp.model.sums import Sums
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
-from soup_nlp.report.check import _same_depth
 from soup_nlp.schema.section import Section
 from soup_nlp.solve.stages import _near
 from soup_nlp.storage.atomic import write_text
@@ -243,40 +242,12 @@ def test_an_answer_does_not_print_its_numbers():
 # --- the check -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("lost", "ok"), [(1, True), (3, False)])
-def test_one_pixel_in_ten_thousand_may_be_known_in_one_map_only(lost, ok):
-    z = np.ones((100, 200))
-    other = z.copy()
-    other.ravel()[:lost] = np.nan
-    row = _same_depth("ref", other, z, np.zeros(z.shape, bool))
-    assert row.ok == ok
-    # pixels in doubt do not count
-    assert _same_depth("ref", other, z, np.isnan(other)).ok
-
-
 @pytest.mark.parametrize(("rule", "scale"), [("lsq", 16.5 / 9), ("none", 1.0), ("median", 1.75)])
 def test_rules_of_scale(rule, scale):
     """By hand: least squares is sum z gt / sum z z, of ratios 1.5, 2, 1.75."""
     z, gt = np.array([1.0, 2.0, 2.0]), np.array([1.5, 4.0, 3.5])
     found = recompute.scores(z, gt, rule, None)
     assert found["scale"] == pytest.approx(scale, rel=1e-12)
-
-
-def test_the_pixels_around_a_target_on_a_border_are_in_doubt():
-    one = {
-        "n": [[0, 0, -1.0]],
-        "lam": [1.0],
-        "d": [1.0],
-        "R": np.eye(3)[None],
-        "t": [[5.5, 5.5, 0]],
-    }
-    state = {key: np.array(v) for key, v in one.items()}
-    label = np.zeros((1, 1), int)
-    z, doubt = recompute.next_depth_map(state, label, np.eye(3), np.eye(3), (12, 12))
-    expected = np.zeros((12, 12), bool)
-    expected[5:8, 5:8] = True
-    np.testing.assert_array_equal(doubt, expected)
-    assert np.isfinite(z[6, 6])
 
 
 def test_theta_and_not_the_ridge_is_the_share_of_curvature_that_is_left_out(small_room):

@@ -12,8 +12,6 @@ from helpers_model import PAPER, Tiny, weights_for
 
 from soup_nlp.bench.solvers import runner
 from soup_nlp.bench.solvers.page import conclusion, frame_of_runs
-from soup_nlp.evaluate import recompute_data
-from soup_nlp.export import verify
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, Residuals
 from soup_nlp.model import oracle
 from soup_nlp.model.matrix import build_matrix_nlp
@@ -136,35 +134,3 @@ def test_a_curve_has_the_first_and_the_last_iterate(monkeypatch):
         assert curve[-1] == [count - 1, count - 1]
         assert len(curve) == min(count, runner.CURVE_POINTS)
     assert runner._curve(None, np.zeros(0), np.zeros((0, 1))) == []
-
-
-@pytest.mark.parametrize(("slant", "gap"), [(1.0, False), (0.85, True)])
-def test_contact_is_weaker_where_a_component_hides_another(slant, gap):
-    """Depth of a plane at the middle of a border is its distance through the cosine there."""
-    ray = np.array([0.0, 0.0, 1.0])
-    normal = -np.array([ray, slant * ray])
-    tree = {
-        "start": {
-            "n": normal, "lam": np.ones(2), "d": np.ones(2), "component": np.arange(2),
-            "surface": np.zeros(2, int), "bending": False,
-        },
-        "segmentation": {"pair_weight": np.array([0.8])},
-        "energy": {"boundary_ray": np.tile(ray, (1, 3, 1)), "pairs": np.array([[0, 1]])},
-    }  # fmt: skip
-    form = {
-        "occlusion_gap": 0.1, "cont_occluded": 0.25, "units": "pixel",
-        "weights": {"cont": 1.0}, "bending": {"cont_across": 0.5, "weights": {"cont": 1.0}},
-    }  # fmt: skip
-    np.testing.assert_allclose(recompute_data._pair_weights(tree, form), [0.2 if gap else 0.8])
-
-
-def test_a_bound_s_multiplier_shares_what_is_left_of_the_gradient_with_its_gap(monkeypatch):
-    """Dual infeasibility r - lam and complementarity lam * gap are equal."""
-    left = np.array([2.0, -3.0, 5.0, 4.0])
-    monkeypatch.setattr(verify, "_gradient", lambda *_: -left)
-    monkeypatch.setattr(verify, "_jacobian", lambda *_: np.zeros((1, 4)))
-    bounds = {"lbx": np.array([0.0, 0, 0, 1]), "ubx": np.array([0.5, 1, np.inf, 1])}
-    lam = verify.bound_multipliers(
-        SimpleNamespace(**bounds), np.array([0.25, 0.5, 0.5, 1]), np.zeros(1)
-    )
-    np.testing.assert_allclose(lam, [2 / 1.25, -3 / 1.5, 0, 4], rtol=1e-12)

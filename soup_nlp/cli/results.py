@@ -8,7 +8,7 @@ from typing import Annotated, cast, get_args
 import numpy as np
 import typer
 
-from soup_nlp.cli.options import Overwrite, input_pair
+from soup_nlp.cli.options import Overwrite
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.evaluate.metrics import Scale
@@ -33,9 +33,7 @@ def check(
 ) -> None:
     """Recompute energy, constraints and metrics of a result, or the constraints of a .sol."""
     if is_folder(folder) or folder.suffix != ".sol":
-        pair = input_pair(folder)
-        images = None if pair is None else (pair.image_ref, pair.image_next)
-        report = check_folder(folder, images)
+        report = check_folder(folder)
         tree = read_h5(folder / "result.h5")
         c = float(tree["weights"]["min_facing"])
         print(table_text(residual_table(tree["solution"], tree["energy"]["rim_ray"], c, LIMITS)))

@@ -10,12 +10,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.arrays import Float, Int
 
-DOUBT = 1e-6
-"""Distance from a pixel border, in pixels, within which a target may round to either side."""
 State = Mapping[str, Float]
 """lam (N,), n (N, 3), d (N,), R (N, 3, 3), t (N, 3) of a soup."""
 
@@ -69,8 +66,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
         apart = _length(e["anchor_ray"][i] - e["anchor_ray"][k])
         rho = 1 / A[:, 2]
         change = (rho[i] - rho[k]) / ((rho[i] ** 4 + rho[k] ** 4) / 2) ** 0.25
-        # older results have no relief that is free
-        change = np.abs(change - e.get("prior_relief", 0.0))
+        change = np.abs(change - e["prior_relief"])
         prior = float((e["prior_weight"] * change / apart).sum())
 
     image = lift(s, e["pixel_ray"], every)[1] @ e["K_next"].T
@@ -126,61 +122,6 @@ def depth_map(s: State, labels: Int, K: Float) -> Float:
     with np.errstate(divide="ignore", invalid="ignore"):
         z = (s["lam"] * s["d"])[labels] / facing
     return np.where(facing > 1e-6, z, np.nan)
-
-
-def next_depth_map(
-    s: State, labels: Int, K_ref: Float, K_next: Float, size: tuple[int, int]
-) -> tuple[Float, Mask]:
-    """Depth of the next frame, and where rounding decides it.
-
-    Every reference pixel is moved to the pixel nearest to its target, and the nearest surface is
-    kept; pixels that stay empty take the nearest surface of the 2 x 2 footprints that cover them.
-
-    Args:
-        s: Soup.
-        labels: (H, W) superpixel of every pixel.
-        K_ref: (3, 3) intrinsics of the reference frame.
-        K_next: (3, 3) intrinsics of the next frame.
-        size: (H', W') of the next frame.
-
-    Returns:
-        (H', W') z, NaN where there is no target; (H', W') True where a target lies so near to a
-        border between two pixels that either may receive it.
-    """
-    z = depth_map(s, labels, K_ref).ravel()
-    v, u = (x.ravel() for x in np.mgrid[0 : labels.shape[0], 0 : labels.shape[1]])
-    who = labels.ravel()
-    X = z[:, None] * (np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K_ref).T)
-    Y = np.matmul(s["R"][who], X[..., None])[..., 0] + (s["lam"][:, None] * s["t"])[who]
-    Y = Y[Y[:, 2] > 0]
-    # farthest first, so that the nearest one is written last
-    Y = Y[np.argsort(-Y[:, 2], kind="stable")]
-    image = Y @ K_next.T
-    at = image[:, :2] / image[:, 2:]
-
-    def inside(column: Float, row: Float) -> Mask:
-        return np.asarray((column >= 0) & (row >= 0) & (column < size[1]) & (row < size[0]))
-
-    def put(out: NDArray[Any], uv: Float, value: Any) -> None:
-        good = inside(uv[:, 0], uv[:, 1])
-        out[uv[good, 1].astype(int), uv[good, 0].astype(int)] = value[good]
-
-    nearest = np.full(size, np.nan)
-    put(nearest, np.floor(at + 0.5), Y[:, 2])
-    covered = np.full((4, *size), np.nan)
-    for k, corner in enumerate([(0, 0), (1, 0), (0, 1), (1, 1)]):
-        put(covered[k], np.floor(at) + corner, Y[:, 2])
-    empty = np.isnan(nearest)
-    filled = np.where(empty, np.fmin.reduce(covered), nearest)
-
-    either, crack = np.zeros(size, bool), np.zeros(size, bool)
-    beside = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
-    for mark, shift in ((either, 0.5), (crack, 0.0)):
-        off = at + shift
-        near = (np.abs(off - np.round(off)) < DOUBT).any(1)
-        for step in beside:
-            put(mark, np.floor(at[near] + 0.5) + step, np.ones(int(near.sum()), bool))
-    return filled, either | (crack & empty)
 
 
 def scores(z: Float, gt: Float, rule: str, cap: float | None) -> dict[str, float]:

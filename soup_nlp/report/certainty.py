@@ -88,5 +88,4 @@ def guess_words(found: Mapping[str, float], of: str = "") -> str:
 
 
 def _parts(found: Mapping[str, float], names: tuple[str, ...]) -> str:
-    # results of earlier versions have fewer parts
     return ", ".join(f"{found[k]:.0%} {WORDS[k]}" for k in names if found.get(k, 0.0) >= 0.005)

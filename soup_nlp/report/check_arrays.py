@@ -21,8 +21,6 @@ SHARED = ("N", "E", "P", "H", "W")
 """Axes with one size in all arrays: superpixels, edges, pairs, rows and columns."""
 FREE = ("depth/next", "depth/sigma_next", "input/image_next", "truth/depth_next")
 """Maps of the next frame, whose size may differ."""
-ONE = ("energy/rotation_scale",)
-"""Arrays of which older results have one number for all."""
 
 
 def require_layout(tree: Mapping[str, Any]) -> None:
@@ -62,8 +60,6 @@ def _require_shapes(
         if name.startswith("image_") and value.dtype != np.uint8:
             raise _wrong(place, value.dtype, "uint8")
         axes = letters.split(",") if letters else []
-        if place in ONE and not value.ndim:
-            continue
         if len(axes) != value.ndim:
             raise _wrong(place, value.shape, f"axes ({letters})")
         for axis, size in zip(axes, value.shape, strict=True):

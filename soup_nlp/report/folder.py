@@ -280,7 +280,7 @@ def renew_page(folder: Path, pair: Pair | None = None) -> Path:
     """Make the page of a result folder again from its arrays; returns the file of the page.
 
     Args:
-        folder: Result folder, which an earlier version may have written.
+        folder: Result folder.
         pair: Its input, see `of_folder`.
 
     Raises:

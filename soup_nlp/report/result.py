@@ -142,7 +142,7 @@ def read_result(folder: Path) -> Result:
             "result holds no images",
             where=path,
             expected="input/image_ref and input/image_next",
-            hint="solve the pair again: an older version has written this result",
+            hint="solve the pair again",
         )
     require_layout(tree)
     try:
@@ -155,7 +155,6 @@ def rebuilt(tree: Mapping[str, Any]) -> tuple[Reconstruction, Components]:
     """Reconstruction and components of the delivered soup from the arrays of result.h5."""
     soup = Soup(*(tree["solution"][key] for key in ("lam", "n", "d", "R", "t")))
     K_ref, K_next = (tree["input"][f"K_{frame}"] for frame in FRAMES)
-    # arrays that are not needed here may be missing in results of earlier versions
     seg = Segmentation(**{f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)})
     height, width = tree["depth"]["next"].shape
     rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))

@@ -61,10 +61,8 @@ class Shown:
 
     @property
     def bends(self) -> Mask:
-        """(N,) True in regions that bend, which are not rigid; older results have one answer."""
-        start = self.tree["start"]
-        own = start.get("bends", np.full(len(start["component"]), start.get("bending", False)))
-        return np.asarray(own, bool)
+        """(N,) True in regions that bend, which are not rigid."""
+        return np.asarray(self.tree["start"]["bends"], bool)
 
     @property
     def bending(self) -> bool:
@@ -74,7 +72,7 @@ class Shown:
     @property
     def at_rest(self) -> bool:
         """Whether the initialisation found the camera at rest or only rotating."""
-        return bool(self.tree["start"].get("at_rest", False))
+        return bool(self.tree["start"]["at_rest"])
 
     @property
     def scale(self) -> float:
