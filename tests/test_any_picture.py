@@ -13,8 +13,8 @@ from PIL import ExifTags, Image
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.formats.exif import GUESS, estimated_intrinsics
-from soup_nlp.data.formats.images import DataWarning
+from soup_nlp.data.formats.exif import GUESS, estimated_cameras
+from soup_nlp.data.formats.images import DataWarning, read_image
 from soup_nlp.data.formats.map_files import read_flow
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
@@ -22,6 +22,10 @@ from soup_nlp.errors import ConfigError, DataError
 pytestmark = pytest.mark.slow
 
 SIZE = (160, 120)
+
+
+def camera_of(path, fov=None):
+    return estimated_cameras([path], [read_image(path, turn=True)], fov)[0]
 
 
 def picture(path, tags=None):
@@ -35,17 +39,16 @@ def picture(path, tags=None):
 @pytest.mark.parametrize(
     ("tags", "focal"),
     [
-        # 200 px of diagonal, 43.27 mm on film
-        ({ExifTags.Base.FocalLengthIn35mmFilm: 43}, 43 / np.hypot(36, 24) * 200),
-        # 5 mm at 100 px per mm, stored ten times as large
+        ({ExifTags.Base.FocalLengthIn35mmFilm: 43}, 43 / 36 * 160),
+        # 5 mm of a sensor of 8 mm, stored ten times as large
         (
             {
                 ExifTags.Base.FocalLength: 5.0,
-                ExifTags.Base.FocalPlaneXResolution: 1000.0,
+                ExifTags.Base.FocalPlaneXResolution: 2000.0,
                 ExifTags.Base.FocalPlaneResolutionUnit: 3,
                 ExifTags.Base.ExifImageWidth: 1600,
             },
-            50.0,
+            100.0,
         ),
         ({ExifTags.Base.FocalLength: 5.0}, GUESS * 160),
         ({}, GUESS * 160),
@@ -53,9 +56,9 @@ def picture(path, tags=None):
 )
 def test_focal_length_is_of_exif_or_a_guess_that_is_said(tags, focal, tmp_path):
     path = picture(tmp_path / "a.jpg", tags)
-    said = "EXIF" if focal != GUESS * 160 else "1.2 times the larger side.*--fov"
+    said = "EXIF" if focal != GUESS * 160 else "1.2 times the longer side.*--fov"
     with pytest.warns(DataWarning, match=said):
-        K = estimated_intrinsics(path)
+        K = camera_of(path)
     assert K[0, 0] == pytest.approx(focal)
     assert K[1, 1] == K[0, 0]
     assert K[:2, 2].tolist() == [79.5, 59.5]
@@ -65,9 +68,9 @@ def test_a_field_of_view_is_taken_without_a_word(tmp_path):
     path = picture(tmp_path / "a.jpg", {ExifTags.Base.FocalLengthIn35mmFilm: 43})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert estimated_intrinsics(path, 90.0)[0, 0] == pytest.approx(80.0)
+        assert camera_of(path, 90.0)[0, 0] == pytest.approx(80.0)
     with pytest.raises(ConfigError, match="0 to 180"):
-        estimated_intrinsics(path, 180.0)
+        camera_of(path, 180.0)
 
 
 def stored_turned(path, image, orientation):
@@ -106,8 +109,8 @@ def test_the_focal_length_of_a_turned_photo_is_that_of_what_is_shown(tmp_path):
     image = np.zeros((160, 120, 3), np.uint8)
     stored_turned(tmp_path / "a.jpg", image, 6)
     with pytest.warns(DataWarning, match="EXIF"):
-        K = estimated_intrinsics(tmp_path / "a.jpg")
-    f = 43 / np.hypot(36, 24) * 200
+        K = camera_of(tmp_path / "a.jpg")
+    f = 43 / 36 * 160
     np.testing.assert_allclose(K, [[f, 0, 59.5], [0, f, 79.5], [0, 0, 1]])
 
 
@@ -193,7 +196,7 @@ def test_two_pictures_are_enough(orbit, tmp_path, capsys):
     assert summary["sizes"]["knn_edges"] > 0
     assert summary["flow"].endswith("50.0% usable)")
     # a line a stage, none an iteration
-    assert "1.2 times the larger side" in told.err
+    assert "1.2 times the longer side" in told.err
     stages = [line.split()[0] for line in told.err.splitlines() if " s  " in f"{line}  "]
     assert [s for s in stages if s in ("load", "flow", "nlp", "files")] == [
         "load", "flow", "nlp", "files",

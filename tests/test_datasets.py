@@ -11,7 +11,7 @@ from helpers_files import write_cam, write_dpt, write_flo, write_kitti_flow
 
 from soup_nlp.data.datasets.driving import load_kitti, load_vkitti
 from soup_nlp.data.datasets.folders import load_folder, load_motorcycle, load_tum
-from soup_nlp.data.datasets.sintel import DEFAULT_CAMERA, load_sintel
+from soup_nlp.data.datasets.sintel import load_sintel
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.formats.map_files import KITTI_DISPARITY, read_depth_png16
 from soup_nlp.errors import DataError
@@ -229,13 +229,15 @@ def vkitti_flow(path: Path) -> None:
     png16(path, bgr)
 
 
-def test_vkitti1(tmp_path: Path) -> None:
+def test_vkitti1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("soup_nlp.data.datasets.driving.VKITTI1_CAMERA", (725, 725, 4, 2.5))
     for number in (0, 1):
         name = f"0001/clone/{number:05d}.png"
         picture(tmp_path / "vkitti_1.3.1_rgb" / name, number)
         png16(tmp_path / "vkitti_1.3.1_depthgt" / name, np.full((H, W), 1234))
     vkitti_flow(tmp_path / "vkitti_1.3.1_flowgt" / "0001/clone/00000.png")
-    pair = load_vkitti("vkitti1", tmp_path, "0001", 0)
+    with pytest.warns(DataWarning, match="9 x 6, but the intrinsics"):
+        pair = load_vkitti("vkitti1", tmp_path, "0001", 0)
     assert pair.truth is not None
     np.testing.assert_allclose(pair.truth.depth_next, 12.34)
     assert pair.truth.flow is not None
@@ -253,8 +255,8 @@ def test_vkitti2(tmp_path: Path) -> None:
         picture(base / "frames" / "rgb" / "Camera_0" / f"rgb_{number:05d}.jpg", number)
         png16(base / f"frames/depth/Camera_0/depth_{number:05d}.png", np.full((H, W), 65535))
     vkitti_flow(base / "frames" / "forwardFlow" / "Camera_0" / "flow_00003.png")
-    rows = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]\n3 0 725 725 620.5 187\n"
-    (base / "intrinsic.txt").write_text(rows + "4 0 726 726 620.5 187\n")
+    rows = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]\n3 0 725 725 4 2.5\n"
+    (base / "intrinsic.txt").write_text(rows + "4 0 726 726 4 2.5\n")
     pair = load_vkitti("vkitti2", tmp_path, "Scene01", 3)
     assert (pair.K_ref[0, 0], pair.K_next[0, 0]) == (725, 726)
     assert pair.truth is not None
@@ -270,17 +272,19 @@ def test_vkitti2(tmp_path: Path) -> None:
 # --- Sintel, TUM, Motorcycle --------------------------------------------------------------------
 
 
-def test_sintel(tmp_path: Path) -> None:
+def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("soup_nlp.data.datasets.sintel.DEFAULT_CAMERA", (688, 688, 4, 2.5))
     base = tmp_path / "training"
     for number in (1, 2):
         picture(base / "final" / "cave_2" / f"frame_{number:04d}.png", number)
     with pytest.warns(DataWarning, match=r"cave_2/frame_0001\.cam.*alley_1"):
         pair = load_sintel(tmp_path, "cave_2", 1, "final")
-    assert pair.K_ref[0, 0] == DEFAULT_CAMERA[0]
+    assert pair.K_ref[0, 0] == 688
     for number in (1, 2):
         picture(base / "final" / "alley_1" / f"frame_{number:04d}.png", number)
-    # the one scene whose camera is known: no warning, which would be an error here
-    assert load_sintel(tmp_path, "alley_1", 1, "final").K_ref[0, 0] == DEFAULT_CAMERA[0]
+    # of this scene the camera is known, and yet it is not that of a file
+    with pytest.warns(DataWarning, match=r"alley_1 is taken, 688 pixels; camdata_left"):
+        assert load_sintel(tmp_path, "alley_1", 1, "final").K_ref[0, 0] == 688
     for kind in ("camdata_left", "depth", "flow", "occlusions", "invalid"):
         (base / kind / "cave_2").mkdir(parents=True)
     for number, focal in ((1, 100.0), (2, 120.0)):
@@ -312,19 +316,25 @@ def test_sintel(tmp_path: Path) -> None:
         load_sintel(tmp_path, "cave_2", 1)
 
 
-def test_tum(tmp_path: Path, folder: Path) -> None:
+def test_tum(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras = {"freiburg3": (535.4, 539.2, 4, 2.5), "": (525, 525, 4, 2.5)}
+    monkeypatch.setattr("soup_nlp.data.datasets.folders._TUM_CAMERAS", cameras)
     root = tmp_path / "rgbd_dataset_freiburg3_x"
     for k in range(3):
         picture(root / "rgb" / f"{k}.png", k)
         png16(root / "depth" / f"{k}.png", np.full((H, W), 5000 * (k + 1)))
     (root / "rgb.txt").write_text("# colour\n1.00 rgb/0.png\n1.03 rgb/1.png\n1.06 rgb/2.png\n")
     (root / "depth.txt").write_text("1.001 depth/0.png\n1.2 depth/1.png\n1.055 depth/2.png\n")
-    pair = load_tum(root, frame=0, step=2)
+    with pytest.warns(DataWarning, match=r"freiburg3 are assumed \(535.4,539.2,4,2.5\)"):
+        pair = load_tum(root, frame=0, step=2)
     assert pair.truth is not None
     assert pair.K_ref[0, 0] == 535.4
     np.testing.assert_array_equal(pair.truth.depth_ref, 1.0)
     np.testing.assert_array_equal(pair.truth.depth_next, 3.0)
-    assert load_tum(root, frame=1).truth.depth_ref is None
+    (root / "camera.txt").write_text("90 91 4 3")
+    pair_1 = load_tum(root, frame=1)
+    assert pair_1.truth.depth_ref is None
+    assert (pair_1.K_ref[0, 0], pair_1.K_next[1, 1]) == (90, 91)
     with raises(r"not in the sequence[\s\S]*0 to 2"):
         load_tum(root, frame=2)
     (root / "rgb" / "1.png").unlink()
@@ -393,9 +403,12 @@ def test_real_pairs(shared_data: Path) -> None:
     np.testing.assert_array_equal(np.isfinite(depth), known)
     np.testing.assert_allclose(depth[known] * disparity[known], 718.856 * 0.53717, rtol=1e-4)
     assert 0.01 < pair.truth.occluded.mean() < 0.1
-    sintel = load_sintel(shared_data / "sintel", "alley_1", 2)
+    with pytest.warns(DataWarning, match="688 pixels"):
+        sintel = load_sintel(shared_data / "sintel", "alley_1", 2)
+    with pytest.warns(DataWarning, match="688 pixels"):
+        far = load_sintel(shared_data / "sintel", "alley_1", 20, step=5)
     assert "flow, occluded" in str(sintel)
-    assert "depth_ref" in str(load_sintel(shared_data / "sintel", "alley_1", 20, step=5))
+    assert "depth_ref" in str(far)
     driving = load_folder(shared_data / "driving_synthetic")
     assert "depth_ref, flow" in str(driving)
     paper = load_folder(shared_data / "kinect_paper" / "pair_049")

@@ -205,7 +205,7 @@ def test_resolve_flow(tmp_path: Path) -> None:
     found = resolve_flow(pair, "dis")
     assert found.source == "dis"
     assert np.median(np.abs(found.uv - [3, 1])) < 0.1
-    write_flo(tmp_path / "mine.flo", np.zeros((60, 80, 2)))
+    write_flo(tmp_path / "mine.flo", np.full((60, 80, 2), [3.0, 1.0]))
     assert resolve_flow(pair, str(tmp_path / "mine.flo")).source == "mine.flo"
     with raises(r"unknown flow source[\s\S]*dis, truth"):
         resolve_flow(pair, "raft")

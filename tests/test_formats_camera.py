@@ -121,7 +121,7 @@ def test_image_kinds(tmp_path: Path) -> None:
     cv2.imwrite(str(path), rgb[:, :, 0])
     np.testing.assert_array_equal(read_image(path), np.repeat(rgb[:, :, :1], 3, axis=2))
     cv2.imwrite(str(path), rgb[:, :, ::-1].astype(np.uint16) * 257)
-    out = read_image(path)
+    out = read_image(path, white=65535)
     np.testing.assert_array_equal(out, rgb)
     assert out.dtype == np.uint8
     assert out.flags.c_contiguous
@@ -129,7 +129,7 @@ def test_image_kinds(tmp_path: Path) -> None:
 
 def test_image_16_bit_white(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.array([[0, 4095, 2048, 65535]], np.uint16))
-    assert read_image(tmp_path / "a.png")[0, :, 0].tolist() == [0, 16, 8, 255]
+    assert read_image(tmp_path / "a.png", white=65535)[0, :, 0].tolist() == [0, 16, 8, 255]
     assert read_image(tmp_path / "a.png", white=4095)[0, :, 0].tolist() == [0, 255, 128, 255]
 
 

@@ -50,6 +50,7 @@ def chain(
     fov: Annotated[
         float | None, typer.Option(help="Horizontal field of view, degrees, instead.")
     ] = None,
+    undistort: options.Undistort = False,
     stride: Annotated[
         str, typer.Option(help="Take every so many frames; auto: until there is parallax.")
     ] = "1",
@@ -75,7 +76,8 @@ def chain(
     """Solve the consecutive pairs of a sequence and put them on one scale."""
     name, subject = _subject(source)
     out = out or default_folder(f"chain-{name}", subject)
-    sequence = _frames(source, out, intrinsics, fov, _step(stride), frames, depth_scale)
+    camera = _camera(intrinsics, fov, undistort)
+    sequence = _frames(source, out, camera, _step(stride), frames, depth_scale)
     count = len(sequence)
     claim(out, chain_files(count), overwrite, subject)
     sources = [sequence.source(k) for k in range(count)]
@@ -136,8 +138,7 @@ def _step(stride: str) -> int | None:
 def _frames(
     source: list[str],
     out: Path,
-    intrinsics: str | None,
-    fov: float | None,
+    camera: dict[str, Any],
     step: int | None,
     most: int | None,
     depth_scale: float,
@@ -146,7 +147,7 @@ def _frames(
     first = source[0]
     if first.startswith(SCENE):
         own = first.removeprefix(SCENE)
-        if len(source) > 1 or step != 1 or intrinsics or fov is not None:
+        if len(source) > 1 or step != 1 or camera:
             raise ConfigError("a rendered scene has its own camera and steps", found=source)
         return SceneFrames(own, most or 10)
     path = as_path(first, "frames", home=True)
@@ -160,7 +161,7 @@ def _frames(
         images = video_frames(path, out / "frames", step or 1, end or read)
     else:
         images = find_images(path)[:: step or 1][:end]
-        depths = find_depths(images)
+        depths = [] if "undistort" in camera else find_depths(images)
     images = [p.absolute() for p in images]
     if len(images) < 2:
         raise ConfigError(
@@ -169,22 +170,26 @@ def _frames(
             found=len(images),
             expected="more frames, or a smaller stride",
         )
+    beside = images[0].parent / "K.txt"
+    if not camera.keys() & {"intrinsics", "fov"} and os.path.lexists(beside):
+        camera = {"intrinsics": str(beside), **camera}
     found = FileFrames(
         tuple(images),
-        _camera(images[0].parent, intrinsics, fov),
+        camera,
         tuple(p.absolute() for p in depths),
         depth_scale,
     )
+    found.check()
     return found if step else found.apart(most)
 
 
-def _camera(folder: Path, intrinsics: str | None, fov: float | None) -> dict[str, Any]:
-    """Keys of an input of files."""
+def _camera(intrinsics: str | None, fov: float | None, undistort: bool) -> dict[str, Any]:
+    """Keys of an input of files that the options name."""
     if intrinsics and fov is not None:
         raise ConfigError("two cameras are named", found="--intrinsics and --fov", expected="one")
+    out: dict[str, Any] = {"undistort": True} if undistort else {}
     if fov is not None:
-        return {"fov": fov}
-    if intrinsics is None:
-        own = folder / "K.txt"
-        return {"intrinsics": str(own)} if os.path.lexists(own) else {}
-    return {"intrinsics": options.camera(intrinsics, "--intrinsics")}
+        out["fov"] = fov
+    if intrinsics:
+        out["intrinsics"] = options.camera(intrinsics, "--intrinsics")
+    return out

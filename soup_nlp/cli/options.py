@@ -28,6 +28,9 @@ Neighbours = Annotated[int | None, typer.Option(help="K of the K-NN graph; defau
 MaxSize = Annotated[
     float | None, typer.Option(help="Megapixels at which larger images are solved; 1.5.")
 ]
+Undistort = Annotated[
+    bool, typer.Option("--undistort", help="Remove the distortion that the camera file holds.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Overwrite files that this program did not make.")

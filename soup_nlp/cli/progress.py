@@ -109,11 +109,13 @@ class SolveLog(logging.Handler):
     ) -> None:
         """Print a warning about the input; warnings of libraries are not printed."""
         if issubclass(category, DataWarning):
-            self.announce(f"warning: {message}")
+            self._announce_once(f"warning: {message}")
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a message of the logger of the package, unless it was printed before."""
-        line = record.getMessage()
+        self._announce_once(record.getMessage())
+
+    def _announce_once(self, line: str) -> None:
         if line not in self._announced:
             self._announced.add(line)
             self.announce(line)

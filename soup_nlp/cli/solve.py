@@ -54,6 +54,9 @@ def solve(
     depth: Annotated[
         str | None, typer.Option(help="True depth of the reference frame, to score.", **INPUT)
     ] = None,
+    undistort: Annotated[
+        bool, typer.Option("--undistort", help="Remove the camera file's distortion.", **INPUT)
+    ] = False,
     flow: Annotated[
         str | None, typer.Option(help=".flo, KITTI .png, .npy, .onnx or a name; DIS.", **FLOW)
     ] = None,
@@ -126,6 +129,7 @@ def solve(
         "--intrinsics-next": intrinsics_next,
         "--depth": depth,
         "--fov": None if fov is None else str(fov),
+        "--undistort": "true" if undistort else None,
     }
     flows = {"source": flow, "backward": flow_backward, "confidence": flow_confidence}
     if problem is None:
@@ -191,7 +195,7 @@ def _from_options(
     pair: Mapping[str, str | None], flows: Mapping[str, str | None], overrides: Sequence[str]
 ) -> Problem:
     """The problem of the pair that the options name."""
-    ref, following, intrinsics, intrinsics_next, depth, fov = pair.values()
+    ref, following, intrinsics, intrinsics_next, depth, fov, undistort = pair.values()
     if not (ref and following):
         raise ConfigError(
             "nothing to solve",
@@ -208,6 +212,8 @@ def _from_options(
         source["fov"] = float(fov)
     if depth:
         source["depth"] = depth
+    if undistort:
+        source["undistort"] = True
     place = as_path(ref, "reference image", home=True).absolute()
     name = title("-".join([place.parent.name, place.stem, Path(following).stem]).lstrip("-"))
     raw: dict[str, Any] = {"name": name, "input": source, "base": str(Path.cwd())}

@@ -16,8 +16,7 @@ from soup_nlp.data.datasets.driving import load_kitti, load_vkitti
 from soup_nlp.data.datasets.folders import load_folder, load_motorcycle, load_tum
 from soup_nlp.data.datasets.layout import make_pair
 from soup_nlp.data.datasets.sintel import load_sintel
-from soup_nlp.data.formats.camera_files import read_intrinsics
-from soup_nlp.data.formats.exif import estimated_intrinsics
+from soup_nlp.data.formats.camera_files import read_camera, read_intrinsics
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.data.scenes.catalogue import render_scene
@@ -55,11 +54,12 @@ class FilesInput(PairInput):
     """Next image."""
     intrinsics: Camera | str | None = None
     """[fx, fy, cx, cy] of the reference frame in pixels, or a file of 4 or 9 numbers; null for
-    `fov`, or else EXIF's focal length, or else 1.2 times the larger side."""
+    `fov`, or else EXIF's focal length, or else 1.2 times the longer side."""
     fov: Positive | None = None
-    """Horizontal field of view of both frames as shown, degrees, where `intrinsics` is null."""
+    """Horizontal field of view of the reference frame as shown, degrees, where `intrinsics` is
+    null; the next frame has the same lens unless EXIF names another."""
     intrinsics_next: Camera | str | None = None
-    """The same of the next frame; null for the same camera."""
+    """The same of the next frame; null for the same camera if `intrinsics` is given."""
     depth: str | None = None
     """True depth of the reference frame, for measuring only (.dpt .npy .pfm .png)."""
     depth_next: str | None = None
@@ -69,27 +69,52 @@ class FilesInput(PairInput):
     unit: str = "m"
     """Unit of the true depth."""
     white: White | None = None
-    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for 65535."""
+    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for
+    the values that occur."""
+
+    cropped: bool = False
+    """The images are parts of larger ones: the principal point may be anywhere."""
+    undistort: bool = False
+    """Remove the distortion that the files of the cameras hold from the images (OpenCV)."""
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
 
-        def camera(given: list[float] | str) -> Float:
-            return read_intrinsics(path(given)) if isinstance(given, str) else intrinsics(*given)
-
         def depth(name: str | None) -> Float | None:
             return None if name is None else read_depth(path(name), self.depth_scale)
 
+        if self.undistort and (self.depth or self.depth_next):
+            raise ConfigError(
+                "depth belongs to the images before they are undistorted",
+                where="input.undistort",
+                expected="images without distortion, or no true depth",
+            )
         images = [path(self.ref), path(self.next)]
         truth = Truth(depth(self.depth), depth(self.depth_next), unit=self.unit)
-        if self.intrinsics is None:
-            K = estimated_intrinsics(images[0], self.fov)
-        else:
-            K = camera(self.intrinsics)
-        K_next = K if self.intrinsics_next is None else camera(self.intrinsics_next)
-        # a given camera may belong to the stored or to the rotated image
-        turn = self.intrinsics is None and self.intrinsics_next is None
-        return make_pair(images, [K, K_next], truth, "files", self.white, turn=turn)
+        given = [self.intrinsics, self.intrinsics_next or self.intrinsics]
+        lenses = [self._camera(camera, path) for camera in given]
+        return make_pair(
+            images,
+            [K for K, _ in lenses],
+            truth,
+            "files",
+            self.white,
+            fov=self.fov,
+            cropped=self.cropped,
+            distortion=[d for _, d in lenses] if self.undistort else (),
+        )
+
+    def _camera(self, given: list[float] | str | None, path: Resolve) -> tuple[Float | None, Float]:
+        """Intrinsics (3, 3) or None, and distortion (n,) of a camera."""
+        if given is None:
+            return None, np.zeros(0)
+        if not isinstance(given, str):
+            return intrinsics(*given), np.zeros(0)
+        return (
+            read_camera(path(given))
+            if self.undistort
+            else (read_intrinsics(path(given)), np.zeros(0))
+        )
 
     def files(self) -> list[str]:
         """See `PairInput`."""
@@ -109,11 +134,16 @@ class FolderInput(PairInput):
     unit: str = "m"
     """Unit of the true depth."""
     white: White | None = None
-    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for 65535."""
+    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for
+    the values that occur."""
+
+    cropped: bool = False
+    """The images are parts of larger ones: the principal point may be anywhere."""
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        return load_folder(path(self.path), self.depth_scale, self.unit, self.white)
+        scale, unit = self.depth_scale, self.unit
+        return load_folder(path(self.path), scale, unit, self.white, self.cropped)
 
 
 class MotorcycleInput(PairInput):

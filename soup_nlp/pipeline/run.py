@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from soup_nlp.config.problem import Problem, make_problem, title
+from soup_nlp.data.flow.plausible import check_flow
 from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import StoppedError, expect
@@ -260,6 +261,8 @@ def solve_pair(pair: Pair, **options: Any) -> Run:
         DataError: the pair cannot be used.
     """
     expect(pair, Pair, "pair", PAIR)
+    if pair.flow is not None:
+        check_flow(pair.flow, pair)
     source = {"kind": "memory", "hash": pair_hash(pair)}
     raw = {"name": title(pair.name), "input": source, **options}
     return run(make_problem(raw, where="solve_pair"), pair=pair)

@@ -109,10 +109,11 @@ def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> 
 def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
     """Links of all pairs that share a frame, from static pixels that are confident in both.
 
-    The depth of a pair without parallax is a guess, so its links are flagged. The pairs before and
-    after it are linked directly, with the depth of the former moved by the flow of this pair.
+    The depth of a pair without parallax is a guess, so its links are flagged, as are those of pairs
+    without a pixel that is confident in both. The pairs before and after a run of pairs without
+    parallax are linked directly, with the depth of the former moved by the flow of the run.
     """
-    out: list[Link] = []
+    out: list[Link | None] = []
     for b, second in enumerate(pairs):
         for a, first in enumerate(pairs[:b]):
             for frame in {first.first, first.second} & {second.first, second.second}:
@@ -120,16 +121,19 @@ def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
                 z2, keep2 = _view(second, frame)
                 guess = first.still or second.still
                 found = link(a, b, z1, z2, keep1 & keep2, flagged=guess)
-                out += [found] if found else []
-    for pair in pairs:
-        before = [a for a, p in enumerate(pairs) if p.second == pair.first and not p.still]
-        after = [b for b, p in enumerate(pairs) if p.first == pair.second and not p.still]
-        if pair.still and before and after:
-            z, keep = _carry(pairs[before[0]], pair)
-            other, sure = _view(pairs[after[0]], pair.second)
-            found = link(before[0], after[0], z, other, keep & sure, bridge=True)
-            out += [found] if found else []
-    return out
+                every = np.ones_like(keep1)
+                out.append(found or link(a, b, z1, z2, every, flagged=True))
+    # consecutive pairs are the first of those that start at a frame
+    at = {pair.first: b for b, pair in reversed([*enumerate(pairs)])}
+    for a, pair in enumerate(pairs):
+        frame, (z, keep) = pair.second, _view(pair, pair.second)
+        while not pair.still and frame in at and pairs[at[frame]].still:
+            z, keep = _carry(z, keep, pairs[at[frame]])
+            frame = pairs[at[frame]].second
+        if frame > pair.second and frame in at:
+            other, sure = _view(pairs[at[frame]], frame)
+            out.append(link(a, at[frame], z, other, keep & sure, bridge=True))
+    return [found for found in out if found]
 
 
 def _view(pair: SolvedPair, frame: int) -> tuple[Float, Mask]:
@@ -141,10 +145,8 @@ def _view(pair: SolvedPair, frame: int) -> tuple[Float, Mask]:
     return result.depths[1], carried(keep, result.reconstruction) > 0
 
 
-def _carry(before: SolvedPair, still: SolvedPair) -> tuple[Float, Mask]:
-    """z and mask of the next frame of a pair, moved by the flow of a following static pair."""
-    z, keep = _view(before, before.second)
-    _, own = _view(still, still.first)
+def _carry(z: Float, keep: Mask, still: SolvedPair) -> tuple[Float, Mask]:
+    """z (H, W) and mask of the reference frame of a pair without parallax, in its next frame."""
     source = still.result.reconstruction.source_next
-    there = (source >= 0) & (keep & own).ravel()[source]
+    there = (source >= 0) & (keep & (still.result.components.of_pixel == 0)).ravel()[source]
     return np.where(there, z.ravel()[source], np.nan), there

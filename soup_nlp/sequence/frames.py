@@ -6,13 +6,14 @@ import re
 import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 import cv2
 
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.formats.images import DataWarning
+from soup_nlp.data.formats.images import DataWarning, read_image
 from soup_nlp.errors import DataError
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence.key_frames import key_frames
@@ -21,7 +22,11 @@ from soup_nlp.storage.folders import staged
 
 Raw = dict[str, Any]
 
-IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp", ".webp")
+IMAGES = (
+    *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp", ".webp", ".avif"),
+    # these are found, so that the message can say that they must be converted
+    *(".heic", ".heif"),
+)
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 LAYOUT = "frame_*"
 """Pattern of the images in a folder that also holds other images, such as depth."""
@@ -75,6 +80,18 @@ class FileFrames(Frames):
         """See `Frames`."""
         return str(self.paths[frame])
 
+    def check(self) -> None:
+        """Read every frame.
+
+        Raises:
+            DataError: a frame is damaged, or it is stored turned and its camera is given.
+        """
+        for path in self.paths:
+            with warnings.catch_warnings():
+                # every solve gives the warnings too
+                warnings.simplefilter("ignore", DataWarning)
+                read_image(path, turn="intrinsics" not in self.camera)
+
     def apart(self, most: int | None = None) -> FileFrames:
         """The frames with enough parallax, see `key_frames`."""
         with warnings.catch_warnings():
@@ -116,17 +133,26 @@ class SceneFrames(Frames):
 def find_images(source: Path) -> list[Path]:
     """Images of a folder or of a pattern such as `clip/*.jpg`, in the order of their numbers.
 
-    In a folder with images named frame_*, only these are used.
+    In a folder with images named frame_*, only these are used. Hidden files are no images, and
+    neither are masks such as x.jpg.png beside x.jpg.
 
     Raises:
         DataError: there are fewer than two.
     """
     source = as_path(source, "frames")
+    root = source
     if source.is_dir():
         found = [p for p in source.glob(LAYOUT) if p.suffix.lower() in IMAGES]
         found = found or [p for p in source.iterdir() if p.suffix.lower() in IMAGES]
     else:
-        found = [p for p in source.parent.glob(source.name) if p.is_file()]
+        root = next(folder for folder in source.parents if folder.is_dir())
+        found = [p for p in root.glob(str(source.relative_to(root))) if p.is_file()]
+    # hidden by its own name, or by that of a folder that the pattern matched
+    found = [
+        p for p in found if not any(part.startswith(".") for part in p.parts[len(root.parts) :])
+    ]
+    names = {*found}
+    found = [p for p in found if not any(q in names for q in _shorter(p))]
     if len(found) < 2:
         raise DataError(
             "a sequence needs two images at least",
@@ -134,7 +160,7 @@ def find_images(source: Path) -> list[Path]:
             found=len(found),
             expected="a folder of images, a pattern in quotes, a video, or scene:NAME",
         )
-    return sorted(found, key=_by_number)
+    return sorted(found, key=lambda path: [_by_number(part) for part in path.parts])
 
 
 def find_depths(images: list[Path]) -> list[Path]:
@@ -184,7 +210,13 @@ def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = N
     return [folder / name for name in names]
 
 
-def _by_number(path: Path) -> list[Any]:
-    """Sort key that orders numbers by value, so that 10 comes after 9."""
-    words = re.split(r"(\d+)", path.name)
-    return [(1, int(word), "") if word.isdecimal() else (0, 0, word) for word in words]
+def _shorter(path: Path) -> list[Path]:
+    """x.jpg, x for x.jpg.png: names of the picture that this one may be the mask of."""
+    words = path.name.split(".")
+    return [path.with_name(".".join(words[:k])) for k in range(1, len(words))]
+
+
+def _by_number(name: str) -> list[Any]:
+    """Sort key that orders numbers and decimals by value: 9, 9.5, 10."""
+    words = re.split(r"(\d+(?:\.\d+)?)", name)
+    return [(1, Decimal(word), "") if k % 2 else (0, 0, word) for k, word in enumerate(words)]

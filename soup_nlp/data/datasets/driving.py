@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from soup_nlp.arrays import Mask
 from soup_nlp.data.datasets.layout import make_pair, need, need_folder, read_if, training_folder
 from soup_nlp.data.formats.camera_files import read_kitti_projections, read_vkitti2_intrinsics
-from soup_nlp.data.formats.images import decode
+from soup_nlp.data.formats.images import DataWarning, decode
 from soup_nlp.data.formats.map_files import (
     KITTI_DISPARITY,
     read_depth_png16,
@@ -69,7 +70,9 @@ _VKITTI = {
 """Paths of image, depth and flow; {} stands for scene, variation and frame, * for a version."""
 
 VKITTI1_CAMERA = (725.0, 725.0, 620.5, 187.0)
-"""fx, fy, cx, cy of every Virtual KITTI 1 image (1242 x 375), pixels."""
+"""fx, fy, cx, cy of every Virtual KITTI 1 image, pixels."""
+VKITTI1_SIZE = (375, 1242)
+"""(height, width) of these images."""
 
 
 def load_kitti(benchmark: str, root: PathLike, index: int | str, occ: bool = True) -> Pair:
@@ -202,4 +205,12 @@ def load_vkitti(
         depth_next=read_if(read_vkitti_depth, path(depth, frame + step)),
         flow=read_if(read_vkitti_flow, path(flow, frame) if step == 1 else None),
     )
-    return make_pair(images, cameras, truth, f"{benchmark}_{scene}_{variation}_{frame:05d}")
+    pair = make_pair(images, cameras, truth, f"{benchmark}_{scene}_{variation}_{frame:05d}")
+    if benchmark == "vkitti1" and pair.size != VKITTI1_SIZE:
+        warnings.warn(
+            f"{images[0]}: {pair.size[1]} x {pair.size[0]}, but the intrinsics of Virtual KITTI 1"
+            f" are assumed, of {VKITTI1_SIZE[1]} x {VKITTI1_SIZE[0]}",
+            DataWarning,
+            stacklevel=2,
+        )
+    return pair

@@ -8,6 +8,7 @@ unknown.
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from skimage.measure import label
 from soup_nlp.data.datasets.layout import is_result, make_pair, need, need_folder, read_if
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_intrinsics
-from soup_nlp.data.formats.images import read_mask
+from soup_nlp.data.formats.images import DataWarning, read_mask
 from soup_nlp.data.formats.map_files import read_depth, read_depth_png16, read_flow
 from soup_nlp.data.formats.npy_files import read_npz
 from soup_nlp.data.pair import Float, Pair, Truth
@@ -38,7 +39,10 @@ _FLOWS = (".flo", ".npy", ".png")
 TUM_SCALE = 5000.0
 """Values per metre of a TUM RGB-D depth image."""
 
-TUM_LAYOUT = "rgb.txt, depth.txt, rgb/*.png, depth/*.png (or frame_0.png, depth_0.png, K.txt)"
+TUM_LAYOUT = (
+    "rgb.txt, depth.txt, rgb/*.png, depth/*.png, optional K.txt or camera.txt (or frame_0.png, "
+    "depth_0.png, K.txt)"
+)
 _TUM_CAMERAS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
     "freiburg2": (520.9, 521.0, 325.1, 249.7),
@@ -58,7 +62,11 @@ def _find(folder: Path, stems: tuple[str, ...], suffixes: tuple[str, ...]) -> Pa
 
 
 def load_folder(
-    folder: PathLike, depth_scale: float = 1000.0, unit: str = "m", white: int | None = None
+    folder: PathLike,
+    depth_scale: float = 1000.0,
+    unit: str = "m",
+    white: int | None = None,
+    cropped: bool = False,
 ) -> Pair:
     """Load a pair from a plain folder.
 
@@ -76,7 +84,8 @@ def load_folder(
         folder: The folder.
         depth_scale: Values per `unit` of a 16-bit depth image, e.g. 1000 for mm read as metres.
         unit: Unit of length of the truth.
-        white: Value of white in a 16-bit image, see `read_image`.
+        white: Value of white in 16-bit images, see `read_images`.
+        cropped: The images are parts of larger ones, see `make_pair`.
 
     Raises:
         DataError: a required file is missing, a file is malformed or has a wrong size, or the
@@ -110,9 +119,8 @@ def load_folder(
         points=read_if(_read_points, folder / "points.npz", unit),
         unit=unit,
     )
-    return make_pair(
-        images, [K, K if K_next is None else K_next], truth, folder.resolve().name, white
-    )
+    cameras = [K, K if K_next is None else K_next]
+    return make_pair(images, cameras, truth, folder.resolve().name, white, cropped=cropped)
 
 
 def _moving_components(path: PathLike) -> NDArray[np.int32]:
@@ -171,13 +179,28 @@ def load_tum(folder: PathLike, frame: int = 0, step: int = 1) -> Pair:
                 found=index,
                 expected=f"0 to {len(images) - 1}",
             )
-    sensor = re.search(r"freiburg[123]", str(folder.resolve()))
-    K = intrinsics(*_TUM_CAMERAS[sensor.group() if sensor else ""])
+    beside = _find(folder, ("K", "camera"), (".txt",))
+    K = _tum_camera(folder) if beside is None else read_intrinsics(beside)
     (time_ref, ref), (time_next, following) = images[frame], images[frame + step]
     truth = Truth(depth_ref=_tum_depth(depths, time_ref), depth_next=_tum_depth(depths, time_next))
     name = f"{folder.resolve().name}_{frame}"
     files = [need(path, TUM_LAYOUT) for path in (ref, following)]
     return make_pair(files, [K, K], truth, name)
+
+
+def _tum_camera(folder: Path) -> Float:
+    """Intrinsics of TUM's sensors, by the name of the folder, with a warning."""
+    sensor = re.search(r"freiburg[123]", str(folder.resolve()))
+    name = sensor.group() if sensor else ""
+    numbers = ",".join(f"{x:g}" for x in _TUM_CAMERAS[name])
+    warnings.warn(
+        f"{folder}: neither K.txt nor camera.txt beside rgb.txt; the intrinsics of"
+        f" {name or 'the default camera of TUM RGB-D'} are assumed ({numbers}), and {TUM_SCALE:g}"
+        " values of depth per metre",
+        DataWarning,
+        stacklevel=3,
+    )
+    return intrinsics(*_TUM_CAMERAS[name])
 
 
 def _tum_list(path: Path) -> list[tuple[float, Path]]:

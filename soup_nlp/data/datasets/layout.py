@@ -6,7 +6,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from soup_nlp.data.formats.images import read_image
+import numpy as np
+
+from soup_nlp.data.camera_check import check_camera
+from soup_nlp.data.formats.camera_files import undistorted
+from soup_nlp.data.formats.exif import estimated_cameras
+from soup_nlp.data.formats.images import read_images
 from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import PathLike, as_path, is_file, is_folder, read_json
@@ -70,29 +75,43 @@ def read_if(reader: Callable[..., T], path: Path | None, *options: object) -> T 
 
 def make_pair(
     images: Sequence[Path],
-    cameras: Sequence[Float],
+    cameras: Sequence[Float | None],
     truth: Truth,
     name: str,
     white: int | None = None,
     *,
-    turn: bool = False,
+    fov: float | None = None,
+    cropped: bool = False,
+    distortion: Sequence[Float] = (),
 ) -> Pair:
     """The pair of two image files; its truth is None if no part of it is known.
 
     Args:
         images: Reference and next image.
-        cameras: (3, 3) intrinsics of both frames, pixels.
+        cameras: (3, 3) intrinsics of both frames, pixels. Without any, images are rotated by their
+            EXIF orientation. Those that are None are estimated, see `estimated_cameras`.
         truth: Truth from its files.
         name: Name of the pair.
-        white: Value of white in a 16-bit image, see `read_image`.
-        turn: Rotate images by their EXIF orientation, see `read_image`.
+        white: Value of white in 16-bit images, see `read_images`.
+        fov: Horizontal field of view, degrees, if the cameras are not known.
+        cropped: The images are parts of larger ones, see `check_camera`.
+        distortion: Coefficients (n,) of both lenses, removed from the images, see `undistorted`.
 
     Raises:
-        DataError: an image is damaged, or the truth has another size.
+        DataError: an image is damaged, a camera is impossible, or the truth has another size.
     """
-    ref, following = (read_image(path, white, turn=turn) for path in images)
-    K_ref, K_next = cameras
-    return Pair(ref, following, K_ref, K_next, truth=truth if truth.known() else None, name=name)
+    # a given camera may belong to the stored or to the rotated image
+    pictures = read_images(images, white, turn=all(K is None for K in cameras))
+    if any(K is None for K in cameras):
+        estimated = estimated_cameras(images, pictures, fov)
+    own = [estimated[k] if K is None else K for k, K in enumerate(cameras)]
+    alike = pictures[0].shape == pictures[1].shape and np.array_equal(own[0], own[1])
+    for k in range(1 if alike else 2):
+        check_camera(own[k], pictures[k].shape[:2], images[k], cropped)
+    for k, coefficients in enumerate(distortion):
+        pictures[k], own[k] = undistorted(pictures[k], own[k], coefficients)
+    known = truth if truth.known() else None
+    return Pair(pictures[0], pictures[1], own[0], own[1], truth=known, name=name)
 
 
 def is_result(folder: Path) -> bool:

@@ -50,7 +50,7 @@ def load_sintel(
         DataError: an image is missing, or a file is malformed or has a wrong size.
 
     Warns:
-        DataWarning: there is no camera file, and the scene is not alley_1.
+        DataWarning: there is no camera file.
     """
     base = training_folder(root, LAYOUT)
     names = [f"{scene}/frame_{number:04d}" for number in (frame, frame + step)]
@@ -85,11 +85,12 @@ def _flow_truth(base: Path, name: str) -> tuple[Float | None, Mask | None]:
 def _cameras(paths: list[Path], scene: str) -> list[Float]:
     """Intrinsics of the frames; `DEFAULT_CAMERA` with a warning if a file is missing."""
     absent = [path for path in paths if not is_file(path)]
-    if absent and scene != DEFAULT_SCENE:
+    if absent:
+        doubt = "" if scene == DEFAULT_SCENE else f", which may be wrong for {scene}"
         warnings.warn(
             f"no camera file {absent[0]}: the focal length of {DEFAULT_SCENE} is taken,"
-            f" {DEFAULT_CAMERA[0]:g} pixels, which may be wrong for {scene}; camdata_left comes"
-            " with Sintel's depth training data",
+            f" {DEFAULT_CAMERA[0]:g} pixels{doubt}; camdata_left comes with Sintel's depth training"
+            " data",
             DataWarning,
             stacklevel=3,
         )

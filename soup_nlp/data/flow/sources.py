@@ -14,10 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.data.flow.common_focal import at_common_focal, in_own_pixels
 from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
 from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.dis_options import DisOptions
 from soup_nlp.data.flow.learned import learned_flow
+from soup_nlp.data.flow.plausible import check_flow
 from soup_nlp.data.flow.rlof import rlof_flow
 from soup_nlp.data.formats.map_files import read_confidence, read_flow
 from soup_nlp.data.pair import Flow, Pair, check_size
@@ -187,11 +189,17 @@ class FlowOptions(Section):
         """
         if self.backward or self.confidence:
             return self._load_with_confidence(pair, path)
-        if self.source == "dis":
-            return dis_flow(pair.image_ref, pair.image_next, **dict(self.dis))
         if self.source == "truth":
             return flow_from_truth(pair, self.occluded_confidence)
-        return resolve_flow(pair, str(path(self.source)) if is_path(self.source) else self.source)
+        source = str(path(self.source)) if is_path(self.source) else self.source
+        if self.is_file() or source.startswith(NOISE):
+            return resolve_flow(pair, source)
+        near = at_common_focal(pair)
+        if source == "dis":
+            flow = dis_flow(near.image_ref, near.image_next, **dict(self.dis))
+        else:
+            flow = resolve_flow(near, source)
+        return flow if near is pair else in_own_pixels(flow, pair)
 
     def _load_with_confidence(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
         if not self.is_file():
@@ -276,6 +284,7 @@ def resolve_flow(pair: Pair, source: str) -> Flow:
         )
     flow = load_flow(source)
     pair.with_flow(flow)  # checks its size
+    check_flow(flow, pair)
     return flow
 
 

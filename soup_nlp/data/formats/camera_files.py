@@ -6,16 +6,23 @@ another kind, or without a valid camera.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from typing import Any
 
+import cv2
 import numpy as np
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import Float, Image
 from soup_nlp.data.formats.images import check_body
 from soup_nlp.data.formats.map_files import check_magic
 from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry.camera import intrinsics
-from soup_nlp.storage.files import PathLike, read_bytes, read_text
+from soup_nlp.storage.files import PathLike, parse_yaml, read_bytes, read_text
+
+CAMERA = ("fx", "fy", "cx", "cy")
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Coefficients of distortion in OpenCV's order; up to six more have no common names."""
 
 _CAM_BYTES = 8 * (9 + 12)  # intrinsics (3, 3) and extrinsics (3, 4)
 _VKITTI2_COLUMNS = ("frame", "cameraID", "K[0,0]", "K[1,1]", "K[0,2]", "K[1,2]")
@@ -59,6 +66,7 @@ def check_intrinsics(given: object, where: object) -> Float:
             where=where,
             found=f"fx {K[0, 0]:g}, fy {K[1, 1]:g}",
             expected="fx > 0 and fy > 0, in pixels",
+            hint="of a camera whose y axis points up (ICL-NUIM), give fy without its sign",
         )
     if np.any(np.tril(K, -1)) or K[2, 2] != 1:
         raise DataError(
@@ -71,22 +79,97 @@ def check_intrinsics(given: object, where: object) -> Float:
 
 
 def read_intrinsics(path: PathLike) -> Float:
-    """Read intrinsics from a text file.
+    """Read intrinsics without distortion, see `read_camera`.
+
+    Raises:
+        DataError: the file holds distortion.
+    """
+    K, distortion = read_camera(path)
+    if distortion.any():
+        raise DataError(
+            "camera file holds lens distortion, which the method does not model",
+            where=path,
+            found=" ".join(f"{n} {x:g}" for n, x in zip(DISTORTION, distortion)),
+            expected="fx fy cx cy of images without distortion",
+            hint="--undistort (input.undistort) removes it from both images by OpenCV; if they are"
+            " free of it already, delete its numbers from the file",
+        )
+    return K
+
+
+def read_camera(path: PathLike) -> tuple[Float, Float]:
+    """Read intrinsics (3, 3) and distortion (n,) of OpenCV (k1 k2 p1 p2 k3 ...) from a text file.
 
     The file holds nine numbers (the 3x3 matrix, row by row) or four (fx fy cx cy), separated by
-    blanks or commas; lines that start with # are comments.
+    blanks or commas; lines that start with # are comments. The distortion follows if there is one.
+    Instead, numbers may have names (fx: 500), or the file may be a YAML file of OpenCV or ROS.
     """
     lines = [x for x in read_text(path, "intrinsics").splitlines() if not x.strip().startswith("#")]
-    values = _numbers("\n".join(lines), path, "intrinsics file")
-    if len(values) not in (4, 9):
+    text = "\n".join(lines)
+    values = _named(text, path) or _numbers(text, path, "intrinsics file")
+    matrix = len(values) in (13, 14, 17) or (len(values) == 9 and values[6:] == [0, 0, 1])
+    count = 9 if matrix or (len(values) == 9 and not _is_distortion(values[4:])) else 4
+    if not (len(values) == count or (_is_distortion(values[count:]) and len(values) < 23)):
         raise DataError(
             "intrinsics file has the wrong number of values",
             where=path,
             found=len(values),
-            expected="9 (the 3x3 matrix by rows) or 4 (fx fy cx cy)",
+            expected="9 (the 3x3 matrix by rows) or 4 (fx fy cx cy), then the distortion if any",
         )
-    K = np.reshape(values, (3, 3)) if len(values) == 9 else intrinsics(*values)
-    return check_intrinsics(K, path)
+    K = np.reshape(values[:9], (3, 3)) if count == 9 else intrinsics(*values[:4])
+    return check_intrinsics(K, path), np.array(values[count:])
+
+
+def _is_distortion(values: Sequence[float]) -> bool:
+    """Whether numbers may be coefficients of distortion, which are small."""
+    return len(values) > 0 and max(abs(x) for x in values) < 100
+
+
+def _named(text: str, where: PathLike) -> list[float]:
+    """fx, fy, cx, cy and distortion of a text with names; empty if it has none.
+
+    Raises:
+        DataError: the model of the lens is another one than OpenCV's.
+    """
+    if re.search("fisheye|equidistant|KannalaBrandt", text, re.IGNORECASE):
+        raise DataError(
+            "camera file holds the distortion of a fisheye lens",
+            where=where,
+            expected="a pinhole camera, with distortion k1 k2 p1 p2 k3 ... or without",
+            hint="undistort the images first, for example by cv2.fisheye.undistortImage",
+        )
+    pattern = rf"\b({'|'.join((*CAMERA, *DISTORTION))})\b[\"']?\s*[:=]?\s*(-?[\d.]+(?:e[-+]?\d+)?)"
+    named = {name.lower(): float(x) for name, x in re.findall(pattern, text, re.IGNORECASE)}
+    if named.keys() >= set(CAMERA):
+        last = max((k + 1 for k, name in enumerate(DISTORTION) if name in named), default=0)
+        return [named.get(name, 0.0) for name in (*CAMERA, *DISTORTION[:last])]
+    try:
+        # a header and tags of OpenCV are not known to YAML
+        tree = parse_yaml(re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE))
+    except ValueError:
+        return []
+    if not isinstance(tree, dict):
+        return []
+
+    def entry(names: str) -> list[float]:
+        found: Any = next((v for k, v in tree.items() if re.fullmatch(names, str(k))), [])
+        found = found.get("data", []) if isinstance(found, dict) else found
+        return [float(x) for x in np.ravel(found)]
+
+    try:
+        K = entry("camera_?[mM]atrix|K")
+        return [*K, *entry("distortion_(coefficients|parameters)|dist_?[cC]oeffs|D")] if K else []
+    except (TypeError, ValueError):
+        return []
+
+
+def undistorted(image: Image, K: Float, distortion: Float) -> tuple[Image, Float]:
+    """An image (H, W, 3) without distortion, all of whose pixels are known, and its intrinsics."""
+    padded = np.zeros(14)
+    padded[: len(distortion)] = distortion
+    size = image.shape[1], image.shape[0]
+    new, _ = cv2.getOptimalNewCameraMatrix(K, padded, size, 0)
+    return np.asarray(cv2.undistort(image, K, padded, None, new)), np.asarray(new, np.float64)
 
 
 def read_cam(path: PathLike) -> Float:

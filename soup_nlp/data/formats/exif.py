@@ -1,86 +1,157 @@
-"""Intrinsics of a picture without a camera file: from EXIF, a field of view, or a guess."""
+"""Intrinsics of pictures without a camera file: from EXIF, a field of view, or a guess."""
 
 from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from PIL import ExifTags, Image
+import numpy as np
+from PIL.ExifTags import Base
 
-from soup_nlp.arrays import Float
-from soup_nlp.data.formats.images import SHOWN, DataWarning, PathLike, decode
+from soup_nlp.arrays import Float, Image
+from soup_nlp.data.formats.images import DataWarning, PathLike, exif_tags
 from soup_nlp.errors import ConfigError
 from soup_nlp.geometry.camera import intrinsics
 
 GUESS = 1.2
-"""Default focal length relative to the larger side of the image (45 degrees of view)."""
+"""Default focal length relative to the longer side of the image (45 degrees of view)."""
+NARROWEST, WIDEST = 10.0, 150.0
+"""Plausible fields of view along the longer side, degrees."""
 
-_DIAGONAL_35 = math.hypot(36.0, 24.0)
-"""Diagonal of a frame of 35 mm film, mm."""
+_LONGER_35 = 36.0
+"""Longer side of a frame of 35 mm film, mm."""
 _UNITS = {2: 25.4, 3: 10.0}
 """Millimetres in EXIF's units of length: inches and centimetres."""
+_SENSORS = (13.2, 17.3, 18.7, 22.3, 23.5, 28.4, 36.0, 43.8, 53.7)
+"""Widths of the large sensors that are built, mm; those below `_SMALL` have any width."""
+_SMALL, _SMALLEST = 9.5, 2.5
+_LONGEST_OF_SMALL = 14.0
+"""Focal length that a lens of a small sensor rarely exceeds, mm."""
 
 
-def estimated_intrinsics(path: PathLike, fov: float | None = None) -> Float:
-    """Intrinsics with square pixels and the principal point in the middle of the image.
+def estimated_cameras(
+    paths: Sequence[PathLike], images: Sequence[Image], fov: float | None = None
+) -> list[Float]:
+    """Intrinsics of pictures, with square pixels and the principal point in the middle.
+
+    Each picture has its own size, orientation and lens. The focal length of one without EXIF is
+    that of another one, relative to the longer side.
 
     Args:
-        path: The image; the axes are those after rotation by its EXIF orientation.
-        fov: Horizontal field of view, degrees; None for the focal length of EXIF, or else `GUESS`
-            times the larger side.
+        paths: The files, whose EXIF is read.
+        images: The pictures, (H, W, 3), rotated by their EXIF orientation.
+        fov: Horizontal field of view of the first picture, degrees; None for the focal length of
+            EXIF, or else `GUESS` times the longer side.
 
     Returns:
-        (3, 3) intrinsics, pixels.
+        (3, 3) intrinsics of each picture, pixels.
 
     Raises:
         ConfigError: the field of view is not between 0 and 180 degrees.
 
     Warns:
-        DataWarning: `fov` is not given; the warning names the origin of the focal length.
+        DataWarning: `fov` is not given (the warning names the origin of the focal length), or a
+            focal length of EXIF is implausible.
     """
-    height, width = decode(path, "image", SHOWN).shape[:2]
+    of_exif = [exif_focal(path, image) for path, image in zip(paths, images, strict=True)]
+    some = next((focal for focal in of_exif if focal), None)
+    relative = [focal or some or GUESS for focal in of_exif]
+    sizes = [(image.shape[1], image.shape[0]) for image in images]
     if fov is not None:
         if not 0 < fov < 180:
             raise ConfigError(
                 "field of view is out of range", found=f"{fov:g}", expected="0 to 180 degrees"
             )
-        focal = width / (2 * math.tan(math.radians(fov) / 2))
-    else:
-        found = exif_focal(path)
-        focal = GUESS * max(width, height) if found is None else found
-        degrees = 2 * math.degrees(math.atan(width / (2 * focal)))
-        source = f"{GUESS} times the larger side" if found is None else "EXIF"
-        text = (
-            f"{path}: no intrinsics; focal length {focal:.0f} px from {source}"
-            f" ({degrees:.0f} degrees of view horizontally), principal point in the middle"
+        # the ratio of two lenses is that of EXIF
+        first = sizes[0][0] / (2 * math.tan(math.radians(fov) / 2)) / max(sizes[0])
+        relative = [first * focal / relative[0] for focal in relative]
+    cameras = [
+        intrinsics(focal * max(size), focal * max(size), (size[0] - 1) / 2, (size[1] - 1) / 2)
+        for focal, size in zip(relative, sizes, strict=True)
+    ]
+    for k, (path, K) in enumerate(zip(paths, cameras, strict=True)):
+        if fov is None and (k == 0 or not np.array_equal(K, cameras[0])):
+            _say(path, K, sizes[k], of_exif[k] is not None, some is not None)
+    return cameras
+
+
+def _say(path: PathLike, K: Float, size: tuple[int, int], of_exif: bool, shared: bool) -> None:
+    """Warn about the origin of a focal length."""
+    focal = K[0, 0]
+    source = f"{GUESS} times the longer side"
+    if shared:
+        source = "EXIF" if of_exif else "the EXIF of the other frame"
+    text = (
+        f"{path}: no intrinsics; focal length {focal:.0f} px from {source}"
+        f" ({_degrees(focal / size[0]):.0f} degrees of view horizontally), principal point in the"
+        " middle"
+    )
+    if not shared:
+        text += (
+            ". A wrong focal length stretches and bends depth (47 % too long raised the"
+            " relative error of tum_fr1 from 0.096 to 0.113): give --intrinsics or --fov"
         )
-        if found is None:
-            text += (
-                ". A wrong focal length stretches and bends depth (47 % too long raised the"
-                " relative error of tum_fr1 from 0.096 to 0.113): give --intrinsics or --fov"
-            )
-        warnings.warn(text, DataWarning, stacklevel=2)
-    return intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2)
+    warnings.warn(text, DataWarning, stacklevel=3)
 
 
-def exif_focal(path: PathLike) -> float | None:
-    """Focal length of EXIF in pixels; None if EXIF does not determine it.
+def _degrees(focal: float) -> float:
+    """Field of view of a side of length 1, degrees."""
+    return 2 * math.degrees(math.atan(0.5 / focal))
 
-    It follows from the equivalent for 35 mm film, relative to the diagonal, or else from the focal
-    length in millimetres and the resolution of the sensor.
+
+def exif_focal(path: PathLike, image: Image) -> float | None:
+    """Focal length of EXIF relative to the longer side of a picture; None if not determined.
+
+    It follows from the equivalent for 35 mm film, or else from the focal length in millimetres and
+    the resolution of the sensor.
+
+    Warns:
+        DataWarning: the focal length is implausible, and is ignored.
     """
+    tags = exif_tags(path)
+    found = [_number(tags, Base.FocalLengthIn35mmFilm) / _LONGER_35, _by_sensor(tags, image)]
+    given = [focal for focal in found if focal > 0]
+    for focal in given:
+        if NARROWEST <= _degrees(focal) <= WIDEST:
+            return focal
+    if given:
+        warnings.warn(
+            f"{path}: the focal length of EXIF is ignored, since {given[0]:.3g} times the longer"
+            f" side ({_degrees(given[0]):.1f} degrees of view) is implausible",
+            DataWarning,
+            stacklevel=2,
+        )
+    return None
+
+
+def _by_sensor(tags: Mapping[int, Any], image: Image) -> float:
+    """Focal length in mm over the sensor's longer side; 0 if unknown.
+
+    A picture that was cropped has other sides than EXIF says. One that was reduced by a program
+    that changed the size in EXIF, but not the resolution, has a sensor that is not built.
+    """
+    sides = sorted(image.shape[:2], reverse=True)
+    stored = sorted(
+        (_number(tags, tag) for tag in (Base.ExifImageWidth, Base.ExifImageHeight)), reverse=True
+    )
+    stored[0] = stored[0] or sides[0]
+    if stored[1] and abs(stored[0] / stored[1] / (sides[0] / sides[1]) - 1) > 0.02:
+        return 0.0
+    length = _number(tags, Base.FocalLength)
+    per_unit = _number(tags, Base.FocalPlaneXResolution)
+    unit = _UNITS.get(int(_number(tags, Base.FocalPlaneResolutionUnit)) or 2, 25.4)
+    sensor = stored[0] / per_unit * unit if per_unit > 0 else 0.0
+    built = any(abs(sensor / width - 1) < 0.05 for width in _SENSORS)
+    small = _SMALLEST < sensor < _SMALL and length <= _LONGEST_OF_SMALL
+    return length / sensor if built or small else 0.0
+
+
+def _number(tags: Mapping[int, Any], tag: int) -> float:
+    """Value of a tag; 0 if it is no positive number."""
     try:
-        with Image.open(path) as image:
-            tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
-            width, height = image.size
-        equivalent = float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm) or 0)
-        if equivalent > 0:
-            return equivalent / _DIAGONAL_35 * math.hypot(width, height)
-        length = float(tags.get(ExifTags.Base.FocalLength) or 0)
-        per_unit = float(tags.get(ExifTags.Base.FocalPlaneXResolution) or 0)
-        unit = _UNITS.get(int(tags.get(ExifTags.Base.FocalPlaneResolutionUnit) or 2), 25.4)
-        stored = float(tags.get(ExifTags.Base.ExifImageWidth) or width)
-    except (OSError, ValueError, TypeError, ZeroDivisionError):
-        return None
-    focal = length * per_unit / unit * width / stored if stored > 0 else 0.0
-    return focal if math.isfinite(focal) and focal > 0 else None
+        value = float(tags.get(tag, 0))
+    except Exception:  # of whatever the file holds there
+        return 0.0
+    return value if math.isfinite(value) and value > 0 else 0.0

@@ -8,23 +8,21 @@ from __future__ import annotations
 import contextlib
 import io
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from soup_nlp.arrays import Mask
 from soup_nlp.errors import DataError
 from soup_nlp.schema.limits import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, read_bytes
 
-DARK = 65535 // 3
-"""A 16-bit image with a smaller largest value may hold fewer bits."""
-
-SHOWN = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-"""OpenCV flags that rotate an image by its EXIF orientation."""
+OUTER = (0.5, 99.5)
+"""Percentiles of the values of 16-bit pictures that become black and white."""
 
 
 class DataWarning(UserWarning):
@@ -44,32 +42,40 @@ def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
         )
 
 
-def decode(path: PathLike, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
-    """Decode an image file to BGR or BGRA with flags of OpenCV; by default it keeps all bits."""
+def decode(path: PathLike, what: str) -> NDArray[Any]:
+    """Decode an image file as stored, with all its bits, to grey, BGR or BGRA.
+
+    OpenCV decodes it, or else Pillow, which tolerates more, to 8 bits.
+    """
     content = read_bytes(path, what)
-    png = content.startswith(b"\x89PNG\r\n\x1a\n") and b"IEND" not in content
-    last_scan, end = content.rfind(b"\xff\xda"), content.rfind(b"\xff\xd9")
-    if png or (content.startswith(b"\xff\xd8") and end < last_scan):
-        # OpenCV would decode the first part without an error
-        raise DataError(
-            f"{what} is truncated",
-            where=path,
-            found=f"a {'PNG' if png else 'JPEG'} without its end marker",
-            hint="copy or download the file again",
-        )
     _check_header(content, path, what)
     image = None
     with contextlib.suppress(cv2.error):
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    if image is None:
-        raise DataError(
-            f"{what} cannot be decoded",
-            where=path,
-            found=f"{len(content)} bytes that start with {content[:8]!r}",
-            expected="an image file that OpenCV reads (PNG, JPEG, TIFF, PPM ...)",
-            hint="the file may be damaged; try to open it in an image viewer",
-        )
-    return np.asarray(image)
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    return _decode_by_pillow(content, path, what) if image is None else np.asarray(image)
+
+
+def _decode_by_pillow(content: bytes, path: PathLike, what: str) -> NDArray[np.uint8]:
+    """Decode an image file to BGR, or raise DataError with the reason of the decoder."""
+    try:
+        with warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
+            warnings.simplefilter("ignore")
+            return np.asarray(image.convert("RGB"))[:, :, ::-1]
+    except Exception as error:  # decoders raise many types
+        reason, known = str(error), not isinstance(error, UnidentifiedImageError)
+    hint = "copy or download the file again: it may be damaged"
+    if not known:
+        reason = f"{len(content)} bytes that start with {content[:12]!r}"
+        hint = "convert it to PNG or JPEG first"
+        if content[4:8] == b"ftyp" and content[8:12] != b"avif":
+            reason = f"a HEIC picture or a video ({reason})"
+    raise DataError(
+        f"{what} is truncated" if "truncated" in reason.lower() else f"{what} cannot be decoded",
+        where=path,
+        found=reason,
+        expected="an image file that OpenCV or Pillow reads (PNG, JPEG, TIFF, WebP, AVIF ...)",
+        hint=hint,
+    )
 
 
 def _check_header(content: bytes, path: PathLike, what: str) -> None:
@@ -109,43 +115,86 @@ def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]
     return image
 
 
-def exif_orientation(path: PathLike) -> int:
-    """EXIF orientation of an image file, 1 to 8; 1 (as stored) if it has none."""
+def exif_tags(path: PathLike) -> dict[int, Any]:
+    """EXIF tags of an image file, of the picture and of the camera; none if there are none.
+
+    Warns:
+        DataWarning: EXIF is malformed; whatever is wrong in it does not end a run.
+    """
+    content = read_bytes(path, "image")
     try:
-        with Image.open(io.BytesIO(read_bytes(path, "image"))) as image:
-            found = image.getexif().get(ExifTags.Base.Orientation, 1)
-    except DataError:
-        raise
-    except Exception:  # OpenCV may read formats that Pillow does not
-        return 1
-    return found if found in range(1, 9) else 1
+        with warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
+            warnings.simplefilter("ignore")
+            exif = image.getexif()
+            return {**exif.get_ifd(ExifTags.IFD.Exif), **exif}
+    except UnidentifiedImageError:  # OpenCV may read formats that Pillow does not
+        return {}
+    except Exception as error:  # readers of metadata raise many types
+        text = f"{path}: its EXIF is malformed and is ignored ({type(error).__name__}: {error})"
+        warnings.warn(text, DataWarning, stacklevel=2)
+        return {}
 
 
 def read_image(
     path: PathLike, white: int | None = None, *, turn: bool = False
 ) -> NDArray[np.uint8]:
-    """Read a picture as 8-bit RGB.
+    """Read one picture, see `read_images`."""
+    return read_images([path], white, turn=turn)[0]
+
+
+def read_images(
+    paths: Sequence[PathLike], white: int | None = None, *, turn: bool = False
+) -> list[NDArray[np.uint8]]:
+    """Read the pictures of one scene as 8-bit RGB.
 
     8 and 16 bit, grey, RGB and RGBA are accepted. Grey is repeated in the three channels, and alpha
-    is dropped. 16-bit values v become round(255 v / white), clipped to 255. An image with an EXIF
-    rotation is rejected unless `turn` is set, since its camera may be that of either orientation.
+    is dropped. 16-bit values v become 255 v / white; without `white` the values that occur in all
+    pictures, without the outermost, become 0 to 255. An image with an EXIF rotation is rejected
+    unless `turn` is set, since its camera may be that of either orientation.
 
     Args:
-        path: Image file (PNG, JPEG, TIFF, PPM ...).
-        white: Value of a 16-bit image that becomes 255, such as 4095 for 12-bit images; None for
-            65535.
-        turn: Rotate the image by its EXIF orientation, as viewers do.
+        paths: Image files (PNG, JPEG, TIFF, PPM ...).
+        white: Value of a 16-bit image that becomes 255, such as 4095 for 12-bit images.
+        turn: Rotate the images by their EXIF orientation, as viewers do.
 
     Returns:
-        (H, W, 3) uint8 RGB image, indexed [v, u].
+        (H, W, 3) uint8 RGB images, indexed [v, u].
 
     Raises:
-        DataError: the file is damaged, of another kind, or has an EXIF rotation without `turn`.
+        DataError: a file is damaged, of another kind, or has an EXIF rotation without `turn`.
 
     Warns:
-        DataWarning: no `white` is given and a 16-bit image is dark throughout.
+        DataWarning: 16-bit images without `white`; the warning names the values.
     """
-    orientation = exif_orientation(path)
+    images = [_colours(path, turn) for path in paths]
+    deep = [image for image in images if image.dtype == np.uint16]
+    low, high = 0.0, float(white or 0)
+    if deep and white is None:
+        # a million values of each determine the percentiles
+        values = np.concatenate([x.ravel()[:: x.size // 10**6 + 1] for x in deep])
+        low, high = np.percentile(values, OUTER)
+        least, most = min(x.min() for x in deep), max(x.max() for x in deep)
+        names = ", ".join(str(path) for path in paths)
+        warnings.warn(
+            f"{names}: 16 bit, values {least} to {most}; {low:.0f} to {high:.0f}"
+            " become black to white; the key white of the input (4095 for 12 bits) sets 0 to white",
+            DataWarning,
+            stacklevel=3,
+        )
+    scale = 255.0 / max(high - low, 1.0)
+    return [
+        image
+        if image.dtype == np.uint8
+        else np.clip(np.rint((image - low) * scale), 0, 255).astype(np.uint8)
+        for image in images
+    ]
+
+
+def _colours(path: PathLike, turn: bool) -> NDArray[Any]:
+    """(H, W, 3) RGB of 8 or 16 bits, see `read_images`."""
+    image = decode(path, "image")
+    orientation = exif_tags(path).get(ExifTags.Base.Orientation, 1)
+    orientation = orientation if orientation in range(1, 9) else 1
     if orientation != 1 and not turn:
         raise DataError(
             "image is stored turned, and its camera is given",
@@ -155,7 +204,6 @@ def read_image(
             hint="save it upright (Pillow: ImageOps.exif_transpose), or leave the intrinsics out:"
             " soup-nlp then turns it",
         )
-    image = decode(path, "image", cv2.IMREAD_UNCHANGED if orientation == 1 else SHOWN)
     if image.ndim == 2:
         image = image[:, :, None]
     channels = image.shape[2]
@@ -166,9 +214,7 @@ def read_image(
             found=channels,
             expected="1 (grey), 3 (RGB) or 4 (RGBA)",
         )
-    if image.dtype == np.uint16:
-        image = _to_8_bit(image, white, path)
-    elif image.dtype != np.uint8:
+    if image.dtype not in (np.uint8, np.uint16):
         raise DataError(
             "image is neither 8-bit nor 16-bit",
             where=path,
@@ -176,23 +222,13 @@ def read_image(
             expected="uint8 or uint16",
             hint="convert it to an 8-bit PNG first",
         )
+    # OpenCV turns TIFF files itself
+    if read_bytes(path, "image")[:3] not in (b"II*", b"II+", b"MM\0"):
+        image = image.swapaxes(0, 1) if orientation >= 5 else image
+        image = image[:: -1 if orientation in (3, 4, 7, 8) else 1]
+        image = image[:, :: -1 if orientation in (2, 3, 6, 7) else 1]
     rgb = np.repeat(image, 3, axis=2) if channels == 1 else image[:, :, 2::-1]
     return np.ascontiguousarray(rgb)
-
-
-def _to_8_bit(image: NDArray[np.uint16], white: int | None, path: PathLike) -> NDArray[np.uint8]:
-    """round(255 v / white), clipped to 255; warns if `white` is None and the image is dark."""
-    largest = int(image.max())
-    if white is None and 0 < largest < DARK:
-        # only a warning, since the scene may be dark
-        full = 2 ** largest.bit_length() - 1
-        warnings.warn(
-            f"{path}: 16-bit image is dark, its largest value is {largest} of 65535; if its"
-            f" white is {full}, say so by the key white of the input (white: {full})",
-            DataWarning,
-            stacklevel=3,
-        )
-    return np.minimum(np.rint(image * (255.0 / (white or 65535))), 255).astype(np.uint8)
 
 
 def read_mask(path: PathLike) -> Mask:

@@ -120,7 +120,16 @@ def _read_flow_png(path: PathLike, what: str) -> Float:
     """(H, W, 2) values of a 16-bit flow PNG, R and G; NaN where B is 0."""
     bgr = decode_png16(path, 3, what)
     code = bgr[:, :, :0:-1].astype(np.float64)
-    code[bgr[:, :, 0] == 0] = np.nan
+    known = bgr[:, :, 0] > 0
+    if known.any() and code[known, 0].max() <= 1:
+        raise DataError(
+            f"{what} has its channels exchanged",
+            where=path,
+            found="R of 0 and 1 only, which are the values of the mask",
+            expected="R and G for u and v, B for the mask",
+            hint="OpenCV writes channels in the order B, G, R: reverse them before",
+        )
+    code[~known] = np.nan
     return code
 
 
@@ -206,9 +215,10 @@ def read_pfm(path: PathLike) -> Float:
         raise DataError(
             "PFM file is in colour", where=path, found="'PF'", expected="'Pf' (grey, one channel)"
         )
-    number = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-    pattern = rb"Pf\s+(-?\d+)\s+(-?\d+)\s+(" + number + rb")[ \t]*\r?\n"
-    header = re.match(pattern, content[:256])
+    number = rb"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
+    gap = rb"\s+(?:#[^\n]*\n\s*)*"
+    pattern = gap.join([rb"Pf", rb"(-?\d+)", rb"(-?\d+)", number]) + rb"[ \t]*\r?\n"
+    header = re.match(pattern, content[:4096])
     scale = float(header.group(3)) if header else 0.0
     if header is None or scale == 0.0:
         raise DataError(
