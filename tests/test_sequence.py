@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from helpers_chromium import Chromium, find_chromium
 from helpers_result import CAMERA, small_result
+from PIL import ExifTags, Image
 
 from soup_nlp.bench import chain as chain_study
 from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.cli.main import main
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.figures import write_png
@@ -241,6 +243,84 @@ def test_frames_of_a_folder_a_pattern_and_a_video(tmp_path):
     (tmp_path / "b.mp4").write_bytes(b"no video")
     with pytest.raises(DataError, match="video"):
         video_frames(tmp_path / "b.mp4", tmp_path / "frames2")
+
+
+@pytest.mark.parametrize(
+    ("names", "ordered"),
+    [
+        (["IMG_1.jpg", "._IMG_1.jpg", "IMG_2.jpg", ".x.png"], ["IMG_1.jpg", "IMG_2.jpg"]),
+        (["x.jpg", "x.jpg.png", "y.jpg", "y.jpg.mask.png"], ["x.jpg", "y.jpg"]),
+        (["10.png", "9.5.png", "9.25.png", "9.png"], ["9.png", "9.25.png", "9.5.png", "10.png"]),
+        (
+            ["t1305031102175304321.png", "t1305031102175304320.png"],
+            ["t1305031102175304320.png", "t1305031102175304321.png"],
+        ),
+    ],
+)
+def test_files_of_a_folder_that_are_frames(names, ordered, tmp_path):
+    for name in names:
+        write_png(tmp_path / "image.png", IMAGE)
+        (tmp_path / "image.png").rename(tmp_path / name)
+    for source in (tmp_path, tmp_path / "*"):
+        assert [p.name for p in find_images(source)] == ordered
+
+
+def test_a_pattern_may_match_folders(tmp_path):
+    for name in ("10", "9", ".hidden", "[9]"):
+        (tmp_path / name).mkdir()
+        write_png(tmp_path / name / "x.png", IMAGE)
+        write_png(tmp_path / name / "z.png", IMAGE)
+    found = find_images(tmp_path / "*" / "x.png")
+    assert [p.parent.name for p in found] == ["9", "10", "[9]"]
+    # brackets in the name of a folder that exists are no pattern
+    assert [p.name for p in find_images(tmp_path / "[9]" / "*.png")] == ["x.png", "z.png"]
+
+
+@pytest.mark.parametrize("kind", ["damaged", "heic", "turned"])
+def test_a_frame_that_cannot_be_read_is_found_before_the_first_solve(
+    kind, tmp_path, capsys, monkeypatch
+):
+    def solve(*args):
+        raise AssertionError("a pair was solved")
+
+    monkeypatch.setattr(pairs, "_solve", solve)
+    for k in range(3):
+        write_png(tmp_path / f"{k}.png", IMAGE)
+    last = tmp_path / "3.png"
+    write_png(last, IMAGE)
+    if kind == "damaged":
+        last.write_bytes(last.read_bytes()[:500])
+    elif kind == "heic":
+        last.unlink()
+        last = tmp_path / "3.heic"
+        last.write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    else:
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = 6
+        Image.fromarray(IMAGE).save(last, exif=exif)
+    camera = ["--intrinsics", "60,60,31.5,23.5"]
+    assert main(["chain", str(tmp_path), *camera, "-o", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert last.name in error
+    assert {"damaged": "truncated", "heic": "convert it", "turned": "turned"}[kind] in error
+
+
+@pytest.mark.parametrize("order", [[0, 0, 1, 1, 1, 2], [0, 1, 2, 2], [0, 0]])
+def test_duplicate_frames_are_bridged(order, tmp_path):
+    """A recording that starts, pauses or ends at rest."""
+    for k, frame in enumerate(order):
+        write_png(tmp_path / f"{k}.png", render_scene("orbit", 0, 160, 108, frame).image_ref)
+    np.savetxt(tmp_path / "K.txt", render_scene("orbit", 0, 160, 108).K_ref)
+    fast = ["--superpixels", "30", "--neighbours", "5", "--set", "refine.enabled=false", "-q"]
+    assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out"), *fast]) == 0
+    told = json.loads((tmp_path / "out" / "chain.json").read_text())
+    links = {tuple(link["pairs"]): link for link in told["links"]}
+    for k in range(len(order) - 2):
+        same = len({*order[k : k + 3]}) < 3
+        assert links[k, k + 1]["flagged"] == same
+    if len(order) == 6:
+        assert links[1, 4]["bridge"]
+        assert not links[1, 4]["flagged"]
 
 
 def test_frames_of_a_scene_follow_each_other():
