@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from test_flow import texture
 
+from soup_nlp.data.flow import dis
 from soup_nlp.data.flow.consistency import confidence_of
 from soup_nlp.data.flow.guided import dominant_homographies, guided_flow
-from soup_nlp.data.flow.sources import dis_flow
 
 HEIGHT, WIDTH = 200, 360
 # the road of a driving camera: what is far down comes nearer fast
@@ -74,9 +74,10 @@ def test_a_first_flow_that_is_half_wrong_is_completed():
 
 
 @pytest.mark.parametrize("planes", [0, 4])
-def test_dis_option(planes):
+def test_flow_with_and_without_homographies(planes, monkeypatch):
+    monkeypatch.setattr(dis, "PLANES", planes)
     first, second = images(ROAD)
-    flow = dis_flow(first, second, planes=planes)
+    flow = dis.dis_flow(first, second)
     assert np.isfinite(flow.uv).all()
     sure = flow.confidence > 0.5
     assert sure.mean() > 0.3

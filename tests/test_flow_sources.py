@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.consistency import checked_flow
 from soup_nlp.data.flow.learned import learned_flow
-from soup_nlp.data.flow.rlof import rlof_flow
-from soup_nlp.data.flow.robust import reweighted
 from soup_nlp.data.flow.sources import add_noise, flow_from_truth, is_named, resolve_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
-from soup_nlp.geometry.superpixels import segment
-from soup_nlp.pipeline.case import prepare
 
 
 @pytest.fixture(scope="module")
@@ -64,59 +59,8 @@ def test_a_problem_can_ask_for_noise(pair):
         assert error(problem.flow.load(pair, problem.path), pair).mean() > 0.5 * float(level)
     with pytest.raises(DataError, match="number of pixels"):
         resolve_flow(pair, "truth+noise:much")
-    assert is_named("rlof")
+    assert is_named("dis")
     assert not is_named("flow.flo")
-
-
-def test_reweighting_suspects_the_minority_of_a_superpixel(pair):
-    labels = segment(pair.image_ref, 30)
-    true = flow_from_truth(pair)
-    rng = np.random.default_rng(0)
-    wrong = rng.random(labels.shape) < 0.15
-    uv = true.uv + np.where(wrong[..., None], 6.0, 0.0).astype(np.float32)
-    flow = Flow(uv, true.confidence * 0.8, "x")
-    out = reweighted(flow, labels)
-    assert np.all(out.confidence <= flow.confidence)
-    assert np.array_equal(out.confidence > 0, flow.confidence > 0)
-    assert np.array_equal(out.uv, flow.uv)
-    assert np.median(out.confidence[wrong]) < 0.1 * np.median(out.confidence[~wrong])
-    # an affine flow is not suspected at all
-    v, u = np.mgrid[: labels.shape[0], : labels.shape[1]].astype(np.float32)
-    affine = np.stack([1 + 0.02 * u - 0.01 * v, 0.03 * v - 2], axis=-1)
-    same = reweighted(Flow(affine, flow.confidence, "x"), labels)
-    np.testing.assert_allclose(same.confidence, flow.confidence, rtol=1e-3)
-    with pytest.raises(DataError, match="differ in size"):
-        reweighted(flow, labels[1:])
-    with pytest.raises(DataError, match="positive"):
-        reweighted(flow, labels, 0.0)
-
-
-def test_a_problem_can_ask_for_reweighting():
-    scene = {"kind": "scene", "scene": "street", "width": 128, "height": 64}
-    raw = {"input": scene, "segmentation": {"superpixels": 30, "neighbours": 5}}
-    weights = [
-        prepare(make_problem({**raw, "flow": {"reweight_px": px}})).data.pixel_weight
-        for px in (None, 0.3)
-    ]
-    assert 0.1 * weights[0].sum() < weights[1].sum() < 0.98 * weights[0].sum()
-
-
-def test_rlof_needs_the_contributed_modules(pair, monkeypatch):
-    monkeypatch.delattr(cv2, "optflow", raising=False)
-    with pytest.raises(DataError, match=r"DenseRLOF[\s\S]*opencv-contrib"):
-        resolve_flow(pair, "rlof")
-
-
-@pytest.mark.skipif(
-    not hasattr(cv2, "optflow"), reason="this OpenCV has no contributed modules (RLOF)"
-)
-def test_rlof_on_a_rendered_scene(pair):
-    flow = resolve_flow(pair, "rlof")
-    sure = flow.confidence > 0.5
-    assert sure.mean() > 0.4
-    assert np.median(error(flow, pair)[sure]) < 0.5
-    with pytest.raises(DataError, match="do not suit"):
-        rlof_flow(pair.image_ref, pair.image_next[:40])
 
 
 @pytest.fixture(scope="module")
@@ -189,19 +133,3 @@ def test_onnx_input_range_and_bad_networks(onnx, tmp_path, pair):
         resolve_flow(pair, str(tmp_path / "absent.onnx"))
     with pytest.raises(DataError, match="two RGB images"):
         learned_flow(str(unit), first, second[:32])
-
-
-def test_raft_from_a_file(tmp_path, pair):
-    torch = pytest.importorskip("torch", reason="torch is not installed (extra raft)")
-    models = pytest.importorskip(
-        "torchvision.models.optical_flow", reason="torchvision is not installed (extra raft)"
-    )
-    torch.manual_seed(0)
-    state = models.raft_small(weights=None).state_dict()
-    torch.save(state, tmp_path / "small.pth")
-    flow = resolve_flow(pair, str(tmp_path / "small.pth"))
-    assert flow.uv.shape == (*pair.size, 2)
-    assert np.isfinite(flow.uv).all()
-    (tmp_path / "no.pth").write_bytes(b"no weights")
-    with pytest.raises(DataError, match="cannot be loaded"):
-        resolve_flow(pair, str(tmp_path / "no.pth"))

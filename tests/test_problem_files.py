@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from soup_nlp.cli.main import main
 from soup_nlp.config.problem import dump_problem, load_problem, make_problem
 from soup_nlp.errors import ConfigError
 
@@ -55,7 +56,6 @@ def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path):
         ),
         (MOTORCYCLE + "superpixels: 3\n", ["did you mean segmentation.superpixels?"]),
         (MOTORCYCLE + "sed: 5\nname: 3\n", ["(and 1 more mistake)"]),
-        (MOTORCYCLE + "flow: {dis: {patch_stride: 30}}\n", ["patch_stride at most patch_size"]),
         (MOTORCYCLE + "seed: 1\nseed: 2\n", ["given twice", "line 3", "found: seed"]),
         ("- 1\n", ["must be a mapping", "found: list"]),
         ("a: [\n", ["not YAML", "line 2"]),
@@ -85,3 +85,16 @@ def test_an_override_is_checked_like_the_file(override, parts):
         make_problem({"input": {"kind": "motorcycle"}}, [override])
     for part in parts:
         assert part in str(caught.value)
+
+
+def test_show_prints_what_users_turn_and_what_differs(capsys):
+    assert main(["show", "street", "--set", "energy.weights.cont=0.5"]) == 0
+    short = capsys.readouterr().out
+    assert "superpixels: 1000" in short
+    assert "cont: 0.5" in short
+    assert "leak_arap" not in short
+    assert main(["show", "street", "--set", "energy.weights.cont=0.5", "--all"]) == 0
+    whole = capsys.readouterr().out
+    assert "leak_arap" in whole
+    one, other = (make_problem(yaml.safe_load(text)) for text in (short, whole))
+    assert one.digest() == other.digest()

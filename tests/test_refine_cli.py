@@ -152,20 +152,15 @@ def test_an_interrupted_refinement_keeps_its_best_and_exits_with_1(tmp_path):
     assert done.refined.energy["total"] < done.refined.energy_begin["total"]
 
 
-def test_a_polish_keeps_the_better_soup(tmp_path):
-    code, summary = solve(tmp_path, "--set", "refine.polish=true", "--set", "refine.rounds=1")
-    assert code == 0
-    r = summary["refinement"]
-    assert r["polish_gain"] >= 0
-    last = r["rounds"][-1]["energy"]["total"]
-    assert r["end"]["total"] == pytest.approx(last - r["polish_gain"])
-    assert check_folder(tmp_path).ok
-
-
 def test_the_section_mirrors_its_record_and_is_strict():
     problem = make_problem({"input": {"kind": "motorcycle"}})
     assert problem.refine == RefineOptions()
     assert problem.refine.particles == 50
-    for wrong in ("refine.particles=1", "refine.keep=2", "refine.round=3", "refine.rounds=-1"):
+    for wrong in (
+        "refine.particles=1",
+        "refine.depth_reach=0",
+        "refine.round=3",
+        "refine.rounds=-1",
+    ):
         with pytest.raises(ConfigError):
             make_problem({"input": {"kind": "motorcycle"}}, [wrong])

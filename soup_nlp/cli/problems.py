@@ -35,6 +35,9 @@ def show(
     problem: Annotated[Path | None, typer.Argument(help=PROBLEM)] = None,
     overrides: Set = None,
     preset: PresetName = None,
+    every: Annotated[
+        bool, typer.Option("--all", help="Every option, also the unusual ones.")
+    ] = False,
 ) -> None:
     """Print the merged problem and its hash; without a problem, the options of a preset."""
     if problem is None:
@@ -48,7 +51,8 @@ def show(
         print(dump_preset(preset), end="")
         return
     chosen = load_problem(problem, preset_first(preset, overrides))
-    print(f"{dump_problem(chosen)}# hash {chosen.digest()}")
+    more = "" if every else "# all other options have their defaults: soup-nlp show --all\n"
+    print(f"{dump_problem(chosen, every)}{more}# hash {chosen.digest()}")
 
 
 def list_(

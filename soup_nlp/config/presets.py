@@ -32,7 +32,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "neighbours": 15,
             },
             # all flow vectors alike
-            "flow": {"see_through": False, "reweight_px": None, "dis": {"tau": 1e6, "limit": 1e4}},
+            "flow": {"see_through": False, "dis": {"tau": 1e6, "limit": 1e4}},
             "start": {
                 "method": "homography",
                 "samples": 100,

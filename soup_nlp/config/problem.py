@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import AfterValidator, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from soup_nlp.config.presets import with_preset
 from soup_nlp.config.yaml_text import Dumper, parse
@@ -257,20 +258,43 @@ def make_problem(
         raise explain(error, Problem, tree, where, lines) from error
 
 
-def dump_problem(problem: Problem) -> str:
-    """The complete, merged problem as YAML with a comment on every key; it can be solved again."""
-    return "\n".join(_write(problem, "")) + "\n"
+USUAL = (
+    "max_size", "seed",
+    "segmentation.superpixels", "segmentation.neighbours",
+    "flow.source", "flow.backward", "flow.confidence", "flow.dis.equalize",
+    "start.upright",
+    "solver.max_iter", "solver.max_seconds",
+    "refine.enabled", "refine.from_start", "refine.rounds", "refine.particles",
+    "refine.max_seconds",
+    "output.page", "output.min_confidence",
+)  # fmt: skip
+"""Keys that users turn; `soup-nlp show` prints them and those that differ from their defaults."""
 
 
-def _write(model: Section, pad: str) -> Iterator[str]:
+def dump_problem(problem: Problem, every: bool = True) -> str:
+    """The merged problem as YAML with a comment on every key; it can be solved again.
+
+    Args:
+        problem: The problem.
+        every: Write all keys; otherwise those of `USUAL` and those that differ from the defaults.
+    """
+    return "\n".join(_write(problem, "", "", every)) + "\n"
+
+
+def _differs(field: FieldInfo, value: Any) -> bool:
+    """Whether a value is not the default of its field."""
+    return field.is_required() or value != field.get_default(call_default_factory=True)
+
+
+def _write(model: Section, pad: str, place: str, every: bool) -> Iterator[str]:
     docs = model.help()
-    for key in type(model).model_fields:
+    for key, field in type(model).model_fields.items():
         value = getattr(model, key)
         comment = f"  # {docs[key]}" if key in docs else ""
         if isinstance(value, Section):
-            yield f"{pad}{key}:{comment}"
-            yield from _write(value, pad + "  ")
-        else:
+            lines = list(_write(value, pad + "  ", f"{place}{key}.", every))
+            yield from [f"{pad}{key}:{comment}", *lines] if lines else []
+        elif every or f"{place}{key}" in USUAL or _differs(field, value):
             flow = None if isinstance(value, list | tuple | dict) else False
             text = yaml.dump({key: value}, Dumper=Dumper, default_flow_style=flow, width=10**6)
             yield f"{pad}{text.rstrip()}{comment}"

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_flow
-from soup_nlp.data.flow.robust import reweighted
 from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.working_size import smaller_flow, working_size
@@ -121,9 +120,6 @@ def prepare(
     s, flow = problem.segmentation, pair.flow
     assert flow is not None
     labels = superpixels(problem, pair)
-    if problem.flow.reweight_px is not None:
-        flow = reweighted(flow, labels, problem.flow.reweight_px)
-        pair = pair.with_flow(flow)
     samples = None if s.boundary_samples == "all" else s.boundary_samples
     seg = build_segmentation(labels, pair.image_ref, s.neighbours, s.beta, s.beta_colour, samples)
     done("segmentation", seg)

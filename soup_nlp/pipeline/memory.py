@@ -29,7 +29,7 @@ def estimate(problem: Problem, pair: Pair) -> dict[str, float]:
     inside = pixels if sampled == "all" else min(pixels, n * sampled)
     around = 4 * (pixels / n) ** 0.5
     points = around if s.boundary_samples == "all" else min(around, s.boundary_samples)
-    tables = 2.0 * graph * r.particles**2 * (4 if r.float32 else 8) if r.enabled else 0.0
+    tables = 2.0 * graph * r.particles**2 * 8 if r.enabled else 0.0
     return {
         "images": float(PIXEL * pixels),
         "sampled pixels": float(ROW * inside),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from types import FunctionType, NoneType
 from typing import Any
@@ -25,7 +25,7 @@ from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.pipeline.full_size import full_size
 from soup_nlp.pipeline.record import Run
-from soup_nlp.refine.mppbp import objective, refine_soup
+from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.refine.records import Refined
 from soup_nlp.solve.kkt import constraint_residuals
@@ -107,18 +107,15 @@ def run(
     watch = Watch(listener, stop or threading.Event(), log or (lambda line: None), ipopt_log)
     case = prepare(problem, pair=pair, log=log, on_stage=clock)
 
-    def nlp(soup: Soup) -> Solution:
-        own = soup, case.data, case.weights, case.formulation(), case.options
-        return solve_soup(*own, watch=watch)
-
     if problem.refine.enabled and problem.refine.from_start:
         solution = skipped(case)
     else:
-        solution = nlp(case.start.soup)
+        energy = case.data, case.weights, case.formulation()
+        solution = solve_soup(case.start.soup, *energy, case.options, watch=watch)
         clock("nlp")
     refined = None
     if problem.refine.enabled:
-        refined = _refined(case, solution.soup, nlp, watch)
+        refined = _refined(case, solution.soup, watch)
         if log:
             log(str(refined))
         clock("refine")
@@ -128,19 +125,12 @@ def run(
     return replace(done, seconds={**clock.seconds, **parts})
 
 
-def _refined(case: Case, soup: Soup, nlp: Callable[[Soup], Solution], watch: Watch) -> Refined:
-    """The refinement of a soup, and the NLP's answer from it where the problem asks for one.
-
-    Args:
-        case: The problem before the solve.
-        soup: The NLP's solution, or the start.
-        nlp: Solves the constrained NLP from a soup.
-        watch: See `refine_soup`.
-    """
+def _refined(case: Case, soup: Soup, watch: Watch) -> Refined:
+    """The refinement of the NLP's solution or the start, with the images unless flow is exact."""
     problem, photo = case.problem, None
     if not flow_is_exact(case.start):
         photo = photometric_term(case.seen, case.segmentation.labels, soup, problem.refine)
-    refined = refine_soup(
+    return refine_soup(
         soup,
         case.data,
         case.weights,
@@ -151,10 +141,6 @@ def _refined(case: Case, soup: Soup, nlp: Callable[[Soup], Solution], watch: Wat
         depth_ratio=problem.formulation.depth_ratio,
         watch=watch,
     )
-    if not problem.refine.polish or refined.status == "interrupted":
-        return refined
-    again = nlp(refined.soup).soup
-    return _polished(refined, again, objective(again, case.data, case.weights, photo))
 
 
 def flow_is_exact(start: Start) -> bool:
@@ -236,15 +222,6 @@ def skipped(case: Case) -> Solution:
         seconds={},
         delivered="start",
     )
-
-
-def _polished(refined: Refined, again: Soup, energy: Mapping[str, float]) -> Refined:
-    """The refined soup, or the NLP's answer from it where the refinement's objective is lower."""
-    gain = refined.energy["total"] - energy["total"]
-    # a gain of rounding size is none
-    if gain <= 1e-9 * refined.energy["total"]:
-        return replace(refined, polish_gain=0.0)
-    return replace(refined, soup=again, energy=energy, polish_gain=gain)
 
 
 def solve_pair(pair: Pair, **options: Any) -> Run:

@@ -41,6 +41,8 @@ from soup_nlp.refine.sweep import swept
 from soup_nlp.storage.progress import Progress, Watch
 
 CURRENT, KEPT = KINDS.index("current"), KINDS.index("kept")
+KEPT_SHARE = 0.25
+"""Share of the particles that stays for the next round."""
 
 
 def refine_soup(
@@ -182,7 +184,7 @@ class _Costs:
         if lost.any():
             exact = self.weights.proj * oracle.reprojection(best, data, self.weights)
             unary[lost, 0] = np.minimum(exact, 1e9)[lost]
-        return unary, self.pairs.tables(p, unit, np.float32 if o.float32 else np.float64)
+        return unary, self.pairs.tables(p, unit)
 
 
 def length_slope(soup: Soup, data: EnergyData, weights: Weights) -> float:
@@ -269,7 +271,7 @@ class _Rounds:
         if taken:
             self.best, self.energy = new, energy
         cost = conditional_costs(labels, unary, edges, pairwise)
-        self.kept = p.take(diverse(p, labels, cost, round(o.keep * o.particles), costs.data))
+        self.kept = p.take(diverse(p, labels, cost, round(KEPT_SHARE * o.particles), costs.data))
         spread = spread_of(p, result.min_marginals, costs.data.anchor_ray)
         done = _record(result, drawn, unary, labels, self.energy, taken, mark, spread)
         self.done.append(done)

@@ -35,6 +35,8 @@ BEHIND = 1.1
 """A sample is hidden where something is nearer by this factor."""
 SAMPLES = 24
 """Pixels per superpixel."""
+PROJ, SIGMA_PROJ = 0.3, 2.0
+"""Factor of alpha1, and truncation of a re-projection error (pixels), where images count."""
 BLOCK = 1 << 19
 """Samples that are looked up at once."""
 
@@ -147,6 +149,6 @@ def photometric_term(
         distance=soup.distance,
         K_next=pair.K_next,
         weight=o.photo,
-        proj=o.photo_proj,
-        sigma_proj=o.photo_sigma_proj,
+        proj=PROJ,
+        sigma_proj=SIGMA_PROJ,
     )

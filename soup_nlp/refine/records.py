@@ -18,7 +18,6 @@ from soup_nlp.schema.section import (
     NonNegative,
     Section,
     Tolerance,
-    Truncation,
     Whole,
 )
 
@@ -36,8 +35,6 @@ class RefineOptions(Section):
     """Labels of every superpixel, the current belief among them."""
     proposals: Literal["all", "walks"] = "all"
     """all, or walks: steps around the current belief alone, as in the paper."""
-    keep: Annotated[float, Field(ge=0, le=0.9)] = 0.25
-    """Share of the particles that stays for the next round."""
     depth_reach: Annotated[float, Field(ge=1, le=MOST)] = 2.0
     """A new depth is at most this many times the upper quartile of the neighbours' depths, and
     at least their lower quartile over this squared."""
@@ -50,18 +47,10 @@ class RefineOptions(Section):
     photo: NonNegative = 10.0
     """Factor of E_photo, which measures how far the images contradict a superpixel's homography
     (`refine.photometric`); 0 leaves the images out."""
-    photo_proj: NonNegative = 0.3
-    """Factor of alpha1 beside the images."""
-    photo_sigma_proj: Truncation = 2.0
-    """Truncation of a pixel's re-projection error beside the images, pixels."""
     sweep: Count = 6
     """Planes swept over depth that every superpixel is offered, where images count."""
     max_seconds: Tolerance = 300.0
     """Time limit of the rounds together."""
-    float32: bool = False
-    """Tables in single precision: half the memory; the bound is exact to that rounding."""
-    polish: bool = False
-    """Solve the NLP again from the refined soup and keep the better."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +112,6 @@ class Refined:
         rounds: Every round.
         status: "rounds" (all of them), "stagnated", "interrupted" or "time limit".
         seconds: Wall time.
-        polish_gain: By how much an NLP from the last round's soup lowered E; None without one.
     """
 
     soup: Soup
@@ -132,7 +120,6 @@ class Refined:
     rounds: tuple[Round, ...]
     status: str
     seconds: float
-    polish_gain: float | None = None
 
     def __str__(self) -> str:
         gap = f", gap {self.rounds[-1].gap:.3g}" if self.rounds else ""

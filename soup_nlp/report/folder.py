@@ -249,7 +249,6 @@ def _refinement(run: Run) -> dict[str, Any] | None:
         return None
     return {
         "status": r.status,
-        "polish_gain": r.polish_gain,
         "seconds": r.seconds,
         "begin": r.energy_begin,
         "end": r.energy,

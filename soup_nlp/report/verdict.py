@@ -128,8 +128,6 @@ def refinement(r: Refined) -> list[str]:
     ]
     if images:
         lines.append("E alone may rise: the images outweigh the flow where they contradict it")
-    if r.polish_gain is not None:
-        lines.append(f"polish by the NLP: E {r.polish_gain:.3g} lower")
     return lines
 
 

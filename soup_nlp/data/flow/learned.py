@@ -1,4 +1,4 @@
-"""Flow of a trained network: RAFT of torchvision, or any ONNX file (optional extras)."""
+"""Flow of a trained network in an ONNX file (extra `onnx`)."""
 
 from __future__ import annotations
 
@@ -17,14 +17,8 @@ from soup_nlp.storage.files import is_file
 
 Image = NDArray[np.uint8]
 
-MODELS = {"raft_small": "Raft_Small_Weights", "raft_large": "Raft_Large_Weights"}
-"""Name of the weights by name of a network of torchvision, which downloads them once."""
-
 RANGES = {"255": (0.0, 255.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
 """Input values of black and white by the metadata `input_range` of an ONNX file; default "255"."""
-
-RAFT_SIDE = 128
-"""Smallest image side of RAFT, pixels: its correlation pyramid has four levels of 1/8 size."""
 
 
 class Network(NamedTuple):
@@ -33,21 +27,20 @@ class Network(NamedTuple):
     Attributes:
         predict: Makes outputs, flows (1, 2, h, w) in pixels among them, of two images (1, 3, H, W).
         levels: Input values of black and white.
-        size: Fixed (H, W) of the images, to which they are resized; None if any size is possible.
-        least: Smallest side of the images; they are padded to it and to a multiple of 8.
+        size: Fixed (H, W) of the images, to which they are resized; None if they are padded to a
+            multiple of 8.
     """
 
     predict: Callable[[list[FloatMap]], list[Any]]
     levels: tuple[float, float]
     size: tuple[int, int] | None = None
-    least: int = 8
 
 
 def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
     """Flow of a network in both directions, with forward-backward confidence.
 
     Args:
-        source: "raft_small", "raft_large", a .pth file with the state of either, or an .onnx file.
+        source: Path of an .onnx file.
         image_ref: (H, W, 3) uint8 RGB reference image.
         image_next: (H, W, 3) uint8 RGB next image of the same size.
 
@@ -59,9 +52,9 @@ def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
             "a network needs two RGB images of one size",
             found=f"{image_ref.shape} and {image_next.shape}",
         )
-    if source not in MODELS and not is_file(source):
+    if not is_file(source):
         raise DataError("file of a network is missing", where=source)
-    network = onnx_network(Path(source)) if source.endswith(".onnx") else raft_network(source)
+    network = onnx_network(Path(source))
     forward = _run(network, image_ref, image_next, source)
     backward = _run(network, image_next, image_ref, source)
     return checked_flow(forward, backward, Path(source).name)
@@ -118,49 +111,10 @@ def onnx_network(path: Path) -> Network:
     return Network(predict, RANGES[word], (height, width) if fixed else None)
 
 
-def raft_network(source: str) -> Network:
-    """RAFT of torchvision with its published weights, or with those of a .pth file.
-
-    Raises:
-        DataError: torchvision is not installed, or the weights cannot be loaded.
-    """
-    try:
-        import torch
-        from torchvision.models import optical_flow
-    except ImportError as error:
-        raise DataError(
-            "RAFT needs torch and torchvision", where=source, hint="pip install soup-nlp[raft]"
-        ) from error
-    try:
-        if source in MODELS:
-            weights: Any = getattr(optical_flow, MODELS[source]).DEFAULT
-            model = getattr(optical_flow, source)(weights=weights, progress=False)
-        else:
-            state = torch.load(source, map_location="cpu", weights_only=True)
-            # only the large network has batch normalisation in its context encoder
-            large = any("context_encoder" in k and "running_mean" in k for k in state)
-            model = (optical_flow.raft_large if large else optical_flow.raft_small)(weights=None)
-            model.load_state_dict(state)
-    except Exception as error:  # urllib, pickle and torch raise many types
-        raise DataError(
-            "weights of RAFT cannot be loaded",
-            where=source,
-            found=_first_line(error),
-            hint="give a .pth file with the state of torchvision's raft_small or raft_large",
-        ) from error
-    model.eval()
-
-    def predict(images: list[FloatMap]) -> list[Any]:
-        with torch.inference_mode():
-            return [model(*(torch.from_numpy(image) for image in images))[-1].numpy()]
-
-    return Network(predict, RANGES["signed"], least=RAFT_SIDE)
-
-
 def _run(network: Network, first: Image, second: Image, where: str) -> FloatMap:
     """(H, W, 2) flow of a network, in pixels of the images (H, W, 3)."""
     height, width = first.shape[:2]
-    rows, cols = network.size or (-(-max(n, network.least) // 8) * 8 for n in (height, width))
+    rows, cols = network.size or (-(-n // 8) * 8 for n in (height, width))
     black, white = network.levels
     images = []
     for image in (first, second):

@@ -123,27 +123,6 @@ def _medians(which: Ints, values: Float, n: int) -> Float:
     return np.where(count > 0, values[order][np.minimum(middle, len(order) - 1)], 0.0)
 
 
-def reweighted(flow: Flow, labels: NDArray[np.integer], scale_px: float = 0.5) -> Flow:
-    """The flow with lower confidence where it differs from the affine flow of its superpixel.
-
-    The last weights of the affine fits multiply the confidence; positive confidences stay positive.
-
-    Args:
-        flow: Flow with confidence.
-        labels: (H, W) superpixel labels 0..N-1.
-        scale_px: Smallest residual of an outlier, pixels.
-
-    Raises:
-        DataError: sizes differ, or the scale is not positive.
-    """
-    _, weight = fit_affine(flow, labels, scale_px)
-    used = flow.confidence > 0
-    confidence = flow.confidence.copy()
-    lowered = flow.confidence[used].astype(np.float64) * weight
-    confidence[used] = np.maximum(lowered, np.finfo(np.float32).tiny).astype(np.float32)
-    return Flow(flow.uv, np.minimum(confidence, flow.confidence), flow.source)
-
-
 def _weighted(which: Ints, X: Float, Y: Float, w: Float, n: int) -> Float:
     """(N, 3, 2) weighted affine fits."""
     A = np.empty((n, 3, 3))

@@ -20,11 +20,10 @@ from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.dis_options import DisOptions
 from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.flow.plausible import check_flow
-from soup_nlp.data.flow.rlof import rlof_flow
 from soup_nlp.data.formats.map_files import read_confidence, read_flow
 from soup_nlp.data.pair import Flow, Pair, check_size
 from soup_nlp.errors import ConfigError, DataError
-from soup_nlp.schema.section import Positive, Section, Share
+from soup_nlp.schema.section import Section, Share
 from soup_nlp.storage.files import PathLike, is_file
 
 Image = NDArray[np.uint8]
@@ -70,7 +69,7 @@ def with_confidence(
         backward: File of the flow from the next to the reference image.
         confidence: File of a map in [0, 1], see `read_confidence`.
         size: (H', W') of the next image.
-        check: Its `tau`, `limit` and `support` make confidence of the round-trip error.
+        check: Its `tau` and `limit` make confidence of the round-trip error.
 
     Raises:
         DataError: a file is malformed or has another size.
@@ -80,7 +79,7 @@ def with_confidence(
         back = read_flow(backward).astype(np.float32)
         check_size("backward flow and next image", back.shape, size, backward)
         gap = round_trip_error(flow.uv, back)
-        own *= confidence_of(gap, check.tau, check.limit, check.support)
+        own *= confidence_of(gap, check.tau, check.limit)
     if confidence is not None:
         given = read_confidence(confidence)
         check_size("flow confidence and flow", given.shape, flow.uv.shape, confidence)
@@ -168,9 +167,6 @@ class FlowOptions(Section):
     black for unusable."""
     occluded_confidence: Share = 1.0
     """Confidence of occluded pixels when the source is truth."""
-    reweight_px: Positive | None = None
-    """Pixels that disagree with their superpixel's affine flow by more than about this count
-    less; null for never."""
     see_through: bool = True
     """Where flow that was computed follows a layer that stands still before a moving scene (a
     reflection in a windscreen), search for the scene's own along its epipolar lines."""
@@ -242,17 +238,14 @@ def is_path(source: str) -> bool:
 
 def is_network(source: str) -> bool:
     """Whether a flow source is the path of a network."""
-    return Path(source).suffix in (".onnx", ".pth")
+    return Path(source).suffix == ".onnx"
 
 
 METHODS: dict[str, Callable[[Pair], Flow]] = {
     "dis": lambda pair: dis_flow(pair.image_ref, pair.image_next),
     "truth": flow_from_truth,
-    "rlof": lambda pair: rlof_flow(pair.image_ref, pair.image_next),
-    "raft_small": lambda pair: learned_flow("raft_small", pair.image_ref, pair.image_next),
-    "raft_large": lambda pair: learned_flow("raft_large", pair.image_ref, pair.image_next),
 }
-"""Flow methods of this package by name; rlof needs opencv-contrib, raft needs torchvision."""
+"""Flow methods of this package by name."""
 
 
 def resolve_flow(pair: Pair, source: str) -> Flow:
@@ -261,7 +254,7 @@ def resolve_flow(pair: Pair, source: str) -> Flow:
     Args:
         pair: The pair; its `flow` is ignored.
         source: One of `METHODS` with default options, "truth+noise:SIGMA" (`add_noise`), the name
-            of a plug-in, the path of a network (.onnx, or .pth for RAFT) or of a flow file.
+            of a plug-in, the path of a network (.onnx) or of a flow file.
 
     Raises:
         DataError: the source is unknown or fails, or its flow has another size.
