@@ -1,4 +1,4 @@
-"""What tests of .nl files share: the file as CasADi reads it."""
+"""Tools of tests of .nl files: plain SX problems as files, and files as CasADi reads them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,41 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+
+from soup_nlp.export import nl
+from soup_nlp.export.nl import NLFile
+from soup_nlp.model.kernel import Group, Kernel, Table
+
+
+def write_sx_nl(
+    path: Path,
+    problem: dict[str, ca.SX],
+    *,
+    x0: np.ndarray | None = None,
+    lbx: np.ndarray | None = None,
+    ubx: np.ndarray | None = None,
+    lbg: np.ndarray | None = None,
+    ubg: np.ndarray | None = None,
+    x_names: list[str] | None = None,
+    g_names: list[str] | None = None,
+) -> NLFile:
+    """Write a problem in the form of nlpsol as one kernel with one row."""
+    x, f, g = problem["x"], problem["f"], problem.get("g", ca.SX(0, 1))
+    n, m, none = x.numel(), g.numel(), ca.SX(0, 1)
+    kernel = Kernel("nlp", x, none, none, objective=f, constraints=g if m else None)
+    table = Table(np.arange(n)[None], np.zeros((1, 0)), np.arange(m)[None])
+
+    def vector(values: np.ndarray | None, size: int, default: float) -> np.ndarray:
+        return np.full(size, default) if values is None else np.asarray(values, float)
+
+    return nl._write(
+        path,
+        (Group(kernel, table),),
+        np.zeros(0),
+        (vector(x0, n, 0.0), vector(lbx, n, -np.inf), vector(ubx, n, np.inf)),
+        (vector(lbg, m, -np.inf), vector(ubg, m, np.inf)),
+        (x_names, g_names, "f"),
+    )
 
 
 class ReadBack:

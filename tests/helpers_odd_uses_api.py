@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from helpers_odd_api import THINGS
 from helpers_odd_run import Case
@@ -17,7 +16,6 @@ from PIL import ExifTags, Image
 import soup_nlp
 from soup_nlp.cli.main import main
 from soup_nlp.export.foreign import import_sol
-from soup_nlp.export.nl import write_sx_nl
 from soup_nlp.export.sol import read_sol
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.result import read_result
@@ -36,11 +34,6 @@ CALLS: dict[str, Call] = {
     "make_chain pair": lambda w, o, x: make_chain([x]),
     "find_images": lambda w, o, x: find_images(x),
     "video_frames": lambda w, o, x: video_frames(x, o / "frames"),
-    "write_sx_nl problem": lambda w, o, x: write_sx_nl(o / "a.nl", x),
-    "write_sx_nl path": lambda w, o, x: write_sx_nl(x, {"x": (v := ca.SX.sym("v")), "f": v}),
-    "write_sx_nl start": lambda w, o, x: write_sx_nl(
-        o / "a.nl", {"x": (v := ca.SX.sym("v")), "f": v}, x0=x
-    ),
     "read_sol": lambda w, o, x: read_sol(x, np.arange(2), np.arange(2)),
     "import_sol folder": lambda w, o, x: import_sol(x, w.exported / "soup.sol"),
     "import_sol file": lambda w, o, x: import_sol(w.exported, x),
@@ -66,9 +59,6 @@ FINE = {
     ("make_problem preset", "None"),
     ("save formats", "list"),
     ("save formats", "dict"),
-    ("write_sx_nl start", "None"),
-    ("write_sx_nl start", "int"),
-    ("write_sx_nl start", "scalar array"),
     ("make_problem overrides", "list"),
     ("make_problem where", "text"),
     ("with_flow", "None"),
@@ -79,7 +69,7 @@ FINE = {
 """Arguments that are right, or of no use but harmless."""
 SOLVES = {("solve_pair preset", "None"), ("solve_pair flow", "None"), ("solve_pair flow", "dict")}
 SOLVES |= {(f"run {n}", "None") for n in ("listener", "stop", "log", "on_stage", "ipopt_log")}
-WRITES = {("save folder", "text"), ("write_sx_nl path", "text"), ("run ipopt_log", "text")}
+WRITES = {("save folder", "text"), ("run ipopt_log", "text")}
 """Right names of files, in the working folder."""
 CALLABLE = {(f"run {n}", k) for n in ("listener", "log", "on_stage") for k in ("type", "function")}
 """What the caller's own function raises is his."""

@@ -17,7 +17,6 @@ from soup_nlp.evaluate import recompute
 from soup_nlp.export import verify
 from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.names import readable_names
-from soup_nlp.export.nl import write_sx_nl
 from soup_nlp.export.program import make_program
 from soup_nlp.export.residuals import kind
 from soup_nlp.export.sol import Sol
@@ -213,12 +212,6 @@ def test_rows_of_one_superpixel_are_named_by_it_alone():
     nlp, layout = tiny().nlp(PAPER, form(gauge="unit-translation"))
     _, names = readable_names(nlp, layout)
     assert {"so3[0,1]", "so3[11,6]", "normal[3]", "visible[5,1]", "translation[4]"} <= set(names)
-
-
-def test_an_objective_that_is_left_out_is_zero(tmp_path):
-    x = ca.SX.sym("x")
-    file = write_sx_nl(tmp_path / "none.nl", {"x": x, "g": x**2})
-    assert "O0 0\nn0\n" in file.path.read_text()
 
 
 def test_a_formulation_has_up_to_three_words():

@@ -1,4 +1,4 @@
-"""Writers of AMPL's .nl text format, for NLPs of kernels and tables and for plain SX NLPs.
+"""Writer of AMPL's .nl text format for NLPs of kernels and tables.
 
 The expression of every kernel is traced once and filled in for every element (`template`, `body`).
 The format requires an order of the variables (nonlinear in both, in constraints, in the objective,
@@ -9,13 +9,12 @@ Gay, "Writing .nl files" (2005), and the AMPL/MP reader.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from soup_nlp.arrays import Float, Int
@@ -23,14 +22,7 @@ from soup_nlp.errors import ExportError
 from soup_nlp.export.body import Body
 from soup_nlp.export.program import make_program, orders
 from soup_nlp.export.segments import bounds, header, linear, start
-from soup_nlp.export.validate import (
-    plain_problem,
-    require_bounds,
-    require_finite,
-    require_names,
-    vector,
-)
-from soup_nlp.model.kernel import Group, Kernel, Table
+from soup_nlp.model.kernel import Group
 from soup_nlp.model.nlp import NLP
 from soup_nlp.storage.atomic import write_bytes, write_text
 from soup_nlp.storage.files import as_path
@@ -89,8 +81,7 @@ def write_nl(path: str | Path, nlp: NLP, names: tuple[Names, Names] | None = Non
         names: Names of variables and constraints; default those of the NLP.
 
     Raises:
-        ExportError: an operation has no opcode, a number is not finite, bounds cross, or the
-            number of names is wrong.
+        ExportError: an operation has no opcode, a number is not finite, or bounds cross.
         DataError: the folder cannot be written.
     """
     x_names, g_names = names or (nlp.x_names(), nlp.g_names())
@@ -100,64 +91,6 @@ def write_nl(path: str | Path, nlp: NLP, names: tuple[Names, Names] | None = Non
     return _write(path, nlp.groups, theta, x, g, (x_names, g_names, "E"))
 
 
-def write_sx_nl(
-    path: str | Path,
-    problem: Mapping[str, ca.SX],
-    *,
-    x0: Float | float | None = None,
-    lbx: Float | float | None = None,
-    ubx: Float | float | None = None,
-    lbg: Float | float | None = None,
-    ubg: Float | float | None = None,
-    x_names: Names | None = None,
-    g_names: Names | None = None,
-    lam_g0: Float | float | None = None,
-) -> NLFile:
-    """Write any plain NLP in the form of CasADi's nlpsol.
-
-    Args:
-        path: The .nl file.
-        problem: `x`, `f` and, if there are constraints, `g`, all SX; no parameters.
-        x0: (nx,) start, default 0; here and below a number stands for all entries.
-        lbx: (nx,) lower bounds, default none.
-        ubx: (nx,) upper bounds, default none.
-        lbg: (ng,) lower bounds of g, default none.
-        ubg: (ng,) upper bounds of g, default none.
-        x_names: Names for the .col file; None writes none.
-        g_names: Names for the .row file; None writes none.
-        lam_g0: (ng,) initial multipliers in CasADi's sign (positive at upper bounds), which is
-            the opposite of AMPL's sign in the file; None writes none.
-
-    Raises:
-        ExportError: see `write_nl`; or the problem is not SX, has a free symbol or no scalar
-            objective, or a vector has a wrong length.
-
-    Example:
-        >>> x = ca.SX.sym("x", 2)
-        >>> rosenbrock = {"x": x, "f": (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2}
-        >>> write_sx_nl("rosenbrock.nl", rosenbrock, x0=[-1.2, 1])  # doctest: +SKIP
-    """
-    path = as_path(path, "file", error=ExportError)
-    x, f, g = plain_problem(problem, path)
-    nx, ng = x.numel(), g.numel()
-    none = ca.SX(0, 1)
-    kernel = Kernel("nlp", x, none, none, objective=f, constraints=g if ng else None)
-    table = Table(np.arange(nx)[None], np.zeros((1, 0)), np.arange(ng)[None])
-    return _write(
-        path,
-        (Group(kernel, table),),
-        np.zeros(0),
-        (
-            vector("x0", x0, nx, 0.0, path),
-            vector("lbx", lbx, nx, -np.inf, path),
-            vector("ubx", ubx, nx, np.inf, path),
-        ),
-        (vector("lbg", lbg, ng, -np.inf, path), vector("ubg", ubg, ng, np.inf, path)),
-        (x_names, g_names, "f"),
-        None if lam_g0 is None else vector("lam_g0", lam_g0, ng, 0.0, path),
-    )
-
-
 def _write(
     path: Path,
     groups: Sequence[Group],
@@ -165,10 +98,18 @@ def _write(
     x: tuple[Float, Float, Float],
     g: tuple[Float, Float],
     names: AllNames,
-    lam_g0: Float | None = None,
 ) -> NLFile:
-    """Check and write an NLP."""
-    _check(path, x, g, names, lam_g0)
+    """Check and write an NLP.
+
+    Args:
+        path: The file.
+        groups: Kernels with their tables.
+        theta: Numbers that the kernels share.
+        x: Start, lower and upper bounds of the variables.
+        g: Lower and upper bounds of the constraints.
+        names: Of variables, constraints and objective; None for no files of names.
+    """
+    _check(path, x, g)
     program = make_program(groups, len(x[0]), len(g[0]), theta)
     variables, rows = orders(program)
     body = Body(program, np.argsort(variables), np.argsort(rows))
@@ -182,7 +123,7 @@ def _write(
     lines = chain(
         header(program, (lbg, ubg), longest, body.classes),
         body.segments(),
-        start(x0, None if lam_g0 is None else lam_g0[rows]),
+        start(x0),
         bounds("r", lbg, ubg),
         bounds("b", lbx, ubx),
         linear(J, G),
@@ -205,21 +146,21 @@ def _write(
     )
 
 
-def _check(
-    path: Path,
-    x: tuple[Float, Float, Float],
-    g: tuple[Float, Float],
-    names: AllNames,
-    lam_g0: Float | None,
-) -> None:
-    """Raise ExportError if a .nl file cannot hold the problem."""
-    if lam_g0 is not None:
-        require_finite("lam_g0", lam_g0, path)
-    require_finite("x0", x[0], path)
-    require_bounds("x", x[1], x[2], path)
-    require_bounds("g", g[0], g[1], path)
-    require_names("x_names", names[0], len(x[0]), path)
-    require_names("g_names", names[1], len(g[0]), path)
+def _check(path: Path, x: tuple[Float, Float, Float], g: tuple[Float, Float]) -> None:
+    """Raise ExportError if the start is not finite or bounds hold for no finite number."""
+    if not np.isfinite(x[0]).all():
+        k = int(np.argmin(np.isfinite(x[0])))
+        raise ExportError("x0 is not finite", where=path, found=f"{x[0][k]} at entry {k}")
+    for name, (lower, upper) in {"x": x[1:], "g": g}.items():
+        # false for NaN too
+        good = (lower <= upper) & (lower < np.inf) & (upper > -np.inf)
+        if not good.all():
+            k = int(np.argmin(good))
+            raise ExportError(
+                f"bounds of {name} hold for no number",
+                where=path,
+                found=f"[{lower[k]}, {upper[k]}] at entry {k}",
+            )
 
 
 def _write_names(path: Path, names: AllNames, variables: Int, rows: Int) -> None:

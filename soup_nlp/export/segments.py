@@ -47,11 +47,8 @@ def header(
     ]
 
 
-def start(x0: Float, lam: Float | None) -> Iterator[str]:
-    """`d` and `x` segments; AMPL's multipliers have the sign opposite to CasADi's."""
-    if lam is not None and len(lam):
-        yield f"d{len(lam)}"
-        yield from (f"{k} {number(-v)}" for k, v in enumerate(lam.tolist()))
+def start(x0: Float) -> Iterator[str]:
+    """`x` segment."""
     yield f"x{len(x0)}"
     yield from (f"{k} {number(v)}" for k, v in enumerate(x0.tolist()))
 
