@@ -94,23 +94,33 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
-def walk(tree: ast.AST) -> Iterator[ast.AST]:
-    """Every node but expressions and what stands under `if TYPE_CHECKING:`."""
-    todo = [tree]
-    while todo:
-        node = todo.pop()
-        yield node
-        for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
-                todo += child.orelse
-            elif not isinstance(child, ast.expr):
-                todo.append(child)
+LATER = {("pipeline.record", "report.save")}
+"""The only arrow up: `Run.save` and `Run.plot` call the room that writes, once a run is there."""
 
 
-def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[str]:
-    """Absolute names that a module imports, also inside functions; not those for types alone."""
-    for node in walk(tree):
-        if isinstance(node, ast.Import):
+def for_types(tree: ast.AST) -> set[ast.AST]:
+    """Nodes under `if TYPE_CHECKING:`."""
+    return {
+        inner
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        for line in node.body
+        for inner in ast.walk(line)
+    }
+
+
+def imports(tree: ast.AST, module: str, is_package: bool, types: bool = True) -> Iterator[str]:
+    """Absolute names that a module imports, also inside functions and by `import_module`.
+
+    Imports for types alone are left out unless `types`.
+    """
+    left_out = set() if types else for_types(tree)
+    for node in ast.walk(tree):
+        if node in left_out:
+            continue
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            yield from (a.value for a in node.args if isinstance(a, ast.Constant))
+        elif isinstance(node, ast.Import):
             yield from (a.name for a in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
@@ -131,14 +141,14 @@ def own(name: str) -> str | None:
     return inner
 
 
-def graph() -> tuple[dict[str, set[str]], dict[str, set[str]]]:
-    """(own modules, foreign libraries) that every module imports."""
+def graph(types: bool) -> tuple[dict[str, set[str]], dict[str, set[str]]]:
+    """(own modules, foreign libraries) that every module imports; `types` as in `imports`."""
     inside: dict[str, set[str]] = {}
     outside: dict[str, set[str]] = {}
     for module, path in MODULES.items():
         inside[module], outside[module] = set(), set()
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        for name in imports(tree, module, path.name == "__init__.py"):
+        for name in imports(tree, module, path.name == "__init__.py", types):
             target = own(name)
             if target is None:
                 outside[module].add(name.partition(".")[0])
@@ -147,7 +157,8 @@ def graph() -> tuple[dict[str, set[str]], dict[str, set[str]]]:
     return inside, outside
 
 
-INSIDE, OUTSIDE = graph()
+INSIDE, OUTSIDE = graph(types=False)
+WITH_TYPES, _ = graph(types=True)
 
 
 def room(module: str) -> str:
@@ -162,8 +173,9 @@ def test_the_parser_sees_the_imports():
     tree = ast.parse("def f():\n    from ..model import nlp\n    from . import costs")
     found = set(imports(tree, "refine.mppbp", False))
     assert found == {"soup_nlp.model.nlp", "soup_nlp.refine.costs"}
-    tree = ast.parse("if TYPE_CHECKING:\n    import a\nelse:\n    import b")
-    assert set(imports(tree, "errors", False)) == {"b"}
+    tree = ast.parse("if TYPE_CHECKING:\n    import a\nelse:\n    import_module('soup_nlp.b')")
+    assert set(imports(tree, "errors", False)) == {"a", "soup_nlp.b"}
+    assert set(imports(tree, "errors", False, types=False)) == {"soup_nlp.b"}
     assert own("soup_nlp.model.nlp.NLP") == "model.nlp"
     assert own("soup_nlp.__version__") == ""
     assert own("soup_nlpx") is None
@@ -185,11 +197,13 @@ def test_nothing_else_stands_beside_the_rooms():
 def test_no_room_imports_a_later_room():
     wrong = [
         f"{module} imports {target}"
-        for module, targets in INSIDE.items()
+        for module, targets in WITH_TYPES.items()
         if room(module) in ALLOWED
         for target in sorted(targets)
         # "" is the package itself: its version
-        if target and room(target) not in {room(module), *COMMON, *ALLOWED[room(module)]}
+        if target
+        and (module, target) not in LATER
+        and room(target) not in {room(module), *COMMON, *ALLOWED[room(module)]}
     ]
     assert not wrong
 
@@ -197,7 +211,7 @@ def test_no_room_imports_a_later_room():
 def test_rooms_are_entered_through_their_doors():
     wrong = [
         f"{module} imports {target}"
-        for module, targets in INSIDE.items()
+        for module, targets in WITH_TYPES.items()
         for target in sorted(targets)
         if target not in DOORS.get((room(module), room(target)), {target})
     ]
@@ -232,7 +246,7 @@ def reached(module: str) -> set[str]:
         here = todo.pop()
         if here not in seen:
             seen.add(here)
-            todo += INSIDE[here] - {""}
+            todo += {t for t in INSIDE[here] - {""} if (here, t) not in LATER}
     return seen
 
 
@@ -244,7 +258,7 @@ def test_numbers_do_not_reach_symbols(module):
 
 def test_modules_do_not_import_in_circles():
     for module in MODULES:
-        for target in INSIDE[module] - {""}:
+        for target in {t for t in INSIDE[module] - {""} if (module, t) not in LATER}:
             assert module not in reached(target), f"{module} and {target} need each other"
 
 

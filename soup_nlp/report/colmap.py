@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -13,10 +12,8 @@ from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.figures import write_png
+from soup_nlp.report.result import Result
 from soup_nlp.storage.atomic import write_text
-
-if TYPE_CHECKING:
-    from soup_nlp.report.result import Result
 
 POINTS = 50_000
 """Largest number of points of a model."""

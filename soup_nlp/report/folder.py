@@ -7,13 +7,14 @@ import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import component_overlaps, skill
+from soup_nlp.pipeline.record import Run
 from soup_nlp.report.certainty import certainty
 from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture
 from soup_nlp.report.formats import write_formats
@@ -30,9 +31,6 @@ from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.store import write_h5, write_json
 from soup_nlp.storage.versions import versions
-
-if TYPE_CHECKING:
-    from soup_nlp.pipeline.record import Run
 
 FULL = {"ref_full": "depth_ref_full.png", "next_full": "depth_next_full.png"}
 """Files of the depth at the size of the images, for a pair that was solved at a smaller size."""

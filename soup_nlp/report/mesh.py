@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.surface import triangles
+from soup_nlp.report.result import Result
 from soup_nlp.storage.atomic import PathLike, write_bytes
-
-if TYPE_CHECKING:
-    from soup_nlp.report.result import Result
-
 
 CELLS = 250_000
 """Largest number of cells of a mesh; larger images are subsampled."""

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.rotation import log
 from soup_nlp.report.pointcloud import AXES
-
-if TYPE_CHECKING:
-    from soup_nlp.report.result import Result
+from soup_nlp.report.result import Result
 
 CONVENTIONS = {
     "axes": f"of a camera: {AXES}",

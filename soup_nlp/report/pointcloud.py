@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from soup_nlp.report.result import Result
 from soup_nlp.storage.atomic import PathLike, write_bytes
-
-if TYPE_CHECKING:
-    from soup_nlp.report.result import Result
 
 AXES = "x right, y down, z ahead"
 """Axes of a camera, in words."""

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from soup_nlp.errors import DataError
+from soup_nlp.report.result import Result
 from soup_nlp.storage.atomic import PathLike, atomic_path
-
-if TYPE_CHECKING:
-    from soup_nlp.report.result import Result
 
 
 def write_rrd(path: PathLike, result: Result) -> None:

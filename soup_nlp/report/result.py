@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
@@ -19,14 +19,11 @@ from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.surface import at_jumps, hidden, joined
+from soup_nlp.pipeline.record import Run
 from soup_nlp.report.check_arrays import require_layout
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.h5_files import read_attrs, read_h5
 from soup_nlp.storage.store import require
-
-if TYPE_CHECKING:
-    from soup_nlp.pipeline.record import Run
-
 
 UNIT = "soup unit (free scale: the mean distance of the planes is 1)"
 """Unit of lengths in files."""

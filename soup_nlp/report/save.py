@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from soup_nlp.pipeline.record import Run
 from soup_nlp.report.figures import strip_figure, without_gaps
 from soup_nlp.report.folder import prepare_folder, summary, write_folder
 from soup_nlp.report.formats import check_formats, write_formats
@@ -17,8 +18,6 @@ from soup_nlp.storage.folders import staged
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from soup_nlp.pipeline.record import Run
 
 
 def save(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +15,12 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError, printable
 from soup_nlp.geometry.components import Components
 from soup_nlp.geometry.soup import Reconstruction
+from soup_nlp.pipeline.record import Run
 from soup_nlp.report.result import rebuilt
 from soup_nlp.report.tree import result_tree
 from soup_nlp.storage.files import is_file, read_json, read_text
 from soup_nlp.storage.h5_files import ReadTree, read_attrs, read_h5
 from soup_nlp.storage.store import Array, Tree, plain
-
-if TYPE_CHECKING:
-    from soup_nlp.pipeline.record import Run
 
 PAGE = "report.html"
 """Name of the page in a result folder."""

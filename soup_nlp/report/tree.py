@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from soup_nlp.pipeline.record import Run
 from soup_nlp.solve.ipopt import Stage
 from soup_nlp.storage.store import Array, Tree
-
-if TYPE_CHECKING:
-    from soup_nlp.pipeline.record import Run
 
 Table: TypeAlias = Mapping[str, tuple[str, str, str]]
 """Unit, axes and description by name; "truth" stands for the unit of the truth."""
