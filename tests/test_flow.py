@@ -177,8 +177,6 @@ def test_flow_from_truth() -> None:
     kept = flow_from_truth(pair)
     assert kept.confidence[0, 0] == 0
     assert kept.confidence.sum() == 60 * 80 - 1
-    half = flow_from_truth(pair, occluded_confidence=0.5)
-    assert (half.confidence[5] == 0.5).all()
     assert kept.confidence[5].all()
     assert np.isnan(uv[0, 0]).all()
     for truth in (None, Truth(depth_ref=np.ones((60, 80)))):

@@ -1,4 +1,4 @@
-"""Flow sources beside DIS: noise, robust re-weighting, RLOF, networks."""
+"""Flow sources beside DIS: noise, networks."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from soup_nlp.data.formats.map_files import read_depth, read_flow
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.data.working_size import scaled_camera
-from soup_nlp.errors import DataError
+from soup_nlp.errors import ConfigError, DataError
 
 SIZE = (96, 64)  # width, height
 MIDDLE = (47.5, 31.5)
@@ -186,6 +186,14 @@ def test_frames_of_other_focal_lengths_have_a_flow(factor: float) -> None:
     assert np.median(np.linalg.norm(found.uv - true, axis=2)[use]) < 0.2
 
 
+def test_focal_lengths_that_the_images_contradict_are_said() -> None:
+    pair = render_scene("orbit", 0, 256, 108)
+    K = pair.K_next * [[3, 1, 1], [1, 3, 1], [1, 1, 1]]
+    with pytest.warns(DataWarning, match="not at their focal lengths.*probably wrong"):
+        found = FlowOptions().load(Pair(pair.image_ref, pair.image_next, pair.K_ref, K), Path)
+    np.testing.assert_array_equal(found.uv, FlowOptions().load(pair, Path).uv)
+
+
 # --- 4 implausible intrinsics --------------------------------------------------------------------
 
 
@@ -264,6 +272,17 @@ def test_distortion_is_named_or_removed(text: str, folder: Path) -> None:
     seen = cv2.remap(image, x, y, cv2.INTER_LINEAR)[0, 0]
     # OpenCV rounds places to 1/32 pixel
     np.testing.assert_allclose(pair.image_ref[v, u], seen, atol=4)
+
+
+def test_undistortion_needs_the_file_of_a_camera_and_no_truth(folder: Path) -> None:
+    (folder / "K.txt").write_text("80 80 47.5 31.5 0.1")
+    np.save(folder / "d.npy", np.ones((64, 96)))
+    for keys in (
+        {"intrinsics": [80.0, 80.0, 47.5, 31.5]},
+        {"intrinsics": "K.txt", "depth": "d.npy"},
+    ):
+        with pytest.raises(ConfigError, match="cannot be undistorted"):
+            load(folder, undistort=True, **keys)
 
 
 def test_lenses_that_are_not_distorted_or_of_another_model(folder: Path) -> None:

@@ -43,7 +43,21 @@ class PairInput(Section, ABC):
         return [getattr(self, name) for name in ("root", "path") if name in type(self).model_fields]
 
 
-class FilesInput(PairInput):
+class FramesInput(PairInput):
+    """Base of inputs of image files, which say nothing of their truth and pixels themselves."""
+
+    depth_scale: Positive = 1000.0
+    """Values per unit of length of a 16-bit .png depth."""
+    unit: str = "m"
+    """Unit of the true depth."""
+    white: White | None = None
+    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for the values that
+    occur."""
+    cropped: bool = False
+    """The images are parts of larger ones: the principal point may be anywhere."""
+
+
+class FilesInput(FramesInput):
     """Two image files and their cameras; the flow file is named under `flow.source`."""
 
     kind: Literal["files"]
@@ -64,16 +78,6 @@ class FilesInput(PairInput):
     """True depth of the reference frame, for measuring only (.dpt .npy .pfm .png)."""
     depth_next: str | None = None
     """True depth of the next frame."""
-    depth_scale: Positive = 1000.0
-    """Values per unit of length of a 16-bit .png depth."""
-    unit: str = "m"
-    """Unit of the true depth."""
-    white: White | None = None
-    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for
-    the values that occur."""
-
-    cropped: bool = False
-    """The images are parts of larger ones: the principal point may be anywhere."""
     undistort: bool = False
     """Remove the distortion that the files of the cameras hold from the images (OpenCV)."""
 
@@ -83,18 +87,23 @@ class FilesInput(PairInput):
         def depth(name: str | None) -> Float | None:
             return None if name is None else read_depth(path(name), self.depth_scale)
 
-        if self.undistort and (self.depth or self.depth_next):
+        if self.undistort and (
+            self.depth or self.depth_next or not isinstance(self.intrinsics, str)
+        ):
             raise ConfigError(
-                "depth belongs to the images before they are undistorted",
+                "images cannot be undistorted",
                 where="input.undistort",
-                expected="images without distortion, or no true depth",
+                found="no file of the camera"
+                if not isinstance(self.intrinsics, str)
+                else "true depth",
+                expected="intrinsics in a file with distortion, and no true depth, which would"
+                " belong to the images before",
             )
-        images = [path(self.ref), path(self.next)]
         truth = Truth(depth(self.depth), depth(self.depth_next), unit=self.unit)
-        given = [self.intrinsics, self.intrinsics_next or self.intrinsics]
-        lenses = [self._camera(camera, path) for camera in given]
+        following = self.intrinsics_next or self.intrinsics
+        lenses = [self._lens(given, path) for given in (self.intrinsics, following)]
         return make_pair(
-            images,
+            [path(self.ref), path(self.next)],
             [K for K, _ in lenses],
             truth,
             "files",
@@ -104,17 +113,12 @@ class FilesInput(PairInput):
             distortion=[d for _, d in lenses] if self.undistort else (),
         )
 
-    def _camera(self, given: list[float] | str | None, path: Resolve) -> tuple[Float | None, Float]:
-        """Intrinsics (3, 3) or None, and distortion (n,) of a camera."""
-        if given is None:
-            return None, np.zeros(0)
-        if not isinstance(given, str):
-            return intrinsics(*given), np.zeros(0)
-        return (
-            read_camera(path(given))
-            if self.undistort
-            else (read_intrinsics(path(given)), np.zeros(0))
-        )
+    def _lens(self, given: list[float] | str | None, path: Resolve) -> tuple[Float | None, Float]:
+        """Intrinsics (3, 3) or None, and distortion (n,)."""
+        if isinstance(given, str):
+            where = path(given)
+            return read_camera(where) if self.undistort else (read_intrinsics(where), np.zeros(0))
+        return intrinsics(*given) if given else None, np.zeros(0)
 
     def files(self) -> list[str]:
         """See `PairInput`."""
@@ -122,23 +126,13 @@ class FilesInput(PairInput):
         return [x for x in (*named, self.depth, self.depth_next) if isinstance(x, str)]
 
 
-class FolderInput(PairInput):
+class FolderInput(FramesInput):
     """A folder with frame_0, frame_1, K.txt and optional truth."""
 
     kind: Literal["folder"]
     """Kind of input."""
     path: str
     """The folder."""
-    depth_scale: Positive = 1000.0
-    """Values per unit of length of a 16-bit .png depth."""
-    unit: str = "m"
-    """Unit of the true depth."""
-    white: White | None = None
-    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for
-    the values that occur."""
-
-    cropped: bool = False
-    """The images are parts of larger ones: the principal point may be anywhere."""
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from abc import ABC, abstractmethod
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -146,7 +147,9 @@ def find_images(source: Path) -> list[Path]:
         found = found or [p for p in source.iterdir() if p.suffix.lower() in IMAGES]
     else:
         root = next(folder for folder in source.parents if folder.is_dir())
-        found = [p for p in root.glob(str(source.relative_to(root))) if p.is_file()]
+        found = []
+        with suppress(ValueError):  # of a pattern such as a**
+            found = [p for p in root.glob(str(source.relative_to(root))) if p.is_file()]
     # hidden by its own name, or by that of a folder that the pattern matched
     found = [
         p for p in found if not any(part.startswith(".") for part in p.parts[len(root.parts) :])

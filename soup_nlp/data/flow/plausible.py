@@ -58,10 +58,6 @@ def check_flow(flow: Flow, pair: Pair) -> None:
         both = np.isfinite(of) & np.isfinite(other)
         return float(of[both].mean()) if both.sum() > _LEAST * known.sum() else np.inf
 
-    def ratio(new: FloatMap, old: FloatMap) -> float:
-        """Ratio of two differences where both are known; 0 if these pixels are few."""
-        return mean(new, old) / max(mean(old, new), 1e-6) if mean(old, new) < np.inf else 0.0
-
     along = differences(uv)
     # without motion a pixel keeps its ray
     A = (pair.K_next @ np.linalg.inv(pair.K_ref))[:2]
@@ -71,8 +67,10 @@ def check_flow(flow: Flow, pair: Pair) -> None:
     cause, least = "", BETTER
     for name, changed in _changes(uv, pair).items():
         new = differences(changed)
-        relative = max(ratio(new, along), ratio(new, without))
-        if np.isfinite(mean(new, new)) and 0 < relative < least:
+        # pixels that leave the image along one flow only say nothing
+        both = [(mean(new, old), max(mean(old, new), 1e-6)) for old in (along, without)]
+        relative = max((a / b for a, b in both if a < np.inf), default=np.inf)
+        if relative < least:
             cause, least = name, relative
     if cause:
         problem, hint = "flow does not fit the images", f"it does {cause}"

@@ -23,7 +23,7 @@ from soup_nlp.data.flow.plausible import check_flow
 from soup_nlp.data.formats.map_files import read_confidence, read_flow
 from soup_nlp.data.pair import Flow, Pair, check_size
 from soup_nlp.errors import ConfigError, DataError
-from soup_nlp.schema.section import Section, Share
+from soup_nlp.schema.section import Section
 from soup_nlp.storage.files import PathLike, is_file
 
 Image = NDArray[np.uint8]
@@ -55,52 +55,8 @@ def load_flow(path: PathLike) -> Flow:
     return flow
 
 
-def with_confidence(
-    flow: Flow,
-    backward: PathLike | None,
-    confidence: PathLike | None,
-    size: tuple[int, int],
-    check: DisOptions,
-) -> Flow:
-    """The flow with a confidence from a backward flow, from a file, or the product of both.
-
-    Args:
-        flow: From the reference to the next image.
-        backward: File of the flow from the next to the reference image.
-        confidence: File of a map in [0, 1], see `read_confidence`.
-        size: (H', W') of the next image.
-        check: Its `tau` and `limit` make confidence of the round-trip error.
-
-    Raises:
-        DataError: a file is malformed or has another size.
-    """
-    own = flow.confidence.copy()
-    if backward is not None:
-        back = read_flow(backward).astype(np.float32)
-        check_size("backward flow and next image", back.shape, size, backward)
-        gap = round_trip_error(flow.uv, back)
-        own *= confidence_of(gap, check.tau, check.limit)
-    if confidence is not None:
-        given = read_confidence(confidence)
-        check_size("flow confidence and flow", given.shape, flow.uv.shape, confidence)
-        own *= given
-    if not own.any():
-        raise DataError(
-            "the flow has confidence 0 everywhere",
-            where=backward or confidence,
-            expected="a backward flow that leads back, or a map that is not black",
-            hint="the backward flow is from the next image to the reference image, in pixels",
-        )
-    return Flow(flow.uv, own, flow.source)
-
-
-def flow_from_truth(pair: Pair, occluded_confidence: float = 1.0) -> Flow:
+def flow_from_truth(pair: Pair) -> Flow:
     """The true flow of a pair, with confidence 0 where it is unknown.
-
-    Args:
-        pair: A pair whose truth has a flow.
-        occluded_confidence: Confidence of occluded pixels, in [0, 1]. The true flow is known there
-            too; 0 leaves them out, as in a flow that is estimated from images.
 
     Raises:
         DataError: the pair has no true flow.
@@ -112,10 +68,7 @@ def flow_from_truth(pair: Pair, occluded_confidence: float = 1.0) -> Flow:
             found=pair.truth or "no truth",
             hint="use the flow source 'dis' or give a flow file",
         )
-    flow = flow_from_array(pair.truth.flow, "truth")
-    if pair.truth.occluded is not None:
-        flow.confidence[pair.truth.occluded] *= np.float32(occluded_confidence)
-    return flow
+    return flow_from_array(pair.truth.flow, "truth")
 
 
 def add_noise(flow: Flow, sigma: float, correlation: float = 5.0) -> Flow:
@@ -165,8 +118,6 @@ class FlowOptions(Section):
     confidence: str | None = None
     """File of the confidence of a `source` that is a file: .npy in [0, 1], or a grey picture,
     black for unusable."""
-    occluded_confidence: Share = 1.0
-    """Confidence of occluded pixels when the source is truth."""
     see_through: bool = True
     """Where flow that was computed follows a layer that stands still before a moving scene (a
     reflection in a windscreen), search for the scene's own along its epipolar lines."""
@@ -185,19 +136,21 @@ class FlowOptions(Section):
         """
         if self.backward or self.confidence:
             return self._load_with_confidence(pair, path)
-        if self.source == "truth":
-            return flow_from_truth(pair, self.occluded_confidence)
         source = str(path(self.source)) if is_path(self.source) else self.source
-        if self.is_file() or source.startswith(NOISE):
+        if self.is_file() or source.startswith("truth"):
             return resolve_flow(pair, source)
+
+        def compute(pair: Pair) -> Flow:
+            if source == "dis":
+                return dis_flow(pair.image_ref, pair.image_next, **dict(self.dis))
+            return resolve_flow(pair, source)
+
         near = at_common_focal(pair)
-        if source == "dis":
-            flow = dis_flow(near.image_ref, near.image_next, **dict(self.dis))
-        else:
-            flow = resolve_flow(near, source)
-        return flow if near is pair else in_own_pixels(flow, pair)
+        flow = compute(near)
+        return flow if near is pair else in_own_pixels(flow, pair, compute)
 
     def _load_with_confidence(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
+        """The flow of a file, its confidence from a backward flow and a map."""
         if not self.is_file():
             raise ConfigError(
                 "a backward flow or a confidence goes with the file of a flow only",
@@ -207,10 +160,25 @@ class FlowOptions(Section):
                 hint="every other source has a confidence of its own",
             )
         flow = resolve_flow(pair, str(path(self.source)))
-        backward = path(self.backward) if self.backward else None
-        confidence = path(self.confidence) if self.confidence else None
-        size = pair.image_next.shape[0], pair.image_next.shape[1]
-        return with_confidence(flow, backward, confidence, size, self.dis)
+        own = flow.confidence.copy()
+        if self.backward:
+            back = read_flow(path(self.backward)).astype(np.float32)
+            size = pair.image_next.shape
+            check_size("backward flow and next image", back.shape, size, self.backward)
+            gap = round_trip_error(flow.uv, back)
+            own *= confidence_of(gap, self.dis.tau, self.dis.limit)
+        if self.confidence:
+            given = read_confidence(path(self.confidence))
+            check_size("flow confidence and flow", given.shape, flow.uv.shape, self.confidence)
+            own *= given
+        if not own.any():
+            raise DataError(
+                "the flow has confidence 0 everywhere",
+                where=self.backward or self.confidence,
+                expected="a backward flow that leads back, or a map that is not black",
+                hint="the backward flow is from the next image to the reference image, in pixels",
+            )
+        return Flow(flow.uv, own, flow.source)
 
     def is_file(self) -> bool:
         """Whether the source is the file of a flow."""

@@ -20,15 +20,11 @@ GUESS = 1.2
 NARROWEST, WIDEST = 10.0, 150.0
 """Plausible fields of view along the longer side, degrees."""
 
-_LONGER_35 = 36.0
-"""Longer side of a frame of 35 mm film, mm."""
-_UNITS = {2: 25.4, 3: 10.0}
-"""Millimetres in EXIF's units of length: inches and centimetres."""
-_SENSORS = (13.2, 17.3, 18.7, 22.3, 23.5, 28.4, 36.0, 43.8, 53.7)
-"""Widths of the large sensors that are built, mm; those below `_SMALL` have any width."""
-_SMALL, _SMALLEST = 9.5, 2.5
-_LONGEST_OF_SMALL = 14.0
-"""Focal length that a lens of a small sensor rarely exceeds, mm."""
+_LONGER_35 = 36.0  # longer side of a frame of 35 mm film, mm
+_UNITS = {2: 25.4, 3: 10.0}  # millimetres in EXIF's units of length: inches and centimetres
+_SENSORS = (13.2, 17.3, 18.7, 22.3, 23.5, 28.4, 36.0, 43.8, 53.7)  # widths that are built, mm
+_SMALL = (2.5, 9.5)  # between these, sensors of any width are built, mm
+_LONGEST_OF_SMALL = 14.0  # focal length that a lens of a small sensor rarely exceeds, mm
 
 
 def estimated_cameras(
@@ -67,33 +63,24 @@ def estimated_cameras(
         # the ratio of two lenses is that of EXIF
         first = sizes[0][0] / (2 * math.tan(math.radians(fov) / 2)) / max(sizes[0])
         relative = [first * focal / relative[0] for focal in relative]
-    cameras = [
-        intrinsics(focal * max(size), focal * max(size), (size[0] - 1) / 2, (size[1] - 1) / 2)
-        for focal, size in zip(relative, sizes, strict=True)
-    ]
-    for k, (path, K) in enumerate(zip(paths, cameras, strict=True)):
-        if fov is None and (k == 0 or not np.array_equal(K, cameras[0])):
-            _say(path, K, sizes[k], of_exif[k] is not None, some is not None)
-    return cameras
-
-
-def _say(path: PathLike, K: Float, size: tuple[int, int], of_exif: bool, shared: bool) -> None:
-    """Warn about the origin of a focal length."""
-    focal = K[0, 0]
-    source = f"{GUESS} times the longer side"
-    if shared:
-        source = "EXIF" if of_exif else "the EXIF of the other frame"
-    text = (
-        f"{path}: no intrinsics; focal length {focal:.0f} px from {source}"
-        f" ({_degrees(focal / size[0]):.0f} degrees of view horizontally), principal point in the"
-        " middle"
-    )
-    if not shared:
-        text += (
-            ". A wrong focal length stretches and bends depth (47 % too long raised the"
-            " relative error of tum_fr1 from 0.096 to 0.113): give --intrinsics or --fov"
-        )
-    warnings.warn(text, DataWarning, stacklevel=3)
+    out: list[Float] = []
+    for path, own, focal, (width, height) in zip(paths, of_exif, relative, sizes, strict=True):
+        focal *= max(width, height)
+        out.append(intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2))
+        if fov is None and (len(out) == 1 or not np.array_equal(out[0], out[-1])):
+            other = "the EXIF of the other frame" if some else f"{GUESS} times the longer side"
+            text = (
+                f"{path}: no intrinsics; focal length {focal:.0f} px from"
+                f" {'EXIF' if own else other} ({_degrees(focal / width):.0f} degrees of view"
+                " horizontally), principal point in the middle"
+            )
+            if not some:
+                text += (
+                    ". A wrong focal length stretches and bends depth (47 % too long raised the"
+                    " relative error of tum_fr1 from 0.096 to 0.113): give --intrinsics or --fov"
+                )
+            warnings.warn(text, DataWarning, stacklevel=2)
+    return out
 
 
 def _degrees(focal: float) -> float:
@@ -105,10 +92,7 @@ def exif_focal(path: PathLike, image: Image) -> float | None:
     """Focal length of EXIF relative to the longer side of a picture; None if not determined.
 
     It follows from the equivalent for 35 mm film, or else from the focal length in millimetres and
-    the resolution of the sensor.
-
-    Warns:
-        DataWarning: the focal length is implausible, and is ignored.
+    the resolution of the sensor. An implausible one is ignored with a warning.
     """
     tags = exif_tags(path)
     found = [_number(tags, Base.FocalLengthIn35mmFilm) / _LONGER_35, _by_sensor(tags, image)]
@@ -127,24 +111,20 @@ def exif_focal(path: PathLike, image: Image) -> float | None:
 
 
 def _by_sensor(tags: Mapping[int, Any], image: Image) -> float:
-    """Focal length in mm over the sensor's longer side; 0 if unknown.
+    """Focal length over the width of the sensor; 0 if unknown.
 
     A picture that was cropped has other sides than EXIF says. One that was reduced by a program
     that changed the size in EXIF, but not the resolution, has a sensor that is not built.
     """
-    sides = sorted(image.shape[:2], reverse=True)
-    stored = sorted(
-        (_number(tags, tag) for tag in (Base.ExifImageWidth, Base.ExifImageHeight)), reverse=True
-    )
-    stored[0] = stored[0] or sides[0]
-    if stored[1] and abs(stored[0] / stored[1] / (sides[0] / sides[1]) - 1) > 0.02:
+    short, long = sorted(image.shape[:2])
+    low, high = sorted(_number(tags, x) for x in (Base.ExifImageWidth, Base.ExifImageHeight))
+    length, per_unit = (_number(tags, x) for x in (Base.FocalLength, Base.FocalPlaneXResolution))
+    if per_unit == 0 or (low and abs(high * short / (low * long) - 1) > 0.02):
         return 0.0
-    length = _number(tags, Base.FocalLength)
-    per_unit = _number(tags, Base.FocalPlaneXResolution)
-    unit = _UNITS.get(int(_number(tags, Base.FocalPlaneResolutionUnit)) or 2, 25.4)
-    sensor = stored[0] / per_unit * unit if per_unit > 0 else 0.0
+    unit = _UNITS.get(int(_number(tags, Base.FocalPlaneResolutionUnit)), 25.4)
+    sensor = (high or long) / per_unit * unit
     built = any(abs(sensor / width - 1) < 0.05 for width in _SENSORS)
-    small = _SMALLEST < sensor < _SMALL and length <= _LONGEST_OF_SMALL
+    small = _SMALL[0] < sensor < _SMALL[1] and length <= _LONGEST_OF_SMALL
     return length / sensor if built or small else 0.0
 
 

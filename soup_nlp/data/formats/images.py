@@ -61,18 +61,16 @@ def _decode_by_pillow(content: bytes, path: PathLike, what: str) -> NDArray[np.u
         with warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
             warnings.simplefilter("ignore")
             return np.asarray(image.convert("RGB"))[:, :, ::-1]
+    except UnidentifiedImageError:
+        heic = content[4:8] == b"ftyp" and content[8:12] != b"avif"
+        found = f"{'a HEIC picture or a video, ' if heic else ''}{len(content)} bytes that start"
+        found, hint = f"{found} with {content[:12]!r}", "convert it to PNG or JPEG first"
     except Exception as error:  # decoders raise many types
-        reason, known = str(error), not isinstance(error, UnidentifiedImageError)
-    hint = "copy or download the file again: it may be damaged"
-    if not known:
-        reason = f"{len(content)} bytes that start with {content[:12]!r}"
-        hint = "convert it to PNG or JPEG first"
-        if content[4:8] == b"ftyp" and content[8:12] != b"avif":
-            reason = f"a HEIC picture or a video ({reason})"
+        found, hint = str(error), "copy or download the file again: it may be damaged"
     raise DataError(
-        f"{what} is truncated" if "truncated" in reason.lower() else f"{what} cannot be decoded",
+        f"{what} is truncated" if "truncated" in found.lower() else f"{what} cannot be decoded",
         where=path,
-        found=reason,
+        found=found,
         expected="an image file that OpenCV or Pillow reads (PNG, JPEG, TIFF, WebP, AVIF ...)",
         hint=hint,
     )
