@@ -46,7 +46,9 @@ def assert_partition(labels: np.ndarray) -> int:
 @pytest.mark.parametrize("count", [1, 2, 12, 60, 300])
 def test_superpixels_are_connected_and_numbered(image, method, count):
     n = assert_partition(segment(image, count, method))
-    assert n == 1 if count == 1 else 0.6 * count <= n <= 1.4 * count
+    # a grid has a whole number of rows and columns
+    near = max(1, 0.03 * count) if method == "slic" else 0.15 * count
+    assert abs(n - count) <= near
 
 
 @pytest.mark.parametrize("count", [40, 150])
@@ -59,7 +61,7 @@ def test_superpixels_of_noise_are_connected_and_not_tiny(count):
 @pytest.mark.parametrize("count", [60, 300])
 def test_fine_texture_does_not_cost_superpixels(count):
     labels = segment(noise(120, 320), count)
-    assert 0.5 * count <= labels.max() + 1 <= 2 * count
+    assert abs(labels.max() + 1 - count) <= max(1, 0.03 * count)
 
 
 def test_an_image_of_one_colour_is_cut_into_a_grid():

