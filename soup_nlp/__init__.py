@@ -11,12 +11,14 @@ import soup_nlp.evaluate  # noqa: F401
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from soup_nlp.arrays import Float
     from soup_nlp.config.problem import Problem, load_problem, make_problem
     from soup_nlp.data.pair import Flow, Pair, Truth
     from soup_nlp.errors import SoupError
     from soup_nlp.evaluate.metrics import DepthMetrics, Scale
     from soup_nlp.geometry.soup import Reconstruction, Soup
     from soup_nlp.pipeline import Run, run, solve_pair
+    from soup_nlp.report.result import Result, load
     from soup_nlp.storage.versions import __version__
 
 __all__ = [
@@ -24,12 +26,14 @@ __all__ = [
     "Pair",
     "Problem",
     "Reconstruction",
+    "Result",
     "Run",
     "Soup",
     "SoupError",
     "Truth",
     "__version__",
     "evaluate",
+    "load",
     "load_problem",
     "make_problem",
     "run",
@@ -41,11 +45,13 @@ _HOMES = {
     "Pair": "data.pair",
     "Problem": "config.problem",
     "Reconstruction": "geometry.soup",
+    "Result": "report.result",
     "Run": "pipeline",
     "Soup": "geometry.soup",
     "SoupError": "errors",
     "Truth": "data.pair",
     "__version__": "storage.versions",
+    "load": "report.result",
     "load_problem": "config.problem",
     "make_problem": "config.problem",
     "run": "pipeline",
@@ -55,17 +61,17 @@ _HOMES = {
 
 
 def evaluate(
-    folder: str | Path,
-    depth: str | Path,
+    result: object,
+    depth: str | Path | Float,
     *,
     scale: Scale = "median",
     cap: float | None = None,
     depth_scale: float = 1000.0,
 ) -> dict[str, DepthMetrics]:
-    """Score the depth of a result folder against a truth file; see `evaluate.scoring.evaluate`."""
+    """Score a depth against the truth; see `evaluate.scoring.evaluate`."""
     from soup_nlp.evaluate import scoring
 
-    return scoring.evaluate(folder, depth, scale=scale, cap=cap, depth_scale=depth_scale)
+    return scoring.evaluate(result, depth, scale=scale, cap=cap, depth_scale=depth_scale)
 
 
 def __getattr__(name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.formats.camera_files import check_intrinsics, read_intrinsics
+from soup_nlp.data.formats.exif import estimated_cameras
 from soup_nlp.data.formats.images import read_image
 from soup_nlp.data.formats.map_files import read_flow
 from soup_nlp.errors import DataError
@@ -18,7 +20,8 @@ from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.limits import check_image_size
 
 ImageLike: TypeAlias = Any
-"""An 8-bit array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4), a file, or a PIL image."""
+"""An array (H, W), (H, W, C) or (C, H, W) with 1, 3 or 4 channels, of 8 bits or of floats from 0 to
+1, a file, or a PIL image."""
 CameraLike: TypeAlias = Any
 """A 3x3 matrix, four numbers (fx, fy, cx, cy) in pixels, or a file of either."""
 FlowLike: TypeAlias = Any
@@ -46,22 +49,37 @@ def image_of(given: ImageLike, where: str) -> Image:
     image = _array(given, "image", where, "uint8 (H, W, 3) array, path or PIL image")
     if image.ndim == 2:
         image = image[:, :, None]
+    elif image.ndim == 3 and image.shape[0] in (1, 3, 4) and image.shape[2] not in (1, 3, 4):
+        image = np.moveaxis(image, 0, 2)
+    if image.dtype.kind == "f" and image.size and image.min() >= 0 and image.max() <= 1:
+        image = np.rint(255 * image.astype(np.float64)).astype(np.uint8)
     if image.ndim != 3 or image.shape[2] not in (1, 3, 4) or image.dtype != np.uint8:
         floats = image.dtype.kind == "f"
         raise DataError(
-            "image must be 8-bit RGB",
+            "image must be 8-bit RGB, or floats from 0 to 1",
             where=where,
             found=f"{image.dtype} {np.shape(given)}",
             expected="uint8 (H, W, 3)",
-            hint="(255 * image).round().astype(np.uint8), if its values are 0 to 1"
-            if floats
-            else None,
+            hint="image / 255, if its values are 0 to 255" if floats else None,
         )
     if image.size == 0:
         raise DataError("image has no pixels", where=where, found=image.shape)
     check_image_size(image.shape[1], image.shape[0], "image", where)
     image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[:, :, :3]
     return np.ascontiguousarray(image)
+
+
+def cameras_without(
+    given: Sequence[ImageLike], images: Sequence[Image], fov: float | None
+) -> list[Float]:
+    """(3, 3) intrinsics of images by a field of view, EXIF, or a guess.
+
+    Args:
+        given: The images as they were given: a file may have EXIF.
+        images: (H, W, 3) their pixels.
+        fov: Horizontal field of view of the first one, degrees; None if it is not known.
+    """
+    return estimated_cameras([Path(g) if is_path(g) else None for g in given], images, fov)
 
 
 def camera_of(given: CameraLike, where: str) -> Float:

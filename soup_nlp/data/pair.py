@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import InitVar, dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap, Image, Mask
-from soup_nlp.data.accept import CameraLike, FlowLike, ImageLike, camera_of, flow_of, image_of
+from soup_nlp.data.accept import (
+    CameraLike,
+    FlowLike,
+    ImageLike,
+    camera_of,
+    cameras_without,
+    flow_of,
+    image_of,
+)
 from soup_nlp.errors import DataError, expect, printable, repr_of
 
 SHORTEST = 0.05
@@ -167,6 +175,9 @@ class Truth:
                     + ("True and False" if kinds == "b" else "numbers"),
                     hint="soup_nlp.Truth(depth_ref=array); files are read by a problem's input",
                 )
+            if made.dtype.kind == "f":
+                # float32 cannot be compared with what overflows
+                made = made.astype(np.float64)
             if made.dtype.kind == "f" and (abs(made[np.isfinite(made)]) > LARGEST).any():
                 raise DataError(
                     "part of the truth has numbers whose squares overflow",
@@ -193,7 +204,8 @@ class Pair:
 
     Images may be arrays, files or PIL images, also grey ones. Cameras may be matrices,
     (fx, fy, cx, cy) or files; the default camera of the next frame is that of the reference frame.
-    A flow may be an array or a file.
+    Without K_ref, the focal length follows from `fov`, the horizontal field of view in degrees, or
+    from the EXIF of a file, or it is a guess. A flow may be an array or a file.
 
     Attributes:
         image_ref: (H, W, 3) uint8 RGB reference image, indexed [v, u].
@@ -211,11 +223,12 @@ class Pair:
 
     image_ref: Image
     image_next: Image
-    K_ref: Float
+    K_ref: Float = None  # type: ignore[assignment]
     K_next: Float = None  # type: ignore[assignment]
     flow: Flow | None = None
     truth: Truth | None = field(default=None)
     name: str = "pair"
+    fov: InitVar[float | None] = None
 
     if TYPE_CHECKING:
 
@@ -223,17 +236,26 @@ class Pair:
             self,
             image_ref: ImageLike,
             image_next: ImageLike,
-            K_ref: CameraLike,
+            K_ref: CameraLike = None,
             K_next: CameraLike = None,
             flow: Flow | FlowLike | None = None,
             truth: Truth | None = None,
             name: str = "pair",
+            fov: float | None = None,
         ) -> None: ...
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, fov: float | None) -> None:
         expect(self.name, str, "name of the pair", "text")
+        given = self.image_ref, self.image_next
         for what in ("image_ref", "image_next"):
             object.__setattr__(self, what, image_of(getattr(self, what), what))
+        if self.K_ref is None:
+            cameras = cameras_without(given, (self.image_ref, self.image_next), fov)
+            object.__setattr__(self, "K_ref", cameras[0])
+            if self.K_next is None:
+                object.__setattr__(self, "K_next", cameras[1])
+        elif fov is not None:
+            raise DataError("two cameras are given", found="K_ref and fov", expected="one of them")
         if self.K_next is None:
             object.__setattr__(self, "K_next", self.K_ref)
         for what in ("K_ref", "K_next"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import get_args
@@ -92,24 +93,24 @@ def surest(gt: Float, sigma: Float) -> dict[str, Float]:
 
 
 def evaluate(
-    folder: str | Path,
-    depth: str | Path,
+    result: object,
+    depth: str | Path | Float,
     *,
     scale: Scale = "median",
     cap: float | None = None,
     depth_scale: float = 1000.0,
 ) -> dict[str, DepthMetrics]:
-    """Score the depth of a result folder against a truth file.
+    """Score a depth against the truth.
 
     Args:
-        folder: Result folder.
-        depth: .dpt, .npy, .pfm or 16-bit .png depth of the reference frame.
+        result: Result folder, `Run`, stored result, or depth of the reference frame (H, W).
+        depth: True depth of the reference frame (H, W), or a file: .dpt, .npy, .pfm, 16-bit .png.
         scale: "median", "mre", "lsq" or "none".
         cap: Truth beyond this depth is dropped, positive.
         depth_scale: Values per unit of length of a .png.
 
     Returns:
-        Metrics by "solution", "start", "nlp" and "rigid" (if stored) and "constant".
+        Metrics by "solution", "start", "nlp" and "rigid" (if known) and "constant".
 
     Raises:
         DataError: the cap is not positive, a file is missing, sizes differ, or the truth knows no
@@ -120,20 +121,52 @@ def evaluate(
         raise DataError(
             "unknown scale rule", found=repr_of(scale), expected=", ".join(get_args(Scale))
         )
-    tree = read_h5(as_path(folder, "result folder") / "result.h5")
-    depths = {
-        k: require(tree, f"depth/{v}") for k, v in DEPTHS.items() if v in tree.get("depth", {})
-    }
-    gt = read_depth(depth, depth_scale)
-    expected = require(tree, "depth/ref").shape
+    depths = _depths(result)
+    where = depth if isinstance(depth, str | Path) else "truth"
+    gt = _map(depth, "truth") if where == "truth" else read_depth(where, depth_scale)
+    expected = depths["solution"].shape
     if gt.shape != expected:
         raise DataError(
-            "truth and result differ in size", where=depth, found=gt.shape, expected=expected
+            "truth and result differ in size", where=where, found=gt.shape, expected=expected
         )
     if not true_pixels(gt, cap).any():
         raise DataError(
             "truth has no pixel to compare with",
-            where=depth,
+            where=where,
             found="no finite, positive depth" + ("" if cap is None else f" up to the cap {cap:g}"),
         )
     return score_depths(Truth(depth_ref=gt), depths, scale, cap)
+
+
+def _depths(result: object) -> dict[str, Float]:
+    """Depth maps of the reference frame by the name of their metrics."""
+    if isinstance(result, str | os.PathLike):
+        tree = read_h5(as_path(result, "result folder") / "result.h5")
+        stored = tree.get("depth", {})
+        require(tree, "depth/ref")
+        return {k: require(tree, f"depth/{v}") for k, v in DEPTHS.items() if v in stored}
+    own = getattr(result, "reconstruction", None)
+    if own is None:
+        return {"solution": _map(result, "depth")}
+    others = {
+        name: getattr(getattr(result, f"{name}_reconstruction", None), "depth_ref", None)
+        for name in ("nlp", "start")
+    }
+    found = {"solution": own.depth_ref, **others, "rigid": getattr(result, "rigid", None)}
+    return {name: z for name, z in found.items() if z is not None}
+
+
+def _map(given: object, what: str) -> Float:
+    """(H, W) numbers.
+
+    Raises:
+        DataError: it is something else.
+    """
+    array = np.asarray(given)
+    if array.ndim != 2 or array.dtype.kind not in "fiu":
+        raise DataError(
+            f"{what} is no map",
+            found=repr_of(given),
+            expected="(H, W) numbers, or a file; NaN where unknown",
+        )
+    return array.astype(np.float64)

@@ -131,6 +131,10 @@ class Run:
         """The overview as a `matplotlib.figure.Figure`: notebooks show it, `.savefig` writes it."""
         return import_module("soup_nlp.report.save").plot(self)
 
+    def _repr_html_(self) -> str:
+        """Text and overview, for notebooks."""
+        return str(import_module("soup_nlp.report.save").overview_html(self))
+
     @property
     def delivered(self) -> str:
         """Origin of `solution.soup`: "constrained NLP", or "presolve" or "start" where these have

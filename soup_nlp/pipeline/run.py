@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import FunctionType, NoneType
 from typing import Any
 
 import numpy as np
 
-from soup_nlp.config.problem import Problem, make_problem, title
+from soup_nlp.config.problem import (
+    Expected,
+    OutputOptions,
+    Problem,
+    SegmentationOptions,
+    make_problem,
+    title,
+)
 from soup_nlp.data.flow.plausible import check_flow
+from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import StoppedError, expect
@@ -22,15 +31,20 @@ from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.model import oracle
+from soup_nlp.model.energy_options import EnergyOptions
+from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.pipeline.full_size import full_size
 from soup_nlp.pipeline.record import Run
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.photometric import photometric_term
-from soup_nlp.refine.records import Refined
+from soup_nlp.refine.records import Refined, RefineOptions
+from soup_nlp.schema.section import Section
 from soup_nlp.solve.kkt import constraint_residuals
+from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.propose import Start
+from soup_nlp.start.start_options import StartOptions
 from soup_nlp.storage.progress import Listener, Watch
 
 EXACT, EXACT_PARALLAX = 0.015, 1.0
@@ -224,22 +238,83 @@ def skipped(case: Case) -> Solution:
     )
 
 
-def solve_pair(pair: Pair, **options: Any) -> Run:
+Options = Mapping[str, Any]
+"""Keys of a section of a problem file."""
+
+
+def solve_pair(
+    pair: Pair,
+    *,
+    progress: bool | Listener = False,
+    preset: str | None = None,
+    seed: int = 0,
+    max_size: float | None = 1.5,
+    segmentation: Options | SegmentationOptions | None = None,
+    flow: Options | FlowOptions | None = None,
+    start: Options | StartOptions | None = None,
+    energy: Options | EnergyOptions | None = None,
+    formulation: Options | FormulationOptions | None = None,
+    solver: Options | SolverOptions | None = None,
+    refine: Options | RefineOptions | None = None,
+    expected: Options | Expected | None = None,
+    output: Options | OutputOptions | None = None,
+) -> Run:
     """Solve a pair that is in memory.
 
     The problem of the run holds a hash of the pair, so its config.yaml cannot be solved again.
+    `soup-nlp show street` lists the keys of every section.
 
     Args:
         pair: Images, cameras, and a flow if there is one (else OpenCV DIS).
-        options: Sections of a problem file, e.g. `segmentation={"superpixels": 500}`.
+        progress: True prints a line after every stage; a function is called at every iteration.
+        preset: "paper" for the method as printed.
+        seed: Of every random draw.
+        max_size: Largest image that is solved as it is, megapixels; None for no limit.
+        segmentation: E.g. `{"superpixels": 500}` or `SegmentationOptions(superpixels=500)`.
+        flow: Where the flow comes from, if the pair has none.
+        start: How the start is made.
+        energy: Terms, weights, units.
+        formulation: How the energy is written for the solver.
+        solver: Stages and limits.
+        refine: Discrete refinement.
+        expected: What the run should score.
+        output: What a result folder holds.
 
     Raises:
         ConfigError: an option is wrong.
         DataError: the pair cannot be used.
     """
+    sections = {
+        "segmentation": segmentation,
+        "flow": flow,
+        "start": start,
+        "energy": energy,
+        "formulation": formulation,
+        "solver": solver,
+        "refine": refine,
+        "expected": expected,
+        "output": output,
+    }
     expect(pair, Pair, "pair", PAIR)
+<<<<<<< HEAD
     if pair.flow is not None:
         check_flow(pair.flow, pair)
     source = {"kind": "memory", "hash": pair_hash(pair)}
     raw = {"name": title(pair.name), "input": source, **options}
     return run(make_problem(raw, where="solve_pair"), pair=pair)
+    raw: dict[str, Any] = {"preset": preset, "seed": seed}
+    if max_size != Problem.model_fields["max_size"].default:
+        # the default is that of the preset
+        raw["max_size"] = max_size
+    for key, own in sections.items():
+        if own is not None:
+            raw[key] = own.model_dump(exclude_unset=True) if isinstance(own, Section) else own
+    raw |= {"name": title(pair.name), "input": {"kind": "memory", "hash": pair_hash(pair)}}
+    begin = time.perf_counter()
+
+    def say(stage: str) -> None:
+        print(f"{stage:<13}{time.perf_counter() - begin:6.1f} s", file=sys.stderr)
+
+    listener = progress if callable(progress) else None
+    problem = make_problem(raw, where="solve_pair")
+    return run(problem, pair=pair, listener=listener, on_stage=say if progress is True else None)

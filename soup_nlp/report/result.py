@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +17,15 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, SIGMA_PRIOR
+from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.surface import at_jumps, hidden, joined
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.check_arrays import require_layout
-from soup_nlp.storage.files import as_path
+from soup_nlp.storage.files import as_path, read_json
 from soup_nlp.storage.h5_files import read_attrs, read_h5
 from soup_nlp.storage.store import require
 
@@ -45,6 +49,9 @@ class Result:
         metre: Unit of length of the reconstruction in units of the truth; None without truth.
         metre_unit: Name of the unit of the truth.
         min_confidence: Smallest confidence of points in clouds.
+        metrics: Scores against the truth, as those of a `Run`.
+        summary: Contents of summary.json, for a stored result.
+        overview: The overview as PNG, for a stored result.
     """
 
     name: str
@@ -56,12 +63,24 @@ class Result:
     metre: float | None = None
     metre_unit: str = "m"
     min_confidence: float = MIN_CONFIDENCE
+    metrics: Mapping[str, DepthMetrics] = field(default_factory=dict, repr=False)
+    summary: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    overview: bytes = field(default=b"", repr=False)
 
     def __str__(self) -> str:
         h, w = self.images[0].shape[:2]
         return f"Result({self.name}, {w}x{h}, {self.reconstruction}, {self.components})"
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        """Text and overview, for notebooks."""
+        return html(str(self), self.overview)
+
+    @property
+    def camera(self) -> RigidMotion:
+        """next_from_ref of the static scene."""
+        return self.components.camera
 
     @property
     def depths(self) -> tuple[Float, Float]:
@@ -123,7 +142,48 @@ def result_of(run: Run) -> Result:
         metre=None if m is None else m.scale,
         metre_unit="m" if pair.truth is None else pair.truth.unit,
         min_confidence=run.problem.output.min_confidence,
+        metrics=run.metrics,
     )
+
+
+def html(text: str, png: bytes) -> str:
+    """Text and picture as HTML."""
+    picture = base64.b64encode(png).decode()
+    shown = f'<img alt="overview" style="max-width:100%" src="data:image/png;base64,{picture}">'
+    return f"<pre>{escape(text)}</pre>" + (shown if png else "")
+
+
+def load(folder: str | Path) -> Result:
+    """A result that `solve`, `import` or `Run.save` wrote: depth, points, sigma, motions, scores.
+
+    Its `reconstruction`, `components`, `camera` and `metrics` are those of the `Run`.
+
+    Args:
+        folder: Result folder.
+
+    Raises:
+        DataError: the folder holds no result, or a damaged one.
+    """
+    place = as_path(folder, "result folder")
+    summary = read_json(place / "summary.json", "summary.json")
+    picture = place / "overview.png"
+    try:
+        metrics = {name: _metrics(row) for name, row in summary["metrics"].items()}
+        return replace(
+            read_result(place),
+            metrics=metrics,
+            summary=summary,
+            overview=picture.read_bytes() if picture.is_file() else b"",
+        )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise DataError("summary.json cannot be read", where=place, found=error) from error
+
+
+def _metrics(row: Mapping[str, Any]) -> DepthMetrics:
+    """Scores of summary.json, in which null stands for NaN."""
+    own: dict[str, Any] = {f.name: row[f.name] for f in fields(DepthMetrics)}
+    own |= {k: np.nan for k, v in own.items() if v is None and k != "cap"}
+    return DepthMetrics(**own)
 
 
 def read_result(folder: Path) -> Result:

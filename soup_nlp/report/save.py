@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from soup_nlp.report.folder import prepare_folder, summary, write_folder
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.record import extended
-from soup_nlp.report.result import read_result
+from soup_nlp.report.result import html, read_result
 from soup_nlp.report.shown import of_run
 from soup_nlp.storage.folders import staged
 
@@ -36,6 +37,13 @@ def plot(run: Run) -> Figure:
     """The overview of a run as a figure of matplotlib, which a notebook shows."""
     drawn = pictures(of_run(run, summary(run), ""))
     return strip_figure(without_gaps(drawn), run.problem.name)
+
+
+def overview_html(run: Run) -> str:
+    """Text and overview of a run as HTML."""
+    picture = BytesIO()
+    plot(run).savefig(picture, format="png", dpi=80)
+    return html(str(run), picture.getvalue())
 
 
 def convert(

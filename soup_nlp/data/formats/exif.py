@@ -28,7 +28,7 @@ _LONGEST_OF_SMALL = 14.0  # focal length that a lens of a small sensor rarely ex
 
 
 def estimated_cameras(
-    paths: Sequence[PathLike], images: Sequence[Image], fov: float | None = None
+    paths: Sequence[PathLike | None], images: Sequence[Image], fov: float | None = None
 ) -> list[Float]:
     """Intrinsics of pictures, with square pixels and the principal point in the middle.
 
@@ -36,7 +36,7 @@ def estimated_cameras(
     that of another one, relative to the longer side.
 
     Args:
-        paths: The files, whose EXIF is read.
+        paths: The files, whose EXIF is read; None for a picture of no file.
         images: The pictures, (H, W, 3), rotated by their EXIF orientation.
         fov: Horizontal field of view of the first picture, degrees; None for the focal length of
             EXIF, or else `GUESS` times the longer side.
@@ -70,7 +70,7 @@ def estimated_cameras(
         if fov is None and (len(out) == 1 or not np.array_equal(out[0], out[-1])):
             other = "the EXIF of the other frame" if some else f"{GUESS} times the longer side"
             text = (
-                f"{path}: no intrinsics; focal length {focal:.0f} px from"
+                f"{path or 'image'}: no intrinsics; focal length {focal:.0f} px from"
                 f" {'EXIF' if own else other} ({_degrees(focal / width):.0f} degrees of view"
                 " horizontally), principal point in the middle"
             )
@@ -88,13 +88,13 @@ def _degrees(focal: float) -> float:
     return 2 * math.degrees(math.atan(0.5 / focal))
 
 
-def exif_focal(path: PathLike, image: Image) -> float | None:
+def exif_focal(path: PathLike | None, image: Image) -> float | None:
     """Focal length of EXIF relative to the longer side of a picture; None if not determined.
 
     It follows from the equivalent for 35 mm film, or else from the focal length in millimetres and
     the resolution of the sensor. An implausible one is ignored with a warning.
     """
-    tags = exif_tags(path)
+    tags = {} if path is None else exif_tags(path)
     found = [_number(tags, Base.FocalLengthIn35mmFilm) / _LONGER_35, _by_sensor(tags, image)]
     given = [focal for focal in found if focal > 0]
     for focal in given:
