@@ -18,7 +18,7 @@ $(VENV)/.installed: pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	touch $@
 
-# solvers, joblib and networks: where they cannot be had, their tests skip
+# solvers and networks: where they cannot be had, their tests skip
 $(VENV)/.optional: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,optional]' && touch $@ \
 		|| echo "optional packages could not be installed: their tests skip"

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from soup_nlp.geometry.soup import Reconstruction, Soup
     from soup_nlp.pipeline import Run, run, solve_pair
     from soup_nlp.report.result import Result, load
+    from soup_nlp.sequence.solve import solve_chain as chain
     from soup_nlp.storage.versions import __version__
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "SoupError",
     "Truth",
     "__version__",
+    "chain",
     "evaluate",
     "load",
     "load_problem",
@@ -51,13 +53,14 @@ _HOMES = {
     "SoupError": "errors",
     "Truth": "data.pair",
     "__version__": "storage.versions",
+    "chain": "sequence.solve:solve_chain",
     "load": "report.result",
     "load_problem": "config.problem",
     "make_problem": "config.problem",
     "run": "pipeline",
     "solve_pair": "pipeline",
 }
-"""Module of every public name; it is imported when the name is first used."""
+"""Module of every public name, and its name there if it is another one; imported on first use."""
 
 
 def evaluate(
@@ -78,7 +81,8 @@ def __getattr__(name: str) -> Any:
     """A public name, from its module."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    home, _, own = _HOMES[name].partition(":")
+    found = getattr(import_module(f"{__name__}.{home}"), own or name)
     globals()[name] = found
     return found
 

@@ -226,7 +226,6 @@ def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
 
 
 def test_parallel_processes_and_one_that_dies(tmp_path):
-    pytest.importorskip("joblib", reason="joblib is not installed (extra bench)")
     # the children must find this module's function
     os.environ["PYTHONPATH"] = os.pathsep.join(
         [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from helpers_chromium import Chromium, find_chromium
 from helpers_result import CAMERA, small_result
 from PIL import ExifTags, Image
@@ -18,7 +18,7 @@ from soup_nlp.bench import chain as chain_study
 from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.cli.main import main
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.errors import DataError
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence import pairs
@@ -30,13 +30,14 @@ from soup_nlp.sequence.frames import (
     find_images,
     video_frames,
 )
+from soup_nlp.sequence.fused import fuse, movers
 from soup_nlp.sequence.key_frames import key_frames, parallax
 from soup_nlp.sequence.pairs import SolvedPair
 from soup_nlp.sequence.scales import Link, link, solve_scales
 from soup_nlp.sequence.score import aligned
+from soup_nlp.sequence.stored import COLMAP_POINTS
 from soup_nlp.sequence.tracks import carried, follow, number
 from soup_nlp.sequence.write import chain_files, write_chain
-from soup_nlp.storage.rows import Job, measure_all, read_rows
 
 pytestmark = pytest.mark.slow
 
@@ -130,6 +131,35 @@ def test_a_chain_has_one_scale_and_one_frame_of_reference():
     np.testing.assert_allclose(chain.motion(1, 0).matrix, np.eye(4), atol=1e-9)
     with pytest.raises(DataError, match="consecutive"):
         make_chain(toy_pairs()[1:])
+
+
+def test_the_static_scene_becomes_one_cloud():
+    chain = make_chain(toy_pairs())
+    cloud = fuse(chain)
+    both = sum(
+        int((p.result.sure & (p.result.components.of_pixel == 0)).sum()) for p in chain.pairs
+    )
+    # both pairs see the same wall: far fewer points than pixels, from either frame
+    assert 0 < len(cloud) <= both
+    assert set(cloud.label) <= {0, 1}
+    # points of the second pair lie on the surface of the first
+    wall = chain.points(0)[chain.pairs[0].result.sure]
+    for point in cloud.points[cloud.label == 1][::50]:
+        assert np.linalg.norm(wall - point, axis=1).min() < 0.05 * np.linalg.norm(point)
+    # short tracks are not shown
+    assert len(movers(chain, 0)) == 0 or len(chain.path(1)) >= 3
+
+
+def test_pictures_of_no_sequence_are_refused(tmp_path, capsys):
+    rng = np.random.default_rng(1)
+    for k, size in enumerate(((48, 64), (48, 64), (40, 64))):
+        write_png(tmp_path / f"{k}.png", rng.integers(0, 256, (*size, 3)).astype(np.uint8))
+    assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
+    assert "differ in size: are they one sequence?" in capsys.readouterr().err
+    (tmp_path / "2.png").unlink()
+    assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
+    assert "continues the one before it" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_chain_is_written(tmp_path):
@@ -347,9 +377,24 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     assert told["score"]["cost"] < 0.02
     assert told["score"]["path"]["share"] < 0.01
     assert "with one for the sequence" in printed
-    page = (tmp_path / "out" / "chain.html").read_text()
-    assert "src=" not in page.replace(".src = ", "")
-    assert "http" not in page.replace("http-equiv", "")
+    # the folder is a result
+    out = tmp_path / "out"
+    assert main(["check", str(out)]) == 0
+    assert "camera poses follow" in capsys.readouterr().out
+    assert main(["convert", str(out), "--to", "glb,colmap", "-o", str(tmp_path / "more")]) == 0
+    assert main(["view", str(out), "--renew", "--no-open"]) == 0
+    assert main(["convert", str(out), "--to", "pfm"]) == 2
+    assert "pairs/000_001" in capsys.readouterr().err
+    scene = trimesh.load(tmp_path / "more" / "scene.glb")
+    assert "static scene" in scene.graph.nodes_geometry
+    rows = (tmp_path / "more" / "colmap" / "sparse" / "0" / "points3D.txt").read_text()
+    assert len(rows.splitlines()) == 2 + min(COLMAP_POINTS, len(rows.splitlines()) - 2) > 1000
+    for k in range(3):
+        truth = render_scene("street", 0, 160, 108, k).truth.depth_ref
+        (tmp_path / "true").mkdir(exist_ok=True)
+        np.save(tmp_path / "true" / f"{k}.npy", truth)
+    assert main(["evaluate", str(out), "--depth", str(tmp_path / "true")]) == 0
+    assert f"{told['score']['mre_one_scale']:.4f}" in capsys.readouterr().out
     video = cv2.VideoCapture(str(tmp_path / "out" / "depth.mp4"))
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 3
     video.release()
@@ -384,7 +429,7 @@ def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch)
         return {}
 
     monkeypatch.setattr(pairs, "_solve", solve)
-    monkeypatch.setattr(pairs, "_read", lambda first, second, place: (first, second))
+    monkeypatch.setattr(pairs, "read_pair", lambda first, second, place: (first, second))
     for own in (["a"], ["a"], ["b"], ["a"]):
         assert pairs.solve_pairs(SceneFrames("street", 3), [(0, 1)], tmp_path, own) == [(0, 1)]
     assert seen == [("a",), ("b",), ("a",)]
@@ -430,25 +475,3 @@ def test_frames_are_as_far_apart_as_their_parallax_asks(tmp_path):
 def test_strides_are_checked(stride, tmp_path, capsys):
     assert main(["chain", str(tmp_path), "--stride", stride]) == 2
     assert "auto" in capsys.readouterr().err
-
-
-def answer(number):
-    if number == 3:
-        raise ValueError("three")
-    return {"number": number}
-
-
-def test_rows_come_from_dask(tmp_path):
-    distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra: dask)")
-    jobs = [Job({"key": str(k)}, partial(answer, k)) for k in range(4)]
-    with (
-        distributed.LocalCluster(
-            processes=False, n_workers=1, dashboard_address=None, protocol="inproc"
-        ) as cluster,
-    ):
-        rows = measure_all(jobs, tmp_path / "rows.jsonl", dask=cluster.scheduler_address)
-    assert [r.get("number") for r in rows] == [0, 1, 2, None]
-    assert "three" in rows[3]["error"]
-    assert len(read_rows(tmp_path / "rows.jsonl")) == 4
-    with pytest.raises(ConfigError, match="no Dask scheduler"):
-        measure_all(jobs, tmp_path / "rows.jsonl", dask="nonsense://nowhere")

@@ -19,6 +19,7 @@ from soup_nlp.sequence.frames import (
     FileFrames,
     Frames,
     SceneFrames,
+    check_sequence,
     find_depths,
     find_images,
     video_frames,
@@ -69,7 +70,6 @@ def chain(
     neighbours: options.Neighbours = None,
     max_size: options.MaxSize = None,
     workers: options.Workers = 1,
-    dask: options.Dask = None,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -94,7 +94,7 @@ def chain(
     }
     changes = ["output.page=false", *options.changed(preset, overrides, short)]
     try:
-        pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet), dask)
+        pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet))
     except KeyboardInterrupt:
         raise StoppedError(
             "interrupted: the pairs that were finished are kept",
@@ -103,7 +103,7 @@ def chain(
         ) from None
     done = make_chain(pairs[: len(which)], pairs[len(which) :])
     with staged(out, whole=True, overwrite=overwrite, subject=subject) as new:
-        write_chain(new, done, name, sources)
+        write_chain(new, done, name, sources, over)
     print(table(done))
     print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "points/", "pairs/"]))
 
@@ -161,6 +161,7 @@ def _frames(
         images = video_frames(path, out / "frames", step or 1, end or read)
     else:
         images = find_images(path)[:: step or 1][:end]
+        check_sequence(images)
         depths = [] if "undistort" in camera else find_depths(images)
     images = [p.absolute() for p in images]
     if len(images) < 2:

@@ -50,11 +50,7 @@ Superpixels = Annotated[
     list[int] | None, typer.Option(help="Wanted number, 50 to 2000; may be repeated.")
 ]
 Data = Annotated[Path | None, typer.Option(help="Root folder of the dataset.")]
-Workers = Annotated[int, typer.Option(help="Processes of this machine (extra: bench).", min=1)]
-Dask = Annotated[
-    str | None,
-    typer.Option(help="Address of a Dask scheduler that shares the files, or local (extra: dask)."),
-]
+Workers = Annotated[int, typer.Option(help="Processes of this machine.", min=1)]
 AnyCode = Annotated[bool, typer.Option(help="Also take stored rows of other code versions.")]
 
 

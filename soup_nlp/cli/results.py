@@ -10,6 +10,7 @@ import typer
 
 from soup_nlp.cli.options import Overwrite
 from soup_nlp.config.problem import dump_problem
+from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.evaluate.metrics import Scale
 from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
@@ -19,20 +20,27 @@ from soup_nlp.family.results import check_sol
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.verdict import accuracy, protocol
+from soup_nlp.sequence.frames import depth_files
+from soup_nlp.sequence.score import score, score_lines
+from soup_nlp.sequence.stored import check_chain, is_chain, read_chain
 from soup_nlp.solve.kkt import LIMITS
 from soup_nlp.storage.files import is_folder
 from soup_nlp.storage.h5_files import read_h5
 
 
 def check(
-    folder: Annotated[Path, typer.Argument(help="Result folder, or a .sol file.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain, or a .sol file.")],
     export_: Annotated[
         Path | None,
         typer.Option("--export", help="Exported folder of a .sol; default where the .sol lies."),
     ] = None,
 ) -> None:
     """Recompute energy, constraints and metrics of a result, or the constraints of a .sol."""
-    if is_folder(folder) or folder.suffix != ".sol":
+    if is_chain(folder):
+        claims = list(check_chain(folder))
+        print("\n".join(f"{'ok  ' if ok else 'FAIL'} {text}" for text, ok in claims))
+        good, claim = all(ok for _, ok in claims), "claim"
+    elif is_folder(folder) or folder.suffix != ".sol":
         report = check_folder(folder)
         tree = read_h5(folder / "result.h5")
         c = float(tree["weights"]["min_facing"])
@@ -56,8 +64,11 @@ def check(
 
 
 def evaluate(
-    folder: Annotated[Path, typer.Argument(help="Result folder.")],
-    depth: Annotated[Path, typer.Option(help="True depth: .dpt, .npy, .pfm or 16-bit .png.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain.")],
+    depth: Annotated[
+        Path,
+        typer.Option(help="True depth: .dpt, .npy, .pfm, 16-bit .png; of a chain their folder."),
+    ],
     scale: Annotated[str, typer.Option(help="median, mre, lsq or none.")] = "median",
     cap: Annotated[float | None, typer.Option(help="Drop truth beyond this depth.")] = None,
     depth_scale: Annotated[
@@ -70,6 +81,10 @@ def evaluate(
         raise ConfigError(
             "unknown scale rule", where="--scale", found=scale, expected=", ".join(rules)
         )
+    if is_chain(folder):
+        truths = [read_depth(path, depth_scale) for path in depth_files(depth)]
+        print("\n".join(score_lines(score(read_chain(folder)[0], truths))))
+        return
     rule = cast(Scale, scale)
     scores = evaluate_folder(folder, depth, scale=rule, cap=cap, depth_scale=depth_scale)
     print(protocol(scores), *accuracy(scores), sep="\n")

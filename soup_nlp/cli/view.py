@@ -14,10 +14,12 @@ from soup_nlp.cli.options import input_pair
 from soup_nlp.errors import DataError
 from soup_nlp.report.folder import renew_page
 from soup_nlp.report.shown import PAGE
+from soup_nlp.sequence.stored import is_chain
+from soup_nlp.sequence.write import CHAIN_PAGE, renew_chain_page
 
 
 def view(
-    folder: Annotated[Path, typer.Argument(help="Result folder.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain.")],
     serve: Annotated[
         int | None,
         typer.Option(help="Serve the folder at this port of this machine instead; 0 chooses one."),
@@ -28,8 +30,12 @@ def view(
     ] = False,
 ) -> None:
     """Open the page of a result in a browser, or serve it."""
-    place = folder / PAGE
-    if renew or not place.is_file():
+    page = CHAIN_PAGE if is_chain(folder) else PAGE
+    place = folder / page
+    if page != PAGE:
+        if renew or not place.is_file():
+            place = renew_chain_page(folder)
+    elif renew or not place.is_file():
         place = renew_page(folder, input_pair(folder))
     if serve is None:
         address = place.resolve().as_uri()
@@ -37,7 +43,7 @@ def view(
         print(f"opened      {place}" if opened else f"open        {address}")
         return
     with _server(folder, serve) as server:
-        address = f"http://127.0.0.1:{server.server_address[1]}/{PAGE}"
+        address = f"http://127.0.0.1:{server.server_address[1]}/{page}"
         print(f"serving     {address} until Ctrl-C", flush=True)
         if not no_open:
             webbrowser.open(address)

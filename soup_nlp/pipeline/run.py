@@ -39,7 +39,6 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.refine.records import Refined, RefineOptions
-from soup_nlp.schema.section import Section
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
@@ -296,19 +295,16 @@ def solve_pair(
         "output": output,
     }
     expect(pair, Pair, "pair", PAIR)
-<<<<<<< HEAD
     if pair.flow is not None:
         check_flow(pair.flow, pair)
-    source = {"kind": "memory", "hash": pair_hash(pair)}
-    raw = {"name": title(pair.name), "input": source, **options}
-    return run(make_problem(raw, where="solve_pair"), pair=pair)
     raw: dict[str, Any] = {"preset": preset, "seed": seed}
     if max_size != Problem.model_fields["max_size"].default:
         # the default is that of the preset
         raw["max_size"] = max_size
     for key, own in sections.items():
         if own is not None:
-            raw[key] = own.model_dump(exclude_unset=True) if isinstance(own, Section) else own
+            dump = getattr(own, "model_dump", None)
+            raw[key] = own if dump is None else dump(exclude_unset=True)
     raw |= {"name": title(pair.name), "input": {"kind": "memory", "hash": pair_hash(pair)}}
     begin = time.perf_counter()
 

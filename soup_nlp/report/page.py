@@ -61,7 +61,7 @@ def page(shown: Shown, found: Mapping[str, Picture]) -> str:
     images = {name: _data_uri(picture) for name, picture in found.items()}
     parts = {
         "title": escape(shown.name),
-        "style": _file("page.css"),
+        "style": web_file("page.css"),
         "summary": _summary(shown),
         "gallery": "\n".join(_figure(picture, images[name]) for name, picture in found.items()),
         "limits": "\n".join(f"<li>{escape(line)}</li>" for line in limits(shown)),
@@ -69,12 +69,12 @@ def page(shown: Shown, found: Mapping[str, Picture]) -> str:
         "accuracy": _accuracy(shown),
         "components": _components(shown),
         "verdict": escape(shown.verdict) or "not recorded",
-        "three": _file("three.js"),
-        "script": _file("page.js"),
+        "three": web_file("three.js"),
+        "script": web_file("page.js"),
         # "<" could end the script element
         "data": json.dumps(plain(data)).replace("<", "\\u003c"),
     }
-    head, *rest = _file("page.html").split("{{")
+    head, *rest = web_file("page.html").split("{{")
     out = [head]
     for piece in rest:
         name, _, text = piece.partition("}}")
@@ -83,14 +83,15 @@ def page(shown: Shown, found: Mapping[str, Picture]) -> str:
 
 
 @cache
-def _file(name: str) -> str:
+def web_file(name: str) -> str:
+    """A file of the pages."""
     return (files("soup_nlp.report") / "web" / name).read_text(encoding="utf-8")
 
 
 def _scene(shown: Shown, scene: Scene) -> dict[str, Any]:
     """The 3D view as numbers, lists and packed arrays."""
     height, width = shown.labels.shape
-    packed = {
+    arrays = {
         "labels": (scene.labels, np.uint16),
         "planes": (scene.planes, np.float32),
         "motion": (scene.motion, np.float32),
@@ -100,7 +101,7 @@ def _scene(shown: Shown, scene: Scene) -> dict[str, Any]:
         "surface": (np.packbits(scene.surface, bitorder="little"), np.uint8),
     }
     return {
-        **{key: _packed(array, kind) for key, (array, kind) in packed.items()},
+        **{key: packed(array, kind) for key, (array, kind) in arrays.items()},
         "count": len(scene.planes),
         "step": scene.step,
         "size": [width, height],
@@ -122,7 +123,7 @@ def _next_size(shown: Shown) -> list[int]:
     return [depth.shape[1], depth.shape[0]]
 
 
-def _packed(array: NDArray[Any], kind: type) -> str:
+def packed(array: NDArray[Any], kind: type) -> str:
     """An array's numbers, deflated, as base64."""
     if np.issubdtype(kind, np.floating):
         # limits values of a diverged solve

@@ -8,16 +8,18 @@ from abc import ABC, abstractmethod
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import cv2
+from PIL import Image
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.images import DataWarning, read_image
 from soup_nlp.errors import DataError
 from soup_nlp.report.figures import write_png
-from soup_nlp.sequence.key_frames import key_frames
+from soup_nlp.sequence.key_frames import continues, key_frames
 from soup_nlp.storage.files import as_path, require_file
 from soup_nlp.storage.folders import staged
 
@@ -29,6 +31,8 @@ IMAGES = (
     *(".heic", ".heif"),
 )
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
+PROBED = 3
+"""Number of pairs in which points are tracked before a folder is solved."""
 LAYOUT = "frame_*"
 """Pattern of the images in a folder that also holds other images, such as depth."""
 
@@ -177,6 +181,52 @@ def find_depths(images: list[Path]) -> list[Path]:
             return []
         out.append(there[0])
     return out
+
+
+def depth_files(folder: Path) -> list[Path]:
+    """Depth maps of a folder, in the order of their numbers: those named depth_*, or all.
+
+    Raises:
+        DataError: there is none.
+    """
+    folder = as_path(folder, "folder of depth maps")
+    kinds = (".png", ".npy", ".pfm", ".dpt")
+    every = [p for p in folder.glob("*") if p.suffix.lower() in kinds]
+    found = [p for p in every if p.name.startswith("depth_")] or every
+    if not found:
+        raise DataError(
+            "folder holds no depth maps", where=folder, expected="one for every frame of the chain"
+        )
+    return sorted(found, key=lambda path: _by_number(path.name))
+
+
+def check_sequence(images: list[Path]) -> None:
+    """Check that the pictures of a folder are frames of one sequence.
+
+    Raises:
+        DataError: they differ in size, or no picture continues the one before it.
+    """
+    sizes: dict[tuple[int, int], Path] = {}
+    for path in images:
+        with suppress(OSError), Image.open(path) as image:
+            sizes.setdefault(image.size, path)
+    if len(sizes) > 1:
+        raise DataError(
+            "pictures of the folder differ in size: are they one sequence?",
+            where=images[0].parent,
+            found=", ".join(f"{p.name} {w}x{h}" for (w, h), p in list(sizes.items())[:4]),
+            expected="frames of one camera",
+            hint="name the frames by a pattern such as 'clip/frame_*.png'",
+        )
+    first = images[: PROBED + 1]
+    if not any(continues(a, b) for a, b in pairwise(first)):
+        raise DataError(
+            "no picture of the folder continues the one before it: are they one sequence?",
+            where=images[0].parent,
+            found=", ".join(path.name for path in first),
+            expected="consecutive frames, of which points can be tracked",
+            hint="name the images one by one to solve them all the same",
+        )
 
 
 def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = None) -> list[Path]:

@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Image
 from soup_nlp.data.formats.images import read_image
+from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.geometry.rotation import exp
 
 KEY_PARALLAX = 0.01
@@ -53,6 +54,13 @@ def key_frames(images: Sequence[Path], K: Float, most: int | None = None) -> lis
                 break
         chosen.append(best)
     return chosen
+
+
+def continues(one: Path, other: Path) -> bool:
+    """Whether enough points of an image can be tracked into the other one."""
+    a, b = (_small(path)[0] for path in (one, other))
+    camera = intrinsics(a.shape[1], a.shape[1], a.shape[1] / 2, a.shape[0] / 2)
+    return parallax(a, b, camera) is not None
 
 
 def parallax(one: Image, other: Image, K: Float) -> float | None:

@@ -13,12 +13,18 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Image
 from soup_nlp.report.colour import colourise_depth
-from soup_nlp.report.page import colour_bar, encoded, table
+from soup_nlp.report.page import colour_bar, encoded, packed, table, web_file
 from soup_nlp.report.pictures import Bar
 from soup_nlp.sequence.chain import Chain
+from soup_nlp.sequence.fused import Cloud, fuse, movers, shown_tracks
+from soup_nlp.storage.store import plain
 
 WIDTH = 720
 """Largest width of an image in the page, pixels."""
+MANY = 24
+"""Frames above which the images have half the width."""
+STILL, MOVING = 120_000, 60_000
+"""Largest numbers of points of the static scene, and of what moves in all frames."""
 QUALITY = 80
 """JPEG quality of the images."""
 PLAN = 360
@@ -42,13 +48,21 @@ def chain_page(
         depths: (H, W, 3) its depth in colour, one range for all.
         span: That range, (near, far).
     """
-    frames = [[_jpeg(a), _jpeg(b)] for a, b in zip(images, depths)]
+    # long sequences have smaller pictures
+    width = WIDTH if len(images) <= MANY else WIDTH // 2
+    data = {
+        "frames": [[_jpeg(a, width), _jpeg(b, width)] for a, b in zip(images, depths)],
+        "names": [Path(x).name for x in contents["sources"]],
+        "scene": _scene(chain),
+    }
     title = html.escape(str(contents["name"]))
     return _PAGE.format(
         title=title,
         last=len(chain) - 1,
-        frames=json.dumps(frames),
-        names=json.dumps([Path(x).name for x in contents["sources"]]).replace("<", "\\u003c"),
+        # "<" could end the script element
+        data=json.dumps(plain(data)).replace("<", "\\u003c"),
+        three=web_file("three.js"),
+        script=web_file("chain.js"),
         bar=_bar(*span),
         plan=_plan(chain),
         table=_table(contents),
@@ -56,11 +70,43 @@ def chain_page(
     )
 
 
-def _jpeg(image: Image) -> str:
-    """A picture as the address of its data."""
+def _scene(chain: Chain) -> dict[str, Any]:
+    """The 3D view: clouds, paths and cameras as numbers and packed arrays."""
+    still = fuse(chain)
+    still = still.kept(np.arange(0, len(still), max(1, -(-len(still) // STILL))))
+    most = MOVING // len(chain)
+    moving = []
+    for k in range(len(chain)):
+        own = movers(chain, k)
+        moving.append(own.kept(np.arange(0, len(own), max(1, -(-len(own) // most)))))
+    result = chain.pairs[0].result
+    K, (height, width) = result.K[0], result.images[0].shape[:2]
+    far = float(np.abs(still.points).max(initial=1.0))
+    return {
+        "still": _cloud(still),
+        "moving": [_cloud(own) for own in moving],
+        "tracks": [
+            {"path": list(chain.path(t).values()), "colour": COLOURS[k % len(COLOURS)]}
+            for k, t in enumerate(shown_tracks(chain))
+        ],
+        "cameras": [pose.matrix for pose in chain.world_from_camera],
+        "K": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+        "size": [width, height],
+        "middle": float(np.median(still.points[:, 2])) if len(still) else 1.0,
+        "far": far,
+    }
+
+
+def _cloud(cloud: Cloud) -> dict[str, str]:
+    points, colours = packed(cloud.points, np.float32), packed(cloud.colours, np.uint8)
+    return {"points": points, "colours": colours}
+
+
+def _jpeg(image: Image, most: int) -> str:
+    """A picture of at most so many columns as the address of its data."""
     height, width = image.shape[:2]
-    if width > WIDTH:
-        size = (WIDTH, round(height * WIDTH / width))
+    if width > most:
+        size = (most, round(height * most / width))
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     return encoded(image, "jpeg", [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
@@ -138,6 +184,10 @@ _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
 <style>
 body {{ font: 15px/1.4 system-ui, sans-serif; margin: 1.2em; color: #222; }}
+#stage {{ position: relative; height: 58vh; background: #20262e; }}
+#canvas {{ width: 100%; height: 100%; display: block; }}
+#message {{ position: absolute; inset: 1em; color: #ddd; }} label {{ margin: 0 .6em; }}
+#size {{ width: 7em; }}
 .row {{ display: flex; flex-wrap: wrap; gap: 1em; align-items: flex-start; }}
 figure {{ margin: 0; }} .pictures figure {{ flex: 1 1 380px; max-width: 720px; }}
 img {{ width: 100%; max-height: 62vh; object-fit: contain; object-position: left; }}
@@ -150,8 +200,19 @@ table {{ border-collapse: collapse; }} td, th {{ padding: .2em .7em; text-align:
 tr:nth-child(even) {{ background: #f3f3f3; }} svg {{ border: 1px solid #ddd; font-size: 12px; }}
 </style></head><body>
 <h1>{title}</h1>
-<p><button id="play">play</button> <input id="time" type="range" min="0" max="{last}" value="0">
+<div id="stage"><canvas id="canvas" aria-label="3D view"></canvas><p id="message">loading</p></div>
+<p><span id="views"></span>
+<label>point size <input id="size" type="range" min="1" max="8" value="2"></label>
+<label><input id="movers" type="checkbox" checked> what moves</label>
+<label><input id="paths" type="checkbox" checked> its paths</label>
+<label><input id="cameras" type="checkbox" checked> cameras</label>
+<label><input id="follow" type="checkbox"> look from the camera</label>
+drag: turn, right drag: move, wheel: zoom</p>
+<p><button id="play">play</button>
+<input id="time" type="range" min="0" max="{last}" value="0" aria-label="frame">
 <span id="now">frame 0</span></p>
+<p>The static scene of all frames as one cloud: guesses and points that contradict a surer frame
+are left out, so that there are holes behind what moves.</p>
 <div class="row pictures">
 <figure><img id="image" alt="image"><figcaption>image</figcaption></figure>
 <figure><img id="depth" alt="depth"><figcaption>
@@ -165,27 +226,7 @@ scale of its own in every pair: its path is as good as its depth.</figcaption>
 </figure>
 <div class="words">{table}<p>Unit of length: {unit}.</p></div>
 </div>
-<script>
-const frames = {frames};
-const names = {names};
-const time = document.getElementById("time"), play = document.getElementById("play");
-let timer = null;
-function show() {{
-  const k = Number(time.value);
-  document.getElementById("image").src = frames[k][0];
-  document.getElementById("depth").src = frames[k][1];
-  document.getElementById("now").textContent = "frame " + k + ": " + names[k];
-}}
-time.addEventListener("input", show);
-play.addEventListener("click", () => {{
-  if (timer) {{ clearInterval(timer); timer = null; play.textContent = "play"; return; }}
-  play.textContent = "stop";
-  timer = setInterval(() => {{
-    time.value = (Number(time.value) + 1) % frames.length;
-    show();
-  }}, 250);
-}});
-show();
-document.body.dataset.ready = "yes";
-</script></body></html>
+<script>{three}</script>
+<script type="application/json" id="data">{data}</script>
+<script>{script}</script></body></html>
 """

@@ -54,9 +54,8 @@ def solve_pairs(
     overrides: Sequence[str] = (),
     workers: int = 1,
     say: Callable[[int, int, Row], None] | None = None,
-    dask: str | None = None,
 ) -> list[SolvedPair]:
-    """Solve pairs of frames in parallel processes or on Dask; stored results are read.
+    """Solve pairs of frames in parallel processes; stored results are read.
 
     Args:
         frames: The sequence.
@@ -65,7 +64,6 @@ def solve_pairs(
         overrides: Overrides of the problems, such as segmentation.superpixels=500.
         workers: Number of processes.
         say: Called with (done, total, row) after every solve.
-        dask: See `measure_all`; its workers write into the same folder.
 
     Raises:
         SolverError: a pair cannot be solved.
@@ -82,7 +80,7 @@ def solve_pairs(
         work = partial(attempt, partial(_solve, raw, tuple(overrides), place))
         jobs.append(Job(name, work, stale=not same))
         places.append(place)
-    rows = measure_all(jobs, folder / ROWS, workers, say=say, dask=dask)
+    rows = measure_all(jobs, folder / ROWS, workers, say=say)
     wrong = [row for row in rows if failed(row)]
     if wrong:
         raise SolverError(
@@ -91,7 +89,7 @@ def solve_pairs(
             found=wrong[0]["error"],
             hint="the others are kept: the same command goes on",
         )
-    return [_read(*pair, place) for pair, place in zip(which, places, strict=True)]
+    return [read_pair(*pair, place) for pair, place in zip(which, places, strict=True)]
 
 
 def _solve(raw: Raw, overrides: tuple[str, ...], place: Path) -> Row:
@@ -105,7 +103,8 @@ def _solve(raw: Raw, overrides: tuple[str, ...], place: Path) -> Row:
     }
 
 
-def _read(first: int, second: int, place: Path) -> SolvedPair:
+def read_pair(first: int, second: int, place: Path) -> SolvedPair:
+    """The pair of two frames from its result folder."""
     result = read_result(place)
     tree = read_h5(place / "result.h5")
     own = result.components.of_superpixel == 0

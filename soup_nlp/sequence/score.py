@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from soup_nlp.arrays import Float
+from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import depth_metrics, true_pixels
 from soup_nlp.sequence.chain import Chain
 
@@ -19,18 +21,30 @@ def true_depth(chain: Chain, frame: int) -> Float | None:
     return chain.pairs[frame].truth.get("depth_ref")
 
 
-def score(chain: Chain) -> dict[str, Any] | None:
+def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any] | None:
     """Errors of depth and path; None without a truth.
+
+    `truths` (H, W) of every frame stand for those of the pairs.
 
     "frames" has the MRE of every frame with its own median scale and with one for the sequence,
     "links" the estimated and the true ratio of scales, and "path" the error of the camera positions
     after the best similarity relative to the length of the true path, if it is known.
     """
-    found = [(k, true_depth(chain, k)) for k in range(len(chain))]
+    if truths is not None and len(truths) != len(chain):
+        raise DataError("truth and chain differ in length", found=len(truths), expected=len(chain))
+    found = [(k, true_depth(chain, k) if truths is None else truths[k]) for k in range(len(chain))]
     known = {k: z for k, z in found if z is not None and true_pixels(z, None).any()}
     if not known:
         return None
     depths = {k: chain.depth(k) for k in known}
+    for k, z in known.items():
+        if z.shape != depths[k].shape:
+            raise DataError(
+                "truth and frame differ in size",
+                where=f"frame {k}",
+                found=z.shape,
+                expected=depths[k].shape,
+            )
     ratio = []
     for k, z in depths.items():
         good = true_pixels(known[k], None) & (z > 0)
@@ -62,6 +76,22 @@ def score(chain: Chain) -> dict[str, Any] | None:
 
 
 _KEYS = ("mre_own_scale", "mre_one_scale")
+
+
+def score_lines(found: Mapping[str, Any] | None) -> list[str]:
+    """Scores as lines of text."""
+    if found is None:
+        return ["the truth knows no pixel of any frame"]
+    rows = [
+        f"{f['frame']:>5}{f['mre_own_scale']:>12.4f}{f['mre_one_scale']:>12.4f}"
+        f"{f['coverage']:>10.1%}"
+        for f in found["frames"]
+    ]
+    head = f"{'frame':>5}{'own scale':>12}{'one scale':>12}{'coverage':>10}"
+    means = f"{'mean':>5}{found[_KEYS[0]]:>12.4f}{found[_KEYS[1]]:>12.4f}"
+    path = found["path"]
+    rest = [] if path is None else [f"path   off by {path['share']:.2%} of its length"]
+    return ["MRE of the depth, median scales, no depth cap", head, *rows, means, *rest]
 
 
 def path_error(chain: Chain) -> dict[str, float] | None:

@@ -17,11 +17,13 @@ from soup_nlp.report.pointcloud import AXES, write_ply
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.page import chain_page
 from soup_nlp.sequence.score import score
+from soup_nlp.sequence.stored import read_chain, write_fused
 from soup_nlp.storage.atomic import write_bytes, write_text
-from soup_nlp.storage.folders import scratch
+from soup_nlp.storage.folders import scratch, staged
 from soup_nlp.storage.store import write_json
 
-SINGLE = "chain.json", "trajectory.tum", "depth.mp4", "chain.html"
+CHAIN_PAGE = "chain.html"
+SINGLE = "chain.json", "trajectory.tum", "depth.mp4", CHAIN_PAGE, "scene.ply"
 """Files of a chain that are not made for each frame."""
 POINTS = 100_000
 """Largest number of points in the cloud of a frame."""
@@ -36,8 +38,22 @@ def chain_files(count: int) -> list[str]:
     return [*SINGLE, *(f"depth/{k:04d}.png" for k in range(count)), *clouds]
 
 
-def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -> None:
-    """Write every file of a chain, `chain_files`, into an existing folder."""
+def write_chain(
+    folder: Path,
+    chain: Chain,
+    name: str,
+    sources: Sequence[str],
+    over: Sequence[tuple[int, int]] = (),
+) -> None:
+    """Write every file of a chain, `chain_files`, into an existing folder.
+
+    Args:
+        folder: The folder.
+        chain: The chain.
+        name: Name of the sequence.
+        sources: Path or description of every frame.
+        over: Frames of the further pairs that link the chain.
+    """
     (folder / "depth").mkdir(exist_ok=True)
     (folder / "points").mkdir(exist_ok=True)
     depths = [chain.depth(k) for k in range(len(chain))]
@@ -46,15 +62,30 @@ def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -
         write_clipped_depth_png16(folder / "depth" / f"{k:04d}.png", z, scale)
     for k in range(len(chain.pairs)):
         _cloud(folder / "points" / f"{k:04d}.ply", chain, k, name)
-    contents = {"name": name, "sources": list(sources), **summary(chain)}
+    contents = {"name": name, "sources": list(sources), "over": list(over), **summary(chain)}
     contents |= {"depth_png_scale": scale, "score": score(chain)}
     write_json(folder / "chain.json", contents)
     write_text(folder / "trajectory.tum", trajectory(chain))
+    write_fused(folder, chain, contents)
+    pictures, text = _page(chain, contents)
+    write_video(folder / "depth.mp4", [np.vstack(p) for p in zip(images(chain), pictures)])
+    write_text(folder / CHAIN_PAGE, text)
+
+
+def renew_chain_page(folder: Path) -> Path:
+    """Make the page of a chain's folder again; returns its file."""
+    _, text = _page(*read_chain(folder))
+    with staged(folder, overwrite=True) as new:
+        write_text(new / CHAIN_PAGE, text)
+    return folder / CHAIN_PAGE
+
+
+def _page(chain: Chain, contents: dict[str, Any]) -> tuple[list[Image], str]:
+    """Depth of all frames in colour, and the page."""
+    depths = [chain.depth(k) for k in range(len(chain))]
     span = depth_range(np.concatenate([z.ravel()[::7] for z in depths]))
     pictures = [colourise_depth(z, *span) for z in depths]
-    write_video(folder / "depth.mp4", [np.vstack(p) for p in zip(images(chain), pictures)])
-    page = chain_page(chain, contents, images(chain), pictures, span)
-    write_text(folder / "chain.html", page)
+    return pictures, chain_page(chain, contents, images(chain), pictures, span)
 
 
 def summary(chain: Chain) -> dict[str, Any]:

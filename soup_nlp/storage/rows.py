@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.errors import DataError
 from soup_nlp.storage.files import is_file, parse_json, read_bytes
 from soup_nlp.storage.store import plain
 from soup_nlp.storage.system import end_with_parent
@@ -123,7 +127,6 @@ def measure_all(
     say: Say | None = None,
     after: Callable[[list[Row]], None] | None = None,
     any_code: bool = False,
-    dask: str | None = None,
 ) -> list[Row]:
     """The row of every job; jobs whose row the file does not hold yet are measured.
 
@@ -138,12 +141,9 @@ def measure_all(
         after: Called with all rows known so far, in the order of the jobs, after every new row and
             at the end.
         any_code: Also use stored rows of other code versions.
-        dask: Address of a Dask scheduler that runs the jobs; "local" starts one with `workers`
-            processes.
 
     Raises:
         DataError: the file cannot be written.
-        ConfigError: joblib or Dask is needed but not installed, or the scheduler does not answer.
     """
     code = code_version()
     names = [_identity(job.name) for job in jobs]
@@ -158,8 +158,7 @@ def measure_all(
     def so_far() -> list[Row]:
         return [known[name] for name in names if name in known]
 
-    results = _measured(todo, workers) if dask is None else _on_dask(todo, dask, workers)
-    for name, result in results:
+    for name, result in _measured(todo, workers):
         known[name] = {**plain(todo[name].name), "code": code, **plain(result)}
         append_row(path, known[name])
         if say:
@@ -181,24 +180,23 @@ def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]
     if workers < 2 or not todo:
         yield from ((name, job.work()) for name, job in todo.items())
         return
-    try:
-        from joblib.externals.loky import ProcessPoolExecutor, as_completed
-        from joblib.externals.loky.process_executor import BrokenProcessPool
-    except ImportError as error:
-        raise ConfigError(
-            "parallel processes need joblib", where="--workers", hint="pip install soup-nlp[bench]"
-        ) from error
     left = dict(todo)
     # a broken pool does not say which job broke it: the remaining jobs run again, one pool each
     for names in ([*todo], *([name] for name in todo)):
         again = [name for name in names if name in left]
         if not again:
             continue
+        before = set(multiprocessing.active_children())
+        # a fork of a process with threads may hang
         pool = ProcessPoolExecutor(
-            max_workers=min(workers, len(again)), env=ONE_THREAD, initializer=end_with_parent
+            min(workers, len(again)), multiprocessing.get_context("spawn"), end_with_parent
         )
+        futures: dict[Future[Row], str] = {}
         try:
-            futures = {pool.submit(left[name].work): name for name in again}
+            # the processes begin here
+            with _environment(ONE_THREAD), suppress(BrokenProcessPool):
+                for name in again:
+                    futures[pool.submit(left[name].work)] = name
             for future in as_completed(futures):
                 try:
                     result = future.result()
@@ -209,33 +207,21 @@ def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]
                 del left[futures[future]]
                 yield futures[future], result
         finally:
-            pool.shutdown(wait=False, kill_workers=True)
+            pool.shutdown(wait=False, cancel_futures=True)
+            for child in set(multiprocessing.active_children()) - before:
+                child.kill()
 
 
-def _on_dask(todo: Mapping[str, Job], address: str, workers: int) -> Iterator[tuple[str, Row]]:
-    """The same by the workers of a Dask scheduler."""
-    if not todo:
-        return
+@contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Variables of the environment that processes inherit which begin in the block."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
     try:
-        from distributed import Client, as_completed
-    except ImportError as error:
-        raise ConfigError(
-            "Dask is not installed", where="--dask", hint="pip install soup-nlp[dask]"
-        ) from error
-    options: dict[str, Any] = {"address": address}
-    if address == "local":
-        options = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None}
-    try:
-        client = Client(**options)
-    except (OSError, ValueError) as error:
-        raise ConfigError(
-            "no Dask scheduler answers",
-            where="--dask",
-            found=f"{address}: {error}",
-            expected="an address such as tcp://host:8786, or local",
-        ) from error
-    with client:
-        futures = {client.submit(job.work, pure=False): name for name, job in todo.items()}
-        for future in as_completed(futures):
-            wrong = future.exception()
-            yield futures[future], future.result() if wrong is None else failure(repr(wrong))
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
