@@ -46,7 +46,7 @@ docs: $(VENV)/.docs
 
 # lowest and newest packages, Python 3.11 to 3.13, odd surroundings: an hour, most of it installation
 versions:
-	$(PYTHON) tests/versions.py
+	$(PYTHON) tests/tools/versions.py
 
 results: $(VENV)/.optional
 	$(BIN)/soup-nlp bench all --out results --overwrite $(if $(DATA),--data $(DATA))

@@ -12,7 +12,7 @@ vector counts scales as `N lam` and lengths in `1 / N`:
     translation   1 per superpixel, |t| = tau   unit-translation
     epigraph      1 per norm, s^2 >= |v|^2 + eps^2
 
-`tests/constraint_mutants.py` deletes each of these and each bound, and runs this file.
+`tests/tools/constraint_mutants.py` deletes each of these and each bound, and runs this file.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A few rows of the table of kills; `python tests/kill_table.py --kills 60` makes the whole."""
+"""Some rows of the table of kills; `tests/tools/kill_table.py --kills 60` makes the whole."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_killed_exports_leave_whole_folders():
-    script = Path(__file__).with_name("kill_table.py")
+    script = Path(__file__).parent / "tools" / "kill_table.py"
     words = [sys.executable, str(script), "--kills", "3", "--only", "export"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]

@@ -1,6 +1,6 @@
 """Bad and odd inputs: every one ends in an error that helps, or in a result that holds.
 
-`python tests/count_odd.py` counts them by class, each in a process of its own with little memory;
+`tests/tools/count_odd.py` counts them by class, each in a process of its own with little memory;
 it has the cases that solve as well.
 """
 

@@ -1,8 +1,8 @@
 """The fast tests in several Pythons, with the lowest and the newest packages that are allowed.
 
-python tests/versions.py                              # the whole table
-python tests/versions.py --only "3.13 lowest"         # rows whose name holds one of the words
-python tests/versions.py --python /opt/python3.13     # where an interpreter is not on the PATH
+python tests/tools/versions.py                              # the whole table
+python tests/tools/versions.py --only "3.13 lowest"         # rows whose name holds one of the words
+python tests/tools/versions.py --python /opt/python3.13  # where it is not on the PATH
 
 Every row has an environment of its own in a temporary folder. Rows of circumstances (no compiler,
 no home folder, ...) run a few commands, their output in a pipe, in an environment of the Python
@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PYTHONS = ("3.11", "3.12", "3.13")
 RUNNERS = ("cvxopt", "pytest", "hypothesis")
 """What the tests need besides the dependencies."""

@@ -1,10 +1,10 @@
-"""Kill commands at random times and look at what is left: `python tests/kill_table.py --kills 84`.
+"""Kill commands at random times and look at what is left: `tests/tools/kill_table.py --kills 84`.
 
 Every command first runs undisturbed. Then it runs again and again and gets a signal: half of the
 times at any moment, half of the times while its files are being written. Afterwards the folder
 must hold the old result or the new one, whole, and one more run must leave no temporary files.
 
-`python tests/kill_table.py --disk` runs every command on file systems of its own instead (tmpfs,
+`tests/tools/kill_table.py --disk` runs every command on file systems of its own instead (tmpfs,
 which needs the right to mount): as large as its files and the space that they take while they are
 replaced, then with every free byte taken, then on a disk of half the size from the beginning.
 """

@@ -1,4 +1,4 @@
-"""Which random changes of a result `check` notices: `python tests/alter_result.py --count 200`.
+"""Which random changes of a result `check` notices: `tests/tools/alter_result.py --count 200`.
 
 A result of a rendered pair is written in all formats. Every alteration changes one byte of one of
 its files, or one value: an entry of summary.json, an element of an array or an attribute of

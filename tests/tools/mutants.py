@@ -1,7 +1,7 @@
 """Which bugs the tests do not see: a seeded sample of mutants, by the operators of cosmic-ray.
 
 pip install cosmic-ray coverage
-python tests/mutants.py --count 250 --seed 0 --minutes 25
+python tests/tools/mutants.py --count 250 --seed 0 --minutes 25
 
 The tests run once under coverage, with the test that reaches each line and its seconds. Then every
 mutant runs the tests that reach its line, the shortest first, until one fails. Annotations and
@@ -33,7 +33,7 @@ import coverage
 from cosmic_ray.ast import ast_nodes, get_ast_from_path
 from cosmic_ray.mutating import mutate_code
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 ROOMS = {
     "model": "soup_nlp/model/*.py",
     "export": "soup_nlp/export/*.py",

@@ -1,4 +1,4 @@
-"""Delete each constraint row and each bound of the NLP: `python tests/constraint_mutants.py`.
+"""Delete each constraint row and each bound of the NLP: `python tests/tools/constraint_mutants.py`.
 
 A mutant is one change in a copy of the package. The fast tests of `test_constraints.py` have to
 fail; the table says which test saw it. The exit code is the number of mutants that survive.
@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class Mutant(NamedTuple):

@@ -1,6 +1,6 @@
 """Counts odd inputs that are not answered as promised, by class, each in its own process.
 
-python tests/count_odd.py [WORD ...]     # only cases whose name holds one of the words
+python tests/tools/count_odd.py [WORD ...]     # only cases whose name holds one of the words
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
+
+# the helpers of the tests are in the folder above
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from helpers_odd_cases import CASES
 from helpers_odd_run import Case, fault
