@@ -142,6 +142,44 @@ def test_switches(browser):
     assert browser.log == []
 
 
+def test_a_click_tells_depth_sigma_and_component(browser, small_run):
+    browser.value("soupView.setMode('image_ref'); soupView.setTime(0); soupView.setFar(1e9)")
+    browser.value("soupView.setLeast(0); soupView.setView('reference')")
+    width = small_run.pair.size[1]
+    # the middle of the view is the principal point
+    u, v = (round(x) for x in small_run.pair.K_ref[:2, 2])
+    found = browser.value(
+        "(() => { const c = document.getElementById('canvas');"
+        " return soupView.pick(c.clientWidth / 2, c.clientHeight / 2); })()"
+    )
+    assert abs(found % width - u) <= 2
+    assert abs(found // width - v) <= 2
+    browser.value(f"soupView.tell({found})")
+    said = browser.value("document.getElementById('picked').textContent")
+    shown = of_run(small_run, summary(small_run), "")
+    z = shown.scale * small_run.reconstruction.depth_ref[found // width, found % width]
+    assert f"depth {z:.4g}"[:9] in said
+    assert "sigma" in said
+    assert "superpixel" in said
+    browser.value("soupView.tell(-1)")
+    assert "No point" in browser.value("document.getElementById('picked').textContent")
+
+
+def test_the_least_confidence_hides_points_and_what_is_shown_is_saved(browser, small_run):
+    browser.value("soupView.setMode('image_ref'); soupView.setTime(0); soupView.setFar(1e9)")
+    size = "soupView.ply().size"
+    browser.value("soupView.setLeast(0)")
+    before, whole = canvas(browser), browser.value(size)
+    assert whole > 15 * 0.9 * np.isfinite(small_run.reconstruction.depth_ref).sum()
+    browser.value("soupView.setLeast(0.98)")
+    assert browser.value(size) < whole
+    assert drawn(canvas(browser)) < drawn(before)
+    browser.value("soupView.setLeast(0)")
+    browser.value("document.querySelectorAll('#modes button')[1].click()")
+    browser.wait("location.hash.startsWith('#mode=')")
+    assert browser.log == []
+
+
 def test_the_address_opens_a_view_while_the_page_is_shown(browser):
     browser.value("location.hash = 'mode=normals&time=0.5&view=top'")
     browser.wait("document.querySelector('#modes .on').value == 'normals'")

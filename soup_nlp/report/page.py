@@ -24,6 +24,7 @@ from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.report.scene3d import Scene, make_scene
 from soup_nlp.report.shown import Shown
 from soup_nlp.report.verdict import TITLES
+from soup_nlp.start.components import TIES
 from soup_nlp.storage.store import plain
 
 MODES = {
@@ -98,6 +99,9 @@ def _scene(shown: Shown, scene: Scene) -> dict[str, Any]:
         "motionCamera": (scene.motion_camera, np.float32),
         "guess": (scene.guess, np.uint8),
         "seen": (scene.seen, np.uint8),
+        "sigma": (scene.sigma, np.uint8),
+        "component": (shown.components.of_superpixel, np.uint16),
+        "tie": (np.asarray(shown.tree["start"]["tie"]), np.uint8),
         "surface": (np.packbits(scene.surface, bitorder="little"), np.uint8),
     }
     return {
@@ -114,6 +118,7 @@ def _scene(shown: Shown, scene: Scene) -> dict[str, Any]:
         "far": scene.far,
         "deepest": scene.deepest,
         "unit": shown.length,
+        "ties": TIES,
     }
 
 

@@ -33,6 +33,7 @@ class Scene:
         motion_camera: (N, 9) the same relative to the camera.
         guess: (N,) the depth comes from neighbours.
         seen: (h, w) pixels that are visible in the next frame.
+        sigma: (h, w) standard deviation of log depth, 0 to 254 for 0 to 0.5; 255 where unknown.
         surface: (h - 1, w - 1) cells of four pixels without a jump of the depth.
         camera: (4, 4) pose of the next camera, reference_from_next; the identity if surfaces bend.
         middle: Median depth.
@@ -48,6 +49,7 @@ class Scene:
     guess: Mask
     surface: Mask
     seen: Mask
+    sigma: Int
     camera: Float
     middle: float
     far: float
@@ -77,6 +79,7 @@ def make_scene(shown: Shown) -> Scene:
         guess=np.asarray(shown.tree["start"]["borrowed"], bool) & ~shown.bends,
         surface=_surface(shown, step),
         seen=~hidden(rec)[every, every],
+        sigma=_sigma(shown)[every, every],
         camera=camera.matrix,
         middle=float(np.median(z)) if z.size else 1.0,
         far=far,
@@ -95,6 +98,15 @@ def _surface(shown: Shown, step: int) -> Mask:
     out = np.zeros(((height - 1) // step, (width - 1) // step), bool)
     out[v // step, u // step] = True
     return out
+
+
+def _sigma(shown: Shown) -> Int:
+    """(H, W) sigma as a byte, see `Scene.sigma`."""
+    sigma = shown.array("depth/sigma_ref")
+    if sigma is None:
+        return np.zeros(shown.labels.shape, np.int64)
+    byte = np.rint(np.clip(sigma / 0.5, 0, 1) * 254)
+    return np.where(np.isfinite(sigma), byte, 255).astype(np.int64)
 
 
 def _far(z: Float) -> tuple[float, float]:

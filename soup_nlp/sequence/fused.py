@@ -16,7 +16,7 @@ MOST = 300_000
 """Largest number of points that enter the fusion, all frames together."""
 OF_MOVER = 4_000
 """Largest number of points of what moves in a frame."""
-IN_FRONT = 0.9
+IN_FRONT = 0.8
 """A point contradicts a view if it stands before what the view shows, by more than this ratio."""
 SHOWN = 3
 """Least number of frames of a track that is shown; shorter ones are mostly no real bodies."""

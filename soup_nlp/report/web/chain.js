@@ -92,12 +92,12 @@ if (renderer) {
   cameras.add(now);
   body.add(paths, cameras);
 
-  const eye = new THREE.PerspectiveCamera(50, 1, scene.middle / 200, scene.far * 4);
+  const eye = new THREE.PerspectiveCamera(40, 1, scene.middle / 200, scene.far * 4);
   const controls = new THREE.OrbitControls(eye, $("canvas"));
   const up = (x, y, z) => new THREE.Vector3(x, -y, -z), m = scene.middle;
   const [x, y, z] = eyes[eyes.length - 1];
   const VIEWS = {
-    aside: () => { eye.position.copy(up(0.3 * m, -0.3 * m, -0.6 * m)); controls.target.copy(up(x / 2, y / 2, m + z / 2)); },
+    aside: () => { eye.position.copy(up(0.25 * m, -0.25 * m, -0.3 * m)); controls.target.copy(up(x / 2, y / 2, m + z / 2)); },
     above: () => { eye.position.copy(up(x / 2, -1.6 * m, m / 2 + z / 2)); controls.target.copy(up(x / 2, 0, m / 2 + z / 2 + 0.01 * m)); },
     camera: () => {
       const pose = new THREE.Matrix4().set(...scene.cameras[Number($("time").value)].flat());

@@ -19,10 +19,11 @@ async function unpack(text, Kind) {
   return new Kind(await new Response(stream).arrayBuffer());
 }
 
-const [labels, planes, motion, motionCamera, guess, seen, surface] = await Promise.all([
+const [labels, planes, motion, motionCamera, guess, seen, surface, sigma, component, tie] = await Promise.all([
   unpack(scene.labels, Uint16Array), unpack(scene.planes, Float32Array),
   unpack(scene.motion, Float32Array), unpack(scene.motionCamera, Float32Array),
   unpack(scene.guess, Uint8Array), unpack(scene.seen, Uint8Array), unpack(scene.surface, Uint8Array),
+  unpack(scene.sigma, Uint8Array), unpack(scene.component, Uint16Array), unpack(scene.tie, Uint8Array),
 ]);
 const [w, h] = scene.grid;
 
@@ -60,12 +61,12 @@ function pieces() {
 }
 
 const VERTEX = `
-  in float label, seen;
+  in float label, seen, sigma;
   uniform sampler2D motion;
-  uniform float time, pixel, focal;
+  uniform float time, pixel, focal, size;
   uniform vec2 grid;
   out vec2 place;
-  out float depth, guess, hidden;
+  out float depth, guess, hidden, unsure;
   vec3 turned(vec3 w, vec3 x) {
     float angle = length(w);
     if (angle < 1e-9) return x + cross(w, x);
@@ -88,6 +89,7 @@ const VERTEX = `
     vec3 x = position;
     guess = texelFetch(motion, ivec2(0, int(label + 0.5)), 0).w;
     depth = x.z;
+    unsure = sigma;
     hidden = 0.0;
     place = (vec2(p % w, p / w) + 0.5) / grid;
     if (fromNext) {
@@ -99,18 +101,18 @@ const VERTEX = `
     vec4 seenAt = modelViewMatrix * vec4(at, 1.0);
     gl_Position = projectionMatrix * seenAt;
     /* a point is as large as its pixel */
-    gl_PointSize = clamp(depth * pixel * focal / max(-seenAt.z, 1e-6 * depth), 1.0, 8.0);
+    gl_PointSize = clamp(depth * pixel * focal / max(-seenAt.z, 1e-6 * depth), 1.0, 8.0) * size;
   }`;
 const FRAGMENT = `
   precision highp float;
   in vec2 place;
-  in float depth, guess, hidden;
+  in float depth, guess, hidden, unsure;
   uniform sampler2D colours;
-  uniform float far;
+  uniform float far, most;
   uniform bool guesses;
   out vec4 colour;
   void main() {
-    if (!(depth < far) || (!guesses && guess > 0.5)) discard;
+    if (!(depth < far) || unsure > most || (!guesses && guess > 0.5)) discard;
     vec2 inside = step(vec2(0.0), place) * step(place, vec2(1.0));
     colour = inside.x * inside.y > 0.5 && hidden < 0.5 ? texture(colours, place) : vec4(0.35, 0.35, 0.38, 1.0);
   }`;
@@ -161,7 +163,7 @@ const uniforms = {
   focal: { value: 1 },
   cameraNext: { value: new THREE.Matrix3().set(...K[0], ...K[1], ...K[2]) },
   sizeNext: { value: new THREE.Vector2(...scene.sizeNext) }, fromNext: { value: false },
-  colours: { value: null }, far: { value: scene.far }, guesses: { value: true },
+  size: { value: 1 }, most: { value: 1 }, colours: { value: null }, far: { value: scene.far }, guesses: { value: true },
 };
 const material = new THREE.ShaderMaterial({
   uniforms, vertexShader: VERTEX, fragmentShader: FRAGMENT, glslVersion: THREE.GLSL3,
@@ -170,11 +172,13 @@ const material = new THREE.ShaderMaterial({
 const position = new THREE.BufferAttribute(points(), 3);
 const label = new THREE.BufferAttribute(Float32Array.from(labels), 1);
 const shown = new THREE.BufferAttribute(Float32Array.from(seen), 1);
+const unsure = new THREE.BufferAttribute(Float32Array.from(sigma, (x) => x / 255), 1);
 const geometry = (index) => {
   const out = new THREE.BufferGeometry();
   out.setAttribute("position", position);
   out.setAttribute("label", label);
   out.setAttribute("seen", shown);
+  out.setAttribute("sigma", unsure);
   if (index) out.setIndex(new THREE.BufferAttribute(index, 1));
   return out;
 };
@@ -313,8 +317,99 @@ function buttons(id, entries, act) {
     $(id).append(button);
   }
 }
-buttons("modes", data.modes.map((mode) => [mode.name, mode.word]), setMode);
-buttons("views", Object.keys(VIEWS).map((name) => [name, name]), setView);
+/* the address opens what is shown */
+const asked = { mode: data.modes[0].name, view: "aside" };
+function remember(change) {
+  Object.assign(asked, change);
+  history.replaceState(null, "", `#mode=${asked.mode}&view=${asked.view}&time=${$("time").value}`);
+}
+buttons("modes", data.modes.map((mode) => [mode.name, mode.word]),
+  (mode) => { setMode(mode); remember({ mode }); });
+buttons("views", Object.keys(VIEWS).map((name) => [name, name]),
+  (view) => { setView(view); remember({ view }); });
+$("time").onchange = () => remember({});
+$("size").oninput = () => { uniforms.size.value = Number($("size").value); draw(); };
+/* confidence is 1 - sigma / 0.5; bytes hold sigma up to 0.5 */
+function setLeast(value) {
+  $("least").value = value;
+  $("least-text").textContent = Number(value).toFixed(2);
+  uniforms.most.value = 1 - Number(value);
+  draw();
+}
+$("least").oninput = () => setLeast($("least").value);
+
+/* where a point of the reference frame is at a time; it is drawn if nothing hides it */
+function moved(p, t) {
+  const table = $("still").checked ? motionCamera : motion, k = 9 * labels[p];
+  const turn = new THREE.Vector3(table[k], table[k + 1], table[k + 2]), angle = turn.length();
+  const pivot = new THREE.Vector3(table[k + 3], table[k + 4], table[k + 5]);
+  const x = new THREE.Vector3(position.getX(p), position.getY(p), position.getZ(p)).sub(pivot);
+  if (angle > 1e-9) x.applyAxisAngle(turn.divideScalar(angle), t * angle);
+  return x.add(pivot).addScaledVector(new THREE.Vector3(table[k + 6], table[k + 7], table[k + 8]), t);
+}
+const drawn = (p) => position.getZ(p) < uniforms.far.value && sigma[p] / 255 <= uniforms.most.value
+  && (uniforms.guesses.value || !guess[labels[p]]);
+
+/* the nearest point to the eye within a few pixels of a place of the canvas; -1 for none */
+function pick(x, y) {
+  const { clientWidth, clientHeight } = $("canvas"), t = uniforms.time.value;
+  eye.updateMatrixWorld();
+  const all = new THREE.Matrix4().multiplyMatrices(eye.projectionMatrix, eye.matrixWorldInverse).multiply(body.matrix);
+  const e = all.elements;
+  let best = -1, nearest = Infinity;
+  for (let p = 0; p < w * h; p++) {
+    if (!drawn(p)) continue;
+    const q = moved(p, t), depth = e[3] * q.x + e[7] * q.y + e[11] * q.z + e[15];
+    if (!(depth > 0) || depth >= nearest) continue;
+    const u = (0.5 + 0.5 * (e[0] * q.x + e[4] * q.y + e[8] * q.z + e[12]) / depth) * clientWidth;
+    const v = (0.5 - 0.5 * (e[1] * q.x + e[5] * q.y + e[9] * q.z + e[13]) / depth) * clientHeight;
+    if (Math.abs(u - x) < 3 && Math.abs(v - y) < 3) { best = p; nearest = depth; }
+  }
+  return best;
+}
+function tell(p) {
+  if (p < 0) { $("picked").textContent = "No point is shown there."; return; }
+  const i = labels[p], spread = sigma[p] < 255 ? `${(sigma[p] / 5.1).toFixed(sigma[p] < 26 ? 1 : 0)} %` : "50 % or unknown";
+  const part = component[i] ? `component ${component[i]}, its scale from: ${scene.ties[tie[i]]}` : "the static scene";
+  const source = guess[i] ? "depth taken from neighbours" : sigma[p] > 127 ? "a guess: little information" : "flow and parallax";
+  $("picked").textContent = `pixel (${(p % w) * scene.step}, ${Math.floor(p / w) * scene.step}): depth`
+    + ` ${position.getZ(p).toPrecision(4)} ${scene.unit}, sigma ${spread}; superpixel ${i}, ${part}; ${source}`;
+}
+let pressed = null;
+$("canvas").addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; });
+$("canvas").addEventListener("pointerup", (event) => {
+  if (!pressed || Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > 3) return;
+  const box = $("canvas").getBoundingClientRect();
+  tell(pick(event.clientX - box.left, event.clientY - box.top));
+});
+
+/* the points that are shown, where they are now, in their colours; of the next frame in those of the
+   first picture */
+function ply() {
+  const flatImage = document.createElement("canvas"), pen = flatImage.getContext("2d");
+  [flatImage.width, flatImage.height] = [w, h];
+  const on = document.querySelector("#modes .on").value, name = uniforms.fromNext.value ? data.modes[0].name : on;
+  pen.drawImage(document.querySelector(`figure > img[data-name="${name}"]`), 0, 0, w, h);
+  const pixels = pen.getImageData(0, 0, w, h).data, kept = [];
+  for (let p = 0; p < w * h; p++) if (drawn(p)) kept.push(p);
+  const head = `ply\nformat binary_little_endian 1.0\ncomment time ${uniforms.time.value}, x right, y down, z ahead\n`
+    + `element vertex ${kept.length}\nproperty float x\nproperty float y\nproperty float z\n`
+    + "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n";
+  const rows = new DataView(new ArrayBuffer(15 * kept.length));
+  kept.forEach((p, k) => {
+    const q = moved(p, uniforms.time.value);
+    [q.x, q.y, q.z].forEach((x, j) => rows.setFloat32(15 * k + 4 * j, x, true));
+    for (let c = 0; c < 3; c++) rows.setUint8(15 * k + 12 + c, pixels[4 * p + c]);
+  });
+  return new Blob([head, rows.buffer]);
+}
+$("ply").onclick = () => {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(ply());
+  link.download = `${document.title || "points"}.ply`;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+};
 $("time").oninput = () => setTime($("time").value);
 $("points").onchange = () => { cloud.visible = $("points").checked; mesh.visible = fringe.visible = !cloud.visible; draw(); };
 $("guesses").onchange = () => { uniforms.guesses.value = $("guesses").checked; draw(); };
@@ -367,7 +462,7 @@ resize();
 await show();
 $("message").textContent = "";
 document.body.dataset.ready = "yes";
-window.soupView = { setMode, setTime, setView, setFar, eye, modes: data.modes.map((one) => one.name) };
+window.soupView = { setMode, setTime, setView, setFar, setLeast, pick, tell, ply, eye, modes: data.modes.map((one) => one.name) };
 })().catch((error) => {
   document.getElementById("message").textContent = `The 3D view failed: ${error.message}`;
   throw error;
