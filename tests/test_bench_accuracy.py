@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from helpers_rows import fake_row
 
-from soup_nlp.bench.accuracy import measure_pair, moving
+from soup_nlp.bench.accuracy import BASELINES, METHODS, measure_pair, moving
 from soup_nlp.bench.accuracy_page import suite_page
-from soup_nlp.bench.depth_maps import BASELINES, METHODS
 from soup_nlp.bench.published import COMPARISON, published
 from soup_nlp.bench.study import Cell, frame_of, input_hash, settings_hash
 from soup_nlp.bench.suite_pairs import Item

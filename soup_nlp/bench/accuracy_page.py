@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from soup_nlp.bench.depth_maps import BASELINES, METHODS
+from soup_nlp.bench.accuracy import BASELINES, METHODS
 from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC, PROTOCOL, SOURCE, published
 from soup_nlp.bench.study import (
     Study,
