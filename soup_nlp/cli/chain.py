@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +12,7 @@ import typer
 
 from soup_nlp.cli import options
 from soup_nlp.cli.options import Progress
+from soup_nlp.cli.progress import SolveLog
 from soup_nlp.config.problem import title
 from soup_nlp.errors import ConfigError, StoppedError
 from soup_nlp.sequence.chain import make_chain
@@ -93,8 +95,11 @@ def chain(
         "max_size": max_size,
     }
     changes = ["output.page=false", *options.changed(preset, overrides, short)]
+    every = [*which, *over]
     try:
-        pairs = solve_pairs(sequence, [*which, *over], out, changes, workers, Progress(quiet))
+        with warnings.catch_warnings():
+            warnings.showwarning = SolveLog(quiet).warn
+            pairs = solve_pairs(sequence, every, out, changes, workers, Progress(quiet))
     except KeyboardInterrupt:
         raise StoppedError(
             "interrupted: the pairs that were finished are kept",

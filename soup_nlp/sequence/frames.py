@@ -92,16 +92,14 @@ class FileFrames(Frames):
             DataError: a frame is damaged, or it is stored turned and its camera is given.
         """
         for path in self.paths:
-            with warnings.catch_warnings():
-                # every solve gives the warnings too
-                warnings.simplefilter("ignore", DataWarning)
+            # every solve gives the warnings too
+            with warnings.catch_warnings(action="ignore", category=DataWarning):
                 read_image(path, turn="intrinsics" not in self.camera)
 
     def apart(self, most: int | None = None) -> FileFrames:
         """The frames with enough parallax, see `key_frames`."""
-        with warnings.catch_warnings():
-            # every solve gives this warning too
-            warnings.simplefilter("ignore", DataWarning)
+        # every solve gives this warning too
+        with warnings.catch_warnings(action="ignore", category=DataWarning):
             first = make_problem({"input": self.pair(0, 1)}, where="sequence").load_pair()
         keep = key_frames(self.paths, first.K_ref, most)
         paths, depths = (tuple(x[k] for k in keep) if x else () for x in (self.paths, self.depths))

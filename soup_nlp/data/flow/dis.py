@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from soup_nlp.data.flow.consistency import FloatMap, confidence_of
-from soup_nlp.data.flow.dis_options import DisOptions
 from soup_nlp.data.flow.guided import guided_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
+from soup_nlp.schema.section import Section
 
 Image = NDArray[np.uint8]
 
@@ -29,6 +30,18 @@ PLANES = 4
 
 _FLAT = 1.0  # standard deviation in grey levels of an image without contrast
 _WORK_SIDE = 64  # DIS gets images of at least this side; smaller ones are padded
+_HUGE = float(np.finfo(np.float32).max)  # OpenCV's parameters are float32
+
+
+class DisOptions(Section):
+    """Options of `dis_flow`."""
+
+    equalize: bool = False
+    """Equalise local contrast (CLAHE) first; for pairs with a change of exposure."""
+    tau: Annotated[float, Field(ge=1e-6)] = 1.0
+    """Forward-backward error, pixels, at which confidence is exp(-1)."""
+    limit: Annotated[float, Field(ge=1e-6, le=_HUGE)] = 3.0
+    """Forward-backward error, pixels, above which confidence is 0."""
 
 
 def dis_flow(image_ref: Image, image_next: Image, **options: Any) -> Flow:

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.data.flow.common_focal import at_common_focal, in_own_pixels
 from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
-from soup_nlp.data.flow.dis import dis_flow
-from soup_nlp.data.flow.dis_options import DisOptions
+from soup_nlp.data.flow.dis import DisOptions, dis_flow
 from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.flow.plausible import check_flow
 from soup_nlp.data.formats.map_files import read_confidence, read_flow

@@ -45,10 +45,23 @@ def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
 def decode(path: PathLike, what: str) -> NDArray[Any]:
     """Decode an image file as stored, with all its bits, to grey, BGR or BGRA.
 
-    OpenCV decodes it, or else Pillow, which tolerates more, to 8 bits.
+    OpenCV decodes it, or else Pillow, which tolerates more, to 8 bits. The size in the header is
+    checked before, since a small file can have many pixels of one colour.
     """
     content = read_bytes(path, what)
-    _check_header(content, path, what)
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(content)) as header:
+            size = header.size
+    except Image.DecompressionBombError as error:
+        raise DataError(
+            f"{what} has an impossible size",
+            where=path,
+            found=error,
+            expected=f"at most {MAX_PIXELS} pixels",
+        ) from None
+    except Exception:  # OpenCV may read formats that Pillow does not
+        size = (1, 1)
+    check_image_size(*size, what, path)
     image = None
     with contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -58,8 +71,7 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
 def _decode_by_pillow(content: bytes, path: PathLike, what: str) -> NDArray[np.uint8]:
     """Decode an image file to BGR, or raise DataError with the reason of the decoder."""
     try:
-        with warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(content)) as image:
             return np.asarray(image.convert("RGB"))[:, :, ::-1]
     except UnidentifiedImageError:
         heic = content[4:8] == b"ftyp" and content[8:12] != b"avif"
@@ -74,28 +86,6 @@ def _decode_by_pillow(content: bytes, path: PathLike, what: str) -> NDArray[np.u
         expected="an image file that OpenCV or Pillow reads (PNG, JPEG, TIFF, WebP, AVIF ...)",
         hint=hint,
     )
-
-
-def _check_header(content: bytes, path: PathLike, what: str) -> None:
-    """Raise DataError if the size in the header of an image exceeds the limits.
-
-    A small file can have many pixels of one colour, so the pixels are not decoded here.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            with Image.open(io.BytesIO(content)) as header:
-                width, height = header.size
-        except Image.DecompressionBombError as error:
-            raise DataError(
-                f"{what} has an impossible size",
-                where=path,
-                found=error,
-                expected=f"at most {MAX_PIXELS} pixels",
-            ) from None
-        except Exception:  # OpenCV may read formats that Pillow does not
-            return
-    check_image_size(width, height, what, path)
 
 
 def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]:
@@ -121,8 +111,7 @@ def exif_tags(path: PathLike) -> dict[int, Any]:
     """
     content = read_bytes(path, "image")
     try:
-        with warnings.catch_warnings(), Image.open(io.BytesIO(content)) as image:
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(content)) as image:
             exif = image.getexif()
             return {**exif.get_ifd(ExifTags.IFD.Exif), **exif}
     except UnidentifiedImageError:  # OpenCV may read formats that Pillow does not
