@@ -41,7 +41,8 @@ def solve_chain(
         overwrite: Replace the result of another sequence.
 
     Raises:
-        DataError: the frames are no sequence, or the folder holds the result of another one.
+        DataError: the frames are no sequence, one is damaged, or the folder holds the result of
+            another one.
         SolverError: a pair cannot be solved; the others are kept.
     """
     folder = as_path(out, "output folder")
@@ -57,6 +58,7 @@ def solve_chain(
     if intrinsics is not None:
         camera = {"intrinsics": intrinsics if isinstance(intrinsics, str) else [*intrinsics]}
     found = FileFrames(tuple(path.absolute() for path in images), camera)
+    found.check()
     which = [(k, k + 1) for k in range(len(found) - 1)]
     changes = ["output.page=false", *overrides]
     chain = make_chain(solve_pairs(found, which, folder, changes, workers))
