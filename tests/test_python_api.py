@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -98,3 +100,10 @@ def test_a_stored_result_has_what_its_run_has(run, tmp_path):
         assert 'alt="overview"' in shown
     with pytest.raises(DataError, match=r"summary\.json"):
         soup_nlp.load(tmp_path)
+
+
+def test_heavy_packages_of_pictures_are_imported_on_use():
+    code = "import sys, soup_nlp.cli.solve; print([m for m in NAMES if m in sys.modules])"
+    code = code.replace("NAMES", "('matplotlib', 'trimesh', 'pandas', 'skimage.segmentation')")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

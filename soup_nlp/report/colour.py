@@ -5,7 +5,8 @@ Unknown values are grey, which none of the colour scales contains; unusable flow
 
 from __future__ import annotations
 
-import matplotlib
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -76,7 +77,7 @@ def colourise_sigma(sigma: Float) -> Image:
 
 def component_colours(count: int) -> Image:
     """(count, 3) colours of components: slate for the first, vivid colours for the others."""
-    vivid = (matplotlib.colormaps["tab10"](np.arange(10))[:, :3] * 255).round()
+    vivid = _map("tab10", 10).astype(float)
     # without the grey of tab10, which means unknown
     vivid = np.delete(vivid, 7, axis=0)[[1, 2, 3, 4, 5, 6, 7, 8, 0]]
     turns = np.arange(max(count - 1, 0))
@@ -103,10 +104,18 @@ def _paint_up_to(limit: float, value: Float, name: str) -> Image:
 
 def _paint(level: NDArray[np.float64], known: Mask, name: str) -> Image:
     """(H, W, 3) colours of levels (H, W) in [0, 1] by a matplotlib map, grey where not known."""
-    table = (matplotlib.colormaps[name](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
-    out = table[(level * 255).round().astype(np.intp)]
+    out = _map(name, 256)[(level * 255).round().astype(np.intp)]
     out[~known] = UNKNOWN
     return np.asarray(out)
+
+
+@cache
+def _map(name: str, count: int) -> Image:
+    """(count, 3) colours of a map of matplotlib, whose import takes half a second."""
+    import matplotlib
+
+    colours = matplotlib.colormaps[name](np.arange(count))[:, :3]
+    return np.asarray((colours * 255).round(), np.uint8)
 
 
 def colour_wheel() -> NDArray[np.float64]:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pil
@@ -133,6 +132,8 @@ def _draw_swatches(sheet: Pil.Image, key: Swatches, left: int, bottom: int, widt
 def _font(points: float, bold: bool) -> ImageFont.FreeTypeFont:
     """The font that comes with matplotlib."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    import matplotlib
+
     path = Path(matplotlib.get_data_path(), "fonts", "ttf", name)
     return ImageFont.truetype(path, points * _DPI / 72)
 
