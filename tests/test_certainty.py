@@ -8,20 +8,22 @@ import numpy as np
 import pytest
 
 from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR
-from soup_nlp.report.certainty import certainty, certainty_lines
+from soup_nlp.report.certainty import GUESSES, certainty, certainty_lines, guess_reason
 from soup_nlp.start.components import TIES
 
-REASONS = ("unseen", "still", "scale", "weak")
+REASONS = GUESSES
 
 
 def unsure(run, component_variance=None):
-    """The same run where every pixel is a guess."""
+    """The same run where every pixel is a guess, though the flow is evidence of depth."""
     sure = run.confidence
+    far = np.full_like(sure.evidence.turn, 9.0)
+    seen = replace(sure.evidence, turn=far, constant=far, solution=np.zeros_like(far))
     own = sure.marginals
     if component_variance is not None:
         own = replace(own, component=np.full_like(own.component, component_variance))
     sigma = np.full_like(sure.sigma, SIGMA_PRIOR)
-    return replace(run, confidence=replace(sure, sigma=sigma, marginals=own))
+    return replace(run, confidence=replace(sure, sigma=sigma, marginals=own, evidence=seen))
 
 
 def test_shares_add_up(small_run):
@@ -46,8 +48,15 @@ def test_a_scale_that_contact_hardly_determines_is_named(small_run):
     loose = certainty(unsure(small_run, 1.0))
     firm = certainty(unsure(small_run, 1e-6))
     others = (start.tie != TIES.index("reference"))[labels].mean()
-    assert firm["scale"] == 0
-    assert 0 < loose["scale"] <= others
-    assert loose["scale"] + loose["weak"] == pytest.approx(firm["weak"])
+    # without evidence of depth the scale is not the reason
+    assert 0 <= firm["scale"] < loose["scale"] <= others
+    assert loose["scale"] + loose["weak"] == pytest.approx(firm["scale"] + firm["weak"])
     (line,) = certainty_lines(loose)
     assert "with a scale that contact hardly determines" in line
+
+
+def test_a_camera_at_rest_is_the_reason_of_every_guess(small_run):
+    rest = replace(small_run, start=replace(small_run.start, at_rest=True))
+    found = certainty(unsure(rest))
+    assert found["rest"] == 1.0
+    assert "turns or stands still" in guess_reason(found)

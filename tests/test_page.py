@@ -197,8 +197,7 @@ def test_limits_name_what_is_wrong(shown):
     assert "did not converge" not in good
     tree = {**shown.tree, "input": dict(shown.tree["input"]), "start": dict(shown.tree["start"])}
     tree["input"]["confidence"] = np.zeros_like(tree["input"]["confidence"])
-    tree["start"]["parallax"] = np.full_like(tree["start"]["parallax"], 0.1)
-    shares = {"guess": 0.3, "unseen": 0.2, "still": 0.004, "weak": 0.096}
+    shares = {"guess": 0.3, "unseen": 0.2, "rest": 0.004, "flat": 0.06, "weak": 0.036}
     told = {
         **shown.summary, "status": "Time_Limit", "converged": False, "certainty": shares
     }  # fmt: skip
@@ -206,9 +205,11 @@ def test_limits_name_what_is_wrong(shown):
     assert found[0] == "The NLP did not converge (Time_Limit): try a larger solver.max_iter."
     assert "usable at 0% of the pixels" in found[1]
     assert found[2].startswith(
-        "30% of the image is a guess (sigma above 25%): 20% no usable flow, 10% little information."
+        "30% of the image is a guess (sigma above 25%): 20% no usable flow, 6% a turn alone or a"
+        " constant depth explains the flow nearly as well, 4% little information."
     )
-    assert "parallax below 1 px (median 0.1 px)" in found[3]
+    assert found[3].startswith("6% of the image lies in components whose flow a turn alone")
+    assert "Try frames farther apart" in found[3]
 
 
 def test_a_result_without_sigma_has_no_such_mode(shown):

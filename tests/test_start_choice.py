@@ -17,6 +17,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.start import choice as choosing
 from soup_nlp.start import merge as gathering
+from soup_nlp.start import propose as proposing
 from soup_nlp.start.choice import Choice, of_neighbourhoods, of_pieces, select
 from soup_nlp.start.components import TIES, borrow, contact_scales, depth_from_inside
 from soup_nlp.start.epipolar import Motion
@@ -278,6 +279,7 @@ def test_the_main_motion_is_preferred_where_another_is_not_clearly_better(monkey
     exact = Motion(move[:3, :3], move[:3, 3] / np.linalg.norm(move[:3, 3]))
     near = Motion(turn(4e-4) @ exact.R, exact.t)
     monkeypatch.setattr(choosing, "of_pieces", lambda *a: [])
+    monkeypatch.setattr(proposing, "settle", lambda views, choice, *a: choice)
 
     def first_of(*motions: Motion) -> np.ndarray:
         monkeypatch.setattr(choosing, "dominant", lambda *a: list(motions))

@@ -26,11 +26,8 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import (
     BENDING_FACTOR,
     FACTOR,
-    LARGEST,
-    SIGMA_PRIOR,
     calibrated,
     confidence,
-    scale_by_contact,
     with_prior,
 )
 from soup_nlp.evaluate.metrics import true_pixels
@@ -89,8 +86,7 @@ def _calibration(result: Run) -> tuple[Float, Float, Float]:
     true = true_pixels(gt, None) & np.isfinite(z)
     bends = result.start.bends[rec.labels]
     whole = calibrated(sure.spread, sure.noise, sure.misfit[rec.labels], np.inf, bends)
-    scale = scale_by_contact(sure.marginals, result.start)[rec.labels]
-    added = np.minimum(np.hypot(SIGMA_PRIOR * sure.still, scale), LARGEST)
+    added = sure.added[rec.labels]
     images = whole / np.where(bends, BENDING_FACTOR, FACTOR), added, bends.astype(float)
     unit, added, bending = (at_truth(truth, image)[0][true] for image in images)
     return unit, added, bending

@@ -102,7 +102,7 @@ DEPARTURES = (
     ),
     Departure(
         "another energy where surfaces bend",
-        ("start.bending_price", "start.at_rest"),
+        ("start.bending_price",),
         with_on={**_SHARED, **_PIXELS},
         needs="on: with the start that finds them, and pixel units",
     ),

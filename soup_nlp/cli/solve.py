@@ -20,6 +20,7 @@ from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, DataError, SoupError
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run as run_problem
+from soup_nlp.report.certainty import certainty, guess_reason
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.verdict import missed, verdict
 from soup_nlp.sequence.frames import IMAGES
@@ -283,7 +284,8 @@ def exit_code(run: Run, mre_at_most: float | None) -> tuple[int, str]:
     if not run.solved:
         return 1, f"the NLP did not converge ({run.solution.status}); the best iterate is written"
     if not run.good:
-        return 1, f"{run.confidence.guessed:.0%} of the image is a guess, more than half"
+        why = guess_reason(certainty(run))
+        return 1, f"{run.confidence.guessed:.0%} of the image is a guess: {why}"
     if mre_at_most is not None and missed(run):
         return 1, f"the MRE is above the expected {mre_at_most:g}"
     return 0, "solved, and at most half of the image is a guess"

@@ -13,6 +13,7 @@ import numpy as np
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import ModelError
+from soup_nlp.evaluate.evidence import Evidence, evidence
 from soup_nlp.evaluate.information import (
     Marginals,
     information,
@@ -20,28 +21,32 @@ from soup_nlp.evaluate.information import (
     marginals,
     spread_in_image,
 )
-from soup_nlp.geometry.soup import Reconstruction, Soup
+from soup_nlp.geometry.soup import Reconstruction
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
-from soup_nlp.start.choice import LEAST_NOISE, MOST_NOISE
+from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.components import TIES
 from soup_nlp.start.propose import Start
 
 log = logging.getLogger(__name__)
 
-SIGMA_PRIOR = 0.5
-"""Standard deviation of log depth where the pair says nothing: scenes vary by about that much."""
+SIGMA_PRIOR = 1.0
+"""Standard deviation of log depth where the pair says nothing: 0.3 in rooms, up to 1.2 outdoors."""
 PRIOR_SHARE = 0.001
 """Factor of E_prior in the information: it holds depth where nothing else does, knowing little."""
 FLOW_SHARE = 0.01
 """Factor of E_proj in the information without the flow; without any, motions would be free."""
-MOST_BORROWED = 0.5
-"""Share of superpixels without a depth of their own from which the camera is at rest."""
+CONTACT = 0.2
+"""Standard deviation of the log scale of a component by what it stands on or touches, beside that
+of the marginals: what moves need not touch what is below it in the image."""
 FACTOR, POWER = 7.0, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
 BENDING_FACTOR = 0.5
 """sigma = BENDING_FACTOR misfit sqrt(spread) where surfaces bend."""
+BENDING_SIGMA = 0.24
+"""Least standard deviation of log depth where surfaces bend: without a rigid motion, relief follows
+from the surface's own stretching and not from parallax."""
 LEAST_SPREAD = 0.1
 """Added in squares to spreads where surfaces bend: errors hardly follow smaller ones."""
 MOST_MISFIT, BENDING_MISFIT = 5.0, 100.0
@@ -49,9 +54,11 @@ MOST_MISFIT, BENDING_MISFIT = 5.0, 100.0
 surfaces bend: what an answer with a motion for every superpixel cannot follow is far off."""
 LARGEST = 1e6
 """Of what is calibrated: anything above is as little."""
+NO_CONFIDENCE = 0.5
+"""Sigma from which the confidence, 1 - sigma / `NO_CONFIDENCE`, is 0."""
 MIN_CONFIDENCE = 0.5
-"""A pixel whose confidence, 1 - sigma / `SIGMA_PRIOR`, is less is a guess."""
-MOST_SIGMA = (1 - MIN_CONFIDENCE) * SIGMA_PRIOR
+"""A pixel whose confidence is less is a guess."""
+MOST_SIGMA = (1 - MIN_CONFIDENCE) * NO_CONFIDENCE
 """The sigma of that confidence."""
 
 
@@ -65,8 +72,10 @@ class Confidence:
         marginals: Of the planes and of the components' scales.
         noise: Of the flow, pixels.
         component_sigma: (C,) standard deviation of the components' log scale.
-        still: Share of the image that stands still where surfaces bend.
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
+        evidence: What the flow says of the depth of every component.
+        added: (N,) standard deviation of log depth that does not follow the flow's random noise:
+            of scales by contact, of motions left open, of depth without evidence.
     """
 
     sigma: Float
@@ -74,36 +83,14 @@ class Confidence:
     marginals: Marginals
     noise: float
     component_sigma: Float
-    still: float
     misfit: Float
+    evidence: Evidence
+    added: Float
 
     @property
     def guessed(self) -> float:
         """Share of the pixels whose depth is a guess."""
         return float(np.mean(self.sigma > MOST_SIGMA))
-
-
-def without_parallax(start: Start) -> Mask:
-    """(N,) superpixels that the start gave the depth of others, where these are most of the image.
-
-    The camera is at rest then. A few of them take their depth from a surface that is known.
-    """
-    rest = ~start.bends
-    most = rest.any() and float(start.borrowed[rest].mean()) >= MOST_BORROWED
-    return np.asarray(start.borrowed & rest & most)
-
-
-def stands_still(soup: Soup, anchor_ray: Float, K_next: Float) -> Mask:
-    """(N,) superpixels whose translation moves them by less than any flow's noise.
-
-    Args:
-        soup: The answer.
-        anchor_ray: (N, 3).
-        K_next: (3, 3) intrinsics of the next frame.
-    """
-    focal = np.array([K_next[0, 0], K_next[1, 1]])
-    moved = np.linalg.norm(soup.parallax(anchor_ray) * focal, axis=1)
-    return np.asarray(moved < MOST_NOISE)
 
 
 def flow_misfit(rec: Reconstruction, flow: Flow, most: Float | float = MOST_MISFIT) -> Float:
@@ -126,8 +113,7 @@ def calibrated(
     misfit: Float | float = 0.0,
     prior: float = SIGMA_PRIOR,
     bends: Mask | bool = False,
-    still: float = 0.0,
-    scale: Float | float = 0.0,
+    added: Float | float = 0.0,
 ) -> Float:
     """Standard deviation of log depth that errors keep to.
 
@@ -141,18 +127,15 @@ def calibrated(
             mean is the noise.
         prior: Standard deviation before looking; its information is added.
         bends: Where regions bend; of the same shape, or one for all.
-        still: Share of the image that stands still. Nothing tells its depth, nor that of the rest
-            beside it: so much of `SIGMA_PRIOR` is added everywhere, in squares.
-        scale: Standard deviation of the log scale of its component by the marginals, 0 for the
-            reference component. The others have their scale from contact and not from the flow,
-            so it counts whatever the flow's noise is; added in squares.
+        added: Standard deviation of log depth that does not depend on the flow's random noise:
+            of scales by contact, and of what motions leave open; added in squares.
     """
     # no limits where regions bend: what is below them keeps its order
     known = np.sqrt(np.hypot(LEAST_SPREAD, spread))
     bent = BENDING_FACTOR * np.hypot(LEAST_NOISE, misfit) * known
     rigid = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
     sigma = np.where(bends, bent, rigid)
-    return with_prior(np.hypot(np.hypot(sigma, scale), SIGMA_PRIOR * still), prior)
+    return with_prior(np.hypot(sigma, added), prior)
 
 
 def with_prior(sigma: Float, prior: float = SIGMA_PRIOR) -> Float:
@@ -161,13 +144,21 @@ def with_prior(sigma: Float, prior: float = SIGMA_PRIOR) -> Float:
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
 
-def scale_by_contact(own: Marginals, start: Start) -> Float:
-    """(N,) standard deviation of the log scale of a superpixel's component, by the marginals.
+def scale_by_contact(own: Marginals, start: Start, sizes: Int) -> Float:
+    """(N,) standard deviation of log depth by the scales of components.
 
-    It is 0 for the reference component, which defines the scale.
+    That of a component which has its scale from contact is the marginal and `CONTACT`, in squares.
+    It also moves the mean of the image, to which all depths refer, by the component's area.
+
+    Args:
+        own: Marginal variances of the components' scales.
+        start: Components, and what gives each its scale.
+        sizes: (N,) pixels of every superpixel.
     """
-    reference = start.tie == TIES.index("reference")
-    return np.where(reference, 0.0, np.sqrt(own.component)[start.component])
+    contact = start.tie != TIES.index("reference")
+    scale = np.where(contact, np.hypot(np.sqrt(own.component)[start.component], CONTACT), 0.0)
+    mean = float(np.sum(sizes * np.minimum(scale, SIGMA_PRIOR)) / np.sum(sizes))
+    return np.hypot(scale, mean)
 
 
 def _spread(
@@ -210,7 +201,6 @@ def confidence(
             _spread(rec, data, w, form, start.component, pair.K_ref) for w in (weak, blind)
         )
         spread = np.sqrt(learned(seen**2, guessed**2))
-        spread[without_parallax(start)[rec.labels]] = np.inf
         own = replace(own, component=learned(own.component, without.component))
     except (ModelError, ArithmeticError) as error:
         # numbers that no answer has, as a foreign solver may return: nothing is known
@@ -223,13 +213,11 @@ def confidence(
     bends = start.bends[rec.labels]
     most = np.where(bends, BENDING_MISFIT, MOST_MISFIT)
     noise, misfit = start.noise, flow_misfit(rec, pair.flow, most)
-    stands = stands_still(rec.soup, data.anchor_ray, pair.K_next) & start.bends
-    # the answer may explain a part of the camera's turn by translations
-    stands |= start.at_rest & (start.parallax < MOST_NOISE)
-    still = float(stands[rec.labels].mean())
-    scale = scale_by_contact(own, start)
-    sigma = calibrated(
-        spread, noise, misfit[rec.labels], bends=bends, still=still, scale=scale[rec.labels]
-    )
+    found = evidence(rec.soup, data, start.component, noise)
+    scale = scale_by_contact(own, start, np.bincount(rec.labels.ravel()))
+    rigid = np.hypot(scale, found.sigma)
+    added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), rigid)
+    added[found.guess[start.component] | start.at_rest] = LARGEST
+    sigma = calibrated(spread, noise, misfit[rec.labels], bends=bends, added=added[rec.labels])
     component_sigma = with_prior(np.sqrt(own.component))
-    return Confidence(sigma, spread, own, noise, component_sigma, still, misfit)
+    return Confidence(sigma, spread, own, noise, component_sigma, misfit, found, added)

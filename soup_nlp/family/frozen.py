@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
@@ -61,9 +62,7 @@ class Frozen:
         """The merged problem."""
         raw = yaml.safe_load(self.text)
         # options of earlier code; the record has the weights and the start that they gave
-        raw["energy"].pop("prior_contact", None)
-        raw["start"].pop("bending", None)
-        return make_problem(raw)
+        return make_problem(_present(raw, Problem))
 
     @property
     def start(self) -> Soup:
@@ -74,6 +73,16 @@ class Frozen:
     def best(self) -> Soup:
         """The best known point."""
         return decoded(self.minimum)
+
+
+def _present(raw: Mapping[str, Any], section: Any) -> dict[str, Any]:
+    """The options that a section and its own sections still have."""
+    out = {}
+    for key, value in raw.items():
+        if key in section.model_fields:
+            inner = section.model_fields[key].annotation
+            out[key] = _present(value, inner) if hasattr(inner, "model_fields") else value
+    return out
 
 
 def encoded(soup: Soup) -> Float:

@@ -145,6 +145,11 @@ def in_pixels(
     )
 
 
+def without_flow(data: EnergyData, wrong: Mask) -> EnergyData:
+    """The same data where the flow of superpixels `wrong` (N,) does not count."""
+    return replace(data, pixel_weight=np.where(wrong[:, None], 0.0, data.pixel_weight))
+
+
 def within_bending(
     data: EnergyData, bends: Mask, rigid: Weights, bent: Weights, rotation_px: float
 ) -> EnergyData:

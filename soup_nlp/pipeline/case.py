@@ -28,6 +28,7 @@ from soup_nlp.model.reweighting import (
     in_pixels,
     over_ground,
     within_bending,
+    without_flow,
 )
 from soup_nlp.pipeline.memory import check_fits
 from soup_nlp.pipeline.still_layer import see_through
@@ -209,7 +210,7 @@ def build_energy(
     data = build_energy_data(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, at_anchors
     )
-    data = in_noise(data, start.noise)
+    data = without_flow(in_noise(data, start.noise), start.wrong)
     free = data.prior_weight
     data = across_components(data, start.component, e.arap_across)
     if e.prior_ground is not None:

@@ -8,24 +8,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from soup_nlp.arrays import Mask
-from soup_nlp.evaluate.confidence import MOST_SIGMA, scale_by_contact, with_prior
+from soup_nlp.evaluate.confidence import MOST_SIGMA, scale_by_contact
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.start.components import TIES
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run
 
-LITTLE = 1.0
-"""Parallax in pixels below which errors of the flow dominate."""
 WORDS = {
     "flow": "by flow and parallax",
     "contact": "with the scale of a contact",
     "outline": "with the scale of an outline",
     "unseen": "no usable flow",
-    "still": "hardly any parallax",
+    "rest": "the camera only turns or stands still",
+    "flat": "a turn alone or a constant depth explains the flow nearly as well",
     "scale": "with a scale that contact hardly determines",
     "weak": "little information",
 }
+
+
+GUESSES = ("rest", "unseen", "flat", "scale", "weak")
+"""Reasons of guesses, each where those before it do not hold."""
 
 
 def certainty(run: Run) -> dict[str, float]:
@@ -35,7 +38,8 @@ def certainty(run: Run) -> dict[str, float]:
         "determined": share with a sigma of log depth of at most `MOST_SIGMA`; the sum of "flow"
         (pixels of the largest component), "contact" and "outline" (pixels of other components, by
         the source of their scale). "guess": the rest; the sum of "unseen" (no usable flow, or
-        hidden in the next frame), "still" (parallax below a pixel), "scale" (of a component whose
+        hidden in the next frame), "rest" (the camera is at rest or only turns), "flat" (of a
+        component without evidence of depth, see `Evidence.guess`), "scale" (of a component whose
         scale alone is that uncertain) and "weak". "median_sigma": median over the determined
         pixels.
     """
@@ -45,8 +49,14 @@ def certainty(run: Run) -> dict[str, float]:
     tie = start.tie[labels]
     assert run.pair.flow is not None
     unseen = (run.pair.flow.confidence <= 0) | hidden(run.reconstruction)
-    still = (start.parallax < LITTLE)[labels]
-    scale = with_prior(scale_by_contact(run.confidence.marginals, start))[labels] > MOST_SIGMA
+    rest = np.full(labels.shape, start.at_rest)
+    flat = run.confidence.evidence.guess[start.component][labels]
+    sizes = run.segmentation.sizes
+    scale = scale_by_contact(run.confidence.marginals, start, sizes)[labels] > MOST_SIGMA
+    guess, left = {}, ~sure
+    for name, mask in (("rest", rest), ("unseen", unseen), ("flat", flat), ("scale", scale)):
+        guess[name] = left & mask
+        left = left & ~mask
 
     def share(mask: Mask) -> float:
         return float(mask.mean())
@@ -57,10 +67,8 @@ def certainty(run: Run) -> dict[str, float]:
         "contact": share(sure & (tie == TIES.index("contact below"))),
         "outline": share(sure & (tie > TIES.index("contact below"))),
         "guess": share(~sure),
-        "unseen": share(~sure & unseen),
-        "still": share(~sure & ~unseen & still),
-        "scale": share(~sure & ~unseen & ~still & scale),
-        "weak": share(~sure & ~unseen & ~still & ~scale),
+        **{name: share(mask) for name, mask in guess.items()},
+        "weak": share(left),
         "median_sigma": float(np.median(sigma[sure])) if sure.any() else float("nan"),
     }
 
@@ -79,11 +87,16 @@ def certainty_lines(found: Mapping[str, float]) -> list[str]:
     return lines
 
 
+def guess_reason(found: Mapping[str, float]) -> str:
+    """The reason of the largest part of the guess."""
+    return WORDS[max(GUESSES, key=lambda name: found.get(name, 0.0))]
+
+
 def guess_words(found: Mapping[str, float], of: str = "") -> str:
     """Sentence on the share that is a guess and the reasons."""
     return (
         f"{found['guess']:.0%}{of} is a guess (sigma above {MOST_SIGMA:.0%}):"
-        f" {_parts(found, ('unseen', 'still', 'scale', 'weak'))}"
+        f" {_parts(found, GUESSES)}"
     )
 
 

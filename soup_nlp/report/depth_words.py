@@ -12,25 +12,27 @@ from soup_nlp.report.limits import SHARE, USABLE
 if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run
 
-STILL = 0.3
-"""Other frames are recommended if a larger share of the image has no parallax."""
+FAST = 0.05
+"""Median length of the flow, relative to the image's width, above which motion is fast."""
 
 
 def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
     """Lines of the verdict: usable flow, parallax, moving components, what to try."""
     assert run.pair.flow is not None
     usable = float((run.pair.flow.confidence > 0).mean())
-    lines = [f"flow usable at {usable:.0%} of the pixels"]
+    sure, main = run.confidence.evidence, int(np.argmax(np.bincount(run.start.component)))
+    lines = [
+        f"flow usable at {usable:.0%} of the pixels, noise {sure.noise:.2f} px",
+        f"error of the flow of the largest component: {sure.turn[main]:.2f} px by a turn alone,"
+        f" {sure.constant[main]:.2f} px at a constant depth, {sure.solution[main]:.2f} px here",
+    ]
     if run.start.at_rest:
-        lines.append("the camera is at rest or turns only: depth is a guess")
+        lines.append("the camera stands still or only turns: depth is a guess")
     elif run.start.bends.all():
         lines.append("surfaces bend: their relief is weakly determined")
-    else:
-        if run.start.bending:
-            share = float(run.start.bends[run.segmentation.labels].mean())
-            lines.append(f"{share:.0%} of the image bends: its relief is weakly determined")
-        pixels = np.sort(run.start.parallax[run.segmentation.labels].ravel())
-        lines[0] += f", median parallax {pixels[len(pixels) // 2]:.3g} px"
+    elif run.start.bending:
+        share = float(run.start.bends[run.segmentation.labels].mean())
+        lines.append(f"{share:.0%} of the image bends: its relief is weakly determined")
     moving = [part.pixels / run.segmentation.labels.size for part in run.components.members[1:]]
     large = [share for share in moving if share >= SHARE / 5]
     if moving:
@@ -44,9 +46,13 @@ def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
         lines.append(f"solved at {w}x{h}, brought to {width}x{height}{scored}")
     hints = []
     if usable < USABLE:
-        hints.append("a better flow (--flow), or frames closer in time")
-    if shares["still"] >= STILL:
-        hints.append("frames further apart: the camera has to move, not to turn alone")
+        length = np.linalg.norm(run.pair.flow.uv, axis=-1)[run.pair.flow.confidence > 0]
+        fast = len(length) and np.median(length) > FAST * run.pair.size[1]
+        hints.append("frames closer in time" if fast else "a better flow (--flow)")
+    if shares["rest"] > 0.5:
+        hints.append("frames between which the camera moves aside, not only turns")
+    elif shares["flat"] >= SHARE:
+        hints.append("frames farther apart in time")
     if hints:
         lines.append(f"try {'; '.join(hints)}")
     return lines

@@ -215,6 +215,7 @@ def summary(run: Run) -> dict[str, Any]:
             "median_error_px": float(np.median(run.start.error)),
         },
         "certainty": certainty(run),
+        "evidence": run.confidence.evidence.rows(),
         "flow": str(run.pair.flow),
         "versions": versions(),
         "seed": run.problem.seed,

@@ -9,8 +9,6 @@ from soup_nlp.report.shown import Shown
 
 USABLE = 0.8
 """Share of usable flow below which the flow counts as a limit."""
-PARALLAX = 1.0
-"""Parallax in pixels below which errors of the flow dominate the depth."""
 SHARE = 0.05
 """Share of the image above which a limit is mentioned."""
 
@@ -35,18 +33,17 @@ def _flow(shown: Shown) -> list[str]:
         return []
     return [
         f"The flow is usable at {share:.0%} of the pixels; the rest takes its depth from its"
-        " surroundings. Try a better flow (flow.source), or frames closer in time."
+        " surroundings. Try a better flow (flow.source)."
     ]
 
 
 def _parallax(shown: Shown) -> list[str]:
     """Superpixels whose depth the images hardly determine."""
-    start = shown.tree["start"]
     if shown.at_rest:
         return [
-            "Most of the image has no parallax: the camera is taken to be at rest, or to turn only,"
-            " and images from one place hold no depth. What is shown is a guess. Try frames between"
-            " which the camera moves."
+            "The flow is that of a camera that stands still or only turns: images from one place"
+            " hold no depth. What is shown is a guess. Try frames between which the camera moves"
+            " aside."
         ]
     if shown.bending:
         return [
@@ -54,12 +51,7 @@ def _parallax(shown: Shown) -> list[str]:
             " own stretching, and relief is weakly determined."
         ]
     pixels = np.asarray(shown.tree["segmentation"]["sizes"], float)
-    pixels = pixels / pixels.sum()
-    bends = float(pixels[shown.bends].sum())
-    parallax = np.asarray(start["parallax"], float)
-    little = float(pixels[parallax < PARALLAX].sum())
-    order = np.argsort(parallax)
-    middle = float(parallax[order][np.searchsorted(np.cumsum(pixels[order]), 0.5)])
+    bends = float(pixels[shown.bends].sum() / pixels.sum())
     out = []
     if bends:
         out.append(
@@ -70,10 +62,11 @@ def _parallax(shown: Shown) -> list[str]:
     if shares.get("guess", 0.0) >= SHARE:
         guess = guess_words(shares, " of the image")
         out.append(f"{guess}. What is shown there follows from the neighbours.")
-    if little >= SHARE:
+    if shares.get("flat", 0.0) >= SHARE:
         out.append(
-            f"{little:.0%} of the image has a parallax below {PARALLAX:g} px (median {middle:.2g}"
-            " px): errors of the flow decide the depth there. Try frames further apart."
+            f"{shares['flat']:.0%} of the image lies in components whose flow a turn alone or a"
+            " constant depth explains nearly as well as depth does. Try frames farther apart in"
+            " time."
         )
     return out
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, SIGMA_PRIOR
+from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, NO_CONFIDENCE
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.graph import Segmentation
@@ -114,7 +114,7 @@ class Result:
         """(H, W) confidence of the depth from 0 (unknown) to 1 (certain); 1 without sigma."""
         if self.sigma is None:
             return np.ones(self.flow_confidence.shape)
-        return np.asarray(1.0 - self.sigma / SIGMA_PRIOR)
+        return np.maximum(1.0 - self.sigma / NO_CONFIDENCE, 0.0)
 
     @cached_property
     def surface(self) -> tuple[Mask, Mask]:

@@ -7,47 +7,76 @@ into rigid pieces, each with its own parallax, the depths do not follow its shap
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.start.choice import Choice
 from soup_nlp.start.components import connected_labels
 from soup_nlp.start.views import Views
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+REST_PX = 0.08
+"""Mean error, pixels, by which a rigid motion with depths must explain the flow of the largest
+component better than a turn alone; errors of the flow reach it."""
+CLIP_PX = 1.0
+"""Limit of an error where the two are compared, pixels: movers that the component took along."""
 
 
-STILL_PX = 0.5
-"""Parallax, in pixels, below which a pixel counts as having none."""
+def turn_alone(views: Views, choice: Choice, component: Int, usable: Mask) -> Float | None:
+    """The camera's rotation, if it explains the flow of the largest component without depth.
 
-
-def at_rest(views: Views, rotations: Sequence[Float] = ()) -> tuple[float, Float]:
-    """Largest share of the usable samples that a rotation alone explains, and the rotation.
-
-    A small translation explains these samples as well and would give depth to moving objects in
-    front of them, but the depth of the background would then be arbitrary.
+    The focal length is free in the fit, because a wrong one leaves a residual that depths explain.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
-        rotations: (3, 3) rotations to try in addition to the identity.
+        choice: Rigid motion and plane of every superpixel.
+        component: (N,) rigid component of every superpixel.
+        usable: (N,) True where the flow counts.
 
     Returns:
-        The share, and the (3, 3) rotation.
+        The (3, 3) rotation, or None where the camera's translation is seen.
     """
-    total = max(float(views.weight.sum()), 1e-9)
-    tried = [np.eye(3), *rotations]
-    shares = []
-    for R in tried:
-        turned = views.ray @ R.T
-        off = (turned[..., :2] / turned[..., 2:] - views.target[..., :2]) * np.asarray(views.focal)
-        near = np.linalg.norm(off, axis=-1) < STILL_PX
-        shares.append(float(np.sum(views.weight * near)) / total)
-    return max(shares), tried[int(np.argmax(shares))]
+    at = np.flatnonzero(usable & (component == np.argmax(np.bincount(component))))
+    if not len(at):
+        return None
+    turn, error = fit_turn(views.some(at))
+    gain = np.minimum(error, CLIP_PX) - np.minimum(choice.fit.cost[at, 0], CLIP_PX)
+    return None if gain.mean() > REST_PX else turn
+
+
+def fit_turn(views: Views, count: int = 3000) -> tuple[Float, Float]:
+    """Rotation that explains a flow best, the focal length free, and (N,) its mean error, pixels.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        count: Largest number of pixels that are used.
+    """
+    focal = np.asarray(views.focal)
+    step = max(1, views.weight.size // count)
+    ray, target = (v.reshape(-1, 3)[::step] for v in (views.ray, views.target))
+    root = np.sqrt(views.weight.ravel()[::step])[:, None]
+
+    def miss(x: Float, ray: Float, target: Float) -> Float:
+        longer = np.array([1.0, 1.0, np.exp(x[3])])
+        turned = (ray / longer) @ rotation.exp(x[:3]).T * longer
+        return (turned[..., :2] / turned[..., 2:] - target[..., :2]) * focal
+
+    x = np.zeros(4)
+    for scale in (10.0, 3.0, 1.0, 0.3):
+        x = least_squares(
+            lambda x: (root * miss(x, ray, target)).ravel(),
+            x,
+            loss="cauchy",
+            f_scale=scale,
+            max_nfev=30,
+            bounds=([-1, -1, -1, -1.5], [1, 1, 1, 1.5]),
+        ).x
+    error = np.linalg.norm(miss(x, views.ray, views.target), axis=2)
+    total = np.maximum(views.weight.sum(axis=1), 1e-9)
+    return rotation.exp(x[:3]), np.sum(views.weight * error, axis=1) / total
 
 
 ABOVE_NOISE, LEAST_SHARE = 10.0, 0.25

@@ -12,12 +12,14 @@ import numpy as np
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.start.choice import CLIP, Choice, flow_affinity, least_gain, smooth_choice
-from soup_nlp.start.components import connected_labels
+from soup_nlp.start.components import connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion, estimate
 from soup_nlp.start.neighbourhoods import fit_translation, refine_motion
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
 
+LEAST_GAIN_PX = 0.15
+"""Least mean error, pixels, that the main motion leaves of a region with motions of its own."""
 PIXELS = 1500
 """Largest number of pixels of a component to which a motion is fitted."""
 AGREE = 0.7
@@ -51,6 +53,39 @@ def gather(
             views, seg, jump < share * o.discontinuity_px, choice, noise, gain, o
         )
     return _spread(views, seg, jump, choice, gain, o)
+
+
+def earned(views: Views, choice: Choice, seg: Segmentation, noise: float) -> tuple[Choice, Mask]:
+    """The choice without regions whose own motions explain too little.
+
+    A motion has six parameters. By the Bayesian information criterion they cost `PRICE` nats; the
+    gain of a superpixel is the part of its error that the main motion leaves, in units of the
+    flow's systematic error. A connected region that does not earn a motion takes the main one.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        choice: Present choice.
+        seg: Superpixels and graphs.
+        noise: Flow noise, pixels.
+
+    Returns:
+        The choice, and (N,) True where the main motion does not explain the flow, so that its depth
+        is not known.
+    """
+    if not (choice.label >= 0).any():
+        return choice, np.zeros(len(seg), bool)
+    main = main_motion(choice.label)
+    first = int(np.argmax(choice.label == main))
+    R, t = choice.R[first], choice.t[first]
+    fit = views.fit([Motion(R, t)])
+    gain = np.clip(fit.penalised()[:, 0] - choice.error, 0.0, CLIP) * views.weight.mean(axis=1)
+    moves = choice.label != main
+    region = connected_pieces(moves, seg)
+    count, total = (np.bincount(region[moves], v, minlength=1) for v in (None, gain[moves]))
+    left = moves & ((total < LEAST_GAIN_PX * count)[region])
+    at = np.flatnonzero(left)
+    kept = choice.taking(at, R, t, fit.pick((at, np.zeros(len(at), int))), main)
+    return kept, left & (gain > 3 * noise)
 
 
 def main_motion(label: Int) -> int:

@@ -16,10 +16,10 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import sample_pixels
 from soup_nlp.start.bending import (
     affine_flow,
-    at_rest,
     constant_depth,
     flow_jump,
     surfaces,
+    turn_alone,
 )
 from soup_nlp.start.choice import LEAST_NOISE, Choice, limited_noise, rigid_choice
 from soup_nlp.start.components import (
@@ -32,16 +32,17 @@ from soup_nlp.start.components import (
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import above_ground, floating, ground
 from soup_nlp.start.homographies import unorganised
-from soup_nlp.start.merge import gather
-from soup_nlp.start.regions import LEAST_REGION, bending_regions
+from soup_nlp.start.merge import earned, gather
+from soup_nlp.start.regions import bending_regions
+from soup_nlp.start.settle import settle
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
 
 __all__ = ["SeededStart", "Start", "propose"]
 
 
-LITTLE_PARALLAX = 0.5
-"""Share of `at_rest` from which a scene that bends has no rigid rest with a depth of its own."""
+SURE = 0.5
+"""Mean confidence from which the flow of a superpixel counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +66,8 @@ class Start:
             components that start at a constant depth, each superpixel with a motion of its own. If
             the rest is small or has no parallax, or the camera is at rest, it is the whole image
             and one component.
+        wrong: (N,) True where no motion that earned itself explains the flow, which then counts as
+            wrong.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
         noise: Noise of the flow, pixels, see `limited_noise`.
     """
@@ -80,6 +83,7 @@ class Start:
     tie: Int
     grounded: Mask
     bends: Mask
+    wrong: Mask
     at_rest: bool = False
     noise: float = LEAST_NOISE
 
@@ -119,24 +123,36 @@ def propose(
         return _of_homographies(views, seg, o)
     affine, residual = affine_flow(views)
     jump = flow_jump(affine, views, seg.pairs, rays(K_ref, seg.boundary))
-    choice, motions, noise = rigid_choice(views, seg, jump, o)
-    surface = surfaces(jump, seg, o.discontinuity_px)
-    bends = bending_regions(views, seg, surface, jump, residual, choice, o)
-    turns = [m.R for m in motions]
-    still, turn = at_rest(views, turns)
-    rests = still > o.at_rest
-    if rests or (bends.any() and _nothing_else(views, bends, turns, still, o)):
-        noise = limited_noise(residual)
-        return _constant(views, surface, motions, noise, turn if rests else None)
+    surface, usable = surfaces(jump, seg, o.discontinuity_px), views.weight.mean(axis=1) > SURE
+    choice, noise = rigid_motions(views, seg, jump, o)
+    component = rigid_components(choice.label, seg)
+    bends = bending_regions(
+        seg,
+        surface,
+        jump,
+        residual,
+        choice.fit.cost[:, 0],
+        component,
+        usable,
+        price=o.bending_price,
+        discontinuity_px=o.discontinuity_px,
+    )
+    turn = turn_alone(views, choice, component, usable)
+    if turn is not None or bends.all():
+        return _constant(views, surface, choice, limited_noise(residual), turn)
     free = constant_depth(views) if bends.any() else None
     if free is not None:
         # the flow of bending regions says nothing about the motions of the rest
         views, poor = views.without(bends), poor | bends
-        choice, motions, noise = rigid_choice(views, seg, jump, o)
+        choice, noise = rigid_motions(views, seg, jump, o)
     else:
         surface = connected_labels(jump < o.discontinuity_px, seg)
-    choice, motions = gather(views, seg, jump, choice, noise, o).renumbered()
-    soup, weak = _with_depth(choice, views, poor, seg, o)
+    choice, wrong = earned(views, choice, seg, noise)
+    centre = np.concatenate([affine[:, 0] / views.focal, np.ones((len(seg), 1))], axis=1)
+    weight = np.where(usable & ~bends, 1.0, 0.0)
+    choice = settle(views, choice, centre, weight, limited_noise(residual), o.piece_size)
+    choice, motions = choice.renumbered()
+    soup, weak = _with_depth(choice, views, poor | wrong, seg, o)
     label, parallax = choice.label, choice.parallax
     component, error = rigid_components(label, seg), choice.fit.cost[:, 0]
     if free is not None:
@@ -154,7 +170,15 @@ def propose(
         grounded = weak & (floor > 0)
     soup = soup.normalised()
     found = soup, error, parallax, weak, label, component, motions, surface, tie, grounded, bends
-    return Start(*found, noise=limited_noise(error[~bends]))
+    return Start(*found, wrong & ~bends, noise=limited_noise(error[~bends]))
+
+
+def rigid_motions(
+    views: Views, seg: Segmentation, jump: Float, o: SeededStart
+) -> tuple[Choice, float]:
+    """One of few rigid motions for every superpixel, and the noise of the flow, pixels."""
+    choice, _, noise = rigid_choice(views, seg, jump, o)
+    return gather(views, seg, jump, choice, noise, o).renumbered()[0], noise
 
 
 def _with_depth(
@@ -186,33 +210,15 @@ def _with_depth(
     return _soup(mu, slope, choice.R, t, views.anchor, views.radius), weak
 
 
-def _nothing_else(
-    views: Views, bends: Mask, turns: list[Float], still: float, o: SeededStart
-) -> bool:
-    """Whether the superpixels that do not bend are too few, or have too little parallax, for depth.
-
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        bends: (N,) True where a region bends.
-        turns: (3, 3) rotations to try, see `at_rest`.
-        still: Share of the usable pixels without parallax.
-        o: Share of them at which the camera is taken to be at rest.
-    """
-    rest = np.flatnonzero(~bends)
-    if len(rest) < LEAST_REGION * len(bends):
-        return True
-    return max(still, at_rest(views.some(rest), turns)[0]) > LITTLE_PARALLAX * o.at_rest
-
-
 def _constant(
-    views: Views, surface: Int, motions: list[Motion], noise: float, turn: Float | None
+    views: Views, surface: Int, choice: Choice, noise: float, turn: Float | None
 ) -> Start:
     """Start without relief, where everything bends or the camera is at rest (`turn` is given)."""
     soup, error = constant_depth(views, turn)
     zero, every = np.zeros(len(surface), np.int64), np.ones(len(surface), bool)
     own = soup, error, _parallax(soup, views), every, zero - 1, zero
-    found = *own, motions, surface, zero, ~every, every
-    return Start(*found, at_rest=turn is not None, noise=noise)
+    found = *own, choice.renumbered()[1], surface, zero, ~every, every
+    return Start(*found, ~every, at_rest=turn is not None, noise=noise)
 
 
 def _with_bending(component: Int, bends: Mask, seg: Segmentation) -> Int:
@@ -234,7 +240,7 @@ def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
     noise = limited_noise(error)
     none = np.zeros(len(seg), bool)
     own = soup, error, parallax, borrowed, whole - 1, whole
-    return Start(*own, [], whole, whole, none, none, noise=noise)
+    return Start(*own, [], whole, whole, none, none, none, noise=noise)
 
 
 def _on_ground(

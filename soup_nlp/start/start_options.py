@@ -34,12 +34,9 @@ class StartOptions(Section):
     """Largest number of unexplained pieces that get candidate motions in a round."""
     piece_size: Whole = 4
     """Least number of superpixels of a piece."""
-    bending_price: NonNegative = 1.0
-    """Price of a motion of its own for every superpixel of a region that bends, in units of the
-    flow's noise (`start.regions`); at 4, the limit of what it can gain, nothing bends."""
-    at_rest: NonNegative = 0.6
-    """The camera is taken to be at rest, or to rotate only, if more than this share of the usable
-    pixels has no parallax; depth then starts constant, as for bending surfaces; 1 for never."""
+    bending_price: NonNegative = 2.75
+    """Price of a motion of its own for every superpixel of a region that bends, in nats
+    (`start.regions`); at 100 nothing bends."""
     discontinuity_px: NonNegative = 1.0
     """Jump of the flow between two neighbours at which a surface ends, pixels."""
     upright: bool = True

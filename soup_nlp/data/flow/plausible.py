@@ -68,8 +68,9 @@ def check_flow(flow: Flow, pair: Pair) -> None:
     for name, changed in _changes(uv, pair).items():
         new = differences(changed)
         # pixels that leave the image along one flow only say nothing
-        both = [(mean(new, old), max(mean(old, new), 1e-6)) for old in (along, without)]
-        relative = max((a / b for a, b in both if a < np.inf), default=np.inf)
+        both = [(mean(new, old), mean(old, new)) for old in (along, without)]
+        # images without contrast agree with every flow
+        relative = max((a / b if b > WORSE else 1.0 for a, b in both if a < np.inf), default=np.inf)
         if relative < least:
             cause, least = name, relative
     if cause:

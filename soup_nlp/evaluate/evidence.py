@@ -1,0 +1,183 @@
+"""What two views say of depth: parallax beyond any rotation, relief, what motion leaves open.
+
+See docs/confidence.md. Curvature at the answer is conditional on the motions of the components. A
+small turn and a small translation move an image almost alike, so that a flow with a small
+systematic error determines the depth of a component only where neither a turn alone nor a constant
+depth explains it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.geometry import rotation
+from soup_nlp.geometry.camera import project
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.start.settle import RELIEF
+
+LEAST_GAP_PX, LEAST_GAP = 0.5, 3.0
+"""Error, in pixels and in units of the flow's noise, by which depth must explain the flow of a
+component better than a turn alone or a constant depth does; below either depth is a guess."""
+OPEN = 0.5
+"""Systematic error of the flow that leaves motions open, in units of its noise."""
+CLIP_PX = 3.0
+"""Limit of a superpixel's error where explanations are compared, pixels."""
+FEWEST = 3
+"""Least number of superpixels with flow of a component whose depth can be known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the flow says of the depth of C components; errors are in pixels.
+
+    Attributes:
+        turn: (C,) mean error of the best rotation alone, the focal length free.
+        constant: (C,) mean error of the best rigid motion of a component at a constant depth.
+        solution: (C,) mean error of the answer.
+        noise: Noise of the flow, pixels.
+        sigma: (N,) standard deviation of log depth by the systematic error of the flow.
+    """
+
+    turn: Float
+    constant: Float
+    solution: Float
+    noise: float
+    sigma: Float
+
+    @property
+    def gap(self) -> Float:
+        """(C,) pixels by which depth explains the flow better than no or constant depth."""
+        return np.minimum(self.turn, self.constant) - self.solution
+
+    @property
+    def guess(self) -> Mask:
+        """(C,) True where the depth of a component is a guess."""
+        return ~(self.gap >= max(LEAST_GAP_PX, LEAST_GAP * self.noise))
+
+    def rows(self) -> list[dict[str, float | bool | None]]:
+        """A row for every component: errors in pixels, the gap in units of the noise, whether its
+        depth is a guess; None where no flow is known."""
+        names = ("turn", "constant", "solution", "gap")
+        return [
+            {
+                **{f"{k}_px": _known(getattr(self, k)[c]) for k in names},
+                "gap_in_noise": _known(self.gap[c] / self.noise),
+                "guess": bool(self.guess[c]),
+            }
+            for c in range(len(self.turn))
+        ]
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def evidence(soup: Soup, data: EnergyData, component: Int, noise: float) -> Evidence:
+    """What the flow says of the depth of every component.
+
+    Args:
+        soup: The answer.
+        data: Sampled pixels with their flow.
+        component: (N,) rigid component of every superpixel.
+        noise: Noise of the flow, pixels.
+    """
+    seen = data.pixel_weight.sum(axis=1) > 0.25
+    moved = soup.moved(soup.points(data.pixel_ray))
+    own = _error(project(data.K_next, moved), data)
+    count = int(component.max()) + 1
+    errors = np.full((3, count), np.nan)
+    sigma = np.full(len(soup), np.inf)
+    for c in range(count):
+        at = np.flatnonzero((component == c) & seen)
+        if len(at) < FEWEST:
+            continue
+        errors[:, c] = *_without_depth(data, at), _mean(own[at])
+        every = np.flatnonzero(component == c)
+        sigma[every] = _open_motion(soup, data, every, seen[every], OPEN * noise)
+    return Evidence(errors[0], errors[1], errors[2], noise, sigma)
+
+
+def _error(pixel: Float, data: EnergyData, at: Int | slice = slice(None)) -> Float:
+    """(N,) mean distance of pixels (N, S, 2) from the flow's targets, limited."""
+    distance = np.linalg.norm(pixel - data.pixel_target[at], axis=2)
+    distance = np.where(np.isfinite(distance), np.minimum(distance, CLIP_PX), CLIP_PX)
+    weight = data.pixel_weight[at]
+    return np.asarray(np.sum(weight * distance, axis=1) / np.maximum(weight.sum(axis=1), 1e-9))
+
+
+def _mean(error: Float) -> float:
+    """Mean error without the tenth with the largest: what a component took along by mistake."""
+    return float(np.mean(np.sort(error)[: max(1, int(np.ceil(0.9 * len(error))))]))
+
+
+def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float, float]:
+    """Errors of superpixels `at` under the best turn alone and the best motion at equal depths."""
+    step = max(1, data.pixel_ray[at].shape[0] * data.pixel_ray.shape[1] // pixels)
+    ray = data.pixel_ray[at].reshape(-1, 3)[::step]
+    target = data.pixel_target[at].reshape(-1, 2)[::step]
+    root = np.sqrt(data.pixel_weight[at].ravel()[::step] * data.pixel_ray.shape[1])[:, None]
+
+    def turned(x: Float, ray: Float) -> Float:
+        longer = np.array([1.0, 1.0, np.exp(x[3])])
+        return (ray / longer) @ rotation.exp(x[:3]).T * longer
+
+    def shifted(x: Float, ray: Float) -> Float:
+        return ray @ rotation.exp(x[:3]).T + x[3:]
+
+    out = []
+    for model, size in ((turned, 4), (shifted, 6)):
+        x = np.zeros(size)
+        for scale in (10.0, 3.0, 1.0, 0.3):
+            x = least_squares(
+                lambda x, model=model: (
+                    root * np.nan_to_num(project(data.K_next, model(x, ray)) - target, nan=1e3)
+                ).ravel(),
+                x,
+                loss="cauchy",
+                f_scale=scale,
+                max_nfev=30,
+            ).x
+        out.append(_mean(_error(project(data.K_next, model(x, data.pixel_ray[at])), data, at)))
+    return out[0], out[1]
+
+
+def _open_motion(soup: Soup, data: EnergyData, at: Int, seen: Mask, error: float) -> Float:
+    """(K,) standard deviation of log depth by the motion that a systematic error leaves open.
+
+    A change of the component's motion moves a superpixel along its epipolar line, which its depth
+    follows, and across it, which the flow contradicts. The information on the motion is that of
+    one measurement with the error of the flow, and of relief with the deviation `RELIEF`.
+
+    Args:
+        soup: The answer.
+        data: Anchors.
+        at: (K,) superpixels of the component.
+        seen: (K,) True where their flow is known.
+        error: Systematic error of the flow, pixels.
+    """
+    ray, focal = data.anchor_ray[at], np.diag(data.K_next)[:2]
+    z = soup.depth_at(data.anchor_ray)[at]
+    turned = np.einsum("nij,nj->ni", soup.R[at], z[:, None] * ray)
+    X = turned + soup.translation[at]
+    depth = np.maximum(X[:, 2], 1e-9)
+    slope = np.zeros((len(at), 2, 3))
+    slope[:, 0, 0], slope[:, 1, 1] = focal[0] / depth, focal[1] / depth
+    slope[:, :, 2] = -focal * X[:, :2] / depth[:, None] ** 2
+    length = max(float(np.median(np.linalg.norm(soup.translation[at], axis=1))), 1e-12)
+    J = np.concatenate([-slope @ rotation.hat(X), slope * length], axis=2)
+    along = np.einsum("nij,nj->ni", slope, turned)
+    # what a log depth moves, at least what a relief of one deviation needs to be seen
+    squared = np.sum(along**2, axis=1) + (error / RELIEF) ** 2
+    follow = -np.einsum("ni,nij->nj", along, J) / squared[:, None]
+    across = J + along[:, :, None] * follow[:, None]
+    follow = follow - follow[seen].mean(axis=0)
+    information = np.mean(across[seen].transpose(0, 2, 1) @ across[seen], axis=0) / error**2
+    information += np.mean(follow[seen][:, :, None] * follow[seen][:, None], axis=0) / RELIEF**2
+    covariance = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
+    motion = np.einsum("ni,ij,nj->n", follow, covariance, follow)
+    return np.sqrt(np.maximum(motion, 0.0) + error**2 / squared)

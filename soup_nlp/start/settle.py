@@ -1,0 +1,106 @@
+"""Motions of rigid components where the flow leaves them open: with the least relief.
+
+A small turn and a small translation move an image almost alike (the bas-relief ambiguity). Motions
+whose residuals differ by less than the systematic error of the flow explain it equally well, and
+their depths range from a flat scene to one that recedes to infinity. Among them the one whose log
+depths vary as scenes do is the most probable.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from soup_nlp.arrays import Float
+from soup_nlp.geometry import rotation
+from soup_nlp.start.choice import Choice
+from soup_nlp.start.epipolar import Motion, sampson, triangulate
+from soup_nlp.start.views import Views
+
+SYSTEMATIC, MOST_SYSTEMATIC_PX = 1.5, 0.15
+"""Error of the flow that is alike over large parts of the image, in units of its noise, and its
+limit in pixels: more noise than that averages out."""
+RELIEF = 0.5
+"""Standard deviation of log depth within a scene."""
+MOST_RELIEF = 3.0
+"""Limit of a log depth relative to the median: points at infinity or behind the camera."""
+EXACT_PX = 0.005
+"""Median error of rigid motions below which the flow is exact and leaves no motion open, pixels."""
+CLIP_PX = 0.3
+"""Scale of the Cauchy loss of epipolar distances, pixels."""
+
+
+def settle(
+    views: Views, choice: Choice, centre: Float, usable: Float, noise: float, fewest: int
+) -> Choice:
+    """The choice with the most probable motion of every rigid component.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        choice: Motion and plane of every superpixel.
+        centre: (N, 3) rays of the next frame to which the anchors move, by affine flow.
+        usable: (N,) weight of every superpixel; 0 where the flow is not known.
+        noise: Noise of the flow, pixels.
+        fewest: Least number of superpixels of a component.
+    """
+    if not usable.any() or np.median(choice.error[usable > 0]) < EXACT_PX:
+        return choice
+    for c in np.unique(choice.label[choice.label >= 0]):
+        at = np.flatnonzero(choice.label == c)
+        seen = at[usable[at] > 0]
+        if len(seen) < max(fewest, 4):
+            continue
+        motion = Motion(choice.R[at[0]], choice.t[at[0]])
+        own = views.anchor[seen], centre[seen], usable[seen], views.focal[0]
+        found = most_probable(motion, *own, min(SYSTEMATIC * noise, MOST_SYSTEMATIC_PX))
+        fit = views.some(at).fit([found])
+        choice = choice.taking(at, found.R, found.t, fit, int(c))
+    return choice
+
+
+def most_probable(
+    motion: Motion, r: Float, q: Float, weight: Float, focal: float, error: float
+) -> Motion:
+    """The motion that minimises the mean squared epipolar distance and the relief.
+
+    `mean rho(e, CLIP_PX) / error^2 + mean rho(log(z / median z), RELIEF) / RELIEF^2`, with e the
+    Sampson distance and rho(x, c) = c^2 log(1 + x^2 / c^2) the Cauchy loss.
+
+    Args:
+        motion: Where to begin.
+        r: (M, 3) reference rays.
+        q: (M, 3) next rays.
+        weight: (M,) confidence.
+        focal: Pixels per ray unit.
+        error: Systematic error of the flow, pixels.
+    """
+    basis = np.linalg.svd(motion.t[None])[2][1:]
+    root = np.sqrt(weight / weight.sum())
+
+    def unpack(x: Float) -> Motion:
+        t = motion.t + x[3:] @ basis
+        return Motion(rotation.exp(x[:3]) @ motion.R, t / np.linalg.norm(t))
+
+    def residual(x: Float) -> Float:
+        own = unpack(x)
+        distance = cauchy(sampson(own.essential(), r, q, focal), CLIP_PX)
+        depth = cauchy(relief(own, r, q), RELIEF)
+        return np.concatenate([root * distance / error, root * depth / RELIEF])
+
+    x = least_squares(residual, np.zeros(5), x_scale=[0.01] * 3 + [0.1] * 2, max_nfev=30).x
+    return unpack(x)
+
+
+def cauchy(x: Float, scale: float) -> Float:
+    """x (M,) whose squares are its Cauchy losses."""
+    return scale * np.sqrt(np.log1p((x / scale) ** 2))
+
+
+def relief(motion: Motion, r: Float, q: Float) -> Float:
+    """(M,) log depth of correspondences under a motion, relative to their median, limited."""
+    z, _ = triangulate(motion, r, q)
+    inverse = 1 / np.where(np.abs(z) < 1e-12, 1e-12, z)
+    middle = np.median(inverse)
+    if middle <= 0:
+        return np.full(len(r), MOST_RELIEF)
+    return -np.log(np.clip(inverse / middle, np.exp(-MOST_RELIEF), np.exp(MOST_RELIEF)))

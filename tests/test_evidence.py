@@ -1,0 +1,102 @@
+"""What two views say of depth: residuals of a turn, of a constant depth, and of the answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soup_nlp.evaluate.evidence import LEAST_GAP_PX, evidence
+from soup_nlp.geometry import rotation
+from soup_nlp.geometry.camera import project
+from soup_nlp.geometry.soup import Soup
+
+NOISE = 0.05
+
+
+def scene(case, depth: float, t: tuple[float, float, float], turn: float = 0.02):
+    """A soup of planes that face the camera, and the data with exactly its flow.
+
+    `depth` is the standard deviation of log depth.
+    """
+    n = len(case.data)
+    lam = np.exp(depth * np.random.default_rng(0).standard_normal(n))
+    R = rotation.exp(np.array([0.3 * turn, turn, 0.1 * turn]))
+    soup = Soup(
+        lam,
+        np.tile([0.0, 0.0, -1.0], (n, 1)),
+        np.ones(n),
+        np.tile(R, (n, 1, 1)),
+        np.array(t) / lam[:, None],
+    )
+    target = project(case.data.K_next, soup.moved(soup.points(case.data.pixel_ray)))
+    weight = np.full_like(case.data.pixel_weight, 1 / case.data.pixel_weight.shape[1])
+    return soup, replace(case.data, pixel_target=target, pixel_weight=weight)
+
+
+def of(case, *args, **more):
+    soup, data = scene(case, *args, **more)
+    return evidence(soup, data, np.zeros(len(soup), np.int64), NOISE)
+
+
+def test_parallax_of_a_scene_with_relief_is_evidence(small_room):
+    found = of(small_room, 0.4, (0.3, 0.0, 0.1))
+    assert found.solution[0] < 1e-9
+    assert found.gap[0] > LEAST_GAP_PX
+    assert not found.guess[0]
+    assert np.median(found.sigma) < 0.1
+
+
+@pytest.mark.parametrize(("depth", "t"), [(0.4, (0.0, 0.0, 0.0)), (0.0, (0.3, 0.0, 0.1))])
+def test_a_turn_and_a_constant_depth_are_no_evidence(small_room, depth, t):
+    found = of(small_room, depth, t)
+    assert found.gap[0] < 0.02
+    assert found.guess[0]
+
+
+def test_a_turn_is_no_evidence_with_a_wrong_focal_length(small_room):
+    soup, data = scene(small_room, 0.4, (0.0, 0.0, 0.0), turn=0.05)
+    K = data.K_next.copy()
+    K[:2, :2] *= 1.3
+    ray = data.pixel_ray / np.array([1.3, 1.3, 1.0])
+    found = evidence(
+        soup, replace(data, K_next=K, pixel_ray=ray), np.zeros(len(soup), np.int64), NOISE
+    )
+    assert found.turn[0] < 0.02
+    assert found.guess[0]
+
+
+def test_less_parallax_leaves_more_open(small_room):
+    near, far = (np.median(of(small_room, 0.3, (x, 0.0, 0.0)).sigma) for x in (0.3, 0.06))
+    assert far > 3 * near
+
+
+def test_what_motion_leaves_open_is_that_of_refitted_motions(small_room):
+    """The linear prediction agrees with depths that follow a changed motion."""
+    soup, data = scene(small_room, 0.3, (0.3, 0.0, 0.1))
+    found = evidence(soup, data, np.zeros(len(soup), np.int64), NOISE)
+    # a turn about y by so much that the flow changes by the systematic error at most
+    error = 0.5 * NOISE
+    w = np.array([0.0, error / data.K_next[0, 0], 0.0])
+    X = np.einsum("nij,nj->ni", rotation.exp(w) @ soup.R, data.anchor_ray)
+    q = project(data.K_next, soup.moved(soup.points(data.anchor_ray)))
+    r = (q - data.K_next[:2, 2]) / np.diag(data.K_next)[:2]
+    t = soup.translation
+    a = X[:, :2] - r * X[:, 2:]
+    b = t[:, :2] - r * t[:, 2:]
+    z = -np.sum(a * b, axis=1) / np.sum(a * a, axis=1)
+    change = np.log(z / soup.depth_at(data.anchor_ray))
+    change -= change.mean()
+    # this change is one of those that the error leaves open
+    assert np.sqrt(np.mean(change**2)) < 3 * np.sqrt(np.mean(found.sigma**2))
+
+
+def test_a_component_without_flow_is_a_guess(small_room):
+    soup, data = scene(small_room, 0.4, (0.3, 0.0, 0.1))
+    component = (np.arange(len(soup)) >= len(soup) - 5).astype(np.int64)
+    weight = np.where(component[:, None] == 1, 0.0, data.pixel_weight)
+    found = evidence(soup, replace(data, pixel_weight=weight), component, NOISE)
+    assert found.guess.tolist() == [False, True]
+    assert found.rows()[1]["turn_px"] is None
+    assert np.isinf(found.sigma[component == 1]).all()
