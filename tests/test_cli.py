@@ -322,7 +322,8 @@ def test_frames_that_are_no_pair_are_refused(words, part, capsys):
         ({"mre": 0.3}, 1, "above the expected 0.2"),
     ],
 )
-def test_the_exit_code_has_a_reason(changes, code, part):
+def test_the_exit_code_has_a_reason(changes, code, part, monkeypatch):
+    monkeypatch.setattr("soup_nlp.cli.solve.certainty", lambda run: {"weak": 0.51})
     own = {"status": "Solve_Succeeded", "solved": True, "guessed": 0.1, "mre": 0.1} | changes
     expected = SimpleNamespace(mre_at_most=0.2)
     fake = SimpleNamespace(

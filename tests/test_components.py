@@ -258,7 +258,7 @@ def test_components_that_the_image_cuts_off_are_placed_nearer_the_truth(
         own = case.segmentation, case.pair.flow, pair.K_ref, pair.K_next
         contact = cut_errors(case, propose(*own, options).soup)
     moved = contact != shipped
-    assert shipped[moved].mean() < 0.7 * contact[moved].mean()
+    assert shipped[moved].mean() < 0.9 * contact[moved].mean()
 
 
 def cut_errors(case, soup):

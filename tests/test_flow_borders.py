@@ -111,4 +111,4 @@ def test_a_problem_has_fewer_mixed_superpixels_with_it_than_without():
             np.testing.assert_array_equal(
                 case.segmentation.labels, segment(case.pair.image_ref, 300)
             )
-    assert share[1.0] < 0.25 * share[None]
+    assert share[1.0] < 0.5 * share[None]

@@ -178,6 +178,9 @@ def _open_motion(soup: Soup, data: EnergyData, at: Int, seen: Mask, error: float
     follow = follow - follow[seen].mean(axis=0)
     information = np.mean(across[seen].transpose(0, 2, 1) @ across[seen], axis=0) / error**2
     information += np.mean(follow[seen][:, :, None] * follow[seen][:, None], axis=0) / RELIEF**2
+    if not np.isfinite(information).all():
+        # numbers that no answer has, as a foreign solver may return
+        return np.full(len(at), np.inf)
     covariance = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
     motion = np.einsum("ni,ij,nj->n", follow, covariance, follow)
     return np.sqrt(np.maximum(motion, 0.0) + error**2 / squared)
