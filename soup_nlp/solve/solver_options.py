@@ -14,41 +14,43 @@ class SolverOptions(Section):
 
     The presolve is a descent in tangent coordinates (`solve.descent`). Its reweighted phases narrow
     the smoothing until the energy stagnates: their quadratic model lies above every norm, so that
-    full steps descend. Its last phase uses the exact Hessian and converges quadratically. Ipopt
-    then solves the constrained NLP from this point and its multipliers.
+    full steps descend. Its last phase uses the exact Hessian and converges quadratically. Without
+    the presolve, Ipopt takes these steps (`solve.continuation`), with Gauss-Newton stages between
+    the two. Ipopt then solves the constrained NLP from this point and its multipliers.
     """
 
     presolve: bool = True
-    """Run the tangent presolve. Without it Ipopt alone solves the problem, see `continuation`."""
+    """A Newton method of this package takes the steps of all stages but the last; if false, Ipopt
+    does."""
     continuation: bool = True
-    """Without the presolve: Ipopt first narrows the smoothing as in `presolve_eps`, in the
-    coordinates of the presolve, with the majorant and then the exact Hessian. If false, it solves
-    the constrained NLP at the final smoothing at once."""
+    """If false, and without `presolve`, Ipopt solves the constrained NLP at the final smoothing at
+    once."""
     presolve_eps: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)] = (
         0.3,
         0.03,
         0.01,
     )
-    """Smoothing widths of the reweighted phases, decreasing."""
+    """Smoothing widths of the stages with the majorant Hessian, decreasing."""
     presolve_iterations: Whole = 60
-    """Iteration limit of each reweighted phase."""
+    """Iteration limit of each of these stages and of the Gauss-Newton ones."""
     stagnation: NonNegative = 1e-3
-    """Relative change of f that ends a reweighted phase if it occurs twice in a row; for the last
-    phase a hundredth of it."""
+    """Relative change of f that ends a majorant stage if it occurs twice in a row; for Gauss-Newton
+    stages a tenth and a thousandth of it."""
     untruncated: bool = False
-    """The reweighted phases also run with a second strategy, which truncates E_arap only at its
+    """The majorant stages also run with a second strategy, which truncates E_arap only at its
     end, and the result with the lower energy is taken; always on where surfaces bend."""
     polish_iterations: Count = 100
-    """Iteration limit of the phase with the exact Hessian, at `eps`; 0 omits the phase."""
+    """Iteration limit of the stage with the exact Hessian, at `eps`; 0 omits it and those of
+    Gauss-Newton."""
     presolve_tol: Tolerance = 1e-7
-    """Dual infeasibility that ends the presolve."""
+    """Dual infeasibility that ends the stages before the constrained NLP."""
     eps: Tolerance = 0.01
     """Smoothing of the constrained NLP."""
     max_iter: Count = 30
     """Iteration limit of the constrained NLP; 0 omits Ipopt's continuation as well."""
     far_iterations: Count = 5
-    """Iteration limit of the constrained NLP if the presolve ended far from a minimum: Ipopt does
-    not find one from there either, and each of its iterations takes seconds."""
+    """Iteration limit of the constrained NLP if the stages before it ended far from a minimum:
+    Ipopt does not find one from there either, and each of its iterations takes seconds."""
     tol: Tolerance = 1e-6
     """Tolerance of the constrained NLP."""
     max_seconds: Tolerance = 600.0

@@ -21,7 +21,7 @@ from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import polish_chart
-from soup_nlp.solve.continuation import Continuation
+from soup_nlp.solve.continuation import EXACT, STOPPED, Continuation
 from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import UNMET, feasible, residuals
@@ -32,8 +32,6 @@ from soup_nlp.solve.warm import WARM, warm_start
 from soup_nlp.storage.progress import Watch
 
 _ENDS = ("start", "presolve", "constrained NLP")
-STOPPED = ("Interrupted", "Time_Limit")
-"""Statuses of a stage after which no further stage begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +144,9 @@ def _near(stage: Stage) -> bool:
 
 
 def _far(stages: Sequence[Stage]) -> bool:
-    """Whether the polish ended, by itself or at its limit, where Ipopt would find no minimum."""
+    """Whether the exact Hessian ended, by itself or at its limit, far from a minimum."""
     last = stages[-1] if stages else None
-    ended = last is not None and last.name == POLISH and last.status not in STOPPED
+    ended = last is not None and last.name in (POLISH, EXACT) and last.status not in STOPPED
     return ended and not _near(stages[-1])
 
 
