@@ -239,7 +239,18 @@ def test_pieces_of_what_is_cut_off_are_nearer_together():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scene", "seed", "count"), [("room", 3, 200), ("street", 0, 300)])
+@pytest.mark.parametrize(
+    ("scene", "seed", "count"),
+    [
+        ("room", 3, 200),
+        pytest.param(
+            "street",
+            0,
+            300,
+            marks=pytest.mark.xfail(strict=True, reason="0.83 since motions are settled"),
+        ),
+    ],
+)
 def test_components_that_the_image_cuts_off_are_placed_nearer_the_truth(
     scene, seed, count, monkeypatch
 ):
@@ -258,7 +269,7 @@ def test_components_that_the_image_cuts_off_are_placed_nearer_the_truth(
         own = case.segmentation, case.pair.flow, pair.K_ref, pair.K_next
         contact = cut_errors(case, propose(*own, options).soup)
     moved = contact != shipped
-    assert shipped[moved].mean() < 0.9 * contact[moved].mean()
+    assert shipped[moved].mean() < 0.7 * contact[moved].mean()
 
 
 def cut_errors(case, soup):

@@ -72,7 +72,20 @@ def test_a_pixel_without_backward_flow_affects_its_neighbourhood_alone():
     assert (confidence_of(gap, support=5) == 1).mean() > 0.98
 
 
-@pytest.mark.parametrize(("scene", "said"), [("still", True), ("orbit", False)])
+@pytest.mark.parametrize(
+    ("scene", "said"),
+    [
+        ("still", True),
+        ("orbit", False),
+        pytest.param(
+            "sheet",
+            False,
+            marks=pytest.mark.xfail(
+                strict=True, reason="60 superpixels are too few to see bending"
+            ),
+        ),
+    ],
+)
 def test_the_verdict_warns_where_depth_is_a_guess(scene, said, tmp_path):
     raw = {
         "input": {"kind": "scene", "scene": scene, "seed": 0, "width": 256, "height": 109},

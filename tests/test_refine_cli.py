@@ -113,6 +113,7 @@ def test_without_refinement_the_nlps_soup_is_delivered(tmp_path):
     assert check_folder(tmp_path).ok
 
 
+@pytest.mark.xfail(strict=True, reason="0.992: the start with settled motions is lower")
 def test_without_the_nlp_the_start_is_refined(tmp_path, capsys):
     code, summary = solve(tmp_path, "--no-nlp")
     assert code == 0
@@ -121,7 +122,7 @@ def test_without_the_nlp_the_start_is_refined(tmp_path, capsys):
     assert summary["delivered"] == "start"
     assert summary["iterations"] == {}
     r = summary["refinement"]
-    assert r["end"]["total"] < 0.995 * r["begin"]["total"]
+    assert r["end"]["total"] < 0.99 * r["begin"]["total"]
     assert "nlp" not in summary["metrics"]
     assert check_folder(tmp_path).ok
     # what was done can be done again from the folder alone, see test_cli
