@@ -113,7 +113,6 @@ def test_without_refinement_the_nlps_soup_is_delivered(tmp_path):
     assert check_folder(tmp_path).ok
 
 
-@pytest.mark.xfail(strict=True, reason="0.992: the start with settled motions is lower")
 def test_without_the_nlp_the_start_is_refined(tmp_path, capsys):
     code, summary = solve(tmp_path, "--no-nlp")
     assert code == 0
@@ -122,13 +121,19 @@ def test_without_the_nlp_the_start_is_refined(tmp_path, capsys):
     assert summary["delivered"] == "start"
     assert summary["iterations"] == {}
     r = summary["refinement"]
-    assert r["end"]["total"] < 0.99 * r["begin"]["total"]
+    assert r["end"]["total"] < r["begin"]["total"]
     assert "nlp" not in summary["metrics"]
     assert check_folder(tmp_path).ok
     # what was done can be done again from the folder alone, see test_cli
     again = load_problem(tmp_path / "config.yaml")
     assert again.digest() == summary["problem_hash"]
     assert again.refine.from_start
+
+
+@pytest.mark.xfail(strict=True, reason="0.992: the start with settled motions is lower")
+def test_the_refinement_lowers_the_start_by_a_hundredth(tmp_path):
+    r = solve(tmp_path, "--no-nlp")[1]["refinement"]
+    assert r["end"]["total"] < 0.99 * r["begin"]["total"]
 
 
 def test_both_halves_cannot_be_left_out(tmp_path, capsys):
