@@ -8,16 +8,17 @@ depth explains it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.start.bending import fit_robustly, turned
 from soup_nlp.start.settle import RELIEF
 
 LEAST_GAP_PX, LEAST_GAP = 0.5, 3.0
@@ -122,28 +123,17 @@ def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float
     target = data.pixel_target[at].reshape(-1, 2)[::step]
     root = np.sqrt(data.pixel_weight[at].ravel()[::step] * data.pixel_ray.shape[1])[:, None]
 
-    def turned(x: Float, ray: Float) -> Float:
-        longer = np.array([1.0, 1.0, np.exp(x[3])])
-        return (ray / longer) @ rotation.exp(x[:3]).T * longer
-
     def shifted(x: Float, ray: Float) -> Float:
         return ray @ rotation.exp(x[:3]).T + x[3:]
 
-    out = []
-    for model, size in ((turned, 4), (shifted, 6)):
-        x = np.zeros(size)
-        for scale in (10.0, 3.0, 1.0, 0.3):
-            x = least_squares(
-                lambda x, model=model: (
-                    root * np.nan_to_num(project(data.K_next, model(x, ray)) - target, nan=1e3)
-                ).ravel(),
-                x,
-                loss="cauchy",
-                f_scale=scale,
-                max_nfev=30,
-            ).x
-        out.append(_mean(_error(project(data.K_next, model(x, data.pixel_ray[at])), data, at)))
-    return out[0], out[1]
+    def error(model: Callable[[Float, Float], Float], size: int) -> float:
+        def miss(x: Float) -> Float:
+            return root * np.nan_to_num(project(data.K_next, model(x, ray)) - target, nan=1e3)
+
+        moved = model(fit_robustly(miss, size), data.pixel_ray[at])
+        return _mean(_error(project(data.K_next, moved), data, at))
+
+    return error(turned, 4), error(shifted, 6)
 
 
 def _open_motion(soup: Soup, data: EnergyData, at: Int, seen: Mask, error: float) -> Float:

@@ -7,6 +7,8 @@ into rigid pieces, each with its own parallax, the depths do not follow its shap
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -47,6 +49,20 @@ def turn_alone(views: Views, choice: Choice, component: Int, usable: Mask) -> Fl
     return None if gain.mean() > REST_PX else turn
 
 
+def turned(x: Float, ray: Float) -> Float:
+    """Rays (..., 3) turned by the rotation vector x[:3], with the focal length times exp(x[3])."""
+    longer = np.array([1.0, 1.0, np.exp(x[3])])
+    return (ray / longer) @ rotation.exp(x[:3]).T * longer
+
+
+def fit_robustly(miss: Callable[[Float], Float], size: int) -> Float:
+    """(size,) parameters with the least Cauchy loss of `miss`, pixels, from 0 and narrowing."""
+    x = np.zeros(size)
+    for scale in (10.0, 3.0, 1.0, 0.3):
+        x = least_squares(lambda x: miss(x).ravel(), x, loss="cauchy", f_scale=scale, max_nfev=30).x
+    return x
+
+
 def fit_turn(views: Views, count: int = 3000) -> tuple[Float, Float]:
     """Rotation that explains a flow best, the focal length free, and (N,) its mean error, pixels.
 
@@ -60,20 +76,10 @@ def fit_turn(views: Views, count: int = 3000) -> tuple[Float, Float]:
     root = np.sqrt(views.weight.ravel()[::step])[:, None]
 
     def miss(x: Float, ray: Float, target: Float) -> Float:
-        longer = np.array([1.0, 1.0, np.exp(x[3])])
-        turned = (ray / longer) @ rotation.exp(x[:3]).T * longer
-        return (turned[..., :2] / turned[..., 2:] - target[..., :2]) * focal
+        moved = turned(x, ray)
+        return (moved[..., :2] / moved[..., 2:] - target[..., :2]) * focal
 
-    x = np.zeros(4)
-    for scale in (10.0, 3.0, 1.0, 0.3):
-        x = least_squares(
-            lambda x: (root * miss(x, ray, target)).ravel(),
-            x,
-            loss="cauchy",
-            f_scale=scale,
-            max_nfev=30,
-            bounds=([-1, -1, -1, -1.5], [1, 1, 1, 1.5]),
-        ).x
+    x = fit_robustly(lambda x: root * miss(x, ray, target), 4)
     error = np.linalg.norm(miss(x, views.ray, views.target), axis=2)
     total = np.maximum(views.weight.sum(axis=1), 1e-9)
     return rotation.exp(x[:3]), np.sum(views.weight * error, axis=1) / total

@@ -58,9 +58,8 @@ def gather(
 def earned(views: Views, choice: Choice, seg: Segmentation, noise: float) -> tuple[Choice, Mask]:
     """The choice without regions whose own motions explain too little.
 
-    A motion has six parameters. By the Bayesian information criterion they cost `PRICE` nats; the
-    gain of a superpixel is the part of its error that the main motion leaves, in units of the
-    flow's systematic error. A connected region that does not earn a motion takes the main one.
+    A connected region keeps its motions if the main one leaves a mean error of at least
+    `LEAST_GAIN_PX` more there; otherwise it takes the main one.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
