@@ -49,7 +49,7 @@ def whole(folder: Path) -> bool:
 
 @pytest.mark.parametrize("below", ["", "out"])
 def test_an_earlier_result_outlives_a_full_disk(below, small_disk):
-    """At the root of the file system, where folders cannot be exchanged, and below it."""
+    """At the root of the file system and below it."""
     target = small_disk / below
     for size, fits in ((300_000, True), (900_000, False), (400_000, True), (5_000_000, False)):
         before = (

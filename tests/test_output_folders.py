@@ -8,7 +8,6 @@ import signal
 import stat
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.storage import folders
 from soup_nlp.storage.folders import claim, recover, scratch, staged
 from soup_nlp.storage.mark import MARK, digest_of, files_in, made_files
-from soup_nlp.storage.system import deferred_signals, exchange
+from soup_nlp.storage.system import deferred_signals
 
 
 def write(folder: Path, whole: bool = True, **files: str) -> None:
@@ -27,19 +26,15 @@ def write(folder: Path, whole: bool = True, **files: str) -> None:
             (new / name).write_text(text)
 
 
+def content_names(folder: Path) -> set[str]:
+    return set(os.listdir(folder)) - {MARK}
+
+
 def content(folder: Path) -> dict[str, str]:
     return {p.name: p.read_text() for p in folder.iterdir() if p.name != MARK}
 
 
-@pytest.fixture(params=["exchanged", "moved"])
-def way(request, monkeypatch) -> str:
-    """Both ways of moving new files to their places."""
-    if request.param == "moved":
-        monkeypatch.setattr(folders, "exchange", lambda a, b: False)
-    return str(request.param)
-
-
-def test_a_new_result_replaces_the_old_one_whole(tmp_path, way):
+def test_a_new_result_replaces_the_old_one_whole(tmp_path):
     target = tmp_path / "out"
     write(target, a="1", b="1")
     write(target, a="2", c="2")
@@ -48,7 +43,7 @@ def test_a_new_result_replaces_the_old_one_whole(tmp_path, way):
     assert os.listdir(tmp_path) == ["out"]
 
 
-def test_files_of_the_user_stay(tmp_path, way):
+def test_files_of_the_user_stay(tmp_path):
     target = tmp_path / "out"
     write(target, a="1", b="1")
     (target / "mine").write_text("m")
@@ -62,14 +57,14 @@ def test_files_of_the_user_stay(tmp_path, way):
     assert content(target) == {"a": "2", "b": "changed by the user", "mine": "m"}
 
 
-def test_pages_of_several_commands_share_a_folder(tmp_path, way):
+def test_pages_of_several_commands_share_a_folder(tmp_path):
     for name in ("x", "y", "x"):
         write(tmp_path, False, **{f"{name}.md": name})
     assert content(tmp_path) == {"x.md": "x", "y.md": "y"}
     assert made_files(tmp_path).keys() == {"x.md", "y.md"}
 
 
-def test_a_failure_leaves_the_old_result(tmp_path, way):
+def test_a_failure_leaves_the_old_result(tmp_path):
     target = tmp_path / "out"
     write(target, a="1")
 
@@ -175,7 +170,7 @@ def test_a_symbolic_mark_is_not_followed(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["out", "victim"]
 
 
-def test_folders_in_a_result_are_replaced_file_by_file(tmp_path, way):
+def test_folders_in_a_result_are_replaced_file_by_file(tmp_path):
     target = tmp_path / "out"
 
     def colmap(text: str, *names: str) -> None:
@@ -210,21 +205,12 @@ def test_a_mark_owns_nothing_outside_its_folder(tmp_path):
     assert content(tmp_path / "out") == {"b": "2"}
 
 
-@pytest.mark.parametrize("text", ["x", "[]", '{"files": 3}', '{"files": {"a": {}}}', "\x00"])
+@pytest.mark.parametrize("text", ["", "x", "[]", '{"files": 3}', '{"files": {"a": {}}}', "\x00"])
 def test_a_broken_mark_owns_nothing(text, tmp_path):
     (tmp_path / MARK).write_text(text)
     (tmp_path / "a").write_text("precious")
     with pytest.raises(DataError, match="overwritten"):
         claim(tmp_path, ["a"])
-
-
-def test_an_empty_mark_is_of_an_early_version(tmp_path):
-    (tmp_path / MARK).touch()
-    for name in ("a", "notes"):
-        (tmp_path / name).write_text("1")
-    claim(tmp_path, ["a"])
-    write(tmp_path, a="2")
-    assert content(tmp_path) == {"a": "2", "notes": "1"}
 
 
 def test_a_link_to_a_folder_is_followed(tmp_path):
@@ -260,48 +246,47 @@ KILLED = """
 import os, signal, sys
 from soup_nlp.storage import folders
 from soup_nlp.storage.folders import staged
-if sys.argv[2] == "moved":
-    folders.exchange = lambda a, b: False
-own, left = os.replace, [int(sys.argv[3])]
-def replace(*args):
-    if not left[0]:
-        os.kill(os.getpid(), signal.SIGKILL)
-    left[0] -= 1
-    own(*args)
-os.replace = replace
+moves = int(sys.argv[2])
+def killing(function):
+    def wrapped(*args, **options):
+        global moves
+        if not moves:
+            os.kill(os.getpid(), signal.SIGKILL)
+        moves -= 1
+        function(*args, **options)
+    return wrapped
+os.replace = killing(os.replace)
+folders.shutil.rmtree = killing(folders.shutil.rmtree)
 with staged(sys.argv[1], True) as new:
     for name in "acd":
         (new / name).write_text("2")
-    if sys.argv[2] == "early":
-        os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def killed(target: Path, *args: str) -> None:
-    ended = subprocess.run([sys.executable, "-c", textwrap.dedent(KILLED), str(target), *args])
+def killed(target: Path, moves: int) -> None:
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(target), str(moves)])
     assert ended.returncode == -signal.SIGKILL
 
 
 def test_what_a_kill_leaves_is_removed_by_the_next_run(tmp_path):
     target = tmp_path / "out"
     write(target, a="1", b="1")
-    killed(target, "early", "9")
-    assert content(target) == {"a": "1", "b": "1"}
-    assert len(os.listdir(tmp_path)) == 2
-    # a folder that is in use is not removed
+    killed(target, 0)
+    assert len(os.listdir(target)) == 4
     with staged(target) as new:
+        assert content_names(target) == {"a", "b", new.name}
+        # a folder that is in use is not removed
         claim(target, ["a"])
         assert new.is_dir()
-    assert os.listdir(tmp_path) == ["out"]
     assert content(target) == {"a": "1", "b": "1"}
 
 
-@pytest.mark.parametrize("moves", [1, 2, 3])
+@pytest.mark.parametrize("moves", [1, 2, 3, 4, 5])
 def test_a_move_that_was_killed_is_finished(moves, tmp_path):
     target = tmp_path / "out"
     write(target, a="1", b="1")
-    # the mark of the new files is the first that is replaced
-    killed(target, "moved", str(moves))
+    # the mark of the new files is the first that is replaced, their empty folder the last
+    killed(target, moves)
     recover(target)
     assert content(target) == {"a": "2", "c": "2", "d": "2"}
     assert made_files(target).keys() == {"a", "c", "d"}
@@ -309,19 +294,11 @@ def test_a_move_that_was_killed_is_finished(moves, tmp_path):
     assert content(target) == {"a": "3"}
 
 
-def test_folders_are_exchanged_in_one_step(tmp_path):
-    for name in "ab":
-        (tmp_path / name).mkdir()
-        (tmp_path / name / name).touch()
-    if not exchange(tmp_path / "a", tmp_path / "b"):
-        pytest.skip("this file system cannot exchange folders")
-    assert os.listdir(tmp_path / "a") == ["b"]
-    assert not exchange(tmp_path / "a", tmp_path / "none")
-
-
 def test_scratch_folders_are_removed(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    left = tmp_path / f"soup_nlp-{os.getuid()}-killed"
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    left = tmp_path / f"soup_nlp-{os.getuid()}-{ended.pid}-x"
     left.mkdir()
     (left / "x").touch()
     with scratch() as first, scratch() as second:

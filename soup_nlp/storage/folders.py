@@ -1,43 +1,43 @@
 """Output folders: all files of a command appear at once, and no file of the user is overwritten.
 
-A command first claims the names that it will write (`claim`). Later it writes its files into a new
-folder beside the target, which replaces the target in one step (`staged`). `storage.mark` records
-which files the program made.
+A command first claims the names that it will write (`claim`). Later it writes its files into a
+hidden folder in the target (`staged`). One rename marks that folder as complete; its files are then
+renamed to their places, and a later call finishes what a kill interrupts (`recover`).
+`storage.mark` records which files the program made.
 """
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.atomic import PathLike
-from soup_nlp.storage.files import is_folder
 from soup_nlp.storage.mark import (
     MARK,
-    adopt,
     digest_of,
     files_in,
     is_foreign,
     made_files,
+    release,
     subject_of,
     write_mark,
 )
-from soup_nlp.storage.system import deferred_signals, exchange
+from soup_nlp.storage.system import deferred_signals, is_other_process
 
-_STAGE = ".soup_nlp-"
-"""Part of the names of temporary folders."""
+_STAGE = f"{MARK}-"
+"""First part of the names of temporary folders; the number of their process follows."""
 _COMMIT = f"{_STAGE}commit"
 """Folder of complete new files that are being moved to their places."""
 
-
 _made: list[Path] = []
 """Folders that `claim` has made in this process."""
+_open: set[Path] = set()
+"""Temporary folders that this process is filling."""
 
 
 def default_folder(name: str, subject: str) -> Path:
@@ -75,35 +75,25 @@ def claim(
         DataError: the folder cannot be written, holds a file of the user with one of the names, or
             is the result of another subject.
     """
-    try:
-        target = Path(folder).resolve()
+    with _named_errors(folder):
+        target = _resolved(folder)
         with deferred_signals():
             fresh = [p for p in (target, *target.parents) if not os.path.lexists(p)]
             target.mkdir(parents=True, exist_ok=True)
             _made.extend(reversed(fresh))
             recover(target)
-            _sweep(_left_behind(target))
-            stage, lock = _new_stage(target)
-            _drop(stage, lock)
-            if made_files(target) is None:
-                # an early version did not list its files
-                adopt(target, [n for n in names if (target / n).is_file()])
-        foreign = [name for name in names if is_foreign(target, name)]
-    except (OSError, RuntimeError, ValueError) as error:
-        raise _unwritable(folder, error) from error
-    before = subject_of(target)
-    if subject and before not in ("", subject) and not overwrite:
-        raise DataError(
-            "output folder holds the result of something else",
-            where=folder,
-            found=before,
-            expected=subject,
-            hint="choose another --out, or --overwrite",
-        )
-    if foreign and not overwrite:
-        raise _clash(folder, foreign)
-    if foreign:
-        adopt(target, foreign)
+            # fails where nothing can be written
+            _remove(_new_folder(target, _STAGE))
+        before = subject_of(target)
+        if subject and before not in ("", subject) and not overwrite:
+            raise DataError(
+                "output folder holds the result of something else",
+                where=folder,
+                found=before,
+                expected=subject,
+                hint="choose another --out, or --overwrite",
+            )
+        release(target, names, overwrite)
     return Path(folder)
 
 
@@ -113,9 +103,7 @@ def staged(
 ) -> Iterator[Path]:
     """An empty folder whose files are moved into `folder` when the block ends without exception.
 
-    On an exception `folder` does not change. If it holds only files of the program and the file
-    system can exchange two folders, the new files replace the old ones in one step. Otherwise they
-    are moved one after the other, and `recover` finishes what a killed process has begun.
+    On an exception `folder` does not change.
 
     Args:
         folder: The output folder.
@@ -126,28 +114,32 @@ def staged(
     Raises:
         DataError: a file cannot be written, or a file of the user has the name of a new one.
     """
-    try:
-        target = Path(folder).resolve()
+    with _named_errors(folder):
+        target = _resolved(folder)
         with deferred_signals():
             target.mkdir(parents=True, exist_ok=True)
             recover(target)
-            stage, lock = _new_stage(target)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise _unwritable(folder, error) from error
-    try:
-        yield stage
-        with deferred_signals():
-            _commit(stage, target, whole, overwrite, subject)
-    except DataError as error:
-        # name the final path instead of the temporary one
-        if not isinstance(error.where, Path) or not error.where.is_relative_to(stage):
-            raise
-        place = target / error.where.relative_to(stage)
-        raise DataError(error.what, where=place, found=error.found, hint=error.hint) from error
-    except OSError as error:
-        raise _unwritable(folder, error) from error
-    finally:
-        _drop(stage, lock)
+            stage = _new_folder(target, _STAGE)
+        try:
+            yield stage
+            with deferred_signals():
+                new = {name: digest_of(stage / name) for name in files_in(stage)}
+                release(target, new, overwrite)
+                old = {k: v for k, v in made_files(target).items() if not is_foreign(target, k)}
+                write_mark(stage, new if whole else old | new, subject or subject_of(target))
+                for name in old.keys() & new.keys():
+                    shutil.copymode(target / name, stage / name)
+                _sync(stage)
+                os.rename(stage, target / _COMMIT)
+                _move_in(target)
+        except DataError as error:
+            # name the final path instead of the temporary one
+            if not isinstance(error.where, Path) or not error.where.is_relative_to(stage):
+                raise
+            place = target / error.where.relative_to(stage)
+            raise DataError(error.what, where=place, found=error.found, hint=error.hint) from error
+        finally:
+            _remove(stage)
 
 
 @contextmanager
@@ -157,13 +149,11 @@ def scratch() -> Iterator[Path]:
     Raises:
         DataError: the folder cannot be made.
     """
-    root = Path(tempfile.gettempdir())
-    prefix = f"soup_nlp-{os.getuid()}-"
+    root, prefix = Path(tempfile.gettempdir()), f"soup_nlp-{os.getuid()}-"
     try:
         with deferred_signals():
-            _sweep(root.glob(f"{prefix}*"))
-            folder = Path(tempfile.mkdtemp(prefix=prefix, dir=root))
-            lock = _lock(folder)
+            _sweep(root, prefix)
+            folder = _new_folder(root, prefix)
     except OSError as error:
         raise DataError(
             "no temporary folder can be made", where=root, found=error.strerror, hint="set TMPDIR"
@@ -171,162 +161,55 @@ def scratch() -> Iterator[Path]:
     try:
         yield folder
     finally:
-        _drop(folder, lock)
+        _remove(folder)
 
 
 def recover(folder: Path) -> None:
-    """Finish moving new files into a folder, if a killed process has begun it."""
-    commit = folder / _COMMIT
-    if not is_folder(commit) or commit.is_symlink():
-        return
-    lock = os.open(commit, os.O_RDONLY)
-    try:
-        # another process may be moving the files
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if commit.is_dir():
-            _move_in(commit, folder)
-    finally:
-        os.close(lock)
+    """Finish moving new files into a folder and remove temporary folders, if a kill left them."""
+    _move_in(folder)
+    _sweep(folder, _STAGE)
 
 
-def _below(folder: Path, top: str) -> list[str]:
-    """Names of a file, or of all files below a folder, as seen from its parent."""
-    path = folder / top
-    if path.is_symlink() or not path.is_dir():
-        return [top]
-    return [f"{top}/{name}" for name in files_in(path)]
+def _new_folder(parent: Path, prefix: str) -> Path:
+    """A new temporary folder, whose name has the number of this process."""
+    folder = Path(tempfile.mkdtemp(prefix=f"{prefix}{os.getpid()}-", dir=parent))
+    _open.add(folder)
+    return folder
 
 
-def _clash(folder: PathLike, names: Iterable[str]) -> DataError:
-    return DataError(
-        "output folder holds files that would be overwritten and that this program did not"
-        " make, or that were changed since",
-        where=folder,
-        found=", ".join(names),
-        expected="a new or empty folder, or that of an earlier result",
-        hint="choose another --out, or --overwrite",
-    )
-
-
-def _unwritable(folder: PathLike, error: Exception) -> DataError:
-    reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-    return DataError(
-        "output folder cannot be written",
-        where=folder,
-        found=reason,
-        hint="choose another --out, or make room where the disk is full",
-    )
-
-
-def _new_stage(target: Path) -> tuple[Path, int]:
-    """A new temporary folder beside the target, or in it if they cannot be exchanged."""
-    name = f".{target.name[:64]}{_STAGE}"
-    places = [(target.parent, name), (target, _STAGE)]
-    if os.path.ismount(target) or _inside(target):
-        del places[0]
-    for parent, prefix in places:
-        try:
-            stage = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
-        except OSError:
-            if parent == target:
-                raise
-            continue
-        shutil.copymode(target, stage)
-        lock = _lock(stage)
-        return stage, lock
-    raise AssertionError("unreachable")
-
-
-def _inside(target: Path) -> bool:
-    """Whether the working folder of this process is in the target, which must then stay."""
-    with suppress(OSError):
-        return Path.cwd().is_relative_to(target)
-    return True
-
-
-def _lock(folder: Path) -> int:
-    """Lock a folder, so that no other process treats it as left behind."""
-    handle = os.open(folder, os.O_RDONLY)
-    with suppress(OSError):
-        # some network file systems have no locks
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    return handle
-
-
-def _drop(stage: Path, lock: int) -> None:
-    """Remove a temporary folder."""
+def _remove(folder: Path) -> None:
     with deferred_signals():
-        shutil.rmtree(stage, ignore_errors=True)
-        os.close(lock)
+        shutil.rmtree(folder, ignore_errors=True)
+        _open.discard(folder)
 
 
-def _left_behind(target: Path) -> list[Path]:
-    """Temporary folders of a target that other processes have made."""
-    own = f".{target.name[:64]}{_STAGE}"
-    beside = [p for p in target.parent.iterdir() if p.name.startswith(own)]
-    return beside + [p for p in target.iterdir() if p.name.startswith(_STAGE) and p.name != _COMMIT]
+def _sweep(parent: Path, prefix: str) -> None:
+    """Remove temporary folders whose process has ended."""
+    for path in parent.glob(f"{prefix}*"):
+        number = path.name.removeprefix(prefix).split("-")[0]
+        if number.isdecimal() and path not in _open and not is_other_process(int(number)):
+            shutil.rmtree(path, ignore_errors=True)
 
 
-def _sweep(paths: Iterable[Path]) -> None:
-    """Remove temporary folders whose process has ended, so that nobody locks them."""
-    for path in paths:
-        with suppress(OSError):
-            handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(path, ignore_errors=True)
-            finally:
-                os.close(handle)
-
-
-def _commit(stage: Path, target: Path, whole: bool, overwrite: bool, subject: str) -> None:
-    """Move the files of a temporary folder to their places."""
-    new = {name: digest_of(stage / name) for name in files_in(stage)}
-    clash = [name for name in new if is_foreign(target, name)]
-    if clash and not overwrite:
-        raise _clash(target, clash)
-    if clash:
-        adopt(target, clash)
-    listed = made_files(target) or {}
-    tops = {PurePosixPath(name).parts[0] for name in [*new, *listed]}
-    there = {path.name for path in target.iterdir()} - {MARK, stage.name}
-    here = {name for top in there & tops for name in _below(target, top)}
-    old = {k: v for k, v in listed.items() if k in here and not is_foreign(target, k)}
-    write_mark(stage, new if whole else old | new, subject or subject_of(target))
-    for name in here & new.keys():
-        shutil.copymode(target / name, stage / name)
-    _sync(stage)
-    # whether the target holds only files of the program
-    alone = there <= tops and here <= (old | new if whole else new).keys()
-    if alone and stage.parent == target.parent and exchange(stage, target):
-        return
-    commit = target / _COMMIT
-    try:
-        os.rename(stage, commit)
-    except OSError:
-        # another file system is mounted at the target
-        near = Path(tempfile.mkdtemp(prefix=_STAGE, dir=target))
-        shutil.copytree(stage, near, dirs_exist_ok=True)
-        _sync(near)
-        os.rename(near, commit)
-    _move_in(commit, target)
-
-
-def _move_in(commit: Path, target: Path) -> None:
+def _move_in(target: Path) -> None:
     """Move complete new files to their places and remove old ones; may be repeated."""
-    new, old = made_files(commit), made_files(target)
-    for name in (old or {}).keys() - (new or {}).keys():
-        if os.path.lexists(target / name) and not is_foreign(target, name):
-            (target / name).unlink()
-            with suppress(OSError):
-                # removes empty folders only
-                os.removedirs((target / name).parent)
-    for name in files_in(commit):
-        (target / name).parent.mkdir(parents=True, exist_ok=True)
-        os.replace(commit / name, target / name)
+    commit = target / _COMMIT
+    if commit.is_symlink() or not commit.is_dir():
+        return
+    # the mark is moved last: without it, every file was moved
     if (commit / MARK).exists():
-        os.replace(commit / MARK, target / MARK)
-    shutil.rmtree(commit)
+        for name in made_files(target).keys() - made_files(commit).keys():
+            if os.path.lexists(target / name) and not is_foreign(target, name):
+                (target / name).unlink(missing_ok=True)
+                with suppress(OSError):
+                    # removes empty folders only
+                    os.removedirs((target / name).parent)
+        # another process may be finishing the same moves
+        with suppress(FileNotFoundError):
+            for name in [*files_in(commit), MARK]:
+                (target / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(commit / name, target / name)
+    shutil.rmtree(commit, ignore_errors=True)
 
 
 def _sync(folder: Path) -> None:
@@ -334,3 +217,25 @@ def _sync(folder: Path) -> None:
     for name in [*files_in(folder), MARK]:
         with (folder / name).open("rb") as file:
             os.fsync(file.fileno())
+
+
+@contextmanager
+def _named_errors(folder: PathLike) -> Iterator[None]:
+    """Turn errors of the operating system into a DataError that names the output folder."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            "output folder cannot be written",
+            where=folder,
+            found=error.strerror or error,
+            hint="choose another --out, or make room where the disk is full",
+        ) from error
+
+
+def _resolved(folder: PathLike) -> Path:
+    try:
+        return Path(folder).resolve()
+    except (RuntimeError, ValueError) as error:
+        # a cyclic link, a NUL character
+        raise OSError(str(error)) from error

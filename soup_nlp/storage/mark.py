@@ -22,19 +22,13 @@ SUBJECT = "of"
 """Key of the mark: what the folder is the result of."""
 
 
-def made_files(folder: Path) -> dict[str, str] | None:
-    """SHA-256 by name of the files that the program made in a folder.
-
-    None if the mark is empty, as in folders of early versions.
-    """
+def made_files(folder: Path) -> dict[str, str]:
+    """SHA-256 by name of the files that the program made in a folder; {} without a valid mark."""
     path = folder / MARK
     try:
         if path.is_symlink() or not path.is_file():
             return {}
-        text = path.read_text(encoding="utf-8")
-        if not text:
-            return None
-        listed = json.loads(text)["files"]
+        listed = json.loads(path.read_text(encoding="utf-8"))["files"]
         # a damaged mark must not name files outside the folder
         inside = [n for n in listed if not PurePosixPath(n).is_absolute() and ".." not in n]
         return {str(name): str(listed[name]) for name in inside}
@@ -72,21 +66,36 @@ def is_foreign(folder: Path, name: str) -> bool:
         return False
     if path.is_symlink() or not path.is_file():
         return True
-    listed = made_files(folder)
-    return listed is not None and listed.get(name) != digest_of(path)
+    return made_files(folder).get(name) != digest_of(path)
 
 
-def adopt(folder: Path, names: Iterable[str]) -> None:
-    """Add files of the user to the mark, so that they may be overwritten."""
-    there = {name: folder / name for name in names}
-    for name, path in there.items():
+def release(folder: Path, names: Iterable[str], overwrite: bool) -> None:
+    """Check that files may be written; with `overwrite`, list those of the user in the mark.
+
+    Raises:
+        DataError: the folder holds files of the user with these names and `overwrite` is not set,
+            or a folder with one of them.
+    """
+    foreign = [name for name in names if is_foreign(folder, name)]
+    if not foreign:
+        return
+    if not overwrite:
+        raise DataError(
+            "output folder holds files that would be overwritten and that this program did not"
+            " make, or that were changed since",
+            where=folder,
+            found=", ".join(foreign),
+            expected="a new or empty folder, or that of an earlier result",
+            hint="choose another --out, or --overwrite",
+        )
+    for path in (folder / name for name in foreign):
         if path.is_dir() and not path.is_symlink():
-            raise DataError("cannot write a file over a folder", where=folder / name)
+            raise DataError("cannot write a file over a folder", where=path)
         if path.is_symlink():
             # remove the link but not its target
             path.unlink()
-    digests = {name: digest_of(path) for name, path in there.items() if path.is_file()}
-    write_mark(folder, (made_files(folder) or {}) | digests)
+    digests = {name: digest_of(folder / name) for name in foreign if (folder / name).is_file()}
+    write_mark(folder, made_files(folder) | digests)
 
 
 def write_mark(folder: Path, files: dict[str, str], subject: str = "") -> None:

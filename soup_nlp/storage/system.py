@@ -1,4 +1,4 @@
-"""Functions of the operating system: exchange of folders, delayed signals, end with the parent."""
+"""Functions of the operating system: other processes, delayed signals, end with the parent."""
 
 from __future__ import annotations
 
@@ -9,25 +9,18 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import FrameType
 
-_AT_FDCWD = -100
-_RENAME_EXCHANGE = 2
-_RENAME_SWAP = 2
 
-
-def exchange(a: Path, b: Path) -> bool:
-    """Exchange two folders in one step; False if the system or file system cannot do so."""
-    library, names = ctypes.CDLL(None, use_errno=True), (os.fsencode(a), os.fsencode(b))
+def is_other_process(number: int) -> bool:
+    """Whether a process of this number is running that is not this one."""
     try:
-        if sys.platform == "darwin":
-            return bool(library.renamex_np(*names, _RENAME_SWAP) == 0)
-        own, other = names
-        done = library.renameat2(_AT_FDCWD, own, _AT_FDCWD, other, _RENAME_EXCHANGE)
-        return bool(done == 0)
-    except AttributeError:
+        os.kill(number, 0)
+    except (ProcessLookupError, OverflowError):
         return False
+    except PermissionError:
+        pass
+    return number != os.getpid()
 
 
 @contextmanager

@@ -265,7 +265,8 @@ def on_disk(command: Command, place: Path, states: Sequence[str], size: int) -> 
                 fill(place)
             row = {"command": command.name, "disk": state, "size": size, "exit": run(words)[0]}
             row |= {"broken": broken(target), "earlier kept": listed(target) == before}
-            yield row | {"left": [n for n in os.listdir(place) if ".soup_nlp-" in n]}
+            places = [p for p in (place, target) if p.is_dir()]
+            yield row | {"left": [n for p in places for n in os.listdir(p) if ".soup_nlp-" in n]}
 
 
 def full_disks(names: Sequence[str]) -> list[dict[str, object]]:
