@@ -69,7 +69,7 @@ def evaluate(
     *,
     scale: Scale = "median",
     cap: float | None = None,
-    depth_scale: float = 1000.0,
+    depth_scale: float | None = None,
 ) -> dict[str, DepthMetrics]:
     """Score a depth against the truth; see `evaluate.scoring.evaluate`."""
     from soup_nlp.evaluate import scoring

@@ -65,7 +65,7 @@ def test_folder_with_everything(folder: Path) -> None:
     cv2.imwrite(str(folder / "moving.png"), moving)
     xyz = np.array([[1.0, 2.0, 550.0], [1.0, 2.0, np.nan]])
     np.savez(folder / "points.npz", uv_0=np.array([[3.5, 2.5], [1, 1]]), xyz_mm_0=xyz)
-    pair = load_folder(folder)
+    pair = load_folder(folder, depth_scale=1000.0)
     truth = pair.truth
     assert truth is not None
     assert pair.K_next[1, 1] == 91
@@ -236,7 +236,7 @@ def test_vkitti1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         picture(tmp_path / "vkitti_1.3.1_rgb" / name, number)
         png16(tmp_path / "vkitti_1.3.1_depthgt" / name, np.full((H, W), 1234))
     vkitti_flow(tmp_path / "vkitti_1.3.1_flowgt" / "0001/clone/00000.png")
-    with pytest.warns(DataWarning, match="9 x 6, but the intrinsics"):
+    with pytest.warns(DataWarning, match="assumed: fx,fy,cx,cy 725.* of 1242 x 375"):
         pair = load_vkitti("vkitti1", tmp_path, "0001", 0)
     assert pair.truth is not None
     np.testing.assert_allclose(pair.truth.depth_next, 12.34)
@@ -283,7 +283,9 @@ def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for number in (1, 2):
         picture(base / "final" / "alley_1" / f"frame_{number:04d}.png", number)
     # of this scene the camera is known, and yet it is not that of a file
-    with pytest.warns(DataWarning, match=r"alley_1 is taken, 688 pixels; camdata_left"):
+    with pytest.warns(
+        DataWarning, match=r"camdata_left.*assumed: the focal length of alley_1, 688 pixels$"
+    ):
         assert load_sintel(tmp_path, "alley_1", 1, "final").K_ref[0, 0] == 688
     for kind in ("camdata_left", "depth", "flow", "occlusions", "invalid"):
         (base / kind / "cave_2").mkdir(parents=True)
@@ -325,26 +327,28 @@ def test_tum(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
         png16(root / "depth" / f"{k}.png", np.full((H, W), 5000 * (k + 1)))
     (root / "rgb.txt").write_text("# colour\n1.00 rgb/0.png\n1.03 rgb/1.png\n1.06 rgb/2.png\n")
     (root / "depth.txt").write_text("1.001 depth/0.png\n1.2 depth/1.png\n1.055 depth/2.png\n")
-    with pytest.warns(DataWarning, match=r"freiburg3 are assumed \(535.4,539.2,4,2.5\)"):
-        pair = load_tum(root, frame=0, step=2)
+    with pytest.warns(
+        DataWarning, match=r"assumed: the intrinsics of freiburg3, 535.4,539.2,4,2.5"
+    ):
+        pair = load_tum(root, frame=0, step=2, scale=5000)
     assert pair.truth is not None
     assert pair.K_ref[0, 0] == 535.4
     np.testing.assert_array_equal(pair.truth.depth_ref, 1.0)
     np.testing.assert_array_equal(pair.truth.depth_next, 3.0)
     (root / "camera.txt").write_text("90 91 4 3")
-    pair_1 = load_tum(root, frame=1)
+    pair_1 = load_tum(root, frame=1, scale=5000)
     assert pair_1.truth.depth_ref is None
     assert (pair_1.K_ref[0, 0], pair_1.K_next[1, 1]) == (90, 91)
     with raises(r"not in the sequence[\s\S]*0 to 2"):
-        load_tum(root, frame=2)
+        load_tum(root, frame=2, scale=5000)
     (root / "rgb" / "1.png").unlink()
     with raises(r"1\.png"):
-        load_tum(root)
+        load_tum(root, scale=5000)
     (root / "rgb.txt").write_text("1.0\n")
     with raises("line of a file list"):
-        load_tum(root)
+        load_tum(root, scale=5000)
     png16(folder / "depth_0.png", np.full((H, W), 5000))
-    plain = load_tum(folder).truth
+    plain = load_tum(folder, scale=5000).truth
     assert plain is not None
     np.testing.assert_array_equal(plain.depth_ref, 1.0)
     (folder / "frame_0.png").unlink()

@@ -227,7 +227,7 @@ def test_pfm_errors(tmp_path: Path, content: bytes, match: str) -> None:
 def test_png16_errors(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
     with raises("16-bit PNG with 1 channel"):
-        fmt.read_depth(tmp_path / "a.png")
+        fmt.read_depth(tmp_path / "a.png", 1000.0)
     for scale in (0, -1, np.nan, np.inf):
         with raises("scale must be positive"):
             fmt.read_depth_png16(tmp_path / "a.png", scale)

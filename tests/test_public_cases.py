@@ -6,6 +6,7 @@ import re
 import struct
 import warnings
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,14 +17,17 @@ from PIL import ExifTags, Image, features
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.datasets.folders import load_tum
+from soup_nlp.data.flow.common_focal import at_common_focal
+from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.sources import FlowOptions, resolve_flow
 from soup_nlp.data.formats.camera_files import read_camera, read_intrinsics
 from soup_nlp.data.formats.images import DataWarning, read_image, read_images
 from soup_nlp.data.formats.map_files import read_depth, read_flow
-from soup_nlp.data.pair import Pair
+from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.data.working_size import scaled_camera
+from soup_nlp.data.working_size import resized_flow, scaled_camera
 from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.pipeline.run import solve_pair
 
 SIZE = (96, 64)  # width, height
 MIDDLE = (47.5, 31.5)
@@ -197,6 +201,22 @@ def test_frames_of_other_focal_lengths_have_a_flow(factor: float) -> None:
     assert np.median(np.linalg.norm(found.uv - true, axis=2)[use]) < 0.2
 
 
+def test_flow_of_reduced_frames_is_not_mixed_at_edges() -> None:
+    images = [np.zeros((16, 20, 3), np.uint8), np.zeros((8, 10, 3), np.uint8)]
+    fine = Pair(images[0], images[1], (20, 20, 9.5, 7.5), (10, 10, 4.5, 3.5))
+    near = at_common_focal(fine)
+    assert near.size == (8, 10)
+    np.testing.assert_allclose(near.K_ref, near.K_next)
+    uv = np.zeros((8, 10, 2))
+    uv[:, 5:] = 3, -1
+    found = resized_flow(Flow(uv), near, fine)
+    at = np.stack(np.meshgrid(np.arange(20), np.arange(16)), axis=-1)
+    # displacement in pixels of the next image, of which a pixel has two of the reference image
+    shift = at + found.uv - ((at + 0.5) / 2 - 0.5)
+    np.testing.assert_allclose(shift[:, :10], 0, atol=1e-6)
+    np.testing.assert_allclose(shift[:, 10:], np.broadcast_to((3, -1), (16, 10, 2)), atol=1e-6)
+
+
 def test_focal_lengths_that_the_images_contradict_are_said() -> None:
     pair = render_scene("orbit", 0, 256, 108)
     K = pair.K_next * [[3, 1, 1], [1, 3, 1], [1, 1, 1]]
@@ -237,6 +257,21 @@ def test_implausible_intrinsics_name_their_cause(
         np.testing.assert_array_equal(pair.K_ref[:2, 2], given[2:])
     assert cause in text
     assert f"{fits} would fit" in text
+
+
+def test_intrinsics_of_arrays_are_checked_too() -> None:
+    pair = render_scene("orbit", 0, 128, 54)
+    other = replace(pair, K_next=scaled_camera(pair.K_next, (54, 128), (135, 320)))
+    with pytest.raises(DataError, match=r"principal point is outside[\s\S]*K_next[\s\S]*320 x 135"):
+        solve_pair(other)
+    half = replace(pair, K_ref=scaled_camera(pair.K_ref, (54, 128), (32, 76)))
+    with (
+        pytest.warns(DataWarning, match="K_ref, 128 x 54.*an image of 76 x 32"),
+        pytest.raises(ConfigError),
+    ):
+        solve_pair(half, preset="none")
+    with pytest.raises(ConfigError):
+        solve_pair(other, preset="none", cropped=True)
 
 
 def test_plausible_intrinsics_are_taken_without_a_word(folder: Path) -> None:
@@ -318,15 +353,43 @@ def test_tum_format_of_other_sensors(name: str | None, tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / "rgb" / f"{k}.png"), texture(640, 480, k))
     (tmp_path / "rgb.txt").write_text("0.0 rgb/0.png\n0.1 rgb/1.png\n")
     if name is None:
-        with pytest.warns(DataWarning, match="are assumed.*5000 values of depth"):
+        with pytest.warns(DataWarning, match="assumed: the intrinsics of the default camera"):
             assert load_tum(tmp_path).K_ref[0, 0] == 525
         return
     (tmp_path / name).write_text("# fx fy cx cy\n542.8 542.6 315.6 237.8\n")
     assert load_tum(tmp_path).K_next[0, 0] == 542.8
+    # the scale of depth is said too
+    cv2.imwrite(str(tmp_path / "d.png"), np.full((480, 640), 1000, np.uint16))
+    (tmp_path / "depth.txt").write_text("0.0 d.png\n")
+    with pytest.warns(DataWarning, match="depth is not given; assumed: 5000 values"):
+        assert load_tum(tmp_path).truth.depth_ref[0, 0] == 0.2  # type: ignore[union-attr,index]
+    assert load_tum(tmp_path, scale=1000).truth.depth_ref[0, 0] == 1  # type: ignore[union-attr,index]
     # a camera whose y axis points up
     (tmp_path / name).write_text("481.2 0 319.5\n0 -480 239.5\n0 0 1\n")
     with pytest.raises(DataError, match="fy without its sign"):
         load_tum(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["files", "folder"])
+def test_the_scale_of_depth_is_given_or_said(kind: str, folder: Path) -> None:
+    for k, name in enumerate("ab"):
+        (folder / f"{name}.png").rename(folder / f"frame_{k}.png")
+    (folder / "K.txt").write_text("80 80 47.5 31.5")
+    cv2.imwrite(str(folder / "depth_0.png"), np.full((64, 96), 2000, np.uint16))
+    source = {"kind": kind, "path": str(folder)}
+    if kind == "files":
+        names = {"ref": "frame_0.png", "next": "frame_1.png", "depth": "depth_0.png"}
+        source = {"kind": kind, "intrinsics": "K.txt", **names}
+    for scale, depth in ((None, 2.0), (1000.0, 2.0), (256.0, 2000 / 256)):
+        problem = make_problem({"input": {**source, "depth_scale": scale}, "base": str(folder)})
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            truth = problem.load_pair().truth
+        assert truth is not None
+        assert truth.depth_ref is not None
+        assert truth.depth_ref[0, 0] == depth
+        words = ["assumed: 1000 values per unit" in str(w.message) for w in caught]
+        assert words == [True] * (scale is None)
 
 
 # --- 7 pictures of more than 8 bits --------------------------------------------------------------
@@ -384,7 +447,7 @@ def test_flows_that_do_not_fit_name_their_cause(tmp_path: Path) -> None:
     np.testing.assert_allclose(resolve_flow(pair, str(path)).uv, true, rtol=1e-6)
     wrong = {
         "u and v exchanged": true[..., ::-1],
-        "backward flow": -true,
+        "other direction": -true,
         "times the image's size": true / [256, 108],
         "times half the image's size": true / [128, 54],
         "times 2": true / 2,
@@ -403,6 +466,19 @@ def test_flows_that_do_not_fit_name_their_cause(tmp_path: Path) -> None:
     write_flo(path, true[::2, ::2])
     with pytest.raises(DataError, match="differ in size"):
         resolve_flow(pair, str(path))
+
+
+@pytest.mark.parametrize("change", [-1.0, 0.5, 1 / 256])
+def test_a_backward_flow_is_compared_with_the_images_too(change: float, tmp_path: Path) -> None:
+    pair = render_scene("orbit", 0, 256, 108)
+    back = dis_flow(pair.image_next, pair.image_ref).uv
+    write_flo(tmp_path / "f.flo", pair.truth.flow)  # type: ignore[union-attr]
+    options = FlowOptions(source="f.flo", backward="b.flo")
+    write_flo(tmp_path / "b.flo", back)
+    assert (options.load(pair, lambda name: tmp_path / name).confidence > 0).mean() > 0.7
+    write_flo(tmp_path / "b.flo", change * back)
+    with pytest.raises(DataError, match=r"does not fit the images[\s\S]*b\.flo"):
+        options.load(pair, lambda name: tmp_path / name)
 
 
 def test_a_kitti_flow_with_exchanged_channels_is_refused(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import traceback
 import unicodedata
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import ParamSpec
@@ -43,7 +44,9 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
     @functools.wraps(command)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
-            command(*args, **kwargs)
+            with warnings.catch_warnings():
+                warnings.showwarning = _say
+                command(*args, **kwargs)
         except (SoupError, typer.Exit, typer.Abort, BrokenPipeError):
             raise
         except Exception as error:
@@ -55,6 +58,15 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
             raise typer.Exit(report_bug(error)) from error
 
     return run
+
+
+def _say(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+    """Print a warning about the input on one line; those of libraries are not printed."""
+    # loaded by whoever warns, so that --help is fast
+    from soup_nlp.data.formats.images import DataWarning
+
+    if issubclass(category, DataWarning):
+        print(f"warning: {message}", file=sys.stderr)
 
 
 def refusal(error: Exception) -> DataError | None:

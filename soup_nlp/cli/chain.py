@@ -64,8 +64,11 @@ def chain(
         bool, typer.Option("--two-frame", help="Solve frames k and k + 2 too, for more links.")
     ] = False,
     depth_scale: Annotated[
-        float, typer.Option(help="Values per unit of length of true depth_*.png (KITTI 256).")
-    ] = 1000.0,
+        float | None,
+        typer.Option(
+            help="Values per unit of length of true depth_*.png (KITTI 256); default 1000."
+        ),
+    ] = None,
     preset: options.PresetName = None,
     overrides: options.Set = None,
     superpixels: options.Wanted = None,
@@ -146,7 +149,7 @@ def _frames(
     camera: dict[str, Any],
     step: int | None,
     most: int | None,
-    depth_scale: float,
+    depth_scale: float | None,
 ) -> Frames:
     """The frames of the command line; `step` None takes those with enough parallax."""
     first = source[0]

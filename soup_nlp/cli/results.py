@@ -72,8 +72,9 @@ def evaluate(
     scale: Annotated[str, typer.Option(help="median, mre, lsq or none.")] = "median",
     cap: Annotated[float | None, typer.Option(help="Drop truth beyond this depth.")] = None,
     depth_scale: Annotated[
-        float, typer.Option(help="Values per unit of length of a .png (KITTI 256).")
-    ] = 1000.0,
+        float | None,
+        typer.Option(help="Values per unit of length of a .png (KITTI 256); default 1000."),
+    ] = None,
 ) -> None:
     """Score a result against a truth file."""
     rules = get_args(Scale)

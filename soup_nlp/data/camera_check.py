@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
-from soup_nlp.arrays import Float
+import numpy as np
+
+from soup_nlp.arrays import Float, Image
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
@@ -17,6 +20,15 @@ RESIZED, ALIKE = 1.25, 1.1
 """Ratio of sizes that shows another resolution; ratio of two numbers that are taken as equal."""
 
 Size = tuple[int, int]
+
+
+def check_cameras(
+    cameras: Sequence[Float], images: Sequence[Image], names: Sequence[object], cropped: bool
+) -> None:
+    """Check the intrinsics of both frames, once where they are the same; see `check_camera`."""
+    alike = images[0].shape == images[1].shape and np.array_equal(cameras[0], cameras[1])
+    for k in range(1 if alike else 2):
+        check_camera(cameras[k], images[k].shape[:2], names[k], cropped)
 
 
 def check_camera(K: Float, size: Size, where: object, cropped: bool = False) -> None:
@@ -43,7 +55,8 @@ def check_camera(K: Float, size: Size, where: object, cropped: bool = False) -> 
             where=where,
             found=f"fx,fy,cx,cy {_text(K)} at {width} x {height}",
             expected="a principal point near the middle",
-            hint=f"{hint}. Of images that were cropped, --set input.cropped=true accepts it",
+            hint=f"{hint}. If the images were cropped, --set input.cropped=true accepts it, in"
+            " Python solve_pair(pair, cropped=True)",
         )
     text = f"{where}, {width} x {height}: {' and '.join(problems)}. Likely cause: {hint}"
     warnings.warn(text, DataWarning, stacklevel=3)

@@ -46,8 +46,8 @@ class PairInput(Section, ABC):
 class FramesInput(PairInput):
     """Base of inputs of image files, which say nothing of their truth and pixels themselves."""
 
-    depth_scale: Positive = 1000.0
-    """Values per unit of length of a 16-bit .png depth."""
+    depth_scale: Positive | None = None
+    """Values per unit of length of a 16-bit .png depth; null for 1000, with a warning."""
     unit: str = "m"
     """Unit of the true depth."""
     white: White | None = None
@@ -257,10 +257,12 @@ class TumInput(PairInput):
     """Index of the reference image in rgb.txt."""
     step: Whole = 1
     """Distance of the next image."""
+    depth_scale: Positive | None = None
+    """Values per metre of the depth images; null for the 5000 of TUM, with a warning."""
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        return load_tum(path(self.path), self.frame, self.step)
+        return load_tum(path(self.path), self.frame, self.step, self.depth_scale)
 
 
 class MemoryInput(PairInput):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -28,14 +29,14 @@ def working_size(pair: Pair, megapixels: float | None) -> Pair:
     ref, following = (_smaller(i.shape, factor) for i in (pair.image_ref, pair.image_next))
     small = replace(
         pair,
-        image_ref=_averaged(pair.image_ref, ref),
-        image_next=_averaged(pair.image_next, following),
+        image_ref=resized(pair.image_ref, ref),
+        image_next=resized(pair.image_next, following),
         K_ref=scaled_camera(pair.K_ref, pair.image_ref.shape, ref),
         K_next=scaled_camera(pair.K_next, pair.image_next.shape, following),
         flow=None,
         truth=None if pair.truth is None else _truth(pair.truth, pair, ref, following),
     )
-    return small if pair.flow is None else small.with_flow(smaller_flow(pair.flow, pair, small))
+    return small if pair.flow is None else small.with_flow(resized_flow(pair.flow, pair, small))
 
 
 def scaled_camera(K: Float, old: tuple[int, ...], new: Size) -> Float:
@@ -47,18 +48,18 @@ def scaled_camera(K: Float, old: tuple[int, ...], new: Size) -> Float:
     return out
 
 
-def smaller_flow(flow: Flow, pair: Pair, small: Pair) -> Flow:
-    """The flow of a pair at the size of `small`, the reduced pair."""
-    size = small.size
-    confidence = _averaged(flow.confidence, size)
+def resized_flow(flow: Flow, pair: Pair, other: Pair) -> Flow:
+    """The flow of a pair at the sizes of `other`, the resized pair."""
+    size = other.size
+    confidence = resized(flow.confidence, size)
     known = np.maximum(confidence, np.finfo(np.float32).tiny)
-    mean = _averaged(flow.uv * flow.confidence[..., None], size) / known[..., None]
+    mean = resized(flow.uv * flow.confidence[..., None], size) / known[..., None]
     uv = np.empty((*size, 2), np.float32)
     at = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float32)[::-1]
     for k in range(2):
         own = pair.size[1 - k] / size[1 - k]
-        next_ = small.image_next.shape[1 - k] / pair.image_next.shape[1 - k]
-        # target of the centre of a pixel, in pixels of the reduced next image
+        next_ = other.image_next.shape[1 - k] / pair.image_next.shape[1 - k]
+        # target of the centre of a pixel, in pixels of the resized next image
         uv[..., k] = ((at[k] + 0.5) * own + mean[..., k]) * next_ - 0.5 - at[k]
     uv[confidence == 0] = 0
     return Flow(uv, np.clip(confidence, 0, 1), flow.source)
@@ -68,8 +69,13 @@ def _smaller(shape: tuple[int, ...], factor: float) -> Size:
     return max(1, round(shape[0] * factor)), max(1, round(shape[1] * factor))
 
 
-def _averaged(image: NDArray[Any], size: Size) -> NDArray[Any]:
-    return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA))
+def resized(image: NDArray[Any], size: Sequence[int]) -> NDArray[Any]:
+    """An image or a flow at a size (height, width): the mean of pixels; if larger, the nearest one.
+
+    Interpolation would make displacements between those of two objects.
+    """
+    how = cv2.INTER_AREA if size[0] <= image.shape[0] else cv2.INTER_NEAREST_EXACT
+    return np.asarray(cv2.resize(image, (int(size[1]), int(size[0])), interpolation=how))
 
 
 def _nearest(values: NDArray[Any], size: Size) -> NDArray[Any]:

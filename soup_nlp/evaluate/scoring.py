@@ -98,7 +98,7 @@ def evaluate(
     *,
     scale: Scale = "median",
     cap: float | None = None,
-    depth_scale: float = 1000.0,
+    depth_scale: float | None = None,
 ) -> dict[str, DepthMetrics]:
     """Score a depth against the truth.
 
@@ -107,7 +107,7 @@ def evaluate(
         depth: True depth of the reference frame (H, W), or a file: .dpt, .npy, .pfm, 16-bit .png.
         scale: "median", "mre", "lsq" or "none".
         cap: Truth beyond this depth is dropped, positive.
-        depth_scale: Values per unit of length of a .png.
+        depth_scale: Values per unit of length of a .png; None for 1000, with a warning.
 
     Returns:
         Metrics by "solution", "start", "nlp" and "rigid" (if known) and "constant".

@@ -9,7 +9,7 @@ from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_flow
 from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.data.working_size import smaller_flow, working_size
+from soup_nlp.data.working_size import resized_flow, working_size
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import Labels, segment
@@ -168,7 +168,7 @@ def _flow(problem: Problem, full: Pair, pair: Pair) -> Flow:
         return pair.flow
     if pair is full or not problem.flow.is_file():
         return problem.flow.load(pair, problem.path)
-    return smaller_flow(problem.flow.load(full, problem.path), full, pair)
+    return resized_flow(problem.flow.load(full, problem.path), full, pair)
 
 
 def superpixels(problem: Problem, pair: Pair) -> Labels:

@@ -20,6 +20,7 @@ from soup_nlp.config.problem import (
     make_problem,
     title,
 )
+from soup_nlp.data.camera_check import check_cameras
 from soup_nlp.data.flow.plausible import check_flow
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import pair_hash
@@ -248,6 +249,7 @@ def solve_pair(
     preset: str | None = None,
     seed: int = 0,
     max_size: float | None = 1.5,
+    cropped: bool = False,
     segmentation: Options | SegmentationOptions | None = None,
     flow: Options | FlowOptions | None = None,
     start: Options | StartOptions | None = None,
@@ -269,6 +271,7 @@ def solve_pair(
         preset: "paper" for the method as printed.
         seed: Of every random draw.
         max_size: Largest image that is solved as it is, megapixels; None for no limit.
+        cropped: The images are parts of larger ones: the principal points may be anywhere.
         segmentation: E.g. `{"superpixels": 500}` or `SegmentationOptions(superpixels=500)`.
         flow: Where the flow comes from, if the pair has none.
         start: How the start is made.
@@ -295,6 +298,8 @@ def solve_pair(
         "output": output,
     }
     expect(pair, Pair, "pair", PAIR)
+    images, names = (pair.image_ref, pair.image_next), ("K_ref", "K_next")
+    check_cameras((pair.K_ref, pair.K_next), images, names, cropped)
     if pair.flow is not None:
         check_flow(pair.flow, pair)
     raw: dict[str, Any] = {"preset": preset, "seed": seed}

@@ -67,7 +67,7 @@ class FileFrames(Frames):
     paths: tuple[Path, ...]
     camera: Raw
     depths: tuple[Path, ...] = ()
-    depth_scale: float = 1000.0
+    depth_scale: float | None = None
 
     def __len__(self) -> int:
         return len(self.paths)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +10,7 @@ import numpy as np
 from soup_nlp.arrays import Mask
 from soup_nlp.data.datasets.layout import make_pair, need, need_folder, read_if, training_folder
 from soup_nlp.data.formats.camera_files import read_kitti_projections, read_vkitti2_intrinsics
-from soup_nlp.data.formats.images import DataWarning, decode
+from soup_nlp.data.formats.images import assumed, decode
 from soup_nlp.data.formats.map_files import (
     KITTI_DISPARITY,
     read_depth_png16,
@@ -71,8 +70,7 @@ _VKITTI = {
 
 VKITTI1_CAMERA = (725.0, 725.0, 620.5, 187.0)
 """fx, fy, cx, cy of every Virtual KITTI 1 image, pixels."""
-VKITTI1_SIZE = (375, 1242)
-"""(height, width) of these images."""
+VKITTI1_TEXT = "fx,fy,cx,cy 725,725,620.5,187, of its images of 1242 x 375"
 
 
 def load_kitti(benchmark: str, root: PathLike, index: int | str, occ: bool = True) -> Pair:
@@ -197,6 +195,7 @@ def load_vkitti(
     images = [need(path(image, number), layout) for number in numbers]
     if benchmark == "vkitti1":
         cameras = [intrinsics(*VKITTI1_CAMERA)] * 2
+        assumed(root, "Virtual KITTI 1 has no file of its camera", VKITTI1_TEXT)
     else:
         table = need(root / scene / variation / "intrinsic.txt", layout)
         cameras = read_vkitti2_intrinsics(table, numbers)
@@ -205,12 +204,4 @@ def load_vkitti(
         depth_next=read_if(read_vkitti_depth, path(depth, frame + step)),
         flow=read_if(read_vkitti_flow, path(flow, frame) if step == 1 else None),
     )
-    pair = make_pair(images, cameras, truth, f"{benchmark}_{scene}_{variation}_{frame:05d}")
-    if benchmark == "vkitti1" and pair.size != VKITTI1_SIZE:
-        warnings.warn(
-            f"{images[0]}: {pair.size[1]} x {pair.size[0]}, but the intrinsics of Virtual KITTI 1"
-            f" are assumed, of {VKITTI1_SIZE[1]} x {VKITTI1_SIZE[0]}",
-            DataWarning,
-            stacklevel=2,
-        )
-    return pair
+    return make_pair(images, cameras, truth, f"{benchmark}_{scene}_{variation}_{frame:05d}")

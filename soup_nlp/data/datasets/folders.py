@@ -8,7 +8,6 @@ unknown.
 from __future__ import annotations
 
 import re
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +17,8 @@ from skimage.measure import label
 from soup_nlp.data.datasets.layout import is_result, make_pair, need, need_folder, read_if
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_intrinsics
-from soup_nlp.data.formats.images import DataWarning, read_mask
-from soup_nlp.data.formats.map_files import read_depth, read_depth_png16, read_flow
+from soup_nlp.data.formats.images import assumed, read_mask
+from soup_nlp.data.formats.map_files import MILLIMETRES, read_depth, read_flow
 from soup_nlp.data.formats.npy_files import read_npz
 from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.errors import DataError
@@ -63,10 +62,11 @@ def _find(folder: Path, stems: tuple[str, ...], suffixes: tuple[str, ...]) -> Pa
 
 def load_folder(
     folder: PathLike,
-    depth_scale: float = 1000.0,
+    depth_scale: float | None = None,
     unit: str = "m",
     white: int | None = None,
     cropped: bool = False,
+    usual: float = MILLIMETRES,
 ) -> Pair:
     """Load a pair from a plain folder.
 
@@ -82,10 +82,12 @@ def load_folder(
 
     Args:
         folder: The folder.
-        depth_scale: Values per `unit` of a 16-bit depth image, e.g. 1000 for mm read as metres.
+        depth_scale: Values per `unit` of a 16-bit depth image, e.g. 1000 for mm read as metres;
+            None for the usual ones, with a warning.
         unit: Unit of length of the truth.
         white: Value of white in 16-bit images, see `read_images`.
         cropped: The images are parts of larger ones, see `make_pair`.
+        usual: Usual values per `unit`.
 
     Raises:
         DataError: a required file is missing, a file is malformed or has a wrong size, or the
@@ -111,8 +113,8 @@ def load_folder(
     depth = _find(folder, ("depth", "depth_0", "depth_ref"), _DEPTHS)
     depth_next = _find(folder, ("depth_next", "depth_1"), _DEPTHS)
     truth = Truth(
-        depth_ref=read_if(read_depth, depth, depth_scale),
-        depth_next=read_if(read_depth, depth_next, depth_scale),
+        depth_ref=read_if(read_depth, depth, depth_scale, usual),
+        depth_next=read_if(read_depth, depth_next, depth_scale, usual),
         flow=read_if(read_flow, _find(folder, ("flow",), _FLOWS)),
         occluded=read_if(read_mask, _find(folder, ("occluded",), _IMAGES)),
         components=read_if(_moving_components, _find(folder, ("moving",), _IMAGES)),
@@ -146,17 +148,18 @@ def _read_points(path: Path, unit: str) -> Float:
     return np.asarray(points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)])
 
 
-def load_tum(folder: PathLike, frame: int = 0, step: int = 1) -> Pair:
+def load_tum(folder: PathLike, frame: int = 0, step: int = 1, scale: float | None = None) -> Pair:
     """Load a pair of a TUM RGB-D sequence, depth in metres.
 
     Two layouts are supported: the original one (`rgb.txt` and `depth.txt` list time stamps and
     files; a depth image belongs to a colour image within 20 ms), and the plain folder of
-    `load_folder` with 16-bit `depth_0.png` and `depth_1.png` of 5000 values per metre.
+    `load_folder` with 16-bit `depth_0.png` and `depth_1.png`.
 
     Args:
         folder: The sequence.
         frame: Index of the reference image in rgb.txt (original layout only).
         step: Distance of the next image (original layout only).
+        scale: Values per metre of the depth images; None for 5000, with a warning.
 
     Returns:
         Pair with the true depth of both frames, if known. In the original layout the intrinsics are
@@ -168,7 +171,7 @@ def load_tum(folder: PathLike, frame: int = 0, step: int = 1) -> Pair:
     """
     folder = need_folder(folder, TUM_LAYOUT)
     if _find(folder, ("frame_0", "image_ref"), _IMAGES) and not is_file(folder / "rgb.txt"):
-        return load_folder(folder, depth_scale=TUM_SCALE)
+        return load_folder(folder, scale, usual=TUM_SCALE)
     images = _tum_list(need(folder / "rgb.txt", TUM_LAYOUT))
     depths = read_if(_tum_list, folder / "depth.txt") or []
     for index in (frame, frame + step):
@@ -182,7 +185,11 @@ def load_tum(folder: PathLike, frame: int = 0, step: int = 1) -> Pair:
     beside = _find(folder, ("K", "camera"), (".txt",))
     K = _tum_camera(folder) if beside is None else read_intrinsics(beside)
     (time_ref, ref), (time_next, following) = images[frame], images[frame + step]
-    truth = Truth(depth_ref=_tum_depth(depths, time_ref), depth_next=_tum_depth(depths, time_next))
+    maps = (
+        read_if(read_depth, _tum_depth(depths, time), scale, TUM_SCALE)
+        for time in (time_ref, time_next)
+    )
+    truth = Truth(depth_ref=next(maps), depth_next=next(maps))
     name = f"{folder.resolve().name}_{frame}"
     files = [need(path, TUM_LAYOUT) for path in (ref, following)]
     return make_pair(files, [K, K], truth, name)
@@ -193,12 +200,10 @@ def _tum_camera(folder: Path) -> Float:
     sensor = re.search(r"freiburg[123]", str(folder.resolve()))
     name = sensor.group() if sensor else ""
     numbers = ",".join(f"{x:g}" for x in _TUM_CAMERAS[name])
-    warnings.warn(
-        f"{folder}: neither K.txt nor camera.txt beside rgb.txt; the intrinsics of"
-        f" {name or 'the default camera of TUM RGB-D'} are assumed ({numbers}), and {TUM_SCALE:g}"
-        " values of depth per metre",
-        DataWarning,
-        stacklevel=3,
+    assumed(
+        folder,
+        "neither K.txt nor camera.txt beside rgb.txt",
+        f"the intrinsics of {name or 'the default camera of TUM RGB-D'}, {numbers}",
     )
     return intrinsics(*_TUM_CAMERAS[name])
 
@@ -222,12 +227,12 @@ def _tum_list(path: Path) -> list[tuple[float, Path]]:
     return out
 
 
-def _tum_depth(depths: list[tuple[float, Path]], time: float) -> Float | None:
-    """Depth of the image nearest in time; None if it is more than 20 ms away."""
+def _tum_depth(depths: list[tuple[float, Path]], time: float) -> Path | None:
+    """The depth image nearest in time; None if it is more than 20 ms away."""
     if not depths:
         return None
     stamp, path = min(depths, key=lambda entry: abs(entry[0] - time))
-    return read_depth_png16(path, TUM_SCALE) if abs(stamp - time) <= _TUM_SLACK else None
+    return path if abs(stamp - time) <= _TUM_SLACK else None
 
 
 def load_motorcycle() -> Pair:

@@ -6,9 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-
-from soup_nlp.data.camera_check import check_camera
+from soup_nlp.data.camera_check import check_cameras
 from soup_nlp.data.formats.camera_files import undistorted
 from soup_nlp.data.formats.exif import estimated_cameras
 from soup_nlp.data.formats.images import read_images
@@ -105,9 +103,7 @@ def make_pair(
     if any(K is None for K in cameras):
         estimated = estimated_cameras(images, pictures, fov)
     own = [estimated[k] if K is None else K for k, K in enumerate(cameras)]
-    alike = pictures[0].shape == pictures[1].shape and np.array_equal(own[0], own[1])
-    for k in range(1 if alike else 2):
-        check_camera(own[k], pictures[k].shape[:2], images[k], cropped)
+    check_cameras(own, pictures, images, cropped)
     for k, coefficients in enumerate(distortion):
         pictures[k], own[k] = undistorted(pictures[k], own[k], coefficients)
     known = truth if truth.known() else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from soup_nlp.arrays import Mask
 from soup_nlp.data.datasets.layout import make_pair, need, read_if, training_folder
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_cam
-from soup_nlp.data.formats.images import DataWarning, read_mask
+from soup_nlp.data.formats.images import assumed, read_mask
 from soup_nlp.data.formats.map_files import read_dpt, read_flo
 from soup_nlp.data.pair import Float, Pair, Truth, check_size
 from soup_nlp.geometry.camera import intrinsics
@@ -87,11 +86,9 @@ def _cameras(paths: list[Path], scene: str) -> list[Float]:
     absent = [path for path in paths if not is_file(path)]
     if absent:
         doubt = "" if scene == DEFAULT_SCENE else f", which may be wrong for {scene}"
-        warnings.warn(
-            f"no camera file {absent[0]}: the focal length of {DEFAULT_SCENE} is taken,"
-            f" {DEFAULT_CAMERA[0]:g} pixels{doubt}; camdata_left comes with Sintel's depth training"
-            " data",
-            DataWarning,
-            stacklevel=3,
+        assumed(
+            absent[0],
+            "no such camera file (camdata_left comes with Sintel's depth training data)",
+            f"the focal length of {DEFAULT_SCENE}, {DEFAULT_CAMERA[0]:g} pixels{doubt}",
         )
     return [intrinsics(*DEFAULT_CAMERA) if p in absent else read_cam(p) for p in paths]

@@ -6,14 +6,11 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
-from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.data.working_size import scaled_camera
-from soup_nlp.geometry.camera import pixel_grid
+from soup_nlp.data.working_size import resized, resized_flow, scaled_camera
 
 ALIKE = 1.1
 """Largest ratio of two focal lengths of which flow methods find displacements reliably."""
@@ -22,31 +19,33 @@ FEW = 0.2
 
 
 def at_common_focal(pair: Pair) -> Pair:
-    """The pair with the next image resampled to the intrinsics of the reference frame.
+    """The pair with one image reduced to the focal lengths of the other one.
 
-    It is the same pair if the focal lengths differ by less than a tenth.
+    The finer one is reduced, since a blurred image shifts against a sharp one. It is the same pair
+    if the focal lengths differ by less than a tenth.
     """
-    ratio = np.sqrt(np.linalg.det(pair.K_next[:2, :2]) / np.linalg.det(pair.K_ref[:2, :2]))
-    if 1 / ALIKE <= ratio <= ALIKE:
+    ratio = np.diag(pair.K_next)[1::-1] / np.diag(pair.K_ref)[1::-1]
+    if 1 / ALIKE <= np.sqrt(ratio.prod()) <= ALIKE:
         return pair
-    image, K = pair.image_next, pair.K_next
-    if ratio > 1:
-        # the mean of pixels, since a warp takes single ones
-        size = [max(1, round(side / ratio)) for side in image.shape[:2]]
-        K = scaled_camera(K, image.shape, (size[0], size[1]))
-        image = np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA))
-    warped = cv2.warpPerspective(
-        image,
-        K @ np.linalg.inv(pair.K_ref),
-        pair.size[::-1],
-        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
+    shapes = np.array([pair.image_ref.shape[:2], pair.image_next.shape[:2]])
+    factors = np.minimum([ratio, 1 / ratio], 1.0)
+    sizes = np.maximum(1, np.rint(shapes * factors)).astype(int)
+    (ref, following), cameras = sizes, (pair.K_ref, pair.K_next)
+    K_ref, K_next = (scaled_camera(*own) for own in zip(cameras, shapes, sizes))
+    images = resized(pair.image_ref, ref), resized(pair.image_next, following)
+    return replace(
+        pair,
+        image_ref=images[0],
+        image_next=images[1],
+        K_ref=K_ref,
+        K_next=K_next,
+        flow=None,
+        truth=None,
     )
-    return replace(pair, image_next=np.asarray(warped), K_next=pair.K_ref, truth=None)
 
 
-def in_own_pixels(flow: Flow, pair: Pair, compute: Callable[[Pair], Flow]) -> Flow:
-    """The flow of `at_common_focal(pair)` as the flow of the pair, in pixels of both frames.
+def in_own_pixels(flow: Flow, near: Pair, pair: Pair, compute: Callable[[Pair], Flow]) -> Flow:
+    """The flow of `near`, which is `at_common_focal(pair)`, in the pixels of both frames.
 
     Where hardly any of it is usable, but the images match as they are, that flow (of `compute`) is
     taken.
@@ -54,11 +53,7 @@ def in_own_pixels(flow: Flow, pair: Pair, compute: Callable[[Pair], Flow]) -> Fl
     Warns:
         DataWarning: the images match as they are, which the focal lengths contradict.
     """
-    uv = pixel_grid(*pair.size)
-    A = (pair.K_next @ np.linalg.inv(pair.K_ref))[:2]
-    own = (uv + flow.uv) @ A[:, :2].T + A[:, 2] - uv
-    seen = ~leaves(own, pair.image_next.shape[:2])
-    found = Flow(own.astype(np.float32), flow.confidence * seen, flow.source)
+    found = resized_flow(flow, near, pair)
     if _usable(found) >= FEW:
         return found
     plain = compute(pair)

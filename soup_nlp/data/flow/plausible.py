@@ -30,8 +30,14 @@ _LEAST = 0.2  # share of the known pixels that must stay in the image
 _FACTORS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 2, 2, 3, 4)
 
 
-def check_flow(flow: Flow, pair: Pair) -> None:
+def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
     """Compare the images along a flow of a pair that was not computed here.
+
+    Args:
+        flow: The flow.
+        pair: Its images.
+        backward: The flow is from the next to the reference image. It may be wrong in parts, which
+            the round trip finds.
 
     Raises:
         DataError: the flow is in another order, direction or unit, leads out of the image, or is
@@ -40,6 +46,8 @@ def check_flow(flow: Flow, pair: Pair) -> None:
     Warns:
         DataWarning: the flow is hardly better than no flow.
     """
+    if backward:
+        pair = Pair(pair.image_next, pair.image_ref, pair.K_next, pair.K_ref)
     step = 1 + int(np.sqrt(flow.confidence.size / _PIXELS))
     height, width = pair.size
     v, u = (x.astype(np.float32) for x in np.mgrid[0:height:step, 0:width:step])
@@ -75,11 +83,11 @@ def check_flow(flow: Flow, pair: Pair) -> None:
             cause, least = name, relative
     if cause:
         problem, hint = "flow does not fit the images", f"it does {cause}"
-    elif own > none + WORSE:
+    elif own > none + WORSE and not backward:
         problem = "flow does not fit the images: it is worse than no flow"
-        hint = "is it of these two images, in this order, in pixels of the reference image?"
+        hint = "is it of these two images, in this order, in pixels?"
     else:
-        if none > WORSE and own > USELESS * none:
+        if not backward and none > WORSE and own > USELESS * none:
             warnings.warn(
                 f"flow {flow.source} explains the images hardly better than no flow"
                 f" ({own:.3f} and {none:.3f}): is it of these images?",
@@ -91,7 +99,7 @@ def check_flow(flow: Flow, pair: Pair) -> None:
         problem,
         where=flow.source,
         found=f"difference of the images {own:.3f} along the flow, {none:.3f} without a flow",
-        expected="displacements (u right, v down) in pixels, from the reference to the next image",
+        expected="displacements (u right, v down) in pixels, to the other image",
         hint=hint,
     )
 
@@ -108,7 +116,7 @@ def _changes(uv: FloatMap, pair: Pair) -> dict[str, FloatMap | Float]:
     size = np.array(pair.size[::-1], np.float64)
     return {
         "with its channels u and v exchanged": uv[..., ::-1],
-        "with both signs changed: it may be the backward flow": -uv,
+        "with both signs changed: it may be of the other direction (backward)": -uv,
         "with the sign of v changed: its axis may point up": uv * [1.0, -1.0],
         "times the image's size: it may be relative to it": uv * size,
         "times half the image's size: it may be relative to it": uv * size / 2,

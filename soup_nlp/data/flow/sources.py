@@ -146,7 +146,7 @@ class FlowOptions(Section):
 
         near = at_common_focal(pair)
         flow = compute(near)
-        return flow if near is pair else in_own_pixels(flow, pair, compute)
+        return flow if near is pair else in_own_pixels(flow, near, pair, compute)
 
     def _load_with_confidence(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
         """The flow of a file, its confidence from a backward flow and a map."""
@@ -161,10 +161,13 @@ class FlowOptions(Section):
         flow = resolve_flow(pair, str(path(self.source)))
         own = flow.confidence.copy()
         if self.backward:
-            back = read_flow(path(self.backward)).astype(np.float32)
+            back = load_flow(path(self.backward))
             size = pair.image_next.shape
-            check_size("backward flow and next image", back.shape, size, self.backward)
-            gap = round_trip_error(flow.uv, back)
+            check_size("backward flow and next image", back.uv.shape, size, self.backward)
+            check_flow(back, pair, backward=True)
+            gap = round_trip_error(
+                flow.uv, np.where(back.confidence[..., None] > 0, back.uv, np.nan)
+            )
             own *= confidence_of(gap, self.dis.tau, self.dis.limit)
         if self.confidence:
             given = read_confidence(path(self.confidence))

@@ -29,6 +29,11 @@ class DataWarning(UserWarning):
     """An input can be used, but it may not be what the user expects."""
 
 
+def assumed(where: object, missing: str, taken: str) -> None:
+    """Warn of values that no input gives: what is missing, and what is taken instead."""
+    warnings.warn(f"{where}: {missing}; assumed: {taken}", DataWarning, stacklevel=3)
+
+
 def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
     """Raise DataError unless a file body has the number of bytes given by its header."""
     if found != expected:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable, Mapping
-from functools import partial
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap
-from soup_nlp.data.formats.images import check_body, decode, decode_png16
+from soup_nlp.data.formats.images import assumed, check_body, decode, decode_png16
 from soup_nlp.data.formats.npy_files import read_npy
 from soup_nlp.errors import DataError, repr_of
 from soup_nlp.schema.limits import check_image_size
@@ -41,6 +40,9 @@ VKITTI_SKY = 65535
 
 KITTI_DISPARITY = 256.0
 """Values per pixel of a KITTI disparity image."""
+
+MILLIMETRES = 1000.0
+"""Values per unit of length of a depth image that is assumed if none are given."""
 
 
 def check_magic(content: bytes, path: PathLike, what: str) -> None:
@@ -232,7 +234,7 @@ def read_pfm(path: PathLike) -> Float:
     return _known_depth(_raster(content, header.end(), size, order, path, "PFM file")[::-1], path)
 
 
-def read_depth_png16(path: PathLike, scale: float = 1000.0) -> Float:
+def read_depth_png16(path: PathLike, scale: float) -> Float:
     """Read a 16-bit grey PNG of depth = value / scale, 0 where unknown.
 
     Args:
@@ -257,15 +259,28 @@ def read_vkitti_depth(path: PathLike) -> Float:
     return depth
 
 
-def read_depth(path: PathLike, png_scale: float = 1000.0) -> Float:
+def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIMETRES) -> Float:
     """Read a depth by the suffix of its file: .dpt, .npy, .pfm or 16-bit .png.
 
-    `png_scale` are the values per unit of length of a .png, see `read_depth_png16`.
+    Args:
+        path: The file.
+        scale: Values per unit of length of a .png, see `read_depth_png16`; None for the usual ones.
+        usual: These values.
+
+    Warns:
+        DataWarning: the usual scale is assumed.
     """
+
+    def by_scale(path: PathLike) -> Float:
+        if scale is None:
+            taken = f"{usual:g} values per unit of length; depth_scale (--depth-scale) sets them"
+            assumed(Path(path).parent, "the scale of its 16-bit depth is not given", taken)
+        return read_depth_png16(path, usual if scale is None else scale)
+
     readers: dict[str, Reader] = {
         ".dpt": read_dpt,
         ".npy": lambda p: _known_depth(read_npy(p, "depth file"), p),
         ".pfm": read_pfm,
-        ".png": partial(read_depth_png16, scale=png_scale),
+        ".png": by_scale,
     }
     return _by_suffix(path, readers, "depth")
