@@ -21,11 +21,12 @@ def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
     assert run.pair.flow is not None
     usable = float((run.pair.flow.confidence > 0).mean())
     sure, main = run.confidence.evidence, int(np.argmax(np.bincount(run.start.component)))
-    lines = [
-        f"flow usable at {usable:.0%} of the pixels, noise {sure.noise:.2f} px",
-        f"error of the flow of the largest component: {sure.turn[main]:.2f} px by a turn alone,"
-        f" {sure.constant[main]:.2f} px at a constant depth, {sure.solution[main]:.2f} px here",
-    ]
+    lines = [f"flow usable at {usable:.0%} of the pixels, noise {sure.noise:.2f} px"]
+    if np.isfinite(sure.turn[main]):
+        lines.append(
+            f"error of the flow of the largest component: {sure.turn[main]:.2f} px by a turn alone,"
+            f" {sure.constant[main]:.2f} px at a constant depth, {sure.solution[main]:.2f} px here"
+        )
     if run.start.at_rest:
         lines.append("the camera stands still or only turns: depth is a guess")
     elif run.start.bends.all():
