@@ -389,6 +389,10 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     assert "static scene" in scene.graph.nodes_geometry
     rows = (tmp_path / "more" / "colmap" / "sparse" / "0" / "points3D.txt").read_text()
     assert len(rows.splitlines()) == 2 + min(COLMAP_POINTS, len(rows.splitlines()) - 2) > 1000
+    poses = (tmp_path / "more" / "colmap" / "sparse" / "0" / "images.txt").read_text()
+    # two lines for each frame, also the last one, which sees points too
+    assert len(poses.splitlines()) == 2 + 2 * 3
+    assert len(poses.splitlines()[-1].split()) > 300
     for k in range(3):
         truth = render_scene("street", 0, 160, 108, k).truth.depth_ref
         (tmp_path / "true").mkdir(exist_ok=True)

@@ -8,9 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from soup_nlp.arrays import Float, Mask
+from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError, expect
 from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.geometry.superpixels import Labels
 from soup_nlp.sequence.pairs import SolvedPair
 from soup_nlp.sequence.scales import Link, link, solve_scales
 from soup_nlp.sequence.tracks import carried, follow, number
@@ -49,6 +50,23 @@ class Chain:
         if frame == len(self.pairs):
             return self.scales[-1] * self.pairs[-1].result.depths[1]
         return self.scales[frame] * self.pairs[frame].result.depths[0]
+
+    def image(self, frame: int) -> Image:
+        """(H, W, 3) uint8 RGB of a frame."""
+        last = frame == len(self.pairs)
+        return self.pairs[frame - last].result.images[int(last)]
+
+    def camera(self, frame: int) -> Float:
+        """(3, 3) intrinsics of a frame, pixels."""
+        last = frame == len(self.pairs)
+        return self.pairs[frame - last].result.K[int(last)]
+
+    def labels(self, frame: int) -> Labels:
+        """(H, W) components of a frame; -1 where the last one shows what the others do not."""
+        last = frame == len(self.pairs)
+        result = self.pairs[frame - last].result
+        own = result.components.of_pixel
+        return np.asarray(carried(own, result.reconstruction) if last else own, np.int32)
 
     def points(self, frame: int) -> Float:
         """(H, W, 3) points of a frame but the last, in world coordinates."""

@@ -118,17 +118,16 @@ def _joined(clouds: list[Cloud]) -> Cloud:
 
 
 def projected(chain: Chain, points: Float, frame: int) -> tuple[Mask, Int, Int, Float]:
-    """Points (M, 3) of the world in a frame that is a reference frame.
+    """Points (M, 3) of the world in a frame.
 
     Returns:
         Mask of the points in the image, their rows and columns, and their depths.
     """
-    result = chain.pairs[frame].result
     local = chain.world_from_camera[frame].inverse(points)
-    height, width = result.images[0].shape[:2]
+    height, width = chain.image(frame).shape[:2]
     z = local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        uv = (local @ result.K[0].T)[:, :2] / z[:, None]
+        uv = (local @ chain.camera(frame).T)[:, :2] / z[:, None]
         inside = (z > 0) & (uv >= -0.5).all(1) & (uv < [width - 0.5, height - 0.5]).all(1)
     u, v = np.rint(np.where(inside[:, None], uv, 0)).astype(np.int64).T
     return inside, v, u, z

@@ -95,24 +95,23 @@ def _write_glb(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> str:
 
 
 def _write_colmap(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> str:
-    """COLMAP's model of the sequence: all frames but the last, and the fused cloud."""
+    """COLMAP's model of the sequence: all frames and the fused cloud."""
     cloud = fuse(chain)
     cloud = cloud.kept(np.arange(0, len(cloud), max(1, -(-len(cloud) // COLMAP_POINTS))))
-    seen = []
-    for k in range(len(chain.pairs)):
+    frames, seen = range(len(chain)), []
+    for k in frames:
         inside, v, u, z = projected(chain, cloud.points, k)
         with np.errstate(invalid="ignore", divide="ignore"):
             near = np.abs(np.log(z / chain.depth(k)[v, u])) < VISIBLE
         at = np.flatnonzero(inside & near)
         seen.append((at, np.stack([u[at], v[at]], 1).astype(float)))
-    results = [pair.result for pair in chain.pairs]
     write_model(
         folder / "colmap",
-        [f"{k:04d}.png" for k in range(len(results))],
-        [r.images[0] for r in results],
-        [r.K[0] for r in results],
-        [pose.inverse for pose in chain.world_from_camera[: len(results)]],
-        [r.components.of_pixel > 0 for r in results],
+        [f"{k:04d}.png" for k in frames],
+        [chain.image(k) for k in frames],
+        [chain.camera(k) for k in frames],
+        [pose.inverse for pose in chain.world_from_camera],
+        [chain.labels(k) > 0 for k in frames],
         (cloud.points, cloud.colours),
         seen,
         f"{contents['name']}; unit: {contents['unit']}",

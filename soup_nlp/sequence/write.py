@@ -68,7 +68,7 @@ def write_chain(
     write_text(folder / "trajectory.tum", trajectory(chain))
     write_fused(folder, chain, contents)
     pictures, text = _page(chain, contents)
-    write_video(folder / "depth.mp4", [np.vstack(p) for p in zip(images(chain), pictures)])
+    write_video(folder / "depth.mp4", pictures)
     write_text(folder / CHAIN_PAGE, text)
 
 
@@ -81,11 +81,13 @@ def renew_chain_page(folder: Path) -> Path:
 
 
 def _page(chain: Chain, contents: dict[str, Any]) -> tuple[list[Image], str]:
-    """Depth of all frames in colour, and the page."""
-    depths = [chain.depth(k) for k in range(len(chain))]
+    """Images of all frames above their depth in colour, and the page."""
+    frames = range(len(chain))
+    depths, shown = [chain.depth(k) for k in frames], [chain.image(k) for k in frames]
     span = depth_range(np.concatenate([z.ravel()[::7] for z in depths]))
     pictures = [colourise_depth(z, *span) for z in depths]
-    return pictures, chain_page(chain, contents, images(chain), pictures, span)
+    text = chain_page(chain, contents, shown, pictures, span)
+    return [np.vstack(both) for both in zip(shown, pictures)], text
 
 
 def summary(chain: Chain) -> dict[str, Any]:
@@ -129,11 +131,6 @@ def trajectory(chain: Chain) -> str:
     """Poses of the camera in the format of the TUM benchmark, world_from_camera."""
     head = f"# timestamp tx ty tz qx qy qz qw; timestamp: frame number; unit: {UNIT}"
     return tum_text([head], chain.world_from_camera)
-
-
-def images(chain: Chain) -> list[Image]:
-    """(H, W, 3) images of all frames."""
-    return [*(p.result.images[0] for p in chain.pairs), chain.pairs[-1].result.images[1]]
 
 
 def write_video(path: Path, pictures: list[Image]) -> None:
