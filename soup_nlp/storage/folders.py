@@ -128,7 +128,9 @@ def staged(
                 old = {k: v for k, v in made_files(target).items() if not is_foreign(target, k)}
                 write_mark(stage, new if whole else old | new, subject or subject_of(target))
                 for name in old.keys() & new.keys():
-                    shutil.copymode(target / name, stage / name)
+                    # a file of the program may have been removed
+                    with suppress(FileNotFoundError):
+                        shutil.copymode(target / name, stage / name)
                 _sync(stage)
                 os.rename(stage, target / _COMMIT)
                 _move_in(target)
