@@ -187,6 +187,22 @@ def test_the_page_can_be_left_out(small_run, folder):
     assert "overview.png" in files
 
 
+def test_a_component_whose_depth_is_a_guess_is_striped(shown):
+    def stripes(sigma):
+        tree = {**shown.tree, "depth": {**shown.tree["depth"], "sigma_ref": sigma}}
+        own = pictures(replace(shown, tree=tree))["components"]
+        return (own.image == 255).all(axis=2), own.title
+
+    sigma = np.full(shown.labels.shape, 0.02)
+    white, title = stripes(sigma)
+    assert "striped" not in title
+    assert white.mean() < 0.01
+    sigma[shown.components.of_superpixel[shown.labels] == 0] = 0.4
+    white, title = stripes(sigma)
+    assert "striped: most of its depth is a guess" in title
+    assert 0.3 < white[shown.components.of_superpixel[shown.labels] == 0].mean() < 0.45
+
+
 def test_view_of_no_result(tmp_path, capsys):
     assert main(["view", str(tmp_path)]) == 2
     assert "result file does not exist" in capsys.readouterr().err

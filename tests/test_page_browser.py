@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from helpers_chromium import Chromium, file_address, find_chromium
 
 from soup_nlp.report.folder import summary
@@ -177,6 +180,47 @@ def test_the_least_confidence_hides_points_and_what_is_shown_is_saved(browser, s
     browser.value("soupView.setLeast(0)")
     browser.value("document.querySelectorAll('#modes button')[1].click()")
     browser.wait("location.hash.startsWith('#mode=')")
+    assert browser.log == []
+
+
+@pytest.mark.parametrize("points", [False, True])
+def test_what_is_shown_is_saved_for_other_viewers(browser, small_run, tmp_path, points):
+    browser.value("soupView.setMode('image_ref'); soupView.setTime(1); soupView.setFar(1e9)")
+    if points:
+        browser.value("document.getElementById('points').click()")
+    text = browser.value(
+        "soupView.glb().arrayBuffer().then((b) => btoa([...new Uint8Array(b)]"
+        ".map((c) => String.fromCharCode(c)).join('')))"
+    )
+    if points:
+        browser.value("document.getElementById('points').click()")
+    (tmp_path / "a.glb").write_bytes(base64.b64decode(text))
+    (found,) = trimesh.load(tmp_path / "a.glb").geometry.values()
+    assert isinstance(found, trimesh.PointCloud if points else trimesh.Trimesh)
+    shown = of_run(small_run, summary(small_run), "")
+    own = shown.scale * small_run.reconstruction.points_ref.reshape(-1, 3)
+    assert len(found.vertices) > 0.5 * len(own)
+    # the scene at time 1 in the reference camera's axes, y up
+    depth = np.median(-found.vertices[:, 2])
+    assert depth == pytest.approx(np.median(own[:, 2]), rel=0.05)
+    colours = found.colors if points else found.visual.vertex_colors
+    assert np.std(colours[:, :3]) > 10
+
+
+def test_keys_and_the_edge_between_the_frames(browser):
+    browser.value("soupView.setTime(0.5); document.activeElement.blur()")
+    press = (
+        "document.body.dispatchEvent(new KeyboardEvent('keydown', {{key: '{}', bubbles: true}}))"
+    )
+    browser.value(press.format("ArrowRight"))
+    assert float(browser.value("document.getElementById('time').value")) == pytest.approx(0.6)
+    browser.value(press.format(" "))
+    assert browser.value("document.getElementById('play').textContent") == "\u25a0"
+    browser.value(press.format(" "))
+    assert browser.value("document.getElementById('play').textContent") == "\u25b6"
+    assert browser.value("document.getElementById('before').naturalWidth") > 0
+    browser.value("const e = document.getElementById('edge'); e.value = 80; e.oninput()")
+    assert "20%" in browser.value("document.getElementById('before').style.clipPath")
     assert browser.log == []
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from soup_nlp.arrays import Mask
+from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.report.colour import (
     ERROR_LIMIT,
     SIGMA_LIMIT,
@@ -116,10 +118,25 @@ def _parts(shown: Shown) -> list[Picture]:
     word = f"one {kind}" if count == 1 else f"{count} {kind}s, share of the image"
     grey = back.astype(float).mean(axis=2, keepdims=True)
     shaded = colours[component[labels]] * (0.6 + 0.4 * grey / 255)
+    unsure = _unsure(shown, count)
+    stripe = np.add.outer(np.arange(labels.shape[0]), np.arange(labels.shape[1])) % 8 < 3
+    shaded[unsure[component[labels]] & stripe] = 255
+    if unsure.any():
+        word += "; striped: most of its depth is a guess"
     return [
         Picture("superpixels", f"{number} superpixels", draw_superpixels(back, labels)),
         Picture("components", word, shaded.astype(np.uint8), Swatches(tuple(first))),
     ]
+
+
+def _unsure(shown: Shown, count: int) -> Mask:
+    """(count,) True for components most of whose pixels have a guess as depth, or no sigma."""
+    sigma = shown.array("depth/sigma_ref")
+    if sigma is None:
+        return np.zeros(count, bool)
+    part = shown.components.of_superpixel[shown.labels].ravel()
+    guess = np.bincount(part, ~(sigma.ravel() <= MOST_SIGMA), minlength=count)
+    return np.asarray(guess > 0.5 * np.bincount(part, minlength=count))
 
 
 def _flow(shown: Shown) -> list[Picture]:

@@ -10,7 +10,21 @@ for (const image of document.querySelectorAll("figure > img"))
 addEventListener("keydown", (event) => {
   if (event.key === "Escape")
     document.querySelectorAll("figure.large").forEach((f) => f.classList.remove("large"));
+  /* sliders and buttons have keys of their own */
+  if (event.target !== document.body || !window.soupView) return;
+  const step = { ArrowLeft: -0.1, ArrowRight: 0.1 }[event.key];
+  if (step) window.soupView.setTime(Math.min(Math.max(Number($("time").value) + step, 0), 1));
+  else if (event.key === " ") $("play").click();
+  else return;
+  event.preventDefault();
 });
+
+/* both frames one above the other, cut at an edge that can be moved */
+const [left, right] = ["ref", "next"].map((name) => document.querySelector(`img[data-name="image_${name}"]`));
+if (left && right) {
+  [$("before").src, $("after").src, $("split").hidden] = [left.src, right.src, false];
+  $("edge").oninput = () => { $("before").style.clipPath = `inset(0 ${100 - $("edge").value}% 0 0)`; };
+}
 
 /* numbers that were deflated and written as base64 */
 async function unpack(text, Kind) {
@@ -385,31 +399,68 @@ $("canvas").addEventListener("pointerup", (event) => {
 
 /* the points that are shown, where they are now, in their colours; of the next frame in those of the
    first picture */
-function ply() {
+function shownPoints() {
   const flatImage = document.createElement("canvas"), pen = flatImage.getContext("2d");
   [flatImage.width, flatImage.height] = [w, h];
   const on = document.querySelector("#modes .on").value, name = uniforms.fromNext.value ? data.modes[0].name : on;
   pen.drawImage(document.querySelector(`figure > img[data-name="${name}"]`), 0, 0, w, h);
   const pixels = pen.getImageData(0, 0, w, h).data, kept = [];
   for (let p = 0; p < w * h; p++) if (drawn(p)) kept.push(p);
+  const places = kept.map((p) => moved(p, uniforms.time.value));
+  return { kept, places, colours: kept.map((p) => pixels.subarray(4 * p, 4 * p + 3)) };
+}
+function ply() {
+  const { kept, places, colours } = shownPoints();
   const head = `ply\nformat binary_little_endian 1.0\ncomment time ${uniforms.time.value}, x right, y down, z ahead\n`
     + `element vertex ${kept.length}\nproperty float x\nproperty float y\nproperty float z\n`
     + "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n";
   const rows = new DataView(new ArrayBuffer(15 * kept.length));
-  kept.forEach((p, k) => {
-    const q = moved(p, uniforms.time.value);
+  places.forEach((q, k) => {
     [q.x, q.y, q.z].forEach((x, j) => rows.setFloat32(15 * k + 4 * j, x, true));
-    for (let c = 0; c < 3; c++) rows.setUint8(15 * k + 12 + c, pixels[4 * p + c]);
+    colours[k].forEach((c, j) => rows.setUint8(15 * k + 12 + j, c));
   });
   return new Blob([head, rows.buffer]);
 }
-$("ply").onclick = () => {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(ply());
-  link.download = `${document.title || "points"}.ply`;
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
-};
+/* glTF: y up, z towards the viewer; the surface where it is shown, else points */
+function glb() {
+  const { kept, places, colours } = shownPoints(), count = kept.length;
+  const number = new Map(kept.map((p, k) => [p, k])), index = [];
+  if (mesh.visible)
+    for (let k = 0; k < corners.length; k += 3) {
+      const three = [...corners.subarray(k, k + 3)].map((p) => number.get(p));
+      if (!three.includes(undefined)) index.push(...three);
+    }
+  const xyz = Float32Array.from(places.flatMap((q) => [q.x, -q.y, -q.z]));
+  const tint = Uint8Array.from(colours.flatMap((c) => [...c, 255])), faces = Uint32Array.from(index);
+  const least = [0, 1, 2].map((j) => places.reduce((m, q) => Math.min(m, [q.x, -q.y, -q.z][j]), Infinity));
+  const most = [0, 1, 2].map((j) => places.reduce((m, q) => Math.max(m, [q.x, -q.y, -q.z][j]), -Infinity));
+  const accessors = [
+    { bufferView: 0, componentType: 5126, count, type: "VEC3", min: least, max: most },
+    { bufferView: 1, componentType: 5121, count, type: "VEC4", normalized: true }];
+  const bufferViews = [{ buffer: 0, byteLength: xyz.byteLength },
+    { buffer: 0, byteOffset: xyz.byteLength, byteLength: tint.byteLength }];
+  const primitive = { attributes: { POSITION: 0, COLOR_0: 1 }, mode: index.length ? 4 : 0 };
+  if (index.length) {
+    primitive.indices = 2;
+    accessors.push({ bufferView: 2, componentType: 5125, count: index.length, type: "SCALAR" });
+    bufferViews.push({ buffer: 0, byteOffset: xyz.byteLength + tint.byteLength, byteLength: faces.byteLength });
+  }
+  const length = xyz.byteLength + tint.byteLength + faces.byteLength;
+  const text = JSON.stringify({ asset: { version: "2.0" }, scene: 0, scenes: [{ nodes: [0] }], nodes: [{ mesh: 0 }],
+    meshes: [{ primitives: [primitive] }], accessors, bufferViews, buffers: [{ byteLength: length }] });
+  const json = new TextEncoder().encode(text + " ".repeat(-new TextEncoder().encode(text).length & 3));
+  const head = new Uint32Array([0x46546c67, 2, 28 + json.length + length, json.length, 0x4e4f534a]);
+  return new Blob([head, json, new Uint32Array([length, 0x004e4942]), xyz, tint, faces]);
+}
+for (const [kind, make] of Object.entries({ ply, glb }))
+  $(kind).onclick = () => {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(make());
+    link.download = `${document.title || "points"}.${kind}`;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  };
+
 $("time").oninput = () => setTime($("time").value);
 $("points").onchange = () => { cloud.visible = $("points").checked; mesh.visible = fringe.visible = !cloud.visible; draw(); };
 $("guesses").onchange = () => { uniforms.guesses.value = $("guesses").checked; draw(); };
@@ -462,7 +513,7 @@ resize();
 await show();
 $("message").textContent = "";
 document.body.dataset.ready = "yes";
-window.soupView = { setMode, setTime, setView, setFar, setLeast, pick, tell, ply, eye, modes: data.modes.map((one) => one.name) };
+window.soupView = { setMode, setTime, setView, setFar, setLeast, pick, tell, ply, glb, eye, modes: data.modes.map((one) => one.name) };
 })().catch((error) => {
   document.getElementById("message").textContent = `The 3D view failed: ${error.message}`;
   throw error;
