@@ -78,7 +78,8 @@ def _parts(shown: Shown) -> list[str]:
         return []
     pixels = shown.labels.size
     moving = 1 - parts.background.pixels / pixels
+    some = "1 component" if len(parts) == 2 else f"{len(parts) - 1} components"
     return [
-        f"{len(parts) - 1} components beside the background ({moving:.1%} of the image) have"
-        " no scale from the images: theirs follows from what they stand on or touch."
+        f"The scale of {some} beside the background ({moving:.1%} of the image) follows not from"
+        " the images but from what it stands on or touches."
     ]
