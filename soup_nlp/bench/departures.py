@@ -102,7 +102,7 @@ DEPARTURES = (
     ),
     Departure(
         "another energy where surfaces bend",
-        ("start.bending_price",),
+        ("start.bending",),
         with_on={**_SHARED, **_PIXELS},
         needs="on: with the start that finds them, and pixel units",
     ),

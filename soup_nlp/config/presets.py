@@ -37,7 +37,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "method": "homography",
                 "samples": 100,
                 "threshold_px": 0.5,
-                "bending_price": 100.0,
+                "bending": False,
                 "ground": False,
             },
             "energy": {

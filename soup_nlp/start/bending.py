@@ -20,16 +20,30 @@ from soup_nlp.start.choice import Choice
 from soup_nlp.start.components import connected_labels
 from soup_nlp.start.views import Views
 
-REST_PX = 0.08
-"""Mean error, pixels, by which a rigid motion with depths must explain the flow of the largest
-component better than a turn alone; errors of the flow reach it."""
-CLIP_PX = 1.0
-"""Limit of an error where the two are compared, pixels: movers that the component took along."""
+SYSTEMATIC, LEAST_PX, MOST_PX = 4.0, 0.01, 0.07
+"""Systematic error of a dense flow, in units of its noise, and its limits in pixels."""
+REFERENCE = 1000
+"""Number of superpixels at which the noise is measured: an affine flow leaves a residual that grows
+with the diameter of the superpixel."""
 
 
-def turn_alone(views: Views, choice: Choice, component: Int, usable: Mask) -> Float | None:
+def reference_noise(residual: Float) -> float:
+    """Noise of the flow, pixels, from (N,) residuals of affine flows, whatever N."""
+    return float(np.median(residual) * np.sqrt(len(residual) / REFERENCE))
+
+
+def systematic_error(noise: float) -> float:
+    """Error, pixels, that large parts of a flow may have in common."""
+    return float(np.clip(SYSTEMATIC * noise, LEAST_PX, MOST_PX))
+
+
+def turn_alone(
+    views: Views, choice: Choice, component: Int, usable: Mask, noise: float
+) -> Float | None:
     """The camera's rotation, if it explains the flow of the largest component without depth.
 
+    It does if the rigid motion of most superpixels, with depths, has an error that is smaller by no
+    more than the systematic error of the flow: movers that the component took along do not count.
     The focal length is free in the fit, because a wrong one leaves a residual that depths explain.
 
     Args:
@@ -37,6 +51,7 @@ def turn_alone(views: Views, choice: Choice, component: Int, usable: Mask) -> Fl
         choice: Rigid motion and plane of every superpixel.
         component: (N,) rigid component of every superpixel.
         usable: (N,) True where the flow counts.
+        noise: See `reference_noise`, pixels.
 
     Returns:
         The (3, 3) rotation, or None where the camera's translation is seen.
@@ -45,8 +60,8 @@ def turn_alone(views: Views, choice: Choice, component: Int, usable: Mask) -> Fl
     if not len(at):
         return None
     turn, error = fit_turn(views.some(at))
-    gain = np.minimum(error, CLIP_PX) - np.minimum(choice.fit.cost[at, 0], CLIP_PX)
-    return None if gain.mean() > REST_PX else turn
+    gain = np.median(error - choice.fit.cost[at, 0])
+    return None if gain > systematic_error(noise) else turn
 
 
 def turned(x: Float, ray: Float) -> Float:

@@ -274,8 +274,8 @@ def _adopt(
 
 
 def rigid_choice(
-    views: Views, seg: Segmentation, jump: Float, o: SeededStart
-) -> tuple[Choice, list[Motion], float]:
+    views: Views, seg: Segmentation, jump: Float, motions: list[Motion], o: SeededStart
+) -> tuple[Choice, float]:
     """One of few rigid motions of the whole image, or of a neighbourhood, for every superpixel.
 
     Args:
@@ -288,7 +288,6 @@ def rigid_choice(
         The choice, the motions of the whole image, and the noise of the flow, pixels.
     """
     known = views.weight.any(axis=1)
-    motions = dominant(views, o)
     fit = views.fit(motions)
     cost = fit.penalised()
     noise = limited_noise(cost.min(axis=1)[known])
@@ -310,4 +309,4 @@ def rigid_choice(
     label = smooth_choice(cost, flow_affinity(jump, o), seg, o.smoothness)
     R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
     choice = Choice(R, t, fit.pick((np.arange(len(seg)), label)), label)
-    return of_neighbourhoods(views, seg, choice, noise, o), motions, noise
+    return of_neighbourhoods(views, seg, choice, noise, o), noise

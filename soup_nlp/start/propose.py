@@ -18,6 +18,7 @@ from soup_nlp.start.bending import (
     affine_flow,
     constant_depth,
     flow_jump,
+    reference_noise,
     surfaces,
     turn_alone,
 )
@@ -33,7 +34,7 @@ from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import above_ground, floating, ground
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import earned, gather
-from soup_nlp.start.regions import bending_regions
+from soup_nlp.start.regions import surface_motions
 from soup_nlp.start.settle import settle
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
@@ -124,31 +125,22 @@ def propose(
     affine, residual = affine_flow(views)
     jump = flow_jump(affine, views, seg.pairs, rays(K_ref, seg.boundary))
     surface, usable = surfaces(jump, seg, o.discontinuity_px), views.weight.mean(axis=1) > SURE
-    choice, noise = rigid_motions(views, seg, jump, o)
+    centre = np.concatenate([affine[:, 0] / views.focal, np.ones((len(seg), 1))], axis=1)
+    motions, bends = surface_motions(views, seg, surface, residual, usable, o)
+    bends &= o.bending
+    choice, noise = rigid_motions(views, seg, jump, motions, o)
     component = rigid_components(choice.label, seg)
-    bends = bending_regions(
-        seg,
-        surface,
-        jump,
-        residual,
-        choice.fit.cost[:, 0],
-        component,
-        usable,
-        price=o.bending_price,
-        discontinuity_px=o.discontinuity_px,
-    )
-    turn = turn_alone(views, choice, component, usable)
+    turn = turn_alone(views, choice, component, usable, reference_noise(residual))
     if turn is not None or bends.all():
         return _constant(views, surface, choice, limited_noise(residual), turn)
     free = constant_depth(views) if bends.any() else None
     if free is not None:
         # the flow of bending regions says nothing about the motions of the rest
         views, poor = views.without(bends), poor | bends
-        choice, noise = rigid_motions(views, seg, jump, o)
+        choice, noise = rigid_motions(views, seg, jump, motions, o)
     else:
         surface = connected_labels(jump < o.discontinuity_px, seg)
     choice, wrong = earned(views, choice, seg, noise)
-    centre = np.concatenate([affine[:, 0] / views.focal, np.ones((len(seg), 1))], axis=1)
     weight = np.where(usable & ~bends, 1.0, 0.0)
     choice = settle(views, choice, centre, weight, limited_noise(residual), o.piece_size)
     choice, motions = choice.renumbered()
@@ -174,10 +166,10 @@ def propose(
 
 
 def rigid_motions(
-    views: Views, seg: Segmentation, jump: Float, o: SeededStart
+    views: Views, seg: Segmentation, jump: Float, motions: list[Motion], o: SeededStart
 ) -> tuple[Choice, float]:
     """One of few rigid motions for every superpixel, and the noise of the flow, pixels."""
-    choice, _, noise = rigid_choice(views, seg, jump, o)
+    choice, noise = rigid_choice(views, seg, jump, motions, o)
     return gather(views, seg, jump, choice, noise, o).renumbered()[0], noise
 
 

@@ -1,8 +1,8 @@
-"""Which regions of the image bend: rigid components against a free motion of each superpixel.
+"""Which surfaces bend: those of which no single rigid motion explains most of the flow.
 
-Both hypotheses explain the same flow, and both are measured by the length of their description per
-superpixel, in nats: the residual in units of the flow's noise, and what it costs to say which
-component a superpixel belongs to. A free motion fits any flow and costs `bending_price`.
+The flow is continuous within a surface (`start.bending.surfaces`). Of a rigid surface one motion
+explains the flow of most superpixels, whatever else moves there; of a bending one no motion does.
+The test does not depend on the number of superpixels or of rigid components.
 """
 
 from __future__ import annotations
@@ -11,69 +11,87 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.start.choice import limited_noise
-from soup_nlp.start.components import connected_labels
+from soup_nlp.start.bending import reference_noise, systematic_error
+from soup_nlp.start.choice import Choice, dominant
+from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.merge import candidates
+from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import Views
 
-MOST_EXCESS = 4.0
-"""Limit of a superpixel's excess, in units of the noise: beyond it the flow itself may be wrong."""
-FEWEST = 15
-"""Least number of superpixels of a region beside the largest component that is tested."""
+NOISES = 0.4
+"""Median excess of the error up to which a surface is rigid, beside the systematic error, in units
+of the noise."""
+LEAST_SHARE = 0.06
+"""Least share of the superpixels that makes a surface: a smaller one joins a neighbour, because a
+few superpixels with a wrong flow look like a bending one."""
 
 
-def bending_regions(
-    seg: Segmentation,
-    surface: Int,
-    jump: Float,
-    residual: Float,
-    error: Float,
-    component: Int,
-    usable: Mask,
-    *,
-    price: float,
-    discontinuity_px: float,
-) -> Mask:
-    """(N,) True where the superpixel lies in a region that bends.
+def surface_motions(
+    views: Views, seg: Segmentation, surface: Int, residual: Float, usable: Mask, o: SeededStart
+) -> tuple[list[Motion], Mask]:
+    """The best rigid motion of each surface that does not bend, and which surfaces bend.
 
-    The description by rigid components costs the mean excess of their error over that of free
-    affine flows, and the entropy of the component labels. Components that really move apart leave a
-    discontinuity of the flow; by the share of their common outlines where the flow is continuous,
-    the labels cost up to twice the entropy. The whole image is tested first, then every connected
-    region of a surface outside the largest component.
+    A surface bends if under every rigid motion the median excess of its superpixels' error over the
+    residual of an affine flow of their own is above the flow's systematic error plus `NOISES` times
+    its noise.
 
     Args:
+        views: Rays, targets and confidence of every superpixel.
         seg: Superpixels and graphs.
         surface: (N,) surface of every superpixel.
-        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
         residual: (N,) mean error of the affine flow of every superpixel, pixels.
-        error: (N,) mean error of the flow under its rigid component, pixels.
-        component: (N,) rigid component of every superpixel.
         usable: (N,) True where the flow counts.
-        price: Price of a free motion, nats.
-        discontinuity_px: Jump of the flow that certainly is a discontinuity, pixels.
+        o: Numbers, inlier distance and seed.
+
+    Returns:
+        The motions that many pixels share and those of the surfaces, and (N,) True where the
+        surface bends.
     """
-    excess = np.clip((error - residual) / limited_noise(residual), 0.0, MOST_EXCESS)
-    i, k = seg.pairs.T
+    noise = reference_noise(residual)
+    most = systematic_error(noise) + NOISES * noise
+    motions = dominant(views, o)
+    choice = nearest(views, motions)
+    surface = joined(surface, usable, seg)
+    bends = np.zeros(len(seg), bool)
+    for c in np.unique(surface[usable]):
+        at = np.flatnonzero(usable & (surface == c))
+        R, t = candidates(views, choice, at, motions[0].R, noise, o)
+        tried = [*map(Motion, R, t)]
+        excess = np.median(views.some(at).fit(tried).cost - residual[at, None], axis=0)
+        best = int(np.argmin(excess))
+        bends[surface == c] = excess[best] > most
+        if not bends[at[0]]:
+            motions.append(tried[best])
+    return motions, bends
+
+
+def nearest(views: Views, motions: list[Motion]) -> Choice:
+    """The motion of a list with the smallest error for every superpixel."""
+    fit = views.fit(motions)
+    label = np.argmin(fit.penalised(), axis=1)
+    R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
+    return Choice(R, t, fit.pick((np.arange(len(label)), label)), label)
+
+
+def joined(surface: Int, usable: Mask, seg: Segmentation) -> Int:
+    """(N,) surfaces, the ones with too few usable superpixels joined to a neighbour.
+
+    The smallest joins the one with which it has the longest outline, until each has `LEAST_SHARE`.
+    """
+    surface, (i, k) = surface.copy(), seg.pairs.T
     length = seg.boundary_length.astype(float)
-    continuous = jump < 0.5 * discontinuity_px
-
-    def bends(region: Mask) -> bool:
-        at = region & usable
-        if at.sum() < FEWEST:
-            return False
-        share = np.bincount(component[at]) / at.sum()
-        entropy = float(-np.sum(share * np.log(np.maximum(share, 1e-12))))
-        seam = region[i] & region[k] & (component[i] != component[k])
-        whole = float(length[seam & continuous].sum() / max(length[seam].sum(), 1.0))
-        return bool(excess[at].mean() + (1 + whole) * entropy > price)
-
-    every = np.ones(len(seg), bool)
-    if bends(every):
-        return every
-    beside = component != np.argmax(np.bincount(component))
-    joined = beside[i] & beside[k] & (surface[i] == surface[k])
-    region = np.where(beside, connected_labels(joined, seg), -1)
-    out = ~every
-    for c in np.unique(region[beside]):
-        if bends(region == c):
-            out |= region == c
-    return out
+    alone: set[int] = set()
+    while True:
+        count = np.bincount(surface, usable)
+        small = [
+            c for c in np.unique(surface) if count[c] < LEAST_SHARE * len(seg) and c not in alone
+        ]
+        if not small:
+            return surface
+        c = min(small, key=lambda c: (count[c], c))
+        beside = np.where(surface[i] == c, surface[k], surface[i])
+        outline = ((surface[i] == c) != (surface[k] == c)) * length
+        if not outline.any():
+            alone.add(c)
+            continue
+        surface[surface == c] = np.argmax(np.bincount(beside, outline))

@@ -34,9 +34,8 @@ class StartOptions(Section):
     """Largest number of unexplained pieces that get candidate motions in a round."""
     piece_size: Whole = 4
     """Least number of superpixels of a piece."""
-    bending_price: NonNegative = 2.75
-    """Price of a motion of its own for every superpixel of a region that bends, in nats
-    (`start.regions`); at 100 nothing bends."""
+    bending: bool = True
+    """Whether surfaces may bend (`start.regions`); if false, everything is rigid."""
     discontinuity_px: NonNegative = 1.0
     """Jump of the flow between two neighbours at which a surface ends, pixels."""
     upright: bool = True
