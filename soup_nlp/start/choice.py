@@ -288,20 +288,17 @@ def rigid_choice(
         The choice, the motions of the whole image, and the noise of the flow, pixels.
     """
     known = views.weight.any(axis=1)
-    fit = views.fit(motions)
-    cost = fit.penalised()
-    noise = limited_noise(cost.min(axis=1)[known])
-    # what no motion explains yet, piece by piece
-    for _ in range(o.rounds):
-        extra = of_pieces(views, seg, motions, cost, noise, o)
+    for extend in range(o.rounds + 1):
+        fit = views.fit(motions)
+        cost = fit.penalised()
+        kept = select(cost, limited_noise(cost.min(axis=1)[known]), o)
+        motions, fit, cost = [motions[c] for c in kept], fit.columns(kept), cost[:, kept]
+        noise = limited_noise(cost.min(axis=1)[known])
+        # what no motion explains yet, piece by piece
+        extra = of_pieces(views, seg, motions, cost, noise, o) if extend < o.rounds else []
         if not extra:
             break
         motions = motions + extra
-        fit = views.fit(motions)
-        cost = fit.penalised()
-        kept = select(cost, noise, o)
-        motions, fit, cost = [motions[c] for c in kept], fit.columns(kept), cost[:, kept]
-        noise = limited_noise(cost.min(axis=1)[known])
     # the dominant motion is preferred where another is not clearly better
     prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * o.unexplained_px))
     # beyond 5 pixels one motion is as wrong as another
