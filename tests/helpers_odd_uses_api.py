@@ -18,7 +18,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.sol import read_sol
 from soup_nlp.report.check import check_folder
-from soup_nlp.report.result import read_result
+from soup_nlp.report.result import load
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import find_images, video_frames
 
@@ -29,7 +29,7 @@ CALLS: dict[str, Call] = {
     "save formats": lambda w, o, x: w.run.save(o / "out", formats=x),
     "save format": lambda w, o, x: w.run.save(o / "out", formats=[x]),
     "check_folder": lambda w, o, x: check_folder(x),
-    "read_result": lambda w, o, x: read_result(x),
+    "load": lambda w, o, x: load(x),
     "make_chain": lambda w, o, x: make_chain(x),
     "make_chain pair": lambda w, o, x: make_chain([x]),
     "find_images": lambda w, o, x: find_images(x),

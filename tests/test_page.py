@@ -10,7 +10,6 @@ import zlib
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
@@ -23,13 +22,13 @@ from soup_nlp.report.folder import summary, write_folder
 from soup_nlp.report.limits import limits
 from soup_nlp.report.page import MODES, page
 from soup_nlp.report.pictures import _enlarged, pictures
+from soup_nlp.report.result import result_of
 from soup_nlp.report.scene3d import make_scene
-from soup_nlp.report.shown import of_run
 
 
 @pytest.fixture(scope="module")
 def shown(small_run):
-    return of_run(small_run, summary(small_run), "status  <fine> & dandy")
+    return result_of(small_run, summary(small_run), "status  <fine> & dandy")
 
 
 @pytest.fixture(scope="module")
@@ -162,20 +161,6 @@ def test_a_folder_makes_the_same_page_again(folder, capsys):
     # the log holds no verdict here
     cut = re.compile(r"<h2>Verdict.*?</pre>", re.DOTALL)
     assert cut.sub("", again) == cut.sub("", written)
-
-
-@pytest.mark.parametrize("input_there", [True, False])
-def test_a_folder_of_an_earlier_version(folder, input_there):
-    """A result without images and unit; the images come from its input if it is available."""
-    with h5py.File(folder / "result.h5", "a") as file:
-        del file["input/image_ref"], file["input/image_next"], file.attrs["truth_unit"]
-    (folder / "report.html").unlink()
-    if not input_there:
-        (folder / "config.yaml").write_text("input: {kind: folder, path: gone}\n")
-    assert main(["view", str(folder), "--no-open"]) == 0
-    text = (folder / "report.html").read_text()
-    assert ('data-name="image_ref"' in text) == input_there
-    assert "true depth" in text
 
 
 def test_the_page_can_be_left_out(small_run, folder):

@@ -13,7 +13,7 @@ from helpers_chromium import Chromium, file_address, find_chromium
 from soup_nlp.report.folder import summary
 from soup_nlp.report.page import MODES, page
 from soup_nlp.report.pictures import pictures
-from soup_nlp.report.shown import of_run
+from soup_nlp.report.result import result_of
 
 CHROMIUM = find_chromium()
 pytestmark = [
@@ -25,7 +25,7 @@ BACKGROUND = (0x20, 0x26, 0x2E)
 
 @pytest.fixture(scope="module")
 def browser(small_run, tmp_path_factory):
-    shown = of_run(small_run, summary(small_run), "verdict")
+    shown = result_of(small_run, summary(small_run), "verdict")
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(page(shown, pictures(shown)), encoding="utf-8")
     assert CHROMIUM is not None
@@ -159,7 +159,7 @@ def test_a_click_tells_depth_sigma_and_component(browser, small_run):
     assert abs(found // width - v) <= 2
     browser.value(f"soupView.tell({found})")
     said = browser.value("document.getElementById('picked').textContent")
-    shown = of_run(small_run, summary(small_run), "")
+    shown = result_of(small_run, summary(small_run), "")
     z = shown.scale * small_run.reconstruction.depth_ref[found // width, found % width]
     assert f"depth {z:.4g}"[:9] in said
     assert "sigma" in said

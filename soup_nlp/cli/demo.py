@@ -10,7 +10,7 @@ from soup_nlp.cli.options import Out, Overwrite, Quiet
 from soup_nlp.cli.progress import SolveLog
 from soup_nlp.cli.solve import solve_problem
 from soup_nlp.config.problem import load_problem
-from soup_nlp.report.shown import PAGE
+from soup_nlp.report.result import PAGE
 
 PAIRS = {
     "motorcycle": "a real pair, rigid: here one rigid motion for the whole image is as good",

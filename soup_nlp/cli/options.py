@@ -10,9 +10,7 @@ from typing import Annotated
 import typer
 
 from soup_nlp.config.presets import PRESETS
-from soup_nlp.config.problem import load_problem
-from soup_nlp.data.pair import Pair
-from soup_nlp.errors import ConfigError, SoupError
+from soup_nlp.errors import ConfigError
 from soup_nlp.schema.limits import MAX_SEED
 from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.rows import Row, failed, reason
@@ -122,14 +120,6 @@ def camera(text: str, option: str) -> list[float] | str:
             expected="fx,fy,cx,cy or a text file of 4 or 9 numbers",
         )
     return values
-
-
-def input_pair(folder: Path) -> Pair | None:
-    """The pair of a result folder, by its config.yaml; None if the input cannot be loaded."""
-    try:
-        return load_problem(folder / "config.yaml").load_pair()
-    except SoupError:
-        return None
 
 
 class Progress:

@@ -10,10 +10,9 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.cli.options import input_pair
 from soup_nlp.errors import DataError
 from soup_nlp.report.folder import renew_page
-from soup_nlp.report.shown import PAGE
+from soup_nlp.report.result import PAGE
 from soup_nlp.sequence.stored import is_chain
 from soup_nlp.sequence.write import CHAIN_PAGE, renew_chain_page
 
@@ -36,7 +35,7 @@ def view(
         if renew or not place.is_file():
             place = renew_chain_page(folder)
     elif renew or not place.is_file():
-        place = renew_page(folder, input_pair(folder))
+        place = renew_page(folder)
     if serve is None:
         address = place.resolve().as_uri()
         opened = not no_open and webbrowser.open(address)

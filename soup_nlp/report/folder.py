@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import component_overlaps, skill
 from soup_nlp.pipeline.record import Run
@@ -21,8 +20,7 @@ from soup_nlp.report.formats import write_formats
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import Picture, pictures
 from soup_nlp.report.record import RECORD, extended, record_of
-from soup_nlp.report.result import result_of
-from soup_nlp.report.shown import PAGE, of_folder, of_run
+from soup_nlp.report.result import PAGE, load, result_of
 from soup_nlp.report.tree import attributes, result_tree
 from soup_nlp.report.verdict import facts
 from soup_nlp.solve.kkt import constraint_residuals
@@ -163,12 +161,12 @@ def _write_files(
     """Every file of a run but its logs and result.h5."""
     write_text(folder / "config.yaml", config)
     contents = summary(run)
-    shown = of_run(run, contents, facts(run) if verdict is None else verdict)
-    drawn = pictures(shown)
+    result = result_of(run, contents, facts(run) if verdict is None else verdict)
+    drawn = pictures(result)
     scales = _pictures(folder, run, drawn)
-    write_formats(folder, result_of(run), ("motions", "ply", *formats))
+    write_formats(folder, result, ("motions", "ply", *formats))
     if run.problem.output.page:
-        write_text(folder / PAGE, page(shown, drawn))
+        write_text(folder / PAGE, page(result, drawn))
     write_json(folder / "summary.json", {**contents, "depth_png_scale": scales})
 
 
@@ -274,19 +272,18 @@ def _pictures(folder: Path, run: Run, drawn: Mapping[str, Picture]) -> dict[str,
     return scales
 
 
-def renew_page(folder: Path, pair: Pair | None = None) -> Path:
+def renew_page(folder: Path) -> Path:
     """Make the page of a result folder again from its arrays; returns the file of the page.
 
     Args:
         folder: Result folder.
-        pair: Its input, see `of_folder`.
 
     Raises:
         DataError: the folder holds no result, or cannot be written.
     """
-    shown = of_folder(folder, pair)
+    result = load(folder)
     try:
-        text = page(shown, pictures(shown))
+        text = page(result, pictures(result))
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise DataError(
             "result lacks what a page shows", where=folder, found=repr(error), hint="solve it again"

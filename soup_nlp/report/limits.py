@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from soup_nlp.report.certainty import guess_words
-from soup_nlp.report.shown import Shown
+from soup_nlp.report.result import Result
 
 USABLE = 0.8
 """Share of usable flow below which the flow counts as a limit."""
@@ -13,20 +13,20 @@ SHARE = 0.05
 """Share of the image above which a limit is mentioned."""
 
 
-def limits(shown: Shown) -> list[str]:
+def limits(shown: Result) -> list[str]:
     """Sentences on the limits of a result and on what to try; at least one."""
     found = [*_convergence(shown), *_flow(shown), *_parallax(shown), *_parts(shown)]
     return found or ["Nothing stands out: flow, parallax and convergence are good."]
 
 
-def _convergence(shown: Shown) -> list[str]:
+def _convergence(shown: Result) -> list[str]:
     s = shown.summary
     if s["converged"] or s["status"] == "Skipped":
         return []
     return [f"The NLP did not converge ({s['status']}): try a larger solver.max_iter."]
 
 
-def _flow(shown: Shown) -> list[str]:
+def _flow(shown: Result) -> list[str]:
     """Unusable flow, and pixels that leave the image."""
     share = float((np.asarray(shown.array("input/confidence")) > 0).mean())
     if share >= USABLE:
@@ -37,7 +37,7 @@ def _flow(shown: Shown) -> list[str]:
     ]
 
 
-def _parallax(shown: Shown) -> list[str]:
+def _parallax(shown: Result) -> list[str]:
     """Superpixels whose depth the images hardly determine."""
     if shown.at_rest:
         return [
@@ -71,7 +71,7 @@ def _parallax(shown: Shown) -> list[str]:
     return out
 
 
-def _parts(shown: Shown) -> list[str]:
+def _parts(shown: Result) -> list[str]:
     """Components whose scale only follows from contact."""
     parts = shown.components
     if len(parts) == 1:

@@ -21,8 +21,8 @@ from soup_nlp.evaluate.metrics import skill
 from soup_nlp.report.colour import component_colours
 from soup_nlp.report.limits import limits
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
+from soup_nlp.report.result import Result
 from soup_nlp.report.scene3d import Scene, make_scene
-from soup_nlp.report.shown import Shown
 from soup_nlp.report.verdict import TITLES
 from soup_nlp.start.components import TIES
 from soup_nlp.storage.store import plain
@@ -48,7 +48,7 @@ SIDE = 1600
 """Larger side of a picture in the page, pixels; larger pictures are resized."""
 
 
-def page(shown: Shown, found: Mapping[str, Picture]) -> str:
+def page(shown: Result, found: Mapping[str, Picture]) -> str:
     """The page of a result: HTML that holds everything it shows."""
     scene = make_scene(shown)
     data = {
@@ -89,7 +89,7 @@ def web_file(name: str) -> str:
     return (files("soup_nlp.report") / "web" / name).read_text(encoding="utf-8")
 
 
-def _scene(shown: Shown, scene: Scene) -> dict[str, Any]:
+def _scene(shown: Result, scene: Scene) -> dict[str, Any]:
     """The 3D view as numbers, lists and packed arrays."""
     height, width = shown.labels.shape
     arrays = {
@@ -122,7 +122,7 @@ def _scene(shown: Shown, scene: Scene) -> dict[str, Any]:
     }
 
 
-def _next_size(shown: Shown) -> list[int]:
+def _next_size(shown: Result) -> list[int]:
     depth = shown.array("depth/next")
     assert depth is not None
     return [depth.shape[1], depth.shape[0]]
@@ -210,7 +210,7 @@ def table(head: list[str], rows: list[list[str]]) -> str:
     return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def _summary(shown: Shown) -> str:
+def _summary(shown: Result) -> str:
     """The most important figures in one line."""
     s, m = shown.summary, shown.summary["metrics"].get("solution")
     words = ["converged" if s["converged"] else f"not converged ({s['status']})"]
@@ -225,7 +225,7 @@ def _summary(shown: Shown) -> str:
     return " &middot; ".join(escape(word) for word in words)
 
 
-def _energy(shown: Shown) -> str:
+def _energy(shown: Result) -> str:
     """Exact energy by stage, with a bar for each total."""
     stages = {"start": "start", "nlp": "NLP", "solution": "solution"}
     known = {k: shown.summary["energy"][k] for k in stages if k in shown.summary["energy"]}
@@ -247,7 +247,7 @@ def _energy(shown: Shown) -> str:
     return table(["stage", *terms, ""], rows) + note
 
 
-def _accuracy(shown: Shown) -> str:
+def _accuracy(shown: Result) -> str:
     """Scores of the solution and of the baselines."""
     metrics: Mapping[str, Any] = shown.summary["metrics"]
     if not metrics:
@@ -268,7 +268,7 @@ def _accuracy(shown: Shown) -> str:
     return table(["depth", "MRE", "median error", "skill", "coverage"], rows)
 
 
-def _components(shown: Shown) -> str:
+def _components(shown: Result) -> str:
     """Motions of the largest components, the camera's first."""
     parts, scale = shown.components, shown.scale
     colours = component_colours(len(parts))

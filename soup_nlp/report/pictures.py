@@ -26,7 +26,7 @@ from soup_nlp.report.colour import (
     flow_limit,
     wheel_key,
 )
-from soup_nlp.report.shown import Shown
+from soup_nlp.report.result import Result
 
 Float = NDArray[np.floating]
 
@@ -77,7 +77,7 @@ class Picture:
     legend: Legend | None = None
 
 
-def pictures(shown: Shown) -> dict[str, Picture]:
+def pictures(shown: Result) -> dict[str, Picture]:
     """All pictures of a result by name, in the order of the overview.
 
     "image_ref", "image_next", "superpixels", "components", "flow", "flow_confidence",
@@ -96,17 +96,15 @@ def pictures(shown: Shown) -> dict[str, Picture]:
     return {picture.name: picture for picture in found}
 
 
-def _images(shown: Shown) -> list[Picture]:
-    named = (("ref", "reference frame", shown.image_ref), ("next", "next frame", shown.image_next))
-    return [Picture(f"image_{k}", title, image) for k, title, image in named if image is not None]
+def _images(shown: Result) -> list[Picture]:
+    named = (("ref", "reference frame", shown.images[0]), ("next", "next frame", shown.images[1]))
+    return [Picture(f"image_{k}", title, image) for k, title, image in named]
 
 
-def _parts(shown: Shown) -> list[Picture]:
+def _parts(shown: Result) -> list[Picture]:
     """Superpixels and components."""
     labels, component = shown.labels, shown.components.of_superpixel
-    back = shown.image_ref
-    if back is None:
-        back = np.full((*labels.shape, 3), 90, np.uint8)
+    back = shown.images[0]
     number, count = len(component), len(shown.components)
     colours = component_colours(count)
     pixels = np.bincount(component[labels].ravel(), minlength=count) / labels.size
@@ -129,7 +127,7 @@ def _parts(shown: Shown) -> list[Picture]:
     ]
 
 
-def _unsure(shown: Shown, count: int) -> Mask:
+def _unsure(shown: Result, count: int) -> Mask:
     """(count,) True for components most of whose pixels have a guess as depth, or no sigma."""
     sigma = shown.array("depth/sigma_ref")
     if sigma is None:
@@ -139,7 +137,7 @@ def _unsure(shown: Shown, count: int) -> Mask:
     return np.asarray(guess > 0.5 * np.bincount(part, minlength=count))
 
 
-def _flow(shown: Shown) -> list[Picture]:
+def _flow(shown: Result) -> list[Picture]:
     """Flow and its confidence."""
     uv, confidence = shown.array("input/flow"), shown.array("input/confidence")
     if uv is None or confidence is None:
@@ -159,7 +157,7 @@ def _flow(shown: Shown) -> list[Picture]:
     ]
 
 
-def _depths(shown: Shown) -> list[Picture]:
+def _depths(shown: Result) -> list[Picture]:
     """Depths of both frames, of the start and of the truth, with one colour scale."""
     s, truth = shown.scale, shown.array("truth/depth_ref")
     maps = {k: shown.array(f"depth/{k}") for k in ("ref", "next", "start_ref")}
@@ -201,19 +199,19 @@ def _enlarged(values: Float) -> Float:
     return np.where(distance < 1.5, values[tuple(nearest)], np.nan)
 
 
-def _own_scale(shown: Shown, which: str) -> float:
+def _own_scale(shown: Result, which: str) -> float:
     """Scale of a depth map to the truth; that of the solution, except for the start."""
     name = "start" if which == "start_ref" else "solution"
     found = shown.summary["metrics"].get(name, {}).get("scale")
     return float(found) if found else 1.0
 
 
-def _score(shown: Shown, name: str) -> str:
+def _score(shown: Result, name: str) -> str:
     m = shown.summary["metrics"].get(name)
     return f", MRE {m['mre']:.3f}" if m and m["mre"] is not None else ""
 
 
-def relative_error(shown: Shown) -> Float | None:
+def relative_error(shown: Result) -> Float | None:
     """(H, W) |z_gt - s z| / z_gt of the reference frame, NaN where unknown; None without truth."""
     truth, z = shown.array("truth/depth_ref"), shown.array("depth/ref")
     if truth is None or z is None or "solution" not in shown.summary["metrics"]:
@@ -231,7 +229,7 @@ def _share_bar(colourise: Callable[[Float], Image], limit: float, steps: int) ->
     return Bar(colourise(np.linspace(0, limit, 128)[None]), tuple(texts))
 
 
-def _error(shown: Shown) -> list[Picture]:
+def _error(shown: Result) -> list[Picture]:
     error = relative_error(shown)
     if error is None:
         return []
@@ -240,7 +238,7 @@ def _error(shown: Shown) -> list[Picture]:
     return [Picture("error", title, colourise_error(_enlarged(error)), bar)]
 
 
-def _sigma(shown: Shown) -> list[Picture]:
+def _sigma(shown: Result) -> list[Picture]:
     sigma = shown.array("depth/sigma_ref")
     if sigma is None:
         return []
@@ -249,7 +247,7 @@ def _sigma(shown: Shown) -> list[Picture]:
     return [Picture("confidence", title, colourise_sigma(sigma), bar)]
 
 
-def _normals(shown: Shown) -> Picture:
+def _normals(shown: Result) -> Picture:
     n = shown.soup("n")[shown.labels]
     entries = {"faces the camera": (0, 0, -1), "right": (1, 0, 0), "left": (-1, 0, 0),
                "up": (0, -1, 0), "down": (0, 1, 0)}  # fmt: skip

@@ -1,4 +1,4 @@
-"""A result for files of other programs, from a run or from a result folder."""
+"""A solved pair for pictures, the page and files, from a run in memory or from a result folder."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import yaml
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image, Mask
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, printable
 from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, NO_CONFIDENCE
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.geometry.components import Components, find_components
@@ -25,10 +25,13 @@ from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.surface import at_jumps, hidden, joined
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.check_arrays import require_layout
-from soup_nlp.storage.files import as_path, read_json
-from soup_nlp.storage.h5_files import read_attrs, read_h5
-from soup_nlp.storage.store import require
+from soup_nlp.report.tree import result_tree
+from soup_nlp.storage.files import as_path, is_file, read_json, read_text
+from soup_nlp.storage.h5_files import ReadTree, read_attrs, read_h5
+from soup_nlp.storage.store import Array, Tree, plain, require
 
+PAGE = "report.html"
+"""Name of the page in a result folder."""
 UNIT = "soup unit (free scale: the mean distance of the planes is 1)"
 """Unit of lengths in files."""
 FRAMES = ("ref", "next")
@@ -37,7 +40,7 @@ FRAMES = ("ref", "next")
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Images, cameras, dense 3D and components of a solved pair.
+    """Images, cameras, dense 3D, components, arrays and texts of a solved pair.
 
     Attributes:
         name: Name for titles.
@@ -50,7 +53,9 @@ class Result:
         metre_unit: Name of the unit of the truth.
         min_confidence: Smallest confidence of points in clouds.
         metrics: Scores against the truth, as those of a `Run`.
-        summary: Contents of summary.json, for a stored result.
+        tree: Arrays as in result.h5.
+        summary: Contents of summary.json.
+        verdict: Verdict that was printed at the end of the solve.
         overview: The overview as PNG, for a stored result.
     """
 
@@ -64,7 +69,9 @@ class Result:
     metre_unit: str = "m"
     min_confidence: float = MIN_CONFIDENCE
     metrics: Mapping[str, DepthMetrics] = field(default_factory=dict, repr=False)
+    tree: ReadTree = field(default_factory=dict, repr=False)
     summary: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    verdict: str = field(default="", repr=False)
     overview: bytes = field(default=b"", repr=False)
 
     def __str__(self) -> str:
@@ -116,6 +123,45 @@ class Result:
             return np.ones(self.flow_confidence.shape)
         return np.maximum(1.0 - self.sigma / NO_CONFIDENCE, 0.0)
 
+    @property
+    def scale(self) -> float:
+        """Factor from the unit of length of the result to that of the truth; 1 without truth."""
+        return self.metre if self.metre is not None and np.isfinite(self.metre) else 1.0
+
+    @property
+    def length(self) -> str:
+        """Name of the unit of length in which depths are shown."""
+        return "units" if self.metre is None else self.metre_unit
+
+    @property
+    def labels(self) -> NDArray[np.integer]:
+        """(H, W) superpixel of every pixel."""
+        return np.asarray(self.tree["segmentation"]["labels"])
+
+    @property
+    def bends(self) -> Mask:
+        """(N,) True in regions that bend, which are not rigid."""
+        return np.asarray(self.tree["start"]["bends"], bool)
+
+    @property
+    def bending(self) -> bool:
+        """Whether the whole image bends; then no component is rigid."""
+        return bool(self.bends.all())
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the initialisation found the camera at rest or only rotating."""
+        return bool(self.tree["start"]["at_rest"])
+
+    def array(self, place: str) -> NDArray[Any] | None:
+        """The array at "a/b" of the tree; None if there is none."""
+        group, name = place.split("/")
+        return self.tree.get(group, {}).get(name)
+
+    def soup(self, key: str) -> Float:
+        """An array of the delivered soup: lam, n, d, R or t."""
+        return np.asarray(self.tree["solution"][key], float)
+
     @cached_property
     def surface(self) -> tuple[Mask, Mask]:
         """Continuity of the surface to the right and downwards, see `geometry.surface.joined`."""
@@ -128,8 +174,8 @@ class Result:
         return known & ~hidden(self.reconstruction) & ~at_jumps(*self.surface)
 
 
-def result_of(run: Run) -> Result:
-    """The result of a run."""
+def result_of(run: Run, summary: Mapping[str, Any], verdict: str = "") -> Result:
+    """The result of a run; `summary` has the contents of summary.json."""
     pair, m = run.pair, run.metrics.get("solution")
     assert pair.flow is not None
     return Result(
@@ -143,7 +189,18 @@ def result_of(run: Run) -> Result:
         metre_unit="m" if pair.truth is None else pair.truth.unit,
         min_confidence=run.problem.output.min_confidence,
         metrics=run.metrics,
+        tree=_values(result_tree(run)),
+        summary=plain(summary),
+        verdict=verdict,
     )
+
+
+def _values(tree: Tree) -> ReadTree:
+    """The arrays of a tree without their descriptions, as `read_h5` returns them."""
+    return {
+        key: np.asarray(item.value) if isinstance(item, Array) else _values(item)
+        for key, item in tree.items()
+    }
 
 
 def html(text: str, png: bytes) -> str:
@@ -165,35 +222,9 @@ def load(folder: str | Path) -> Result:
         DataError: the folder holds no result, or a damaged one.
     """
     place = as_path(folder, "result folder")
-    summary = read_json(place / "summary.json", "summary.json")
-    picture = place / "overview.png"
-    try:
-        metrics = {name: _metrics(row) for name, row in summary["metrics"].items()}
-        return replace(
-            read_result(place),
-            metrics=metrics,
-            summary=summary,
-            overview=picture.read_bytes() if picture.is_file() else b"",
-        )
-    except (KeyError, TypeError, AttributeError) as error:
-        raise DataError("summary.json cannot be read", where=place, found=error) from error
-
-
-def _metrics(row: Mapping[str, Any]) -> DepthMetrics:
-    """Scores of summary.json, in which null stands for NaN."""
-    own: dict[str, Any] = {f.name: row[f.name] for f in fields(DepthMetrics)}
-    own |= {k: np.nan for k, v in own.items() if v is None and k != "cap"}
-    return DepthMetrics(**own)
-
-
-def read_result(folder: Path) -> Result:
-    """The result of a folder that `solve` wrote.
-
-    Raises:
-        DataError: result.h5 is missing, or arrays in it are missing or inconsistent.
-    """
-    path = as_path(folder, "result folder") / "result.h5"
+    path = place / "result.h5"
     tree, attrs = read_h5(path), read_attrs(path)
+    summary = read_json(place / "summary.json", "summary.json")
     if "image_ref" not in tree.get("input", {}):
         raise DataError(
             "result holds no images",
@@ -203,38 +234,61 @@ def read_result(folder: Path) -> Result:
         )
     require_layout(tree)
     try:
-        return _result(tree, attrs)
+        metrics = {name: _metrics(row) for name, row in summary["metrics"].items()}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise DataError("summary.json cannot be read", where=place, found=error) from error
+    try:
+        found = _result(tree, attrs)
     except (KeyError, IndexError, ValueError, TypeError, yaml.YAMLError) as error:
         raise DataError("result does not hold together", where=path, found=error) from error
+    picture = place / "overview.png"
+    return replace(
+        found,
+        metrics=metrics,
+        summary=summary,
+        verdict=_ending(place / "log.txt"),
+        overview=picture.read_bytes() if picture.is_file() else b"",
+    )
 
 
-def rebuilt(tree: Mapping[str, Any]) -> tuple[Reconstruction, Components]:
-    """Reconstruction and components of the delivered soup from the arrays of result.h5."""
-    soup = Soup(*(tree["solution"][key] for key in ("lam", "n", "d", "R", "t")))
-    K_ref, K_next = (tree["input"][f"K_{frame}"] for frame in FRAMES)
+def _ending(log: Path) -> str:
+    """The verdict at the end of a log; "" if there is none."""
+    if not is_file(log):
+        return ""
+    lines = [printable(line) for line in read_text(log, "log.txt").splitlines()]
+    starts = [k for k, line in enumerate(lines) if line.startswith(("status  ", "solver  "))]
+    own = lines[starts[-1] :] if starts else []
+    return "\n".join(line for line in own if not line.startswith(("files  ", "look  ", "next  ")))
+
+
+def _metrics(row: Mapping[str, Any]) -> DepthMetrics:
+    """Scores of summary.json, in which null stands for NaN."""
+    own: dict[str, Any] = {f.name: row[f.name] for f in fields(DepthMetrics)}
+    own |= {k: np.nan for k, v in own.items() if v is None and k != "cap"}
+    return DepthMetrics(**own)
+
+
+def _result(tree: ReadTree, attrs: Mapping[str, Any]) -> Result:
+    """The result of the arrays and attributes of result.h5."""
+    images = [require(tree, f"input/image_{frame}") for frame in FRAMES]
+    K_ref, K_next = (require(tree, f"input/K_{frame}") for frame in FRAMES)
+    soup = Soup(*(require(tree, f"solution/{key}") for key in ("lam", "n", "d", "R", "t")))
+    distance = soup.lam * soup.d
+    if not np.isfinite(distance).all() or not (np.abs(np.linalg.det(soup.R) - 1) < 1e-3).all():
+        raise ValueError("planes or rotations of the solution are none")
     seg = Segmentation(**{f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)})
     height, width = tree["depth"]["next"].shape
     rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
     component, borrowed = tree["start"]["component"], tree["start"]["borrowed"].astype(bool)
-    return rec, find_components(soup, seg, component, K_ref, K_next, borrowed)
-
-
-def _result(tree: Mapping[str, Any], attrs: Mapping[str, Any]) -> Result:
-    images = [require(tree, f"input/image_{frame}") for frame in FRAMES]
-    K = [require(tree, f"input/K_{frame}") for frame in FRAMES]
-    distance, R = (require(tree, f"solution/{key}") for key in ("d", "R"))
-    distance = require(tree, "solution/lam") * distance
-    if not np.isfinite(distance).all() or not (np.abs(np.linalg.det(R) - 1) < 1e-3).all():
-        raise ValueError("planes or rotations of the solution are none")
-    rec, parts = rebuilt(tree)
     metre = attrs.get("scale_to_truth")
     return Result(
         name=str(attrs["name"]),
         images=(images[0], images[1]),
-        K=(K[0], K[1]),
+        K=(K_ref, K_next),
         reconstruction=replace(rec, sigma_ref=tree["depth"].get("sigma_ref")),
-        components=parts,
+        components=find_components(soup, seg, component, K_ref, K_next, borrowed),
         flow_confidence=tree["input"]["confidence"],
         metre=None if metre is None else float(metre),
         metre_unit=str(attrs.get("truth_unit", "m")),
+        tree=tree,
     )

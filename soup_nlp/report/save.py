@@ -13,8 +13,7 @@ from soup_nlp.report.folder import prepare_folder, summary, write_folder
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.record import extended
-from soup_nlp.report.result import html, read_result
-from soup_nlp.report.shown import of_run
+from soup_nlp.report.result import html, load, result_of
 from soup_nlp.storage.folders import staged
 
 if TYPE_CHECKING:
@@ -35,7 +34,7 @@ def save(
 
 def plot(run: Run) -> Figure:
     """The overview of a run as a figure of matplotlib, which a notebook shows."""
-    drawn = pictures(of_run(run, summary(run), ""))
+    drawn = pictures(result_of(run, summary(run)))
     return strip_figure(without_gaps(drawn), run.problem.name)
 
 
@@ -65,7 +64,7 @@ def convert(
         DataError: the folder holds no result, or the other one cannot be written.
     """
     names = check_formats(formats)
-    result = read_result(folder)
+    result = load(folder)
     where = extended(folder, overwrite) if out is None else staged(out, overwrite=overwrite)
     with where as new:
         return write_formats(new, result, names)

@@ -12,7 +12,7 @@ from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, joined, triangles
-from soup_nlp.report.shown import Shown
+from soup_nlp.report.result import Result
 
 Int = NDArray[np.integer]
 
@@ -56,7 +56,7 @@ class Scene:
     deepest: float
 
 
-def make_scene(shown: Shown) -> Scene:
+def make_scene(shown: Result) -> Scene:
     """The 3D view of a result."""
     rec = shown.reconstruction
     step = int(np.ceil(np.sqrt(max(rec.labels.size / MOST_PIXELS, 1.0))))
@@ -87,7 +87,7 @@ def make_scene(shown: Shown) -> Scene:
     )
 
 
-def _surface(shown: Shown, step: int) -> Mask:
+def _surface(shown: Result, step: int) -> Mask:
     """Cells of the surface, see `Scene.surface`."""
     rec, K = shown.reconstruction, np.asarray(shown.array("input/K_ref"), float)
     right, below = joined(rec, K, shown.components.of_pixel)
@@ -100,7 +100,7 @@ def _surface(shown: Shown, step: int) -> Mask:
     return out
 
 
-def _sigma(shown: Shown) -> Int:
+def _sigma(shown: Result) -> Int:
     """(H, W) sigma as a byte, see `Scene.sigma`."""
     sigma = shown.array("depth/sigma_ref")
     if sigma is None:
@@ -118,7 +118,7 @@ def _far(z: Float) -> tuple[float, float]:
     return min(float(np.percentile(z, 99.5)), 4.0 * float(np.percentile(z, 70))), deepest
 
 
-def _pivots(shown: Shown) -> Float:
+def _pivots(shown: Result) -> Float:
     """(N, 3) centre of the component of every superpixel, or of the superpixel if it bends."""
     parts, rec = shown.components, shown.reconstruction
     known = np.isfinite(rec.depth_ref)

@@ -10,7 +10,7 @@ from soup_nlp.evaluate.metrics import DepthMetrics, skill
 from soup_nlp.evaluate.scoring import SURE
 from soup_nlp.report.certainty import certainty, certainty_lines
 from soup_nlp.report.depth_words import depth_words
-from soup_nlp.report.shown import PAGE
+from soup_nlp.report.result import PAGE
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -12,9 +12,8 @@ import numpy as np
 from soup_nlp.config.problem import make_problem
 from soup_nlp.errors import SolverError
 from soup_nlp.pipeline.run import run
-from soup_nlp.report.result import Result, read_result
+from soup_nlp.report.result import Result, load
 from soup_nlp.sequence.frames import Frames, Raw
-from soup_nlp.storage.h5_files import read_h5
 from soup_nlp.storage.rows import Job, Row, attempt, failed, measure_all, read_rows
 
 ROWS = "pairs.jsonl"
@@ -105,8 +104,10 @@ def _solve(raw: Raw, overrides: tuple[str, ...], place: Path) -> Row:
 
 def read_pair(first: int, second: int, place: Path) -> SolvedPair:
     """The pair of two frames from its result folder."""
-    result = read_result(place)
-    tree = read_h5(place / "result.h5")
+    result = load(place)
+    tree = result.tree
     own = result.components.of_superpixel == 0
     parallax = float(np.median(tree["start"]["parallax"][own]))
-    return SolvedPair(first, second, result, dict(tree.get("truth", {})), parallax)
+    # a chain holds many pairs, whose other arrays it does not need
+    kept = replace(result, tree={})
+    return SolvedPair(first, second, kept, dict(tree.get("truth", {})), parallax)
