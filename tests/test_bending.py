@@ -17,6 +17,7 @@ from soup_nlp.evaluate.metrics import depth_metrics
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import reconstruct
+from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import Case, build_energy, prepare, solver_options
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.bending import constant_depth, fit_turn, surfaces, turn_alone
@@ -112,14 +113,14 @@ def test_what_bends_is_found_beside_rigid_surfaces():
 
 def test_regions_that_bend_have_their_own_weights_in_one_energy():
     c, rigid = case("banner"), case("banner", "start.bending=false")
-    own, bent, bends = c.weights, c.problem.energy.bending, c.start.bends
+    own, bends = c.weights, c.start.bends
     assert own == rigid.weights
     assert c.data.arap_at_anchors
     focal = float(c.data.K_next[0, 0])
     any_end = bends[c.data.edges].any(axis=1)
-    np.testing.assert_allclose(c.data.rotation_scale, np.where(any_end, bent.rotation_px, focal))
+    np.testing.assert_allclose(c.data.rotation_scale, np.where(any_end, 1e-3, focal))
     both = bends[c.data.pairs].all(axis=1)
-    more = bent.weights.orient * len(c) / 1000 / own.orient
+    more = 4.0 * len(c) / 1000 / own.orient
     np.testing.assert_allclose(c.data.orient_weight, np.where(both, 2.0 * more, 2.0))
     # elsewhere the weights are those of a scene without bending
     outside = ~bends[c.data.pairs].any(axis=1)
@@ -201,11 +202,10 @@ def test_noise_where_surfaces_bend_is_that_of_affine_flows():
 
 
 def test_where_surfaces_bend_the_presolve_begins_with_narrower_norms():
-    """Also with more widths than that: several that become the widest are one phase."""
+    """Also with more widths than that: those above the limit are one phase."""
     assert case("sheet").options.presolve_eps == (0.1, 0.03, 0.01)
     assert case("room").options.presolve_eps == (0.3, 0.03, 0.01)
-    more = "solver.presolve_eps=[1.0, 0.3, 0.02]", "energy.bending.widest_eps=0.2"
-    assert case("sheet", *more).options.presolve_eps == (0.2, 0.02)
+    assert case("sheet", "solver.presolve_eps=[1.0, 0.3, 0.02]").options.presolve_eps == (0.1, 0.02)
 
 
 def test_the_presolve_takes_the_way_to_the_lower_energy():
@@ -246,17 +246,19 @@ def test_sheet_is_better_than_a_constant_depth():
     assert depth_metrics(z, gt).mre < 0.6 * constant
 
 
-def test_one_weight_that_is_set_leaves_those_of_the_others():
-    own, set_ = (
-        case("sheet", *over).weights for over in ((), ("energy.bending.weights.orient=2.0",))
-    )
-    assert set_ == own.replace(orient=0.5 * own.orient)
-    assert own.cont == 0.05
+def test_weights_where_surfaces_bend_follow_those_that_are_set():
+    own = case("sheet").weights
+    assert (own.cont, own.prior, own.sigma_arap, own.leak_arap) == (0.05, 4.0, 1.0, 0.05)
+    half = case("sheet", "energy.weights.orient=2.5e-3").weights
+    assert half == own.replace(orient=0.5 * own.orient)
+    assert case("sheet", "energy.weights.leak_arap=0.5").weights.leak_arap == 1.0
 
 
-_OTHER = {"arap": 1.0, "cont": 0.5, "orient": 0.75}
-ACROSS = tuple(f"energy.bending.{term}_across={factor}" for term, factor in _OTHER.items())
-"""Other factors, no two alike, for what holds surfaces together across a discontinuity."""
+def with_factors(c: Case, monkeypatch: pytest.MonkeyPatch, **factors: float) -> Case:
+    """A case with other factors of what holds surfaces together across a discontinuity."""
+    monkeypatch.setattr(pipeline_case, "ACROSS_DISCONTINUITIES", factors)
+    data, weights = build_energy(c.problem, c.pair, c.segmentation, c.start)
+    return replace(c, data=data, weights=weights)
 
 
 @pytest.mark.parametrize(
@@ -267,8 +269,10 @@ ACROSS = tuple(f"energy.bending.{term}_across={factor}" for term, factor in _OTH
         (0.3 / 0.75, "pairs", "orient_weight"),
     ],
 )
-def test_little_holds_surfaces_together_across_discontinuities(ratio, graph, column):
-    c, other = case("sheet"), case("sheet", *ACROSS)
+def test_little_holds_surfaces_together_across_discontinuities(ratio, graph, column, monkeypatch):
+    c = case("sheet")
+    # no two alike
+    other = with_factors(c, monkeypatch, arap=1.0, cont=0.5, orient=0.75)
     i, k = getattr(c.data, graph).T
     apart = c.start.surface[i] != c.start.surface[k]
     assert 0 < apart.sum() < 0.3 * len(apart)
@@ -277,16 +281,13 @@ def test_little_holds_surfaces_together_across_discontinuities(ratio, graph, col
     # the discontinuities are the outline of the sheet
     component = majority(c.pair.truth, c.segmentation)[0]
     assert (component[i] != component[k])[apart].mean() > 0.9
-    rigid = [getattr(case("street", *over).data, column) for over in ((), ACROSS)]
-    np.testing.assert_array_equal(*rigid)
 
 
-def test_the_wall_behind_a_sheet_leaves_it_its_relief():
+def test_the_wall_behind_a_sheet_leaves_it_its_relief(monkeypatch):
     # without E_prior, which flattens what these factors leave free
-    free = "energy.bending.weights.prior=0.0"
-    held = "energy.bending.arap_across=1.0", "energy.bending.orient_across=1.0"
-    relief = [own_relief(case("sheet", free, *over)) for over in ((), held)]
-    assert relief[0] < 0.7 * relief[1]
+    c = case("sheet", "energy.weights.prior=0.0")
+    held = with_factors(c, monkeypatch, arap=1.0, cont=0.01, orient=1.0)
+    assert own_relief(c) < 0.7 * own_relief(held)
 
 
 def own_relief(c: Case) -> float:

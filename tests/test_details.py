@@ -20,7 +20,6 @@ from soup_nlp.export.names import readable_names
 from soup_nlp.export.program import make_program
 from soup_nlp.export.residuals import kind
 from soup_nlp.export.sol import Sol
-from soup_nlp.model.energy_options import BendingOptions
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import TangentLayout
@@ -53,7 +52,6 @@ def test_every_default_is_within_its_bounds():
 def test_results_were_made_with_these_numbers():
     """Nothing but the tables under results/ shows them; a change belongs into CHANGELOG.md."""
     assert (Formulation().theta, Formulation().ridge) == (0.9, 1e-2)
-    assert BendingOptions().rotation_px == 1e-3
 
 
 @pytest.mark.parametrize("lifted", [False, True])

@@ -119,7 +119,7 @@ SECTIONS = "segmentation|flow|start|energy|formulation|solver|refine|expected|ou
 @pytest.mark.parametrize("page", PAGES, ids=ids)
 def test_keys_that_are_named_exist(page):
     known = keys(Problem)
-    assert "energy.bending.weights.orient" in known
+    assert "energy.weights.orient" in known
     text = page.read_text(encoding="utf-8")
     for key in re.findall(rf"`((?:{SECTIONS})\.[a-z_.]+)(?=[`:= ])", text):
         # a picture flow.png is none

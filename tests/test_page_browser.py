@@ -197,7 +197,7 @@ def test_what_is_shown_is_saved_for_other_viewers(browser, small_run, tmp_path, 
     (tmp_path / "a.glb").write_bytes(base64.b64decode(text))
     (found,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     assert isinstance(found, trimesh.PointCloud if points else trimesh.Trimesh)
-    shown = of_run(small_run, summary(small_run), "")
+    shown = result_of(small_run, summary(small_run), "")
     own = shown.scale * small_run.reconstruction.points_ref.reshape(-1, 3)
     assert len(found.vertices) > 0.5 * len(own)
     # the scene at time 1 in the reference camera's axes, y up

@@ -19,6 +19,7 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
+from soup_nlp.refine import mppbp
 from soup_nlp.refine.anchored import Local, fit_motion, neighbours
 from soup_nlp.refine.costs import Particles, anchor_depth
 from soup_nlp.refine.kinds import BORROWED, COMMON, KINDS, WALKS
@@ -28,7 +29,7 @@ from soup_nlp.refine.records import RefineOptions
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.storage.progress import Watch
 
-FEW = RefineOptions(rounds=3, particles=16, trws_iterations=15)
+FEW = RefineOptions(rounds=3, particles=16)
 NEW = (*WALKS, *COMMON, *BORROWED)
 
 
@@ -282,6 +283,13 @@ def test_interruption_and_time_limit_keep_the_best():
     assert not late.rounds
 
 
+@pytest.fixture
+def never_near(monkeypatch):
+    """TRW-S does not stop at a gap."""
+    monkeypatch.setattr(mppbp, "TRWS_GAP", -1.0)
+
+
+@pytest.mark.usefixtures("never_near")
 def test_a_listener_hears_every_iteration_and_can_stop_within_a_round():
     tiny = Tiny("pixels", samples=6)
     stop = threading.Event()
@@ -296,7 +304,7 @@ def test_a_listener_hears_every_iteration_and_can_stop_within_a_round():
         tiny.soup,
         tiny.data,
         weights_for("pixels"),
-        FEW.replace(trws_gap=-1.0),
+        FEW,
         seed=1,
         watch=Watch(listener, stop),
     )
@@ -307,6 +315,7 @@ def test_a_listener_hears_every_iteration_and_can_stop_within_a_round():
     assert done.energy["total"] <= done.energy_begin["total"]
 
 
+@pytest.mark.usefixtures("never_near")
 def test_an_interrupt_within_a_round_ends_the_refinement():
     """TRW-S keeps a KeyboardInterrupt to itself: the rounds must not go on after it."""
     tiny = Tiny("pixels", samples=6)
@@ -317,9 +326,10 @@ def test_an_interrupt_within_a_round_ends_the_refinement():
         if len(heard) == 2:
             raise KeyboardInterrupt
 
-    # no round ends by its gap before the second iteration
-    o, stop = FEW.replace(trws_gap=-1.0), threading.Event()
-    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, watch=Watch(listener, stop))
+    stop = threading.Event()
+    done = refine_soup(
+        tiny.soup, tiny.data, weights_for("pixels"), FEW, watch=Watch(listener, stop)
+    )
     assert done.status == "interrupted"
     assert len(heard) == 2
     assert [r.status for r in done.rounds] == ["interrupted"]
@@ -327,9 +337,10 @@ def test_an_interrupt_within_a_round_ends_the_refinement():
     assert not stop.is_set()
 
 
+@pytest.mark.usefixtures("never_near")
 def test_a_time_limit_within_a_round_is_no_interruption():
     tiny = Tiny("pixels", samples=6)
-    o = FEW.replace(trws_gap=-1.0, max_seconds=0.5)
+    o = FEW.replace(max_seconds=0.5)
 
     def listener(progress: object) -> None:
         time.sleep(0.55)

@@ -88,7 +88,7 @@ def test_only_slow_rounds_in_a_row_end_the_refinement(monkeypatch):
     monkeypatch.setattr(
         mppbp.oracle, "energy", lambda *a: {"total": next(totals), "proj": 0.0, "arap": 0.0}
     )
-    o = FEW.replace(rounds=6, stagnation=1e-2, particles=4, trws_iterations=1)
+    o = FEW.replace(rounds=6, stagnation=1e-2, particles=4)
     done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o)
     assert done.status == "stagnated"
     assert [r.energy["total"] for r in done.rounds] == [99.99, 50.0, 49.99, 49.98]

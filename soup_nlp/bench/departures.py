@@ -65,7 +65,9 @@ def _overrides(values: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 _WEIGHTS = tuple(f"energy.weights.{w}" for w in ("arap", "proj", "cont", "orient", "sigma_cont"))
+_ADDED = ("prior", "sigma_arap", "leak_arap")
 _PIXELS = {key: default(key) for key in ("energy.units", "energy.rotation_px", *_WEIGHTS)}
+_HELD = {f"energy.weights.{w}": default(f"energy.weights.{w}") for w in _ADDED}
 _MORE = {"energy.pixel_samples": 64, "segmentation.boundary_samples": 12}
 _SMALL = {"max_size": 0.05}
 _SHARED = {"start.method": "shared"}
@@ -103,8 +105,8 @@ DEPARTURES = (
     Departure(
         "another energy where surfaces bend",
         ("start.bending",),
-        with_on={**_SHARED, **_PIXELS},
-        needs="on: with the start that finds them, and pixel units",
+        with_on={**_SHARED, **_PIXELS, **_HELD},
+        needs="on: with the start that finds them, pixel units and all weights",
     ),
     Departure("prior on relief", ("energy.weights.prior",)),
     Departure("borders that follow the flow", ("segmentation.follow_flow_px",)),

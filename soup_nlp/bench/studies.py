@@ -12,8 +12,8 @@ NOISE_PX = ("0.1", "0.5", "1", "2")
 
 
 def without(*terms: str) -> Overrides:
-    """Overrides that switch off terms of the energy, for rigid and for bending surfaces."""
-    return tuple(f"energy.{w}.{t}=0.0" for t in terms for w in ("weights", "bending.weights"))
+    """Overrides that switch off terms of the energy."""
+    return tuple(f"energy.weights.{t}=0.0" for t in terms)
 
 
 STUDIES: Mapping[str, Study] = MappingProxyType(

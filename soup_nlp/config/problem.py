@@ -42,10 +42,6 @@ class SegmentationOptions(Section):
     """Wanted number; the answer differs by about 3 % at most."""
     method: Literal["slic", "grid"] = "slic"
     """slic, or grid (the paper's worst case)."""
-    compactness: Positive = 10.0
-    """SLIC's balance of colour and distance."""
-    smoothing_px: Annotated[float, Field(ge=0, le=100)] = 0.0
-    """Gaussian pre-smoothing of SLIC, pixels."""
     follow_flow_px: Positive | None = 1.0
     """A pixel on a border goes to the neighbour whose affine flow is nearer to its own by more
     than this, pixels; null leaves the borders to the image alone."""

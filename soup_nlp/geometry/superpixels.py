@@ -20,14 +20,17 @@ NEAR = 0.03
 """Largest share by which the number of superpixels differs from the wanted one."""
 ASKED = 4
 """Most further calls of SLIC for more superpixels."""
+COMPACTNESS = 10.0
+"""SLIC's balance of colour and distance; scikit-image's default."""
+SMOOTHING_PX = (0.0, 1.0, 2.0, 4.0)
+"""Gaussian smoothing before SLIC, pixels, tried in turn: texture as fine as pixels breaks clusters
+into fragments, which are then merged into a few large superpixels. A grid is the last resort."""
 
 
 def segment(
     image: Image,
     count: int,
     method: Literal["slic", "grid"] = "slic",
-    compactness: float = 10.0,
-    sigma: float = 0.0,
 ) -> Labels:
     """Superpixel labels of an image.
 
@@ -36,9 +39,6 @@ def segment(
         count: Wanted number of superpixels; the answer differs by at most 3 %, or by one. A grid
             has a whole number of rows and columns.
         method: "slic" (Achanta et al. 2012, skimage) or "grid" (the paper's worst case).
-        compactness: SLIC's balance of colour and distance.
-        sigma: Gaussian pre-smoothing of SLIC, pixels; more where texture shatters superpixels
-            so that less than half of their number are left, and a grid where that does not help.
 
     Returns:
         (H, W) int32 labels 0..N-1, each connected (4-neighbourhood) and not empty.
@@ -59,22 +59,21 @@ def segment(
     if method == "grid" or np.ptp(image) == 0:
         # SLIC has nothing to follow on an image of one colour: its limit is the grid
         return _grid(height, width, count)
-    # texture as fine as pixels shatters SLIC's clusters, and shards join to a few large ones
-    for smoothing in (sigma, *(wider for wider in (1.0, 2.0, 4.0) if wider > sigma)):
-        labels = _slic(image, count, compactness, smoothing)
+    for smoothing in SMOOTHING_PX:
+        labels = _slic(image, count, smoothing)
         if labels.max() + 1 >= ENOUGH * count:
-            return _as_many(image, labels, count, compactness, smoothing)
+            return _as_many(image, labels, count, smoothing)
     return _grid(height, width, count)
 
 
-def _slic(image: Image, clusters: int, compactness: float, sigma: float) -> Labels:
+def _slic(image: Image, clusters: int, sigma: float) -> Labels:
     """Connected superpixels of SLIC with so many clusters."""
     from skimage.segmentation import slic
 
     raw = slic(
         image,
         n_segments=clusters,
-        compactness=compactness,
+        compactness=COMPACTNESS,
         sigma=sigma,
         start_label=0,
         min_size_factor=LEAST_PIECE,
@@ -84,7 +83,7 @@ def _slic(image: Image, clusters: int, compactness: float, sigma: float) -> Labe
     return split_components(raw.astype(np.int32), least)
 
 
-def _as_many(image: Image, labels: Labels, count: int, compactness: float, sigma: float) -> Labels:
+def _as_many(image: Image, labels: Labels, count: int, sigma: float) -> Labels:
     """Superpixels whose number is near `count`.
 
     SLIC's clusters start on a grid, of which few sizes exist, and how many of them vanish depends
@@ -97,7 +96,7 @@ def _as_many(image: Image, labels: Labels, count: int, compactness: float, sigma
         if n >= count - near:
             break
         asked = min(image.shape[0] * image.shape[1] // 4, math.ceil(asked * 1.03 * count / n))
-        labels = _slic(image, asked, compactness, sigma)
+        labels = _slic(image, asked, sigma)
     return _merged(labels, count) if labels.max() + 1 > count + near else labels
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from soup_nlp.schema.section import NonNegative, Positive, Samples, Section, Share, Truncation
 
@@ -49,46 +48,33 @@ class Weights(Section):
     """Truncation of a pixel's re-projection error, pixels; inf is the paper's form."""
 
 
-class BendingWeights(Weights):
-    """Weights for bending surfaces; `orient` is the value at N = 1,000, see `BendingOptions`."""
+# --- surfaces that bend ---------------------------------------------------------------------------
+#
+# Bending changes rotations but preserves lengths. E_arap therefore compares motions at the anchors,
+# where a bending surface is connected, and gives rotations almost no weight. Lengths, continuity
+# and orientation then hold the relief. This energy is always in pixels.
 
-    cont: NonNegative = 0.05
-    """alpha2."""
-    orient: NonNegative = 4.0
-    """alpha3 at N = 1,000; it grows in proportion to N."""
-    prior: NonNegative = 4.0
-    """alpha4, in units of the flow's noise, here the residual of the superpixels' affine flows."""
-    sigma_arap: Truncation = 1.0
-    """Truncation of every ARAP norm; inf is the paper's form."""
-    leak_arap: Share = 0.05
-    """Share of an ARAP norm that is not truncated."""
+BENDING_WEIGHTS = {"cont": 0.05, "orient": 4.0, "prior": 4.0, "sigma_arap": 1.0, "leak_arap": 0.05}
+"""Constants for surfaces that bend where `Weights` has its defaults; orient is for N = 1,000."""
+BENDING_ROTATION_PX = 1e-3
+"""Pixels per radian of rotation difference where surfaces bend."""
+ACROSS_DISCONTINUITIES = {"arap": 0.3, "cont": 0.01, "orient": 0.3}
+"""Factors of terms across a flow discontinuity where the whole image bends."""
+WIDEST_BENDING_EPS = 0.1
+"""Upper limit of solver.presolve_eps where surfaces bend, pixels. Relief changes the flow by a
+fraction of a pixel, so a wider smoothing would flatten it."""
 
 
-class BendingOptions(Section):
-    """The energy for pairs whose surfaces bend, always in pixels.
+def bending_weights(own: Weights, superpixels: int) -> Weights:
+    """The constants for surfaces that bend, in proportion to those of rigid surfaces.
 
-    Bending changes rotations but preserves lengths. E_arap therefore compares motions at the
-    anchors, where a bending surface is connected, and gives rotations almost no weight. Lengths,
-    continuity and orientation then hold the relief.
+    On the same relief 1 - cos between neighbours falls as 1 / N, so that E_orient grows with N.
     """
-
-    widest_eps: Positive = 0.1
-    """Upper limit of solver.presolve_eps, pixels. Relief changes the flow by a fraction of a pixel,
-    so a wider smoothing would flatten it."""
-    untruncated: bool = True
-    """Sets solver.untruncated where the whole image bends: E_arap truncated from the beginning
-    tears bending surfaces."""
-    rotation_px: Positive = 1e-3
-    """Pixels per radian of rotation difference."""
-    arap_across: Share = 0.3
-    """Factor of E_arap across a flow discontinuity; 1 is the paper's, here and below."""
-    cont_across: Share = 0.01
-    """Factor of E_cont across a flow discontinuity."""
-    orient_across: Share = 0.3
-    """Factor of E_orient across a flow discontinuity."""
-    weights: BendingWeights = BendingWeights()
-    """Factors of the terms and their truncations; orient is the value at N = 1,000 and grows in
-    proportion to N."""
+    usual = Weights()
+    out = {k: v * (getattr(own, k) / getattr(usual, k)) for k, v in BENDING_WEIGHTS.items()}
+    out["orient"] *= superpixels / 1000
+    out["leak_arap"] = min(1.0, out["leak_arap"])
+    return own.replace(**out)
 
 
 class EnergyOptions(Section):
@@ -104,19 +90,11 @@ class EnergyOptions(Section):
     arap_across: Share = 0.03
     """Factor of E_arap and E_prior between superpixels of different components; 1 is the
     paper's."""
-    prior_ground: NonNegative | None = 10.0
-    """Factor of E_prior between two superpixels with borrowed depth over a known ground, where it
-    holds the relief of the initialisation; null treats these superpixels like all others."""
     cont_occluded: Share = 0.03
     """Factor of E_cont where one component occludes another; 1 is the paper's."""
-    occlusion_gap: Annotated[float, Field(ge=0, lt=1)] = 0.1
-    """Relative gap in depth, in the initialisation, from which one component occludes another."""
     rotation_px: Positive | None = None
     """Pixels per radian of rotation difference; null for the focal length."""
     pixel_samples: Samples | Literal["all"] = 16
     """Pixels per superpixel in E_proj, or all."""
     weights: Weights = Weights()
     """Factors of the terms and their truncations."""
-    bending: BendingOptions = BendingOptions()
-    """Replaces rotation_px, arap_at_anchors, weights and the solver's widest smoothing where
-    surfaces bend."""

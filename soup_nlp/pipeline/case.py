@@ -14,7 +14,13 @@ from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import Labels, segment
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
-from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.energy_options import (
+    ACROSS_DISCONTINUITIES,
+    BENDING_ROTATION_PX,
+    WIDEST_BENDING_EPS,
+    Weights,
+    bending_weights,
+)
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.matrix import build_matrix_nlp
@@ -37,6 +43,12 @@ from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.storage.progress import Watch
+
+PRIOR_OVER_GROUND = 10.0
+"""Factor of E_prior between two superpixels with borrowed depth over a known ground, where it holds
+the relief of the initialisation."""
+OCCLUSION_GAP = 0.1
+"""Relative gap in depth, in the initialisation, from which one component occludes another."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +187,7 @@ def superpixels(problem: Problem, pair: Pair) -> Labels:
     """The superpixels that a problem asks for, on a pair that carries its flow."""
     assert pair.flow is not None
     s = problem.segmentation
-    labels = segment(pair.image_ref, s.superpixels, s.method, s.compactness, s.smoothing_px)
+    labels = segment(pair.image_ref, s.superpixels, s.method)
     return labels if s.follow_flow_px is None else follow_flow(labels, pair.flow, s.follow_flow_px)
 
 
@@ -186,13 +198,14 @@ def _bends(problem: Problem, start: Start) -> bool:
 
 def solver_options(problem: Problem, start: Start) -> SolverOptions:
     """The solver's options of a problem, its smoothing no wider than surfaces allow."""
-    own, bending = problem.solver, problem.energy.bending
+    own = problem.solver
     if not _bends(problem, start):
         return own
-    # of several that become the widest one is enough
-    eps = dict.fromkeys(min(e, bending.widest_eps) for e in own.presolve_eps)
-    # beside rigid regions E_arap without truncation lets the scales of components slide
-    both = own.untruncated or (bending.untruncated and bool(start.bends.all()))
+    # widths above the limit become the limit, which then occurs once
+    eps = dict.fromkeys(min(e, WIDEST_BENDING_EPS) for e in own.presolve_eps)
+    # E_arap truncated from the beginning tears bending surfaces; beside rigid regions E_arap
+    # without truncation lets the scales of components slide
+    both = own.untruncated or bool(start.bends.all())
     return own.replace(presolve_eps=tuple(eps), untruncated=both)
 
 
@@ -205,7 +218,6 @@ def build_energy(
     pixels = None if e.pixel_samples == "all" else e.pixel_samples
     bends = start.bends & (e.units == "pixel")
     whole = bool(bends.all())
-    form = e.bending if whole else e
     at_anchors = bool(bends.any()) or e.arap_at_anchors
     data = build_energy_data(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, at_anchors
@@ -213,21 +225,18 @@ def build_energy(
     data = without_flow(in_noise(data, start.noise), start.wrong)
     free = data.prior_weight
     data = across_components(data, start.component, e.arap_across)
-    if e.prior_ground is not None:
-        data = over_ground(data, start.soup, start.grounded, e.prior_ground * free)
-    data = at_occlusions(data, start.soup, start.component, e.occlusion_gap, e.cont_occluded)
+    data = over_ground(data, start.soup, start.grounded, PRIOR_OVER_GROUND * free)
+    data = at_occlusions(data, start.soup, start.component, OCCLUSION_GAP, e.cont_occluded)
     if whole:
-        b = e.bending
-        held = {"arap": b.arap_across, "cont": b.cont_across, "orient": b.orient_across}
-        data = across_discontinuities(data, start.surface, **held)
+        data = across_discontinuities(data, start.surface, **ACROSS_DISCONTINUITIES)
     if e.units == "pixel":
-        data = in_pixels(data, start.soup, seg, form.rotation_px)
+        rotation = BENDING_ROTATION_PX if whole else e.rotation_px
+        data = in_pixels(data, start.soup, seg, rotation)
     else:
         data = in_length(data, start.soup, e.length)
-    # on the same relief 1 - cos between neighbours falls as 1 / N
-    bent = e.bending.weights.replace(orient=e.bending.weights.orient * len(seg) / 1000)
+    bent = bending_weights(e.weights, len(seg))
     if whole:
         return data, bent
     if bends.any():
-        data = within_bending(data, bends, e.weights, bent, e.bending.rotation_px)
+        data = within_bending(data, bends, e.weights, bent, BENDING_ROTATION_PX)
     return data, e.weights

@@ -43,6 +43,8 @@ from soup_nlp.storage.progress import Progress, Watch
 CURRENT, KEPT = KINDS.index("current"), KINDS.index("kept")
 KEPT_SHARE = 0.25
 """Share of the particles that stays for the next round."""
+TRWS_ITERATIONS, TRWS_GAP = 15, 1e-4
+"""Most iterations of TRW-S in a round, and the relative gap at which it stops earlier."""
 
 
 def refine_soup(
@@ -255,8 +257,8 @@ class _Rounds:
             unary,
             edges,
             pairwise,
-            max_iter=o.trws_iterations,
-            gap=o.trws_gap,
+            max_iter=TRWS_ITERATIONS,
+            gap=TRWS_GAP,
             dtype=pairwise.dtype,
             init_labels=none,
             polish=True,

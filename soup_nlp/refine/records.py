@@ -14,11 +14,9 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.schema.limits import MAX_PARTICLES, MOST
 from soup_nlp.schema.section import (
     Count,
-    Finite,
     NonNegative,
     Section,
     Tolerance,
-    Whole,
 )
 
 
@@ -38,10 +36,6 @@ class RefineOptions(Section):
     depth_reach: Annotated[float, Field(ge=1, le=MOST)] = 2.0
     """A new depth is at most this many times the upper quartile of the neighbours' depths, and
     at least their lower quartile over this squared."""
-    trws_iterations: Whole = 15
-    """Most iterations of TRW-S in a round."""
-    trws_gap: Finite = 1e-4
-    """TRW-S stops at this relative gap; negative: never."""
     stagnation: NonNegative = 1e-3
     """End when two rounds in a row lower E by less than this share; 0 never."""
     photo: NonNegative = 10.0
