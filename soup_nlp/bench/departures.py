@@ -142,4 +142,4 @@ DEPARTURES = (
     Departure("rounds end early", ("refine.rounds", "refine.stagnation")),
     Departure("images in the refinement", ("refine.photo", "refine.sweep")),
 )
-"""Every departure that options can undo; `tests/test_bench_paper.py` checks for missing ones."""
+"""Every departure that options can undo; a test checks for missing ones."""

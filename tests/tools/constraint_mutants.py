@@ -93,7 +93,7 @@ def killer(root: Path, mutant: Mutant) -> str:
     path.write_text(text.replace(mutant.old, mutant.new))
     words = ["-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider"]
     done = subprocess.run(
-        [sys.executable, *words, "tests/test_constraints.py"],
+        [sys.executable, *words, "tests/model/test_constraints.py"],
         cwd=root,
         env=os.environ | {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,

@@ -14,8 +14,8 @@ import time
 from collections import Counter
 from pathlib import Path
 
-# the helpers of the tests are in the folder above
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "odd"))
 
 from helpers_odd_cases import CASES
 from helpers_odd_run import Case, fault

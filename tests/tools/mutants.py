@@ -124,7 +124,8 @@ def reached(root: Path, tests: Sequence[str]) -> tuple[dict[tuple[str, int], set
     config.write_text("[run]\ndynamic_context = test_function\nsource = soup_nlp\n")
     words = [sys.executable, "-m", "coverage", "run", f"--rcfile={config}", "-m", "pytest"]
     words += ["-p", "no:cacheprovider", "--durations=0", "-vv", "-W", "default"]
-    words += [f"tests/{name}.py" for name in tests]
+    places = {p.stem: str(p.relative_to(root)) for p in (root / "tests").rglob("test_*.py")}
+    words += [places[name] for name in tests]
     done = subprocess.run(words, cwd=root, capture_output=True, text=True, check=False)
     seconds: dict[str, float] = defaultdict(float)
     for spent, name in re.findall(r"^([\d.]+)s (?:call|setup)\s+(\S+)", done.stdout, re.M):
@@ -138,9 +139,9 @@ def reached(root: Path, tests: Sequence[str]) -> tuple[dict[tuple[str, int], set
             key = str(Path(file).relative_to(root)), line
             for context in contexts:
                 # module.function, or module.Class.function
-                module, _, rest = context.removeprefix("tests.").partition(".")
+                module, _, rest = context.partition(".")
                 if rest:
-                    found[key].add(f"tests/{module}.py::{rest.replace('.', '::')}")
+                    found[key].add(f"{places[module]}::{rest.replace('.', '::')}")
     return found, seconds
 
 

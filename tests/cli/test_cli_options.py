@@ -21,7 +21,7 @@ from soup_nlp.data.scenes.catalogue import render_scene
 
 pytestmark = pytest.mark.slow
 
-ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
+ORBIT = str(Path(__file__).parents[2] / "problems" / "orbit.yaml")
 SMALL = [
     "--set", "input.width=112", "--set", "input.height=84", "--set", "refine.enabled=false",
     "--set", "segmentation.superpixels=16", "--set", "segmentation.neighbours=5",

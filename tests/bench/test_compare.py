@@ -29,7 +29,7 @@ from soup_nlp.model.formulation import Formulation
 
 pytestmark = pytest.mark.slow
 
-PROBLEMS = Path(__file__).parent.parent / "problems"
+PROBLEMS = Path(__file__).parents[2] / "problems"
 MANY = 1 << 30
 LABEL = {
     "problem": "tiny",

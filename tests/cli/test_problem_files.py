@@ -11,7 +11,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import dump_problem, load_problem, make_problem
 from soup_nlp.errors import ConfigError
 
-PROBLEMS = sorted((Path(__file__).resolve().parents[1] / "problems").glob("*.yaml"))
+PROBLEMS = sorted((Path(__file__).resolve().parents[2] / "problems").glob("*.yaml"))
 MOTORCYCLE = "input: {kind: motorcycle}\n"
 
 

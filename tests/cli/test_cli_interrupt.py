@@ -24,7 +24,7 @@ from soup_nlp.storage.mark import MARK
 
 pytestmark = pytest.mark.slow
 
-ORBIT = str(Path(__file__).parent.parent / "problems" / "orbit.yaml")
+ORBIT = str(Path(__file__).parents[2] / "problems" / "orbit.yaml")
 SMALL = [
     "--set", "input.width=160", "--set", "input.height=120", "--set", "flow.source=truth",
     "--set", "segmentation.superpixels=30", "--set", "segmentation.neighbours=5",

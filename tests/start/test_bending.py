@@ -29,7 +29,7 @@ from soup_nlp.start.start_options import SeededStart
 pytestmark = pytest.mark.slow
 
 SEEDED = SeededStart()
-SHEET = Path(__file__).parent.parent / "problems" / "sheet.yaml"
+SHEET = Path(__file__).parents[2] / "problems" / "sheet.yaml"
 
 
 def problem(scene: str, *overrides: str) -> Problem:

@@ -16,7 +16,7 @@ from soup_nlp.cli.main import BENCH, COMMANDS, main
 from soup_nlp.config.problem import load_problem, shipped_problems
 from soup_nlp.errors import ConfigError
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "scipy", "cv2", "casadi", "matplotlib", "skimage")
 
 

@@ -55,7 +55,7 @@ FILES = [
     "points_ref.ply",
     "points_next.ply",
 ]
-PROBLEMS = sorted((Path(__file__).parent.parent / "problems").glob("*.yaml"))
+PROBLEMS = sorted((Path(__file__).parents[2] / "problems").glob("*.yaml"))
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from soup_nlp.report.check import check_folder
 
 pytestmark = pytest.mark.slow
 
-ORBIT = Path(__file__).parent.parent / "problems" / "orbit.yaml"
+ORBIT = Path(__file__).parents[2] / "problems" / "orbit.yaml"
 SMALL = [
     "--set", "input.width=160", "--set", "input.height=96",
     "--set", "segmentation.superpixels=30", "--set", "segmentation.neighbours=6",

@@ -227,7 +227,7 @@ def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
 def test_parallel_processes_and_one_that_dies(tmp_path):
     # the children must find this module's function
     os.environ["PYTHONPATH"] = os.pathsep.join(
-        [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+        [str(Path(__file__).parents[1] / "helpers"), os.environ.get("PYTHONPATH", "")]
     )
     path = tmp_path / "rows.jsonl"
     rows = measure_all(fake_jobs(dies=True), path, workers=2)

@@ -30,7 +30,7 @@ from soup_nlp.solve.stages import solve_soup
 
 pytestmark = pytest.mark.slow
 
-PROBLEMS = Path(__file__).parent.parent / "problems"
+PROBLEMS = Path(__file__).parents[2] / "problems"
 TINY = [
     "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",
     "--set", "segmentation.neighbours=4", "--set", "energy.pixel_samples=4",

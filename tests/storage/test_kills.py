@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_killed_exports_leave_whole_folders():
-    script = Path(__file__).parent / "tools" / "kill_table.py"
+    script = Path(__file__).parents[1] / "tools" / "kill_table.py"
     words = [sys.executable, str(script), "--kills", "3", "--only", "export"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
