@@ -21,9 +21,18 @@ CLIP = 3.0
 """Errors are clipped at this many pixels where motions are compared."""
 
 
-def least_gain(noise: float, o: SeededStart) -> float:
+DOMINANT, ROUNDS = 5, 3
+"""Largest number of motions of the whole image, and rounds in which motions are added."""
+UNEXPLAINED_PX = 0.1
+"""Error below which a superpixel does not look for another motion, pixels."""
+PIECES, PIECE_SIZE = 6, 4
+"""Largest number of unexplained pieces that get candidate motions in a round, and the least number
+of superpixels of one: fewer do not determine a motion."""
+
+
+def least_gain(noise: float) -> float:
     """Least gain in error (pixels) for which a superpixel changes its motion, for a flow noise."""
-    return max(2 * noise, o.unexplained_px)
+    return max(2 * noise, UNEXPLAINED_PX)
 
 
 def dominant(views: Views, o: SeededStart) -> list[Motion]:
@@ -31,7 +40,7 @@ def dominant(views: Views, o: SeededStart) -> list[Motion]:
 
     Args:
         views: Rays, targets and confidence of every superpixel.
-        o: Count, inlier distance and seed.
+        o: Inlier distance and seed.
     """
     rng = np.random.default_rng(o.seed)
     r, q = views.ray.reshape(-1, 3), views.target.reshape(-1, 3)
@@ -43,7 +52,7 @@ def dominant(views: Views, o: SeededStart) -> list[Motion]:
         q[pick],
         w[pick],
         views.focal[0],
-        count=o.dominant,
+        count=DOMINANT,
         threshold=o.threshold_px,
         seed=o.seed,
     )
@@ -81,15 +90,15 @@ def of_pieces(
         motions: The present M motions; the first has the main rotation.
         cost: (N, M) penalised error under them, pixels.
         noise: Flow noise, pixels.
-        o: Number and least size of the pieces.
+        o: Seed.
     """
-    bad = cost.min(axis=1) > max(3 * noise, o.unexplained_px)
+    bad = cost.min(axis=1) > max(3 * noise, UNEXPLAINED_PX)
     bad &= views.weight.mean(axis=1) > 0.3
     piece = connected_pieces(bad, seg)
     out: list[Motion] = []
     sizes = np.bincount(piece[piece >= 0], minlength=1)
-    for c in np.argsort(-sizes)[: o.pieces]:
-        if sizes[c] < o.piece_size:
+    for c in np.argsort(-sizes)[:PIECES]:
+        if sizes[c] < PIECE_SIZE:
             break
         own = piece == c
         r, q = views.ray[own].reshape(-1, 3), views.target[own].reshape(-1, 3)
@@ -103,7 +112,7 @@ def of_pieces(
     return out
 
 
-def select(cost: Float, noise: float, o: SeededStart) -> list[int]:
+def select(cost: Float, noise: float) -> list[int]:
     """Smallest set of motions that explains the flow, found greedily.
 
     Each motion must lower the error of enough superpixels by the least gain.
@@ -111,20 +120,19 @@ def select(cost: Float, noise: float, o: SeededStart) -> list[int]:
     Args:
         cost: (N, M) penalised error of each superpixel under each motion, pixels.
         noise: Flow noise, pixels.
-        o: Least gain and least number of superpixels.
 
     Returns:
         Kept columns, the best motion first.
     """
     clipped = np.minimum(cost, CLIP)
-    gain = least_gain(noise, o)
+    gain = least_gain(noise)
     kept = [int(np.argmin(clipped.sum(axis=0)))]
     while len(kept) < clipped.shape[1]:
         best = clipped[:, kept].min(axis=1)
         better = np.maximum(best[:, None] - clipped - gain, 0.0)
         total = better.sum(axis=0)
         c = int(np.argmax(total))
-        if np.sum(better[:, c] > 0) < o.piece_size:
+        if np.sum(better[:, c] > 0) < PIECE_SIZE:
             break
         kept.append(c)
     return kept
@@ -217,9 +225,7 @@ class Choice:
         return replace(self, label=number[inverse.ravel()]), motions
 
 
-def of_neighbourhoods(
-    views: Views, seg: Segmentation, choice: Choice, noise: float, o: SeededStart
-) -> Choice:
+def of_neighbourhoods(views: Views, seg: Segmentation, choice: Choice, noise: float) -> Choice:
     """Adopt motions fitted to the neighbourhoods of superpixels where they fit better.
 
     Candidates of a superpixel are the motion of its own neighbourhood and those of its neighbours.
@@ -229,7 +235,6 @@ def of_neighbourhoods(
         seg: Superpixels and graphs.
         choice: Present choice.
         noise: Flow noise, pixels.
-        o: Least gain and rounds.
 
     Returns:
         The choice with the adopted motions.
@@ -237,7 +242,7 @@ def of_neighbourhoods(
     n, k = seg.knn.shape
     if k == 0:
         return choice
-    gain = least_gain(noise, o)
+    gain = least_gain(noise)
     for size in (8, 24):
         if not (choice.error > gain).any():
             break
@@ -252,7 +257,7 @@ def of_neighbourhoods(
         R3, t3 = refine_motion(R, t1, r, q, w, views.focal[0], max(noise, 0.1))
         Rs, ts = np.stack([R, R2, R3], axis=1), np.stack([t1, t2, t3], axis=1)
         choice = _adopt(views, Rs, ts, choice, gain)
-    for _ in range(o.rounds):
+    for _ in range(ROUNDS):
         if not (choice.error > gain).any():
             break
         near = seg.knn[:, : min(6, k)]
@@ -282,28 +287,28 @@ def rigid_choice(
         views: Rays, targets and confidence of every superpixel.
         seg: Superpixels and graphs.
         jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
-        o: Numbers, prices and limits.
+        o: Price of differing neighbours, where a surface ends, and seed.
 
     Returns:
         The choice, the motions of the whole image, and the noise of the flow, pixels.
     """
     known = views.weight.any(axis=1)
-    for extend in range(o.rounds + 1):
+    for extend in range(ROUNDS + 1):
         fit = views.fit(motions)
         cost = fit.penalised()
-        kept = select(cost, limited_noise(cost.min(axis=1)[known]), o)
+        kept = select(cost, limited_noise(cost.min(axis=1)[known]))
         motions, fit, cost = [motions[c] for c in kept], fit.columns(kept), cost[:, kept]
         noise = limited_noise(cost.min(axis=1)[known])
         # what no motion explains yet, piece by piece
-        extra = of_pieces(views, seg, motions, cost, noise, o) if extend < o.rounds else []
+        extra = of_pieces(views, seg, motions, cost, noise, o) if extend < ROUNDS else []
         if not extra:
             break
         motions = motions + extra
     # the dominant motion is preferred where another is not clearly better
-    prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * o.unexplained_px))
+    prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * UNEXPLAINED_PX))
     # beyond 5 pixels one motion is as wrong as another
     cost = np.minimum(cost + prefer, 5.0)
     label = smooth_choice(cost, flow_affinity(jump, o), seg, o.smoothness)
     R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
     choice = Choice(R, t, fit.pick((np.arange(len(seg)), label)), label)
-    return of_neighbourhoods(views, seg, choice, noise, o), noise
+    return of_neighbourhoods(views, seg, choice, noise), noise

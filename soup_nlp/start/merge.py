@@ -11,7 +11,15 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.start.choice import CLIP, Choice, flow_affinity, least_gain, smooth_choice
+from soup_nlp.start.choice import (
+    CLIP,
+    PIECE_SIZE,
+    UNEXPLAINED_PX,
+    Choice,
+    flow_affinity,
+    least_gain,
+    smooth_choice,
+)
 from soup_nlp.start.components import connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion, estimate
 from soup_nlp.start.neighbourhoods import fit_translation, refine_motion
@@ -41,14 +49,14 @@ def gather(
         jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
         choice: Present choice.
         noise: Flow noise, pixels.
-        o: Least gain and size of a component, price of differing neighbours, where a surface ends.
+        o: Price of differing neighbours, where a surface ends, and seed.
 
     Returns:
         The choice with the adopted motions; its indices no longer refer to a list of motions.
     """
     if not (choice.label >= 0).any():
         return choice
-    gain = least_gain(noise, o)
+    gain = least_gain(noise)
     for share in DISCONTINUITIES:
         choice = _one_motion_each(
             views, seg, jump < share * o.discontinuity_px, choice, noise, gain, o
@@ -113,7 +121,7 @@ def _one_motion_each(
         at = np.flatnonzero(mover & (piece == c))
         held = np.unique(choice.label[at])
         # one motion already, and what a few pixels would change in it is not to be trusted
-        if len(at) < o.piece_size or (len(held) == 1 and held[0] >= 0):
+        if len(at) < PIECE_SIZE or (len(held) == 1 and held[0] >= 0):
             continue
         R, t = candidates(views, choice, at, R_main, noise, o)
         shape = len(at), len(R)
@@ -171,7 +179,7 @@ def _spread(
     label = choice.label
     count = np.bincount(label[label >= 0])
     main = main_motion(label)
-    large = count >= o.piece_size
+    large = count >= PIECE_SIZE
     large[main] = False
     kept = np.array([main, *np.flatnonzero(large)])
     m = len(kept)
@@ -180,7 +188,7 @@ def _spread(
     first = [np.argmax(label == c) for c in kept]
     fit = views.fit([Motion(choice.R[a], choice.t[a]) for a in first])
     cost = np.minimum(fit.penalised(), CLIP)
-    cost[:, 0] -= 0.5 * o.unexplained_px
+    cost[:, 0] -= 0.5 * UNEXPLAINED_PX
     stay = np.where(np.isin(label, kept), np.inf, np.minimum(choice.error, CLIP) + 0.5 * gain)
     # motions of whole regions are more reliable than those of pieces: twice the price
     near = flow_affinity(jump, o)

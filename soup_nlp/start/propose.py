@@ -42,6 +42,8 @@ from soup_nlp.start.views import Views
 __all__ = ["SeededStart", "Start", "propose"]
 
 
+LEAST_PARALLAX_PX = 0.25
+"""Parallax below which the depth of a superpixel is borrowed from its neighbours, pixels."""
 SURE = 0.5
 """Mean confidence from which the flow of a superpixel counts."""
 
@@ -142,9 +144,9 @@ def propose(
         surface = connected_labels(jump < o.discontinuity_px, seg)
     choice, wrong = earned(views, choice, seg, noise)
     weight = np.where(usable & ~bends, 1.0, 0.0)
-    choice = settle(views, choice, centre, weight, limited_noise(residual), o.piece_size)
+    choice = settle(views, choice, centre, weight, limited_noise(residual))
     choice, motions = choice.renumbered()
-    soup, weak = _with_depth(choice, views, poor | wrong, seg, o)
+    soup, weak = _with_depth(choice, views, poor | wrong, seg)
     label, parallax = choice.label, choice.parallax
     component, error = rigid_components(label, seg), choice.fit.cost[:, 0]
     if free is not None:
@@ -173,9 +175,7 @@ def rigid_motions(
     return gather(views, seg, jump, choice, noise, o).renumbered()[0], noise
 
 
-def _with_depth(
-    choice: Choice, views: Views, poor: Mask, seg: Segmentation, o: SeededStart
-) -> tuple[Soup, Mask]:
+def _with_depth(choice: Choice, views: Views, poor: Mask, seg: Segmentation) -> tuple[Soup, Mask]:
     """Planes under the chosen motions, and (N,) True where they are borrowed from neighbours.
 
     Args:
@@ -183,11 +183,10 @@ def _with_depth(
         views: Rays, targets and confidence of every superpixel.
         poor: (N,) True where these are a neighbour's or have no confidence.
         seg: Superpixels and graphs.
-        o: Least parallax.
     """
     own, parallax = choice.fit, choice.parallax
     mu, slope = own.inverse_depth[:, 0], own.slope[:, 0]
-    weak = (mu <= 0) | (parallax < o.min_parallax_px) | (own.cost[:, 0] > 3.0) | poor
+    weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | (own.cost[:, 0] > 3.0) | poor
     weak |= views.weight.sum(axis=1) < 2.0
     if weak.all():
         # little parallax everywhere is still some, until it is the rounding of the flow

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float
 from soup_nlp.geometry import rotation
-from soup_nlp.start.choice import Choice
+from soup_nlp.start.choice import PIECE_SIZE, Choice
 from soup_nlp.start.epipolar import Motion, sampson, triangulate
 from soup_nlp.start.views import Views
 
@@ -30,9 +30,7 @@ CLIP_PX = 0.3
 """Scale of the Cauchy loss of epipolar distances, pixels."""
 
 
-def settle(
-    views: Views, choice: Choice, centre: Float, usable: Float, noise: float, fewest: int
-) -> Choice:
+def settle(views: Views, choice: Choice, centre: Float, usable: Float, noise: float) -> Choice:
     """The choice with the most probable motion of every rigid component.
 
     Args:
@@ -41,14 +39,13 @@ def settle(
         centre: (N, 3) rays of the next frame to which the anchors move, by affine flow.
         usable: (N,) weight of every superpixel; 0 where the flow is not known.
         noise: Noise of the flow, pixels.
-        fewest: Least number of superpixels of a component.
     """
     if not usable.any() or np.median(choice.error[usable > 0]) < EXACT_PX:
         return choice
     for c in np.unique(choice.label[choice.label >= 0]):
         at = np.flatnonzero(choice.label == c)
         seen = at[usable[at] > 0]
-        if len(seen) < max(fewest, 4):
+        if len(seen) < PIECE_SIZE:
             continue
         motion = Motion(choice.R[at[0]], choice.t[at[0]])
         own = views.anchor[seen], centre[seen], usable[seen], views.focal[0]

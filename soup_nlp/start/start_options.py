@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from soup_nlp.schema.section import Count, NonNegative, Samples, Section, Seed, Whole
+from soup_nlp.schema.section import Count, NonNegative, Samples, Section, Seed
 
 
 class StartOptions(Section):
@@ -18,22 +18,10 @@ class StartOptions(Section):
     superpixel, as in the paper for small ones; with 0 its own homography is decomposed."""
     samples: Samples = 40
     """Sampled pixels per superpixel."""
-    dominant: Whole = 5
-    """Largest number of dominant motions."""
     threshold_px: NonNegative = 1.0
     """Inlier distance of a motion, pixels."""
     smoothness: NonNegative = 0.5
     """Price of different motions of two neighbours with continuous flow, pixels."""
-    min_parallax_px: NonNegative = 0.25
-    """Parallax below which the depth of a superpixel is borrowed from its neighbours, pixels."""
-    rounds: Count = 3
-    """Rounds of candidate motions from unexplained pieces and from neighbours."""
-    unexplained_px: NonNegative = 0.1
-    """Error below which a superpixel does not look for another motion, pixels."""
-    pieces: Whole = 6
-    """Largest number of unexplained pieces that get candidate motions in a round."""
-    piece_size: Whole = 4
-    """Least number of superpixels of a piece."""
     bending: bool = True
     """Whether surfaces may bend (`start.regions`); if false, everything is rigid."""
     discontinuity_px: NonNegative = 1.0

@@ -18,7 +18,14 @@ from soup_nlp.geometry.superpixels import segment
 from soup_nlp.start import choice as choosing
 from soup_nlp.start import merge as gathering
 from soup_nlp.start import propose as proposing
-from soup_nlp.start.choice import Choice, of_neighbourhoods, of_pieces, select
+from soup_nlp.start.choice import (
+    PIECE_SIZE,
+    UNEXPLAINED_PX,
+    Choice,
+    of_neighbourhoods,
+    of_pieces,
+    select,
+)
 from soup_nlp.start.components import TIES, borrow, contact_scales, depth_from_inside
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.propose import propose
@@ -77,9 +84,9 @@ def taken(views: Turns, angle: np.ndarray, label: np.ndarray) -> Choice:
 
 @pytest.mark.parametrize("missing", [0, 1])
 def test_a_motion_is_kept_for_as_many_superpixels_as_make_a_piece(missing):
-    own = np.arange(30) < OPTIONS.piece_size - missing
+    own = np.arange(30) < PIECE_SIZE - missing
     cost = np.where(np.stack([own, ~own], axis=1), 2.0, 0.0)
-    assert select(cost, 0.05, OPTIONS) == ([0] if missing else [0, 1])
+    assert select(cost, 0.05) == ([0] if missing else [0, 1])
 
 
 @pytest.mark.parametrize(("confidence", "found"), [(1.0, True), (0.1, False)])
@@ -104,8 +111,8 @@ def test_a_motion_that_pays_goes_from_neighbour_to_neighbour(monkeypatch):
     before = taken(Turns(np.zeros(24)), np.where(first, 0.0, 0.3), np.where(first, 0, 1))
     count = []
     for rounds in (0, 1, 3):
-        o = OPTIONS.replace(rounds=rounds)
-        after = of_neighbourhoods(Turns(np.zeros(24)), seg, before, 0.05, o)
+        monkeypatch.setattr(choosing, "ROUNDS", rounds)
+        after = of_neighbourhoods(Turns(np.zeros(24)), seg, before, 0.05)
         np.testing.assert_array_equal(after.label == 0, after.error < 1e-9)
         count.append(int((after.label == 0).sum()))
     assert count[0] == 1
@@ -195,7 +202,7 @@ def test_between_motions_that_explain_the_same_the_main_one_is_taken():
     seg = cells(4, 9)
     right = seg.anchors[:, 0] > 48
     # the other is better by a fifth of what would count as unexplained
-    middle = 0.1 + 0.1 * OPTIONS.unexplained_px / PER_RADIAN
+    middle = 0.1 + 0.1 * UNEXPLAINED_PX / PER_RADIAN
     views = Turns(np.where(right, middle, 0.0))
     before = taken(views, np.where(right, 0.2, 0.0), right.astype(int))
     jump = np.full(len(seg.pairs), 10.0)
