@@ -172,6 +172,78 @@ def test_the_readme_is_short():
     assert all(len(line) <= 200 for line in lines)
 
 
+STORED = {
+    **{k: [f"{k}-s0-1024x436"] for k in ("street", "room", "orbit", "banner", "sheet", "still")},
+    "motorcycle": ["motorcycle"],
+    "KITTI 2012": ["kitti2012 000138", "kitti2012 000027"],
+    "KITTI 2015": ["kitti2015 000002", "kitti2015 000007"],
+    "KITTI tracking": [f"kitti_tracking {k}" for k in range(4)],
+    "driving (synthetic), tum_fr1": ["driving_synthetic", "tum_fr1"],
+    "driving, synthetic": ["driving_synthetic"],
+    "tum_fr1": ["tum_fr1"],
+    "bending paper": [f"kinect_paper {k}" for k in ("025", "049", "065", "105", "129", "145")],
+    "kinect_paper": [f"kinect_paper {k}" for k in ("025", "049", "065", "105", "129", "145")],
+    "indoor RGB-D with people, cloth": [
+        *(f"rgbd {k}" for k in ("opening_door", "robot", "two_people_walking")),
+        "deepdeform 017",
+    ],
+    "rgbd": [f"rgbd {k}" for k in ("opening_door", "robot", "two_people_walking")],
+    "deepdeform": ["deepdeform 017"],
+    "Sintel alley_1": ["sintel alley_1-0020+5"],
+}
+"""Pairs of the stored tables by the beginning of their row in a document."""
+
+
+def stored_scores():
+    """{(pair, flow): (solution, constant)}, of KITTI's pairs by KITTI's convention."""
+    out = {}
+    for name in ("rendered", "shared"):
+        text = (ROOT / "results" / "accuracy" / f"{name}.md").read_text(encoding="utf-8")
+        for part in re.split(r"^## ", text, flags=re.MULTILINE):
+            if part.startswith(("MRE, paper", "MRE, kitti")):
+                rows = [[c.strip() for c in line.split("|")[1:-1]] for line in part.splitlines()]
+                head = next(row for row in rows if row[:2] == ["pair", "flow"])
+                at = [head.index("solution"), head.index("constant")]
+                own = [row for row in rows if len(row) == len(head)]
+                out |= {(r[0], r[1]): [r[k] for k in at] for r in own if r[1] in ("truth", "dis")}
+    return out
+
+
+def fits(cell, numbers):
+    """Whether a cell of a document says the numbers of a table, rounded: all, or from a to b."""
+    said = [word for word in re.split(r",| to ", cell) if word.strip() not in ("", "none")]
+    if " to " in cell:
+        numbers = [min(numbers, key=float), max(numbers, key=float)]
+    words = [re.match(r"\s*([\d.]+)", word)[1] for word in said]
+    shown = [float(w) for w in words]
+    # half a unit of the last digit, and the rounding of the table
+    slack = [0.51 * 10.0 ** -len(w.partition(".")[2]) + 6e-5 for w in words]
+    return len(words) == len(numbers) and all(
+        abs(a - float(b)) <= s for a, b, s in zip(shown, numbers, slack)
+    )
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/results.md"])
+def test_scores_are_those_of_the_stored_tables(page):
+    scores, text = stored_scores(), (ROOT / page).read_text(encoding="utf-8")
+    (table,) = re.findall(r"^\| pair \| true flow \|.*\n\|[-|]+\n((?:\|.*\n)+)", text, re.MULTILINE)
+    for line in table.splitlines():
+        cells = [c.strip() for c in line.split("|")[1:-1]]
+        pairs = STORED[max((k for k in STORED if cells[0].startswith(k)), key=len)]
+        for cell, flow, column in ((1, "truth", 0), (2, "dis", 0), (3, "dis", 1)):
+            numbers = [scores[p, flow][column] for p in pairs if (p, flow) in scores]
+            said = cells[cell].partition(", not")[0]
+            assert fits(said, numbers) or (not said and flow == "truth"), (line, numbers)
+
+
+def test_the_comparison_of_scores_can_fail():
+    assert fits("0.016", ["0.0160"])
+    assert not fits("0.016", ["0.0167"])
+    assert not fits("0.016, 0.02", ["0.0160"])
+    assert fits("0.10 to 0.25", ["0.2475", "0.0982", "0.1270"])
+    assert not fits("0.10 to 0.25", ["0.2575", "0.0982"])
+
+
 # --- the recipes of docs/adding.md -------------------------------------------------------------
 
 
