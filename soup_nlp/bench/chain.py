@@ -67,7 +67,7 @@ def measure_chain(
         source = FileFrames(tuple(images), camera, tuple(find_depths(images)), 256.0)
     with scratch() as folder:
         which = [(k, k + 1) for k in range(len(source) - 1)]
-        chain = make_chain(solve_pairs(source, which, folder, ["output.page=false", *overrides]))
+        chain = make_chain(solve_pairs(source, which, folder, overrides))
         seconds = {row["key"]: row["cpu_seconds"] for row in read_rows(folder / ROWS)}
     found = score(chain)
     if found is None:

@@ -97,7 +97,7 @@ def chain(
         "segmentation.neighbours": neighbours,
         "max_size": max_size,
     }
-    changes = ["output.page=false", *options.changed(preset, overrides, short)]
+    changes = options.changed(preset, overrides, short)
     every = [*which, *over]
     try:
         with warnings.catch_warnings():

@@ -18,6 +18,9 @@ from soup_nlp.storage.rows import Job, Row, attempt, failed, measure_all, read_r
 
 ROWS = "pairs.jsonl"
 """File with a row for each pair of a sequence."""
+OF_PAIRS = "output.page=false", "refine.rounds=1"
+"""Overrides of every pair: the sequence has a page of its own, and the first round of the refinement
+does most of its work."""
 MAX_GUESSED = 0.5
 """A pair has no parallax if the depth of a larger share of its background is a guess."""
 
@@ -68,12 +71,13 @@ def solve_pairs(
         SolverError: a pair cannot be solved.
     """
     jobs, places = [], []
+    overrides = [*OF_PAIRS, *overrides]
     # the last row of a pair describes its folder
     last = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
     for first, second in which:
         place = folder.resolve() / "pairs" / f"{first:03d}_{second:03d}"
         raw = {"name": place.name, "input": frames.pair(first, second), "base": str(Path.cwd())}
-        name = {"key": place.name, "input": raw["input"], "overrides": list(overrides)}
+        name = {"key": place.name, "input": raw["input"], "overrides": overrides}
         stored = last.get(place.name, {})
         same = (place / "result.h5").is_file() and all(stored.get(k) == name[k] for k in name)
         work = partial(attempt, partial(_solve, raw, tuple(overrides), place))

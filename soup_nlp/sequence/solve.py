@@ -60,8 +60,7 @@ def solve_chain(
     found = FileFrames(tuple(path.absolute() for path in images), camera)
     found.check()
     which = [(k, k + 1) for k in range(len(found) - 1)]
-    changes = ["output.page=false", *overrides]
-    chain = make_chain(solve_pairs(found, which, folder, changes, workers))
+    chain = make_chain(solve_pairs(found, which, folder, overrides, workers))
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
         write_chain(new, chain, folder.name, [found.source(k) for k in range(len(found))])
     return chain
