@@ -19,8 +19,8 @@ from soup_nlp.storage.rows import Job, Row, attempt, failed, measure_all, read_r
 ROWS = "pairs.jsonl"
 """File with a row for each pair of a sequence."""
 OF_PAIRS = "output.page=false", "refine.rounds=1"
-"""Overrides of every pair: the sequence has a page of its own, and the first round of the refinement
-does most of its work."""
+"""Overrides of every pair: the sequence has its own page, and one round of the refinement does most
+of its work."""
 MAX_GUESSED = 0.5
 """A pair has no parallax if the depth of a larger share of its background is a guess."""
 
