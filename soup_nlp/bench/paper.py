@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.bench.accuracy import scores, solved
-from soup_nlp.bench.departures import DEPARTURES, PAPER
-from soup_nlp.bench.studies import STUDIES, without
+from soup_nlp.bench.studies import DEPARTURES, PAPER, STUDIES, without
 from soup_nlp.bench.study import Cell, Overrides
 from soup_nlp.bench.suite_pairs import RENDERED, Item, Options, spread
 from soup_nlp.bench.suites import list_suite

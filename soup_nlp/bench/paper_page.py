@@ -11,11 +11,10 @@ import numpy as np
 import pandas as pd
 
 from soup_nlp.bench.accuracy_page import published_lines
-from soup_nlp.bench.departures import DEPARTURES
 from soup_nlp.bench.paper import ALL_SECTIONS, DATASETS, METHODS, Plan
 from soup_nlp.bench.processes import processor
 from soup_nlp.bench.published import COMPARISON, DATA, SOURCE
-from soup_nlp.bench.studies import STUDIES
+from soup_nlp.bench.studies import DEPARTURES, STUDIES
 from soup_nlp.bench.study import (
     failures,
     figure,

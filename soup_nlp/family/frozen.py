@@ -19,6 +19,7 @@ from soup_nlp.arrays import Float, Int
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.energy_options import Weights
 from soup_nlp.storage.atomic import write_bytes
 
 
@@ -61,8 +62,19 @@ class Frozen:
     def problem(self) -> Problem:
         """The merged problem."""
         raw = yaml.safe_load(self.text)
-        # options of earlier code; the record has the weights and the start that they gave
-        return make_problem(_present(raw, Problem))
+        # options of earlier code, whose weights and start are stored in the record
+        return make_problem(_present({k: v for k, v in raw.items() if k != "start"}, Problem))
+
+    def weights(self, own: Weights) -> Weights:
+        """Constants of the energy: those of the record where surfaces bend, else `own`.
+
+        Early records list all constants for surfaces that bend, E_orient's for N = 1,000.
+        """
+        energy = yaml.safe_load(self.text)["energy"]
+        if not self.bending or "bending" not in energy:
+            return own
+        stored = Weights(**energy["bending"]["weights"])
+        return stored.replace(orient=stored.orient * (self.labels.max() + 1) / 1000)
 
     @property
     def start(self) -> Soup:

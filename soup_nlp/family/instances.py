@@ -180,6 +180,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
     data, weights = build_energy(problem, pair, seg, start)
     options = solver_options(problem, start)
     data = rounded_data(replace(data, prior_weight=record.prior_weight))
+    weights = record.weights(weights)
     return Case(problem, pair, seg, start, data, weights, start.soup, options, seen=pair)
 
 

@@ -35,7 +35,6 @@ ROUNDINGS = 16
 """Error of a pixel coordinate after projection into both frames, in units of machine precision."""
 LOST = 1e-4
 """Share of the pixels that may lie on either side of a horizon."""
-TERMS = ("arap", "proj", "cont", "orient", "prior")
 RECOMPUTED, WRITTEN = "recomputed", "as written"
 LEFT = (
     "dual infeasibility and complementarity, which need the model's derivatives",
@@ -163,13 +162,13 @@ def _energies(r: Stored) -> Iterator[Claim]:
     # E sums differences of numbers as large as pixel coordinates and focal lengths
     used = np.abs(e["pixel_target"][e["pixel_weight"] > 0])
     size = max(float(used.max(initial=1.0)), float(np.abs(e["K_next"]).max()))
-    factor = max(1.0, *(weights[term] for term in TERMS))
-    slack = ROUNDINGS * float(np.finfo(float).eps) * len(e["anchor_ray"]) * size * factor
+    slack = ROUNDINGS * float(np.finfo(float).eps) * len(e["anchor_ray"]) * size
     for which in ("start", "nlp", "solution"):
         found = recompute.energy(r.soup(which), e, weights)
+        factor = max(1.0, *(weights[term] for term in found if term != "total"))
         for term, value in found.items():
             claimed = _number(r.claims["energy"][which][term])
-            tolerance = RELATIVE * abs(found["total"]) + slack
+            tolerance = RELATIVE * abs(found["total"]) + slack * factor
             yield Claim(f"energy {which} {term}", claimed, value, tolerance)
 
 

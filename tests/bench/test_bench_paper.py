@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from soup_nlp.bench.departures import DEPARTURES, PAPER, default
 from soup_nlp.bench.paper import DATASETS, METHODS, SECTIONS, Sizes, make_plan, measure_paper
 from soup_nlp.bench.paper_page import PICTURES
-from soup_nlp.bench.studies import STUDIES
+from soup_nlp.bench.studies import DEPARTURES, PAPER, STUDIES, default
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.cli import bench_paper
 from soup_nlp.cli.main import main

@@ -16,7 +16,6 @@ from soup_nlp.model.reweighting import in_pixels
 
 UNITS = ("paper", "pixels")
 FORMS = [(n, t) for n in ("smooth", "epigraph") for t in ("smooth", "lifted")]
-TERMS = ("arap", "proj", "cont", "orient", "prior")
 
 
 @cache

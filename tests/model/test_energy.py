@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_formulation import TERMS, UNITS, WORLDS, form, tiny, world
+from helpers_formulation import UNITS, WORLDS, form, tiny, world
 from helpers_model import (
     GAUGES,
     HEIGHT,
@@ -27,7 +27,7 @@ from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
-from soup_nlp.model.energy_data import EnergyData, build_energy_data, sample_pixels
+from soup_nlp.model.energy_data import TERMS, EnergyData, build_energy_data, sample_pixels
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.reweighting import in_noise, in_pixels

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_formulation import FORMS, TERMS, UNITS, assert_same_soup, form, tiny
+from helpers_formulation import FORMS, UNITS, assert_same_soup, form, tiny
 from helpers_model import GAUGES, PAPER, random_soup, value, weights_for
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from soup_nlp.errors import ConfigError, ModelError
+from soup_nlp.model.energy_data import TERMS
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import MatrixLayout, TangentLayout

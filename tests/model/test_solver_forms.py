@@ -7,11 +7,12 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from helpers_formulation import FORMS, TERMS, UNITS, WORLDS, form, tiny, world
+from helpers_formulation import FORMS, UNITS, WORLDS, form, tiny, world
 from helpers_model import GAUGES, PAPER, gradient, value, weights_for
 
 from soup_nlp.geometry import rotation
 from soup_nlp.model import oracle
+from soup_nlp.model.energy_data import TERMS
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 

@@ -17,6 +17,7 @@ import yaml
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem, make_problem
 from soup_nlp.errors import ConfigError
+from soup_nlp.model.energy_data import TERMS
 from soup_nlp.pipeline.run import run
 from soup_nlp.refine.kinds import KINDS
 from soup_nlp.refine.records import RefineOptions
@@ -31,7 +32,6 @@ SMALL = [
     "--set", "flow.source=truth", "--set", "refine.rounds=3", "--set", "refine.particles=20",
     "--set", "refine.stagnation=0",
 ]  # fmt: skip
-TERMS = ("total", "arap", "proj", "cont", "orient", "prior")
 
 
 def solve(folder: Path, *options: str) -> tuple[int, dict]:
@@ -66,7 +66,7 @@ def test_solve_delivers_the_refined_soup_and_keeps_the_nlps(both):
     assert r["end"]["photo"] < r["begin"]["photo"]
     assert set(r["rounds"][0]["accepted"]) == set(KINDS)
     with h5py.File(both / "result.h5") as file:
-        for term in TERMS:
+        for term in ("total", *TERMS):
             values = file[f"refine/energy_{term}"][:]
             assert list(values) == [one["energy"][term] for one in r["rounds"]]
         assert file["refine/accepted"].shape == (3, len(KINDS))
