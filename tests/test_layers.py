@@ -262,7 +262,7 @@ def test_modules_do_not_import_in_circles():
             assert module not in reached(target), f"{module} and {target} need each other"
 
 
-def test_every_module_says_in_its_first_line_what_it_is_for():
+def test_every_module_has_a_purpose_line():
     for module, path in MODULES.items():
         text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
         assert text, module

@@ -137,7 +137,7 @@ def test_loss_charges_failures():
     assert loss[1:] == [FAILED_LOSS, FAILED_LOSS]
 
 
-def test_one_family_at_a_time_has_no_part_in_the_choice():
+def test_one_family_at_a_time_is_left_out():
     def frame(**trials: dict[str, float]) -> pd.DataFrame:
         lines = [
             {"variant": t, "sequence": f, "side": "train", "loss": math.log(mre)}
@@ -173,8 +173,10 @@ def test_split_keeps_scenes_apart():
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_every_variant_of_a_study_is_a_problem(name):
-    for overrides in STUDIES[name].variants.values():
-        items(0)[0].problem(overrides)
+    variants = STUDIES[name].variants
+    problems = [items(0)[0].problem(overrides) for overrides in variants.values()]
+    # no two variants are the same problem
+    assert len({problem.digest() for problem in problems}) == len(variants)
 
 
 def test_a_study_writes_table_and_picture(tmp_path):
@@ -251,6 +253,7 @@ def test_every_command_of_bench_all_is_understood(line):
     while hasattr(command, "resolve_command"):
         name, command, words = command.resolve_command(context, words)
         context = command.make_context(name, words, parent=context)
+    assert not words or context.params
 
 
 def test_bench_all_leaves_out_what_needs_data(capsys):

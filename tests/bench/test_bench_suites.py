@@ -61,7 +61,7 @@ def test_a_limit_counts_pairs_and_keeps_every_flow(tmp_path):
     assert str(listing) == f"suite kitti2012: {text}"
 
 
-def test_sintel_needs_its_cameras_but_for_the_scene_whose_camera_is_known(tmp_path):
+def test_sintel_needs_cameras_except_for_the_known_scene(tmp_path):
     suite = SUITES["sintel"]
     for i in suite.items(tmp_path, Options()):
         if i.sequence in ("alley_1", "temple_2"):

@@ -14,6 +14,7 @@ from helpers_model import PAPER, Tiny
 from test_compare import LABEL, MANY, PROBLEMS, ROWS, page, row
 
 from soup_nlp.bench.processes import isolated
+from soup_nlp.bench.solvers import runner
 from soup_nlp.bench.solvers.page import conclusion, frame_of_runs
 from soup_nlp.bench.solvers.profiles import _draw_profile, cost_table, draw_curves, draw_profiles
 from soup_nlp.bench.solvers.registry import executable, find_solver, reference
@@ -66,7 +67,7 @@ def program(folder: Path, text: str) -> Path:
 # --- answers -------------------------------------------------------------------------------------
 
 
-def test_the_start_is_not_the_answer_of_a_solver_that_gave_none(task, tmp_path, monkeypatch):
+def test_the_start_is_no_answer_of_a_solver(task, tmp_path, monkeypatch):
     # a program that waits uses no CPU time, so that wall time ends it
     monkeypatch.setattr("soup_nlp.bench.solvers.registry.WALL_PER_CPU", 1.0)
     mine = program(tmp_path, "exec sleep 30")
@@ -78,7 +79,7 @@ def test_the_start_is_not_the_answer_of_a_solver_that_gave_none(task, tmp_path, 
     assert "| - | - | - | - |" in page([found]).replace(f"{found['energy_start']:.6g}", "-")
 
 
-def test_a_solver_named_by_its_path_has_a_folder_of_its_own(task, tmp_path, monkeypatch):
+def test_a_solver_named_by_path_has_its_own_folder(task, tmp_path, monkeypatch):
     mine = program(tmp_path, "exit 3")
     monkeypatch.chdir(tmp_path)
     for name in (str(mine), f"./{mine.name}"):
@@ -128,7 +129,7 @@ def test_a_claim_after_the_limit_is_not_within_it(task, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "form", [{"norm": "epigraph"}, {"norm": "epigraph", "truncation": "lifted"}]
 )
-def test_a_reference_solver_hands_back_a_point_of_the_epigraph_form(form, tmp_path):
+def test_a_reference_solver_returns_a_point_of_the_epigraph_form(form, tmp_path):
     task = make_task(tmp_path, **form)
     task = replace(task, limits=replace(task.limits, seconds=2.0))
     x = reference(task).x
@@ -167,6 +168,7 @@ def test_pictures_of_nothing_verified_say_nothing(tmp_path):
         frame = frame_of_runs(failed)
         draw_profiles(tmp_path / "p.png", {"": frame}, ("seconds", "energy"))
         draw_curves(tmp_path / "c.png", frame)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["c.png", "p.png"]
 
 
 def test_a_profile_names_the_solvers_that_solve_nothing():
@@ -204,3 +206,25 @@ def test_an_input_that_cannot_be_used_leaves_the_others_page(tmp_path, monkeypat
     assert main(["compare", orbit, orbit, "-o", str(out), *words, *SMALL]) == 2
     assert "1 runs" in (out / "README.md").read_text()
     assert "image is gone" in capsys.readouterr().err
+
+
+def test_a_problems_lowest_energy_is_of_its_own_runs():
+    def row(problem: str, energy: float) -> dict[str, object]:
+        label = {"problem": problem, "superpixels": 9, "formulation": "f", "solver": "s"}
+        point = {"energy": energy, "primal": 0.0, "seconds": 1.0, "verified": True}
+        return {**label, **point, "claimed": True, "problem_hash": problem, "start": "presolve"}
+
+    text = "\n".join(conclusion(frame_of_runs([row("a", 1.0), row("b", 2.0)])))
+    assert text.count("lowest exact energy of any run 1 by s") == 1
+    assert text.count("lowest exact energy of any run 2 by s") == 1
+
+
+def test_a_curve_has_the_first_and_the_last_iterate(monkeypatch):
+    monkeypatch.setattr(runner, "_energy", lambda _, x: float(x[0]))
+    for count in (1, 2, 500):
+        at = np.arange(float(count))
+        curve = runner._curve(None, at, at[:, None])
+        assert curve[0] == [0, 0]
+        assert curve[-1] == [count - 1, count - 1]
+        assert len(curve) == min(count, runner.CURVE_POINTS)
+    assert runner._curve(None, np.zeros(0), np.zeros((0, 1))) == []

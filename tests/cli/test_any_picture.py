@@ -54,7 +54,7 @@ def picture(path, tags=None):
         ({}, GUESS * 160),
     ],
 )
-def test_focal_length_is_of_exif_or_a_guess_that_is_said(tags, focal, tmp_path):
+def test_focal_length_comes_from_exif_or_a_stated_guess(tags, focal, tmp_path):
     path = picture(tmp_path / "a.jpg", tags)
     said = "EXIF" if focal != GUESS * 160 else "1.2 times the longer side.*--fov"
     with pytest.warns(DataWarning, match=said):
@@ -105,7 +105,7 @@ def test_a_photo_is_turned_as_its_exif_says(orientation, suffix, tmp_path):
             make_problem(given).load_pair()
 
 
-def test_the_focal_length_of_a_turned_photo_is_that_of_what_is_shown(tmp_path):
+def test_a_turned_photo_has_the_focal_length_as_shown(tmp_path):
     image = np.zeros((160, 120, 3), np.uint8)
     stored_turned(tmp_path / "a.jpg", image, 6)
     with pytest.warns(DataWarning, match="EXIF"):

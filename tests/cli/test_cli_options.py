@@ -33,7 +33,7 @@ SMALL = [
 @pytest.mark.parametrize(
     "option", [("--depth", "truth.npy"), ("--intrinsics-next", "1,1,0,0"), ("--ref", "a.png")]
 )
-def test_options_of_a_pair_do_not_go_with_a_problem_file(option, tmp_path, capsys):
+def test_options_of_a_pair_exclude_a_problem_file(option, tmp_path, capsys):
     assert main(["solve", ORBIT, "--out", str(tmp_path / "out"), *option]) == 2
     error = capsys.readouterr().err
     assert option[0] in error
@@ -94,7 +94,7 @@ def test_an_input_in_a_result_folder_is_not_overwritten(solved, tmp_path, capsys
     assert "an input would be overwritten" in capsys.readouterr().err
 
 
-def test_a_result_folder_takes_the_next_result_and_is_no_input(solved, tmp_path, capsys):
+def test_a_result_folder_is_an_output_but_no_input(solved, tmp_path, capsys):
     args, out = solved[0], shutil.copytree(solved[1], tmp_path / "out")
     foreign(tmp_path / "pair")
     assert main([*args, "--out", str(out)]) in (0, 1)

@@ -106,13 +106,13 @@ def test_a_dumped_preset_is_the_same_problem(tmp_path):
     assert load_problem(tmp_path / "bare.yaml").digest() == problem.digest()
 
 
-def test_an_unknown_preset_is_an_error_that_names_the_known_ones():
+def test_an_unknown_preset_is_refused_with_the_known_names():
     with pytest.raises(ConfigError, match="preset") as caught:
         make_problem({"input": STREET, "preset": "papr"})
     assert "paper" in str(caught.value)
 
 
-def test_the_command_line_shows_a_preset_and_puts_it_below_overrides(capsys):
+def test_the_command_line_puts_a_preset_below_overrides(capsys):
     assert main(["show", "--preset", "paper"]) == 0
     assert yaml.safe_load(capsys.readouterr().out) == PRESETS["paper"]
     assert main(["show", "street", "--preset", "paper", "--set", "refine.rounds=9"]) == 0
@@ -234,7 +234,7 @@ def test_slanted_planes_do_not_lengthen_the_unit(case):
     assert problem.length(x) @ problem.growth(x) == pytest.approx(unit(x), rel=1e-12)
 
 
-def test_the_constrained_nlp_of_the_paper_has_the_minimum_of_the_presolve(case):
+def test_the_papers_nlp_has_the_minimum_of_the_presolve(case):
     """Ipopt starts where the presolve ends: with held slopes it started a fifth of E higher."""
     options = case.options.replace(polish_iterations=20, max_iter=0)
     done = solve_soup(case.soup, case.data, case.weights, case.formulation(), options)

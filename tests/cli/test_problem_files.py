@@ -8,8 +8,9 @@ import pytest
 import yaml
 
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import dump_problem, load_problem, make_problem
+from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
 from soup_nlp.errors import ConfigError
+from soup_nlp.schema.section import Section
 
 PROBLEMS = sorted((Path(__file__).resolve().parents[2] / "problems").glob("*.yaml"))
 MOTORCYCLE = "input: {kind: motorcycle}\n"
@@ -98,3 +99,18 @@ def test_show_prints_what_users_turn_and_what_differs(capsys):
     assert "leak_arap" in whole
     one, other = (make_problem(yaml.safe_load(text)) for text in (short, whole))
     assert one.digest() == other.digest()
+
+
+def sections(kind: type[Section]) -> list[type[Section]]:
+    """A kind of section and all kinds in it that can be left out."""
+    inner = [type(f.default) for f in kind.model_fields.values() if isinstance(f.default, Section)]
+    return [kind, *(found for one in inner for found in sections(one))]
+
+
+def test_every_default_is_within_its_bounds():
+    street = make_problem({"input": {"kind": "scene", "scene": "street"}}).input
+    for section in sections(Problem):
+        fields = {k: f for k, f in section.model_fields.items() if not f.is_required()}
+        own = {k: f.get_default(call_default_factory=True) for k, f in fields.items()}
+        made = section(**own, **({"input": street} if section is Problem else {}))
+        assert {k: getattr(made, k) for k in own} == own

@@ -25,7 +25,7 @@ def run() -> soup_nlp.Run:
     return soup_nlp.solve_pair(pair, segmentation=SMALL, flow={"source": "truth"}, refine=none)
 
 
-def test_images_of_floats_and_of_channels_first_are_the_same_images():
+def test_float_and_channels_first_images_are_the_same():
     image = render_scene("orbit", 0, 64, 48).image_ref
     for other in (image / 255.0, (image / 255.0).astype(np.float32), image.transpose(2, 0, 1)):
         pair = soup_nlp.Pair(other, image, (70, 70, 31, 24))
@@ -34,7 +34,7 @@ def test_images_of_floats_and_of_channels_first_are_the_same_images():
         soup_nlp.Pair(image.astype(float), image, (70, 70, 31, 24))
 
 
-def test_a_camera_follows_from_a_field_of_view_or_is_a_guess():
+def test_a_camera_is_a_field_of_view_or_guess():
     image = render_scene("orbit", 0, 64, 48).image_ref
     pair = soup_nlp.Pair(image, image, fov=90)
     assert pair.K_ref[0, 0] == pytest.approx(32)
@@ -70,7 +70,7 @@ def test_options_may_be_records_and_progress_is_reported(capsys):
     assert "evaluation" in capsys.readouterr().err
 
 
-def test_depth_is_scored_from_a_run_an_array_or_a_stored_result(run, tmp_path):
+def test_depth_is_scored_from_run_array_or_stored_result(run, tmp_path):
     truth = run.pair.truth.depth_ref
     run.save(tmp_path / "out")
     stored = soup_nlp.load(tmp_path / "out")

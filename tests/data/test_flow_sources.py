@@ -37,7 +37,7 @@ def test_checked_flow_trusts_what_the_way_back_confirms():
     assert np.isfinite(checked_flow(forward, backward, "x").uv).all()
 
 
-def test_noise_has_its_size_and_is_alike_over_a_few_pixels(pair):
+def test_noise_has_its_size_and_correlation_length(pair):
     true = flow_from_truth(pair)
     flow = add_noise(true, 0.5)
     gap = flow.uv - true.uv

@@ -159,7 +159,7 @@ def test_an_absurd_focal_length_is_ignored(
 # --- 3 every frame has its own camera ------------------------------------------------------------
 
 
-def test_each_frame_has_the_camera_of_its_size_turn_and_lens(tmp_path: Path) -> None:
+def test_each_frame_has_its_own_camera(tmp_path: Path) -> None:
     photo(tmp_path / "wide.jpg", FocalLengthIn35mmFilm=26)
     photo(tmp_path / "turned.jpg", turned=6, FocalLengthIn35mmFilm=26)
     photo(tmp_path / "tele.jpg", FocalLengthIn35mmFilm=77)

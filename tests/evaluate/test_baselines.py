@@ -147,7 +147,7 @@ def test_without_flow_or_motion_there_is_no_baseline(orbit, monkeypatch):
     assert rigid_depth(orbit) is None
 
 
-def test_a_flow_of_zeros_gives_no_baseline_or_a_depth_map(orbit):
+def test_zero_flow_gives_no_baseline_or_a_depth_map(orbit):
     still = Flow(np.zeros_like(orbit.flow.uv), np.ones_like(orbit.flow.confidence), "still")
     found = rigid_depth(orbit.with_flow(still))
     assert found is None or found.shape == orbit.size

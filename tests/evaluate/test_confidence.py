@@ -63,7 +63,7 @@ def blocks_of(matrix: np.ndarray, size: int) -> np.ndarray:
 
 @pytest.mark.parametrize("piece", [1, 4, 1000])
 @pytest.mark.parametrize("seed", range(4))
-def test_diagonal_blocks_of_the_inverse_are_those_of_a_dense_inverse(monkeypatch, piece, seed):
+def test_diagonal_blocks_equal_those_of_a_dense_inverse(monkeypatch, piece, seed):
     """Random graphs; the third and fourth have parts that nothing couples."""
     monkeypatch.setattr(selected_inverse, "PIECE", piece)
     rng = np.random.default_rng(seed)
@@ -108,7 +108,7 @@ def test_all_depths_growing_alike_costs_nothing(info):
     assert abs(info.matrix @ info.growth).max() < 1e-9 * size.max()
 
 
-def test_the_variance_of_a_pixel_is_that_of_its_log_depth(small_room, info, dense):
+def test_the_variance_of_a_pixel_is_of_log_depth(small_room, info, dense):
     """By the derivative of the log depth of a plane, by differences."""
     seg, K = small_room.segmentation, small_room.pair.K_ref
     found = marginals(info, seg.sizes, np.zeros(len(small_room), int))
@@ -250,7 +250,7 @@ def sure_of(case, data=None, weights=None):
     return confidence(rec, case.pair, case.start, *energy)
 
 
-def test_a_superpixel_that_nothing_holds_has_the_sigma_of_the_prior(small_room):
+def test_an_undetermined_superpixel_has_the_sigma_of_the_prior(small_room):
     blind = 25
     weight = small_room.data.pixel_weight.copy()
     weight[blind] = 0.0
@@ -287,7 +287,7 @@ def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
     assert loud / quiet == pytest.approx(2**POWER, rel=1e-3)
 
 
-def test_where_surfaces_bend_a_misfit_counts_in_full_and_the_spread_by_its_root():
+def test_misfit_and_spread_count_differently_where_surfaces_bend():
     spread, misfit = np.array([100 * LEAST_SPREAD]), 100 * LEAST_NOISE
     base = calibrated(spread, 0.1, misfit, prior=np.inf, bends=True)
     # what is added in squares is 1e-4 of either square
@@ -303,7 +303,7 @@ def test_where_surfaces_bend_a_misfit_counts_in_full_and_the_spread_by_its_root(
 
 
 @pytest.mark.parametrize("bends", [False, True])
-def test_what_does_not_follow_the_noise_is_added_whatever_the_noise_is(bends):
+def test_systematic_uncertainty_is_added_at_any_noise(bends):
     spread = np.array([0.01])
     for noise in (0.05, 0.6):
         alone, both = (
@@ -314,7 +314,7 @@ def test_what_does_not_follow_the_noise_is_added_whatever_the_noise_is(bends):
     assert calibrated(spread, 0.1, added=np.inf)[0] == pytest.approx(SIGMA_PRIOR)
 
 
-def test_the_reference_component_defines_the_scale_and_the_others_are_less_sure(small_room):
+def test_other_components_are_less_sure_than_the_reference(small_room):
     sure, start = sure_of(small_room), small_room.start
     sizes = small_room.segmentation.sizes
     scale = scale_by_contact(sure.marginals, start, sizes)

@@ -42,7 +42,7 @@ def turned(angle: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.02])
-def test_a_start_without_parallax_borrows_every_depth_and_reproduces_the_flow(tiles, angle):
+def test_a_start_without_parallax_borrows_depth_but_fits_flow(tiles, angle):
     flow = Flow(turned(angle).astype(np.float32), np.ones((120, 160), np.float32), "turn")
     start = propose(tiles, flow, K, K)
     assert start.borrowed.all()

@@ -52,7 +52,7 @@ def test_a_second_export_removes_the_files_of_the_first(tmp_path):
     assert names == own | {"mine.casadi", "mine.txt", MARK}
 
 
-def test_sizes_that_give_the_same_number_have_folders_of_their_own(tmp_path, capsys):
+def test_sizes_of_equal_number_have_their_own_folders(tmp_path, capsys):
     words = [w for n in ("15", "16", "16") for w in ("--superpixels", n)]
     assert write(tmp_path, *words) == 0
     folders = {p.parent.name for p in tmp_path.rglob("soup.nl")}

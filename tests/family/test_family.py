@@ -234,7 +234,7 @@ def test_the_index_says_what_problem_sets_say(folder):
     assert easy["sha256"][:16] in (folder / "README.md").read_text()
 
 
-def test_a_best_point_is_read_back_as_the_answer_that_it_is(folder):
+def test_a_best_point_is_read_back_as_an_answer(folder):
     # the proposal stands for the best point here: on the constraints, but no minimum
     verdict = check_sol(folder / "SOUP-room-unit-offset-smooth-smooth-N100.sol")
     assert verdict.objective == verdict.best

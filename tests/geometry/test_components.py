@@ -106,7 +106,7 @@ def test_a_component_gains_little_by_receding(world, factor):
     assert (oracle.arap(away, data, weights)[across] >= 2**-0.25 * gap * (1 - 1e-12)).all()
 
 
-def test_pairs_of_two_components_weigh_less_where_one_hides_the_other(world):
+def test_pairs_across_an_occlusion_weigh_less(world):
     """Of the right component's outline the lower half touches the left one; the upper is in
     front."""
     seg, soup, component, data = world
@@ -161,7 +161,7 @@ def test_a_component_in_pieces_is_placed_from_the_ground_up():
     np.testing.assert_allclose(scales(z, own), np.where(own > 0, 2.0, 1.0), rtol=1e-12)
 
 
-def test_a_component_that_stands_on_its_own_filling_is_placed_all_the_same():
+def test_a_component_on_its_own_filling_is_still_placed():
     """All that is below the arch is a component that touches nothing else: neither can wait."""
     own = thrice([[0, 0, 0, 0, 0], [0, 2, 2, 2, 0], [0, 2, 1, 2, 0]])
     z = thrice([[4.0] * 5, [4, 1, 1, 1, 4], [4, 1, 1, 1, 4]])
@@ -214,7 +214,7 @@ def test_a_component_with_nothing_below_it_touches_its_outline():
     # than what a camera at rest could tell anything about
     [(1 / 3, 3.0), (0.1, 3.0), (4 / 3, 1.5), (1e3, 3.0)],
 )
-def test_what_the_lower_edge_cuts_off_is_nearer_the_faster_it_moves(far, scale):
+def test_components_at_the_lower_edge_are_nearer_when_faster(far, scale):
     """Half way, in logarithms, to where it moves as far as the scene."""
     z = thrice([[4.0, 6, 4], [3, 1, 3.5]])
     own = z == 1
@@ -251,9 +251,7 @@ def test_pieces_of_what_is_cut_off_are_nearer_together():
         ),
     ],
 )
-def test_components_that_the_image_cuts_off_are_placed_nearer_the_truth(
-    scene, seed, count, monkeypatch
-):
+def test_components_cut_off_by_the_image_are_placed_well(scene, seed, count, monkeypatch):
     """Rendered pairs whose lower part is cropped: contact alone puts what is cut too far."""
     what = {"kind": "scene", "scene": scene, "seed": seed, "width": 512, "height": 218}
     problem = make_problem({"input": what, "segmentation": {"superpixels": count}})

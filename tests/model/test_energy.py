@@ -62,7 +62,7 @@ def test_energy_knows_no_global_scale_and_no_gauge(units, seed, scale):
 @pytest.mark.parametrize("units", UNITS)
 @settings(max_examples=15)
 @given(seed=st.integers(0, 10_000))
-def test_a_rigid_motion_of_the_next_camera_changes_the_projection_only(units, at_anchors, seed):
+def test_a_motion_of_the_next_camera_changes_only_projection(units, at_anchors, seed):
     """X'' = Q X' + s: distances of all motions and points of the next frame stay."""
     problem, weights = tiny(units, at_anchors), weights_for(units).replace(sigma_proj=np.inf)
     soup = random_soup(seed, 12)
@@ -284,7 +284,7 @@ def test_records_print_themselves():
     assert all(isinstance(v, np.ndarray) for v in arrays.values())
 
 
-def test_prior_is_the_mean_slope_of_inverse_depth_relative_to_it():
+def test_prior_is_the_relative_slope_of_inverse_depth():
     problem = tiny("pixels")
     soup, data = problem.soup, replace(problem.data, prior_relief=0 * problem.data.edge_unit)
     expected = 0.0

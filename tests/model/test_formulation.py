@@ -17,6 +17,7 @@ from soup_nlp.model.energy_data import TERMS
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
 # --- layouts -------------------------------------------------------------------------------------
@@ -56,7 +57,7 @@ def test_the_base_of_the_presolve_is_where_it_says():
     np.testing.assert_allclose(x[:, 3:6], 0, atol=1e-14)
 
 
-def test_a_superpixel_at_rest_gets_a_tiny_translation_in_its_gauge():
+def test_a_superpixel_at_rest_gets_a_tiny_translation():
     soup = random_soup(0, 6)
     t = soup.t.copy()
     t[2] = 0
@@ -199,3 +200,18 @@ def test_the_presolve_has_the_same_objective_as_the_constrained_nlp(units):
     one, _ = problem.nlp(weights_for(units), form())
     two, _ = build_tangent_nlp(problem.soup, problem.data, weights_for(units), form())
     assert value(two, two.x0)[0] == pytest.approx(value(one, one.x0)[0], rel=1e-11)
+
+
+@pytest.mark.parametrize("gauge", ["free", "unit-translation"])
+def test_a_free_gauges_length_unit_weighs_distances_by_share(gauge):
+    problem = tiny()
+    share = np.linspace(1.0, 4.0, len(problem.soup))
+    share /= share.sum()
+    data = replace(problem.data, share=share)
+    nlp, layout = build_matrix_nlp(problem.soup, data, PAPER, form(gauge=gauge))
+    row = nlp.g_names().index(next(name for name in nlp.g_names() if name.startswith("unit")))
+    g = np.asarray(nlp.oracle(nlp.x0, nlp.p)[1]).ravel()
+    assert g[row] == pytest.approx(1.0, rel=1e-12)
+    # with equal shares the unit would be the mean distance, which is another one
+    soup = layout.unpack(nlp.x0[: layout.size])
+    assert abs(float(np.mean(soup.distance)) - 1) > 0.01

@@ -273,7 +273,7 @@ def test_a_linear_residual_has_its_exact_hessian_at_theta_one():
 
 
 @pytest.mark.parametrize("width", [1e-3, 0.1, 1.0])
-def test_smooth_min_is_zero_at_zero_below_both_and_has_its_slope(width):
+def test_smooth_min_bounds_and_slope(width):
     y = ca.SX.sym("y")
     f = ca.Function(
         "f",

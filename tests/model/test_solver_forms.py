@@ -112,14 +112,14 @@ def test_epigraph_and_lifted_at_their_optimum_are_the_exact_energy(gauge, units,
 
 
 @pytest.mark.parametrize("units", UNITS)
-def test_lifted_alone_at_its_optimum_is_the_exact_energy_as_eps_vanishes(units):
+def test_lifted_optimum_tends_to_the_exact_energy(units):
     problem, weights = tiny(units), weights_for(units)
     nlp, _ = problem.nlp(weights, form(truncation="lifted", eps=1e-9, eps_pixel=1e-9))
     exact = oracle.energy(problem.soup, problem.data, weights)["total"]
     assert value(nlp, optimal_extras(nlp))[0] == pytest.approx(exact, rel=1e-7)
 
 
-def test_epigraph_alone_at_its_optimum_is_the_exact_energy_without_truncations():
+def test_epigraph_optimum_is_the_exact_energy_without_truncations():
     problem = tiny()
     weights = PAPER.replace(sigma_cont=np.inf, orient=0.0)
     nlp, _ = problem.nlp(weights, form(norm="epigraph", eps=0.0, eps_pixel=0.0))
@@ -173,7 +173,7 @@ def test_a_rigid_plane_has_no_energy_at_the_truth(name, units, at_anchors):
 
 @pytest.mark.parametrize(("norm", "truncation"), FORMS)
 @pytest.mark.parametrize("name", ["fronto-parallel, turning", "slanted"])
-def test_the_truth_of_a_rigid_plane_is_stationary_in_every_form(name, norm, truncation):
+def test_a_rigid_planes_truth_is_stationary_in_every_form(name, norm, truncation):
     soup, data = world(name, "pixels", False)
     # a plane that is slanted has relief
     flat = PAPER.replace(prior=0.0)

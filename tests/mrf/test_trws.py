@@ -42,7 +42,7 @@ def test_equals_plain_loops(seed):
         np.testing.assert_allclose(result.best_history, np.minimum.accumulate(energies[:k]))
 
 
-def test_equals_plain_loops_on_a_grid_with_many_tables_a_block(monkeypatch):
+def test_equals_plain_loops_on_a_grid(monkeypatch):
     monkeypatch.setattr("soup_nlp.mrf.levels._CACHE_BYTES", 3 * 7 * 7 * 8)
     rng = np.random.default_rng(3)
     index = np.arange(48).reshape(6, 8)
@@ -119,7 +119,7 @@ def test_bound_linear_program_brute_force_in_this_order(seed):
 
 @given(seeds)
 @settings(max_examples=20, deadline=None)
-def test_min_marginals_bound_the_energy_of_every_labelling_with_the_label(seed):
+def test_min_marginals_bound_the_energy_of_labellings(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 6))
     unary, edges, tables = ragged(rng, n, int(rng.integers(1, 10)), most=4)

@@ -32,7 +32,7 @@ def test_an_infinite_unary_cost_forbids_a_label():
     assert allowed[np.arange(7), other.labels].all()
 
 
-def test_parallel_edges_add_up_in_the_energy_and_keep_the_bound():
+def test_parallel_edges_add_up_and_keep_the_bound():
     rng = np.random.default_rng(10)
     unary, edges, tables = dense(rng, 6, 8, 3)
     twice = np.concatenate([edges, edges[[2, 5]], edges[[2, 7], ::-1]])
@@ -85,7 +85,7 @@ def test_never_worse_than_the_initial_labels():
         assert result.best_history[0] <= result.energy_history[0]
 
 
-def test_initial_labels_come_back_where_rounding_took_worse_ones_for_better():
+def test_initial_labels_return_where_rounding_misled():
     """In float32 the three costs are one, below the exact cost of the initial label."""
     unary = np.array([[3.5, 3.0, 3.9]]) + 1e8
     result = solve_trws(unary, [], NO_TABLES, init_labels=np.array([1]), dtype=np.float32)

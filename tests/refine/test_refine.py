@@ -108,7 +108,7 @@ def test_every_proposal_is_feasible_by_construction(kind):
     assert (moved > 1e-9).any(axis=1).all()
 
 
-def test_a_step_of_scale_leaves_the_anchors_target_and_a_turn_about_it_too():
+def test_scale_steps_and_turns_keep_the_anchors_target():
     tiny = Tiny("pixels")
     before = anchor_targets(Particles.of(tiny.soup), tiny.data)
     for kind in ("walk_scale", "walk_pivot"):
@@ -191,7 +191,7 @@ def test_neighbours_come_nearest_first():
 
 
 @pytest.mark.parametrize("units", ["paper", "pixels"])
-def test_no_round_raises_the_exact_energy_and_the_soup_is_feasible(units):
+def test_no_round_raises_the_energy_or_violates_constraints(units):
     tiny = Tiny(units, samples=6)
     weights = weights_for(units)
     done = refine_soup(tiny.soup, tiny.data, weights, FEW, seed=1)
@@ -290,7 +290,7 @@ def never_near(monkeypatch):
 
 
 @pytest.mark.usefixtures("never_near")
-def test_a_listener_hears_every_iteration_and_can_stop_within_a_round():
+def test_a_listener_can_stop_within_a_round():
     tiny = Tiny("pixels", samples=6)
     stop = threading.Event()
     heard: list[str] = []
@@ -359,7 +359,7 @@ def test_stagnation_ends_the_rounds():
 
 
 @pytest.mark.parametrize("particles", [2, 3, 9])
-def test_few_particles_and_a_superpixel_without_edges_are_no_special_case(particles):
+def test_few_particles_and_isolated_superpixels_work(particles):
     tiny = Tiny("pixels", samples=6)
     o = FEW.replace(particles=particles)
     done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o)

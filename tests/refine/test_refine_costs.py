@@ -59,7 +59,7 @@ def test_costs_of_chosen_labels_are_the_exact_energy(units, at_anchors, truncate
         assert delivered == pytest.approx(exact, rel=1e-12)
 
 
-def test_every_entry_is_the_energy_of_its_pair_however_close_the_particles():
+def test_every_entry_is_the_energy_of_its_pair():
     tiny = Tiny("pixels")
     weights = weights_for("pixels", truncated=False)
     n = len(tiny.soup)
@@ -248,3 +248,18 @@ def test_no_particle_runs_away_but_the_current_one_may_stay():
     # back to its neighbours is open to the one that ran away
     assert found[3, 3]
     assert anchor_depth(p, tiny.data.anchor_ray)[3, 3] < 2.0
+
+
+def test_turns_between_neighbours_count_in_both_directions():
+    problem = Tiny("pixels", samples=None)
+    names = ("arap", "proj", "cont", "prior")
+    weights = weights_for("pixels", False).replace(**dict.fromkeys(names, 0.0), orient=1.0)
+    costs = PairCosts(problem.data, weights)
+    found = costs.tables(Particles.of(problem.soup))[:, 0, 0].sum()
+    i, k = problem.data.pairs.T
+    n = problem.soup.n
+    turn = np.minimum(1 - np.sum(n[i] * n[k], axis=1), weights.sigma_orient)
+    assert turn.sum() > 0.01
+    assert found == pytest.approx(float(2 * turn.sum()), rel=1e-12)
+    exact = oracle.energy(problem.soup, problem.data, weights)["orient"]
+    assert found == pytest.approx(exact, rel=1e-12)

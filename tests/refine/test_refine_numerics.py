@@ -24,7 +24,7 @@ from soup_nlp.refine.records import RefineOptions
 from soup_nlp.refine.select import spread_of
 
 
-def test_the_mrf_follows_the_exact_energy_when_the_length_unit_changes():
+def test_the_mrf_follows_a_change_of_length_unit():
     """In the paper's units every depth changes the unit of all: its price is in the unary costs."""
     tiny = Tiny(samples=6)
     weights = weights_for("paper", truncated=False)
@@ -55,7 +55,7 @@ def test_the_mrf_follows_the_exact_energy_when_the_length_unit_changes():
         assert abs(np.diff(mrf)[0] - np.diff(exact)[0]) < 0.02 * abs(slope * h * unit)
 
 
-def test_what_is_accepted_is_proposed_more_and_nothing_is_given_up():
+def test_accepted_kinds_are_proposed_more_often():
     tiny = Tiny("pixels")
     proposer = Proposer(tiny.data, neighbours(tiny.data.edges, tiny.data.anchor_ray), 0)
     kinds = list(SHARES)
@@ -113,7 +113,7 @@ def test_a_refit_under_the_true_motion_finds_the_true_slope():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_motion_of_exact_points_is_found_in_a_few_steps(seed):
+def test_a_motion_of_exact_points_is_found_quickly(seed):
     rng = np.random.default_rng(seed)
     X = rng.uniform([-1, -1, 2], [1, 1, 4], (60, 3))
     begin = rotation.exp([0.2, -0.1, 0.8])

@@ -8,12 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
 
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
+from soup_nlp.evaluate import recompute
 from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import WRITTEN, CheckReport, check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
@@ -150,7 +152,7 @@ def change(folder: Path, edit: Callable[[dict], object]) -> None:
     path.write_text(json.dumps(claims))
 
 
-def test_a_claim_that_is_missing_is_an_error_of_the_file(folder):
+def test_a_missing_claim_is_an_error_of_the_file(folder):
     change(folder, lambda s: s.pop("delivered"))
     with pytest.raises(DataError, match="lacks a claim"):
         check_folder(folder)
@@ -187,3 +189,11 @@ def test_contents_of_the_arrays_are_as_written(place, folder):
             first = (0,) * file[place].ndim
             file[place][first] += 1e-3
     assert "contents of result.h5 as written" in bad(check_folder(folder))
+
+
+@pytest.mark.parametrize(("rule", "scale"), [("lsq", 16.5 / 9), ("none", 1.0), ("median", 1.75)])
+def test_rules_of_scale(rule, scale):
+    """By hand: least squares is sum z gt / sum z z, of ratios 1.5, 2, 1.75."""
+    z, gt = np.array([1.0, 2.0, 2.0]), np.array([1.5, 4.0, 3.5])
+    found = recompute.scores(z, gt, rule, None)
+    assert found["scale"] == pytest.approx(scale, rel=1e-12)

@@ -82,7 +82,7 @@ def test_flow_wheel():
     np.testing.assert_array_equal(beyond, [191, 0, 0])
 
 
-def test_flow_colour_is_continuous_but_for_the_seam_of_the_wheel():
+def test_flow_colour_is_continuous_except_at_the_seam():
     """The published wheel has a seam of 43 grey levels in blue, between its last and first."""
     angle = np.linspace(-np.pi, np.pi, 2000)
     uv = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[None]
@@ -119,7 +119,7 @@ def test_component_colours():
     assert np.ptp(colours, axis=1).min() > 20
 
 
-def test_the_limit_of_a_flow_is_its_longest_vector_without_outliers():
+def test_the_limit_of_a_flow_ignores_outliers():
     uv = np.zeros((10, 100, 2))
     uv[..., 0] = np.linspace(0, 10, 1000).reshape(10, 100)
     assert flow_limit(uv) == pytest.approx(10)

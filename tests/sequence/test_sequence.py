@@ -44,7 +44,7 @@ pytestmark = pytest.mark.slow
 IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
 
 
-def test_the_link_of_two_maps_is_the_median_of_their_ratio():
+def test_the_link_of_two_maps_is_their_median_ratio():
     rng = np.random.default_rng(0)
     one = rng.uniform(1, 5, (30, 40))
     other = one / 1.3 * np.exp(rng.normal(0, 0.02, one.shape))
@@ -307,9 +307,7 @@ def test_a_pattern_may_match_folders(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["damaged", "heic", "turned"])
-def test_a_frame_that_cannot_be_read_is_found_before_the_first_solve(
-    kind, tmp_path, capsys, monkeypatch
-):
+def test_an_unreadable_frame_is_found_before_the_first_solve(kind, tmp_path, capsys, monkeypatch):
     def solve(*args):
         raise AssertionError("a pair was solved")
 

@@ -152,7 +152,7 @@ def test_hessian_of_an_unsorted_table_is_upper_triangular():
     np.testing.assert_allclose(H, expected, rtol=1e-12)
 
 
-def test_a_bound_that_cuts_off_the_optimum_is_active_with_its_multiplier():
+def test_a_bound_beyond_the_optimum_is_active():
     nlp = rosenbrock(2, ubx=0.5)
     stage = solve(nlp)
     # on x1 = 0.5 the best x2 is 0.25
@@ -272,7 +272,7 @@ def test_control_c_sets_the_event_and_the_old_handler_returns():
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_control_c_ends_a_solve_at_the_next_iteration_and_is_raised(number):
+def test_control_c_ends_a_solve_at_the_next_iteration(number):
     """CasADi swallows what is raised in its callbacks: the caller would go on."""
     seen = []
 

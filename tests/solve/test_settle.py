@@ -40,7 +40,7 @@ def test_a_motion_that_parallax_determines_is_kept():
     np.testing.assert_allclose(found.t, TRUE.t, atol=5e-3)
 
 
-def test_with_little_parallax_and_a_biased_flow_depth_is_nearer_the_truth():
+def test_depth_survives_little_parallax_and_biased_flow():
     """The motion of the least residual follows the bias, and distant points recede."""
     r, q, log_z = flow(0.006, bias=0.4)
     least = most_probable(TRUE, r, q, np.ones(len(r)), FOCAL, 1e-4)

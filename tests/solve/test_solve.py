@@ -297,7 +297,7 @@ def test_far_from_a_minimum_ipopt_has_few_iterations(room, few, spent):
     assert stages[-1].iterations == spent
 
 
-def test_a_stop_that_is_set_before_the_start_gives_the_start(room):
+def test_a_stop_before_the_start_gives_the_start(room):
     stop = threading.Event()
     stop.set()
     solution = room.solve(watch=Watch(stop=stop))

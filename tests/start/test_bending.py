@@ -150,7 +150,7 @@ def test_depth_starts_constant_where_the_camera_is_at_rest():
 
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.02, -0.05, 0.03)])
 @pytest.mark.parametrize("longer", [1.0, 1.4])
-def test_a_turn_is_found_with_a_wrong_focal_length_and_movers(turn, longer):
+def test_a_turn_is_found_despite_wrong_focal_length_and_movers(turn, longer):
     c = case("street")
     views, _ = look(c.segmentation, c.pair.flow, c.pair.K_ref, c.pair.K_next, SeededStart())
     R = rotation.exp(np.array(turn))

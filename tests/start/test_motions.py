@@ -71,7 +71,7 @@ def test_groups_of_one_motion_are_one_component():
     assert found[1].centre[2] == pytest.approx(2)
 
 
-def test_one_stray_superpixel_does_not_move_the_motion_of_its_component():
+def test_one_stray_superpixel_keeps_its_components_motion():
     seg = tiles()
     soup = soup_of([*[CAMERA] * 11, CAR])
     found = find_components(soup, seg, np.zeros(12, int), K, K)
@@ -88,7 +88,7 @@ def test_what_is_not_rigid_says_so():
     assert 1 < found[0].residual_px < 15
 
 
-def test_a_component_behind_the_camera_takes_the_motion_of_its_first_superpixel():
+def test_a_component_behind_the_camera_takes_its_first_motion():
     seg = tiles()
     group = np.r_[np.zeros(11, int), 1]
     back = RigidMotion(np.eye(3), np.array([0.0, 0.0, -5.0]))

@@ -83,16 +83,14 @@ def taken(views: Turns, angle: np.ndarray, label: np.ndarray) -> Choice:
 
 
 @pytest.mark.parametrize("missing", [0, 1])
-def test_a_motion_is_kept_for_as_many_superpixels_as_make_a_piece(missing):
+def test_a_motion_needs_a_piece_of_superpixels(missing):
     own = np.arange(30) < PIECE_SIZE - missing
     cost = np.where(np.stack([own, ~own], axis=1), 2.0, 0.0)
     assert select(cost, 0.05) == ([0] if missing else [0, 1])
 
 
 @pytest.mark.parametrize(("confidence", "found"), [(1.0, True), (0.1, False)])
-def test_pieces_whose_flow_is_not_trusted_have_no_motion_of_their_own(
-    monkeypatch, confidence, found
-):
+def test_pieces_of_untrusted_flow_have_no_motion(monkeypatch, confidence, found):
     seg = cells(4, 6)
     odd = seg.anchors[:, 0] > 24
     views = Turns(np.zeros(24), np.where(odd[:, None], confidence, 1.0) * np.ones((24, 4)))
@@ -136,7 +134,7 @@ def offered(monkeypatch, *angles: float) -> None:
 
 
 @pytest.mark.parametrize("enough", [True, False])
-def test_a_motion_that_many_of_a_component_contradict_is_not_its_motion(monkeypatch, enough):
+def test_a_contradicted_motion_is_not_the_components(monkeypatch, enough):
     seg = cells(6, 10)
     column = (seg.anchors[:, 0] // 8).astype(int)
     component = column >= 6
@@ -198,7 +196,7 @@ def test_one_of_a_component_goes_with_its_neighbours():
     np.testing.assert_array_equal(after.label, right)
 
 
-def test_between_motions_that_explain_the_same_the_main_one_is_taken():
+def test_the_main_motion_wins_between_equal_ones():
     seg = cells(4, 9)
     right = seg.anchors[:, 0] > 48
     # the other is better by a fifth of what would count as unexplained
@@ -240,7 +238,7 @@ def facing(z: np.ndarray) -> Soup:
 K = camera.intrinsics(50.0, 50.0, 27.5, 19.5)
 
 
-def test_of_the_planes_behind_an_outline_one_wild_one_does_not_decide():
+def test_one_wild_plane_behind_an_outline_does_not_decide():
     seg = cells(3, 3)
     label = (np.arange(9) == 1).astype(int)
     z = np.full(9, 4.0)

@@ -121,7 +121,7 @@ def test_what_is_not_confident_does_not_bend_a_motion():
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])
-def test_of_stacked_essential_matrices_the_one_that_explains_most_is_taken(monkeypatch, place):
+def test_the_essential_matrix_that_explains_most_is_taken(monkeypatch, place):
     m, r, q = rigid(100)
     others = [perturbed(m, 0.3, 0.8, seed).essential() for seed in (5, 6)]
     stack = np.concatenate(np.insert(np.stack(others), place, m.essential(), axis=0))
@@ -159,7 +159,7 @@ def test_a_plane_behind_the_camera_costs_more_than_its_error():
     assert cost[3] == 0.2
 
 
-def test_of_two_mirrored_translations_the_one_with_points_in_front_is_cheaper():
+def test_a_translation_with_points_in_front_is_cheaper():
     m, r, q = rigid(40)
     views = Views(r[None], q[None], np.ones((1, 40)), np.array([[0.0, 0, 1]]), np.ones(1), (1.0, 1))
     fit = replace(views, focal=(FOCAL, FOCAL)).fit([m, Motion(m.R, -m.t)])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.storage.atomic import atomic_path, write_text
 from soup_nlp.storage.h5_files import read_attrs, read_h5
 from soup_nlp.storage.store import Array, plain, require, write_h5, write_json
 from soup_nlp.storage.versions import versions
@@ -232,3 +232,8 @@ def test_versions():
     assert " ".join(out) == "soup_nlp python casadi numpy scipy opencv skimage h5py"
     assert out["numpy"] == np.__version__
     assert "unknown" not in out.values()
+
+
+def test_text_of_names_that_are_no_utf8_is_written(tmp_path):
+    write_text(tmp_path / "log.txt", "folder \udcff")
+    assert (tmp_path / "log.txt").read_text() == "folder \\udcff"

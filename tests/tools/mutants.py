@@ -45,7 +45,7 @@ ROOMS = {
 CHECK = "check_files check_rounding damage"
 TESTS = {
     "model": "constraints energy model_faces formulation sums thresholds ipopt",
-    "export": "export export_folder nl nl_sx sol solver_forms",
+    "export": "export export_folder nl nl_sx sol solver_forms verify",
     "mrf": "trws trws_inputs",
     "compare": "compare compare_rows family_compare",
     "check": CHECK,
