@@ -97,7 +97,7 @@ if (renderer) {
   const up = (x, y, z) => new THREE.Vector3(x, -y, -z), m = scene.middle;
   const [x, y, z] = eyes[eyes.length - 1];
   const VIEWS = {
-    aside: () => { eye.position.copy(up(0.25 * m, -0.25 * m, -0.3 * m)); controls.target.copy(up(x / 2, y / 2, m + z / 2)); },
+    aside: () => { eye.position.copy(up(0.26 * m, -0.27 * m, -0.48 * m)); controls.target.copy(up(x / 2, y / 2, 0.6 * m)); },
     above: () => { eye.position.copy(up(x / 2, -1.6 * m, m / 2 + z / 2)); controls.target.copy(up(x / 2, 0, m / 2 + z / 2 + 0.01 * m)); },
     camera: () => {
       const pose = new THREE.Matrix4().set(...scene.cameras[Number($("time").value)].flat());
