@@ -13,7 +13,7 @@ from soup_nlp.geometry.plane_fit import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.start.components import connected_pieces
 from soup_nlp.start.epipolar import Motion, estimate, repeated
-from soup_nlp.start.neighbourhoods import fit_translation, neighbourhood, refine_motion
+from soup_nlp.start.motions import fit_translation
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
 
@@ -225,72 +225,20 @@ class Choice:
         return replace(self, label=number[inverse.ravel()]), motions
 
 
-def of_neighbourhoods(views: Views, seg: Segmentation, choice: Choice, noise: float) -> Choice:
-    """Adopt motions fitted to the neighbourhoods of superpixels where they fit better.
-
-    Candidates of a superpixel are the motion of its own neighbourhood and those of its neighbours.
-
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        seg: Superpixels and graphs.
-        choice: Present choice.
-        noise: Flow noise, pixels.
-
-    Returns:
-        The choice with the adopted motions.
-    """
-    n, k = seg.knn.shape
-    if k == 0:
-        return choice
-    gain = least_gain(noise)
-    for size in (8, 24):
-        if not (choice.error > gain).any():
-            break
-        near = np.column_stack([np.arange(n), seg.knn[:, : min(size, k)]])
-        step = max(1, near.shape[1] * views.ray.shape[1] // 200)
-        r, q, w = (
-            neighbourhood(v[:, ::step], near) for v in (views.ray, views.target, views.weight)
-        )
-        R, t = choice.R, choice.t
-        t1 = fit_translation(R, r, q, w, views.focal[0], max(noise, 0.1))
-        R2, t2 = refine_motion(R, t, r, q, w, views.focal[0], max(noise, 0.1))
-        R3, t3 = refine_motion(R, t1, r, q, w, views.focal[0], max(noise, 0.1))
-        Rs, ts = np.stack([R, R2, R3], axis=1), np.stack([t1, t2, t3], axis=1)
-        choice = _adopt(views, Rs, ts, choice, gain)
-    for _ in range(ROUNDS):
-        if not (choice.error > gain).any():
-            break
-        near = seg.knn[:, : min(6, k)]
-        choice = _adopt(views, choice.R[near], choice.t[near], choice, gain, choice.label[near])
-    return choice
-
-
-def _adopt(
-    views: Views, Rs: Float, ts: Float, choice: Choice, gain: float, labels: Int | None = None
-) -> Choice:
-    """Take the best candidate (N, C) where it lowers the error by more than `gain` pixels."""
-    fit = views.fit_own(Rs, ts)
-    cost = fit.penalised()
-    c = np.argmin(cost, axis=1)
-    at = np.flatnonzero(cost[np.arange(len(c)), c] + gain < choice.error)
-    take = at, c[at]
-    taken = labels[take] if labels is not None else -1
-    return choice.taking(at, Rs[take], ts[take], fit.pick(take), taken)
-
-
 def rigid_choice(
     views: Views, seg: Segmentation, jump: Float, motions: list[Motion], o: SeededStart
 ) -> tuple[Choice, float]:
-    """One of few rigid motions of the whole image, or of a neighbourhood, for every superpixel.
+    """One of few rigid motions for every superpixel.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
         seg: Superpixels and graphs.
         jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
+        motions: Candidates for the whole image; those of unexplained pieces are added.
         o: Price of differing neighbours, where a surface ends, and seed.
 
     Returns:
-        The choice, the motions of the whole image, and the noise of the flow, pixels.
+        The choice, and the noise of the flow, pixels.
     """
     known = views.weight.any(axis=1)
     for extend in range(ROUNDS + 1):
@@ -310,5 +258,4 @@ def rigid_choice(
     cost = np.minimum(cost + prefer, 5.0)
     label = smooth_choice(cost, flow_affinity(jump, o), seg, o.smoothness)
     R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
-    choice = Choice(R, t, fit.pick((np.arange(len(seg)), label)), label)
-    return of_neighbourhoods(views, seg, choice, noise), noise
+    return Choice(R, t, fit.pick((np.arange(len(seg)), label)), label), noise

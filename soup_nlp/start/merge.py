@@ -22,7 +22,7 @@ from soup_nlp.start.choice import (
 )
 from soup_nlp.start.components import connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion, estimate
-from soup_nlp.start.neighbourhoods import fit_translation, refine_motion
+from soup_nlp.start.motions import fit_translation, refine_motion
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
 

@@ -22,7 +22,6 @@ from soup_nlp.start.choice import (
     PIECE_SIZE,
     UNEXPLAINED_PX,
     Choice,
-    of_neighbourhoods,
     of_pieces,
     select,
 )
@@ -99,22 +98,6 @@ def test_pieces_of_untrusted_flow_have_no_motion(monkeypatch, confidence, found)
     cost = np.where(odd, 3.0, 0.0)[:, None]
     main = [Motion(np.eye(3), np.array([1.0, 0, 0]))]
     assert bool(of_pieces(views, seg, main, cost, 0.05, OPTIONS)) == found
-
-
-def test_a_motion_that_pays_goes_from_neighbour_to_neighbour(monkeypatch):
-    seg = cells(2, 12)
-    monkeypatch.setattr(choosing, "fit_translation", lambda R, *a: np.tile([1.0, 0, 0], (24, 1)))
-    monkeypatch.setattr(choosing, "refine_motion", lambda R, t, *a: (R, t))
-    first = np.arange(24) == 0
-    before = taken(Turns(np.zeros(24)), np.where(first, 0.0, 0.3), np.where(first, 0, 1))
-    count = []
-    for rounds in (0, 1, 3):
-        monkeypatch.setattr(choosing, "ROUNDS", rounds)
-        after = of_neighbourhoods(Turns(np.zeros(24)), seg, before, 0.05)
-        np.testing.assert_array_equal(after.label == 0, after.error < 1e-9)
-        count.append(int((after.label == 0).sum()))
-    assert count[0] == 1
-    assert 1 < count[1] < count[2] < 24
 
 
 # --- components

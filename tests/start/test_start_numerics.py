@@ -12,7 +12,7 @@ from soup_nlp.geometry.plane_fit import PlaneFit
 from soup_nlp.start import epipolar
 from soup_nlp.start.bending import affine_flow, constant_depth
 from soup_nlp.start.epipolar import Motion, estimate, sampson, sampson_slopes
-from soup_nlp.start.neighbourhoods import fit_translation, refine_motion
+from soup_nlp.start.motions import fit_translation, refine_motion
 from soup_nlp.start.views import Views
 
 FOCAL = 200.0
@@ -42,7 +42,7 @@ def perturbed(m: Motion, turn: float, tilt: float, seed: int = 1) -> Motion:
     return Motion(rotation.exp(turn * a / np.linalg.norm(a)) @ m.R, t)
 
 
-# --- motions of neighbourhoods -------------------------------------------------------------------
+# --- motions of groups -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", range(4))

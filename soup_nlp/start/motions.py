@@ -1,28 +1,17 @@
-"""Motions of the neighbourhoods of all superpixels: translation alone, then rotation as well."""
+"""Motions fitted to groups of pixels: translation alone, then rotation as well."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from soup_nlp.arrays import Float, Int
+from soup_nlp.arrays import Float
 from soup_nlp.geometry import rotation
-
-
-def neighbourhood(values: Float, members: Int) -> Float:
-    """(N, M S, ...) values of every superpixel's members, from (N, S, ...) of each.
-
-    Args:
-        values: (N, S, ...) per superpixel and pixel.
-        members: (N, M) superpixels of each neighbourhood.
-    """
-    picked = values[members]
-    return picked.reshape(len(members), -1, *values.shape[2:])
 
 
 def fit_translation(
     R: Float, r: Float, q: Float, weight: Float, focal: float, noise: float, rounds: int = 6
 ) -> Float:
-    """Translation direction of every neighbourhood for a given rotation.
+    """Translation direction of every group for a given rotation.
 
     The epipolar constraint `t . (R r x q) = 0` is linear in t, which is the eigenvector of the
     re-weighted scatter matrix with the smallest eigenvalue.
@@ -96,7 +85,7 @@ def refine_motion(
     translation_prior: float = 0.3,
     rounds: int = 8,
 ) -> tuple[Float, Float]:
-    """Rotation and translation direction of every neighbourhood near a given motion.
+    """Rotation and translation direction of every group near a given motion.
 
     Re-weighted Gauss-Newton steps on the Sampson distance. Priors hold the directions that a small
     patch does not determine.
