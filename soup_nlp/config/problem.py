@@ -127,9 +127,9 @@ class Problem(Section):
 
     def path(self, name: str) -> Path:
         """A path of this problem, relative ones from its file's folder."""
-        base, own = as_path(self.base, "folder of the problem"), as_path(name, "input", home=True)
+        base, path = as_path(self.base, "folder of the problem"), as_path(name, "input", home=True)
         # realpath, unlike resolve, bears a link to itself
-        return Path(os.path.realpath(base / own))
+        return Path(os.path.realpath(base / path))
 
     def digest(self) -> str:
         """Hash of everything that decides the result: not of the names, the place and the files."""
@@ -139,13 +139,13 @@ class Problem(Section):
     @property
     def subject(self) -> str:
         """What is solved: the kind of input and what names its frames, without any option."""
-        own = self.input.model_dump()
-        found = [own.pop("kind")]
+        options = self.input.model_dump()
+        found = [options.pop("kind")]
         for key in ("root", "path", "ref", "next"):
-            if key in own:
-                found.append(str(self.path(own[key])))
+            if key in options:
+                found.append(str(self.path(options[key])))
         keys = ("scene", "seed", "variation", "render", "index", "frame", "step", "hash")
-        return " ".join([*found, *(f"{key} {own[key]}" for key in keys if key in own)])
+        return " ".join([*found, *(f"{key} {options[key]}" for key in keys if key in options)])
 
     def load_pair(self) -> Pair:
         """The frame pair, without its flow.

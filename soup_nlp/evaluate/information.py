@@ -100,7 +100,7 @@ def marginals(info: Information, sizes: Int, component: Int) -> Marginals:
     """
     n, g = len(sizes), info.growth
     diagonal = info.matrix.diagonal()
-    # what no term sees gets next to no information, so that nothing is known of it
+    # coordinates without any information get a negligible one, so that the matrix is regular
     least = 1e-12 * float(diagonal.max()) or 1.0
     weight = np.where(diagonal > least, 0.0, least)
     # any weight on the global scale makes the matrix definite; what it is cancels below

@@ -41,10 +41,10 @@ def classes(nlp: NLP) -> dict[str, Any]:
         if kernel.objective is not None:
             objective = max(objective, degree(kernel.objective, kernel.x))
         if kernel.constraints is not None:
-            own = np.unique(group.table.rows)
-            equal = bool((nlp.lbg[own] == nlp.ubg[own]).all())
+            places = np.unique(group.table.rows)
+            equal = bool((nlp.lbg[places] == nlp.ubg[places]).all())
             rows[kernel.name if group.kernel.objective is None else f"epigraph_{kernel.name}"] = {
-                "rows": len(own),
+                "rows": len(places),
                 "class": CLASSES[degree(kernel.constraints, kernel.x)],
                 "kind": "equality" if equal else "inequality",
             }
@@ -108,13 +108,13 @@ def qualification(nlp: NLP, x: Float) -> dict[str, Any]:
         active[near] |= np.abs(g - bound)[near] <= ACTIVE * (1 + np.abs(bound[near]))
     # variables on their bounds cannot move
     off = (x - nlp.lbx > ACTIVE) & (nlp.ubx - x > ACTIVE)
-    own = rank(J[active][:, off])
+    active_rank = rank(J[active][:, off])
     return {
         "jacobian_rank": rank(J),
         "active_rows": int(active.sum()),
-        "active_rank": own,
+        "active_rank": active_rank,
         "variables_on_bounds": int(len(x) - off.sum()),
-        "licq": own == int(active.sum()),
+        "licq": active_rank == int(active.sum()),
     }
 
 

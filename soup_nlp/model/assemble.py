@@ -193,7 +193,7 @@ def _symbols(nx: int, ng: int, np_: int) -> tuple[ca.MX, ca.MX, ca.MX, ca.MX]:
 def _compiled(made: list[dict[str, ca.Function]]) -> list[dict[str, ca.Function]]:
     out = []
     for functions in made:
-        # a library for every kernel, so that another of one leaves the others in the cache
+        # one library per kernel: the cache then still holds the kernels that did not change
         fast = compile_functions(list(functions.values())) if functions else {}
         out.append({k: fast[f.name()] for k, f in functions.items()})
     return out

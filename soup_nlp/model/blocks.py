@@ -98,7 +98,7 @@ def _starts(nx: int, sets: Sequence[Elements]) -> Int:
     first = np.zeros(nx + 1, bool)
     first[[0, nx]] = True
     for index, rows, _ in sets:
-        # an element with one variable cuts no run
+        # an element with one variable ends no run of consecutive variables
         if not len(rows) or index.shape[1] == 1:
             continue
         jump = index[:, 1:] != index[:, :-1] + 1

@@ -122,7 +122,7 @@ class Sums:
         """
         if self.vectorised:
             try:
-                # a library for every kernel, so that another of one leaves the others in the cache
+                # one library per kernel: the cache then still holds the kernels that did not change
                 library = compile_lanes(list(functions.values()))
                 lanes = Lanes.of(table)
                 return {

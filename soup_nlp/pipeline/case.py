@@ -86,8 +86,8 @@ class Case:
 
     def formulation(self, **changes: object) -> Formulation:
         """The problem's formulation with its smoothing, changed."""
-        own, eps = dict(self.problem.formulation), self.options.eps
-        return Formulation.make({**own, "eps": eps, "eps_pixel": eps, **changes})
+        options, eps = dict(self.problem.formulation), self.options.eps
+        return Formulation.make({**options, "eps": eps, "eps_pixel": eps, **changes})
 
     def nlp(self, form: Formulation) -> tuple[NLP, MatrixLayout]:
         """The constrained NLP at the case's soup."""
@@ -199,15 +199,15 @@ def _bends(problem: Problem, start: Start) -> bool:
 
 def solver_options(problem: Problem, start: Start) -> SolverOptions:
     """The solver's options of a problem, its smoothing no wider than surfaces allow."""
-    own = problem.solver
+    solver = problem.solver
     if not _bends(problem, start):
-        return own
+        return solver
     # widths above the limit become the limit, which then occurs once
-    eps = dict.fromkeys(min(e, WIDEST_BENDING_EPS) for e in own.presolve_eps)
+    eps = dict.fromkeys(min(e, WIDEST_BENDING_EPS) for e in solver.presolve_eps)
     # E_arap truncated from the beginning tears bending surfaces; beside rigid regions E_arap
     # without truncation lets the scales of components slide
-    both = own.untruncated or bool(start.bends.all())
-    return own.replace(presolve_eps=tuple(eps), untruncated=both)
+    both = solver.untruncated or bool(start.bends.all())
+    return solver.replace(presolve_eps=tuple(eps), untruncated=both)
 
 
 def build_energy(

@@ -121,8 +121,8 @@ class Run:
     def components(self) -> Components:
         """What moves as one, with its rigid motion; the first is the static scene."""
         pair, start = self.pair, self.start
-        own = self.soup, self.segmentation, start.component, pair.K_ref, pair.K_next
-        return find_components(*own, start.borrowed)
+        geometry = self.soup, self.segmentation, start.component, pair.K_ref, pair.K_next
+        return find_components(*geometry, start.borrowed)
 
     @property
     def camera(self) -> RigidMotion:
@@ -190,8 +190,8 @@ class Run:
     def residuals(self) -> dict[str, float]:
         """Constraint residuals of `soup`, beside those of Ipopt's answer."""
         facing = self.problem.formulation.min_facing
-        own = constraint_residuals(self.soup, self.data.rim_ray, facing)
-        return {**self.solution.residuals, **own}
+        constraints = constraint_residuals(self.soup, self.data.rim_ray, facing)
+        return {**self.solution.residuals, **constraints}
 
     @property
     def good(self) -> bool:

@@ -159,9 +159,9 @@ class Proposer:
         X = soup.points(self.data.pixel_ray)
         out_R, out_T = [], []
         for c in range(len(R)):
-            own = np.flatnonzero((member == c) & (error[:, c] < 1.0))
-            points, target = X[own].reshape(-1, 3), self.target[own].reshape(-1, 3)
-            weight = self.data.pixel_weight[own].ravel()
+            inliers = np.flatnonzero((member == c) & (error[:, c] < 1.0))
+            points, target = X[inliers].reshape(-1, 3), self.target[inliers].reshape(-1, 3)
+            weight = self.data.pixel_weight[inliers].ravel()
             if (weight > 0).sum() >= 8:
                 pick = self.rng.permutation(np.flatnonzero(weight > 0))[:3000]
                 a, b = fit_motion(R[c], T[c], points[pick], target[pick], weight[pick], self.focal)
@@ -181,13 +181,13 @@ class Proposer:
         order = np.argsort(key, axis=1)[:, : min(count, k)]
         return np.take_along_axis(self.near, order, axis=1)
 
-    def _extrapolated(self, soup: Soup, who: Int, own: Local) -> tuple[Float, Float]:
+    def _extrapolated(self, soup: Soup, who: Int, local: Local) -> tuple[Float, Float]:
         """Depth and slope of the planes of others (N, C) at the own anchor."""
         m = inverse_depth(soup.n, soup.distance)[who]
         inverse = np.einsum("ncj,nj->nc", m, self.data.anchor_ray)
         # a plane that does not meet the anchor's ray in front: its depth is borrowed instead
-        bad = inverse * own.Z < 0.1
-        Z = np.where(bad, own.Z[who, 0], 1.0 / np.where(bad, 1.0, inverse))
+        bad = inverse * local.Z < 0.1
+        Z = np.where(bad, local.Z[who, 0], 1.0 / np.where(bad, 1.0, inverse))
         g = np.where(bad[..., None], 0.0, m[..., :2] * Z[..., None])
         return Z, g
 
@@ -196,8 +196,8 @@ class Proposer:
         Z, g = self._extrapolated(soup, who, now)
         # every other one keeps its motion, the rest take the scale along with the depth
         scale = np.where(np.arange(who.shape[1]) % 2, 1.0, Z / now.Z)
-        own = now.repeated(who.shape[1])
-        return Local(Z, g, own.R, own.T * scale[..., None]), None
+        current = now.repeated(who.shape[1])
+        return Local(Z, g, current.R, current.T * scale[..., None]), None
 
     def _neighbour_both(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, None]:
         who = self._some(count)
@@ -242,9 +242,9 @@ class Proposer:
         R, T = soup.R[pick], soup.translation[pick]
         X = now.Z[:, 0, None] * self.data.anchor_ray
         Y = np.einsum("mij,nj->nmi", R, X) + T
-        own = np.einsum("nij,nj->ni", soup.R, X) + soup.translation
-        z = np.maximum(np.stack([Y[..., 2], np.broadcast_to(own[:, None, 2], Y.shape[:2])]), 1e-9)
-        gap = Y[..., :2] / z[0][..., None] - (own[:, None] / z[1][..., None])[..., :2]
+        moved = np.einsum("nij,nj->ni", soup.R, X) + soup.translation
+        z = np.maximum(np.stack([Y[..., 2], np.broadcast_to(moved[:, None, 2], Y.shape[:2])]), 1e-9)
+        gap = Y[..., :2] / z[0][..., None] - (moved[:, None] / z[1][..., None])[..., :2]
         error = np.minimum(self.focal * np.linalg.norm(gap, axis=-1), 3.0)
         best = np.full(n, 3.0)
         kept: list[int] = []
@@ -298,12 +298,12 @@ class Proposer:
         mu = fit.inverse_depth
         # depth is known to about a pixel of parallax; half a pixel is required
         known = (mu > 1e-9) & (fit.parallax * mu > 0.5) & (length > 1e-12)
-        own = now.repeated(count)
-        Z = np.where(known, length / np.where(known, mu, 1.0), own.Z)
+        current = now.repeated(count)
+        Z = np.where(known, length / np.where(known, mu, 1.0), current.Z)
         # depths beyond 20 times the present one, or below a twentieth, are not proposed
-        sane = known & (Z < 20 * own.Z) & (Z > own.Z / 20)
-        Z = np.where(sane, Z, own.Z)
-        g = own.g
+        sane = known & (Z < 20 * current.Z) & (Z > current.Z / 20)
+        Z = np.where(sane, Z, current.Z)
+        g = current.g
         if slopes:
             g = np.where(sane[..., None], fit.slope / d.radius[:, None, None], g)
         return Local(Z, g, R, T)

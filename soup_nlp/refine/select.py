@@ -33,8 +33,9 @@ def conditional_costs(
 def diverse(p: Particles, labels: Int, cost: Float, count: int, data: EnergyData) -> Int:
     """(N, count) particles of low cost that differ from the chosen one and from one another.
 
-    Two particles are alike when their coordinates, in pixels of the next frame, are within a
-    quarter pixel; one that is alike to a cheaper one is taken only when there are no others.
+    Two particles are near-duplicates if their coordinates, in pixels of the next frame, differ by
+    less than a quarter pixel. A near-duplicate of a cheaper particle is chosen only if no other
+    feasible particle is left.
 
     Args:
         p: (N, L) particles.
@@ -46,10 +47,10 @@ def diverse(p: Particles, labels: Int, cost: Float, count: int, data: EnergyData
     n, size = p.shape
     focal = float(data.K_next[0, 0])
     Z = anchor_depth(p, data.anchor_ray)
-    own = np.arange(n)
-    first = Z[own, labels][:, None]
-    # depth and slope have no pixel of their own: a per cent, and 0.05, count as one
-    place = np.concatenate(
+    every = np.arange(n)
+    first = Z[every, labels][:, None]
+    # depth and slope are not in pixels: 1 % of depth and 0.05 of slope count as one pixel
+    coordinates = np.concatenate(
         [
             100 * np.log(np.maximum(Z / first, 1e-9))[..., None],
             20 * p.n,
@@ -59,20 +60,20 @@ def diverse(p: Particles, labels: Int, cost: Float, count: int, data: EnergyData
         axis=2,
     )
     rank = cost.astype(float).copy()
-    alike = np.zeros((n, size), bool)
+    duplicate = np.zeros((n, size), bool)
     taken = np.zeros((n, size), bool)
-    taken[own, labels] = True
+    taken[every, labels] = True
     out = np.empty((n, min(count, size - 1)), np.int64)
     last = labels
     for c in range(out.shape[1]):
-        gap = np.abs(place - place[own, last][:, None]).max(axis=2)
-        alike |= gap < 0.25
-        # the infeasible last, the alike before them
-        order = np.where(np.isfinite(rank), 0, 2) + alike + 4 * taken
+        gap = np.abs(coordinates - coordinates[every, last][:, None]).max(axis=2)
+        duplicate |= gap < 0.25
+        # order of choice: feasible particles, then near-duplicates, then infeasible ones
+        order = np.where(np.isfinite(rank), 0, 2) + duplicate + 4 * taken
         value = np.where(np.isfinite(rank), rank, 0.0)
         low = order.min(axis=1, keepdims=True)
         last = np.where(order == low, value, np.inf).argmin(axis=1)
-        taken[own, last] = True
+        taken[every, last] = True
         out[:, c] = last
     return out
 
@@ -87,7 +88,7 @@ def spread_of(p: Particles, min_marginals: Float, anchor_ray: Float) -> Float:
     """
     weight = np.exp(-np.asarray(min_marginals, np.float64))
     weight /= weight.sum(axis=1, keepdims=True)
-    # what is not allowed may lie behind the camera
+    # a particle that is not allowed may lie behind the camera
     log = np.log(np.where(weight > 0, anchor_depth(p, anchor_ray), 1.0))
     mean = np.sum(weight * log, axis=1, keepdims=True)
     return np.asarray(np.sqrt(np.sum(weight * (log - mean) ** 2, axis=1)))
@@ -106,14 +107,14 @@ def within_reach(p: Particles, soup: Soup, near: Int, anchor_ray: Float, reach: 
         near: (N, K) neighbours.
         anchor_ray: (N, 3).
         reach: At most this many times the upper quartile of the neighbours' depths, at least the
-            lower quartile over its square (a thing in front of its background is common).
+            lower quartile over its square (an object in front of its background is common).
     """
-    own = soup.depth_at(anchor_ray)
+    depth = soup.depth_at(anchor_ray)
     Z = anchor_depth(p, anchor_ray)
     if not near.shape[1]:
         return np.ones(Z.shape, bool)
-    low, high = np.quantile(own[near], (0.25, 0.75), axis=1)
-    high = np.maximum(reach * high, own) * (1 + 1e-9)
-    low = np.minimum(low / reach**2, own) * (1 - 1e-9)
+    low, high = np.quantile(depth[near], (0.25, 0.75), axis=1)
+    high = np.maximum(reach * high, depth) * (1 + 1e-9)
+    low = np.minimum(low / reach**2, depth) * (1 - 1e-9)
     inside = np.less_equal(Z, high[:, None]) & np.greater_equal(Z, low[:, None])
     return np.asarray(inside)

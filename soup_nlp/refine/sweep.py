@@ -57,10 +57,10 @@ def swept(
         Z = 1 / np.maximum(mu, 1e-9)
         for normal in normals:
             facing = -np.sum(normal * ray, axis=1)
-            own = np.where((facing < STEEP)[:, None], frontal, normal)
+            slanted = np.where((facing < STEEP)[:, None], frontal, normal)
             p = Particles(
-                np.broadcast_to(own[:, None], (n, LEVELS, 3)),
-                Z * -np.sum(own * ray, axis=1)[:, None],
+                np.broadcast_to(slanted[:, None], (n, LEVELS, 3)),
+                Z * -np.sum(slanted * ray, axis=1)[:, None],
                 np.broadcast_to(turn, (n, LEVELS, 3, 3)),
                 np.broadcast_to(shift, (n, LEVELS, 3)),
             )
@@ -100,9 +100,9 @@ def common_normals(n: Float, count: int) -> Float:
         gap = 1 - (n @ centre.T).max(axis=1)
         centre = np.vstack([centre, n[np.argsort(gap, kind="stable")[int(0.9 * len(n))]]])
     for _ in range(10):
-        own = (n @ centre.T).argmax(axis=1)
+        nearest = (n @ centre.T).argmax(axis=1)
         for c in range(1, count):
-            if (own == c).any():
-                middle = np.median(n[own == c], axis=0)
+            if (nearest == c).any():
+                middle = np.median(n[nearest == c], axis=0)
                 centre[c] = middle / max(np.linalg.norm(middle), 1e-12)
     return centre

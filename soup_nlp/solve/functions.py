@@ -109,7 +109,7 @@ class Functions:
     def __init__(self, nlp: NLP) -> None:
         """Find the patterns; the Hessian is not compiled."""
         self._nlp = nlp
-        # another theta here leaves that of the NLP's own
+        # a copy, since theta is set here and the NLP's own sums keep theirs
         self._first = copy(nlp.sums)
         self._second: Sums | None = None
         at = {"x": nlp.nx, "p": len(nlp.theta)}

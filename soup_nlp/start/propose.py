@@ -189,7 +189,7 @@ def _with_depth(choice: Choice, views: Views, poor: Mask, seg: Segmentation) -> 
     weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | (own.cost[:, 0] > 3.0) | poor
     weak |= views.weight.sum(axis=1) < 2.0
     if weak.all():
-        # little parallax everywhere is still some, until it is the rounding of the flow
+        # where every superpixel has little parallax, it is used as long as it exceeds rounding
         weak = ~np.isfinite(mu) | (mu <= 0) | (parallax < 0.02)
     if weak.all():
         # no depth is known: all are at one, where translations move the image as they did
