@@ -1,77 +1,194 @@
-"""A sequence solved from Python: `soup_nlp.chain`."""
+"""A sequence from any source, solved into a folder: `soup_nlp.chain` and its command."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
+from soup_nlp.config.problem import title
 from soup_nlp.data.accept import ImageLike, image_of, is_path
-from soup_nlp.errors import DataError
+from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence.chain import Chain, make_chain
-from soup_nlp.sequence.frames import FileFrames, check_sequence, find_images
+from soup_nlp.sequence.frames import (
+    VIDEOS,
+    FileFrames,
+    Frames,
+    Raw,
+    SceneFrames,
+    check_sequence,
+    find_depths,
+    find_images,
+    video_frames,
+)
+from soup_nlp.sequence.key_frames import MAX_STEP
 from soup_nlp.sequence.pairs import solve_pairs
 from soup_nlp.sequence.write import chain_files, write_chain
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import claim, staged
+from soup_nlp.storage.rows import Say
+
+SCENE = "scene:"
+"""Prefix of the name of a rendered scene."""
+AUTO = "auto"
+"""Stride that is chosen by parallax."""
+
+Source = str | Path | Sequence[ImageLike]
+"""Folder or pattern of images, video, scene:NAME, or a list of files, arrays or PIL images."""
 
 
 def solve_chain(
-    frames: str | Path | Sequence[ImageLike],
+    frames: Source,
     out: str | Path,
     *,
     intrinsics: Sequence[float] | str | None = None,
     fov: float | None = None,
+    undistort: bool = False,
+    stride: int | str = 1,
+    most: int | None = None,
+    two_frame: bool = False,
+    depth_scale: float | None = None,
     overrides: Sequence[str] = (),
     workers: int = 1,
     overwrite: bool = False,
+    begin: Callable[[Frames, int], None] | None = None,
+    say: Say | None = None,
 ) -> Chain:
     """Solve consecutive frames as pairs, put them on one scale, and write the chain's folder.
 
     A call that was interrupted goes on where it stopped.
 
     Args:
-        frames: Folder or pattern of images, or a list of files, arrays or PIL images.
-        out: Folder of the chain, as `soup-nlp chain` writes it.
-        intrinsics: fx, fy, cx, cy in pixels, or a file; None for `fov`, EXIF, or a guess.
+        frames: See `Source`.
+        out: Folder of the chain.
+        intrinsics: fx, fy, cx, cy in pixels, or a file; None for `fov`, K.txt beside the images,
+            EXIF, or a guess.
         fov: Horizontal field of view, degrees.
+        undistort: Remove the distortion that the file of the camera holds.
+        stride: Take every so many frames; "auto" takes those with enough parallax.
+        most: Most frames; of a scene 10 unless given.
+        two_frame: Solve frames k and k + 2 too, for more links.
+        depth_scale: Values per unit of length of true depth_*.png beside frame_*.
         overrides: Keys of a problem file, such as `["segmentation.superpixels=500"]`.
         workers: Processes; with more than one, a script needs `if __name__ == "__main__":`.
         overwrite: Replace the result of another sequence.
+        begin: Called with the frames and the number of pairs before the first is solved.
+        say: Called with (done, total, row) after every pair.
 
     Raises:
+        ConfigError: two cameras are given, the stride is none, or a scene cannot be stepped.
         DataError: the frames are no sequence, one is damaged, or the folder holds the result of
             another one.
         SolverError: a pair cannot be solved; the others are kept.
     """
     folder = as_path(out, "output folder")
-    if isinstance(frames, str | Path):
-        images = find_images(Path(frames))
-        check_sequence(images)
-        subject = f"sequence {Path(frames).absolute()}"
-    else:
-        subject = f"sequence of {len(frames)} images for {folder.absolute()}"
-        images = _files(frames, folder)
-    claim(folder, chain_files(len(images)), overwrite, subject)
-    camera: dict[str, Any] = {"fov": fov} if fov is not None else {}
+    name, subject = named(frames, folder)
+    if intrinsics is not None and fov is not None:
+        raise ConfigError("two cameras are named", found="intrinsics and fov", expected="one")
+    camera: Raw = {"undistort": True} if undistort else {}
+    if fov is not None:
+        camera["fov"] = fov
     if intrinsics is not None:
-        camera = {"intrinsics": intrinsics if isinstance(intrinsics, str) else [*intrinsics]}
-    found = FileFrames(tuple(path.absolute() for path in images), camera)
-    found.check()
-    which = [(k, k + 1) for k in range(len(found) - 1)]
-    chain = make_chain(solve_pairs(found, which, folder, overrides, workers))
+        camera["intrinsics"] = intrinsics if isinstance(intrinsics, str) else [*intrinsics]
+    found = _frames(frames, folder, camera, _step(stride), most, depth_scale)
+    count = len(found)
+    claim(folder, chain_files(count), overwrite, subject)
+    which = [(k, k + 1) for k in range(count - 1)]
+    over = [(k, k + 2) for k in range(count - 2)] if two_frame else []
+    if begin:
+        begin(found, len(which) + len(over))
+    pairs = solve_pairs(found, [*which, *over], folder, overrides, workers, say)
+    chain = make_chain(pairs[: len(which)], pairs[len(which) :])
+    sources = [found.source(k) for k in range(count)]
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
-        write_chain(new, chain, folder.name, [found.source(k) for k in range(len(found))])
+        write_chain(new, chain, name, sources, over)
     return chain
+
+
+def named(frames: Source, folder: Path | None = None) -> tuple[str, str]:
+    """Name of a sequence, and what its folder is the result of.
+
+    Images in memory are named after the folder.
+    """
+    if isinstance(frames, str) and frames.startswith(SCENE):
+        return title(frames.removeprefix(SCENE)), frames
+    one = isinstance(frames, str | Path)
+    first = frames if isinstance(frames, str | Path) else next(iter(frames), None)
+    if not isinstance(first, str | Path):
+        place = Path(folder or "chain").absolute()
+        return place.name, f"sequence of images in memory for {place}"
+    path = as_path(first, "frames", home=True).absolute()
+    # several images, or a pattern, are named after their folder
+    place = path if one and path.exists() else path.parent
+    return title(place.stem if place.is_file() else place.name), f"sequence {place}"
+
+
+def _step(stride: int | str) -> int | None:
+    """The stride as a number; None if parallax decides.
+
+    Raises:
+        ConfigError: it is neither a positive number nor AUTO.
+    """
+    if stride == AUTO:
+        return None
+    text = str(stride)
+    # limits the number of digits
+    if not text.isdecimal() or len(text) > 8 or int(text) < 1:
+        raise ConfigError(
+            "unknown stride", where="stride", found=stride, expected=f"a number from 1, or {AUTO}"
+        )
+    return int(text)
+
+
+def _frames(
+    source: Source,
+    out: Path,
+    camera: Raw,
+    step: int | None,
+    most: int | None,
+    depth_scale: float | None,
+) -> Frames:
+    """The frames of a source; `step` None takes those with enough parallax."""
+    if isinstance(source, str) and source.startswith(SCENE):
+        if step != 1 or camera:
+            raise ConfigError("a rendered scene has its own camera and steps", found=source)
+        return SceneFrames(source.removeprefix(SCENE), most or 10)
+    depths: list[Path] = []
+    # with AUTO the limit applies to the chosen frames
+    end = most if step else None
+    if not isinstance(source, str | Path):
+        images = _files(source, out)[:: step or 1][:end]
+    elif (path := as_path(source, "frames", home=True)).suffix.lower() in VIDEOS:
+        read = None if most is None or step else most * MAX_STEP
+        images = video_frames(path, out / "frames", step or 1, end or read)
+    else:
+        images = find_images(path)[:: step or 1][:end]
+        if len(images) > 1:
+            check_sequence(images)
+        depths = [] if "undistort" in camera else find_depths(images)
+    if len(images) < 2:
+        raise ConfigError(
+            "a sequence needs two frames at least",
+            where="stride" if step != 1 else None,
+            found=len(images),
+            expected="more frames, or a smaller stride",
+        )
+    images, depths = ([p.absolute() for p in own] for own in (images, depths))
+    beside = images[0].parent / "K.txt"
+    if not camera.keys() & {"intrinsics", "fov"} and os.path.lexists(beside):
+        camera = {"intrinsics": str(beside), **camera}
+    found = FileFrames(tuple(images), camera, tuple(depths), depth_scale)
+    found.check()
+    return found if step else found.apart(most)
 
 
 def _files(frames: Sequence[ImageLike], folder: Path) -> list[Path]:
     """Files of images; arrays are written into the folder of the chain."""
-    if len(frames) < 2:
-        raise DataError("a sequence needs two images at least", found=len(frames))
     if all(is_path(frame) for frame in frames):
-        return [as_path(frame, "image") for frame in frames]
+        if any(str(frame).startswith(SCENE) for frame in frames):
+            raise DataError("a rendered scene is a sequence by itself", found=[*frames])
+        return [as_path(frame, "image", home=True) for frame in frames]
     names = [f"{k:04d}.png" for k in range(len(frames))]
     with staged(folder / "frames", whole=True) as new:
         for name, frame in zip(names, frames):
