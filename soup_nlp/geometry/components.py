@@ -140,14 +140,14 @@ def find_components(
     joined = np.empty(len(count), np.int64)
     # large ones first: small ones join those whose motion is theirs
     for c in np.argsort(-count, kind="stable"):
-        members = label == c
-        x, y, weight = _usable(before[members], after[members], seg.sizes[members])
+        mask = label == c
+        x, y, weight = _usable(before[mask], after[mask], seg.sizes[mask])
         gap = [float(np.median(_gap(m, x, y, K_next))) if len(x) else np.inf for m in motions]
         if gap and min(gap) <= SAME_PX:
             joined[c] = int(np.argmin(gap))
             continue
         joined[c] = len(motions)
-        motions.append(_fit(x, y, weight, K_next) if len(x) else _first(soup, members))
+        motions.append(_fit(x, y, weight, K_next) if len(x) else _first(soup, mask))
     label = joined[label]
     pixels = np.bincount(label, seg.sizes, len(motions)).astype(np.int64)
     order = np.concatenate([[0], 1 + np.argsort(-pixels[1:], kind="stable")])
@@ -155,17 +155,17 @@ def find_components(
     guess = np.zeros(len(soup), bool) if borrowed is None else borrowed
     members = []
     for c, old in enumerate(order):
-        members = label == c
-        x, y, _ = _usable(before[members], after[members], seg.sizes[members])
+        mask = label == c
+        x, y, _ = _usable(before[mask], after[mask], seg.sizes[mask])
         motion = motions[old]
         members.append(
             Component(
                 label=c,
                 motion=motion,
-                superpixels=int(members.sum()),
+                superpixels=int(mask.sum()),
                 pixels=int(pixels[old]),
                 residual_px=float(np.median(_gap(motion, x, y, K_next))) if len(x) else np.nan,
-                borrowed=float(seg.sizes[members & guess].sum() / pixels[old]),
+                borrowed=float(seg.sizes[mask & guess].sum() / pixels[old]),
                 centre=np.median(x, axis=0) if len(x) else np.full(3, np.nan),
             )
         )
@@ -198,7 +198,7 @@ def _fit(x: Float, y: Float, size: Float, K: Float) -> RigidMotion:
     return motion
 
 
-def _first(soup: Soup, members: Mask) -> RigidMotion:
+def _first(soup: Soup, mask: Mask) -> RigidMotion:
     """The motion of a group's first superpixel, for one that has no point in front."""
-    i = int(np.argmax(members))
+    i = int(np.argmax(mask))
     return RigidMotion(soup.R[i], soup.translation[i])
