@@ -164,7 +164,8 @@ def plot_growth(path: Path, frame: pd.DataFrame) -> None:
     """CPU seconds of NLP, reference solver and other stages, and peak memory, over N (log-log)."""
     picture = figure(11, 4)
     left, right = picture.subplots(1, 2)
-    groups = with_costs(frame).sort_values("n").groupby(["sequence", "k"])
+    good = with_costs(frame)
+    groups = good.sort_values("n").groupby(["sequence", "k"]) if len(good) else ()
     for index, ((scene, k), group) in enumerate(groups):
         style = {"color": f"C{index % 10}"}
         slope = fit(group["n"], group["cpu.nlp"])
@@ -176,7 +177,7 @@ def plot_growth(path: Path, frame: pd.DataFrame) -> None:
     left.set(xlabel="superpixels N", ylabel="CPU s")
     left.set_title("NLP (o), reference solver (x), all stages outside (.)", fontsize=10)
     right.set(xlabel="superpixels N", ylabel="GB", title="peak memory")
-    if groups.ngroups:
+    if len(good):
         left.legend(fontsize=8)
     save(picture, path)
 

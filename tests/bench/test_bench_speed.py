@@ -141,6 +141,14 @@ def worse(rows: list[dict], runs: list) -> set[str]:
     return set(found.loc[~found["ok"].astype(bool), "value"])
 
 
+def test_pages_of_failed_runs_list_them(tmp_path):
+    failed = {"ok": False, "error": "out of memory", "code": "c0de", "cpu_seconds": 1.0}
+    frame = frame_of([{**speed_cell("street", 250, 10).identity(), **failed}])
+    assert "out of memory" in speed_page(frame)
+    plot_growth(tmp_path / "growth.png", frame)
+    assert (tmp_path / "growth.png").is_file()
+
+
 def test_the_gate_holds_for_the_same_and_for_better(kept):
     assert set(check(frame_of([made()]), kept)["value"]) == set(LIMITS)
     assert not worse([made()], kept)

@@ -52,100 +52,74 @@ def _write(path: Path, text: str | bytes) -> None:
     path.write_bytes(text.encode() if isinstance(text, str) else text)
 
 
+Use = tuple[Callable[[World, Path, str | bytes, str], list[str]], tuple[int, ...], bool]
+"""Command line of a world, a folder, a text and its name; exit codes; whether it may solve."""
+
+
+def replaced(w: World, which: str, file: str, text: str | bytes, name: str) -> Path:
+    """A copy of a folder in which a file holds a text."""
+    copy = w.root / "copies" / f"{file} {name}"
+    if not copy.exists():
+        _write(w.copy(which, copy.name) / file, text)
+    return copy
+
+
+def manifest(w: World, text: str | bytes, name: str) -> str:
+    return str(replaced(w, "exported", "manifest.json", text, name))
+
+
+USES: dict[str, Use] = {
+    "summary": (
+        lambda w, o, t, n: ["check", str(replaced(w, "result", "summary.json", t, n))], (2,), False,
+    ),
+    "config": (
+        lambda w, o, t, n: ["check", str(replaced(w, "result", "config.yaml", t, n))], (1, 2), True,
+    ),
+    "manifest": (
+        lambda w, o, t, n: [
+            "import", manifest(w, t, n), str(w.exported / "soup.sol"), "-o", str(o / "out"),
+        ],
+        (2,), False,
+    ),
+    "over manifest": (
+        lambda w, o, t, n: [
+            "export", str(w.good("p.yaml")), "-o", manifest(w, t, f"{n} over"), "-q",
+        ],
+        (0, 2), True,
+    ),
+    "problem": (
+        lambda w, o, t, n: [
+            "check", str(replaced(w, "exported", "problem.yaml", t, n) / "soup.sol"),
+        ],
+        (2,), False,
+    ),
+    "show": (lambda w, o, t, n: ["show", str(problem_case(w, o, t))], (2,), False),
+    "list": (lambda w, o, t, n: ["list", str(problem_case(w, o, t).parent)], (0, 2), False),
+    "baseline": (
+        lambda w, o, t, n: [
+            "bench", "speed", "--check", str(problem_case(w, o, t)), "-o", str(o / "out"),
+        ],
+        (2,), False,
+    ),
+}  # fmt: skip
+"""Commands that read a text, by what it stands for."""
+
+
 def text_cases() -> Iterator[Case]:
-    def replaced(which: str, file: str, text: str | bytes) -> Callable[[World, str], Path]:
-        def make(w: World, name: str) -> Path:
-            copy = w.root / "copies" / f"{file} {name}"
-            if not copy.exists():
-                _write(w.copy(which, copy.name) / file, text)
-            return copy
-
-        return make
-
     for name, text in TEXTS.items():
-        summary = replaced("result", "summary.json", text)
-        manifest = replaced("exported", "manifest.json", text)
-        problem = replaced("exported", "problem.yaml", text)
-        config = replaced("result", "config.yaml", text)
-        yield Case(
-            "5 doors",
-            f"text summary {name}",
-            lambda w, o, f=summary, n=name: ["check", str(f(w, n))],
-        )
-        yield Case(
-            "5 doors",
-            f"text config {name}",
-            lambda w, o, f=config, n=name: ["check", str(f(w, n))],
-            (1, 2),
-            solves=name not in FEW,
-        )
-        yield Case(
-            "5 doors",
-            f"text manifest {name}",
-            lambda w, o, f=manifest, n=name: [
-                "import",
-                str(f(w, n)),
-                str(w.exported / "soup.sol"),
-                "-o",
-                str(o / "out"),
-            ],
-        )
-        yield Case(
-            "5 doors",
-            f"text over manifest {name}",
-            lambda w, o, f=manifest, n=name: [
-                "export",
-                str(w.good("p.yaml")),
-                "-o",
-                str(f(w, n + " over")),
-                "-q",
-            ],
-            (0, 2),
-            solves=name not in FEW,
-        )
-        yield Case(
-            "5 doors",
-            f"text problem {name}",
-            lambda w, o, f=problem, n=name: ["check", str(f(w, n) / "soup.sol")],
-        )
-        yield Case(
-            "5 doors",
-            f"text show {name}",
-            lambda w, o, t=text: ["show", str(problem_case(w, o, t))],
-        )
-        yield Case(
-            "5 doors",
-            f"text list {name}",
-            lambda w, o, t=text: ["list", str(problem_case(w, o, t).parent)],
-            (0, 2),
-        )
-        yield Case(
-            "5 doors",
-            f"text baseline {name}",
-            lambda w, o, t=text: [
-                "bench",
-                "speed",
-                "--check",
-                str(problem_case(w, o, t)),
-                "-o",
-                str(o / "out"),
-            ],
-        )
-        if (
-            "\0" not in (text if isinstance(text, str) else text.decode("latin-1"))
-            and len(text) < 100_000
-        ):
+        for use, (words, codes, solves) in USES.items():
             yield Case(
-                "5 doors",
-                f"text --set {name}",
-                lambda w, o, t=text: [
-                    "show",
-                    str(w.good("p.yaml")),
-                    "--set",
-                    "name=" + (t if isinstance(t, str) else t.decode("utf-8", "surrogateescape")),
-                ],
+                "5 doors", f"text {use} {name}",
+                lambda w, o, t=text, n=name, f=words: f(w, o, t, n),
+                codes, solves=solves and name not in FEW,
+            )  # fmt: skip
+        word = text if isinstance(text, str) else text.decode("utf-8", "surrogateescape")
+        if "\0" not in word and len(text) < 100_000:
+            yield Case(
+                "5 doors", f"text --set {name}",
+                lambda w, o, t=word: ["show", str(w.good("p.yaml")), "--set", f"name={t}"],
                 (0, 2),
-            )
+            )  # fmt: skip
     for kind in ODD:
 
         def odd_in_list(w: World, o: Path, kind=kind) -> list[str]:
@@ -190,24 +164,10 @@ def row_cases() -> Iterator[Case]:
                 (o / file).write_bytes(data)
                 if verb == "compare":
                     # no such limit of time is enough for a run: the rows are read before
-                    return [
-                        "compare",
-                        str(w.good("p.yaml")),
-                        "--solvers",
-                        "no_such_solver",
-                        "-o",
-                        str(o),
-                    ]
-                return [
-                    "bench",
-                    "speed",
-                    *small,
-                    *size,
-                    "--set",
-                    "segmentation.superpixels=x",
-                    "-o",
-                    str(o),
-                ]
+                    words = ["compare", str(w.good("p.yaml")), "--solvers", "no_such_solver"]
+                    return [*words, "-o", str(o)]
+                wrong = ["--set", "segmentation.superpixels=x"]
+                return ["bench", "speed", *small, *size, *wrong, "-o", str(o)]
 
             yield Case("5 doors", f"rows {verb} {name}", rows, (0, 1, 2))
 
@@ -229,6 +189,50 @@ def row_cases() -> Iterator[Case]:
 
 RED = "\x1b[31mred\x1b]0;title\x07\x9b5m\u202e\r\x08"
 LONG = "x" * 100_000
+
+
+def export_of(w: World, o: Path, *words: str) -> list[str]:
+    return ["export", str(w.good("p.yaml")), *words, "-o", str(o / "out")]
+
+
+def named(w: World, o: Path, line: str) -> str:
+    """The tiny problem with a first line."""
+    return str(problem_case(w, o, f"{line}\n{w.problem()}"))
+
+
+UNTRUSTED: dict[str, tuple[Callable[[World, Path, str], list[str]], tuple[int, ...]]] = {
+    "problem name exported": (
+        lambda w, o, t: [
+            "export", named(w, o, f"name: {json.dumps(t)}"), "-o", str(o / "out"),
+            "--superpixels", "12", "--superpixels", "13",
+        ],
+        (0, 2),
+    ),
+    "unknown key": (lambda w, o, t: ["show", named(w, o, f"{json.dumps(t)}: 1")], (2,)),
+    "wrong value": (lambda w, o, t: ["show", named(w, o, f"seed: {json.dumps(t)}")], (2,)),
+    "first line": (lambda w, o, t: problem_case(w, o, f"# {t}\n") and ["list", str(o)], (0,)),
+    "option": (lambda w, o, t: ["solve", f"--{t}"], (2,)),
+    "verb": (lambda w, o, t: [t], (2,)),
+    "override": (lambda w, o, t: ["show", str(w.good("p.yaml")), "--set", t], (2,)),
+    "solver": (
+        lambda w, o, t: [
+            "compare", str(w.good("p.yaml")), "--solvers", t, "-o", str(o / "out"),
+        ],
+        (2,),
+    ),
+    "formulation": (lambda w, o, t: export_of(w, o, "--formulation", t), (2,)),
+    "scale": (
+        lambda w, o, t: [
+            "evaluate", str(w.result), "--depth", str(w.good("d.npy")), "--scale", t,
+        ],
+        (2,),
+    ),
+    "suite": (
+        lambda w, o, t: ["bench", "accuracy", "--suite", t, "-o", str(o / "out")], (2,)
+    ),
+    "flow": (lambda w, o, t: solve(w, o, flow=t), (2,)),
+}  # fmt: skip
+"""Commands that are given a text that nobody should trust."""
 
 
 def untrusted_cases() -> Iterator[Case]:
@@ -265,92 +269,10 @@ def untrusted_cases() -> Iterator[Case]:
             return ["solve", str(path), "-o", str(o / "out")]
 
         yield Case("6 untrusted", f"problem name {name}", title, (0, 1, 2))
-        yield Case(
-            "6 untrusted",
-            f"problem name {name} exported",
-            lambda w, o, t=text: [
-                "export",
-                str(problem_case(w, o, f"name: {json.dumps(t)}\n" + w.problem())),
-                "-o",
-                str(o / "out"),
-                "--superpixels",
-                "12",
-                "--superpixels",
-                "13",
-            ],
-            (0, 2),
-        )
-        yield Case(
-            "6 untrusted",
-            f"unknown key {name}",
-            lambda w, o, t=text: [
-                "show",
-                str(problem_case(w, o, f"{json.dumps(t)}: 1\n" + w.problem())),
-            ],
-        )
-        yield Case(
-            "6 untrusted",
-            f"wrong value {name}",
-            lambda w, o, t=text: [
-                "show",
-                str(problem_case(w, o, f"seed: {json.dumps(t)}\n" + w.problem())),
-            ],
-        )
-        yield Case(
-            "6 untrusted",
-            f"first line {name}",
-            lambda w, o, t=text: (problem_case(w, o, f"# {t}\n"), ["list", str(o)])[1],
-            (0,),
-        )
-        yield Case("6 untrusted", f"option {name}", lambda w, o, t=text: ["solve", f"--{t}"])
-        yield Case("6 untrusted", f"verb {name}", lambda w, o, t=text: [t])
-        yield Case(
-            "6 untrusted",
-            f"override {name}",
-            lambda w, o, t=text: ["show", str(w.good("p.yaml")), "--set", t],
-        )
-        yield Case(
-            "6 untrusted",
-            f"solver {name}",
-            lambda w, o, t=text: [
-                "compare",
-                str(w.good("p.yaml")),
-                "--solvers",
-                t,
-                "-o",
-                str(o / "out"),
-            ],
-        )
-        yield Case(
-            "6 untrusted",
-            f"formulation {name}",
-            lambda w, o, t=text: [
-                "export",
-                str(w.good("p.yaml")),
-                "--formulation",
-                t,
-                "-o",
-                str(o / "out"),
-            ],
-        )
-        yield Case(
-            "6 untrusted",
-            f"scale {name}",
-            lambda w, o, t=text: [
-                "evaluate",
-                str(w.result),
-                "--depth",
-                str(w.good("d.npy")),
-                "--scale",
-                t,
-            ],
-        )
-        yield Case(
-            "6 untrusted",
-            f"suite {name}",
-            lambda w, o, t=text: ["bench", "accuracy", "--suite", t, "-o", str(o / "out")],
-        )
-        yield Case("6 untrusted", f"flow {name}", lambda w, o, t=text: solve(w, o, flow=t))
+        for use, (words, codes) in UNTRUSTED.items():
+            yield Case(
+                "6 untrusted", f"{use} {name}", lambda w, o, t=text, f=words: f(w, o, t), codes
+            )
 
         def status(w: World, o: Path, text=text, name=name) -> list[str]:
             copy = w.copy("result", f"status {name}")

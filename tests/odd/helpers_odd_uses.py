@@ -82,33 +82,11 @@ def rows_before(text: bytes, result: bytes | None = None) -> Words:
 
 
 CHAINS: dict[str, Words] = {
-    **{
-        f"stride {text[:8]!r}": lambda w, o, t=text: chain(w, o, f"--stride={t}")
-        for text in ("0", "-1", "1.5", "auto ", "AUTO", "", "nan", "²", "\u0662", "2", "9" * 13)
-    },
     "stride of 5001 digits": lambda w, o: chain(w, o, f"--stride={DIGITS}"),
     "auto of two frames alike": of("1.png", "2.png", more=("--stride=auto",)),
     "one image": lambda w, o: chain(w, o, count=1),
     "one frame of a folder": of(more=("--stride=3",)),
-    **{
-        f"frames {text[:8]}": lambda w, o, t=text: chain(w, o, f"--frames={t}")
-        for text in ("0", "1", "-3", "x", DIGITS)
-    },
-    **{
-        f"fov {text}": lambda w, o, t=text: chain(w, o, f"--fov={t}")
-        for text in ("0", "nan", "180", "-60", "1e-300", "inf")
-    },
-    **{
-        f"depth scale {text}": lambda w, o, t=text: chain(w, o, f"--depth-scale={t}")
-        for text in ("nan", "inf", "x")
-    },
-    **{
-        f"camera {text}": lambda w, o, t=text: chain(w, o, f"--intrinsics={t}")
-        for text in ("1,2,3", "nan,60,32,24", "0,60,32,24", "a,b,c,d", "nothing.txt", ",,,")
-    },
     "two cameras": lambda w, o: chain(w, o, "--intrinsics=60,60,32,24", "--fov=50"),
-    "no workers": lambda w, o: chain(w, o, "--workers=0"),
-    "unknown option": lambda w, o: chain(w, o, "--set", "solver.no=1"),
     "other input": lambda w, o: chain(w, o, "--set", "input.kind=scene"),
     "memory": lambda w, o: chain(w, o, "--set", "input.kind=memory", "--set", "input.hash=x"),
     **{
@@ -181,19 +159,8 @@ CHAINS: dict[str, Words] = {
 }  # fmt: skip
 """Sequences that cannot be solved."""
 
-FAMILIES: dict[str, tuple[str, ...]] = {
-    **{f"sizes {t[:9]!r}": (f"--sizes={t}",) for t in ("", "0", "abc", "100,", "1e3", "-100")},
-    "sizes unknown": ("--sizes=100,101",),
-    "sizes of 5001 digits": (f"--sizes={DIGITS}",),
-    **{f"scenes {t!r}": (f"--scenes={t}",) for t in ("", ",", "nothing", "still", "street,\x1b[m")},
-    **{f"starts {t!r}": (f"--starts={t}",) for t in ("", "soft", "best", "easy hard")},
-    **{f"formulation {t!r}": (f"--formulation={t}",) for t in ("", "a/b", "free/free", "////")},
-}
-
 
 def family_cases() -> Iterator[Case]:
-    for name, words in FAMILIES.items():
-        yield Case("5 doors", f"family {name}", lambda w, o, x=words: ["family", str(o / "s"), *x])
     for kind in NO_FOLDER:
         yield Case("5 doors", f"family -o {kind}", lambda w, o, k=kind: ["family", w.odd(k, "")])
 
@@ -258,11 +225,6 @@ H5: dict[str, Callable[[h5py.File], object]] = {
 }  # fmt: skip
 """Arrays of a result that do not belong together."""
 ALL = "ply,glb,colmap,npy,pfm,png,rrd,motions"
-FORMATS: dict[str, str] = {
-    "none": "", "commas": ",,", "unknown": "exe", "capitals": "GLB", "space": "glb ply",
-    "control": "\x1b[31m", "long": "x" * 9000, "path": "../glb", "point": ".glb",
-    "one unknown": "glb,none",
-}  # fmt: skip
 
 
 def format_cases() -> Iterator[Case]:
@@ -276,10 +238,6 @@ def format_cases() -> Iterator[Case]:
                 return [verb, str(o / "copy"), *more]
 
             yield Case("5 doors", f"{verb} h5 {name}", odd, (0, 2))
-    for name, to in FORMATS.items():
-        yield Case("5 doors", f"convert to {name}", lambda w, o, t=to: [
-            "convert", str(w.result), "--to", t, "-o", str(o / "out"),
-        ])  # fmt: skip
     for kind in NO_FOLDER:
         yield Case("5 doors", f"convert -o {kind}", lambda w, o, k=kind: [
             "convert", str(w.result), "--to", "npy", "-o", w.odd(k, ""),
@@ -304,10 +262,6 @@ def format_cases() -> Iterator[Case]:
     yield Case("5 doors", "convert an export", lambda w, o: [
         "convert", str(w.exported), "--to", "npy", "-o", str(o / "out"),
     ])  # fmt: skip
-    for port in ("-1", "65536", "70000", "x", "1e3", DIGITS):
-        yield Case("5 doors", f"view --serve {port[:6]}", lambda w, o, p=port: [
-            "view", str(w.result), f"--serve={p}", "--no-open",
-        ])  # fmt: skip
     yield Case("5 doors", "view an export", lambda w, o: ["view", str(w.exported), "--no-open"])
     for kind in ("pipe", "zero", "folder", "loop", "socket", "dangling"):
 
@@ -401,7 +355,6 @@ def use_cases() -> Iterator[Case]:
     # two sizes of images are fine, and what nothing is read with is not looked at
     harmless = (
         "digits of other scripts", "auto of two frames alike", "images of two sizes",
-        "depth scale nan", "depth scale inf",
     )  # fmt: skip
     for name, words in CHAINS.items():
         yield Case("5 doors", f"chain {name}", words, (0, 1, 2) if name in harmless else (2,))
