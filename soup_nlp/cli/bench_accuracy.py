@@ -21,7 +21,7 @@ from soup_nlp.bench.study import Cell, measure_cells
 from soup_nlp.bench.suite_pairs import Options
 from soup_nlp.bench.suites import SUITES, Listing, list_suite
 from soup_nlp.cli import options
-from soup_nlp.cli.options import Progress, numbers, words
+from soup_nlp.cli.options import RowProgress, numbers, words
 from soup_nlp.errors import ConfigError
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.schema.limits import MAX_SIDE
@@ -86,7 +86,7 @@ def accuracy(
     _check_names(analysis, folders, name, suite or [])
     wanted = _wanted(flow, width, numbers(seeds, "--seeds"), only, limit)
     listings = [list_suite(known, data, wanted) for known in suite or ["rendered"]]
-    progress, changes = Progress(quiet, mre_of), tuple(overrides or ())
+    progress, changes = RowProgress(quiet, mre_of), tuple(overrides or ())
     measure_rows = partial(measure_all, workers=workers, say=progress, any_code=any_code)
     if analysis:
         items = [i.scored_by(conventions) for listing in listings for i in listing.items]
@@ -216,7 +216,7 @@ def search(
     items = [i for name in suite or ["rendered"] for i in list_suite(name, data, wanted).items]
     train, validation = searching.split(items, train_seeds, others)
     claim(out, ["search.md"], overwrite)
-    progress = Progress(quiet, mre_of)
+    progress = RowProgress(quiet, mre_of)
     frame: pd.DataFrame = searching.search(
         space,
         train,

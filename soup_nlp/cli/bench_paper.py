@@ -14,7 +14,7 @@ from soup_nlp.bench.paper_page import FILES, write_page
 from soup_nlp.bench.study import measure_cells
 from soup_nlp.cli import options
 from soup_nlp.cli.bench_accuracy import Width, mre_of
-from soup_nlp.cli.options import Progress, words
+from soup_nlp.cli.options import RowProgress, words
 from soup_nlp.schema.limits import MAX_SUPERPIXELS
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.rows import measure_all
@@ -65,7 +65,7 @@ def paper(
     said += [f"--limit {limit}"] * (limit is not None) + ["--data DIR"] * (data is not None)
     said += [f"--set {shlex.quote(o)}" for o in sizes.overrides]
     claim(out, FILES, overwrite)
-    plan, progress = make_plan(data, sizes, out), Progress(quiet, mre_of)
+    plan, progress = make_plan(data, sizes, out), RowProgress(quiet, mre_of)
     run = partial(measure_all, workers=workers, say=progress, any_code=any_code)
     frame = measure_cells(plan.cells(), measure_paper, out / "paper.jsonl", run)
     with staged(out) as new:

@@ -16,7 +16,7 @@ from soup_nlp.bench.chain import chain_page, measure_chain, sequences
 from soup_nlp.bench.speed import measure_speed, speed_cell, speed_cells
 from soup_nlp.bench.study import Cell, measure_cells, show
 from soup_nlp.cli.bench_accuracy import Only, Width
-from soup_nlp.cli.options import Data, Out, Overwrite, Progress, Quiet, Set, numbers, words
+from soup_nlp.cli.options import Data, Out, Overwrite, Quiet, RowProgress, Set, numbers, words
 from soup_nlp.data.scenes.catalogue import SCENES
 from soup_nlp.errors import ConfigError
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SIDE, MAX_SUPERPIXELS
@@ -67,7 +67,7 @@ def speed(
         speed_page.read_baseline(write_baseline)
     names = () if kept else ("table.md", "growth.png")
     claim(out, names, overwrite)
-    run = partial(measure_all, say=Progress(quiet, _result_of))
+    run = partial(measure_all, say=RowProgress(quiet, _result_of))
     frame = measure_cells(cells, measure_speed, out / "table.jsonl", run, own_process=True)
     if write_baseline is not None:
         text = json.dumps(speed_page.baseline(frame, settings), indent=1) + "\n"
@@ -117,7 +117,7 @@ def chain(
         raise ConfigError("no sequence is left", where="--only", expected=names)
     claim(out, ("chain.md",), overwrite)
     cells = [Cell(item, tuple(overrides or ()), f"{frames} frames") for item in chosen]
-    say = Progress(quiet, lambda row: f"cost of one scale {show(row['cost'], '+.2%')}")
+    say = RowProgress(quiet, lambda row: f"cost of one scale {show(row['cost'], '+.2%')}")
     measure, run = partial(measure_chain, frames=frames), partial(measure_all, say=say)
     frame = measure_cells(cells, measure, out / "chain.jsonl", run, own_process=True)
     with staged(out) as new:

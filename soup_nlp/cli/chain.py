@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from soup_nlp.cli import options
-from soup_nlp.cli.options import Progress
+from soup_nlp.cli.options import RowProgress
 from soup_nlp.cli.progress import SolveLog
 from soup_nlp.errors import StoppedError
 from soup_nlp.sequence.frames import Frames
@@ -93,7 +93,7 @@ def chain(
                 workers=workers,
                 overwrite=overwrite,
                 begin=begin,
-                say=Progress(quiet),
+                say=RowProgress(quiet),
             )
     except KeyboardInterrupt:
         raise StoppedError(

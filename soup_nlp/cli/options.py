@@ -122,7 +122,7 @@ def camera(text: str, option: str) -> list[float] | str:
     return values
 
 
-class Progress:
+class RowProgress:
     """Prints finished rows and time left: one updated line on a terminal, else a line per row.
 
     Args:

@@ -60,7 +60,7 @@ class _Part:
         return [text.pattern % values for values in zip(*columns)]
 
 
-class Body:
+class NlBody:
     """Expressions of a program.
 
     Two instances of defined nodes share one defined variable when their text is equal: the same

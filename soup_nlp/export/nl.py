@@ -20,7 +20,7 @@ from scipy import sparse
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ExportError
-from soup_nlp.export.body import Body
+from soup_nlp.export.body import NlBody
 from soup_nlp.export.opcodes import number
 from soup_nlp.export.program import Program, make_program, orders
 from soup_nlp.model.kernel import Group
@@ -113,7 +113,7 @@ def _write(
     _check(path, x, g)
     program = make_program(groups, len(x[0]), len(g[0]), theta)
     variables, rows = orders(program)
-    body = Body(program, np.argsort(variables), np.argsort(rows))
+    body = NlBody(program, np.argsort(variables), np.argsort(rows))
     J = program.jacobian[rows][:, variables].tocsr()
     J.sort_indices()
     G = program.gradient[:, variables].tocsr()

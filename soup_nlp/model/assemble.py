@@ -100,7 +100,7 @@ def _constant(index: Int) -> list[int]:
     return index.astype(np.int64).ravel().tolist()
 
 
-class Functions(NamedTuple):
+class Assembled(NamedTuple):
     """What a solver calls, apart from the Hessian.
 
     Attributes:
@@ -116,7 +116,7 @@ class Functions(NamedTuple):
 
 def assemble_functions(
     groups: Sequence[Group], nx: int, ng: int, thetas: int, compiled: bool = True
-) -> Functions:
+) -> Assembled:
     """Map every kernel over its table and scatter its results.
 
     Args:
@@ -143,7 +143,7 @@ def assemble_functions(
             g += _sum_into(ng, group.table.rows, values["con"])
     pattern = Pattern.of((ng, nx), [jacobian_entries(group) for group, _ in constrained])
     jac = _matrix(pattern, [v["jac"] for _, v in constrained])
-    return Functions(
+    return Assembled(
         oracle=ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]),
         grad_f=ca.Function("nlp_grad_f", [x, p], [f, grad], ["x", "p"], ["f", "grad_f_x"]),
         jac_g=ca.Function("nlp_jac_g", [x, p], [g, jac], ["x", "p"], ["g", "jac_g_x"]),

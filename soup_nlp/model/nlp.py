@@ -13,7 +13,7 @@ from scipy import sparse
 from soup_nlp.arrays import Float
 from soup_nlp.errors import ModelError
 from soup_nlp.model.assemble import (
-    Functions,
+    Assembled,
     Pattern,
     assemble_functions,
     assemble_hessian,
@@ -59,7 +59,7 @@ class NLP:
         return np.concatenate([np.array(list(self.theta.values()), float), *data])
 
     @cached_property
-    def functions(self) -> Functions:
+    def functions(self) -> Assembled:
         """What a solver calls but the Hessian; assembled (a second) by the first access."""
         return assemble_functions(self.groups, self.nx, self.ng, len(self.theta), self.compiled)
 

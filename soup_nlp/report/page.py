@@ -22,7 +22,7 @@ from soup_nlp.report.colour import component_colours
 from soup_nlp.report.limits import limits
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.report.result import Result
-from soup_nlp.report.scene3d import Scene, make_scene
+from soup_nlp.report.scene3d import PageScene, make_scene
 from soup_nlp.report.verdict import TITLES
 from soup_nlp.start.components import TIES
 from soup_nlp.storage.store import plain
@@ -89,7 +89,7 @@ def web_file(name: str) -> str:
     return (files("soup_nlp.report") / "web" / name).read_text(encoding="utf-8")
 
 
-def _scene(shown: Result, scene: Scene) -> dict[str, Any]:
+def _scene(shown: Result, scene: PageScene) -> dict[str, Any]:
     """The 3D view as numbers, lists and packed arrays."""
     height, width = shown.labels.shape
     arrays = {

@@ -21,7 +21,7 @@ MOST_PIXELS = 600_000
 
 
 @dataclass(frozen=True)
-class Scene:
+class PageScene:
     """The 3D view of a result, lengths in the shown unit, camera frame (x right, y down, z ahead).
 
     Attributes:
@@ -56,7 +56,7 @@ class Scene:
     deepest: float
 
 
-def make_scene(shown: Result) -> Scene:
+def make_scene(shown: Result) -> PageScene:
     """The 3D view of a result."""
     rec = shown.reconstruction
     step = int(np.ceil(np.sqrt(max(rec.labels.size / MOST_PIXELS, 1.0))))
@@ -70,7 +70,7 @@ def make_scene(shown: Result) -> Scene:
         camera = RigidMotion(own.R, scale * own.t)
     z = scale * rec.depth_ref[np.isfinite(rec.depth_ref)]
     far, deepest = _far(z)
-    return Scene(
+    return PageScene(
         step=step,
         labels=rec.labels[every, every],
         planes=inverse_depth(n, scale * lam * shown.soup("d")),
@@ -88,7 +88,7 @@ def make_scene(shown: Result) -> Scene:
 
 
 def _surface(shown: Result, step: int) -> Mask:
-    """Cells of the surface, see `Scene.surface`."""
+    """Cells of the surface, see `PageScene.surface`."""
     rec, K = shown.reconstruction, np.asarray(shown.array("input/K_ref"), float)
     right, below = joined(rec, K, shown.components.of_pixel)
     height, width = rec.labels.shape
@@ -101,7 +101,7 @@ def _surface(shown: Result, step: int) -> Mask:
 
 
 def _sigma(shown: Result) -> Int:
-    """(H, W) sigma as a byte, see `Scene.sigma`."""
+    """(H, W) sigma as a byte, see `PageScene.sigma`."""
     sigma = shown.array("depth/sigma_ref")
     if sigma is None:
         return np.zeros(shown.labels.shape, np.int64)

@@ -32,7 +32,7 @@ from soup_nlp.bench.suites import list_suite
 from soup_nlp.cli import bench_accuracy
 from soup_nlp.cli.bench_all import COMMANDS
 from soup_nlp.cli.main import app, main
-from soup_nlp.cli.options import Progress
+from soup_nlp.cli.options import RowProgress
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.storage.rows import measure_all, reason
 
@@ -218,7 +218,7 @@ def test_every_list_of_failures_says_which_file(capsys):
     assert "DataError: image is missing, where: a/0.png, found: nothing\n" in suite_page(
         "T", frame_of([row])
     )
-    Progress(quiet=False)(1, 1, row)
+    RowProgress(quiet=False)(1, 1, row)
     assert "image is missing, where: a/0.png" in capsys.readouterr().err
     assert reason({"error": ""}) == "no reason"
 
