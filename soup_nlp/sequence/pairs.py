@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from soup_nlp.config.problem import make_problem
+from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import SolverError
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.result import Result, load
@@ -83,7 +85,15 @@ def solve_pairs(
         work = partial(attempt, partial(_solve, raw, tuple(overrides), place))
         jobs.append(Job(name, work, stale=not same))
         places.append(place)
-    rows = measure_all(jobs, folder / ROWS, workers, say=say)
+
+    def told(done: int, total: int, row: Row) -> None:
+        # those of a worker process would be printed as Python prints them
+        for text in row.get("warnings", ()):
+            warnings.warn(text, DataWarning, stacklevel=2)
+        if say:
+            say(done, total, row)
+
+    rows = measure_all(jobs, folder / ROWS, workers, say=told)
     wrong = [row for row in rows if failed(row)]
     if wrong:
         raise SolverError(
@@ -97,9 +107,13 @@ def solve_pairs(
 
 def _solve(raw: Raw, overrides: tuple[str, ...], place: Path) -> Row:
     """Solve a pair into its folder."""
-    done = run(make_problem(raw, overrides, where="sequence"))
-    done.save(place)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        done = run(make_problem(raw, overrides, where="sequence"))
+        done.save(place)
+    said = {str(w.message): None for w in caught if issubclass(w.category, DataWarning)}
     return {
+        "warnings": [*said],
         "converged": done.solution.converged,
         "components": len(done.components),
         "mre": done.metrics["solution"].mre if "solution" in done.metrics else None,

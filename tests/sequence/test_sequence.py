@@ -437,6 +437,19 @@ def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch)
     assert seen == [(*pairs.OF_PAIRS, own) for own in "aba"]
 
 
+@pytest.mark.filterwarnings("default:.*no intrinsics")
+@pytest.mark.parametrize("workers", [1, 2])
+def test_warnings_of_pairs_are_printed_as_one_line(workers, tmp_path, capfd):
+    for k in range(2):
+        write_png(tmp_path / f"{k}.png", render_scene("orbit", 0, 160, 108, k).image_ref)
+    fast = ["--superpixels", "20", "--neighbours", "5", "--set", "refine.enabled=false"]
+    call = ["chain", str(tmp_path), "-o", str(tmp_path / "out"), "--workers", str(workers), *fast]
+    assert main(call) == 0
+    lines = capfd.readouterr().err.splitlines()
+    assert [line[:8] for line in lines if "no intrinsics" in line] == ["warning:"]
+    assert not any("DataWarning" in line for line in lines)
+
+
 def test_files_of_the_user_are_left_alone(tmp_path, capsys):
     (tmp_path / "chain.json").write_text("mine")
     assert main(["chain", "scene:street", "--out", str(tmp_path)]) == 2
