@@ -43,11 +43,17 @@ def shared_data() -> Path:
     return SHARED_DATA.resolve()
 
 
+@lru_cache
+def room(seed: int) -> Case:
+    """Sixty superpixels of a rendered room."""
+    scene = {"kind": "scene", "scene": "room", "seed": seed, "width": 256, "height": 128}
+    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+
+
 @pytest.fixture(scope="session")
 def small_room() -> Case:
-    """Sixty superpixels of a rendered room."""
-    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
-    return prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+    """A room in which something moves by itself."""
+    return room(3)
 
 
 @pytest.fixture(scope="session")
@@ -57,7 +63,7 @@ def small_run(small_room: Case) -> Run:
 
 
 @pytest.fixture(scope="module", params=["depth", "inverse-depth"])
-def problem(small_room: Case, request: pytest.FixtureRequest) -> TangentProblem:
-    """Its program on the tangent, in both charts."""
-    own = small_room.soup, small_room.data, small_room.weights
+def problem(request: pytest.FixtureRequest) -> TangentProblem:
+    """The program of a room on the tangent, in both charts."""
+    own = room(1).soup, room(1).data, room(1).weights
     return TangentProblem(*own, Formulation(compiled=False), chart=request.param)
