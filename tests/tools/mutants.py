@@ -140,7 +140,7 @@ def reached(root: Path, tests: Sequence[str]) -> tuple[dict[tuple[str, int], set
             for context in contexts:
                 # module.function, or module.Class.function
                 module, _, rest = context.partition(".")
-                if rest:
+                if rest and module in places:
                     found[key].add(f"{places[module]}::{rest.replace('.', '::')}")
     return found, seconds
 
