@@ -57,13 +57,19 @@ def small_room() -> Case:
 
 
 @pytest.fixture(scope="session")
+def rigid_room() -> Case:
+    """A room with one rigid component."""
+    return room(1)
+
+
+@pytest.fixture(scope="session")
 def small_run(small_room: Case) -> Run:
     """The start of that room as a run: every record is there, nothing was solved."""
     return make_run(small_room, skipped(small_room))
 
 
 @pytest.fixture(scope="module", params=["depth", "inverse-depth"])
-def problem(request: pytest.FixtureRequest) -> TangentProblem:
-    """The program of a room on the tangent, in both charts."""
-    own = room(1).soup, room(1).data, room(1).weights
+def problem(rigid_room: Case, request: pytest.FixtureRequest) -> TangentProblem:
+    """Its program on the tangent, in both charts."""
+    own = rigid_room.soup, rigid_room.data, rigid_room.weights
     return TangentProblem(*own, Formulation(compiled=False), chart=request.param)

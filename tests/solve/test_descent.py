@@ -76,10 +76,10 @@ def test_gradient_and_exact_hessian_are_derivatives(problem):
     np.testing.assert_allclose(product, expected, atol=1e-4 * np.abs(expected).max())
 
 
-def test_the_exact_hessian_beside_the_majorant_is_that_of_an_exact_program(problem, small_room):
+def test_the_exact_hessian_beside_the_majorant_is_that_of_an_exact_program(problem, rigid_room):
     form = FORM.replace(norm="smooth", hessian="exact", theta=0.0, ridge=0.0)
     chart = problem.layout.chart
-    nlp = build_tangent_nlp(small_room.soup, small_room.data, small_room.weights, form, chart)[0]
+    nlp = build_tangent_nlp(rigid_room.soup, rigid_room.data, rigid_room.weights, form, chart)[0]
     x = inner_point(problem)
     found = problem.upper.copy()
     found.data = problem.hessian(x, np.zeros_like(problem.slacks(x)[0]), "exact")
@@ -88,7 +88,7 @@ def test_the_exact_hessian_beside_the_majorant_is_that_of_an_exact_program(probl
     assert abs(found - expected).max() <= 1e-12 * abs(expected).max()
 
 
-def test_the_majorant_lies_above_every_norm(problem, small_room):
+def test_the_majorant_lies_above_every_norm(problem, rigid_room):
     # quadratic model with the majorant >= f wherever residuals are linear: translations
     problem.smoothing(0.2)
     x = Descent(problem).x
@@ -129,28 +129,28 @@ def test_growth_changes_the_length_unit_alone(problem):
     np.testing.assert_allclose(row.toarray().ravel(), problem.length(x), rtol=1e-12)
 
 
-def test_a_turn_of_a_superpixel_leaves_its_anchor_where_it_is(problem, small_room):
+def test_a_turn_of_a_superpixel_leaves_its_anchor_where_it_is(problem, rigid_room):
     x = inner_point(problem).reshape(-1, 9)
     turned = x.copy()
     turned[:, 3:6] += 0.1
 
     def anchors(x):
         soup = problem.layout.unpack(x.ravel())
-        X = soup.depth_at(small_room.data.anchor_ray)[:, None] * small_room.data.anchor_ray
+        X = soup.depth_at(rigid_room.data.anchor_ray)[:, None] * rigid_room.data.anchor_ray
         return np.einsum("nij,nj->ni", soup.R, X) + soup.translation
 
     np.testing.assert_allclose(anchors(turned), anchors(x), rtol=1e-12)
 
 
-def test_a_plane_moves_in_straight_lines_on_inverse_depths(small_room):
+def test_a_plane_moves_in_straight_lines_on_inverse_depths(rigid_room):
     problem = TangentProblem(
-        small_room.soup, small_room.data, small_room.weights, FORM, False, INVERSE
+        rigid_room.soup, rigid_room.data, rigid_room.weights, FORM, False, INVERSE
     )
-    layout, n = problem.layout, len(small_room.data)
+    layout, n = problem.layout, len(rigid_room.data)
 
     def on_plane(m):
         length = np.linalg.norm(m)
-        soup = small_room.soup
+        soup = rigid_room.soup
         normal, D = np.tile(-m / length, (n, 1)), np.full(n, 1 / length)
         x = layout.pack(Soup(D, normal, np.ones(n), soup.R, soup.translation / D[:, None]))
         # pack brings to the length unit; undone, rho is linear in m
@@ -160,11 +160,11 @@ def test_a_plane_moves_in_straight_lines_on_inverse_depths(small_room):
     np.testing.assert_allclose(on_plane(a + b), on_plane(a) + on_plane(b), rtol=1e-10)
 
 
-def test_another_chart_begins_where_the_first_ended(small_room):
-    first = Descent(TangentProblem(small_room.soup, small_room.data, small_room.weights, FORM))
+def test_another_chart_begins_where_the_first_ended(rigid_room):
+    first = Descent(TangentProblem(rigid_room.soup, rigid_room.data, rigid_room.weights, FORM))
     for phase in PHASES:
         first.run(phase)
-    problem = TangentProblem(first.soup, small_room.data, small_room.weights, FORM, chart=INVERSE)
+    problem = TangentProblem(first.soup, rigid_room.data, rigid_room.weights, FORM, chart=INVERSE)
     second = Descent(problem, after=first)
     # one pattern, one symbolic analysis
     assert second.newton._factorise is first.newton._factorise
@@ -199,11 +199,11 @@ def test_a_second_step_leads_back_into_a_bent_valley(problem):
     assert back.merit - at.merit < max(0.5 * (trial.merit - at.merit), trial.merit - at.merit)
 
 
-def test_rounding_of_what_is_far_away_does_not_reach_the_gradient(small_room):
+def test_rounding_of_what_is_far_away_does_not_reach_the_gradient(rigid_room):
     # lengths between near and far, in units of the near: their difference is that of small numbers
-    s, far = small_room.soup, np.where(np.arange(len(small_room.soup)) % 2, 1.0, 60.0)
+    s, far = rigid_room.soup, np.where(np.arange(len(rigid_room.soup)) % 2, 1.0, 60.0)
     mixed = Soup(s.lam * far, s.n, s.d, s.R, s.t / far[:, None])
-    problem = TangentProblem(mixed, small_room.data, small_room.weights, FORM)
+    problem = TangentProblem(mixed, rigid_room.data, rigid_room.weights, FORM)
     problem.smoothing(0.01)
     x, rng = problem.nlp.x0, np.random.default_rng(0)
     before = problem.gradient(x)
@@ -212,12 +212,12 @@ def test_rounding_of_what_is_far_away_does_not_reach_the_gradient(small_room):
         assert np.abs(problem.gradient(rounded) - before).max() < 1e-9 * np.abs(before).max()
 
 
-def test_slopes_are_in_no_edge_but_a_neighbours(problem, small_room):
+def test_slopes_are_in_no_edge_but_a_neighbours(problem, rigid_room):
     # E_arap knows anchors alone, whose depth is a variable: 7 of 9 coordinates, a smaller factor
-    U, n = problem.upper.tocoo(), len(small_room.data)
+    U, n = problem.upper.tocoo(), len(rigid_room.data)
     i, k = U.row // 9, U.col // 9
-    neighbours = {tuple(p) for p in np.sort(small_room.data.pairs, axis=1)}
-    edges = {tuple(p) for p in np.sort(small_room.data.edges, axis=1)} - neighbours
+    neighbours = {tuple(p) for p in np.sort(rigid_room.data.pairs, axis=1)}
+    edges = {tuple(p) for p in np.sort(rigid_room.data.edges, axis=1)} - neighbours
     assert edges
     between = np.bincount(i * n + k, minlength=n * n)
     assert {int(between[a * n + b]) for a, b in edges} == {49}
@@ -284,11 +284,11 @@ def test_a_superpixel_whose_damping_never_falls_is_let_go(problem, monkeypatch, 
     assert runner.run(replace(LAST, iterations=30)).converged == (patience == 10)
 
 
-def test_ipopt_stays_where_it_ends(small_room, problem, solved):
+def test_ipopt_stays_where_it_ends(rigid_room, problem, solved):
     last = solved[1][-1]
     smooth = FORM.replace(hessian="exact", eps=LAST.eps, eps_pixel=LAST.eps)
     nlp, _ = build_tangent_nlp(
-        small_room.soup, small_room.data, small_room.weights, smooth, problem.layout.chart
+        rigid_room.soup, rigid_room.data, rigid_room.weights, smooth, problem.layout.chart
     )
     stage = Ipopt(nlp)(x0=last.x, max_iter=30, tol=1e-6)
     assert stage.converged
