@@ -100,7 +100,7 @@ def test_the_view_of_the_reference_camera_is_the_reference_image(browser, small_
 
 
 def test_time_moves_the_scene(browser):
-    browser.value("soupView.setMode('image_ref'); soupView.setView('aside')")
+    browser.value("soupView.setMode('image_ref'); soupView.setView('reference')")
     images = []
     for time in (0, 0.5, 1, 0):
         browser.value(f"soupView.setTime({time})")
