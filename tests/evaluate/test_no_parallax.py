@@ -73,16 +73,25 @@ def test_a_pixel_without_backward_flow_affects_its_neighbourhood_alone():
 
 
 @pytest.mark.parametrize(
-    ("scene", "said"),
+    ("scene", "width", "said"),
     [
-        ("still", True),
-        ("orbit", False),
-        ("sheet", False),
+        ("still", 256, True),
+        ("orbit", 256, False),
+        ("sheet", 512, False),
+        pytest.param(
+            "sheet",
+            256,
+            False,
+            marks=pytest.mark.xfail(
+                strict=True, reason="a constant depth explains so small a picture to half a pixel"
+            ),
+        ),
     ],
 )
-def test_the_verdict_warns_where_depth_is_a_guess(scene, said, tmp_path):
+def test_the_verdict_warns_where_depth_is_a_guess(scene, width, said, tmp_path):
+    height = width * 109 // 256
     raw = {
-        "input": {"kind": "scene", "scene": scene, "seed": 0, "width": 512, "height": 218},
+        "input": {"kind": "scene", "scene": scene, "seed": 0, "width": width, "height": height},
         "flow": {"source": "truth"},
         "segmentation": {"superpixels": 60, "neighbours": 6},
         "refine": {"enabled": False},
