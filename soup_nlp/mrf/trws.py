@@ -3,7 +3,8 @@
 The energy is ``E(x) = sum_i u_i(x_i) + sum_ij p_ij(x_i, x_j)``. The method is sequential
 tree-reweighted message passing (V. Kolmogorov, "Convergent tree-reweighted message passing for
 energy minimization", IEEE TPAMI 28(10), 2006) on monotonic chains, step by step as in its
-author's TRW_S-v1.3 with general tables, so that the bound of every iteration is the same:
+author's TRW_S-v1.3 with general tables: the bound of every iteration is the one that the original
+has if it visits the nodes in the order used here, colour by colour (another order has others):
 
 * forward pass, for every node s in order: ``D_s = u_s + sum of the messages into s``, and for
   every later neighbour t ``M_st(x_t) = min over x_s of (gamma_s D_s - M_ts)(x_s) + p(x_s, x_t)``,

@@ -142,12 +142,15 @@ def _refined(case: Case, soup: Soup, watch: Watch) -> Refined:
     """The refinement of the NLP's solution or the start, with the images unless flow is exact."""
     problem, photo = case.problem, None
     if not flow_is_exact(case.start):
-        photo = photometric_term(case.seen, case.segmentation.labels, soup, problem.refine)
+        photo = photometric_term(
+            case.seen, case.segmentation.labels, soup, case.data, problem.refine
+        )
     return refine_soup(
         soup,
         case.data,
         case.weights,
         problem.refine,
+        start=case.start.soup,
         photo=photo,
         seed=problem.seed,
         min_facing=problem.formulation.min_facing,

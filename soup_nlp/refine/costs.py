@@ -19,6 +19,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 
 BLOCK_BYTES = 1 << 18  # one of the half dozen buffers of a block of edges
+Floats = NDArray[np.floating]
 UNARY_BYTES = 1 << 23  # one of the arrays of a block of superpixels
 
 
@@ -61,6 +62,10 @@ class Particles:
         rows = np.arange(len(self.D))[:, None]
         return Particles(*(a[rows, which] for a in (self.n, self.D, self.R, self.T)))
 
+    def of_some(self, who: Int) -> Particles:
+        """The particles of some superpixels (M,)."""
+        return Particles(self.n[who], self.D[who], self.R[who], self.T[who])
+
     def soup(self, labels: Int, share: Float) -> Soup:
         """The soup of one label each, with sum(lam) = 1 exactly restored (`Soup.normalised`)."""
         own = self.take(labels[:, None])
@@ -82,32 +87,38 @@ def feasible(p: Particles, visibility_ray: Float, min_facing: float) -> Mask:
     return np.asarray((facing.min(axis=2) >= min_facing) & (p.D > 0))
 
 
-def unary_costs(p: Particles, data: EnergyData, weights: Weights) -> tuple[Float, Mask]:
+def unary_costs(
+    p: Particles, data: EnergyData, weights: Weights, who: Int | None = None
+) -> tuple[Float, Mask]:
     """alpha1 E_proj of every particle, and whether it keeps its pixels in front of the camera.
 
     Args:
         p: (N, L) particles.
         data: Pixels of the pair; all or sampled, as the data has them.
         weights: alpha1 and its truncation.
+        who: (N,) superpixels whose particles these are; None for all, in order.
 
     Returns:
         (N, L) costs and (N, L) bool.
     """
     n_nodes, n_labels = p.shape
     out, ahead = np.empty(p.shape), np.empty(p.shape, bool)
+    every = np.arange(n_nodes) if who is None else who
     step = max(1, UNARY_BYTES // (8 * 3 * n_labels * max(1, data.pixel_ray.shape[1])))
     for a in range(0, n_nodes, step):
         b = slice(a, a + step)
+        ray, confidence = data.pixel_ray[every[b]], data.pixel_weight[every[b]]
+        target = data.pixel_target[every[b], None]
         H = p.R[b] - p.T[b][..., :, None] * (p.n[b] / p.D[b][..., None])[..., None, :]
-        y = np.matmul(data.K_next @ H, np.swapaxes(data.pixel_ray[b], 1, 2)[:, None])
-        used = data.pixel_weight[b, None] > 0
+        y = np.matmul(data.K_next @ H, np.swapaxes(ray, 1, 2)[:, None])
+        used = confidence[:, None] > 0
         ahead[b] = (y[:, :, 2] > 1e-9).all(axis=2, where=used)
         with np.errstate(divide="ignore", invalid="ignore"):
-            u = y[:, :, 0] / y[:, :, 2] - data.pixel_target[b, None, :, 0]
-            v = y[:, :, 1] / y[:, :, 2] - data.pixel_target[b, None, :, 1]
+            u = y[:, :, 0] / y[:, :, 2] - target[..., 0]
+            v = y[:, :, 1] / y[:, :, 2] - target[..., 1]
             error = np.minimum(np.sqrt(u * u + v * v), weights.sigma_proj)
         error = np.where(used, error, 0.0)
-        out[b] = weights.proj * np.einsum("nls,ns->nl", error, data.pixel_weight[b])
+        out[b] = weights.proj * np.einsum("nls,ns->nl", error, confidence)
     return out, ahead & np.isfinite(out)
 
 
@@ -135,7 +146,7 @@ class PairCosts:
 
     def tables(
         self, p: Particles, unit: float = 1.0, dtype: type | np.dtype = np.float64
-    ) -> NDArray[np.floating]:
+    ) -> Floats:
         """(E, L, L) weighted sum of every term but E_proj, of every pair of labels.
 
         Args:
@@ -145,9 +156,9 @@ class PairCosts:
         """
         labels = p.shape[1]
         out = np.zeros((len(self.edges), labels, labels), dtype)
-        state = _State(p, self.data)
-        step = max(1, BLOCK_BYTES // (8 * labels * labels))
-        buffers = np.empty((4, step, labels, labels))
+        state = _State(p, self.data, dtype)
+        step = max(1, BLOCK_BYTES // (out.itemsize * labels * labels))
+        buffers = np.empty((4, step, labels, labels), dtype)
         for rows, add in ((self.arap_row, self._arap), (self.cont_row, self._cont)):
             there = np.flatnonzero(rows >= 0)
             for a in range(0, len(there), step):
@@ -155,16 +166,10 @@ class PairCosts:
                 out[at] += add(state, rows[at], unit, buffers[:, : len(at)])
         return out
 
-    def _unit(self, s: _State, i: Int, k: Int, unit: float, out: Float) -> Float:
-        """1 / length unit of a block, (b, L, L) or (b, 1, 1)."""
-        if not self.data.local_units:
-            return np.full((len(i), 1, 1), 1.0 / unit)
-        return _nearness(s, i, k, out)
-
-    def _arap(self, s: _State, rows: Int, unit: float, buffers: Float) -> Float:
+    def _arap(self, s: _State, rows: Int, unit: float, buffers: Floats) -> Floats:
         d, w = self.data, self.weights
         i, k = d.edges[rows].T
-        total, scale, x, y = buffers
+        total, near, x, y = buffers
         sigma = w.sigma_arap
         # |R - S|_F of unit quaternions q, r: with s = |q - r|^2 it is sqrt(2 s (4 - s))
         _distance2(s.q[:, i], s.q[:, k], total, x)
@@ -172,17 +177,20 @@ class PairCosts:
         total *= x
         np.maximum(total, 0.0, out=total)
         np.sqrt(total, out=total)
-        total *= np.sqrt(2.0) * d.rotation_scale[rows][:, None, None]
+        total *= s.factor(np.sqrt(2.0) * d.rotation_scale[rows])
         _leaky(total, sigma, w.leak_arap)
 
-        per = self._unit(s, i, k, unit, scale) / d.edge_unit[rows][:, None, None]
+        _nearness(s, i, k, near)
+        length = s.factor(1 / (d.edge_unit[rows] * (1.0 if d.local_units else unit)))
         if d.arap_at_anchors:
             gap = _anchor_gap(s, d.anchor_ray, i, k)
             np.sqrt(np.einsum("cbij,cbij->bij", gap, gap), out=x)
         else:
             _distance2(s.T[:, i], s.T[:, k], x, y)
             np.sqrt(x, out=x)
-        x *= per
+        x *= length
+        if d.local_units:
+            x *= near
         total += _leaky(x, sigma, w.leak_arap)
 
         _distance2(s.Y[:, i], s.Y[:, k], x, y)
@@ -191,48 +199,51 @@ class PairCosts:
         np.sqrt(x, out=x)
         x -= after
         np.abs(x, out=x)
-        x *= per
+        x *= length
+        if d.local_units:
+            x *= near
         total += _leaky(x, sigma, w.leak_arap)
-        total *= w.arap * d.edge_weight[rows][:, None, None]
+        total *= s.factor(w.arap * d.edge_weight[rows])
 
         reach = np.linalg.norm(d.anchor_ray[i] - d.anchor_ray[k], axis=1)
-        inverse = 1 / s.Z
-        np.subtract(inverse[i][:, :, None], inverse[k][:, None, :], out=x)
-        x /= _nearness(s, i, k, scale)
-        x -= d.prior_relief[rows][:, None, None]
+        np.subtract(s.inverse[i][:, :, None], s.inverse[k][:, None, :], out=x)
+        x /= near
+        x -= s.factor(d.prior_relief[rows])
         np.abs(x, out=x)
-        x *= (w.prior * d.prior_weight[rows] / reach)[:, None, None]
+        x *= s.factor(w.prior * d.prior_weight[rows] / reach)
         total += x
         return total
 
-    def _cont(self, s: _State, rows: Int, unit: float, buffers: Float) -> Float:
+    def _cont(self, s: _State, rows: Int, unit: float, buffers: Floats) -> Floats:
         d, w = self.data, self.weights
         i, k = d.pairs[rows].T
         total, scale, x, y = buffers
         ray = d.boundary_ray[rows]
         Xi, Yi = s.boundary(i, ray)
         Xk, Yk = s.boundary(k, ray)
-        per = self._unit(s, i, k, unit, scale) * (d.pair_factor / d.pair_unit)[rows][:, None, None]
+        scale[:] = s.factor((d.pair_factor / d.pair_unit)[rows] / (1 if d.local_units else unit))
+        if d.local_units:
+            scale *= _nearness(s, i, k, x)
         # both points lie on the same ray: their gap is |r| times that of the depths
         _distance2(Xi, Xk, total, x)
         np.sqrt(total, out=total)
-        total *= per
+        total *= scale
         np.minimum(total, w.sigma_cont_ref, out=total)
         _distance2(Yi, Yk, x, y)
         np.sqrt(x, out=x)
-        x *= per
+        x *= scale
         total += np.minimum(x, w.sigma_cont, out=x)
-        total *= w.cont * d.pair_weight[rows][:, None, None]
+        total *= s.factor(w.cont * d.pair_weight[rows])
         # 1 - n . n' = |n - n'|^2 / 2 of unit normals
         _distance2(s.n[:, i], s.n[:, k], x, y)
         x *= 0.5
         np.minimum(x, w.sigma_orient, out=x)
-        x *= w.orient * d.orient_weight[rows][:, None, None]
+        x *= s.factor(w.orient * d.orient_weight[rows])
         total += x
         return total
 
 
-def _leaky(y: Float, sigma: float, leak: float) -> Float:
+def _leaky(y: Floats, sigma: float, leak: float) -> Floats:
     """`(1 - leak) min(y, sigma) + leak y` in place, as (1 - leak) (min(y, sigma) + c y)."""
     if leak >= 1:
         return y
@@ -244,27 +255,39 @@ def _leaky(y: Float, sigma: float, leak: float) -> Float:
 
 
 class _State:
-    """Components first, so that those of a block of edges lie together: each (c, N, L)."""
+    """Components first, so that those of a block of edges lie together: each (c, N, L).
 
-    def __init__(self, p: Particles, data: EnergyData) -> None:
+    What is subtracted for every pair of labels has the type of the tables.
+    """
+
+    def __init__(self, p: Particles, data: EnergyData, dtype: type | np.dtype) -> None:
         n_nodes, labels = p.shape
+        self.dtype = dtype
         self.Z = anchor_depth(p, data.anchor_ray)
         q = Rotation.from_matrix(p.R.reshape(-1, 3, 3)).as_quat()
         # the sign does not matter to the chord's formula, but its rounding is best for small s
         q = np.where(q[:, 3:] < 0, -q, q)
         X = self.Z[..., None] * data.anchor_ray[:, None]
         Y = np.matmul(p.R, X[..., None])[..., 0] + p.T
-        self.q = _first(q.reshape(n_nodes, labels, 4))
-        self.n, self.T, self.X, self.Y = (_first(v) for v in (p.n, p.T, X, Y))
-        self.D, self.R = p.D, _first(p.R.reshape(n_nodes, labels, 9))
+        q = q.reshape(n_nodes, labels, 4)
+        self.q, self.n, self.T, self.X, self.Y = (_first(v, dtype) for v in (q, p.n, p.T, X, Y))
+        self.inverse = (1 / self.Z).astype(dtype)
+        self.quarter = (0.5 * self.Z**-4.0).astype(dtype)
+        self.plane = _first(np.concatenate([p.n, p.D[..., None]], axis=2), np.float64)
+        self.R, self.shift = _first(p.R.reshape(n_nodes, labels, 9), np.float64), p.T
 
-    def boundary(self, who: Int, ray: Float) -> tuple[Float, Float]:
+    def factor(self, values: Float) -> Floats:
+        """Numbers of the edges of a block, (b, 1, 1)."""
+        return values.astype(self.dtype)[:, None, None]
+
+    def boundary(self, who: Int, ray: Float) -> tuple[Floats, Floats]:
         """Distances along boundary rays (b, B, 3), and next-frame points.
 
         Returns:
             (B, b, L) depths times |r|, and (3 B, b, L) points.
         """
-        n, D, R, T = self.n[:, who], self.D[who], self.R[:, who], self.T[:, who]
+        (*n, D), R = self.plane[:, who], self.R[:, who]
+        T = np.moveaxis(self.shift[who], 2, 0)
         r = ray.transpose(1, 2, 0)[..., None]
         facing = -(n[0] * r[:, 0] + n[1] * r[:, 1] + n[2] * r[:, 2])
         facing = np.where(np.abs(facing) < 1e-12, 1e-12, facing)
@@ -273,19 +296,19 @@ class _State:
             R[3 * c] * r[:, 0] + R[3 * c + 1] * r[:, 1] + R[3 * c + 2] * r[:, 2] for c in (0, 1, 2)
         ]
         points = np.concatenate([z * v + T[c] for c, v in enumerate(turned)])
-        return z * np.sqrt(np.sum(r * r, axis=1)), points
+        depths = z * np.sqrt(np.sum(r * r, axis=1))
+        return depths.astype(self.dtype), points.astype(self.dtype)
 
 
-def _nearness(s: _State, i: Int, k: Int, out: Float) -> Float:
+def _nearness(s: _State, i: Int, k: Int, out: Floats) -> Floats:
     """Inverse depth (b, L, L) of the anchors of a block, mostly of the nearer one."""
-    q = 0.5 * s.Z**-4.0
-    np.add(q[i][:, :, None], q[k][:, None, :], out=out)
+    np.add(s.quarter[i][:, :, None], s.quarter[k][:, None, :], out=out)
     np.sqrt(out, out=out)
     return np.sqrt(out, out=out)
 
 
-def _first(values: Float) -> Float:
-    return np.ascontiguousarray(np.moveaxis(values, -1, 0))
+def _first(values: Float, dtype: type | np.dtype) -> Floats:
+    return np.ascontiguousarray(np.moveaxis(values, -1, 0), dtype)
 
 
 def _rows(key: Int, part: Int) -> Int:
@@ -294,7 +317,7 @@ def _rows(key: Int, part: Int) -> Int:
     return out
 
 
-def _distance2(a: Float, b: Float, out: Float, buffer: Float) -> None:
+def _distance2(a: Floats, b: Floats, out: Floats, buffer: Floats) -> None:
     """out[e, x, y] = sum_c (a[c, e, x] - b[c, e, y])^2."""
     for c in range(len(a)):
         target = buffer if c else out

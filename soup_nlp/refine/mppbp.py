@@ -45,6 +45,9 @@ KEPT_SHARE = 0.25
 """Share of the particles that stays for the next round."""
 TRWS_ITERATIONS, TRWS_GAP = 15, 1e-4
 """Most iterations of TRW-S in a round, and the relative gap at which it stops earlier."""
+CONTRADICTED = 0.06
+"""Share of superpixels whose flow the images contradict, below which there is one round: on such
+pairs the MRE after four is that after one."""
 
 
 def refine_soup(
@@ -53,6 +56,7 @@ def refine_soup(
     weights: Weights,
     options: RefineOptions | None = None,
     *,
+    start: Soup | None = None,
     photo: Photometric | None = None,
     seed: int = 0,
     min_facing: float = 1e-3,
@@ -61,14 +65,16 @@ def refine_soup(
 ) -> Refined:
     """Lower the exact energy of a soup by particles; see the module.
 
-    With images the energy is that of `objective`, and planes swept over depth under the commonest
-    motions are among the particles of the first round.
+    With images the energy is that of `objective`. Where they contradict the flow of more than a
+    few superpixels, planes swept over depth under the commonest motions are among the particles of
+    the first round; otherwise it is the only one.
 
     Args:
         soup: Current belief. Planes that break visibility are first tilted until they do not.
         data: Numbers of the energy.
         weights: Its constants.
         options: Rounds, particles, limits.
+        start: The initialisation, whose objective is stated beside; None for `soup`.
         photo: Photometric term; None for the flow alone.
         seed: Of every draw.
         min_facing: Visibility, as in the constrained NLP.
@@ -85,39 +91,45 @@ def refine_soup(
         tilt_to_camera(soup, data.anchor_ray, rays, min_facing).normalised(data.share).retracted()
     )
     energy = objective(best, data, weights, photo)
-    beside = photo.beside(weights) if photo else weights
-    pair_costs = PairCosts(data, beside)
+    before = energy if start is None else objective(start, data, weights, photo)
+    pair_costs = PairCosts(data, weights)
     proposer = Proposer(data, neighbours(pair_costs.edges, data.anchor_ray), seed)
-    costs = _Costs(data, beside, photo, o, rays, min_facing, pair_costs, proposer.near)
+    costs = _Costs(data, weights, photo, o, rays, min_facing, pair_costs, proposer.near)
     rounds = _Rounds(costs, proposer, watch or Watch(), best, energy, begin + o.max_seconds)
-    if photo is not None and o.sweep:
+    if photo is not None and o.sweep and not rounds.agreed:
         rounds.kept = swept(best, *proposer.commonest(best, 2), data, photo, o.sweep)
     status, done = rounds.run(), tuple(rounds.done)
-    return Refined(rounds.best, energy, rounds.energy, done, status, time.perf_counter() - begin)
+    return Refined(
+        rounds.best,
+        before,
+        energy,
+        rounds.energy,
+        done,
+        status,
+        time.perf_counter() - begin,
+        0 if photo is None else int(photo.contradicted.sum()),
+    )
 
 
 def objective(
     soup: Soup, data: EnergyData, weights: Weights, photo: Photometric | None = None
 ) -> Mapping[str, float]:
-    """Objective of the refinement by term: E; with images a weaker E_proj, and E_photo.
+    """What the refinement minimises, by term: E; with images also E_photo.
+
+    Where the images contradict the flow, E_proj is weaker (`Photometric.costs_of_flow`).
 
     Args:
         soup: State.
         data: Numbers of the energy.
-        weights: Its constants, without images.
+        weights: Its constants.
         photo: Photometric term, if there is one.
     """
-    return _energy(soup, data, photo.beside(weights) if photo else weights, photo)
-
-
-def _energy(
-    soup: Soup, data: EnergyData, weights: Weights, photo: Photometric | None
-) -> Mapping[str, float]:
     own = oracle.energy(soup, data, weights)
     if photo is None:
         return own
+    proj = float(photo.costs_of_flow(Particles.of(soup), data, weights)[0].sum())
     seen = photo.energy(soup)
-    return {**own, "total": own["total"] + seen, "photo": seen}
+    return {**own, "proj": proj, "total": own["total"] - own["proj"] + proj + seen, "photo": seen}
 
 
 def _draw(
@@ -151,7 +163,7 @@ class _Costs:
 
     Attributes:
         data: Numbers of the energy.
-        weights: Its constants, beside images if there are any.
+        weights: Its constants.
         photo: Photometric term; None for the flow alone.
         options: Precision of the tables, and how far depth may go in a round.
         rays: Where visibility is imposed, see `EnergyData.visibility_ray`.
@@ -172,7 +184,8 @@ class _Costs:
     def of(self, best: Soup, p: Particles) -> tuple[Float, NDArray[np.floating]]:
         """Unary and pairwise costs of particles; what is not feasible costs infinitely much."""
         data, o = self.data, self.options
-        unary, ahead = unary_costs(p, data, self.weights)
+        flow = self.photo.costs_of_flow if self.photo else unary_costs
+        unary, ahead = flow(p, data, self.weights)
         unit = float(np.sum(data.share * best.distance))
         if not data.local_units:
             slope = length_slope(best, data, self.weights)
@@ -186,7 +199,8 @@ class _Costs:
         if lost.any():
             exact = self.weights.proj * oracle.reprojection(best, data, self.weights)
             unary[lost, 0] = np.minimum(exact, 1e9)[lost]
-        return unary, self.pairs.tables(p, unit)
+        # single precision suffices: a choice is taken only where the exact energy falls
+        return unary, self.pairs.tables(p, unit, np.float32)
 
 
 def length_slope(soup: Soup, data: EnergyData, weights: Weights) -> float:
@@ -209,6 +223,7 @@ class _Rounds:
         energy: Its energy by term, see `objective`.
         kept: Particles that the next round uses besides its proposals.
         done: Rounds that have ended.
+        agreed: Whether images and flow agree, so that one round is enough.
     """
 
     def __init__(
@@ -227,21 +242,25 @@ class _Rounds:
         self.shares = {k: v for k, v in SHARES.items() if not walks_only or k in WALKS}
         self.kept: Particles | None = None
         self.done: list[Round] = []
+        photo = costs.photo
+        self.agreed = photo is not None and photo.contradicted.mean() < CONTRADICTED
 
     def run(self) -> str:
         """All rounds; the status of `Refined`."""
-        o, slow, interrupted = self.costs.options, 0, False
-        while len(self.done) < o.rounds and slow < 2 and not (interrupted or self._over()):
+        o, slow, interrupted = self.costs.options, False, False
+        most = min(1, o.rounds) if self.agreed else o.rounds
+        while len(self.done) < most and not (slow or interrupted or self._over()):
             before = self.energy["total"]
             interrupted = self._round()
             self.watch.say(f"refine {len(self.done)}: {self.done[-1]}")
-            fell = before - self.energy["total"]
-            slow = slow + 1 if fell < o.stagnation * abs(before) else 0
+            slow = before - self.energy["total"] < o.stagnation * abs(before)
         if interrupted or self.watch.stop.is_set():
             return "interrupted"
-        if slow >= 2:
+        if slow:
             return "stagnated"
-        return "time limit" if len(self.done) < o.rounds else "rounds"
+        if len(self.done) < most:
+            return "time limit"
+        return "agreed" if most < o.rounds else "rounds"
 
     def _over(self) -> bool:
         """Whether the stop event is set or the time limit has passed."""
@@ -267,7 +286,7 @@ class _Rounds:
         # TRW-S answers Ctrl-C too with the best labels so far
         interrupted = result.status == "interrupted" and time.perf_counter() <= self.deadline
         new = p.soup(result.labels, costs.data.share).retracted()
-        energy = _energy(new, costs.data, costs.weights, costs.photo)
+        energy = objective(new, costs.data, costs.weights, costs.photo)
         taken = energy["total"] < self.energy["total"]
         labels = result.labels if taken else none
         if taken:

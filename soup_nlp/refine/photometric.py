@@ -7,24 +7,29 @@ superpixel i and the pixel of the next frame where the superpixel's homography b
 that leaves the next frame, or that something nearer hides there, costs `UNSEEN` whatever is there:
 more than an agreement, less than a contradiction. What is nearer is read off a depth map of the
 next frame that is the same for all soups which are compared, so E_photo is one function of a soup.
+
+Where the images contradict the flow, E_proj is weaker and truncated; everywhere else it is that of
+E. They contradict it where a superpixel has a flow, but in the soup that followed it the visible
+samples disagree by more than `CONTRADICTION`, or most of them are not visible.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.census import census, census_at
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.soup import Soup, reconstruct
+from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.refine.costs import Particles
+from soup_nlp.refine.costs import Particles, unary_costs
 from soup_nlp.refine.records import RefineOptions
 
-Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 TAU = 0.35
@@ -36,7 +41,12 @@ BEHIND = 1.1
 SAMPLES = 24
 """Pixels per superpixel."""
 PROJ, SIGMA_PROJ = 0.3, 2.0
-"""Factor of alpha1, and truncation of a re-projection error (pixels), where images count."""
+"""Factor of alpha1, and truncation of a re-projection error (pixels), where images contradict."""
+CONTRADICTION = 0.1
+"""Mean difference of a superpixel's visible samples above which the images contradict the flow:
+twice that of most superpixels of real pairs, four times that of rendered ones."""
+USABLE = 0.1
+"""Least mean confidence of a flow that can be contradicted."""
 BLOCK = 1 << 19
 """Samples that are looked up at once."""
 
@@ -53,8 +63,7 @@ class Photometric:
         distance: (N,) distances of the planes of the soup that shows it: gives the length unit.
         K_next: (3, 3) intrinsics of the next frame.
         weight: Factor of E_photo.
-        proj: Factor of alpha1 beside it.
-        sigma_proj: Truncation of a pixel's re-projection error beside it, pixels.
+        contradicted: (N,) superpixels whose flow the images contradict.
     """
 
     ray: Float32
@@ -64,13 +73,16 @@ class Photometric:
     distance: Float
     K_next: Float
     weight: float
-    proj: float
-    sigma_proj: float
+    contradicted: Mask
 
-    def beside(self, weights: Weights) -> Weights:
-        """The weights of the other terms beside E_photo: E_proj is weaker and truncated."""
-        sigma = min(weights.sigma_proj, self.sigma_proj)
-        return weights.replace(proj=self.proj * weights.proj, sigma_proj=sigma)
+    def costs_of_flow(self, p: Particles, data: EnergyData, weights: Weights) -> tuple[Float, Mask]:
+        """`unary_costs`, with a weaker, truncated E_proj where the images contradict the flow."""
+        out, ahead = unary_costs(p, data, weights)
+        who = np.flatnonzero(self.contradicted)
+        sigma = min(weights.sigma_proj, SIGMA_PROJ)
+        weak = weights.replace(proj=PROJ * weights.proj, sigma_proj=sigma)
+        out[who] = unary_costs(p.of_some(who), data, weak, who)[0]
+        return out, ahead
 
     def unit(self, soup: Soup) -> float:
         """Length unit of a soup, relative to that of `nearest`."""
@@ -86,19 +98,29 @@ class Photometric:
         step = max(1, BLOCK // (p.shape[1] * self.ray.shape[1]))
         for a in range(0, len(out), step):
             b = slice(a, a + step)
-            u, v, seen = self._seen(p, b, unit)
-            flat = u.shape[0] * u.shape[1], u.shape[2]
-            there = census_at(self.there, u.reshape(flat), v.reshape(flat))
-            there = there.reshape(2, *u.shape, 4)
-            there -= self.own[:, b, None]
-            np.abs(there, out=there)
-            c = np.minimum(there.sum(axis=(0, 4)) / 16.0, TAU)
+            c, seen = self._differences(p, b, unit)
             out[b] = self.weight * np.where(seen, c, UNSEEN).mean(axis=2)
         return out
 
-    def _seen(
-        self, p: Particles, b: slice, unit: float
-    ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
+    def disagreeing(self, soup: Soup, data: EnergyData) -> Mask:
+        """(N,) where there is a flow, and a soup's samples disagree or are mostly not visible."""
+        c, seen = self._differences(Particles.of(soup), slice(None), self.unit(soup))
+        visible = seen.mean(axis=2)[:, 0]
+        mean = np.where(seen, c, 0).mean(axis=2)[:, 0] / np.maximum(visible, 1e-9)
+        usable = data.pixel_weight.sum(axis=1) > USABLE
+        return np.asarray(usable & ((mean > CONTRADICTION) | (visible <= 0.5)))
+
+    def _differences(self, p: Particles, b: slice, unit: float) -> tuple[Float32, Mask]:
+        """Truncated differences of census, and whether the next frame shows a sample: (n, L, S)."""
+        u, v, seen = self._seen(p, b, unit)
+        flat = u.shape[0] * u.shape[1], u.shape[2]
+        there = census_at(self.there, u.reshape(flat), v.reshape(flat))
+        there = there.reshape(2, *u.shape, 4)
+        there -= self.own[:, b, None]
+        np.abs(there, out=there)
+        return np.minimum(there.sum(axis=(0, 4)) / 16.0, TAU), seen
+
+    def _seen(self, p: Particles, b: slice, unit: float) -> tuple[Float32, Float32, Mask]:
         """Pixels (u, v) of the next frame, and whether it shows them: (n, L, S) each."""
         n, labels = p.D[b].shape
         ray = self.ray[b].transpose(0, 2, 1)
@@ -120,7 +142,7 @@ class Photometric:
 
 
 def photometric_term(
-    pair: Pair, labels: NDArray[np.int32], soup: Soup, o: RefineOptions
+    pair: Pair, labels: NDArray[np.int32], soup: Soup, data: EnergyData, o: RefineOptions
 ) -> Photometric | None:
     """The photometric term of a pair; None where its factor is 0.
 
@@ -129,8 +151,9 @@ def photometric_term(
     Args:
         pair: Images and cameras.
         labels: (H, W) superpixels.
-        soup: Where the refinement starts.
-        o: Factor of E_photo and those of the flow beside it.
+        soup: Where the refinement starts: it followed the flow.
+        data: Confidence of the flow.
+        o: Factor of E_photo.
     """
     if not o.photo:
         return None
@@ -141,7 +164,7 @@ def photometric_term(
     order = np.argsort(flat, kind="stable")
     place = ((np.arange(SAMPLES) + 0.5) / SAMPLES * count[:, None]).astype(np.int64)
     v, u = np.divmod(order[(np.cumsum(count) - count)[:, None] + place], labels.shape[1])
-    return Photometric(
+    photo = Photometric(
         ray=rays(pair.K_ref, np.stack([u, v], axis=-1).astype(float)).astype(np.float32),
         own=census(pair.image_ref)[:, v, u],
         there=census(pair.image_next),
@@ -149,6 +172,6 @@ def photometric_term(
         distance=soup.distance,
         K_next=pair.K_next,
         weight=o.photo,
-        proj=PROJ,
-        sigma_proj=SIGMA_PROJ,
+        contradicted=np.zeros(len(soup), bool),
     )
+    return replace(photo, contradicted=photo.disagreeing(soup, data))

@@ -36,8 +36,8 @@ class RefineOptions(Section):
     depth_reach: Annotated[float, Field(ge=1, le=MOST)] = 2.0
     """A new depth is at most this many times the upper quartile of the neighbours' depths, and
     at least their lower quartile over this squared."""
-    stagnation: NonNegative = 1e-3
-    """End when two rounds in a row lower E by less than this share; 0 never."""
+    stagnation: NonNegative = 1e-2
+    """End after a round that lowers the objective by less than this share; 0 never."""
     photo: NonNegative = 10.0
     """Factor of E_photo, which measures how far the images contradict a superpixel's homography
     (`refine.photometric`); 0 leaves the images out."""
@@ -101,24 +101,29 @@ class Refined:
 
     Attributes:
         soup: Best soup.
-        energy_begin: Objective (`mppbp.objective`) by term before the first round.
+        energy_start: Objective (`mppbp.objective`) by term of the initialisation.
+        energy_begin: The same before the first round.
         energy: The same of `soup`.
         rounds: Every round.
-        status: "rounds" (all of them), "stagnated", "interrupted" or "time limit".
+        status: "rounds" (all of them), "agreed" (one round: the images contradict the flow hardly
+            anywhere), "stagnated", "interrupted" or "time limit".
         seconds: Wall time.
+        contradicted: Superpixels whose flow the images contradict; E rises only there.
     """
 
     soup: Soup
+    energy_start: Mapping[str, float]
     energy_begin: Mapping[str, float]
     energy: Mapping[str, float]
     rounds: tuple[Round, ...]
     status: str
     seconds: float
+    contradicted: int = 0
 
     def __str__(self) -> str:
         gap = f", gap {self.rounds[-1].gap:.3g}" if self.rounds else ""
         return (
-            f"Refined({self.status}, E {self.energy_begin['total']:.5g} ->"
+            f"Refined({self.status}, objective {self.energy_begin['total']:.5g} ->"
             f" {self.energy['total']:.5g} in {len(self.rounds)} rounds{gap}, {self.seconds:.1f} s)"
         )
 

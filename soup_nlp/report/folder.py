@@ -247,6 +247,8 @@ def _refinement(run: Run) -> dict[str, Any] | None:
     return {
         "status": r.status,
         "seconds": r.seconds,
+        "contradicted": r.contradicted,
+        "start": r.energy_start,
         "begin": r.energy_begin,
         "end": r.energy,
         "rounds": [{key: getattr(one, key) for key in _ROUND} for one in r.rounds],

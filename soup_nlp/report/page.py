@@ -231,20 +231,23 @@ def _energy(shown: Result) -> str:
     known = {k: shown.summary["energy"][k] for k in stages if k in shown.summary["energy"]}
     terms = list(known["solution"])
     most = max(float(e["total"] or 0) for e in known.values()) or 1.0
+    refinement = shown.summary.get("refinement")
+    lowered, note = {}, ""
+    if refinement and "photo" in refinement["end"]:
+        lowered = dict(zip(stages, (refinement[k] for k in ("start", "begin", "end"))))
+        note = (
+            "<p>The NLP minimises E, its total; the refinement minimises E + E_photo, in which the"
+            " images outweigh the flow where they contradict it (at"
+            f" {refinement['contradicted']} superpixels). E may rise there.</p>"
+        )
     rows = []
     for key, energy in known.items():
         width = 100 * float(energy["total"] or 0) / most
         bar = f'<div class="length" style="width:{width:.1f}%"></div>'
-        rows.append([stages[key], *(_number(energy.get(t)) for t in terms), bar])
-    refinement = shown.summary.get("refinement")
-    note = ""
-    if refinement and "photo" in refinement["end"]:
-        first, last = (refinement[k]["total"] for k in ("begin", "end"))
-        note = (
-            f"<p>The refinement lowers E and E_photo together, from {_number(first)} to"
-            f" {_number(last)}; E alone may rise.</p>"
-        )
-    return table(["stage", *terms, ""], rows) + note
+        cells = [_number(energy.get(t)) for t in terms]
+        cells += [_number(lowered[key]["total"])] if lowered else []
+        rows.append([stages[key], *cells, bar])
+    return table(["stage", *terms, *["E + E_photo"] * bool(lowered), ""], rows) + note
 
 
 def _accuracy(shown: Result) -> str:

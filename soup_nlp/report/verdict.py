@@ -83,13 +83,7 @@ def facts(run: Run, limit: float | None = None) -> str:
         lines.append(PAD + _found(run))
     if run.refined is not None:
         lines += [PAD + line for line in refinement(run.refined)]
-    names = list(s.energy)
-    lines.append("energy      " + " " * 9 + "".join(f"{k:>11}" for k in names))
-    rows = {"start": s.energy_start, "NLP": s.energy, "solution": run.energy}
-    if run.refined is None or not s.stages:
-        del rows["NLP"]
-    for title, energy in rows.items():
-        lines.append(f"{PAD}{title:<9}" + "".join(f"{energy[k]:>11.5g}" for k in names))
+    lines += energies(run)
     own = {k: v for k, v in run.residuals.items() if k not in OF_ANSWER}
     lines.append("residuals   " + "  ".join(f"{k} {v:.1e}" for k, v in own.items()))
     answer = "  ".join(f"{k} {s.residuals[k]:.1e}" for k in OF_ANSWER if k in s.residuals)
@@ -114,20 +108,41 @@ def facts(run: Run, limit: float | None = None) -> str:
     return "\n".join(lines)
 
 
+def energies(run: Run) -> list[str]:
+    """E by stage and term, and what the refinement minimised where that is not E."""
+    s, r = run.solution, run.refined
+    rows = {"start": s.energy_start, "NLP": s.energy, "solution": run.energy}
+    if r is None or not s.stages:
+        del rows["NLP"]
+    names, lowered = list(s.energy), {}
+    if r is not None and "photo" in r.energy:
+        lowered = {"start": r.energy_start, "NLP": r.energy_begin, "solution": r.energy}
+    head = "energy      " + " " * 9 + "".join(f"{k:>11}" for k in names)
+    lines = [head + ("  E + E_photo" if lowered else "")]
+    for title, energy in rows.items():
+        line = f"{PAD}{title:<9}" + "".join(f"{energy[k]:>11.5g}" for k in names)
+        lines.append(line + (f"{lowered[title]['total']:>13.5g}" if lowered else ""))
+    return lines
+
+
 def refinement(r: Refined) -> list[str]:
     """Result of the refinement, and the gap of its last choice."""
     if not r.rounds:
         return [f"refinement: {r.status} before its first round"]
     last = r.rounds[-1]
     fall = 1 - r.energy["total"] / r.energy_begin["total"]
-    images = " with E_photo" if "photo" in r.energy else ""
+    images = " + E_photo" if "photo" in r.energy else ""
     lines = [
-        f"refinement {len(r.rounds)} rounds ({r.status}): E{images} {fall:.1%} lower; the last"
+        f"refinement {len(r.rounds)} round{'s' * (len(r.rounds) > 1)} ({r.status}): E{images}"
+        f" {fall:.1%} lower; the last"
         f" choice is at most {max(last.gap, 0) / last.mrf_energy:.2%} above the best among its"
         " particles"
     ]
     if images:
-        lines.append("E alone may rise: the images outweigh the flow where they contradict it")
+        lines.append(
+            f"the images contradict the flow at {r.contradicted} superpixels and outweigh it there:"
+            " E may rise"
+        )
     return lines
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
@@ -82,6 +85,21 @@ def test_every_option_of_the_preset_is_in_the_problem():
         found = value(problem, key)
         assert (list(found) if isinstance(found, tuple) else found) == wanted, key
     assert problem == make_problem({"input": STREET, "preset": "paper"}, overrides_of("paper"))
+
+
+def test_the_documented_departures_that_the_preset_keeps():
+    """The table of departures names their keys: the preset sets all but the listed ones."""
+    text = (Path(__file__).parents[2] / "docs" / "formulation.md").read_text()
+    table = text.split("## Departures from the paper at a glance")[1].split("`preset: paper`")[0]
+    keys = set(re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)", table.replace("../soup_nlp", "")))
+    assert keys - {key for key, _ in leaves(PRESETS["paper"])} == {
+        "energy.pixel_samples",
+        "segmentation.boundary_samples",
+        "formulation.norm",
+        "formulation.truncation",
+        "solver.eps",
+        "solver.presolve",
+    }
 
 
 def test_keys_of_the_file_and_overrides_lie_above_the_preset(tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -65,7 +67,8 @@ class TwoPlanes:
         return Soup(np.ones(n), normal, depth, turn, np.tile([SHIFT, 0.0, 0.0], (n, 1)))
 
     def look(self, soup: Soup, **changes: float) -> Photometric:
-        photo = photometric_term(self.pair, self.labels, soup, OPTIONS.replace(**changes))
+        data, o = self.data(self.flow), OPTIONS.replace(**changes)
+        photo = photometric_term(self.pair, self.labels, soup, data, o)
         assert photo is not None
         return photo
 
@@ -156,7 +159,8 @@ def test_blocks_do_not_show(two, monkeypatch):
 
 
 def test_weight_zero_leaves_the_images_out(two):
-    assert photometric_term(two.pair, two.labels, two.truth, RefineOptions(photo=0)) is None
+    o = RefineOptions(photo=0)
+    assert photometric_term(two.pair, two.labels, two.truth, two.data(two.flow), o) is None
 
 
 def test_sweep_finds_depths_that_the_start_does_not_have(two):
@@ -187,10 +191,11 @@ def test_images_repair_what_the_flow_says_wrongly(two):
     depth = np.where(patch, NEAR, two.truth.distance)
     start, w = two.soup(depth), Weights()
     photo = two.look(start)
-    done = refine_soup(start, bad, w, OPTIONS, photo=photo, seed=0)
+    done = refine_soup(start, bad, w, OPTIONS, start=two.truth, photo=photo, seed=0)
     totals = [done.energy_begin["total"], *(r.energy["total"] for r in done.rounds)]
     assert (np.diff(totals) <= 0).all()
     assert done.energy == objective(done.soup, bad, w, photo)
+    assert done.energy_start == objective(two.truth, bad, w, photo)
     scale = np.median(two.truth.distance / done.soup.distance)
     error = np.abs(scale * done.soup.depth_at(data.anchor_ray) / two.truth.distance - 1)
     assert error[patch].max() < 0.1
@@ -199,12 +204,49 @@ def test_images_repair_what_the_flow_says_wrongly(two):
     assert np.abs(scale * alone.soup.depth_at(data.anchor_ray)[patch] / FAR - 1).min() > 0.3
 
 
-def test_objective_is_e_without_images_and_its_parts_add_up(two):
+def test_objective_is_e_without_images_and_e_plus_e_photo_where_they_agree(two):
     data, w = two.data(two.flow), Weights(proj=2.0)
     assert objective(two.truth, data, w) == oracle.energy(two.truth, data, w)
-    photo = two.look(two.truth)
+    photo = replace(two.look(two.truth), contradicted=np.zeros(two.count, bool))
     own = objective(two.truth, data, w, photo)
     assert own["photo"] == pytest.approx(photo.energy(two.truth))
-    assert own["total"] == pytest.approx(sum(v for k, v in own.items() if k != "total"))
-    weak = oracle.energy(two.truth, data, w.replace(proj=0.6, sigma_proj=2.0))
-    assert own["proj"] == pytest.approx(weak["proj"])
+    E = oracle.energy(two.truth, data, w)
+    assert own == pytest.approx({**E, "total": E["total"] + own["photo"], "photo": own["photo"]})
+
+
+def test_e_proj_is_weaker_and_truncated_only_where_the_images_contradict(two):
+    data, w = two.data(two.flow), Weights(proj=2.0)
+    contradicted = np.arange(two.count) % 3 == 0
+    photo = replace(two.look(two.truth), contradicted=contradicted)
+    wrong = two.soup(np.full(two.count, 0.6 * FAR))
+    full = 2.0 * oracle.reprojection(wrong, data, w)
+    weak = 0.6 * oracle.reprojection(wrong, data, w.replace(sigma_proj=2.0))
+    assert full.max() > 4.0
+    expected = np.where(contradicted, weak, full)
+    found, _ = photo.costs_of_flow(Particles.of(wrong), data, w)
+    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-12)
+    assert objective(wrong, data, w, photo)["proj"] == pytest.approx(expected.sum())
+
+
+def test_images_contradict_where_a_soup_follows_a_wrong_flow(two):
+    data = two.data(two.flow)
+    patch = np.zeros(two.count, bool)
+    patch[np.unique(two.labels[20:40, 10:30])] = True
+    wrong = two.soup(np.where(patch, NEAR, two.truth.distance))
+    found = two.look(wrong).contradicted
+    assert found[patch].all()
+    # besides, only what leaves the view or is hidden
+    u = two.seg.anchors[:, 0]
+    assert not found[~patch & ((u < 38) | ((u > 58) & (u < 76)))].any()
+    nothing = replace(data, pixel_weight=np.zeros_like(data.pixel_weight))
+    assert not two.look(wrong).disagreeing(wrong, nothing).any()
+
+
+def test_one_round_is_enough_where_images_and_flow_agree(two):
+    data, w = two.data(two.flow), Weights()
+    photo = two.look(two.truth)
+    o = OPTIONS.replace(stagnation=0.0)
+    done = refine_soup(two.truth, data, w, o, photo=replace(photo, contradicted=np.zeros(40, bool)))
+    assert (done.status, len(done.rounds), done.contradicted) == ("agreed", 1, 0)
+    done = refine_soup(two.truth, data, w, o, photo=replace(photo, contradicted=np.ones(40, bool)))
+    assert (done.status, len(done.rounds), done.contradicted) == ("rounds", 3, 40)

@@ -212,7 +212,7 @@ def test_no_round_raises_the_energy_or_violates_constraints(units):
         assert r.spread.max() > 0
         assert sum(r.proposed.values()) <= FEW.particles * len(tiny.soup)
         if units == "pixels" and r.taken:
-            assert r.mrf_energy == pytest.approx(r.energy["total"], rel=1e-9)
+            assert r.mrf_energy == pytest.approx(r.energy["total"], rel=1e-5)
     assert set(done.rounds[0].accepted) == set(KINDS)
 
 

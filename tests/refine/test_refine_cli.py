@@ -44,7 +44,8 @@ def both(tmp_path_factory) -> Path:
     """A result folder, with what was printed in printed.txt."""
     out = tmp_path_factory.mktemp("both")
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        assert solve(out)[0] == 0
+        # a noise that the images contradict (otherwise one round is enough), too large for depth
+        assert solve(out, "--set", "flow.source=truth+noise:1")[1]["converged"]
     (out / "printed.txt").write_text(printed.getvalue())
     return out
 
@@ -64,6 +65,8 @@ def test_solve_delivers_the_refined_soup_and_keeps_the_nlps(both):
     smooth = {term: E["solution"][term] for term in ("arap", "cont", "orient")}
     assert {term: r["end"][term] for term in smooth} == pytest.approx(smooth, rel=1e-9)
     assert r["end"]["photo"] < r["begin"]["photo"]
+    assert r["start"]["total"] > r["begin"]["total"]
+    assert 0 < r["contradicted"] <= summary["sizes"]["superpixels"]
     assert set(r["rounds"][0]["accepted"]) == set(KINDS)
     with h5py.File(both / "result.h5") as file:
         for term in ("total", *TERMS):
@@ -81,6 +84,12 @@ def test_the_verdict_tells_energy_gap_and_both_depths(both):
     assert "refinement 3 rounds" in text
     assert "above the best among its particles" in text
     assert "NLP alone" in text
+    r = json.loads((both / "summary.json").read_text())["refinement"]
+    rows = text[text.index("E + E_photo\n") :].splitlines()[1:4]
+    for row, stage in zip(rows, ("start", "begin", "end")):
+        assert float(row.split()[-1]) == pytest.approx(r[stage]["total"], rel=1e-4)
+    page = (both / "report.html").read_text()
+    assert f"(at {r['contradicted']} superpixels)" in page
     assert (both / "log.txt").read_text().count("refine ") >= 3
 
 

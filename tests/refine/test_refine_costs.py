@@ -47,6 +47,10 @@ def test_costs_of_chosen_labels_are_the_exact_energy(units, at_anchors, truncate
     weights = weights_for(units, truncated)
     costs = PairCosts(tiny.data, weights)
     p = cloud(tiny, 6)
+    exactly = costs.tables(p, 1.3)
+    np.testing.assert_allclose(
+        costs.tables(p, 1.3, np.float32), exactly, rtol=1e-4, atol=1e-6 * exactly.max()
+    )
     rng = np.random.default_rng(5)
     for _ in range(4):
         labels = rng.integers(0, 6, len(tiny.soup))
