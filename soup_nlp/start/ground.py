@@ -25,7 +25,7 @@ LEVEL = 0.92
 ON, BELOW = 0.05, 0.2
 """Relative differences of inverse depth: up to the first a superpixel lies on the ground, from the
 second on it lies below."""
-LEAST_ON, MOST_BELOW = 0.1, 0.05
+LEAST_ON, MOST_BELOW = 0.05, 0.05
 """Of the area with known depth, the least share on the ground and the largest share below it."""
 STANDS = 1.35
 """Ratio to the inverse depth of the ground from which on a superpixel stands above it; superpixels
@@ -71,7 +71,8 @@ def ground(mu: Float, ray: Float, weight: Float, known: Mask, seed: int) -> Floa
         there = planes @ ray[at].T
         return np.asarray((there > 0) & (np.abs(mu[at] - there) < ON * np.abs(there)))
 
-    best = planes[np.argmax(on(planes) @ weight[at])]
+    under = (mu[at] < (1 - BELOW) * (planes @ ray[at].T)) @ weight[at]
+    best = planes[np.argmax(on(planes) @ weight[at] - under)]
     for _ in range(3):
         own = at[on(best)]
         root = np.sqrt(weight[own]) / mu[own]
