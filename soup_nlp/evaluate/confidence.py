@@ -26,7 +26,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.start.choice import LEAST_NOISE
-from soup_nlp.start.components import TIES
+from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.start.propose import Start
 
 log = logging.getLogger(__name__)
@@ -155,7 +155,7 @@ def scale_by_contact(own: Marginals, start: Start, sizes: Int) -> Float:
         start: Components, and what gives each its scale.
         sizes: (N,) pixels of every superpixel.
     """
-    contact = start.tie != TIES.index("reference")
+    contact = (start.tie != TIES.index("reference")) & (start.tie != FIXED)
     scale = np.where(contact, np.hypot(np.sqrt(own.component)[start.component], CONTACT), 0.0)
     mean = float(np.sum(sizes * np.minimum(scale, SIGMA_PRIOR)) / np.sum(sizes))
     return np.hypot(scale, mean)
@@ -217,7 +217,7 @@ def confidence(
     scale = scale_by_contact(own, start, np.bincount(rec.labels.ravel()))
     rigid = np.hypot(scale, found.sigma)
     added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), rigid)
-    added[found.guess[start.component] | start.at_rest] = LARGEST
+    added[found.guess[start.component] | start.at_rest | (start.tie == FIXED)] = LARGEST
     sigma = calibrated(spread, noise, misfit[rec.labels], bends=bends, added=added[rec.labels])
     component_sigma = with_prior(np.sqrt(own.component))
     return Confidence(sigma, spread, own, noise, component_sigma, misfit, found, added)

@@ -10,7 +10,7 @@ import numpy as np
 from soup_nlp.arrays import Mask
 from soup_nlp.evaluate.confidence import MOST_SIGMA, scale_by_contact
 from soup_nlp.geometry.surface import hidden
-from soup_nlp.start.components import TIES
+from soup_nlp.start.components import FIXED, TIES
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run
@@ -19,6 +19,7 @@ WORDS = {
     "flow": "by flow and parallax",
     "contact": "with the scale of a contact",
     "outline": "with the scale of an outline",
+    "fixed": "stands still in the image while the camera moves",
     "unseen": "no usable flow",
     "rest": "the camera only turns or stands still",
     "flat": "a turn alone or a constant depth explains the flow nearly as well",
@@ -27,7 +28,7 @@ WORDS = {
 }
 
 
-GUESSES = ("rest", "unseen", "flat", "scale", "weak")
+GUESSES = ("rest", "fixed", "unseen", "flat", "scale", "weak")
 """Reasons of guesses, each where those before it do not hold."""
 
 
@@ -37,8 +38,9 @@ def certainty(run: Run) -> dict[str, float]:
     Returns:
         "determined": share with a sigma of log depth of at most `MOST_SIGMA`; the sum of "flow"
         (pixels of the largest component), "contact" and "outline" (pixels of other components, by
-        the source of their scale). "guess": the rest; the sum of "unseen" (no usable flow, or
-        hidden in the next frame), "rest" (the camera is at rest or only turns), "flat" (of a
+        the source of their scale). "guess": the rest; the sum of "rest" (the camera is at rest or
+        only turns), "fixed" (stands still in the image though the camera moves, such as the bonnet
+        of its car), "unseen" (no usable flow, or hidden in the next frame), "flat" (of a
         component without evidence of depth, see `Evidence.guess`), "scale" (of a component whose
         scale alone is that uncertain) and "weak". "median_sigma": median over the determined
         pixels.
@@ -49,12 +51,13 @@ def certainty(run: Run) -> dict[str, float]:
     tie = start.tie[labels]
     assert run.pair.flow is not None
     unseen = (run.pair.flow.confidence <= 0) | hidden(run.reconstruction)
-    rest = np.full(labels.shape, start.at_rest)
+    rest, fixed = np.full(labels.shape, start.at_rest), tie == FIXED
     flat = run.confidence.evidence.guess[start.component][labels]
     sizes = run.segmentation.sizes
     scale = scale_by_contact(run.confidence.marginals, start, sizes)[labels] > MOST_SIGMA
     guess, left = {}, ~sure
-    for name, mask in (("rest", rest), ("unseen", unseen), ("flat", flat), ("scale", scale)):
+    reasons = {"rest": rest, "fixed": fixed, "unseen": unseen, "flat": flat, "scale": scale}
+    for name, mask in reasons.items():
         guess[name] = left & mask
         left = left & ~mask
 

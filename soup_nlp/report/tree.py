@@ -74,7 +74,7 @@ _START: Table = {
         "1",
         "N",
         "what gives its component a scale: 0 largest, 1 contact below, 2 outline,"
-        " 3 cut off below, 4 nothing, 5 ground",
+        " 3 cut off below, 4 nothing, 5 ground, 6 fixed in the image",
     ),
     "bends": ("1", "N", "in a region with the energy for surfaces that bend"),
     "bending": ("1", "", "a region bends"),

@@ -90,11 +90,21 @@ BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 UNKNOWN = np.log(100.0)
 """If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
-TIES = ("reference", "contact below", "outline", "cut off below", "nothing", "ground")
+TIES = (
+    "reference",
+    "contact below",
+    "outline",
+    "cut off below",
+    "nothing",
+    "ground",
+    "fixed in the image",
+)
 """What gives a component its scale. reference: it is the largest component and defines the scale.
 contact below: it stands on its lower neighbours. outline: it touches its neighbours. cut off below:
 the lower image border hides what it stands on. nothing: it has no neighbour with a scale. ground:
-it was lifted to the ground."""
+it was lifted to the ground. fixed in the image: it stands still there, though the camera moves,
+and is placed by its outline."""
+FIXED = TIES.index("fixed in the image")
 UNSUPPORTED = 1e-6
 """Added to the placed share of a component's support, so that the longest contact goes first where
 no support is placed."""
@@ -137,7 +147,12 @@ def outlines(label: Int, seg: Segmentation) -> Outlines:
 
 
 def contact_scales(
-    soup: Soup, label: Int, seg: Segmentation, K_ref: Float, upright: bool = True
+    soup: Soup,
+    label: Int,
+    seg: Segmentation,
+    K_ref: Float,
+    upright: bool = True,
+    fixed: Mask | None = None,
 ) -> tuple[Float, Int]:
     """Relative scale of every component, such that components touch what is around them.
 
@@ -151,6 +166,7 @@ def contact_scales(
     Components are placed one after the other, in the order of their contact length with placed
     components times the placed share of their lower neighbours (1 where there are none). The roof
     of a car that is cut into pieces is thus placed after its wheels, and not on the background.
+    Nothing stands on what is fixed in the image.
 
     Args:
         soup: Planes, every motion in its own scale.
@@ -158,6 +174,7 @@ def contact_scales(
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
         upright: Whether the image is upright.
+        fixed: (N,) True in components that are fixed in the image.
 
     Returns:
         (N,) scale of every superpixel's component, and (N,) its origin, an index of `TIES`.
@@ -171,8 +188,15 @@ def contact_scales(
         return np.ones(len(soup)), tie[label]
     zi, zk = depth_from_inside(soup, label, seg, K_ref)
     ratio = np.log(np.concatenate([zk / zi, zi / zk]))
-    a, b, contact, below, weight, _ = outlines(label, seg)
-    below = below & upright
+    at_camera = np.zeros(count, bool)
+    if fixed is not None:
+        at_camera[label[fixed]] = True
+    around = outlines(label, seg)
+    keep = ~at_camera[around.other]
+    a, b, contact, weight = (
+        v[keep] for v in (around.component, around.other, around.contact, around.weight)
+    )
+    ratio, below = ratio[keep], around.below[keep] & upright
     support = np.bincount(a[below], weight[below], minlength=count)
     placed = np.zeros(count, bool)
     placed[largest] = True
@@ -199,14 +223,15 @@ def contact_scales(
             tie[c] = TIES.index("outline")
         placed[c] = True
     if upright:
-        nearer = nearer_where_cut_off(soup, label, log_scale, seg, K_ref)
+        nearer = nearer_where_cut_off(soup, label, log_scale, seg, K_ref, at_camera)
         log_scale -= nearer
         tie[nearer > 0] = TIES.index("cut off below")
+    tie[at_camera] = FIXED
     return np.exp(log_scale)[label], tie[label]
 
 
 def nearer_where_cut_off(
-    soup: Soup, label: Int, log_scale: Float, seg: Segmentation, K_ref: Float
+    soup: Soup, label: Int, log_scale: Float, seg: Segmentation, K_ref: Float, fixed: Mask
 ) -> Float:
     """(C,) log factor by which components cut off by the lower image border come nearer.
 
@@ -222,11 +247,12 @@ def nearer_where_cut_off(
         log_scale: (C,) scale of every component by contact, in logarithms.
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
+        fixed: (C,) True for components that are fixed in the image, which stay where they are.
     """
     count = len(log_scale)
     scene = int(np.argmax(np.bincount(label, minlength=count)))
     ends = label[seg.pairs]
-    group_of = connected(ends[(ends != scene).all(axis=1)], count)
+    group_of = connected(ends[((ends != scene) & ~fixed[ends]).all(axis=1)], count)
     group, groups = group_of[label], int(group_of.max()) + 1
     # support of a group, visible and beyond the border, weighted by the squared height difference
     around = outlines(group, seg)
@@ -241,7 +267,7 @@ def nearer_where_cut_off(
     far = np.linalg.norm(moved, axis=1) * np.exp(log_scale)[label]
     pace = np.median(far[label == scene])
     nearer = np.zeros(count)
-    for g in np.flatnonzero((hidden > seen) & (np.arange(groups) != group_of[scene])):
+    for g in np.setdiff1d(np.flatnonzero(hidden > seen), group_of[[scene, *np.flatnonzero(fixed)]]):
         own = float(np.median(far[group == g]))
         if pace < own < pace * np.exp(UNKNOWN):
             nearer[group_of == g] = 0.5 * np.log(own / pace)

@@ -24,6 +24,7 @@ from soup_nlp.start.bending import (
 )
 from soup_nlp.start.choice import LEAST_NOISE, Choice, limited_noise, rigid_choice
 from soup_nlp.start.components import (
+    FIXED,
     TIES,
     borrow,
     connected_labels,
@@ -34,6 +35,7 @@ from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import above_ground, floating, ground
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import earned, gather
+from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
 from soup_nlp.start.regions import surface_motions
 from soup_nlp.start.settle import settle
 from soup_nlp.start.start_options import SeededStart
@@ -126,6 +128,10 @@ def propose(
         return _of_homographies(views, seg, o)
     affine, residual = affine_flow(views)
     jump = flow_jump(affine, views, seg.pairs, rays(K_ref, seg.boundary))
+    fixed, shift = np.zeros(len(seg), bool), np.zeros(len(seg))
+    if np.array_equal(K_ref, K_next):
+        fixed, shift = fixed_to_camera(views, seg, jump, o)
+    views, poor = views.without(fixed), poor | fixed
     surface, usable = surfaces(jump, seg, o.discontinuity_px), views.weight.mean(axis=1) > SURE
     centre = np.concatenate([affine[:, 0] / views.focal, np.ones((len(seg), 1))], axis=1)
     motions, bends = surface_motions(views, seg, surface, residual, usable, o)
@@ -153,8 +159,14 @@ def propose(
         soup, error = soup.taking(free[0], bends), np.where(bends, free[1], error)
         parallax = np.where(bends, _parallax(free[0], views), parallax)
         label = np.where(bends, -1, label)
-        component = _with_bending(component, bends, seg)
-    scale, tie = contact_scales(soup, component, seg, K_ref, o.upright)
+        component = with_regions(component, bends, seg)
+    if fixed.any():
+        at_camera = Soup(soup.lam, soup.n, soup.d, 0 * soup.R + np.eye(3), 0 * soup.t)
+        soup, error = soup.taking(at_camera, fixed), np.where(fixed, shift, error)
+        parallax, label = np.where(fixed, 0.0, parallax), np.where(fixed, -1, label)
+        component = with_regions(component, fixed, seg)
+        wrong |= fixed & (shift > STILL_PX)
+    scale, tie = contact_scales(soup, component, seg, K_ref, o.upright, fixed)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t)
     grounded = np.zeros(len(seg), bool)
     if o.upright and o.ground:
@@ -212,10 +224,10 @@ def _constant(
     return Start(*found, ~every, at_rest=turn is not None, noise=noise)
 
 
-def _with_bending(component: Int, bends: Mask, seg: Segmentation) -> Int:
-    """(N,) components without gaps in their numbers; each connected region that bends is one."""
-    region = connected_labels(bends[seg.pairs[:, 0]] & bends[seg.pairs[:, 1]], seg)
-    component = np.where(bends, component.max() + 1 + region, component)
+def with_regions(component: Int, mask: Mask, seg: Segmentation) -> Int:
+    """(N,) components without gaps in their numbers; each connected region of a mask is one."""
+    region = connected_labels(mask[seg.pairs[:, 0]] & mask[seg.pairs[:, 1]], seg)
+    component = np.where(mask, component.max() + 1 + region, component)
     return np.unique(component, return_inverse=True)[1].ravel()
 
 
@@ -252,7 +264,7 @@ def _on_ground(
     area = np.bincount(seg.labels.ravel()).astype(float)
     floor = ground(1 / soup.depth_at(anchor), anchor, area, known, o.seed)
     soup, lifted = above_ground(soup, anchor, area, known, component, floor)
-    tie = np.where(lifted, TIES.index("ground"), tie)
+    tie = np.where(lifted & (tie != FIXED), TIES.index("ground"), tie)
     middle = rays(K_ref, seg.boundary.mean(axis=1))
     lam, component = soup.lam.copy(), component.copy()
     for region, farther in floating(soup, seg, anchor, middle, floor, component):

@@ -9,7 +9,7 @@ import pytest
 
 from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR
 from soup_nlp.report.certainty import GUESSES, certainty, certainty_lines, guess_reason
-from soup_nlp.start.components import TIES
+from soup_nlp.start.components import FIXED, TIES
 
 REASONS = GUESSES
 
@@ -60,3 +60,12 @@ def test_a_camera_at_rest_is_the_reason_of_every_guess(small_run):
     found = certainty(unsure(rest))
     assert found["rest"] == 1.0
     assert "turns or stands still" in guess_reason(found)
+
+
+def test_what_is_fixed_in_the_image_is_named(small_run):
+    start = small_run.start
+    tie = np.where(start.component == start.component[0], FIXED, start.tie)
+    found = certainty(unsure(replace(small_run, start=replace(start, tie=tie))))
+    own = (tie == FIXED)[small_run.segmentation.labels]
+    assert found["fixed"] == pytest.approx(own.mean())
+    assert "stands still in the image while the camera moves" in certainty_lines(found)[0]

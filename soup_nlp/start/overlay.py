@@ -1,0 +1,120 @@
+"""What stands still in the image while the camera moves: bonnet, logo, text, dirt on the lens.
+
+It is fixed to the camera, or moves as the camera does, so that its flow says nothing about depth,
+and nothing about the camera's motion either. A distant region stands still as well, but its depth
+under the camera's motion explains that. The flow of a fixed region contradicts every depth from the
+ground, where there is one, to infinity.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import Delaunay
+
+from soup_nlp.arrays import Float, Mask
+from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.start.choice import PIECE_SIZE, dominant
+from soup_nlp.start.components import connected_labels
+from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.ground import BELOW, ground
+from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import Views
+
+STILL_PX = 1.0
+"""Mean displacement up to which a superpixel may stand still, pixels: it may reflect what moves."""
+CONTRADICTED_PX = 0.5
+"""Least error of the best depth, pixels, beside the displacement."""
+LEAST_SCENE = 0.6
+"""Least share of the superpixels that the camera's motion explains; if it is less, what stands
+still may be the scene."""
+LEAST_SHARE = 0.5
+"""Least share of still superpixels in a piece with continuous flow."""
+LEAST_PARALLAX_PX = 0.25
+"""Parallax from which a superpixel counts for the ground, pixels."""
+
+
+def fixed_to_camera(
+    views: Views, seg: Segmentation, jump: Float, o: SeededStart
+) -> tuple[Mask, Float]:
+    """(N,) True where the image stands still, which the camera's motion contradicts.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        seg: Superpixels and graphs.
+        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
+        o: Inlier distance, seed, where a surface ends, and whether there may be ground.
+
+    Returns:
+        The mask, and (N,) the mean displacement of every superpixel, pixels.
+    """
+    none, usable = np.zeros(len(seg), bool), views.weight.mean(axis=1) > 0.5
+    shift = _distance(views, views.ray)
+    may = usable & (shift < STILL_PX)
+    if may.sum() < PIECE_SIZE:
+        return none, shift
+    camera = dominant(views.without(may | ~usable), o)[0]
+    error = _error_under(camera, views, seg, usable & ~may, o)
+    if (error[usable] < CONTRADICTED_PX).sum() < LEAST_SCENE * usable.sum():
+        return none, shift
+    may &= error - shift > CONTRADICTED_PX
+    moves = ~usable | (error > CONTRADICTED_PX)
+    i, k = seg.pairs.T
+    piece = connected_labels(moves[i] & moves[k] & (jump < o.discontinuity_px), seg)
+    count, own = (np.bincount(piece, m, minlength=len(seg)) for m in (usable & moves, may))
+    core = may & ((own >= PIECE_SIZE) & (own >= LEAST_SHARE * count))[piece]
+    return core | (moves & towards_border(core, seg)), shift
+
+
+def _error_under(
+    camera: Motion, views: Views, seg: Segmentation, known: Mask, o: SeededStart
+) -> Float:
+    """(N,) mean error, pixels, of the best depth up to infinity, or up to that of the ground."""
+    fit = views.fit([camera])
+    mu, error = fit.inverse_depth[:, 0], fit.penalised()[:, 0]
+    if not (o.upright and o.ground):
+        return error
+    known = known & (error < CONTRADICTED_PX) & (mu > 0)
+    known &= fit.parallax[:, 0] * np.abs(mu) > LEAST_PARALLAX_PX
+    area = np.bincount(seg.labels.ravel()).astype(float)
+    floor = ground(mu, views.anchor, area, known, o.seed)
+    least = (1 - BELOW) * floor
+    moved = views.ray @ camera.R.T + np.maximum(mu, least)[:, None, None] * camera.t
+    lifted = _distance(views, moved)
+    return np.where(mu < least, np.maximum(error, lifted), error)
+
+
+def _distance(views: Views, moved: Float) -> Float:
+    """(N,) mean distance of points (N, S, 3) of the next camera from the flow's targets, pixels."""
+    off = (moved[..., :2] / moved[..., 2:] - views.target[..., :2]) * np.asarray(views.focal)
+    total = np.maximum(views.weight.sum(axis=1), 1e-9)
+    return np.asarray(np.sum(views.weight * np.linalg.norm(off, axis=2), axis=1) / total)
+
+
+def towards_border(core: Mask, seg: Segmentation) -> Mask:
+    """(N,) True between the image border and the regions of `core` that touch it.
+
+    A bonnet reflects what moves, so that only parts of it stand still. The rest of it lies in the
+    convex hull of these parts and the border, for each side of the image by itself.
+
+    Args:
+        core: (N,) True where the image certainly stands still.
+        seg: Superpixels and graphs.
+    """
+    height, width = seg.labels.shape
+    i, k = seg.pairs.T
+    region = connected_labels(core[i] & core[k], seg)
+    x, y = seg.anchors.T
+    side = np.argmin(np.stack([y, height - 1 - y, x, width - 1 - x]), axis=0)
+    lines = seg.labels[0], seg.labels[-1], seg.labels[:, 0], seg.labels[:, -1]
+    inside = np.zeros(len(seg), bool)
+    for s, (line, at) in enumerate(zip(lines, (0, height - 1, 0, width - 1))):
+        reach = core & (side == s) & np.isin(region, region[line[core[line]]])
+        if reach.sum() < PIECE_SIZE:
+            continue
+        own = seg.anchors[reach]
+        foot = own.copy()
+        foot[:, 1 if s < 2 else 0] = at
+        # joggled, because the points may lie on one line
+        hull = Delaunay(np.concatenate([own, foot]), qhull_options="QJ")
+        inside |= hull.find_simplex(seg.anchors) >= 0
+    return inside

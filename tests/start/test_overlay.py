@@ -1,0 +1,108 @@
+"""What stands still in the image while the camera moves: found, apart from the scene, a guess."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soup_nlp.data.pair import Flow
+from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.start.components import FIXED
+from soup_nlp.start.overlay import towards_border
+from soup_nlp.start.propose import SeededStart, propose
+
+K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
+H, W, TILE = 120, 160, 10
+AHEAD, TURN = np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.02, 0.0])
+
+
+@pytest.fixture(scope="module")
+def seg():
+    v, u = np.mgrid[0:H, 0:W]
+    labels = (v // TILE * (W // TILE) + u // TILE).astype(np.int32)
+    noise = np.random.default_rng(0).integers(0, 255, (H, W, 3), dtype=np.uint8)
+    return build_segmentation(labels, noise, neighbours=6)
+
+
+def scene_flow(turn=TURN, shift=AHEAD):
+    """Flow of a camera above the ground, before blocks at 4 to 9 and a sky at 1000."""
+    uv = camera.pixel_grid(H, W)
+    ray = camera.rays(K, uv)
+    block = 4.0 + 5.0 * np.random.default_rng(1).random((H // 20, W // 20)).repeat(20, 0).repeat(
+        20, 1
+    )
+    depth = np.where(
+        ray[..., 1] > 0.1, np.minimum(1.0 / np.maximum(ray[..., 1], 0.1), block), block
+    )
+    depth[:20] = 1000.0
+    X = depth[..., None] * ray @ rotation.exp(turn).T + shift
+    return (camera.project(K, X) - uv).astype(np.float32)
+
+
+def start_of(seg, flow, **options):
+    every = np.ones(flow.shape[:2], np.float32)
+    return propose(seg, Flow(flow, every, "made"), K, K, SeededStart(**options))
+
+
+def share(start, seg, mask):
+    """Shares of a mask's pixels and of the others that are fixed in the image."""
+    fixed = (start.tie == FIXED)[seg.labels]
+    return fixed[mask].mean(), fixed[~mask].mean()
+
+
+@pytest.mark.parametrize("where", [np.s_[40:70, 60:100], np.s_[90:, :], np.s_[:30, 120:]])
+def test_a_region_that_stands_still_while_the_camera_turns_is_fixed(seg, where):
+    flow, mask = scene_flow(), np.zeros((H, W), bool)
+    mask[where] = True
+    flow[mask] = 0.0
+    start = start_of(seg, flow)
+    found, false = share(start, seg, mask)
+    assert found > 0.9
+    assert false < 0.02
+    at = start.tie == FIXED
+    np.testing.assert_array_equal(start.soup.t[at], 0.0)
+    assert not set(start.component[at]) & set(start.component[~at])
+    # the rest is as it would be without
+    clean = start_of(seg, scene_flow())
+    ray = camera.rays(K, seg.anchors)
+    log = np.log(start.soup.depth_at(ray) / clean.soup.depth_at(ray))[~at & ~clean.borrowed]
+    assert np.median(np.abs(log - np.median(log))) < 0.02
+
+
+def test_a_bonnet_stands_still_before_a_camera_that_drives_straight(seg):
+    # no rotation: infinity stands still as well, but not below the horizon
+    flow, mask = scene_flow(np.zeros(3)), np.zeros((H, W), bool)
+    mask[100:] = True
+    flow[mask] = 0.0
+    found, false = share(start_of(seg, flow), seg, mask)
+    assert found > 0.9
+    assert false < 0.02
+
+
+def test_a_far_region_is_part_of_the_scene(seg):
+    flow = scene_flow(np.zeros(3))
+    assert np.linalg.norm(flow[:20], axis=2).max() < 0.1
+    assert not (start_of(seg, flow).tie == FIXED).any()
+
+
+def test_the_scene_before_a_resting_camera_is_not_fixed(seg):
+    flow = np.zeros((H, W, 2), np.float32)
+    flow[30:90, 30:110] = scene_flow()[30:90, 30:110]
+    assert not (start_of(seg, flow).tie == FIXED).any()
+
+
+def test_a_mover_with_a_flow_of_its_own_is_not_fixed(seg):
+    flow = scene_flow()
+    flow[50:80, 50:100] = [3.0, -2.0]
+    assert not (start_of(seg, flow).tie == FIXED).any()
+
+
+def test_the_part_between_still_parts_and_the_border_belongs_to_them(seg):
+    x, y = seg.anchors.T
+    core = (y > 90) & ((x < 40) | (x > 110)) & (x > 15) & (x < 145)
+    inside = towards_border(core, seg)
+    assert inside[(y > 100) & (x > 30) & (x < 130)].all()
+    assert not inside[y < 80].any()
+    # what does not touch the border stands for itself
+    assert not towards_border((np.abs(y - 60) < 12) & (np.abs(x - 80) < 20), seg).any()
