@@ -15,10 +15,10 @@ from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
 from soup_nlp.bench.solvers.runner import make_tasks
-from soup_nlp.cli.options import Formulations, Overwrite, Presolve, Set, Superpixels
+from soup_nlp.cli.options import Coordinates, Formulations, Overwrite, Presolve, Set, Superpixels
 from soup_nlp.config.problem import load_problem, title
 from soup_nlp.errors import ConfigError, StoppedError
-from soup_nlp.export.artefact import parse_formulation
+from soup_nlp.export.artefact import parse_formulations
 from soup_nlp.export.verify import Limits
 from soup_nlp.family.results import write_results
 from soup_nlp.pipeline.case import prepare
@@ -40,6 +40,7 @@ def compare(
         str, typer.Option(help="Comma-separated, or all; a program that reads .nl may be named.")
     ] = "all",
     formulation: Formulations = None,
+    coordinates: Coordinates = "matrix",
     superpixels: Superpixels = None,
     seconds: Annotated[float, typer.Option(help="CPU time limit of a run.")] = 60.0,
     iterations: Annotated[int, typer.Option(help="Iteration limit of a run.")] = 300,
@@ -65,7 +66,7 @@ def compare(
         raise ConfigError("no solver is named", where="--solvers", found=solvers)
     for name in names:
         find_solver(name)
-    forms = [parse_formulation(text) for text in formulation or []] or [{}]
+    forms = parse_formulations(formulation, coordinates)
     limits = Limits(seconds, iterations, tol, int(memory * 2**30))
     sizes = [[f"segmentation.superpixels={n}"] for n in superpixels or ()] or [[]]
     # load all problems first: a wrong file must not stop after hours of runs

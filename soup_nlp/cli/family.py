@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.cli.options import Overwrite, numbers
+from soup_nlp.cli.options import Coordinates, Overwrite, numbers
 from soup_nlp.errors import DataError
+from soup_nlp.export.artefact import parse_formulations
 from soup_nlp.family.instances import SCENES, SIZES, STANDARD, STARTS, select
 from soup_nlp.family.write import write_family
 from soup_nlp.storage.folders import claim, staged
@@ -34,6 +35,7 @@ def family(
         list[str] | None,
         typer.Option("--formulation", help="gauge/norm/truncation; may be repeated."),
     ] = None,
+    coordinates: Coordinates = "matrix",
     starts: Annotated[
         str, typer.Option(help="easy (presolved), hard (proposal), cold (constant depth).")
     ] = _list(STARTS),
@@ -45,7 +47,8 @@ def family(
         [word.strip() for word in text.split(",") if word.strip()] for text in (scenes, starts)
     )
     names, begins = parts
-    chosen = select(wanted, names, formulation or [STANDARD], begins)
+    forms = ["/".join(form.values()) for form in parse_formulations(formulation, coordinates)]
+    chosen = select(wanted, names, [form or STANDARD for form in forms], begins)
     if out.is_dir() and any(out.iterdir()) and not (out / "index.json").is_file():
         raise DataError(
             "folder holds other files", where=out, expected="a new or empty folder, or a set"

@@ -44,6 +44,10 @@ Formulations = Annotated[
         "--formulation", help="gauge/norm/truncation, e.g. free/epigraph/lifted; may be repeated."
     ),
 ]
+Coordinates = Annotated[
+    str,
+    typer.Option(help="matrix, or tangent: nine per superpixel about the proposal, without gauge."),
+]
 Superpixels = Annotated[
     list[int] | None, typer.Option(help="Wanted number, 50 to 2000; may be repeated.")
 ]

@@ -11,6 +11,7 @@ import typer
 
 from soup_nlp.cli.options import (
     PROBLEM,
+    Coordinates,
     Formulations,
     Overwrite,
     PresetName,
@@ -24,7 +25,7 @@ from soup_nlp.cli.options import (
 from soup_nlp.config.presets import PRESETS, dump_preset
 from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
 from soup_nlp.errors import ConfigError, DataError, printable
-from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_formulation
+from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_formulations
 from soup_nlp.export.manifest import EXPORT_FILES
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.files import MOST_YAML, is_folder, read_text
@@ -86,6 +87,7 @@ def export(
         Path | None, typer.Option("--out", "-o", help="Output folder; default out/export-NAME.")
     ] = None,
     formulation: Formulations = None,
+    coordinates: Coordinates = "matrix",
     superpixels: Superpixels = None,
     format_: Annotated[
         list[str] | None,
@@ -97,14 +99,14 @@ def export(
     quiet: Quiet = False,
 ) -> None:
     """Write the NLP for other solvers; several sizes or formulations make a folder each."""
-    forms = [parse_formulation(text) for text in formulation or []] or [{}]
+    forms = parse_formulations(formulation, coordinates)
     # without repetitions
     sizes: list[int | None] = [*dict.fromkeys(superpixels or ())] or [None]
     several = len(sizes) * len(forms) > 1
     written = set()
     for size, form in product(sizes, forms):
         own = [] if size is None else [f"segmentation.superpixels={size}"]
-        own += [f"formulation.{k}={v}" for k, v in form.items()]
+        own += [f"formulation.{k}={v}" for k, v in form.items() if k != "coordinates"]
         chosen = load_problem(problem, [*(overrides or []), *own])
         out = out or default_folder(f"export-{chosen.name}", chosen.subject)
         if not several:
@@ -114,7 +116,7 @@ def export(
             case = prepare(chosen, presolve)
         # the same soup in another formulation
         here = replace(case, problem=chosen)
-        style = here.formulation()
+        style = here.formulation(coordinates=form.get("coordinates", "matrix"))
         # the name has the wanted size, since two sizes may give the same number of superpixels
         asked = chosen.segmentation.superpixels
         name = f"{chosen.name}-{asked}-{form_label(style).replace('/', '-')}"

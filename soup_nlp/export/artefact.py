@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import casadi as ca
 import numpy as np
@@ -25,8 +25,8 @@ from soup_nlp.export.manifest import (
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.model import oracle
-from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import GAUGES, MatrixLayout
+from soup_nlp.model.formulation import Coordinates, Formulation
+from soup_nlp.model.layout import GAUGES, MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP, to_scipy
 from soup_nlp.pipeline import Case
 from soup_nlp.storage.atomic import write_text
@@ -39,12 +39,16 @@ INFORMATION = (
     "triu Gauss-Newton information of E at the start in nine coordinates a superpixel: relative"
     " inverse depth at the anchor, its slopes (2), rotation (3), shift of the anchor (3)"
 )
-CHOICES = {"gauge": GAUGES, "norm": NORMS, "truncation": TRUNCATIONS}
+TANGENT = "tangent"
+"""Stands in the place of a gauge for tangent coordinates, which have none."""
+CHOICES = {"gauge": (*GAUGES, TANGENT), "norm": NORMS, "truncation": TRUNCATIONS}
 """Values of each part of a formulation, in the order of its label."""
 
 
 def parse_formulation(text: str) -> dict[str, str]:
     """Parse `gauge/norm/truncation`; missing parts are those of the problem file.
+
+    "tangent" in the place of a gauge becomes `coordinates`.
 
     Raises:
         ConfigError: a word is not one of the choices.
@@ -59,12 +63,39 @@ def parse_formulation(text: str) -> dict[str, str]:
             raise ConfigError(
                 f"unknown {key}", where="--formulation", found=word, expected=", ".join(choices)
             )
-    return dict(zip(CHOICES, words))
+    out = dict(zip(CHOICES, words))
+    if out.get("gauge") == TANGENT:
+        out = {"coordinates": out.pop("gauge"), **out}
+    return out
+
+
+def parse_formulations(texts: Sequence[str] | None, coordinates: str) -> list[dict[str, str]]:
+    """Formulations of the command line, all of them in the coordinates.
+
+    Raises:
+        ConfigError: a word is unknown, or a gauge is named for tangent coordinates.
+    """
+    known = get_args(Coordinates)
+    if coordinates not in known:
+        expected = ", ".join(known)
+        raise ConfigError(
+            "unknown coordinates", where="--coordinates", found=coordinates, expected=expected
+        )
+    forms = [parse_formulation(text) for text in texts or []] or [{}]
+    if coordinates == TANGENT:
+        for form in forms:
+            if "gauge" in form:
+                raise ConfigError(
+                    "tangent coordinates have no gauge", where="--formulation", found=form["gauge"]
+                )
+        forms = [{"coordinates": coordinates, **form} for form in forms]
+    return forms
 
 
 def form_label(form: Formulation) -> str:
-    """`gauge/norm/truncation`."""
-    return f"{form.gauge}/{form.norm}/{form.truncation}"
+    """`gauge/norm/truncation`, with "tangent" in the place of a gauge."""
+    first = TANGENT if form.coordinates == TANGENT else form.gauge
+    return f"{first}/{form.norm}/{form.truncation}"
 
 
 def export_case(
@@ -109,7 +140,7 @@ def _write_files(
     earlier: Path,
     case: Case,
     form: Formulation,
-    program: tuple[NLP, MatrixLayout],
+    program: tuple[NLP, MatrixLayout | TangentLayout],
     formats: Sequence[str],
     presolved: bool,
 ) -> dict[str, Any]:
@@ -141,14 +172,14 @@ def _write_files(
 
 
 def _description(
-    case: Case, form: Formulation, nlp: NLP, layout: MatrixLayout, file: NLFile
+    case: Case, form: Formulation, nlp: NLP, layout: MatrixLayout | TangentLayout, file: NLFile
 ) -> dict[str, Any]:
     """Entries of the manifest that follow from the problem and its .nl file."""
     return {
         "name": case.problem.name,
         "problem_hash": case.problem.digest(),
         "versions": versions(),
-        "formulation": {k: getattr(form, k) for k in CHOICES},
+        "formulation": {k: getattr(form, k) for k in (*CHOICES, "coordinates")},
         "smoothing": {"eps": form.eps, "eps_pixel": form.eps_pixel},
         "sizes": {
             "superpixels": len(case),
@@ -164,7 +195,7 @@ def _description(
     }
 
 
-def fingerprint(case: Case, nlp: NLP, layout: MatrixLayout) -> dict[str, float]:
+def fingerprint(case: Case, nlp: NLP, layout: MatrixLayout | TangentLayout) -> dict[str, float]:
     """f and |g| at the proposal with all slack variables and switches at 1/2."""
     x = np.full(nlp.nx, 0.5)
     x[: layout.size] = layout.pack(case.start.soup)

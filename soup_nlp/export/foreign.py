@@ -20,7 +20,7 @@ from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine, violations
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline import Case, Run, make_run, prepare
 from soup_nlp.solve.ipopt import Stage
@@ -121,7 +121,7 @@ def sol_table(imported: Imported) -> list[Kind]:
     return rows + [kind(k, v, KKT_LIMIT, False) for k, v in imported.violations.items()]
 
 
-def _orders(folder: Path, nlp: NLP, layout: MatrixLayout) -> tuple[Any, Any]:
+def _orders(folder: Path, nlp: NLP, layout: MatrixLayout | TangentLayout) -> tuple[Any, Any]:
     """Orders of variables and rows in the file, from its names."""
     out = []
     for suffix, names in zip((".col", ".row"), readable_names(nlp, layout)):
@@ -144,7 +144,12 @@ def _orders(folder: Path, nlp: NLP, layout: MatrixLayout) -> tuple[Any, Any]:
 
 
 def foreign_run(
-    case: Case, form: Formulation, nlp: NLP, layout: MatrixLayout, answer: Sol, source: str
+    case: Case,
+    form: Formulation,
+    nlp: NLP,
+    layout: MatrixLayout | TangentLayout,
+    answer: Sol,
+    source: str,
 ) -> Run:
     """A run whose solution is the answer of another solver.
 
@@ -183,14 +188,17 @@ def foreign_run(
         for group in nlp.groups
         if group.kernel.nc
     }
+    rest = residuals(nlp, soup, stage, case.data, form.min_facing)
+    # a run holds its last iterate in matrices
+    matrices = MatrixLayout(case.data.share, form.gauge).pack(own)
     solution = Solution(
         soup=soup,
         status=status,
         converged=good,
-        stages=(stage,),
+        stages=(replace(stage, x=matrices),),
         energy_start=start,
         energy=energy,
-        residuals=residuals(nlp, soup, stage, case.data, form.min_facing),
+        residuals=rest,
         multipliers={"lam_x": found.lam_x, **parts},
         nlp=nlp.sizes(),
         description=str(nlp),

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError, create_model
 
 from soup_nlp.errors import ExportError
+from soup_nlp.model.formulation import Coordinates
 from soup_nlp.model.layout import GAUGES
 from soup_nlp.storage.files import read_json
 
@@ -36,7 +37,11 @@ _Best = _record("Best", exact_energy=FiniteFloat, found_by=str)
 _Manifest = _record(
     "Manifest",
     formulation=_record(
-        "Formulation", gauge=Literal[GAUGES], norm=Literal[NORMS], truncation=Literal[TRUNCATIONS]
+        "Formulation",
+        gauge=Literal[GAUGES],
+        norm=Literal[NORMS],
+        truncation=Literal[TRUNCATIONS],
+        coordinates=Coordinates,
     ),
     smoothing=_record("Smoothing", eps=FiniteFloat, eps_pixel=FiniteFloat),
     fingerprint=_record("Fingerprint", objective=FiniteFloat, constraints=FiniteFloat),

@@ -7,16 +7,16 @@ import numpy as np
 from soup_nlp.arrays import Int
 from soup_nlp.errors import ExportError
 from soup_nlp.model.kernel import Group
-from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 
 
-def readable_names(nlp: NLP, layout: MatrixLayout) -> tuple[list[str], list[str]]:
-    """Unique names of variables and constraints of the constrained NLP.
+def readable_names(nlp: NLP, layout: MatrixLayout | TangentLayout) -> tuple[list[str], list[str]]:
+    """Unique names of variables and constraints of an exported NLP.
 
     The first index is the superpixel; for an edge or a neighbour pair the first two indices are the
     two superpixels. A further index counts from 1: the rows of R'R = I in the order 11 12 22 13 23
-    33, rim rays (1 is the anchor), or sampled pixels.
+    33, rim rays (in matrix coordinates 1 is the anchor), or sampled pixels.
     """
     x_names, g_names = nlp.x_names(), nlp.g_names()
     for group in nlp.groups:
@@ -47,7 +47,7 @@ def readable_names(nlp: NLP, layout: MatrixLayout) -> tuple[list[str], list[str]
     return x_names, g_names
 
 
-def _owners(group: Group, layout: MatrixLayout) -> Int | None:
+def _owners(group: Group, layout: MatrixLayout | TangentLayout) -> Int | None:
     """(E, 1 or 2) superpixels of each element; None if it has no variables of superpixels."""
     index = group.table.index
     own = index < layout.count * layout.stride

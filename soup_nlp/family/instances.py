@@ -24,8 +24,9 @@ from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.tangent_nlp import build_tangent_nlp, polish_chart
 from soup_nlp.pipeline.case import Case, build_energy, solver_options
 from soup_nlp.start.choice import limited_noise
 from soup_nlp.start.propose import Start
@@ -52,7 +53,7 @@ class Instance:
 
     Attributes:
         scene: One of SCENES.
-        formulation: gauge/norm/truncation.
+        formulation: gauge/norm/truncation, or tangent/norm/truncation.
         size: Wanted number of superpixels, one of SIZES; the actual number may differ a little.
         start: easy (presolved), hard (the proposal) or cold (constant depth, true flow).
     """
@@ -140,8 +141,8 @@ def select(
 
 def _whole(form: str) -> str:
     """A formulation completed by the parts of STANDARD."""
-    own = dict(zip(("gauge", "norm", "truncation"), STANDARD.split("/")))
-    return "/".join((own | parse_formulation(form)).values())
+    own = dict(zip(CHOICES, STANDARD.split("/"))) | parse_formulation(form)
+    return "/".join([own.pop("coordinates", own["gauge"]), own["norm"], own["truncation"]])
 
 
 def case_of(record: Frozen, pair: Pair | None = None) -> Case:
@@ -195,7 +196,7 @@ def rounded_data(data: EnergyData) -> EnergyData:
 
 def build_instance(
     case: Case, record: Frozen, formulation: str, start: str, hessian: str = "exact"
-) -> tuple[NLP, MatrixLayout, Formulation]:
+) -> tuple[NLP, MatrixLayout | TangentLayout, Formulation]:
     """The NLP of a formulation at a start, its layout and its formulation.
 
     Args:
@@ -209,7 +210,7 @@ def build_instance(
     assert form_label(form) == formulation
     soups = {"easy": record.best, "hard": record.start, "best": record.best}
     soup = constant_depth(case.data) if start == "cold" else soups[start]
-    nlp, layout = replace(case, soup=soup).nlp(form)
+    nlp, layout = _program(case, record, soup, form)
     x0 = nlp.x0 if start == "best" else rounded(nlp.x0)
     if start == "best":
         # optimal switches are at one of their bounds
@@ -217,6 +218,28 @@ def build_instance(
         x0 = np.where(switch, np.round(x0), x0)
     nlp = replace(nlp, x0=np.clip(x0, nlp.lbx, nlp.ubx))
     return nlp, layout, form
+
+
+def _program(
+    case: Case, record: Frozen, soup: Soup, form: Formulation
+) -> tuple[NLP, MatrixLayout | TangentLayout]:
+    """The NLP at a soup. The base of tangent coordinates is the record's start, rounded where it
+    may be: its rotations stay orthogonal, as they are decoded."""
+    if form.coordinates == "matrix":
+        return replace(case, soup=soup).nlp(form)
+    data, start = case.data, record.start.normalised(case.data.share)
+    depth = rounded(start.depth_at(data.anchor_ray))
+    shift = rounded(start.translation / depth[:, None])
+    own = data.anchor_ray, data.radius, data.share, depth, record.start.R, shift
+    base = TangentLayout(*own, polish_chart(data))
+    nlp, layout = build_tangent_nlp(soup, data, case.weights, form, layout=base)
+    unit = [
+        replace(g, table=replace(g.table, data=rounded(g.table.data)))
+        if g.kernel.name == "t_simplex"
+        else g
+        for g in nlp.groups
+    ]
+    return replace(nlp, groups=tuple(unit)), layout
 
 
 def rounded(values: Float) -> Float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -38,9 +38,16 @@ class FormulationOptions(Section):
     """Compile kernels where a C compiler is found."""
 
 
-class Formulation(FormulationOptions):
-    """A formulation with its smoothing, which belongs to the stage of the solver."""
+Coordinates = Literal["matrix", "tangent"]
+"""matrix: rotations, normals, scales and translations with their constraints. tangent: nine
+coordinates per superpixel about the proposal, in which SO(3) and unit normals hold."""
 
+
+class Formulation(FormulationOptions):
+    """A formulation with its smoothing and coordinates, which belong to the stage of the solver."""
+
+    coordinates: Coordinates = "matrix"
+    """matrix or tangent; a gauge is of matrices only."""
     eps: NonNegative = 1e-2
     """Smoothing of lengths and rotations, in the energy's unit (pixels by default)."""
     eps_pixel: NonNegative = 1e-2

@@ -145,6 +145,16 @@ class TangentLayout:
         """Superpixels."""
         return len(self.radius)
 
+    @property
+    def stride(self) -> int:
+        """Variables per superpixel."""
+        return 9
+
+    @property
+    def size(self) -> int:
+        """Length of a vector."""
+        return self.stride * self.count
+
     def of(self, superpixel: Int) -> Int:
         """(E, 9) variable indices of superpixels (E,)."""
         return superpixel[:, None] * 9 + np.arange(9)

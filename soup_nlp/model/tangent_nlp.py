@@ -32,26 +32,36 @@ def _views(chart: Chart) -> Callable[[ca.SX, dict[str, ca.SX], int], View]:
 
 
 def build_tangent_nlp(
-    soup: Soup, data: EnergyData, weights: Weights, form: Formulation, chart: Chart = "depth"
+    soup: Soup,
+    data: EnergyData,
+    weights: Weights,
+    form: Formulation,
+    chart: Chart = "depth",
+    layout: TangentLayout | None = None,
 ) -> tuple[NLP, TangentLayout]:
     """The presolve: 9 coordinates per superpixel about the soup, linear constraints only.
 
     Args:
-        soup: Base and start.
+        soup: Start.
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
         form: Smoothing and Hessian; gauge is not used.
         chart: See TangentLayout.
+        layout: Base; default one about the start. With a base of its own the program is the same
+            for every start, and the simplex is exact.
 
     Returns:
         The NLP and the layout that turns its vectors into soups.
     """
     n = len(data)
-    layout = TangentLayout.about(soup, data, chart)
+    base = layout
+    layout = TangentLayout.about(soup, data, chart) if base is None else base
+    chart = layout.chart
     b = Builder(form, 9 * n)
     for name, element in elements(data, weights, layout).items():
         b.add_norms(f"t_{name}", element, _views(chart), 9)
-    _add_simplex(b, soup, layout, slanted=not data.local_units and chart == "depth")
+    exact = base is not None or (not data.local_units and chart == "depth")
+    _add_simplex(b, soup, layout, slanted=exact)
     # visibility as in the constrained NLP, divided by the anchor's facing 1 / |m| and in chart
     # "inverse-depth" multiplied by rho: the same set, so that one's solution is the other's
     count = data.rim_ray.shape[1] - 1
@@ -107,12 +117,14 @@ def _add_simplex(b: Builder, soup: Soup, layout: TangentLayout, slanted: bool) -
     """
     lam, part = ca.SX.sym("lam"), ca.SX.sym("share")
     x, row = lam, part
-    value = part * lam if layout.chart == "depth" else part / lam
+    depth = layout.chart == "depth"
+    value = part * lam if depth else part / lam
     data = soup.normalised(layout.share).lam[:, None]
     if slanted:
         s, ray, reach = ca.SX.sym("slope", 2), ca.SX.sym("ray", 2), ca.SX.sym("radius")
-        m = ca.vertcat(s / reach, 1 - ca.dot(s, ray) / reach)
-        x, row, value = ca.vertcat(lam, s), ca.vertcat(part, ray, reach), part * lam / ca.norm_2(m)
+        m = ca.vertcat(s / reach, (1 if depth else lam) - ca.dot(s, ray) / reach)
+        x, row = ca.vertcat(lam, s), ca.vertcat(part, ray, reach)
+        value = part * (lam if depth else 1) / ca.norm_2(m)
         own = layout.share * layout.depth, layout.anchor[:, :2], layout.radius
         data = np.column_stack(own)
     index = np.arange(layout.count)[:, None] * 9 + np.arange(x.numel())

@@ -23,7 +23,7 @@ from soup_nlp.model.energy_options import (
     bending_weights,
 )
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.reweighting import (
@@ -37,6 +37,7 @@ from soup_nlp.model.reweighting import (
     within_bending,
     without_flow,
 )
+from soup_nlp.model.tangent_nlp import build_tangent_nlp, polish_chart
 from soup_nlp.pipeline.still_layer import see_through
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
@@ -89,9 +90,13 @@ class Case:
         options, eps = dict(self.problem.formulation), self.options.eps
         return Formulation.make({**options, "eps": eps, "eps_pixel": eps, **changes})
 
-    def nlp(self, form: Formulation) -> tuple[NLP, MatrixLayout]:
-        """The constrained NLP at the case's soup."""
-        return build_matrix_nlp(self.soup, self.data, self.weights, form)
+    def nlp(self, form: Formulation) -> tuple[NLP, MatrixLayout | TangentLayout]:
+        """The NLP of a formulation at the case's soup; tangent coordinates are about the start."""
+        own = self.data, self.weights, form
+        if form.coordinates == "matrix":
+            return build_matrix_nlp(self.soup, *own)
+        base = TangentLayout.about(self.start.soup, self.data, polish_chart(self.data))
+        return build_tangent_nlp(self.soup, *own, layout=base)
 
 
 def prepare(

@@ -20,7 +20,6 @@ from soup_nlp.bench.solvers.task import WALL_PER_CPU, Answer, Solver, Task, Trac
 from soup_nlp.errors import SolverError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import read_sol
-from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.system import end_with_parent
@@ -112,12 +111,10 @@ def reference(task: Task) -> Answer:
     begin = clock()
     record = levenberg_marquardt(*own, eps=eps, seconds=0.8 * WALL_PER_CPU * task.limits.seconds)
     seconds = clock() - begin
-    # slack variables and switches with their optimal values for this soup
-    x = build_matrix_nlp(record.soup, task.data, task.weights, task.form)[0].x0.copy()
-    x[: task.layout.size] = task.layout.pack(record.soup)
     # its history has wall times: convert them to CPU times
     own_seconds = max(float(record.history[-1, 0]), seconds)
     curve = record.history * [seconds / own_seconds, 1.0]
+    x = task.point(record.soup)
     return Answer(x, None, record.status, False, record.iterations, seconds, curve)
 
 
@@ -136,7 +133,11 @@ def package(task: Task) -> Answer:
     stage = answer.stages[-1]
     iterations = sum(s.iterations for s in answer.stages)
     seconds = clock() - begin
-    return Answer(stage.x, stage.lam_g, stage.status, stage.converged, iterations, seconds)
+    ended = stage.status, stage.converged, iterations, seconds
+    if task.form.coordinates == "tangent":
+        # it solves the program in matrices, whose multipliers are others
+        return Answer(task.point(answer.soup), None, *ended)
+    return Answer(stage.x, stage.lam_g, *ended)
 
 
 def available() -> dict[str, Solver]:

@@ -21,7 +21,7 @@ from soup_nlp.export.artefact import form_label
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.case import Case
 from soup_nlp.storage.rows import Job, Row, measure_all
@@ -29,7 +29,7 @@ from soup_nlp.storage.versions import versions
 
 Label = Mapping[str, Any]
 Maker = Callable[[Path], Task]
-Programs = tuple[NLP, NLP, MatrixLayout, Formulation]
+Programs = tuple[NLP, NLP, MatrixLayout | TangentLayout, Formulation]
 
 CURVE_POINTS = 40
 """Iterates of a trace for which the exact energy is computed."""

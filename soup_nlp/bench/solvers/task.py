@@ -15,8 +15,10 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
 
 @dataclass(frozen=True)
@@ -35,13 +37,22 @@ class Task:
 
     nlp: NLP
     gauss_newton: NLP
-    layout: MatrixLayout
+    layout: MatrixLayout | TangentLayout
     soup: Soup
     data: EnergyData
     weights: Weights
     form: Formulation
     limits: Limits
     folder: Path
+
+    def point(self, soup: Soup) -> Float:
+        """(nx,) vector of a soup, slack variables and switches at their best values."""
+        own = soup, self.data, self.weights, self.form
+        if isinstance(self.layout, TangentLayout):
+            nlp, _ = build_tangent_nlp(*own, layout=self.layout)
+        else:
+            nlp, _ = build_matrix_nlp(*own)
+        return np.concatenate([self.layout.pack(soup), nlp.x0[self.layout.size :]])
 
 
 @dataclass(frozen=True)
