@@ -25,6 +25,7 @@ from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import Task
 from soup_nlp.cli.main import app
 from soup_nlp.config.problem import Problem
+from soup_nlp.data.depth_prior import PriorOptions
 from soup_nlp.data.flow.sources import flow_sources, resolve_flow
 from soup_nlp.data.inputs import Input, PairInput, Resolve
 from soup_nlp.data.pair import Pair
@@ -320,6 +321,21 @@ def test_a_network_is_any_onnx_file(tmp_path, monkeypatch):
     # linear in the displacement to first order only
     np.testing.assert_allclose(np.median(inside, axis=(0, 1)), [1, 0], atol=0.1)
     assert np.median(flow.confidence) > 0.9
+
+
+def test_a_depth_prior_may_be_an_onnx_file(tmp_path, monkeypatch):
+    pytest.importorskip("onnx", reason="no onnx")
+    pytest.importorskip("onnxruntime", reason="no onnxruntime")
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs/depth_prior.md").read_text(encoding="utf-8")
+    exec(re.findall(r"```python\n(.*?)```", page, re.DOTALL)[0], {})
+    image = np.zeros((50, 60, 3), np.uint8)
+    pair = Pair(image, image, *[intrinsics(90, 90, 50, 40)] * 2)
+    found = PriorOptions(source="ramp.onnx").load(pair, lambda name: tmp_path / name).depth_prior
+    assert found.shape == (50, 60)
+    # lower is nearer
+    np.testing.assert_allclose(np.diff(found, axis=0), found[1, 0] - found[0, 0], rtol=1e-3)
+    assert found[1, 0] > found[0, 0] > 0
 
 
 def test_a_solver_is_any_program_that_reads_nl(tmp_path, monkeypatch):

@@ -31,6 +31,7 @@ from soup_nlp.storage.folders import default_folder, scratch
 SOURCE = "Two images, or a problem file or name (`soup-nlp list`)."
 INPUT: Mapping[str, Any] = {"rich_help_panel": "Input"}
 FLOW: Mapping[str, Any] = {"rich_help_panel": "Flow"}
+PRIOR: Mapping[str, Any] = {"rich_help_panel": "Depth prior"}
 SIZE: Mapping[str, Any] = {"rich_help_panel": "Size"}
 METHOD: Mapping[str, Any] = {"rich_help_panel": "Method"}
 OUTPUT: Mapping[str, Any] = {"rich_help_panel": "Output"}
@@ -67,6 +68,14 @@ def solve(
     ] = None,
     flow_confidence: Annotated[
         str | None, typer.Option(help="Of --flow: .npy in [0, 1], or a grey picture.", **FLOW)
+    ] = None,
+    depth_prior: Annotated[
+        str | None,
+        typer.Option(help="Depth of ref from elsewhere: .npy .pfm .png, .onnx.", **PRIOR),
+    ] = None,
+    depth_prior_kind: Annotated[
+        str | None,
+        typer.Option(help="metric, relative, inverse, ordinal; default: by the flow.", **PRIOR),
     ] = None,
     superpixels: Annotated[
         int | None, typer.Option(help="Wanted number N; default 1000.", **SIZE)
@@ -120,7 +129,12 @@ def solve(
         "max_size": max_size,
         "refine.enabled": "false" if no_refine else None,
         "refine.from_start": "true" if no_nlp else None,
+        "depth_prior.kind": depth_prior_kind,
     }
+    if depth_prior:
+        # relative to the working folder, unlike paths in a problem file
+        place = as_path(depth_prior, "depth prior", home=True).absolute()
+        short["depth_prior.source"] = json.dumps(str(place))
     overrides = changed(preset, overrides, short)
     problem, ref, next_ = _sources(source or [], ref, next_)
     pair = {

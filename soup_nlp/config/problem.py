@@ -17,6 +17,7 @@ from pydantic.fields import FieldInfo
 
 from soup_nlp.config.presets import with_preset
 from soup_nlp.config.yaml_text import Dumper, parse
+from soup_nlp.data.depth_prior import PriorOptions
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import Input
 from soup_nlp.data.pair import Pair
@@ -108,6 +109,8 @@ class Problem(Section):
     """Superpixels and graphs."""
     flow: FlowOptions = FlowOptions()
     """Where the flow comes from."""
+    depth_prior: PriorOptions = PriorOptions()
+    """A depth of the reference frame from elsewhere."""
     start: StartOptions = StartOptions()
     """How the start is made."""
     energy: EnergyOptions = EnergyOptions()
@@ -162,7 +165,8 @@ class Problem(Section):
         Raises:
             ConfigError: the pair was in memory only.
         """
-        return [self.path(name) for name in (*self.input.files(), *self.flow.files())]
+        prior = [self.depth_prior.source] if self.depth_prior.source else []
+        return [self.path(name) for name in (*self.input.files(), *self.flow.files(), *prior)]
 
 
 def shipped_problems() -> dict[str, Path]:
@@ -258,6 +262,7 @@ USUAL = (
     "max_size", "seed",
     "segmentation.superpixels", "segmentation.neighbours",
     "flow.source", "flow.backward", "flow.confidence", "flow.dis.equalize",
+    "depth_prior.source", "depth_prior.kind",
     "start.upright",
     "solver.max_iter", "solver.max_seconds",
     "refine.enabled", "refine.from_start", "refine.rounds", "refine.particles",

@@ -310,6 +310,8 @@ def pair_hash(pair: Pair) -> str:
     arrays: list[NDArray[Any]] = [pair.image_ref, pair.image_next, pair.K_ref, pair.K_next]
     if pair.flow is not None:
         arrays += [pair.flow.uv, pair.flow.confidence]
+    if pair.depth_prior is not None:
+        arrays.append(pair.depth_prior)
     for array in arrays:
         digest.update(f"{array.dtype} {array.shape}\0".encode())
         digest.update(np.ascontiguousarray(array).tobytes())

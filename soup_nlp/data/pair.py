@@ -17,6 +17,7 @@ from soup_nlp.data.accept import (
     cameras_without,
     flow_of,
     image_of,
+    prior_of,
 )
 from soup_nlp.errors import DataError, expect, printable, repr_of
 
@@ -216,6 +217,8 @@ class Pair:
         flow: The flow from reference to next, or None if it is not estimated yet.
         truth: The truth, or None.
         name: Name for titles and folders.
+        depth_prior: (H, W) depth of the reference frame from elsewhere, or an inverse depth or an
+            order (`data.depth_prior`); NaN where unknown. An array or the name of a file.
 
     Raises:
         DataError: an image has a wrong shape or type, a camera is invalid, or sizes differ.
@@ -229,6 +232,7 @@ class Pair:
     truth: Truth | None = field(default=None)
     name: str = "pair"
     fov: InitVar[float | None] = None
+    depth_prior: Float | None = None
 
     if TYPE_CHECKING:
 
@@ -242,6 +246,7 @@ class Pair:
             truth: Truth | None = None,
             name: str = "pair",
             fov: float | None = None,
+            depth_prior: object = None,
         ) -> None: ...
 
     def __post_init__(self, fov: float | None) -> None:
@@ -269,6 +274,12 @@ class Pair:
                 found=type(self.truth).__name__,
                 expected="soup_nlp.Truth(depth_ref=..., ...) or None",
             )
+        if self.depth_prior is not None:
+            prior = prior_of(self.depth_prior)
+            check_size(
+                "depth prior and reference image", prior.shape, self.image_ref.shape, "prior"
+            )
+            object.__setattr__(self, "depth_prior", prior)
         if not isinstance(self.flow, Flow | None):
             object.__setattr__(self, "flow", Flow(self.flow))
         if self.flow is not None:

@@ -35,6 +35,7 @@ def working_size(pair: Pair, megapixels: float | None) -> Pair:
         K_next=scaled_camera(pair.K_next, pair.image_next.shape, following),
         flow=None,
         truth=None if pair.truth is None else _truth(pair.truth, pair, ref, following),
+        depth_prior=None if pair.depth_prior is None else _nearest(pair.depth_prior, ref),
     )
     return small if pair.flow is None else small.with_flow(resized_flow(pair.flow, pair, small))
 

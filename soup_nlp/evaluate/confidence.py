@@ -27,6 +27,7 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.components import FIXED, TIES
+from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
 
 log = logging.getLogger(__name__)
@@ -111,7 +112,7 @@ def calibrated(
     spread: Float,
     noise: float,
     misfit: Float | float = 0.0,
-    prior: float = SIGMA_PRIOR,
+    prior: Float | float = SIGMA_PRIOR,
     bends: Mask | bool = False,
     added: Float | float = 0.0,
 ) -> Float:
@@ -138,7 +139,7 @@ def calibrated(
     return with_prior(np.hypot(sigma, added), prior)
 
 
-def with_prior(sigma: Float, prior: float = SIGMA_PRIOR) -> Float:
+def with_prior(sigma: Float, prior: Float | float = SIGMA_PRIOR) -> Float:
     """Standard deviation where the information of the prior is added."""
     sigma = np.minimum(sigma, LARGEST)
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
@@ -182,6 +183,7 @@ def confidence(
     data: EnergyData,
     weights: Weights,
     form: FormulationOptions,
+    given: Given | None = None,
 ) -> Confidence:
     """How sure the depth of an answer is.
 
@@ -192,9 +194,10 @@ def confidence(
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
         form: Visibility and whether kernels are compiled.
+        given: A depth prior, a measurement with an error of its own.
     """
     assert pair.flow is not None
-    weak = weights.replace(prior=PRIOR_SHARE * weights.prior)
+    weak = weights.replace(prior=PRIOR_SHARE * weights.prior, depth=0.0)
     blind = weak.replace(proj=FLOW_SHARE * weights.proj)
     try:
         (own, seen), (without, guessed) = (
@@ -218,6 +221,12 @@ def confidence(
     rigid = np.hypot(scale, found.sigma)
     added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), rigid)
     added[found.guess[start.component] | start.at_rest | (start.tie == FIXED)] = LARGEST
-    sigma = calibrated(spread, noise, misfit[rec.labels], bends=bends, added=added[rec.labels])
+    before = np.full(len(added), SIGMA_PRIOR)
+    if given is not None:
+        # a depth that is taken from a prior which no flow confirms is no evidence of the flow
+        added[np.isfinite(given.sigma) & (given.sigma > MOST_SIGMA)] = LARGEST
+        before = 1 / np.hypot(1 / SIGMA_PRIOR, 1 / given.sigma)
+    parts = misfit[rec.labels], before[rec.labels], bends, added[rec.labels]
+    sigma = calibrated(spread, noise, *parts)
     component_sigma = with_prior(np.sqrt(own.component))
     return Confidence(sigma, spread, own, noise, component_sigma, misfit, found, added)

@@ -46,7 +46,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
             return np.asarray((1 / A[pairs, 2] ** 4).mean(axis=1) ** -0.25)
         return np.full(len(pairs), scene)
 
-    arap = cont = orient = prior = 0.0
+    arap = cont = orient = prior = depth = 0.0
     if len(e["edges"]):
         i, k = e["edges"].T
         length = unit(e["edges"]) * e["edge_unit"]
@@ -68,6 +68,8 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
         change = (rho[i] - rho[k]) / ((rho[i] ** 4 + rho[k] ** 4) / 2) ** 0.25
         change = np.abs(change - e["prior_relief"])
         prior = float((e["prior_weight"] * change / apart).sum())
+        off = np.abs(np.log(A[i, 2]) - np.log(A[k, 2]) - e["depth_change"])
+        depth = float((e["depth_weight"] * off).sum())
 
     image = lift(s, e["pixel_ray"], every)[1] @ e["K_next"].T
     miss = _length(image[..., :2] / image[..., 2:] - e["pixel_target"])
@@ -85,6 +87,8 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
         turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
         orient = float((e["orient_weight"] * np.minimum(turn, w["sigma_orient"])).sum())
     terms = {"arap": arap, "proj": proj, "cont": cont, "orient": orient, "prior": prior}
+    if e["depth_weight"].any():
+        terms["depth"] = depth
     terms = {name: w[name] * value for name, value in terms.items()}
     return {"total": sum(terms.values()), **terms}
 

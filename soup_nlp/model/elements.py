@@ -79,7 +79,7 @@ def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]
         layout: Whose variables the views are made of.
 
     Returns:
-        "arap", "proj", "cont", "orient", and "prior" where it has a weight.
+        "arap", "proj", "cont", "orient", and "prior" and "depth" where they have a weight.
     """
     kinds = {
         "arap": _arap(data, w),
@@ -89,6 +89,8 @@ def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]
     }
     if w.prior > 0:
         kinds["prior"] = _prior(data, w)
+    if w.depth > 0 and data.depth_weight.any():
+        kinds["depth"] = _depth(data, w)
     return {name: element.placed(layout) for name, element in kinds.items()}
 
 
@@ -175,6 +177,18 @@ def _prior(data: EnergyData, w: Weights) -> Element:
     if held:
         columns["relief"] = data.prior_relief
     return Element(data.edges, columns, Norms(terms.prior, (held,)), 2)
+
+
+def _depth(data: EnergyData, w: Weights) -> Element:
+    used = data.depth_weight > 0
+    edges = data.edges[used]
+    columns = {
+        "weight": w.depth * data.depth_weight[used],
+        "change": data.depth_change[used],
+        "ray_i": data.anchor_ray[edges[:, 0]],
+        "ray_k": data.anchor_ray[edges[:, 1]],
+    }
+    return Element(edges, columns, Norms(terms.depth), 2)
 
 
 def _orient(data: EnergyData, w: Weights) -> Element:

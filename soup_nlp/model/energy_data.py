@@ -13,6 +13,9 @@ from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 
 TERMS = ("arap", "proj", "cont", "orient", "prior")
+"""Terms that every energy has."""
+GIVEN = "depth"
+"""The term of a given depth prior, which is absent without one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +37,8 @@ class EnergyData:
             that is known.
         prior_relief: (E,) relative difference of inverse depth along each edge that costs nothing
             in E_prior: the initialisation's where both ends borrow their depth, else 0.
+        depth_weight: (E,) weight of E_depth; 0 without a depth prior, and where it is not reliable.
+        depth_change: (E,) difference of log depth along each edge by the depth prior.
         rotation_scale: (E,) factor of |R_i - R_k| (1 in the paper's units, focal in pixel units).
         pairs: (P, 2) neighbours i < k.
         boundary_ray: (P, B, 3) sampled shared boundary points.
@@ -62,6 +67,8 @@ class EnergyData:
     edge_unit: Float
     prior_weight: Float
     prior_relief: Float
+    depth_weight: Float
+    depth_change: Float
     rotation_scale: Float
     pairs: Int
     boundary_ray: Float
@@ -171,6 +178,8 @@ def build_energy_data(
         edge_unit=np.ones(len(seg.edges)),
         prior_weight=seg.edge_multiplicity / max(1, seg.knn.shape[1]),
         prior_relief=np.zeros(len(seg.edges)),
+        depth_weight=np.zeros(len(seg.edges)),
+        depth_change=np.zeros(len(seg.edges)),
         rotation_scale=np.ones(len(seg.edges)),
         pairs=seg.pairs,
         boundary_ray=rays(K_ref, seg.boundary),

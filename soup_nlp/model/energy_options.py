@@ -10,7 +10,8 @@ from soup_nlp.schema.section import NonNegative, Positive, Samples, Section, Sha
 
 
 class Weights(Section):
-    """Constants of E = E_arap + alpha1 E_proj + alpha2 E_cont + alpha3 E_orient + alpha4 E_prior.
+    """Constants of E = E_arap + alpha1 E_proj + alpha2 E_cont + alpha3 E_orient + alpha4 E_prior,
+    and of E_depth where a depth prior is given.
 
     E_prior is not in the paper. Where the flow leaves the depth undetermined (little parallax, a
     camera at rest, a motion of few superpixels), it pulls the depth to that of the neighbours. It
@@ -33,6 +34,9 @@ class Weights(Section):
     prior: NonNegative = 0.03
     """alpha4, cost of a relative change of inverse depth by 1 per ray unit, in units of the flow's
     noise; 0 is the paper's form."""
+    depth: NonNegative = 10.0
+    """Factor of E_depth, differences of log depth from those of a given depth prior in units of its
+    error, times the flow's noise: neighbours share most of that error. 0 ignores a prior."""
     sigma_cont: Truncation = 1.0
     """Truncation of E_cont's second-frame gap (rho), length."""
     sigma_cont_ref: Truncation = np.inf

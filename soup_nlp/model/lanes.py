@@ -39,6 +39,11 @@ static inline real root(real a) {{
   for (int i = 0; i < L; i++) b[i] = sqrt(a[i]);
   return b;
 }}
+static inline real logarithm(real a) {{
+  real b;
+  for (int i = 0; i < L; i++) b[i] = log(a[i]);
+  return b;
+}}
 """
 
 # x, row, theta, lam_f, lam_c -> entries, added up at their places; a block is L elements
@@ -73,6 +78,7 @@ _OPERATIONS: Mapping[int, str] = {
     ca.OP_TWICE: "{0} + {0}",
     ca.OP_INV: "one / {0}",
     ca.OP_SQRT: "root({0})",
+    ca.OP_LOG: "logarithm({0})",
     ca.OP_FMAX: "choose({0} > {1}, {0}, {1})",
     ca.OP_FMIN: "choose({0} < {1}, {0}, {1})",
     ca.OP_FABS: "choose({0} < zero, -{0}, {0})",

@@ -11,7 +11,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_data import GIVEN, EnergyData
 from soup_nlp.model.energy_options import Weights
 
 
@@ -24,7 +24,8 @@ def energy(soup: Soup, data: EnergyData, weights: Weights) -> dict[str, float]:
         weights: alpha1 to alpha4 and the truncations.
 
     Returns:
-        {"total", "arap", "proj", "cont", "orient", "prior"}; the terms include their factors.
+        {"total", "arap", "proj", "cont", "orient", "prior"}, and "depth" with a depth prior; the
+        terms include their factors.
     """
     terms = {
         "arap": weights.arap * float(arap(soup, data, weights).sum()),
@@ -33,6 +34,8 @@ def energy(soup: Soup, data: EnergyData, weights: Weights) -> dict[str, float]:
         "orient": weights.orient * float(orientation(soup, data, weights).sum()),
         "prior": weights.prior * float(prior(soup, data).sum()),
     }
+    if data.depth_weight.any():
+        terms[GIVEN] = weights.depth * float(depth(soup, data).sum())
     return {"total": sum(terms.values()), **terms}
 
 
@@ -126,3 +129,9 @@ def relief(soup: Soup, data: EnergyData) -> Float:
     """(E,) difference of the inverse depths of an edge's anchors, relative to the nearer one."""
     inverse = 1 / soup.depth_at(data.anchor_ray)[data.edges]
     return (inverse[:, 0] - inverse[:, 1]) / np.mean(inverse**4, axis=1) ** 0.25
+
+
+def depth(soup: Soup, data: EnergyData) -> Float:
+    """(E,) E_depth of every edge: `|log(Z_i / Z_k) - change|` of the depths Z of its anchors."""
+    Zi, Zk = soup.depth_at(data.anchor_ray)[data.edges.T]
+    return data.depth_weight * np.abs(np.log(Zi / Zk) - data.depth_change)

@@ -52,6 +52,24 @@ def over_ground(data: EnergyData, soup: Soup, grounded: Mask, weight: Float) -> 
     )
 
 
+def with_prior(data: EnergyData, log_depth: Float, opened: Float, weight: Float) -> EnergyData:
+    """The same data with E_depth instead of E_prior where a depth prior counts.
+
+    Args:
+        data: Data of the pair.
+        log_depth: (N,) log depth of the anchors by the depth prior.
+        opened: (E,) how far the flow leaves the differences along edges open, 0 to 1.
+        weight: (E,) weight of E_depth where it leaves them open; 0 where the prior does not count.
+    """
+    i, k = data.edges.T
+    return replace(
+        data,
+        depth_weight=opened * weight,
+        depth_change=log_depth[i] - log_depth[k],
+        prior_weight=np.where(weight > 0, 1 - opened, 1.0) * data.prior_weight,
+    )
+
+
 def in_noise(data: EnergyData, noise: float) -> EnergyData:
     """The same data with E_prior measured in units of the flow's noise.
 

@@ -114,6 +114,12 @@ def prior(a: View, b: View, row: Row, eps: ca.SX, held: bool) -> list[Norm]:
     return [Norm("slope", row["weight"], change / row["reach"], eps)]
 
 
+def depth(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
+    """E_depth of an edge: difference of the anchors' log depths from that of a depth prior."""
+    Za, Zb = a.anchor(row["ray_i"])[2], b.anchor(row["ray_k"])[2]
+    return [Norm("given", row["weight"], ca.log(Za / Zb) - row["change"], eps)]
+
+
 def so3(a: View) -> ca.SX:
     """(6x1) upper triangle of `R^T R - I`; det R = 1 holds at the start (a row breaks LICQ)."""
     gram = a.R.T @ a.R

@@ -40,6 +40,7 @@ _OPERATIONS: Mapping[int, Callable[..., Any]] = {
     ca.OP_TWICE: lambda a, out: np.add(a, a, out),
     ca.OP_INV: lambda a, out: np.divide(_ONE, a, out),
     ca.OP_SQRT: np.sqrt,
+    ca.OP_LOG: np.log,
     # an output as third argument is deprecated in these two
     ca.OP_FMAX: lambda a, b, out: np.maximum(a, b, out=out),
     ca.OP_FMIN: lambda a, b, out: np.minimum(a, b, out=out),

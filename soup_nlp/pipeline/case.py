@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_flow
 from soup_nlp.data.flow.sources import is_named
@@ -34,6 +36,7 @@ from soup_nlp.model.reweighting import (
     in_noise,
     in_pixels,
     over_ground,
+    with_prior,
     within_bending,
     without_flow,
 )
@@ -41,6 +44,7 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp, polish_chart
 from soup_nlp.pipeline.still_layer import see_through
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
+from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.storage.memory import require_memory
@@ -69,6 +73,7 @@ class Case:
         seen: The pair as the photometric term sees it: without a layer that stands still before
             the scene, where there is one.
         full: The pair at its own size, where it was larger than `max_size`; else None.
+        given: What was made of a depth prior; None without one.
     """
 
     problem: Problem
@@ -81,6 +86,7 @@ class Case:
     options: SolverOptions
     seen: Pair
     full: Pair | None = None
+    given: Given | None = None
 
     def __len__(self) -> int:
         return len(self.segmentation)
@@ -127,7 +133,7 @@ def prepare(
         if on_stage:
             on_stage(stage)
 
-    full = pair or problem.load_pair()
+    full = problem.depth_prior.load(pair or problem.load_pair(), problem.path)
     pair = working_size(full, problem.max_size)
     check_fits(problem, pair)
     if pair is not full and log:
@@ -143,12 +149,17 @@ def prepare(
     seg = build_segmentation(labels, pair.image_ref, s.neighbours, s.beta, s.beta_colour, samples)
     done("segmentation", seg)
     options = SeededStart(**dict(problem.start), seed=problem.seed)
-    start = propose(seg, flow, pair.K_ref, pair.K_next, options)
+    start, given = propose(seg, flow, pair.K_ref, pair.K_next, options), None
+    if pair.depth_prior is not None and problem.energy.weights.depth > 0:
+        start, given = by_prior(start, seg, pair, problem.depth_prior.kind, options)
+        if log:
+            log(str(given))
     done("start", start)
-    data, weights = build_energy(problem, pair, seg, start)
+    data, weights = build_energy(problem, pair, seg, start, given)
     stages = solver_options(problem, start)
     larger = None if pair.size == full.size else full
-    case = Case(problem, pair, seg, start, data, weights, start.soup, stages, seen or pair, larger)
+    own = problem, pair, seg, start, data, weights, start.soup, stages
+    case = Case(*own, seen or pair, larger, given)
     if not presolve:
         return case
     # one iteration of the constrained NLP is the smallest number that a solve has
@@ -216,7 +227,7 @@ def solver_options(problem: Problem, start: Start) -> SolverOptions:
 
 
 def build_energy(
-    problem: Problem, pair: Pair, seg: Segmentation, start: Start
+    problem: Problem, pair: Pair, seg: Segmentation, start: Start, given: Given | None = None
 ) -> tuple[EnergyData, Weights]:
     """The energy that a problem asks for, on a pair that carries its flow."""
     assert pair.flow is not None
@@ -232,7 +243,12 @@ def build_energy(
     free = data.prior_weight
     data = across_components(data, start.component, e.arap_across)
     data = over_ground(data, start.soup, start.grounded, PRIOR_OVER_GROUND * free)
-    data = at_occlusions(data, start.soup, start.component, OCCLUSION_GAP, e.cont_occluded)
+    parts = start.component
+    if given is not None and given.used:
+        data = with_prior(data, given.log_depth, given.opened, free / given.error)
+        # a given depth has steps inside a component as well
+        parts = np.arange(len(seg))
+    data = at_occlusions(data, start.soup, parts, OCCLUSION_GAP, e.cont_occluded)
     if whole:
         data = across_discontinuities(data, start.surface, **ACROSS_DISCONTINUITIES)
     if e.units == "pixel":

@@ -29,6 +29,7 @@ from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.refine.records import Refined
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.stages import Solution
+from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
 
 
@@ -76,6 +77,7 @@ class Run:
         refined: Result of the refinement of `solution`; None where it is off.
         nlp_reconstruction: Dense 3D of `solution`, where there is an NLP and it was refined.
         full: Depth at the images' own size, where the pair was solved at a smaller one.
+        given: What was made of a depth prior; None without one.
     """
 
     problem: Problem
@@ -94,6 +96,7 @@ class Run:
     refined: Refined | None = None
     nlp_reconstruction: Reconstruction | None = None
     full: FullSize | None = None
+    given: Given | None = None
 
     def __str__(self) -> str:
         h, w = self.pair.size

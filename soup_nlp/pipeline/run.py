@@ -20,7 +20,9 @@ from soup_nlp.config.problem import (
     make_problem,
     title,
 )
+from soup_nlp.data.accept import prior_of
 from soup_nlp.data.camera_check import check_cameras
+from soup_nlp.data.depth_prior import PriorOptions, resized_prior
 from soup_nlp.data.flow.plausible import check_flow
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import pair_hash
@@ -187,7 +189,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     between = middle if refined is not None and solution.stages else None
     assert pair.flow is not None
     energy = case.data, case.weights, case.problem.formulation
-    sure = confidence(after, pair, case.start, *energy)
+    sure = confidence(after, pair, case.start, *energy, case.given)
     after = replace(after, sigma_ref=sure.sigma)
     full = None if case.full is None else full_size(case.full, pair, after, expected)
     rigid = rigid_depth(pair) if pair.truth is not None else None
@@ -215,6 +217,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         refined=refined,
         nlp_reconstruction=between,
         full=full,
+        given=case.given,
     )
 
 
@@ -247,6 +250,7 @@ Options = Mapping[str, Any]
 def solve_pair(
     pair: Pair,
     *,
+    prior_ref: object = None,
     progress: bool | Listener = False,
     preset: str | None = None,
     seed: int = 0,
@@ -254,6 +258,7 @@ def solve_pair(
     cropped: bool = False,
     segmentation: Options | SegmentationOptions | None = None,
     flow: Options | FlowOptions | None = None,
+    depth_prior: Options | PriorOptions | None = None,
     start: Options | StartOptions | None = None,
     energy: Options | EnergyOptions | None = None,
     formulation: Options | FormulationOptions | None = None,
@@ -269,6 +274,7 @@ def solve_pair(
 
     Args:
         pair: Images, cameras, and a flow if there is one (else OpenCV DIS).
+        prior_ref: Depth of the reference frame from elsewhere, (H, W) or a file.
         progress: True prints a line after every stage; a function is called at every iteration.
         preset: "paper" for the method as printed.
         seed: Of every random draw.
@@ -276,6 +282,7 @@ def solve_pair(
         cropped: The images are parts of larger ones: the principal points may be anywhere.
         segmentation: E.g. `{"superpixels": 500}` or `SegmentationOptions(superpixels=500)`.
         flow: Where the flow comes from, if the pair has none.
+        depth_prior: What the values of `prior_ref` are, e.g. `{"kind": "inverse"}`.
         start: How the start is made.
         energy: Terms, weights, units.
         formulation: How the energy is written for the solver.
@@ -291,6 +298,7 @@ def solve_pair(
     sections = {
         "segmentation": segmentation,
         "flow": flow,
+        "depth_prior": depth_prior,
         "start": start,
         "energy": energy,
         "formulation": formulation,
@@ -300,6 +308,9 @@ def solve_pair(
         "output": output,
     }
     expect(pair, Pair, "pair", PAIR)
+    if prior_ref is not None:
+        prior = resized_prior(prior_of(prior_ref), pair, "prior_ref")
+        pair = replace(pair, depth_prior=prior)
     images, names = (pair.image_ref, pair.image_next), ("K_ref", "K_next")
     check_cameras((pair.K_ref, pair.K_next), images, names, cropped)
     if pair.flow is not None:

@@ -212,6 +212,13 @@ class PairCosts:
         np.abs(x, out=x)
         x *= s.factor(w.prior * d.prior_weight[rows] / reach)
         total += x
+        if d.depth_weight[rows].any():
+            log = np.log(s.Z)
+            np.subtract(log[i][:, :, None], log[k][:, None, :], out=x)
+            x -= d.depth_change[rows][:, None, None]
+            np.abs(x, out=x)
+            x *= (w.depth * d.depth_weight[rows])[:, None, None]
+            total += x
         return total
 
     def _cont(self, s: _State, rows: Int, unit: float, buffers: Floats) -> Floats:

@@ -19,6 +19,7 @@ WORDS = {
     "flow": "by flow and parallax",
     "contact": "with the scale of a contact",
     "outline": "with the scale of an outline",
+    "given": "by the given depth",
     "fixed": "stands still in the image while the camera moves",
     "unseen": "no usable flow",
     "rest": "the camera only turns or stands still",
@@ -38,7 +39,8 @@ def certainty(run: Run) -> dict[str, float]:
     Returns:
         "determined": share with a sigma of log depth of at most `MOST_SIGMA`; the sum of "flow"
         (pixels of the largest component), "contact" and "outline" (pixels of other components, by
-        the source of their scale). "guess": the rest; the sum of "rest" (the camera is at rest or
+        the source of their scale), and with a depth prior "given" (depth or scale are the
+        prior's). "guess": the rest; the sum of "rest" (the camera is at rest or
         only turns), "fixed" (stands still in the image though the camera moves, such as the bonnet
         of its car), "unseen" (no usable flow, or hidden in the next frame), "flat" (of a
         component without evidence of depth, see `Evidence.guess`), "scale" (of a component whose
@@ -64,11 +66,14 @@ def certainty(run: Run) -> dict[str, float]:
     def share(mask: Mask) -> float:
         return float(mask.mean())
 
+    given = np.zeros(len(sizes), bool) if run.given is None else run.given.held
+    own = sure & ~given[labels]
     return {
         "determined": share(sure),
-        "flow": share(sure & (tie == TIES.index("reference"))),
-        "contact": share(sure & (tie == TIES.index("contact below"))),
-        "outline": share(sure & (tie > TIES.index("contact below"))),
+        "flow": share(own & (tie == TIES.index("reference"))),
+        "contact": share(own & (tie == TIES.index("contact below"))),
+        "outline": share(own & (tie > TIES.index("contact below"))),
+        **({} if run.given is None else {"given": share(sure & given[labels])}),
         "guess": share(~sure),
         **{name: share(mask) for name, mask in guess.items()},
         "weak": share(left),
@@ -83,7 +88,7 @@ def certainty_lines(found: Mapping[str, float]) -> list[str]:
         lines.append(
             f"{found['determined']:.0%} of the image is determined, half of it to"
             f" {found['median_sigma']:.1%} (1 sigma):"
-            f" {_parts(found, ('flow', 'contact', 'outline'))}"
+            f" {_parts(found, ('flow', 'contact', 'outline', 'given'))}"
         )
     if found["guess"] >= 0.005:
         lines.append(guess_words(found))

@@ -27,6 +27,8 @@ def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
             f"error of the flow of the largest component: {sure.turn[main]:.2f} px by a turn alone,"
             f" {sure.constant[main]:.2f} px at a constant depth, {sure.solution[main]:.2f} px here"
         )
+    if run.given is not None:
+        lines.append(str(run.given))
     if run.start.at_rest:
         lines.append("the camera stands still or only turns: depth is a guess")
     elif run.start.bends.all():

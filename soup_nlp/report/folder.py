@@ -214,6 +214,7 @@ def summary(run: Run) -> dict[str, Any]:
         },
         "certainty": certainty(run),
         "evidence": run.confidence.evidence.rows(),
+        **({} if run.given is None else {"depth_prior": run.given.as_dict()}),
         "flow": str(run.pair.flow),
         "versions": versions(),
         "seed": run.problem.seed,

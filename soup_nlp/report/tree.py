@@ -49,6 +49,8 @@ _ENERGY: Table = {
         "E",
         "relative difference of inverse depth that costs nothing in E_prior",
     ),
+    "depth_weight": ("1", "E", "weight of E_depth, 0 without a depth prior"),
+    "depth_change": ("1", "E", "difference of log depth by the depth prior"),
     "edge_unit": ("1", "E", "length unit of an edge, see local_units"),
     "rotation_scale": ("1", "E", "factor of |R_i - R_k|"),
     "pairs": ("1", "P,2", "neighbours i < k that share boundary"),
@@ -74,7 +76,7 @@ _START: Table = {
         "1",
         "N",
         "what gives its component a scale: 0 largest, 1 contact below, 2 outline,"
-        " 3 cut off below, 4 nothing, 5 ground, 6 fixed in the image",
+        " 3 cut off below, 4 nothing, 5 ground, 6 fixed in the image, 7 given depth",
     ),
     "bends": ("1", "N", "in a region with the energy for surfaces that bend"),
     "bending": ("1", "", "a region bends"),

@@ -56,11 +56,18 @@ def settle(views: Views, choice: Choice, centre: Float, usable: Float, noise: fl
 
 
 def most_probable(
-    motion: Motion, r: Float, q: Float, weight: Float, focal: float, error: float
+    motion: Motion,
+    r: Float,
+    q: Float,
+    weight: Float,
+    focal: float,
+    error: float,
+    expected: Float | float = 0.0,
+    spread: float = RELIEF,
 ) -> Motion:
     """The motion that minimises the mean squared epipolar distance and the relief.
 
-    `mean rho(e, CLIP_PX) / error^2 + mean rho(log(z / median z), RELIEF) / RELIEF^2`, with e the
+    `mean rho(e, CLIP_PX) / error^2 + mean rho(log(z / median z), spread) / spread^2`, with e the
     Sampson distance and rho(x, c) = c^2 log(1 + x^2 / c^2) the Cauchy loss.
 
     Args:
@@ -70,22 +77,37 @@ def most_probable(
         weight: (M,) confidence.
         focal: Pixels per ray unit.
         error: Systematic error of the flow, pixels.
+        expected: (M,) log depth by a depth prior, from which relief is counted.
+        spread: Standard deviation of the relief.
     """
     basis = np.linalg.svd(motion.t[None])[2][1:]
-    root = np.sqrt(weight / weight.sum())
 
     def unpack(x: Float) -> Motion:
         t = motion.t + x[3:] @ basis
         return Motion(rotation.exp(x[:3]) @ motion.R, t / np.linalg.norm(t))
 
     def residual(x: Float) -> Float:
-        own = unpack(x)
-        distance = cauchy(sampson(own.essential(), r, q, focal), CLIP_PX)
-        depth = cauchy(relief(own, r, q), RELIEF)
-        return np.concatenate([root * distance / error, root * depth / RELIEF])
+        return improbable(unpack(x), r, q, weight, focal, error, expected, spread)
 
     x = least_squares(residual, np.zeros(5), x_scale=[0.01] * 3 + [0.1] * 2, max_nfev=30).x
     return unpack(x)
+
+
+def improbable(
+    motion: Motion,
+    r: Float,
+    q: Float,
+    weight: Float,
+    focal: float,
+    error: float,
+    expected: Float | float = 0.0,
+    spread: float = RELIEF,
+) -> Float:
+    """(2 M,) whose sum of squares is the objective of `most_probable`."""
+    root = np.sqrt(weight / weight.sum())
+    distance = cauchy(sampson(motion.essential(), r, q, focal), CLIP_PX)
+    depth = cauchy(relief(motion, r, q, expected), spread)
+    return np.concatenate([root * distance / error, root * depth / spread])
 
 
 def cauchy(x: Float, scale: float) -> Float:
@@ -93,10 +115,11 @@ def cauchy(x: Float, scale: float) -> Float:
     return scale * np.sqrt(np.log1p((x / scale) ** 2))
 
 
-def relief(motion: Motion, r: Float, q: Float) -> Float:
-    """(M,) log depth of correspondences under a motion, relative to their median, limited."""
+def relief(motion: Motion, r: Float, q: Float, expected: Float | float = 0.0) -> Float:
+    """(M,) log depth of correspondences under a motion less the expected one, relative to the
+    median, limited."""
     z, _ = triangulate(motion, r, q)
-    inverse = 1 / np.where(np.abs(z) < 1e-12, 1e-12, z)
+    inverse = np.exp(expected) / np.where(np.abs(z) < 1e-12, 1e-12, z)
     middle = np.median(inverse)
     if middle <= 0:
         return np.full(len(r), MOST_RELIEF)

@@ -122,10 +122,11 @@ def test_sizes_are_those_of_the_formulation():
     assert other.sizes()["equalities"] == 8 * n + 2
     slack, _ = problem.nlp(weights_for("paper"), form(norm="epigraph", truncation="lifted"))
     e, p, pixels = len(problem.seg.edges), len(problem.seg.pairs), problem.data.pixel_weight
-    norms = 4 * e + 2 * p + int((pixels > 0).sum())
+    given = int((problem.data.depth_weight > 0).sum())
+    norms = 4 * e + given + 2 * p + int((pixels > 0).sum())
     # orientation has no epigraph (a square is smooth) but a switch
-    # and the prior is not truncated
-    assert slack.sizes()["variables"] == 16 * n + 2 * norms - e + p
+    # and the priors are not truncated
+    assert slack.sizes()["variables"] == 16 * n + 2 * norms - e - given + p
     assert slack.sizes()["inequalities"] == 9 * n + norms
     assert sizes["jacobian_nonzeros"] == nlp.nnzj == nlp.jac_g.nnz_out(1)
 

@@ -40,7 +40,14 @@ pytestmark = pytest.mark.slow
 UNITS = ("paper", "pixels")
 NORMS = ("smooth", "epigraph")
 TRUNCATIONS = ("smooth", "lifted")
-EXACT = {"arap": 1e-11, "proj": 1e-12, "cont": 1e-12, "orient": 1e-12, "prior": 1e-12}
+EXACT = {
+    "arap": 1e-11,
+    "proj": 1e-12,
+    "cont": 1e-12,
+    "orient": 1e-12,
+    "prior": 1e-12,
+    "depth": 1e-12,
+}
 """Relative. The kernel takes distances of anchors as sqrt(|v|^2 + 1e-12): 2e-12 of E_arap."""
 FORMS = list(itertools.product(GAUGES, NORMS, TRUNCATIONS))
 DATA = list(itertools.product(UNITS, (False, True)))

@@ -93,6 +93,8 @@ def test_every_entry_is_the_energy_of_its_pair():
             ],
             prior_relief=tiny.data.prior_relief[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
             prior_weight=tiny.data.prior_weight[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
+            depth_weight=tiny.data.depth_weight[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
+            depth_change=tiny.data.depth_change[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
             pairs=np.array([[i, k]]) if costs.cont_row[e] >= 0 else np.zeros((0, 2), int),
             **{
                 key: getattr(tiny.data, key)[[max(costs.cont_row[e], 0)]]
@@ -119,7 +121,7 @@ def test_alike_motions_and_planes_cost_exactly_nothing():
     n = len(tiny.soup)
     same = Particles(*(np.repeat(v[:1], n, axis=0) for v in (one.n, one.D, one.R, one.T)))
     # their anchors differ in depth
-    weights = weights_for("pixels").replace(prior=0.0)
+    weights = weights_for("pixels").replace(prior=0.0, depth=0.0)
     table = PairCosts(tiny.data, weights).tables(same.joined(one))
     # rotation, translation, gaps and turn vanish; the distances are kept up to rounding
     assert np.abs(table[:, 0, 0]).max() < 1e-12 * table.max()
@@ -256,7 +258,7 @@ def test_no_particle_runs_away_but_the_current_one_may_stay():
 
 def test_turns_between_neighbours_count_in_both_directions():
     problem = Tiny("pixels", samples=None)
-    names = ("arap", "proj", "cont", "prior")
+    names = ("arap", "proj", "cont", "prior", "depth")
     weights = weights_for("pixels", False).replace(**dict.fromkeys(names, 0.0), orient=1.0)
     costs = PairCosts(problem.data, weights)
     found = costs.tables(Particles.of(problem.soup))[:, 0, 0].sum()

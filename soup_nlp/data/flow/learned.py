@@ -60,11 +60,42 @@ def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
     return checked_flow(forward, backward, Path(source).name)
 
 
-def onnx_network(path: Path) -> Network:
+def learned_map(source: str, image: Image) -> FloatMap:
+    """(h, w) depth or inverse depth of one image by a network; NaN where it is not positive.
+
+    Args:
+        source: Path of an .onnx file with one input (1, 3, H, W) and an output (1, h, w) or
+            (1, 1, h, w), the last one of several.
+        image: (H, W, 3) uint8 RGB image.
+
+    Raises:
+        DataError: the library or the file is missing, or the network gives no map.
+    """
+    if not is_file(source):
+        raise DataError("file of a network is missing", where=source)
+    network = onnx_network(Path(source), images=1)
+    outputs, (rows, cols) = _outputs(network, (image,), source)
+    maps = [np.squeeze(o) for o in outputs if np.ndim(o) in (3, 4)]
+    maps = [m for m in maps if m.ndim == 2]
+    if not maps:
+        raise DataError(
+            "network gives no map",
+            where=source,
+            found=[np.shape(o) for o in outputs],
+            expected="an output (1, 1, h, w)",
+        )
+    found = cv2.resize(maps[-1].astype(np.float32), (cols, rows), interpolation=cv2.INTER_LINEAR)
+    # what was added to reach a multiple of 8 goes again
+    whole = found if network.size else found[: image.shape[0], : image.shape[1]]
+    return np.where(np.isfinite(whole) & (whole > 0), whole, np.nan).astype(np.float32)
+
+
+def onnx_network(path: Path, images: int = 2) -> Network:
     """A network of an ONNX file, run by onnxruntime on the CPU.
 
-    Its inputs are two images (1, 3, H, W) or one stack (1, 6, H, W), float, RGB. Of its outputs the
-    largest flow (1, 2, h, w) in pixels is used, and the last one of equal size.
+    Its inputs are two images (1, 3, H, W) or one stack (1, 6, H, W), float, RGB, or one image. Of
+    the outputs for two the largest flow (1, 2, h, w) in pixels is used, and the last one of equal
+    size.
 
     Raises:
         DataError: onnxruntime is not installed, or the file is no such network.
@@ -87,12 +118,14 @@ def onnx_network(path: Path) -> Network:
         ) from error
     inputs = session.get_inputs()
     channels = [i.shape[1] if len(i.shape) == 4 else None for i in inputs]
-    if channels not in ([3, 3], [6]):
+    if channels not in ([[3, 3], [6]] if images == 2 else [[3]]):
         raise DataError(
-            "network does not take two images",
+            f"network does not take {'two images' if images == 2 else 'one image'}",
             where=path,
             found=[i.shape for i in inputs],
-            expected="two inputs (1, 3, H, W), or one (1, 6, H, W)",
+            expected="two inputs (1, 3, H, W), or one (1, 6, H, W)"
+            if images == 2
+            else "one input (1, 3, H, W)",
         )
     word = session.get_modelmeta().custom_metadata_map.get("input_range", "255")
     if word not in RANGES:
@@ -103,7 +136,7 @@ def onnx_network(path: Path) -> Network:
     height, width = inputs[0].shape[2:]
 
     def predict(images: list[FloatMap]) -> list[Any]:
-        feed = images if len(inputs) == 2 else [np.concatenate(images, axis=1)]
+        feed = images if len(inputs) == len(images) else [np.concatenate(images, axis=1)]
         named = {i.name: x.astype(kind) for i, x in zip(inputs, feed, strict=True)}
         return list(session.run(None, named))
 
@@ -111,13 +144,15 @@ def onnx_network(path: Path) -> Network:
     return Network(predict, RANGES[word], (height, width) if fixed else None)
 
 
-def _run(network: Network, first: Image, second: Image, where: str) -> FloatMap:
-    """(H, W, 2) flow of a network, in pixels of the images (H, W, 3)."""
-    height, width = first.shape[:2]
+def _outputs(
+    network: Network, given: tuple[Image, ...], where: str
+) -> tuple[list[Any], tuple[int, int]]:
+    """Outputs of a network for images (H, W, 3), and the (rows, columns) that it saw."""
+    height, width = given[0].shape[:2]
     rows, cols = network.size or (-(-n // 8) * 8 for n in (height, width))
     black, white = network.levels
     images = []
-    for image in (first, second):
+    for image in given:
         if network.size:
             seen = cv2.resize(image, (cols, rows), interpolation=cv2.INTER_AREA)
         else:
@@ -125,9 +160,15 @@ def _run(network: Network, first: Image, second: Image, where: str) -> FloatMap:
         plane = np.ascontiguousarray(np.moveaxis(seen, 2, 0)[None], dtype=np.float32)
         images.append((plane / np.float32(255.0)) * np.float32(white - black) + np.float32(black))
     try:
-        outputs = network.predict(images)
+        return network.predict(images), (rows, cols)
     except Exception as error:  # libraries raise many types
         raise DataError("network failed", where=where, found=_first_line(error)) from error
+
+
+def _run(network: Network, first: Image, second: Image, where: str) -> FloatMap:
+    """(H, W, 2) flow of a network, in pixels of the images (H, W, 3)."""
+    height, width = first.shape[:2]
+    outputs, (rows, cols) = _outputs(network, (first, second), where)
     flows = [o for o in outputs if np.ndim(o) == 4 and o.shape[:2] == (1, 2)]
     if not flows:
         raise DataError(

@@ -1,0 +1,423 @@
+"""A start by a depth prior: what the flow says of the prior, and what the prior then decides.
+
+See docs/depth_prior.md. A prior counts where the flow confirms it: the best rigid motion of the
+largest component at the prior's depths must explain the flow better than that at one depth. Where
+the flow says nothing, it counts as a guess if its steps lie on edges of the image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from scipy import ndimage, stats
+from scipy.spatial import cKDTree
+
+from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.geometry import rotation
+from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.plane import about_anchor, normal_and_distance
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.start.bending import affine_flow, fit_robustly
+from soup_nlp.start.choice import CLIP, PIECE_SIZE
+from soup_nlp.start.components import FIXED, TIES
+from soup_nlp.start.edges import follows_edges
+from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.propose import LEAST_PARALLAX_PX, SURE, Start, look
+from soup_nlp.start.settle import (
+    MOST_SYSTEMATIC_PX,
+    RELIEF,
+    SYSTEMATIC,
+    improbable,
+    most_probable,
+)
+from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import Views
+
+Kind = Literal["metric", "relative", "inverse", "ordinal"]
+
+CONFIRMED, POSSIBLE = 0.6, 0.85
+"""Error of the flow at the prior's depths relative to that at one depth, above the noise: up to the
+first the flow confirms the prior, above the second it contradicts it."""
+TELLS_PX, TELLS = 0.5, 3.0
+"""Pixels, and multiples of the flow's noise, by which depth must explain the flow of a component
+better than one depth does to be determined; a third of it confirms or contradicts a prior."""
+FEWEST = 8
+"""Least number of superpixels whose flow is compared with a prior."""
+LEAST_SIGMA, UNCONFIRMED = 0.12, 0.35
+"""Standard deviation of log depth of a prior: the least, and that of one that no flow confirms."""
+STANDS = {"contact below": 0.7, "ground": 0.7, "outline": 0.4, "cut off below": 0.4}
+"""Probability that the scale of a component by contact is right, by its origin (`TIES`)."""
+RIGHT, WRONG = 0.05, 0.5
+"""Standard deviation of the log of such a scale if it is right, and if it is not."""
+LEAST_RELIEF = 0.05
+"""Least standard deviation of log depth within a component."""
+HELD, NEAR = 4.0, 15
+"""Weight of the whole component's error beside the residuals of so many neighbours."""
+FARTHEST = 50.0
+"""Largest depth relative to the median where an inverse depth has a shift."""
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """A depth prior as the start uses it.
+
+    Attributes:
+        log_depth: (N,) log depth at the anchors, up to a common scale.
+        sigma: (N,) standard deviation of it, estimated from the flow; inf where it does not decide.
+        opened: (E,) how far the flow leaves differences along the K-NN edges open, 0 to 1.
+        error: (E,) standard deviation of the prior's differences along them.
+        kind: What its values are taken for.
+        ratio: Error of the flow of the largest component at the prior's depths relative to that at
+            one depth, above the noise; NaN where the flow says nothing.
+        held: (N,) True where depth or scale of the start are the prior's.
+    """
+
+    log_depth: Float
+    sigma: Float
+    opened: Float
+    error: Float
+    kind: Kind
+    ratio: float
+    held: Mask
+
+    def __str__(self) -> str:
+        if not self.used:
+            return "the depth prior is not used: flow or edges of the image contradict it"
+        own = np.median(self.sigma[np.isfinite(self.sigma)])
+        flow = "the flow confirms it" if self.ratio <= CONFIRMED else "no flow confirms it"
+        return f"depth prior ({self.kind}): {flow}; its sigma is {own:.0%}"
+
+    __repr__ = __str__
+
+    @property
+    def used(self) -> bool:
+        """Whether the prior counts anywhere."""
+        return bool(np.isfinite(self.sigma).any())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Numbers for summary.json; None for the ratio where the flow says nothing."""
+        ratio, sigma = self.ratio, self.sigma[np.isfinite(self.sigma)]
+        return {
+            "used": self.used,
+            "kind": self.kind,
+            "ratio": None if np.isnan(ratio) else ratio,
+            "median_sigma": float(np.median(sigma)) if self.used else None,
+            "held": float(self.held.mean()),
+        }
+
+
+def by_prior(
+    start: Start, seg: Segmentation, pair: Pair, kind: Kind | None, o: SeededStart
+) -> tuple[Start, Given]:
+    """The start with depths and scales of the pair's prior where the flow leaves them open.
+
+    Args:
+        start: Start without the prior.
+        seg: Superpixels and graphs.
+        pair: Images, cameras, flow and depth prior.
+        kind: What the values of the prior are; None to find out.
+        o: Numbers of samples, seed.
+    """
+    prior, flow = pair.depth_prior, pair.flow
+    assert prior is not None
+    assert flow is not None
+    seen = _Seen.of(start, seg, flow, pair, o)
+    value, known = _at_superpixels(prior, seg)
+    main = int(np.argmax(np.bincount(start.component)))
+    none = np.full(len(seg), np.inf), np.zeros(len(seg.edges)), np.full(len(seg.edges), np.inf)
+    nowhere = np.zeros(len(seg), bool)
+    if not known.any() or np.ptp(value[known]) < 1e-6 * value[known].max():
+        return start, Given(np.log(value), *none, kind or "relative", np.nan, nowhere)
+    kind, log_depth, ratio = _calibrated(seen, main, value, known, kind)
+    nothing = Given(log_depth, *none, kind, ratio, nowhere)
+    if ratio <= CONFIRMED:
+        # the share of the relief that is wrong
+        wrong = ratio * _deviation(log_depth[start.component == main])
+        sigma = float(np.clip(wrong, LEAST_SIGMA, RELIEF))
+    else:
+        whole = np.log(np.where(np.isfinite(prior), prior, value[seg.labels]))
+        contradicted = ratio > POSSIBLE and seen.determined(main)
+        if contradicted or not follows_edges(whole, pair.image_ref, seg.labels, o.seed):
+            return start, nothing
+        sigma = UNCONFIRMED
+    placed = _placed(seen, main, log_depth, sigma)
+    if placed is None:
+        return start, nothing
+    soup, log_depth, held, opened, own = placed
+    own = np.where(known, own, np.inf)
+    i, k = seg.edges.T
+    within = start.component[i] == start.component[k]
+    between = np.where(within, np.maximum(opened[i], opened[k]), 1.0)
+    error = np.maximum(own[i], own[k])
+    if not ratio <= CONFIRMED:
+        # no flow to weigh it against: what counts is that terms on shape do not undo it
+        error = np.where(np.isfinite(error), LEAST_SIGMA, error)
+    tie = np.where(held & (start.component != main), TIES.index("given depth"), start.tie)
+    made = replace(start, soup=soup.normalised(), tie=tie)
+    return made, Given(log_depth, np.where(held, own, np.inf), between, error, kind, ratio, held)
+
+
+def _at_superpixels(prior: Float, seg: Segmentation) -> tuple[Float, Mask]:
+    """(N,) median value of every superpixel, the nearest known one where most is unknown."""
+    there = np.isfinite(prior)
+    known = np.bincount(seg.labels[there], minlength=len(seg)) > 0.5 * seg.sizes
+    if not known.any():
+        return np.ones(len(seg)), known
+    labels = np.where(there, seg.labels, -1)
+    value = np.asarray(ndimage.median(np.nan_to_num(prior), labels, np.arange(len(seg))), float)
+    return value[known][cKDTree(seg.anchors[known]).query(seg.anchors)[1]], known
+
+
+def _deviation(value: Float) -> float:
+    """Half the distance of the quantiles of one standard deviation."""
+    low, high = np.quantile(value, (0.16, 0.84))
+    return float(high - low) / 2
+
+
+class _Fit(NamedTuple):
+    """A rigid motion `X' = R X + T` at given depths, its error in pixels, shift of 1 / Z."""
+
+    error: float
+    R: Float
+    T: Float
+    shift: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The flow at the anchors of a start, to which motions at given depths are compared.
+
+    Attributes:
+        start: Components and noise.
+        views: What planes are fitted to.
+        centre: (N, 3) rays to which the anchors move, by an affine flow.
+        usable: (N,) True where that is known.
+    """
+
+    start: Start
+    views: Views
+    centre: Float
+    usable: Mask
+
+    @classmethod
+    def of(cls, start: Start, seg: Segmentation, flow: Flow, pair: Pair, o: SeededStart) -> _Seen:
+        """The flow that the start was made of."""
+        views, poor = look(seg, flow, pair.K_ref, pair.K_next, o)
+        fit = affine_flow(views)[0][:, 0] / views.focal
+        usable = (views.weight.mean(axis=1) > SURE) & ~start.wrong & ~start.bends & ~poor
+        return cls(start, views, np.column_stack([fit, np.ones(len(fit))]), usable)
+
+    def members(self, c: int) -> Int:
+        """Superpixels of a rigid component whose flow is known."""
+        return np.flatnonzero((self.start.component == c) & self.usable)
+
+    def motion(self, at: Int, inverse: Float, shifted: bool = False) -> _Fit:
+        """The rigid motion of superpixels (M,) with inverse depths (M,), to which one shift is
+        added if `shifted`; the tenth with the largest errors does not count."""
+        ray, middle = self.views.anchor[at], float(np.median(np.abs(inverse)))
+
+        def miss(x: Float) -> Float:
+            near = inverse / middle + (x[6] if shifted else 0.0)
+            moved = ray @ rotation.exp(x[:3]).T + near[:, None] * x[3:6]
+            gap = moved / np.maximum(moved[:, 2:], 1e-3) - self.centre[at]
+            return gap[:, :2] * self.views.focal
+
+        x = fit_robustly(miss, 7 if shifted else 6)
+        error = np.sort(np.minimum(np.linalg.norm(miss(x), axis=1), CLIP))
+        mean = float(np.mean(error[: int(np.ceil(0.9 * len(error)))]))
+        return _Fit(mean, rotation.exp(x[:3]), x[3:6] / middle, middle * x[6] if shifted else 0.0)
+
+    @cache  # noqa: B019 - one record a pair
+    def relief(self, c: int) -> tuple[float, float]:
+        """Error of the flow of a component at one depth, above the noise, and the noise; pixels."""
+        at = self.members(c)
+        if len(at) < FEWEST or self.start.at_rest:
+            return 0.0, self.start.noise
+        floor = min(self.start.noise, float(np.median(self.start.error[at])))
+        return self.motion(at, np.ones(len(at))).error - floor, floor
+
+    @property
+    def tells(self) -> float:
+        """Pixels of relief that determine depth."""
+        return max(TELLS_PX, TELLS * self.start.noise)
+
+    def determined(self, c: int) -> bool:
+        """Whether the flow determines the depth of a component."""
+        return self.relief(c)[0] > self.tells
+
+
+def _calibrated(
+    seen: _Seen, c: int, value: Float, known: Mask, kind: Kind | None
+) -> tuple[Kind, Float, float]:
+    """Kind of a prior, (N,) its log depths, and `Given.ratio` by component c."""
+    rank = stats.rankdata(value) / (len(value) + 1)
+    logs: dict[Kind, Float] = {"relative": np.log(value), "inverse": -np.log(value)}
+    logs |= {"metric": logs["relative"], "ordinal": RELIEF * stats.norm.ppf(rank)}
+    relief, floor = seen.relief(c)
+    at = seen.members(c)
+    at = at[known[at]]
+    if len(at) < FEWEST or not relief > seen.tells / 3:
+        # what is lower in an image is mostly nearer
+        rises = np.corrcoef(rank, seen.views.anchor[:, 1])[0, 1] > 0
+        kind = kind or ("inverse" if rises else "relative")
+        return kind, logs[kind], np.nan
+    tried: list[tuple[float, Kind, Float]] = []
+    for name in (kind,) if kind else ("relative", "inverse"):
+        fit = seen.motion(at, np.exp(-logs[name][at]), name == "inverse")
+        log_depth = logs[name]
+        if name == "inverse":
+            near = value + fit.shift
+            log_depth = -np.log(np.maximum(near, np.median(np.abs(near)) / FARTHEST))
+        tried.append(((fit.error - floor) / relief, name, log_depth))
+    ratio, name, log_depth = min(tried, key=lambda one: one[0])
+    # where neither explains the flow a shift lowers the error of any map
+    return (name, log_depth, ratio) if ratio <= POSSIBLE else (tried[0][1], tried[0][2], ratio)
+
+
+def _placed(
+    seen: _Seen, main: int, prior: Float, sigma: float
+) -> tuple[Soup, Float, Mask, Float, Float] | None:
+    """Soup in the unit of a prior, its log depth by component, where the prior decides, how far the
+    flow leaves the shape of a component open (0 to 1), and the sigma of the prior; all (N,).
+
+    None where depths that the flow determines contradict the prior.
+
+    Args:
+        seen: The start and its flow.
+        main: The largest component, to which scales by contact refer.
+        prior: (N,) log depth.
+        sigma: Its standard deviation.
+    """
+    start, anchor = seen.start, seen.views.anchor
+    soup, prior, n = start.soup, prior.copy(), len(prior)
+    held, opened, own = np.zeros(n, bool), np.ones(n), np.full(n, sigma)
+    before = np.log(soup.depth_at(anchor)) - prior
+    contact = np.median(before[start.component == main])
+    for c in np.unique(start.component):
+        mask = start.component == c
+        at = np.flatnonzero(mask)
+        if start.bends[at].all():
+            # every superpixel has a motion of its own, which grows with its depth
+            soup = soup.taking(replace(soup, lam=soup.lam * np.exp(-before)), mask)
+            held[at] = True
+            continue
+        if start.tie[at[0]] == FIXED:
+            # it stays where it is relative to the scene: a map of the scene may not know of it
+            soup = soup.taking(replace(soup, lam=soup.lam * np.exp(-contact)), mask)
+            own[at] = np.inf
+            continue
+        soup, strong = _component(seen, soup, int(c), prior, sigma)
+        moved = np.linalg.norm(soup.parallax(anchor)[at] * seen.views.focal, axis=1)
+        # a turn explains a part of the parallax: what it does not tells depths apart
+        beyond = seen.relief(int(c))[0] / max(_deviation(prior[at]), LEAST_RELIEF)
+        moved *= min(1.0, beyond / max(float(np.median(moved)), 1e-3))
+        flow = (start.noise / np.maximum(moved, 1e-3)) ** 2
+        found = np.log(soup.depth_at(anchor)[at])
+        off = np.zeros(len(at))
+        if strong.any():
+            residual = (found - prior[at])[strong]
+            if c == main and _deviation(residual) > POSSIBLE * _deviation(found[strong]):
+                return None
+            off += np.median(residual)
+            own[at] = _local(anchor[at, :2], strong, residual - off[0], sigma)
+            opened[at] = np.where(strong, flow / (flow + own[at] ** 2), 1.0)
+            if c != main:
+                gap = float(np.median(before[at])) - contact
+                # a contact says nothing where depths of the scene are the prior's
+                stands = STANDS.get(TIES[start.tie[at[0]]], 0.0) if seen.determined(main) else 0.0
+                keep = _kept(gap, sigma, stands)
+                off -= keep * gap
+                prior[at] += keep * gap
+                held[at] = keep < 0.5
+        level = np.where(strong, found - off, prior[at])
+        factor, shift = np.ones(n), np.ones(n)
+        factor[at], shift[at] = np.exp(level - found), np.exp(-off)
+        # the translation is the component's, whatever the depth of a superpixel
+        soup = replace(soup, lam=soup.lam * factor, t=soup.t * (shift / factor)[:, None])
+        held[at] |= ~strong
+    return soup, prior, held, opened, own
+
+
+def _component(seen: _Seen, soup: Soup, c: int, prior: Float, sigma: float) -> tuple[Soup, Mask]:
+    """Soup with the planes and the motion of a rigid component by flow and prior.
+
+    Of the motions that explain the flow about as well, it takes that which agrees with the prior.
+
+    Returns:
+        The soup, and for every member of the component whether the flow determines its depth.
+    """
+    start, views = seen.start, seen.views
+    mask = start.component == c
+    at, use = np.flatnonzero(mask), seen.members(c)
+    T = soup.translation[at[0]]
+    length, rigid = float(np.linalg.norm(T)), np.ptp(soup.R[at], axis=0).max() < 1e-9
+    if len(use) < FEWEST or not rigid or not length > 0:
+        return soup, ~start.borrowed[at] if (~start.borrowed[at]).any() else np.ones(len(at), bool)
+    fit = seen.motion(use, np.exp(-prior[use]))
+    part, flat = views.some(at), np.zeros((len(at), 2))
+    if not seen.determined(c):
+        # any depth explains the flow: the prior's, with the motion that belongs to it
+        own = _soup(np.exp(-prior[at]), flat, fit.R, fit.T, part)
+        return soup.taking(_spread(own, at, len(prior)), mask), np.zeros(len(at), bool)
+    error = min(SYSTEMATIC * start.noise, MOST_SYSTEMATIC_PX)
+    rest = views.anchor[use], seen.centre[use], np.ones(len(use)), views.focal[0], error
+    tried = Motion(soup.R[at[0]], T / length), Motion(fit.R, fit.T / np.linalg.norm(fit.T))
+    found = [most_probable(m, *rest, prior[use], sigma) for m in tried]
+    best = min(found, key=lambda m: float(np.sum(improbable(m, *rest, prior[use], sigma) ** 2)))
+    planes = part.fit([best])
+    mu, cost = planes.inverse_depth[:, 0], planes.cost[:, 0]
+    strong = (mu > 0) & (planes.parallax[:, 0] * mu > LEAST_PARALLAX_PX) & (cost < CLIP)
+    strong &= seen.usable[at]
+    if strong.sum() < PIECE_SIZE:
+        return soup, np.ones(len(at), bool)
+    middle = np.median(mu[strong] * np.exp(prior[at][strong]))
+    mu = np.where(strong, mu, middle * np.exp(-prior[at]))
+    own = _soup(mu, np.where(strong[:, None], planes.slope[:, 0], flat), best.R, best.t, part)
+    return soup.taking(_spread(own, at, len(prior)), mask), strong
+
+
+def _kept(gap: float, sigma: float, stands: float) -> float:
+    """Share of the scale by contact in that of a component, the rest is the prior's.
+
+    The scale by contact is right (`RIGHT`) or not (`WRONG`); the gap tells which.
+
+    Args:
+        gap: Log scale by contact less that by the prior.
+        sigma: Standard deviation of the prior.
+        stands: Probability that the scale by contact is right.
+    """
+    spread = np.hypot(sigma, [RIGHT, WRONG])
+    odds = np.array([stands, 1 - stands]) * np.exp(-0.5 * (gap / spread) ** 2) / spread
+    return float(odds[0] / odds.sum() * sigma**2 / spread[0] ** 2)
+
+
+def _local(place: Float, strong: Mask, residual: Float, sigma: float) -> Float:
+    """(K,) standard deviation of a prior by its residuals at the nearest known depths.
+
+    Args:
+        place: (K, 2) rays of a component's anchors.
+        strong: (K,) True where the flow determines the depth.
+        residual: Log depth less the prior's there.
+        sigma: Standard deviation of the prior in the whole component.
+    """
+    near = min(NEAR, len(residual))
+    index = cKDTree(place[strong]).query(place, k=near)[1].reshape(len(place), near)
+    squared = np.minimum(residual**2, 1.0)[index].sum(axis=1)
+    return np.maximum(np.sqrt((HELD * sigma**2 + squared) / (HELD + near)), LEAST_SIGMA)
+
+
+def _spread(part: Soup, at: Int, count: int) -> Soup:
+    """A soup of `count` superpixels whose superpixels `at` are those of a part."""
+    index = np.zeros(count, int)
+    index[at] = np.arange(len(at))
+    return Soup(part.lam[index], part.n[index], part.d[index], part.R[index], part.t[index])
+
+
+def _soup(mu: Float, slope: Float, R: Float, T: Float, views: Views) -> Soup:
+    """Planes under one motion `X' = R X + T`."""
+    n, D = normal_and_distance(about_anchor(1 / mu, slope / views.radius[:, None], views.anchor))
+    return Soup(D, n, np.ones(len(D)), np.tile(R, (len(D), 1, 1)), T / D[:, None])

@@ -1,0 +1,169 @@
+"""A depth prior counts where the flow confirms it, and decides what the flow leaves open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+import soup_nlp
+from soup_nlp.data.depth_prior import PriorOptions, resized_prior
+from soup_nlp.data.flow.sources import flow_from_truth
+from soup_nlp.data.pair import Pair
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import rays
+from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.geometry.superpixels import segment
+from soup_nlp.report.certainty import certainty
+from soup_nlp.report.folder import summary
+from soup_nlp.start.components import TIES
+from soup_nlp.start.edges import follows_edges
+from soup_nlp.start.given_depth import CONFIRMED, Given, by_prior
+from soup_nlp.start.propose import Start, propose
+from soup_nlp.start.start_options import SeededStart
+
+WAVE = np.sin(np.mgrid[0:240, 0:320] / 40.0).prod(axis=0)
+"""A smooth map that has nothing to do with a scene."""
+
+
+class Seen:
+    """A small scene with true flow, its start, and starts by priors."""
+
+    def __init__(self, scene: str, seed: int = 0) -> None:
+        pair = render_scene(scene, seed, 320, 240)
+        self.pair = pair.with_flow(flow_from_truth(pair))
+        self.seg = build_segmentation(segment(pair.image_ref, 150), pair.image_ref)
+        own = self.pair.flow, pair.K_ref, pair.K_next
+        self.start: Start = propose(self.seg, *own, SeededStart())
+        self.depth = pair.truth.depth_ref
+        self.anchor = rays(pair.K_ref, self.seg.anchors)
+
+    def by(self, prior: np.ndarray, kind: str | None = None) -> tuple[Start, Given]:
+        pair = replace(self.pair, depth_prior=prior)
+        return by_prior(self.start, self.seg, pair, kind, SeededStart())
+
+    def error(self, start: Start) -> np.ndarray:
+        """(N,) log depth of the anchors less the true one, one scale left out."""
+        u, v = np.rint(self.seg.anchors).astype(int).T
+        gap = np.log(start.soup.depth_at(self.anchor) / self.depth[v, u])
+        return gap - np.median(gap)
+
+
+@pytest.fixture(scope="module")
+def swing() -> Seen:
+    return Seen("swing")
+
+
+@pytest.fixture(scope="module")
+def pan() -> Seen:
+    return Seen("pan")
+
+
+def test_a_confirmed_prior_gives_what_swings_its_scale(swing):
+    before = np.abs(swing.error(swing.start)).mean()
+    start, given = swing.by(swing.depth * np.exp(0.1 * WAVE))
+    assert given.kind == "relative"
+    assert given.ratio < CONFIRMED
+    assert np.abs(swing.error(start)).mean() < 0.5 * before
+    assert TIES.index("given depth") in start.tie
+    across = np.ptp(start.component[swing.seg.edges], axis=1) > 0
+    assert (given.opened[across] == 1).all()
+
+
+def test_inverse_depth_with_a_shift_is_found(swing):
+    start, given = swing.by(0.05 + 1 / swing.depth)
+    assert given.kind == "inverse"
+    assert np.abs(swing.error(start)).mean() < 0.1
+
+
+@pytest.mark.parametrize("wrong", ["constant", "smooth", "upside down", "unknown"])
+def test_a_wrong_prior_changes_nothing(swing, pan, wrong):
+    for seen in (swing, pan):
+        prior = {
+            "constant": np.full(seen.depth.shape, 3.0),
+            "smooth": np.exp(WAVE),
+            "upside down": seen.depth[::-1, ::-1],
+            "unknown": np.full(seen.depth.shape, np.nan),
+        }[wrong]
+        start, given = seen.by(prior)
+        assert start is seen.start, wrong
+        assert not given.used
+        assert np.isinf(given.sigma).all()
+        assert "not used" in str(given)
+
+
+def test_before_a_camera_that_turns_a_prior_is_a_guess(pan):
+    assert pan.start.at_rest
+    start, given = pan.by(pan.depth)
+    assert np.isnan(given.ratio)
+    assert given.held.all()
+    assert (given.sigma > 0.25).all()
+    assert np.abs(pan.error(start)).mean() < 0.1 < np.abs(pan.error(pan.start)).mean()
+    # whatever the depth, the flow stays
+    moved = [s.soup.moved(s.soup.points(pan.anchor)) for s in (start, pan.start)]
+    one, two = (m[:, :2] / m[:, 2:] for m in moved)
+    np.testing.assert_allclose(one, two, atol=1e-9)
+
+
+def test_steps_on_the_edges_of_the_image_tell_a_map_of_it():
+    rng = np.random.default_rng(0)
+    image, depth = np.full((120, 160, 3), 90, np.uint8), np.full((120, 160), 5.0)
+    for _ in range(12):
+        x, y, w, h = rng.integers(0, [130, 90, 40, 40])
+        image[y : y + h + 9, x : x + w + 9] = rng.integers(0, 255, 3)
+        depth[y : y + h + 9, x : x + w + 9] = rng.uniform(1, 5)
+    labels = segment(image, 100)
+    log = np.log(depth)
+    assert follows_edges(log, image, labels)
+    assert follows_edges(cv2.GaussianBlur(log, (0, 0), 1.5), image, labels)
+    assert not follows_edges(np.roll(log, (31, 47), axis=(0, 1)), image, labels)
+    assert not follows_edges(np.ones_like(log), image, labels)
+
+
+# --- files -------------------------------------------------------------------------------------
+
+
+def test_a_prior_of_another_size_is_brought_to_the_image(tmp_path, swing):
+    np.save(tmp_path / "half.npy", swing.depth[::2, ::2])
+    pair = PriorOptions(source="half.npy").load(swing.pair, lambda name: tmp_path / name)
+    assert pair.depth_prior.shape == swing.pair.size
+    assert np.median(np.abs(np.log(pair.depth_prior / swing.depth))) < 0.02
+    assert PriorOptions().load(swing.pair, lambda name: tmp_path / name) is swing.pair
+    cv2.imwrite(str(tmp_path / "d.png"), np.rint(1000 * swing.depth).astype(np.uint16))
+    pair = PriorOptions(source="d.png").load(swing.pair, lambda name: tmp_path / name)
+    np.testing.assert_allclose(pair.depth_prior / 1000, swing.depth, rtol=1e-2)
+
+
+def test_a_prior_that_cannot_be_one_is_refused(swing):
+    with pytest.raises(DataError, match="differ in shape"):
+        resized_prior(swing.depth[:, :100], swing.pair, "a file")
+    with pytest.raises(DataError, match="unknown everywhere"):
+        resized_prior(np.full((24, 32), np.nan), swing.pair, "a file")
+    with pytest.raises(DataError, match="no map of numbers"):
+        Pair(swing.pair.image_ref, swing.pair.image_next, fov=60, depth_prior=np.zeros((2, 2, 2)))
+
+
+# --- whole solves ------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_prior_is_a_term_of_the_energy_and_part_of_sigma(pan, swing):
+    options = {"segmentation": {"superpixels": 150}, "refine": {"rounds": 1, "particles": 10}}
+    none = soup_nlp.solve_pair(swing.pair, **options)
+    assert "depth" not in none.energy
+    assert none.given is None
+    assert "depth_prior" not in summary(none)
+    with_it = soup_nlp.solve_pair(swing.pair, prior_ref=swing.depth, **options)
+    assert with_it.energy["depth"] > 0
+    assert with_it.metrics["solution"].mre < 0.7 * none.metrics["solution"].mre
+    assert certainty(with_it)["given"] > 0.05
+    assert summary(with_it)["depth_prior"]["used"]
+    wrong = soup_nlp.solve_pair(swing.pair, prior_ref=np.exp(WAVE), **options)
+    assert wrong.energy == none.energy
+    assert np.array_equal(wrong.confidence.sigma, none.confidence.sigma)
+    guess = soup_nlp.solve_pair(pan.pair, prior_ref=pan.depth, **options)
+    assert guess.metrics["solution"].mre < 0.1
+    assert guess.confidence.guessed == 1.0
