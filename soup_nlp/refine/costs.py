@@ -213,11 +213,11 @@ class PairCosts:
         x *= s.factor(w.prior * d.prior_weight[rows] / reach)
         total += x
         if d.depth_weight[rows].any():
-            log = np.log(s.Z)
-            np.subtract(log[i][:, :, None], log[k][:, None, :], out=x)
-            x -= d.depth_change[rows][:, None, None]
+            nearness = np.log(s.inverse)
+            np.subtract(nearness[k][:, None, :], nearness[i][:, :, None], out=x)
+            x -= s.factor(d.depth_change[rows])
             np.abs(x, out=x)
-            x *= (w.depth * d.depth_weight[rows])[:, None, None]
+            x *= s.factor(w.depth * d.depth_weight[rows])
             total += x
         return total
 

@@ -375,6 +375,8 @@ def test_few_particles_and_isolated_superpixels_work(particles):
                 "rotation_scale",
                 "prior_weight",
                 "prior_relief",
+                "depth_weight",
+                "depth_change",
             )
         },
         **{
