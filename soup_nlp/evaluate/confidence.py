@@ -145,19 +145,24 @@ def with_prior(sigma: Float, prior: Float | float = SIGMA_PRIOR) -> Float:
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
 
-def scale_by_contact(own: Marginals, start: Start, sizes: Int) -> Float:
+def scale_by_contact(own: Marginals, start: Start, sizes: Int, given: Given | None = None) -> Float:
     """(N,) standard deviation of log depth by the scales of components.
 
-    That of a component which has its scale from contact is the marginal and `CONTACT`, in squares.
+    That of a component which has its scale from contact is the marginal and `CONTACT`, in squares;
+    one that has it from a depth prior has the prior's.
     It also moves the mean of the image, to which all depths refer, by the component's area.
 
     Args:
         own: Marginal variances of the components' scales.
         start: Components, and what gives each its scale.
         sizes: (N,) pixels of every superpixel.
+        given: A depth prior.
     """
     contact = (start.tie != TIES.index("reference")) & (start.tie != FIXED)
     scale = np.where(contact, np.hypot(np.sqrt(own.component)[start.component], CONTACT), 0.0)
+    if given is not None:
+        by_prior = (start.tie == TIES.index("given depth")) & np.isfinite(given.sigma)
+        scale = np.where(by_prior, given.sigma, scale)
     mean = float(np.sum(sizes * np.minimum(scale, SIGMA_PRIOR)) / np.sum(sizes))
     return np.hypot(scale, mean)
 
@@ -217,7 +222,7 @@ def confidence(
     most = np.where(bends, BENDING_MISFIT, MOST_MISFIT)
     noise, misfit = start.noise, flow_misfit(rec, pair.flow, most)
     found = evidence(rec.soup, data, start.component, noise)
-    scale = scale_by_contact(own, start, np.bincount(rec.labels.ravel()))
+    scale = scale_by_contact(own, start, np.bincount(rec.labels.ravel()), given)
     rigid = np.hypot(scale, found.sigma)
     added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), rigid)
     added[found.guess[start.component] | start.at_rest | (start.tie == FIXED)] = LARGEST

@@ -56,7 +56,7 @@ def certainty(run: Run) -> dict[str, float]:
     rest, fixed = np.full(labels.shape, start.at_rest), tie == FIXED
     flat = run.confidence.evidence.guess[start.component][labels]
     sizes = run.segmentation.sizes
-    scale = scale_by_contact(run.confidence.marginals, start, sizes)[labels] > MOST_SIGMA
+    scale = scale_by_contact(run.confidence.marginals, start, sizes, run.given)[labels] > MOST_SIGMA
     guess, left = {}, ~sure
     reasons = {"rest": rest, "fixed": fixed, "unseen": unseen, "flat": flat, "scale": scale}
     for name, mask in reasons.items():
