@@ -124,7 +124,7 @@ class Run:
     def components(self) -> Components:
         """What moves as one, with its rigid motion; the first is the static scene."""
         pair, start = self.pair, self.start
-        geometry = self.soup, self.segmentation, start.component, pair.K_ref, pair.K_next
+        geometry = self.soup, self.segmentation, start.part, pair.K_ref, pair.K_next
         return find_components(*geometry, start.borrowed)
 
     @property

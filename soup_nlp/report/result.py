@@ -279,14 +279,14 @@ def _result(tree: ReadTree, attrs: Mapping[str, Any]) -> Result:
     seg = Segmentation(**{f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)})
     height, width = tree["depth"]["next"].shape
     rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
-    component, borrowed = tree["start"]["component"], tree["start"]["borrowed"].astype(bool)
+    part, borrowed = tree["start"]["part"], tree["start"]["borrowed"].astype(bool)
     metre = attrs.get("scale_to_truth")
     return Result(
         name=str(attrs["name"]),
         images=(images[0], images[1]),
         K=(K_ref, K_next),
         reconstruction=replace(rec, sigma_ref=tree["depth"].get("sigma_ref")),
-        components=find_components(soup, seg, component, K_ref, K_next, borrowed),
+        components=find_components(soup, seg, part, K_ref, K_next, borrowed),
         flow_confidence=tree["input"]["confidence"],
         metre=None if metre is None else float(metre),
         metre_unit=str(attrs.get("truth_unit", "m")),

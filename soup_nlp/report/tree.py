@@ -71,6 +71,7 @@ _START: Table = {
     "grounded": ("1", "N", "borrowed, and below the horizon of a known ground"),
     "motion": ("1", "N", "dominant motion, -1 for its own"),
     "component": ("1", "N", "rigid component"),
+    "part": ("1", "N", "what moves as one: its component, or the largest one without usable flow"),
     "surface": ("1", "N", "region without a flow discontinuity"),
     "tie": (
         "1",

@@ -62,6 +62,8 @@ class Start:
         motion: (N,) index of its motion in `motions`, -1 where it has its own.
         component: (N,) index of the rigid component, which shares one scale: the superpixels of a
             dominant motion, or a connected piece of superpixels with their own motions.
+        part: (N,) what moves as one, an index of `component`: its own, or the largest one where its
+            flow is not usable, so that its motion is not known.
         motions: The dominant motions.
         surface: (N,) index of the surface: a connected group without flow discontinuities inside;
             where a region bends, discontinuities make up most of its outline.
@@ -83,6 +85,7 @@ class Start:
     borrowed: Mask
     motion: Int
     component: Int
+    part: Int
     motions: list[Motion]
     surface: Int
     tie: Int
@@ -175,7 +178,9 @@ def propose(
         soup, component, tie, floor = _on_ground(soup, *own_ground)
         grounded = weak & (floor > 0)
     soup = soup.normalised()
-    found = soup, error, parallax, weak, label, component, motions, surface, tie, grounded, bends
+    part = moving_parts(component, views, seg, fixed | bends)
+    own = soup, error, parallax, weak, label, component, part
+    found = *own, motions, surface, tie, grounded, bends
     return Start(*found, wrong & ~bends, noise=limited_noise(error[~bends]))
 
 
@@ -219,7 +224,7 @@ def _constant(
     """Start without relief, where everything bends or the camera is at rest (`turn` is given)."""
     soup, error = constant_depth(views, turn)
     zero, every = np.zeros(len(surface), np.int64), np.ones(len(surface), bool)
-    own = soup, error, _parallax(soup, views), every, zero - 1, zero
+    own = soup, error, _parallax(soup, views), every, zero - 1, zero, zero
     found = *own, choice.renumbered()[1], surface, zero, ~every, every
     return Start(*found, ~every, at_rest=turn is not None, noise=noise)
 
@@ -229,6 +234,31 @@ def with_regions(component: Int, mask: Mask, seg: Segmentation) -> Int:
     region = connected_labels(mask[seg.pairs[:, 0]] & mask[seg.pairs[:, 1]], seg)
     component = np.where(mask, component.max() + 1 + region, component)
     return np.unique(component, return_inverse=True)[1].ravel()
+
+
+def moving_parts(component: Int, views: Views, seg: Segmentation, kept: Mask) -> Int:
+    """(N,) component of every superpixel, the largest one in pieces without usable flow.
+
+    What leaves the image or is hidden has a flow that is alike over some superpixels, and wrong. A
+    component of its own gives it a better depth than its neighbours do, but it need not move.
+    Beside a piece that does move it is taken to be part of it.
+
+    Args:
+        component: (N,) rigid component of every superpixel.
+        views: Confidence of the flow of every superpixel.
+        seg: Superpixels and graphs.
+        kept: (N,) True in components that stay.
+    """
+    main = int(np.argmax(np.bincount(component)))
+    i, k = seg.pairs.T
+    same = component[i] == component[k]
+    piece = connected_labels(same, seg)
+    weight = np.bincount(piece, views.weight.mean(axis=1)) / np.bincount(piece)
+    moves = kept | ((component != main) & (weight >= SURE)[piece])
+    beside = np.zeros(len(weight), bool)
+    for one, other in ((i, k), (k, i)):
+        beside[piece[one[~same & moves[other]]]] = True
+    return np.where(moves | beside[piece], component, main)
 
 
 def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
@@ -242,7 +272,7 @@ def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
     parallax, whole = _parallax(soup, views), np.zeros(len(seg), np.int64)
     noise = limited_noise(error)
     none = np.zeros(len(seg), bool)
-    own = soup, error, parallax, borrowed, whole - 1, whole
+    own = soup, error, parallax, borrowed, whole - 1, whole, whole
     return Start(*own, [], whole, whole, none, none, none, noise=noise)
 
 

@@ -279,3 +279,19 @@ def test_motions_that_are_hardly_different_do_not_mix(monkeypatch):
     assert taken(exact, exact, near).all()
     far = Motion(turn(2e-2) @ exact.R, exact.t)
     assert not taken(far, far, exact).any()
+
+
+def test_only_a_piece_with_usable_flow_moves():
+    seg = cells(4, 8)
+    component = np.zeros(32, int)
+    component[[2, 3]] = 1  # usable
+    component[[4, 5]] = 2  # not, but beside the first
+    component[[16, 17]] = 3  # not
+    component[[22, 23]] = 1  # the first motion again, without usable flow
+    component[[28, 29]] = 4  # not, but of a kind that stays
+    weight = np.where(np.isin(component, (0, 1)), 1.0, 0.2)
+    weight[[22, 23]] = 0.2
+    views = Turns(np.zeros(32), np.repeat(weight[:, None], 4, axis=1))
+    part = proposing.moving_parts(component, views, seg, component == 4)
+    expected = np.where(np.isin(np.arange(32), (16, 17, 22, 23)), 0, component)
+    np.testing.assert_array_equal(part, expected)
