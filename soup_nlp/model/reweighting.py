@@ -52,21 +52,36 @@ def over_ground(data: EnergyData, soup: Soup, grounded: Mask, weight: Float) -> 
     )
 
 
-def with_prior(data: EnergyData, log_depth: Float, opened: Float, weight: Float) -> EnergyData:
+def with_prior(
+    data: EnergyData,
+    log_depth: Float,
+    opened: Float,
+    error: Float,
+    component: Int,
+    weight: Float,
+    stiffer: Float,
+) -> EnergyData:
     """The same data with E_depth instead of E_prior where a depth prior counts.
 
     Args:
         data: Data of the pair.
         log_depth: (N,) log depth of the anchors by the depth prior.
-        opened: (E,) how far the flow leaves the differences along edges open, 0 to 1.
-        weight: (E,) weight of E_depth where it leaves them open; 0 where the prior does not count.
+        opened: (N,) how far the flow leaves the shape of a component open, 0 to 1.
+        error: (N,) standard deviation of the prior; inf where it does not count.
+        component: (N,) group of every superpixel: scales of different ones are open.
+        weight: (E,) of E_depth for a difference by one standard deviation.
+        stiffer: (N,) factor of E_orient between superpixels whose slopes the flow leaves open.
     """
     i, k = data.edges.T
+    between = np.where(component[i] == component[k], np.maximum(opened[i], opened[k]), 1.0)
+    between = np.where(np.isfinite(error[i] + error[k]), between, 0.0)
+    slopes = np.where(opened > 0.5, stiffer, 1.0)[data.pairs].min(axis=1)
     return replace(
         data,
-        depth_weight=opened * weight,
+        depth_weight=between * weight / np.maximum(error[i], error[k]),
         depth_change=log_depth[i] - log_depth[k],
-        prior_weight=np.where(weight > 0, 1 - opened, 1.0) * data.prior_weight,
+        prior_weight=(1 - between) * data.prior_weight,
+        orient_weight=slopes * data.orient_weight,
     )
 
 

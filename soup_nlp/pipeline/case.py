@@ -240,12 +240,15 @@ def build_energy(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, at_anchors
     )
     data = without_flow(in_noise(data, start.noise), start.wrong)
-    free = data.prior_weight
+    free, bent = data.prior_weight, bending_weights(e.weights, len(seg))
     data = across_components(data, start.component, e.arap_across)
     data = over_ground(data, start.soup, start.grounded, PRIOR_OVER_GROUND * free)
     parts = start.component
     if given is not None and given.used:
-        data = with_prior(data, given.log_depth, given.opened, free / given.error)
+        # no flow holds slopes where the prior decides: they are held as those that bend
+        stiffer = np.where(bends, 1.0, bent.orient / max(e.weights.orient, 1e-12))
+        own = given.log_depth, given.opened, given.error, start.component, free, stiffer
+        data = with_prior(data, *own)
         # a given depth has steps inside a component as well
         parts = np.arange(len(seg))
     data = at_occlusions(data, start.soup, parts, OCCLUSION_GAP, e.cont_occluded)
@@ -256,7 +259,6 @@ def build_energy(
         data = in_pixels(data, start.soup, seg, rotation)
     else:
         data = in_length(data, start.soup, e.length)
-    bent = bending_weights(e.weights, len(seg))
     if whole:
         return data, bent
     if bends.any():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from scipy import ndimage, stats
@@ -53,8 +53,6 @@ STANDS = {"contact below": 0.7, "ground": 0.7, "outline": 0.4, "cut off below": 
 """Probability that the scale of a component by contact is right, by its origin (`TIES`)."""
 RIGHT, WRONG = 0.05, 0.5
 """Standard deviation of the log of such a scale if it is right, and if it is not."""
-LEAST_RELIEF = 0.05
-"""Least standard deviation of log depth within a component."""
 HELD, NEAR = 4.0, 15
 """Weight of the whole component's error beside the residuals of so many neighbours."""
 FARTHEST = 50.0
@@ -68,12 +66,13 @@ class Given:
     Attributes:
         log_depth: (N,) log depth at the anchors, up to a common scale.
         sigma: (N,) standard deviation of it, estimated from the flow; inf where it does not decide.
-        opened: (E,) how far the flow leaves differences along the K-NN edges open, 0 to 1.
-        error: (E,) standard deviation of the prior's differences along them.
+        opened: (N,) how far the flow leaves the shape of a component open, 0 to 1.
+        error: (N,) standard deviation of log depth by which E_depth weighs the prior.
         kind: What its values are taken for.
         ratio: Error of the flow of the largest component at the prior's depths relative to that at
             one depth, above the noise; NaN where the flow says nothing.
         held: (N,) True where depth or scale of the start are the prior's.
+        overall: Standard deviation of its log depth in the whole image; inf where it is not used.
     """
 
     log_depth: Float
@@ -83,31 +82,25 @@ class Given:
     kind: Kind
     ratio: float
     held: Mask
+    overall: float = np.inf
 
     def __str__(self) -> str:
         if not self.used:
             return "the depth prior is not used: flow or edges of the image contradict it"
-        own = np.median(self.sigma[np.isfinite(self.sigma)])
         flow = "the flow confirms it" if self.ratio <= CONFIRMED else "no flow confirms it"
-        return f"depth prior ({self.kind}): {flow}; its sigma is {own:.0%}"
+        return f"depth prior ({self.kind}): {flow}; its sigma is {self.overall:.0%}"
 
     __repr__ = __str__
 
     @property
     def used(self) -> bool:
         """Whether the prior counts anywhere."""
-        return bool(np.isfinite(self.sigma).any())
+        return self.overall < np.inf
 
     def as_dict(self) -> dict[str, Any]:
-        """Numbers for summary.json; None for the ratio where the flow says nothing."""
-        ratio, sigma = self.ratio, self.sigma[np.isfinite(self.sigma)]
-        return {
-            "used": self.used,
-            "kind": self.kind,
-            "ratio": None if np.isnan(ratio) else ratio,
-            "median_sigma": float(np.median(sigma)) if self.used else None,
-            "held": float(self.held.mean()),
-        }
+        """Numbers for summary.json; NaN for the ratio where the flow says nothing."""
+        names = ("used", "kind", "ratio", "overall")
+        return {**{k: getattr(self, k) for k in names}, "held": float(self.held.mean())}
 
 
 def by_prior(
@@ -128,7 +121,7 @@ def by_prior(
     seen = _Seen.of(start, seg, flow, pair, o)
     value, known = _at_superpixels(prior, seg)
     main = int(np.argmax(np.bincount(start.component)))
-    none = np.full(len(seg), np.inf), np.zeros(len(seg.edges)), np.full(len(seg.edges), np.inf)
+    none = np.full(len(seg), np.inf), np.zeros(len(seg)), np.full(len(seg), np.inf)
     nowhere = np.zeros(len(seg), bool)
     if not known.any() or np.ptp(value[known]) < 1e-6 * value[known].max():
         return start, Given(np.log(value), *none, kind or "relative", np.nan, nowhere)
@@ -149,16 +142,12 @@ def by_prior(
         return start, nothing
     soup, log_depth, held, opened, own = placed
     own = np.where(known, own, np.inf)
-    i, k = seg.edges.T
-    within = start.component[i] == start.component[k]
-    between = np.where(within, np.maximum(opened[i], opened[k]), 1.0)
-    error = np.maximum(own[i], own[k])
-    if not ratio <= CONFIRMED:
-        # no flow to weigh it against: what counts is that terms on shape do not undo it
-        error = np.where(np.isfinite(error), LEAST_SIGMA, error)
+    # without a flow to weigh it against, terms on shape must not undo the prior
+    error = own if ratio <= CONFIRMED else np.where(np.isfinite(own), LEAST_SIGMA, np.inf)
     tie = np.where(held & (start.component != main), TIES.index("given depth"), start.tie)
     made = replace(start, soup=soup.normalised(), tie=tie)
-    return made, Given(log_depth, np.where(held, own, np.inf), between, error, kind, ratio, held)
+    decides = np.where(held, own, np.inf)
+    return made, Given(log_depth, decides, opened, error, kind, ratio, held, sigma)
 
 
 def _at_superpixels(prior: Float, seg: Segmentation) -> tuple[Float, Mask]:
@@ -176,15 +165,6 @@ def _deviation(value: Float) -> float:
     """Half the distance of the quantiles of one standard deviation."""
     low, high = np.quantile(value, (0.16, 0.84))
     return float(high - low) / 2
-
-
-class _Fit(NamedTuple):
-    """A rigid motion `X' = R X + T` at given depths, its error in pixels, shift of 1 / Z."""
-
-    error: float
-    R: Float
-    T: Float
-    shift: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,9 +195,15 @@ class _Seen:
         """Superpixels of a rigid component whose flow is known."""
         return np.flatnonzero((self.start.component == c) & self.usable)
 
-    def motion(self, at: Int, inverse: Float, shifted: bool = False) -> _Fit:
-        """The rigid motion of superpixels (M,) with inverse depths (M,), to which one shift is
-        added if `shifted`; the tenth with the largest errors does not count."""
+    def motion(
+        self, at: Int, inverse: Float, shifted: bool = False
+    ) -> tuple[float, Float, Float, float]:
+        """The rigid motion of superpixels (M,) with inverse depths (M,), and their shift.
+
+        Returns:
+            Error in pixels without the largest tenth, R and T of `X' = R X + T`, and what is added
+            to all inverse depths, 0 unless `shifted`.
+        """
         ray, middle = self.views.anchor[at], float(np.median(np.abs(inverse)))
 
         def miss(x: Float) -> Float:
@@ -229,7 +215,7 @@ class _Seen:
         x = fit_robustly(miss, 7 if shifted else 6)
         error = np.sort(np.minimum(np.linalg.norm(miss(x), axis=1), CLIP))
         mean = float(np.mean(error[: int(np.ceil(0.9 * len(error)))]))
-        return _Fit(mean, rotation.exp(x[:3]), x[3:6] / middle, middle * x[6] if shifted else 0.0)
+        return mean, rotation.exp(x[:3]), x[3:6] / middle, middle * x[6] if shifted else 0.0
 
     @cache  # noqa: B019 - one record a pair
     def relief(self, c: int) -> tuple[float, float]:
@@ -238,7 +224,7 @@ class _Seen:
         if len(at) < FEWEST or self.start.at_rest:
             return 0.0, self.start.noise
         floor = min(self.start.noise, float(np.median(self.start.error[at])))
-        return self.motion(at, np.ones(len(at))).error - floor, floor
+        return self.motion(at, np.ones(len(at)))[0] - floor, floor
 
     @property
     def tells(self) -> float:
@@ -267,12 +253,12 @@ def _calibrated(
         return kind, logs[kind], np.nan
     tried: list[tuple[float, Kind, Float]] = []
     for name in (kind,) if kind else ("relative", "inverse"):
-        fit = seen.motion(at, np.exp(-logs[name][at]), name == "inverse")
+        error, *_, shift = seen.motion(at, np.exp(-logs[name][at]), name == "inverse")
         log_depth = logs[name]
         if name == "inverse":
-            near = value + fit.shift
+            near = value + shift
             log_depth = -np.log(np.maximum(near, np.median(np.abs(near)) / FARTHEST))
-        tried.append(((fit.error - floor) / relief, name, log_depth))
+        tried.append(((error - floor) / relief, name, log_depth))
     ratio, name, log_depth = min(tried, key=lambda one: one[0])
     # where neither explains the flow a shift lowers the error of any map
     return (name, log_depth, ratio) if ratio <= POSSIBLE else (tried[0][1], tried[0][2], ratio)
@@ -312,9 +298,6 @@ def _placed(
             continue
         soup, strong = _component(seen, soup, int(c), prior, sigma)
         moved = np.linalg.norm(soup.parallax(anchor)[at] * seen.views.focal, axis=1)
-        # a turn explains a part of the parallax: what it does not tells depths apart
-        beyond = seen.relief(int(c))[0] / max(_deviation(prior[at]), LEAST_RELIEF)
-        moved *= min(1.0, beyond / max(float(np.median(moved)), 1e-3))
         flow = (start.noise / np.maximum(moved, 1e-3)) ** 2
         found = np.log(soup.depth_at(anchor)[at])
         off = np.zeros(len(at))
@@ -357,15 +340,15 @@ def _component(seen: _Seen, soup: Soup, c: int, prior: Float, sigma: float) -> t
     length, rigid = float(np.linalg.norm(T)), np.ptp(soup.R[at], axis=0).max() < 1e-9
     if len(use) < FEWEST or not rigid or not length > 0:
         return soup, ~start.borrowed[at] if (~start.borrowed[at]).any() else np.ones(len(at), bool)
-    fit = seen.motion(use, np.exp(-prior[use]))
+    _, R, T_prior, _ = seen.motion(use, np.exp(-prior[use]))
     part, flat = views.some(at), np.zeros((len(at), 2))
     if not seen.determined(c):
         # any depth explains the flow: the prior's, with the motion that belongs to it
-        own = _soup(np.exp(-prior[at]), flat, fit.R, fit.T, part)
+        own = _soup(np.exp(-prior[at]), flat, R, T_prior, part)
         return soup.taking(_spread(own, at, len(prior)), mask), np.zeros(len(at), bool)
     error = min(SYSTEMATIC * start.noise, MOST_SYSTEMATIC_PX)
     rest = views.anchor[use], seen.centre[use], np.ones(len(use)), views.focal[0], error
-    tried = Motion(soup.R[at[0]], T / length), Motion(fit.R, fit.T / np.linalg.norm(fit.T))
+    tried = Motion(soup.R[at[0]], T / length), Motion(R, T_prior / np.linalg.norm(T_prior))
     found = [most_probable(m, *rest, prior[use], sigma) for m in tried]
     best = min(found, key=lambda m: float(np.sum(improbable(m, *rest, prior[use], sigma) ** 2)))
     planes = part.fit([best])
@@ -383,12 +366,8 @@ def _component(seen: _Seen, soup: Soup, c: int, prior: Float, sigma: float) -> t
 def _kept(gap: float, sigma: float, stands: float) -> float:
     """Share of the scale by contact in that of a component, the rest is the prior's.
 
-    The scale by contact is right (`RIGHT`) or not (`WRONG`); the gap tells which.
-
-    Args:
-        gap: Log scale by contact less that by the prior.
-        sigma: Standard deviation of the prior.
-        stands: Probability that the scale by contact is right.
+    With the probability `stands` it is right (`RIGHT`), else not (`WRONG`); the gap of its log to
+    the prior, which has the deviation `sigma`, tells which.
     """
     spread = np.hypot(sigma, [RIGHT, WRONG])
     odds = np.array([stands, 1 - stands]) * np.exp(-0.5 * (gap / spread) ** 2) / spread
@@ -396,13 +375,10 @@ def _kept(gap: float, sigma: float, stands: float) -> float:
 
 
 def _local(place: Float, strong: Mask, residual: Float, sigma: float) -> Float:
-    """(K,) standard deviation of a prior by its residuals at the nearest known depths.
+    """(K,) standard deviation of a prior by its residuals in log depth at the nearest known depths.
 
-    Args:
-        place: (K, 2) rays of a component's anchors.
-        strong: (K,) True where the flow determines the depth.
-        residual: Log depth less the prior's there.
-        sigma: Standard deviation of the prior in the whole component.
+    `place` (K, 2) are a component's anchors, `strong` (K,) marks known depths, to which residuals
+    belong, and `sigma` is the deviation in the whole component.
     """
     near = min(NEAR, len(residual))
     index = cKDTree(place[strong]).query(place, k=near)[1].reshape(len(place), near)
