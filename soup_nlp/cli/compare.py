@@ -15,7 +15,7 @@ from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
 from soup_nlp.bench.solvers.runner import make_tasks
-from soup_nlp.cli.options import Coordinates, Formulations, Overwrite, Presolve, Set, Superpixels
+from soup_nlp.cli.options import Coordinates, Formulations, Overwrite, Set, Superpixels
 from soup_nlp.config.problem import load_problem, title
 from soup_nlp.errors import ConfigError, StoppedError
 from soup_nlp.export.artefact import parse_formulations
@@ -46,7 +46,10 @@ def compare(
     iterations: Annotated[int, typer.Option(help="Iteration limit of a run.")] = 300,
     tol: Annotated[float, typer.Option(help="Dual infeasibility; constraints get 1/100.")] = 1e-4,
     memory: Annotated[float, typer.Option(help="Memory limit of a run, GiB.")] = 4.0,
-    presolve: Presolve = True,
+    presolve: Annotated[
+        bool,
+        typer.Option(help="Begin at the presolve's answer (a confirmation) or the initialisation."),
+    ] = False,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Output folder; default out/solvers-NAMES.")
     ] = None,
@@ -79,17 +82,25 @@ def compare(
     names_of = dict.fromkeys([*(path.name for path in sets), *(p.name for p in chosen)])
     out = out or default_folder(title(f"solvers-{'-'.join(names_of)}"), subject)
     folder = claim(out, written, overwrite, subject)
+    # rows of the problems before, and all rows so far
+    before: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
-    of_family: list[dict[str, Any]] = []
     runs = folder / "runs.jsonl"
+
+    def keep(more: list[dict[str, Any]]) -> None:
+        """The page after every run: a run may take minutes, and a command may be killed."""
+        rows[:] = [*before, *more]
+        with staged(folder, subject=subject) as new:
+            write_text(new / "README.md", page(frame_of_runs(rows), family=bool(sets)))
+
     try:
         with scratch() as temporary:
             for path in sets:
                 for tasks in family_tasks(path, limits):
-                    of_family += run_all(tasks, names, limits, runs, temporary, print)
+                    before += run_all(tasks, names, limits, runs, temporary, print, keep)
             for problem in chosen:
                 tasks = list(make_tasks(prepare(problem, presolve), forms, limits, presolve))
-                rows += run_all(tasks, names, limits, runs, temporary, print)
+                before += run_all(tasks, names, limits, runs, temporary, print, keep)
     except KeyboardInterrupt:
         raise StoppedError(
             "interrupted: the runs that were finished are kept, with a page of them",
@@ -98,9 +109,8 @@ def compare(
         ) from None
     finally:
         # write the page of the finished runs even after an error
-        rows += of_family
         if rows:
-            _write(folder, rows, of_family, limits, subject)
+            _write(folder, rows, [r for r in rows if "best_known" in r], limits, subject)
     print("\n".join(conclusion(frame_of_runs(rows))))
     print(f"files       {out}/: {', '.join(written)}, runs.jsonl")
     verified = sum(bool(r["verified"]) for r in rows)

@@ -17,7 +17,14 @@ from soup_nlp.storage.folders import claim, staged
 QUICK = "100,250"
 """Default sizes, which take about a minute."""
 
-TABLES = ("index.json", "index.csv", "README.md", "LICENSE.txt")
+TABLES = (
+    "index.json",
+    "index.csv",
+    "instancedata.csv",
+    "run.py",
+    "README.md",
+    "LICENSE.txt",
+)
 """Files of a set beside its instances."""
 
 
@@ -56,7 +63,7 @@ def family(
     claim(out, TABLES, overwrite)
     with staged(out, whole=True, overwrite=overwrite) as new:
         entries = write_family(new, chosen)
-    print(f"{len(entries)} instances; index.json, index.csv, README.md, LICENSE.txt in {out}/")
+    print(f"{len(entries)} instances; {', '.join(TABLES)} in {out}/")
     changed = [e["name"] for e in entries if e["published"] is False]
     if changed:
         print(f"{len(changed)} are not the published bytes: please report processor and versions")

@@ -39,6 +39,16 @@ SIZES = (100, 250, 500, 1000, 2000)
 STARTS = ("easy", "hard", "cold")
 STANDARD = "unit-offset/smooth/smooth"
 """Default formulation of the family."""
+INITIALS = {
+    "unit-offset": "o",
+    "unit-translation": "t",
+    "free": "f",
+    "tangent": "n",
+    "smooth": "s",
+    "epigraph": "e",
+    "lifted": "l",
+}
+"""Letter of every word of a formulation."""
 BITS = 20
 """Significant bits of every number of an instance."""
 MIN_EXPONENT = -30
@@ -69,17 +79,30 @@ class Instance:
         return f"{self.problem}-{self.start}"
 
     @property
+    def short(self) -> str:
+        """The same in at most 24 characters, such as `SOUP-street-oss-100h`: initials of gauge,
+        norm and truncation ("n" for tangent coordinates, of which there are nine), and of the
+        start."""
+        form = "".join(INITIALS[word] for word in self.formulation.split("/"))
+        return f"SOUP-{self.scene}-{form}-{self.size}{self.start[0]}"
+
+    @property
     def problem(self) -> str:
         """The name without the start."""
         return f"SOUP-{self.scene}-{self.formulation.replace('/', '-')}-N{self.size}"
 
 
 def parse_name(name: str) -> Instance:
-    """The instance of a name; a name without start gets the first start.
+    """The instance of a long or short name; a long name without start gets the first start.
 
     Raises:
         ConfigError: the name is not one of the family.
     """
+    found = re.fullmatch(r"SOUP-([a-z]+)-([a-z]{3})-(\d+)([a-z])", name)
+    for form, start in product(formulations(), STARTS) if found else ():
+        one = Instance(found[1], form, int(found[3]), start)  # type: ignore[index]
+        if one.short == name and one.scene in SCENES and one.size in SIZES:
+            return one
     found = re.fullmatch(r"SOUP-([a-z]+)-([a-z-]+)-N(\d+)(?:-([a-z]+))?", name)
     for form in formulations() if found else ():
         assert found is not None

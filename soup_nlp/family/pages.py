@@ -30,13 +30,14 @@ solution lies on the kinks of what the objective is a smoothing of (width 0.01 p
     min  f(x) = sum over edges, pixels, boundaries of sqrt(|v(x)|^2 + eps^2) - eps, truncated
     s.t. sum lam = 1, lam > 0,  R_i'R_i = I,  |n_i|^2 = 1,  -n_i . ray >= c
 
-Continuous, sparse, nonconvex, feasible and bounded below by 0 but for truncations; many local
+Continuous, sparse, nonconvex, feasible and bounded below by 0; many local
 minima close to each other. Equality rows are quadratic, the visibility rows linear, the objective
 is general. All functions are twice differentiable at every point with lam > 0 and a positive depth.
 
 | | |
 |---|---|
 | family | {scenes}; names are `SOUP-<scene>-<formulation>-N<size>-<start>` |
+| short names | at most 24 characters, in `instancedata.csv`: `SOUP-street-oss-100h` |
 | sizes | N = {sizes} superpixels asked for; 16 variables each in the standard formulation |
 | start `easy` | the best known point, rounded to 20 significant bits |
 | start `hard` | an initial proposal, made from the true flow |
@@ -45,29 +46,42 @@ is general. All functions are twice differentiable at every point with lam > 0 a
 | determinism | one version, one set of bytes on any processor; SHA-256 in `index.json` |
 | licence | CC BY 4.0, see LICENSE.txt; rendered scenes only |
 
+## How hard they are
+
+`hard` and `cold` are the problem. **No general solver that was tried solves any of them** within
+the limits of the table below: Ipopt and POUNCE with default or tuned options, Bonmin and an SQP
+method stop far above the best known points or without a point. What gets there narrows the
+smoothing in steps (soup_nlp, and its Levenberg-Marquardt method on the manifold, "lm"). An `easy`
+start is a solution already, so that a run from there is a confirmation only.
+
 ## How to run
 
-Any solver that reads AMPL's `.nl` takes the files; nothing else is needed:
+Any solver that reads AMPL's `.nl` takes the files: `SOLVER NAME -AMPL`. A runner in one file calls
+it on every instance, recomputes objective, violation and stationarity from its answer, and says
+whether it converged to the best known point, differs from it, or is WRONG (needs Python with
+casadi; words select instances):
 
-    pounce SOUP-street-unit-offset-smooth-smooth-N100-hard -AMPL      # ipopt, knitro, uno_ampl ...
-    soup-nlp check SOUP-street-unit-offset-smooth-smooth-N100-hard.sol
+    python run.py "pounce mu_init=1e-5 bound_push=1e-6 bound_frac=1e-6 nlp_scaling_method=none" easy
+    python run.py "pounce max_cpu_time=50" hard --seconds 60
 
-An `easy` start is a solution; an interior-point method stays there only with a small barrier:
+The first confirms `easy` starts, of N = 100 in seconds each: an interior-point method stays at a
+solution only with a small barrier. The second ends at its limit (see below). With soup_nlp,
+`soup-nlp check NAME.sol` builds the instance again and recomputes the same from derivatives of its
+own.
 
-    pounce SOUP-street-unit-offset-smooth-smooth-N100-easy -AMPL mu_init=1e-5 bound_push=1e-6 \\
-        bound_frac=1e-6 nlp_scaling_method=none
-
-`.col` and `.row` name variables and rows. The `.sol` that the solver writes has to keep the name of
-its instance; `check` builds the instance again and recomputes objective and KKT residuals. To send
-results, write a JSON object with a list `results` of objects with at least `solver`, `name`, `n`,
-`m`, `status`, `objective`, `iterations`, `time` (seconds).
+`.col` and `.row` name variables and rows. `<name without start>.casadi` is the program as CasADi's
+serialised text: function `nlp` of x to f and g, then lbx, ubx, lbg, ubg and x0 of every start of
+this folder; casadi-reader (PyPI) reads it without CasADi. Converters to GAMS, OSiL or SIF were not
+tried. To send results, write a JSON object with a list `results` of objects with at least `solver`,
+`name`, `n`, `m`, `status`, `objective`, `iterations`, `time` (seconds).
 
 ## Known optima
 
 `<name without start>.sol` is the best known point (primal). `index.json` and `index.csv` have its
 objective, its unscaled KKT residuals, who found it and who reached it: with a verified point at
-most 1e-4 relative above. Of formulations whose truncation is `lifted` the point is feasible, not
-optimal: it is the minimum of the smooth truncation.
+most 1e-4 relative above. `instancedata.csv` has the columns of MINLPLib; its dual bound is 0, as
+every term of the objective is at least 0. Of formulations whose truncation is `lifted` the point
+is feasible, not optimal: it is the minimum of the smooth truncation.
 """
 
 COLUMNS: Mapping[str, Callable[[Entry], str]] = {
@@ -90,6 +104,37 @@ def _share(best: Entry) -> str:
     return f"{len(reached)} of {len(tried)} solvers" if tried else "not measured"
 
 
+def _reached(entries: Sequence[Entry]) -> list[str]:
+    """What each solver reached from each start: objective above the best known one, CPU seconds."""
+    known = [e for e in entries if e["runs"]]
+    solvers = list(dict.fromkeys(s for e in known for s in e["runs"]))
+    if not solvers:
+        return []
+
+    def cell(entry: Entry, solver: str) -> str:
+        objective, seconds, limit, verified = entry["runs"].get(solver, (None, None, None, False))
+        if seconds is None:
+            return "-"
+        if objective is None:
+            return f"no point, {seconds:g} of {limit:g} s"
+        best = entry["best_known"]["objective"]
+        gap = f"{100 * (objective - best) / abs(best):+.2g} %"
+        return f"{f'**{gap}**' if verified else gap}, {seconds:g} of {limit:g} s"
+
+    rows = [[e["short"], *(cell(e, s) for s in solvers)] for e in known]
+    return [
+        "",
+        "## What solvers reached",
+        "",
+        "Objective above the best known one; bold: the point is verified as an optimum. CPU seconds"
+        " of their limit. Options and machine: results/family of the soup_nlp repository.",
+        "",
+        "| instance | " + " | ".join(solvers) + " |",
+        "|" + "---|" * (len(solvers) + 1),
+        *("| " + " | ".join(row) + " |" for row in rows),
+    ]
+
+
 def readme(entries: Sequence[Entry]) -> str:
     """README of the folder, for the entries of its index."""
     scenes = ", ".join(dict.fromkeys(e["scene"] for e in entries))
@@ -110,4 +155,4 @@ def readme(entries: Sequence[Entry]) -> str:
         "Nonzeros of the Hessian are of its upper triangle. LICQ: at the best known point, with the"
         " rank of the active rows in brackets.",
     ]
-    return head + "\n" + "\n".join([*lines, *note, *starts]) + "\n"
+    return head + "\n" + "\n".join([*lines, *note, *_reached(entries), *starts]) + "\n"

@@ -11,13 +11,16 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
+
 from soup_nlp import __version__
 from soup_nlp.data.pair import Pair
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import examine
-from soup_nlp.family.describe import classes, classification, qualification, sizes
+from soup_nlp.family import run_solver
+from soup_nlp.family.describe import CLASSES, classes, classification, qualification, sizes
 from soup_nlp.family.frozen import Frozen, load_frozen
 from soup_nlp.family.instances import VERSION, Instance, build_instance, case_of, problems
 from soup_nlp.family.pages import LICENCE, readme
@@ -28,6 +31,8 @@ from soup_nlp.storage.store import write_json
 
 Entry = dict[str, Any]
 
+REACHED = 1e-4
+"""Relative distance up to which an objective has reached the best known one."""
 DIGITS = 9
 """Significant digits in the index; further digits depend on the processor."""
 
@@ -62,16 +67,23 @@ def write_family(
         for form in dict.fromkeys(i.formulation for i in own):
             starts = [i for i in own if i.formulation == form]
             shared: Entry = {}
+            programs = []
             for instance in starts:
                 nlp, layout, _ = build_instance(case, record, form, instance.start)
                 names = readable_names(nlp, layout)
                 file = write_nl(folder / f"{instance.name}.nl", nlp, names=names)
                 shared = shared or _solved(folder, case, record, instance, file, known)
                 entries.append(_entry(instance, nlp, file, shared, known))
+                programs.append(nlp)
                 say(_line(entries[-1]))
+            write_text(folder / f"{starts[0].problem}.casadi", as_casadi(programs))
     index = {"set": "SOUP", "version": VERSION, "generator": f"soup_nlp {__version__}"}
     write_json(folder / "index.json", {**index, "instances": entries})
-    write_text(folder / "index.csv", as_csv(entries))
+    write_text(
+        folder / "index.csv", as_csv([{k: v for k, v in e.items() if k != "runs"} for e in entries])
+    )
+    write_text(folder / "instancedata.csv", as_csv([instance_data(e) for e in entries], ";"))
+    write_text(folder / "run.py", Path(run_solver.__file__).read_text(encoding="utf-8"))
     write_text(folder / "README.md", readme(entries))
     write_text(folder / "LICENSE.txt", LICENCE)
     return entries
@@ -94,13 +106,18 @@ def _solved(
     file: NLFile,
     known: Mapping[str, Any],
 ) -> Entry:
-    """Write the best known point of a problem as .sol; returns entries that all starts share."""
+    """Write the best known point of a problem as .sol; returns entries that all starts share.
+
+    "runs" has what solvers reached, by start and solver, see `bench.solvers.family_runs.summary`.
+    """
     nlp = build_instance(case, record, instance.formulation, "best")[0]
     x = nlp.x0
     message = f"SOUP {VERSION}: best known point of {instance.problem}"
     order = file.variables, file.rows
     write_sol(folder / f"{instance.problem}.sol", x, None, *order, message)
     found = classes(nlp)
+    solved = dict(known["solved"].get(instance.problem, {}))
+    runs = solved.pop("runs", {})
     r = examine(nlp, x, None).residuals
     return {
         "superpixels": len(case),
@@ -116,8 +133,9 @@ def _solved(
             "reached_by": [],
             "tried_by": [],
             "date": None,
-            **known["solved"].get(instance.problem, {}),
+            **solved,
         },
+        "runs": runs,
     }
 
 
@@ -128,12 +146,14 @@ def _entry(
     sha = known["sha256"].get(instance.name)
     return {
         "name": instance.name,
+        "short": instance.short,
         "file": file.path.name,
         "scene": instance.scene,
         "formulation": instance.formulation,
         "size": instance.size,
         "start": instance.start,
         **shared,
+        "runs": shared["runs"].get(instance.start, {}),
         "objective_at_start": _short(nlp.oracle(nlp.x0, nlp.p)[0]),
         "bytes": file.size,
         "sha256": file.sha256,
@@ -146,12 +166,60 @@ def _short(value: Any, digits: int = DIGITS) -> float:
     return float(f"{float(value):.{digits}g}")
 
 
-def as_csv(entries: Sequence[Entry]) -> str:
+def as_casadi(programs: Sequence[NLP]) -> str:
+    """A program with its starts as CasADi's serialised text: function `nlp` of x to f and g, then
+    lbx, ubx, lbg, ubg, and x0 of every start.
+
+    Variables and rows are in the order of the program, not in that of the .nl file.
+    """
+    nlp = programs[0]
+    x = ca.MX.sym("x", nlp.nx)
+    f, g = nlp.oracle(x, nlp.p)
+    text = ca.StringSerializer()
+    text.pack(ca.Function("nlp", [x], [f, g], ["x"], ["f", "g"]))
+    for vector in (nlp.lbx, nlp.ubx, nlp.lbg, nlp.ubg, *(p.x0 for p in programs)):
+        text.pack(ca.DM(vector))
+    return str(text.encode())
+
+
+def instance_data(entry: Mapping[str, Any]) -> Entry:
+    """An entry in the columns of MINLPLib's instancedata.csv, as far as they have a meaning here.
+
+    The dual bound is 0: every term of the objective is at least 0.
+    """
+    best, rows = entry["best_known"], entry["constraint_classes"].values()
+    by_class = {
+        word: sum(c["rows"] for c in rows if c["class"] == word) for word in CLASSES.values()
+    }
+    return {
+        "name": entry["short"],
+        "file": entry["file"],
+        "probtype": "NLP",
+        "objsense": "min",
+        "objtype": "nonlinear",
+        "nvars": entry["variables"],
+        "nnlvars": entry["nonlinear_variables"]["objective"],
+        "ncons": entry["constraints"],
+        "nlincons": by_class["constant"] + by_class["linear"],
+        "nquadcons": by_class["quadratic"],
+        "ngennlcons": by_class["general"],
+        "njacobiannz": entry["jacobian_nonzeros"],
+        "nlaghessiannz": entry["hessian_nonzeros"],
+        "startvalue": entry["objective_at_start"],
+        "primalbound": best["objective"],
+        "primaltolerance": REACHED,
+        "dualbound": 0.0,
+        "foundby": best["found_by"] or "soup_nlp",
+        "reachedby": " ".join(best["reached_by"]),
+    }
+
+
+def as_csv(entries: Sequence[Entry], delimiter: str = ",") -> str:
     """The entries as a CSV table; columns of nested entries have names with dots."""
     rows = [_flat(e) for e in entries]
     head = list(dict.fromkeys(k for row in rows for k in row))
     out = io.StringIO()
-    writer = csv.DictWriter(out, head, restval="", lineterminator="\n")
+    writer = csv.DictWriter(out, head, restval="", lineterminator="\n", delimiter=delimiter)
     writer.writeheader()
     writer.writerows(rows)
     return out.getvalue()

@@ -250,7 +250,7 @@ def test_profile_of_nothing_solved():
 
 def test_page_and_pictures(tmp_path):
     text = page(ROWS)
-    assert text.index("**2 problems") < text.index("## By run") < text.index("## Limits")
+    assert text.index("**2 problems") < text.index("## Confirmation") < text.index("## Limits")
     assert "a / b" in text
     frame = frame_of_runs(ROWS)
     draw_profiles(tmp_path / "p.png", {"": frame}, ("seconds", "energy"))
@@ -262,7 +262,7 @@ def test_page_and_pictures(tmp_path):
 def test_command(tmp_path, capsys):
     words = [
         "compare", str(PROBLEMS / "orbit.yaml"), "-o", str(tmp_path), "--superpixels", "12",
-        "--solvers", "ipopt-soup", "--seconds", "20", "--set", "input.width=96",
+        "--solvers", "ipopt-soup", "--seconds", "20", "--presolve", "--set", "input.width=96",
         "--set", "input.height=64", "--set", "flow.source=truth",
         "--set", "segmentation.neighbours=4", "--set", "energy.pixel_samples=4",
     ]  # fmt: skip

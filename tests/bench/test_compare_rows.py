@@ -228,3 +228,42 @@ def test_a_curve_has_the_first_and_the_last_iterate(monkeypatch):
         assert curve[-1] == [count - 1, count - 1]
         assert len(curve) == min(count, runner.CURVE_POINTS)
     assert runner._curve(None, np.zeros(0), np.zeros((0, 1))) == []
+
+
+def test_one_tolerance_decides_with_or_without_a_claim(task, tmp_path, monkeypatch):
+    exact = find_solver("ipopt-tuned")(replace(task, folder=tmp_path))
+    rows = []
+    for claimed in (True, False):
+        answer = replace(exact, claimed=claimed)
+        monkeypatch.setattr(
+            "soup_nlp.bench.solvers.runner.find_solver", lambda n, a=answer: lambda t: a
+        )
+        rows += run(task, ["some"], tmp_path / str(claimed))
+    assert [r["verified"] for r in rows] == [True, True]
+    assert [r["claimed"] for r in rows] == [True, False]
+    text = page(rows)
+    assert "| some | 2 | 1 | 2 | 1 of 1 |" in text
+
+
+def test_runs_that_begin_at_a_solution_are_headed_confirmation(task, tmp_path, monkeypatch):
+    answer = find_solver("ipopt-tuned")(replace(task, folder=tmp_path))
+    monkeypatch.setattr("soup_nlp.bench.solvers.runner.find_solver", lambda n: lambda t: answer)
+    (found,) = run(task, ["some"], tmp_path)
+    text = page([{**found, "start": start, "problem": start} for start in ("hard", "easy")])
+    first, second = text.index("## By run"), text.index("## Confirmation")
+    assert first < text.index("| hard |") < second < text.index("| easy |")
+
+
+def test_the_page_is_there_after_every_run(task, tmp_path, monkeypatch):
+    answer = find_solver("ipopt-tuned")(replace(task, folder=tmp_path))
+    seen: list[int] = []
+    said: list[str] = []
+    monkeypatch.setattr("soup_nlp.bench.solvers.runner.find_solver", lambda n: lambda t: answer)
+    tasks = [(LABEL, lambda folder: replace(task, folder=folder))]
+    path = tmp_path / "runs.jsonl"
+    compare(
+        tasks, ["a", "b"], task.limits, path, tmp_path, said.append, lambda r: seen.append(len(r))
+    )
+    assert seen == [1, 2]
+    # the solver is named before it runs
+    assert [line.split()[-3] for line in said[::2]] == ["a", "b"]

@@ -14,15 +14,11 @@ import pytest
 from scipy import sparse
 
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import make_problem
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.nl import write_nl
-from soup_nlp.family import results, write
 from soup_nlp.family.describe import degree, rank
-from soup_nlp.family.freeze import record_of
 from soup_nlp.family.frozen import (
-    Frozen,
     decoded,
     encoded,
     load_frozen,
@@ -38,42 +34,19 @@ from soup_nlp.family.instances import (
     Instance,
     build_instance,
     case_of,
+    formulations,
     parse_name,
     rounded,
     select,
 )
 from soup_nlp.family.results import check_sol, write_results
-from soup_nlp.family.write import published, write_family
+from soup_nlp.family.write import published
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.pipeline.case import prepare
 
 pytestmark = pytest.mark.slow
 
 LIFTED = "free/epigraph/lifted"
-
-
-@pytest.fixture(scope="module")
-def record() -> Frozen:
-    """Thirty superpixels of a small room with the true flow; its best point is the proposal."""
-    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
-    own = {"input": scene, "segmentation": {"superpixels": 30}, "flow": {"source": "truth"}}
-    return record_of(prepare(make_problem(own)))
-
-
-@pytest.fixture(scope="module")
-def folder(record, tmp_path_factory):
-    """The set of that record, under the names of a published size."""
-    out = tmp_path_factory.mktemp("set")
-    patch = pytest.MonkeyPatch()
-    for module in (write, results):
-        patch.setattr(module, "load_frozen", lambda scene, size: record)
-    chosen = select([100], ["room"], [STANDARD]) + select([100], ["room"], [LIFTED], ["hard"])
-    lines: list[str] = []
-    write_family(out, chosen, lines.append)
-    assert len(lines) == len(chosen) == 4
-    yield out
-    patch.undo()
 
 
 # --- names ---------------------------------------------------------------------------------------
@@ -84,6 +57,12 @@ def test_a_name_says_which_instance_it_is():
     assert one.name == "SOUP-street-free-epigraph-lifted-N250-cold"
     assert parse_name(one.name) == one
     assert parse_name(one.problem).start == "easy"
+    assert one.short == "SOUP-street-fel-250c"
+    every = select(SIZES, SCENES, formulations())
+    short = {i.short: i for i in every}
+    assert len(short) == len(every)
+    assert max(map(len, short)) <= 24
+    assert all(parse_name(name) == i for name, i in list(short.items())[::17])
     # the gauge has a dash of its own
     standard = Instance("orbit", STANDARD, 250, "hard")
     assert parse_name(standard.name) == standard
@@ -232,6 +211,14 @@ def test_the_index_says_what_problem_sets_say(folder):
     assert float(rows[0]["best_known.objective"]) == easy["best_known"]["objective"]
     assert "CC BY 4.0" in (folder / "LICENSE.txt").read_text()
     assert easy["sha256"][:16] in (folder / "README.md").read_text()
+    text = (folder / "instancedata.csv").read_text().splitlines()
+    data = {r["name"]: r for r in csv.DictReader(text, delimiter=";")}
+    own = data[easy["short"]]
+    assert own["file"] == easy["file"]
+    assert int(own["nvars"]), int(own["ncons"]) == (16 * n, 16 * n + 1)
+    assert int(own["nlincons"]) + int(own["nquadcons"]) == 16 * n + 1
+    assert int(own["nquadcons"]) == 7 * n
+    assert float(own["dualbound"]) == 0 < float(own["primalbound"])
 
 
 def test_a_best_point_is_read_back_as_an_answer(folder):

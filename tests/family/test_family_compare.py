@@ -44,14 +44,16 @@ def test_a_minimum_is_reached_when_it_is_verified_and_near():
     assert reached(frame_of_runs(ROWS)).tolist() == [True, True, False, False, True]
     # lower than what was known is reached as well
     assert reached(frame_of_runs([row("one", "easy", 3.0)])).all()
-    assert summary(frame_of_runs(ROWS)) == {
-        STUB: {"tried_by": ["one", "two", "three"], "reached_by": ["one", "two"]}
-    }
+    found = summary(frame_of_runs(ROWS))[STUB]
+    runs = found.pop("runs")
+    assert found == {"tried_by": ["one", "two", "three"], "reached_by": ["one", "two"]}
+    assert runs["easy"]["two"] == [4.0001, 3.0, 60.0, True]
+    assert runs["hard"] == {"one": [5.0, 1.0, 60.0, True], "two": [4.0003, 1.0, 60.0, True]}
 
 
 def test_rows_belong_to_a_start_and_a_size(tmp_path):
     frame = frame_of_runs(ROWS)
-    assert list(by_start(frame)) == ["easy, N = 100", "hard, N = 100"]
+    assert list(by_start(frame)) == ["confirmation, N = 100", "hard, N = 100"]
     text = page(frame, family=True)
     assert "| one | 1 of 1 (1), 1.0 s | 1 of 1 (0), 1.0 s |" in text
     assert "| three | 0 of 1 (0) | - |" in text

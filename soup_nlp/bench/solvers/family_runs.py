@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from soup_nlp.bench.solvers.page import reached
@@ -83,13 +84,29 @@ def neutral(frame: pd.DataFrame) -> list[dict[str, Any]]:
     return [{str(k): v for k, v in row.items()} for row in out.to_dict("records")]
 
 
-def summary(frame: pd.DataFrame) -> dict[str, dict[str, list[str]]]:
-    """Solvers that tried and that reached the best known point, by problem (name without start)."""
+def summary(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """Solvers that tried and that reached the best known point, by problem (name without start).
+
+    "runs" has objective, CPU seconds, their limit and whether the point is verified, by start and
+    solver: what `records/published.json` takes for the README of the set.
+    """
     names = frame["name"].str.rpartition("-")[0]
     return {
         str(name): {
             "tried_by": list(group["solver"].unique()),
             "reached_by": list(group.loc[reached(group), "solver"].unique()),
+            "runs": {
+                str(start): {str(row["solver"]): _run(row) for _, row in own.iterrows()}
+                for start, own in group.groupby("start", sort=False)
+            },
         }
         for name, group in frame.groupby(names, sort=False)
     }
+
+
+def _run(row: pd.Series) -> list[Any]:
+    """Objective or None, CPU seconds, their limit, verified."""
+    objective = float(row["objective"])
+    value = float(f"{objective:.9g}") if np.isfinite(objective) else None
+    limit = float(row["limits"]["seconds"])
+    return [value, round(float(row["cpu_seconds"]), 1), limit, bool(row["verified"])]

@@ -1,0 +1,38 @@
+"""A small set under the names of a published size."""
+
+from __future__ import annotations
+
+import pytest
+
+from soup_nlp.config.problem import make_problem
+from soup_nlp.family import results, write
+from soup_nlp.family.freeze import record_of
+from soup_nlp.family.frozen import Frozen
+from soup_nlp.family.instances import STANDARD, select
+from soup_nlp.family.write import write_family
+from soup_nlp.pipeline.case import prepare
+
+LIFTED = "free/epigraph/lifted"
+
+
+@pytest.fixture(scope="module")
+def record() -> Frozen:
+    """Thirty superpixels of a small room with the true flow; its best point is the proposal."""
+    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
+    own = {"input": scene, "segmentation": {"superpixels": 30}, "flow": {"source": "truth"}}
+    return record_of(prepare(make_problem(own)))
+
+
+@pytest.fixture(scope="module")
+def folder(record, tmp_path_factory):
+    """The set of that record, under the names of a published size."""
+    out = tmp_path_factory.mktemp("set")
+    patch = pytest.MonkeyPatch()
+    for module in (write, results):
+        patch.setattr(module, "load_frozen", lambda scene, size: record)
+    chosen = select([100], ["room"], [STANDARD]) + select([100], ["room"], [LIFTED], ["hard"])
+    lines: list[str] = []
+    write_family(out, chosen, lines.append)
+    assert len(lines) == len(chosen) == 4
+    yield out
+    patch.undo()

@@ -1,0 +1,101 @@
+"""Files beside the instances: what solvers reached, CasADi's form, the runner in one file."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import replace
+from functools import partial
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from soup_nlp.family import run_solver
+from soup_nlp.family.instances import STANDARD
+from soup_nlp.family.pages import _reached
+
+pytestmark = pytest.mark.slow
+
+
+def test_what_solvers_reached_is_said_by_start():
+    entry = {
+        "short": "SOUP-orbit-oss-100h",
+        "best_known": {"objective": 10.0},
+        "runs": {
+            "a": [10.0, 2.0, 25.0, True],
+            "b": [12.5, 25.1, 25.0, False],
+            "c": [None, 3, 25, 0],
+        },
+    }
+    *_, row = _reached([entry, {"runs": {}}])
+    assert row == (
+        "| SOUP-orbit-oss-100h | **+0 %**, 2 of 25 s | +25 %, 25.1 of 25 s | no point, 3 of 25 s |"
+    )
+    assert _reached([{"runs": {}}]) == []
+
+
+def test_casadis_form_is_read_back(folder):
+    text = (folder / "SOUP-room-unit-offset-smooth-smooth-N100.casadi").read_text()
+    data = ca.StringDeserializer(text)
+    nlp, *vectors = [data.unpack() for _ in range(8)]
+    lbx, ubx, lbg, ubg, *starts = (np.array(v).ravel() for v in vectors)
+    index = json.loads((folder / "index.json").read_text())["instances"]
+    own = [e for e in index if e["formulation"] == STANDARD]
+    for entry, x0 in zip(own, starts, strict=True):
+        assert float(nlp(x0)[0]) == pytest.approx(entry["objective_at_start"], rel=1e-8)
+        assert (lbx <= x0).all() & (x0 <= ubx).all()
+    g = np.array(nlp(starts[0])[1]).ravel()
+    assert ((g >= lbg - 1e-4) & (g <= ubg + 1e-4)).all()
+
+
+def test_casadis_form_is_read_without_casadi(folder):
+    reader = pytest.importorskip("casadi_reader")
+    path = folder / "SOUP-room-unit-offset-smooth-smooth-N100.casadi"
+    found = reader.read_casadi(str(path))
+    function, *vectors = found["roots"]
+    fields = found["objects"][function["$ref"]]["fields"]
+    assert any(f["value"] == "nlp" for f in fields)
+    assert [v["type"] for v in vectors] == ["DM"] * 7
+    data = ca.StringDeserializer(path.read_text())
+    x0 = np.array([data.unpack() for _ in range(8)][-1]).ravel()
+    (values,) = [f["value"] for f in vectors[-1]["fields"] if f["name"] == "Matrix::nonzeros"]
+    assert values == x0.tolist()
+
+
+@pytest.mark.parametrize(("move", "word"), [(0.0, "converged"), (1e-3, "WRONG")])
+def test_the_runner_judges_an_answer(move, word, folder, tmp_path, capsys):
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    # a solver that returns the best known point, or one off the constraints, and claims success
+    stub = "SOUP-room-unit-offset-smooth-smooth-N100"
+    program = tmp_path / "mine"
+    program.write_text(
+        f"#!{sys.executable}\n"
+        "import sys\n"
+        f"text = open('{stub}.sol').read().splitlines()\n"
+        "first = text.index('Options') + 9\n"
+        f"text[first] = repr(float(text[first]) + {move})\n"
+        "open(sys.argv[1] + '.sol', 'w').write('\\n'.join(text) + '\\n')\n"
+    )
+    program.chmod(0o755)
+    words = [f"{program} fast=1", "room-unit", "hard", "--folder", str(tmp_path)]
+    assert run_solver.main(words) == (word == "WRONG")
+    out = capsys.readouterr().out
+    assert f"SOUP-room-oss-100h       {word}" in out
+    assert f"1 {word}" in out
+
+
+def test_the_runner_knows_limits_and_other_minima(tmp_path):
+    point = run_solver.Point("", 0, np.zeros(0), np.zeros(1))
+    judged = partial(run_solver.verdict, best=10.0, near=1e-4)
+    assert judged(None, 1.0, 0.0, 0.0) == "stopped"
+    assert judged(replace(point, code=400), 10.0, 0.0, 0.0) == "stopped"
+    assert judged(point, 10.0005, 1e-9, 1e-8) == "converged"
+    assert judged(point, 11.0, 1e-9, 1e-8) == "differs"
+    assert judged(point, 10.0, 1e-3, 0.0) == "WRONG"
+    assert judged(point, 10.0, 0.0, 0.1) == "WRONG"
+    # without multipliers the point has to be feasible
+    assert judged(point, 11.0, 0.0, float("nan")) == "differs"
+    (tmp_path / "x.sol").write_text("cut off\n\nOptions\n3\n")
+    assert run_solver.read_point(tmp_path / "x.sol") is None
