@@ -26,7 +26,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.start.choice import LEAST_NOISE
-from soup_nlp.start.components import FIXED, TIES
+from soup_nlp.start.components import FIXED, TIES, displacement
 from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
 
@@ -41,6 +41,9 @@ FLOW_SHARE = 0.01
 CONTACT = 0.2
 """Standard deviation of the log scale of a component by what it stands on or touches, beside that
 of the marginals: what moves need not touch what is below it in the image."""
+USUAL = 0.5
+"""Log ratio of displacements relative to the camera up to which what moves is as fast as usual: see
+docs/confidence.md."""
 FACTOR, POWER = 7.0, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
 BENDING_FACTOR = 0.5
@@ -145,17 +148,22 @@ def with_prior(sigma: Float, prior: Float | float = SIGMA_PRIOR) -> Float:
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
 
-def scale_by_contact(own: Marginals, start: Start, sizes: Int, given: Given | None = None) -> Float:
+def scale_by_contact(
+    own: Marginals, start: Start, sizes: Int, far: Float, given: Given | None = None
+) -> Float:
     """(N,) standard deviation of log depth by the scales of components.
 
     That of a component which has its scale from contact is the marginal and `CONTACT`, in squares;
     one that has it from a depth prior has the prior's.
     It also moves the mean of the image, to which all depths refer, by the component's area.
+    Where contact makes a component move `log_pace` times as far as the scene does, more than is
+    `USUAL`, it may lie anywhere from there to where it moves as far: that ratio is added.
 
     Args:
         own: Marginal variances of the components' scales.
         start: Components, and what gives each its scale.
         sizes: (N,) pixels of every superpixel.
+        far: (N,) displacement relative to the camera (`start.components.displacement`).
         given: A depth prior.
     """
     contact = (start.tie != TIES.index("reference")) & (start.tie != FIXED)
@@ -164,7 +172,16 @@ def scale_by_contact(own: Marginals, start: Start, sizes: Int, given: Given | No
         by_prior = (start.tie == TIES.index("given depth")) & np.isfinite(given.sigma)
         scale = np.where(by_prior, given.sigma, scale)
     mean = float(np.sum(sizes * np.minimum(scale, SIGMA_PRIOR)) / np.sum(sizes))
-    return np.hypot(scale, mean)
+    pace = log_pace(far, start.component)[start.component]
+    free = contact & (pace > USUAL) & (start.tie != TIES.index("given depth"))
+    return np.hypot(np.hypot(scale, mean), np.where(free, pace, 0.0))
+
+
+def log_pace(far: Float, component: Int) -> Float:
+    """(C,) log ratio of the displacement (N,) of every component to that of the largest one."""
+    median = np.array([np.median(far[component == c]) for c in range(int(component.max()) + 1)])
+    scene = int(np.argmax(np.bincount(component)))
+    return np.log(np.maximum(median, 1e-12)) - np.log(np.maximum(median[scene], 1e-12))
 
 
 def _spread(
@@ -222,7 +239,8 @@ def confidence(
     most = np.where(bends, BENDING_MISFIT, MOST_MISFIT)
     noise, misfit = start.noise, flow_misfit(rec, pair.flow, most)
     found = evidence(rec.soup, data, start.component, noise)
-    scale = scale_by_contact(own, start, np.bincount(rec.labels.ravel()), given)
+    far = displacement(rec.soup, data.anchor_ray, start.component)
+    scale = scale_by_contact(own, start, np.bincount(rec.labels.ravel()), far, given)
     rigid = np.hypot(scale, found.sigma)
     added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), rigid)
     added[found.guess[start.component] | start.at_rest | (start.tie == FIXED)] = LARGEST

@@ -10,7 +10,7 @@ import numpy as np
 from soup_nlp.arrays import Mask
 from soup_nlp.evaluate.confidence import MOST_SIGMA, scale_by_contact
 from soup_nlp.geometry.surface import hidden
-from soup_nlp.start.components import FIXED, TIES
+from soup_nlp.start.components import FIXED, TIES, displacement
 
 if TYPE_CHECKING:
     from soup_nlp.pipeline.record import Run
@@ -56,9 +56,11 @@ def certainty(run: Run) -> dict[str, float]:
     rest, fixed = np.full(labels.shape, start.at_rest), tie == FIXED
     flat = run.confidence.evidence.guess[start.component][labels]
     sizes = run.segmentation.sizes
-    scale = scale_by_contact(run.confidence.marginals, start, sizes, run.given)[labels] > MOST_SIGMA
+    far = displacement(run.soup, run.data.anchor_ray, start.component)
+    scale = scale_by_contact(run.confidence.marginals, start, sizes, far, run.given)
+    loose = scale[labels] > MOST_SIGMA
     guess, left = {}, ~sure
-    reasons = {"rest": rest, "fixed": fixed, "unseen": unseen, "flat": flat, "scale": scale}
+    reasons = {"rest": rest, "fixed": fixed, "unseen": unseen, "flat": flat, "scale": loose}
     for name, mask in reasons.items():
         guess[name] = left & mask
         left = left & ~mask

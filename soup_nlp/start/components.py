@@ -261,11 +261,7 @@ def nearer_where_cut_off(
     seen = np.bincount(around.component[on], around.weight[on], minlength=groups)
     last = group[seg.labels[-1]]
     hidden = np.bincount(last, (len(seg.labels) - around.top[last]) ** 2, minlength=groups)
-    # displacements relative to the camera, which rotates as the scene does
-    point = soup.points(rays(K_ref, seg.anchors))
-    moved = np.einsum("nij,nj->ni", soup.R, point) + soup.translation
-    moved -= point @ soup.R[label == scene][0].T
-    far = np.linalg.norm(moved, axis=1) * np.exp(log_scale)[label]
+    far = displacement(soup, rays(K_ref, seg.anchors), label) * np.exp(log_scale)[label]
     pace = np.median(far[label == scene])
     nearer = np.zeros(count)
     for g in np.setdiff1d(np.flatnonzero(hidden > seen), group_of[[scene, *np.flatnonzero(fixed)]]):
@@ -273,6 +269,20 @@ def nearer_where_cut_off(
         if pace < own < pace * np.exp(UNKNOWN):
             nearer[group_of == g] = 0.5 * np.log(own / pace)
     return nearer
+
+
+def displacement(soup: Soup, ray: Float, label: Int) -> Float:
+    """(N,) how far anchors move relative to the camera, which turns as the largest component does.
+
+    Args:
+        soup: Planes and motions.
+        ray: (N, 3) rays of the anchors.
+        label: (N,) index of the component.
+    """
+    point = soup.points(ray)
+    first = int(np.argmax(label == np.argmax(np.bincount(label))))
+    moved = np.einsum("nij,nj->ni", soup.R, point) + soup.translation - point @ soup.R[first].T
+    return np.linalg.norm(moved, axis=1)
 
 
 def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -> Float:

@@ -18,6 +18,7 @@ from soup_nlp.evaluate.confidence import (
     MOST_SIGMA,
     POWER,
     SIGMA_PRIOR,
+    USUAL,
     calibrated,
     confidence,
     flow_misfit,
@@ -317,7 +318,7 @@ def test_systematic_uncertainty_is_added_at_any_noise(bends):
 def test_other_components_are_less_sure_than_the_reference(small_room):
     sure, start = sure_of(small_room), small_room.start
     sizes = small_room.segmentation.sizes
-    scale = scale_by_contact(sure.marginals, start, sizes)
+    scale = scale_by_contact(sure.marginals, start, sizes, np.ones(len(sizes)))
     reference = start.tie == TIES.index("reference")
     assert 0 < reference.sum() < len(reference)
     # the scales of the others move the mean, to which the reference component refers
@@ -328,6 +329,23 @@ def test_other_components_are_less_sure_than_the_reference(small_room):
     raw = np.sqrt(sure.marginals.component)
     expected = 1 / np.sqrt(1 / raw**2 + 1 / SIGMA_PRIOR**2)
     np.testing.assert_allclose(sure.component_sigma, expected)
+
+
+def test_a_scale_is_open_where_contact_makes_a_component_too_fast(small_room):
+    sure, start = sure_of(small_room), small_room.start
+    other = start.tie != TIES.index("reference")
+    fast = int(start.component[other][0])
+    one = start.component == fast
+
+    def scale(ratio):
+        far = np.where(one, ratio, 1.0)
+        return scale_by_contact(sure.marginals, start, small_room.segmentation.sizes, far)
+
+    usual = scale(1.0)
+    np.testing.assert_array_equal(scale(np.exp(0.9 * USUAL)), usual)
+    np.testing.assert_allclose(scale(5.0)[one], np.hypot(usual[one], np.log(5.0)))
+    # the others stay where they are
+    np.testing.assert_array_equal(scale(5.0)[~one], usual[~one])
 
 
 def test_a_camera_at_rest_leaves_everything_a_guess(small_room):
