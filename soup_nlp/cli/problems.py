@@ -94,6 +94,13 @@ def export(
         typer.Option("--format", help=f"{', '.join(FORMATS)} (casadi has h5); may be repeated."),
     ] = None,
     presolve: Presolve = True,
+    suffixes: Annotated[
+        bool,
+        typer.Option(
+            "--suffixes",
+            help="Write suffixes kind, superpixel, scaling_factor (not read by CasADi).",
+        ),
+    ] = False,
     overrides: Set = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -124,7 +131,9 @@ def export(
             continue
         written.add(name)
         folder = out / name if several else out
-        manifest = export_case(here, style, folder, format_ or ["nl"], presolve, overwrite)
+        manifest = export_case(
+            here, style, folder, format_ or ["nl"], presolve, overwrite, suffixes
+        )
         s = manifest["sizes"]
         if not quiet:
             print(

@@ -22,8 +22,9 @@ from soup_nlp.export.manifest import (
     TRUNCATIONS,
     kept_best,
 )
-from soup_nlp.export.names import readable_names
+from soup_nlp.export.names import readable_names, suffixes_of
 from soup_nlp.export.nl import NLFile, write_nl
+from soup_nlp.export.verify import examine
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Coordinates, Formulation
 from soup_nlp.model.layout import GAUGES, MatrixLayout, TangentLayout
@@ -35,6 +36,8 @@ from soup_nlp.storage.store import Array, Tree, write_h5, write_json
 from soup_nlp.storage.versions import versions
 
 FORMATS = ("nl", "casadi", "h5")
+STATIONARY = 1e-3
+"""Largest dual infeasibility of a start whose multipliers are written."""
 INFORMATION = (
     "triu Gauss-Newton information of E at the start in nine coordinates a superpixel: relative"
     " inverse depth at the anchor, its slopes (2), rotation (3), shift of the anchor (3)"
@@ -105,6 +108,7 @@ def export_case(
     formats: Sequence[str] = ("nl",),
     presolved: bool = False,
     overwrite: bool = False,
+    suffixes: bool = False,
 ) -> dict[str, Any]:
     """Write soup.nl with names, problem.yaml and manifest.json; returns the manifest.
 
@@ -117,6 +121,7 @@ def export_case(
         formats: Some of FORMATS; nl is always written, and casadi includes h5.
         presolved: The case starts at the answer of the presolve (for the manifest).
         overwrite: Overwrite files that the program did not make.
+        suffixes: Write the suffixes of `names.suffixes_of`, which CasADi's reader does not accept.
 
     Raises:
         ConfigError: a format is unknown.
@@ -132,7 +137,7 @@ def export_case(
     nlp, layout = case.nlp(form)
     target = claim(folder, EXPORT_FILES, overwrite, case.problem.subject)
     with staged(target, whole=True, subject=case.problem.subject) as new:
-        return _write_files(new, target, case, form, (nlp, layout), formats, presolved)
+        return _write_files(new, target, case, form, (nlp, layout), formats, presolved, suffixes)
 
 
 def _write_files(
@@ -143,11 +148,18 @@ def _write_files(
     program: tuple[NLP, MatrixLayout | TangentLayout],
     formats: Sequence[str],
     presolved: bool,
+    suffixes: bool,
 ) -> dict[str, Any]:
     """Write an export into an empty folder; best_known is taken from an earlier export."""
     nlp, layout = program
     names = readable_names(nlp, layout)
-    file = write_nl(folder / f"{STUB}.nl", nlp, names=names)
+    duals = examine(nlp, nlp.x0, None) if presolved else None
+    if duals is not None and not duals.residuals.dual <= STATIONARY:
+        # multipliers of a point that is not stationary mislead
+        duals = None
+    kinds, found = suffixes_of(nlp, names)
+    lam_g = None if duals is None else duals.lam_g
+    file = write_nl(folder / f"{STUB}.nl", nlp, names, lam_g, found if suffixes else ())
     if "casadi" in formats:
         for function in FUNCTIONS:
             # the file writer of CasADi ignores a full disk
@@ -158,6 +170,8 @@ def _write_files(
     manifest = {
         **_description(case, form, nlp, layout, file),
         "start": "presolve" if presolved else "proposal",
+        "initial_duals": duals is not None,
+        "kinds": kinds,
         "best_known": kept_best(earlier, file.sha256),
     }
     # the functions also need parameters, start and bounds

@@ -6,6 +6,7 @@ import numpy as np
 
 from soup_nlp.arrays import Int
 from soup_nlp.errors import ExportError
+from soup_nlp.export.nl import OF, Suffix
 from soup_nlp.model.kernel import Group
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
@@ -45,6 +46,36 @@ def readable_names(nlp: NLP, layout: MatrixLayout | TangentLayout) -> tuple[list
         if len(set(names)) < len(names):
             raise ExportError("names are not unique", where=nlp.name)
     return x_names, g_names
+
+
+def suffixes_of(
+    nlp: NLP, names: tuple[list[str], list[str]]
+) -> tuple[dict[str, list[str]], list[Suffix]]:
+    """Suffixes of variables and rows, for solvers that exploit structure.
+
+    "superpixel" is 1 + the first superpixel of a variable or row. "kind" is 1 + the place of its
+    name's stem (`R`, `so3`) in the lists that are returned beside. "scaling_factor" is the inverse
+    of a natural step of a variable at the start (Ipopt's `nlp_scaling_method=user-scaling`).
+
+    Args:
+        nlp: The program.
+        names: From `readable_names`.
+    """
+    kinds: dict[str, list[str]] = {}
+    out = []
+    for of, own in zip(OF, names):
+        stems = [name.partition("[")[0] for name in own]
+        kinds[of] = list(dict.fromkeys(stems))
+        place = {stem: k + 1 for k, stem in enumerate(kinds[of])}
+        first = [name.partition("[")[2].strip("]").partition(",")[0] for name in own]
+        out.append(Suffix("kind", of, np.array([place[stem] for stem in stems])))
+        out.append(Suffix("superpixel", of, np.array([int(i) + 1 if i else 0 for i in first])))
+    for group in nlp.groups:
+        if group.kernel.name == "ridge":
+            factor = np.ones(nlp.nx)
+            factor[group.table.index[:, 0]] = np.sqrt(group.table.data[:, 0])
+            out.append(Suffix("scaling_factor", OF[0], factor))
+    return kinds, out
 
 
 def _owners(group: Group, layout: MatrixLayout | TangentLayout) -> Int | None:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy import sparse
@@ -73,13 +73,40 @@ AllNames = tuple[Names | None, Names | None, str]
 """Names of variables, rows and the objective; None writes no file."""
 
 
-def write_nl(path: str | Path, nlp: NLP, names: tuple[Names, Names] | None = None) -> NLFile:
+Of = Literal["variables", "rows"]
+OF: tuple[Of, Of] = ("variables", "rows")
+
+
+@dataclass(frozen=True)
+class Suffix:
+    """Numbers of variables or rows that a solver may ask for by name; 0 is not written.
+
+    Attributes:
+        name: E.g. "scaling_factor", which Ipopt and POUNCE know.
+        of: "variables" or "rows".
+        values: (nx,) or (ng,), integers or reals, in the order of the NLP.
+    """
+
+    name: str
+    of: Of
+    values: Float | Int
+
+
+def write_nl(
+    path: str | Path,
+    nlp: NLP,
+    names: tuple[Names, Names] | None = None,
+    lam_g: Float | None = None,
+    suffixes: Sequence[Suffix] = (),
+) -> NLFile:
     """Write an NLP of kernels and tables; names go to `.col` and `.row` beside the file.
 
     Args:
         path: The .nl file; written whole or not at all.
         nlp: The NLP; its Hessian does not matter.
         names: Names of variables and constraints; default those of the NLP.
+        lam_g: (ng,) multipliers of the start in CasADi's sign, for the segment of initial duals.
+        suffixes: Suffixes of variables and rows.
 
     Raises:
         ExportError: an operation has no opcode, a number is not finite, or bounds cross.
@@ -89,7 +116,7 @@ def write_nl(path: str | Path, nlp: NLP, names: tuple[Names, Names] | None = Non
     theta = nlp.p[: len(nlp.theta)]
     x, g = (nlp.x0, nlp.lbx, nlp.ubx), (nlp.lbg, nlp.ubg)
     path = as_path(path, "file", error=ExportError)
-    return _write(path, nlp.groups, theta, x, g, (x_names, g_names, "E"))
+    return _write(path, nlp.groups, theta, x, g, (x_names, g_names, "E"), lam_g, suffixes)
 
 
 def _write(
@@ -99,6 +126,8 @@ def _write(
     x: tuple[Float, Float, Float],
     g: tuple[Float, Float],
     names: AllNames,
+    lam_g: Float | None = None,
+    suffixes: Sequence[Suffix] = (),
 ) -> NLFile:
     """Check and write an NLP.
 
@@ -109,6 +138,8 @@ def _write(
         x: Start, lower and upper bounds of the variables.
         g: Lower and upper bounds of the constraints.
         names: Of variables, constraints and objective; None for no files of names.
+        lam_g: Multipliers of the start, or None.
+        suffixes: Suffixes of variables and rows.
     """
     _check(path, x, g)
     program = make_program(groups, len(x[0]), len(g[0]), theta)
@@ -123,7 +154,10 @@ def _write(
     longest = [max(map(len, n or ()), default=0) for n in (names[1], names[0])]
     lines = chain(
         header(program, (lbg, ubg), longest, body.classes),
+        *(suffix_segment(s, variables if s.of == "variables" else rows) for s in suffixes),
         body.segments(),
+        # AMPL's multipliers have the other sign
+        [] if lam_g is None else start(-lam_g[rows], "d"),
         start(x0),
         bounds("r", lbg, ubg),
         bounds("b", lbx, ubx),
@@ -209,10 +243,20 @@ def header(
     ]
 
 
-def start(x0: Float) -> Iterator[str]:
-    """`x` segment."""
-    yield f"x{len(x0)}"
-    yield from (f"{k} {number(v)}" for k, v in enumerate(x0.tolist()))
+def suffix_segment(suffix: Suffix, order: Int) -> Iterator[str]:
+    """`S` segment of a suffix, for variables or rows in the order of the file."""
+    values = np.asarray(suffix.values)[order]
+    real = not np.issubdtype(values.dtype, np.integer)
+    there = np.flatnonzero(values)
+    if len(there):
+        yield f"S{(suffix.of == 'rows') + 4 * real} {len(there)} {suffix.name}"
+        yield from (f"{k} {number(values[k]) if real else values[k]}" for k in there.tolist())
+
+
+def start(values: Float, segment: str = "x") -> Iterator[str]:
+    """`x` segment of the start, or `d` segment of its multipliers."""
+    yield f"{segment}{len(values)}"
+    yield from (f"{k} {number(v)}" for k, v in enumerate(values.tolist()))
 
 
 def bounds(segment: str, lower: Float, upper: Float) -> Iterator[str]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 
@@ -27,9 +29,11 @@ from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.stages import solve_soup
+from soup_nlp.solve.warm import WARM
 
 pytestmark = pytest.mark.slow
 
+ENDS = {"variables": ".col", "rows": ".row"}
 PROBLEMS = Path(__file__).parents[2] / "problems"
 TINY = [
     "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",
@@ -264,3 +268,68 @@ def test_options_are_checked(tmp_path, capsys):
     assert write(tmp_path, "--superpixels", "12", "--format", "mps") == 2
     assert "nl, casadi, h5" in capsys.readouterr().err
     assert not list(tmp_path.rglob("manifest.json"))
+
+
+def test_a_presolved_start_has_multipliers(tmp_path):
+    path = str(PROBLEMS / "orbit.yaml")
+    assert main(["export", path, "-o", str(tmp_path), *TINY, "--superpixels", "16"]) == 0
+    assert json.loads((tmp_path / "manifest.json").read_text())["initial_duals"]
+    _, nlp, _, (v, r), _ = problem_of(tmp_path)
+    builder = ca.NlpBuilder()
+    builder.import_nl(str(tmp_path / "soup.nl"), {})
+    x, lam = np.empty(nlp.nx), np.empty(nlp.ng)
+    x[v], lam[r] = builder.x_init, builder.lambda_init
+    # the multipliers make the start stationary, in AMPL's sign
+    gradient, J = nlp.grad_f(x, nlp.p)[1], nlp.jac_g(x, nlp.p)[1]
+    force = np.array(gradient).ravel() - np.array(J.T @ lam).ravel()
+    assert np.abs(force).max() < 1e-3 < np.abs(np.array(gradient)).max()
+
+
+def test_no_multipliers_where_the_start_is_not_stationary(exported):
+    manifest = json.loads((exported / "manifest.json").read_text())
+    assert manifest["start"] == "proposal"
+    assert not manifest["initial_duals"]
+    lines = (exported / "soup.nl").read_text().splitlines()
+    assert not any(line[0] in "dS" for line in lines)
+
+
+def test_suffixes_say_kind_and_superpixel(tmp_path):
+    assert write(tmp_path, "--superpixels", "16", "--suffixes") == 0
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    lines = (tmp_path / "soup.nl").read_text().splitlines()
+    heads = [line for line in lines if line[0] == "S"]
+    assert [line.split()[0] + " " + line.split()[2] for line in heads] == [
+        "S0 kind", "S0 superpixel", "S1 kind", "S1 superpixel", "S4 scaling_factor",
+    ]  # fmt: skip
+    names = {of: (tmp_path / f"soup{end}").read_text().split() for of, end in ENDS.items()}
+    for k, head in enumerate(heads[:4]):
+        own = names[("variables", "rows")[k // 2]]
+        at, count = lines.index(head) + 1, int(head.split()[1])
+        values = dict(tuple(map(int, line.split())) for line in lines[at : at + count])
+        stems = manifest["kinds"][("variables", "rows")[k // 2]]
+        for place, value in values.items():
+            stem, _, rest = own[place].partition("[")
+            if k % 2:
+                assert value - 1 == int(rest.strip("]").split(",")[0])
+            else:
+                assert stems[value - 1] == stem
+    at, count = lines.index(heads[4]) + 1, int(heads[4].split()[1])
+    factors = [float(line.split()[1]) for line in lines[at : at + count]]
+    assert count == len(names["variables"])
+    assert min(factors) > 0
+
+
+def test_pounce_takes_the_multipliers(tmp_path):
+    command = shutil.which("pounce") or shutil.which(str(Path(sys.executable).parent / "pounce"))
+    if command is None:
+        pytest.skip("pounce is not installed")
+    path = str(PROBLEMS / "orbit.yaml")
+    words = ["-o", str(tmp_path), *TINY, "--superpixels", "16", "--suffixes"]
+    assert main(["export", path, *words]) == 0
+    options = {**WARM, "nlp_scaling_method": "none", "tol": 1e-6}
+    words = [f"{k}={v}" for k, v in options.items()]
+    run = subprocess.run(
+        [command, "soup", "-AMPL", *words], cwd=tmp_path, check=True, capture_output=True, text=True
+    )
+    assert "SolveSucceeded" in (tmp_path / "soup.sol").read_text(), run.stdout[-2000:]
+    assert main(["check", str(tmp_path / "soup.sol")]) == 0
