@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from soup_nlp.data.pair import Flow, Pair, Truth
     from soup_nlp.errors import SoupError
     from soup_nlp.evaluate.metrics import DepthMetrics, Scale
+    from soup_nlp.export.symbolic import nlp
     from soup_nlp.geometry.soup import Reconstruction, Soup
     from soup_nlp.pipeline import Run, run, solve_pair
     from soup_nlp.report.result import Result, load
@@ -38,6 +39,7 @@ __all__ = [
     "load",
     "load_problem",
     "make_problem",
+    "nlp",
     "run",
     "solve_pair",
 ]
@@ -57,6 +59,7 @@ _HOMES = {
     "load": "report.result",
     "load_problem": "config.problem",
     "make_problem": "config.problem",
+    "nlp": "export.symbolic",
     "run": "pipeline",
     "solve_pair": "pipeline",
 }

@@ -12,11 +12,9 @@ from hypothesis import settings
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data import inputs
 from soup_nlp.data.scenes import catalogue
-from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import make_run, skipped
-from soup_nlp.solve.tangent_problem import TangentProblem
 
 # drawn cases are the same in every run
 settings.register_profile("fixed", derandomize=True, deadline=None)
@@ -57,19 +55,6 @@ def small_room() -> Case:
 
 
 @pytest.fixture(scope="session")
-def rigid_room() -> Case:
-    """A room with one rigid component."""
-    return room(1)
-
-
-@pytest.fixture(scope="session")
 def small_run(small_room: Case) -> Run:
     """The start of that room as a run: every record is there, nothing was solved."""
     return make_run(small_room, skipped(small_room))
-
-
-@pytest.fixture(scope="module", params=["depth", "inverse-depth"])
-def problem(rigid_room: Case, request: pytest.FixtureRequest) -> TangentProblem:
-    """Its program on the tangent, in both charts."""
-    own = rigid_room.soup, rigid_room.data, rigid_room.weights
-    return TangentProblem(*own, Formulation(compiled=False), chart=request.param)

@@ -143,8 +143,8 @@ def _stages(problem: Problem | None) -> dict[str, int | None]:
     if problem is not None:
         refine, solver = problem.refine, problem.solver
         if not (refine.enabled and refine.from_start):
-            # reweighted phases, polish, Ipopt
-            steps["nlp"] = len(solver.presolve_eps) * solver.presolve + 2
+            # majorant, Gauss-Newton and exact Hessians, then the constrained NLP
+            steps["nlp"] = (len(solver.presolve_eps) + 4) * solver.presolve + 1
         if refine.enabled:
             steps["refine"] = refine.rounds
     return steps | {"evaluation": None}

@@ -19,8 +19,9 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation, FormulationOptions
 from soup_nlp.model.layout import TangentLayout
+from soup_nlp.model.sums import Sums
+from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
 from soup_nlp.solve.selected_inverse import BlockCholesky
-from soup_nlp.solve.tangent_problem import TangentProblem
 
 SMOOTHING = 0.03
 """Width in pixels within which a norm is taken for its square: no flow is more exact."""
@@ -63,15 +64,15 @@ def information(
         form: Visibility and whether kernels are compiled; constraints carry no information.
         smoothing: Width of all norms, pixels.
     """
-    whole = Formulation.make(dict(form))
-    problem = TangentProblem(soup, data, weights, whole, exact=False, chart="inverse-depth")
-    problem.smoothing(smoothing)
-    x = problem.nlp.x0
-    slacks = np.zeros((problem.layout.count, problem.rims + 5))
-    upper = problem.upper.copy()
-    upper.data = problem.hessian(x, slacks, "gauss-newton")
+    whole = majorant(Formulation.make(dict(form)))
+    nlp, layout = build_tangent_nlp(soup, data, weights, whole, "inverse-depth")
+    sums, x = Sums(nlp, first_order=False, second_order=True), nlp.x0
+    sums.theta = nlp.thetas(eps=smoothing, eps_pixel=smoothing)
+    upper = nlp.hessian_pattern.filled(sums.hessian(x, np.zeros(nlp.ng)))
     matrix = (upper + sparse.triu(upper, 1).T).tocsr()
-    return Information(matrix, problem.growth(x), x.reshape(-1, 9)[:, :3], problem.layout)
+    plane, growth = x.reshape(-1, 9)[:, :3], np.zeros((len(data), 9))
+    growth[:, :3] = -plane
+    return Information(matrix, growth.ravel(), plane, layout)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.tangent_nlp import build_tangent_nlp, polish_chart
+from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 from soup_nlp.pipeline.case import Case, build_energy, solver_options
 from soup_nlp.start.choice import limited_noise
 from soup_nlp.start.propose import Start
@@ -255,7 +255,7 @@ def _program(
     depth = rounded(start.depth_at(data.anchor_ray))
     shift = rounded(start.translation / depth[:, None])
     own = data.anchor_ray, data.radius, data.share, depth, record.start.R, shift
-    base = TangentLayout(*own, polish_chart(data))
+    base = TangentLayout(*own, exact_chart(data))
     nlp, layout = build_tangent_nlp(soup, data, case.weights, form, layout=base)
     unit = [
         replace(g, table=replace(g.table, data=rounded(g.table.data)))

@@ -105,12 +105,11 @@ class Kernel:
         return {k: ca.Function(f"{self.name}_{k}", args, ca.cse([v])) for k, v in out.items()}
 
     @_once
-    def second_order(self, hessian: str, suffix: str = "") -> ca.Function | None:
+    def second_order(self, hessian: str) -> ca.Function | None:
         """Nonzeros of the triu-Hessian of one element.
 
         Args:
             hessian: One of HESSIANS.
-            suffix: Of the function's name, which ends with "_hess" otherwise.
 
         Returns:
             Function of (x, row, theta, lam_f, lam_c); None where it is 0.
@@ -120,8 +119,7 @@ class Kernel:
         if not H.nnz():
             return None
         args = [self.x, self.row, self.theta, lam_f, lam_c]
-        name = f"{self.name}_hess{suffix}"
-        return ca.Function(name, args, ca.cse([_nonzeros(H)]))
+        return ca.Function(f"{self.name}_hess", args, ca.cse([_nonzeros(H)]))
 
     @_once
     def jacobian_pattern(self) -> tuple[Int, Int]:

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.arrays import Float
 from soup_nlp.model.compile import shared_library
 from soup_nlp.model.kernel import Table
 
@@ -205,14 +205,6 @@ class Lanes:
         # without constraints a table has no rows at all
         rows = table.rows.reshape(len(table), table.rows.shape[1])
         return cls(in_lanes(table.index, np.int32), in_lanes(table.data), in_lanes(rows, np.int32))
-
-    def touched(self, some: Mask) -> Int:
-        """Blocks with an element that one of these variables (nx,) is in."""
-        return np.flatnonzero(some[self.index].any(axis=(1, 2)))
-
-    def taken(self, blocks: Int) -> Lanes:
-        """Some of the blocks alone."""
-        return Lanes(self.index[blocks], self.data[blocks], self.rows[blocks])
 
 
 @dataclass(frozen=True, eq=False)

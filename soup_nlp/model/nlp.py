@@ -66,7 +66,7 @@ class NLP:
     @cached_property
     def sums(self) -> Sums:
         """f, g and their first derivatives as numpy arrays, at the NLP's own theta."""
-        return Sums(self, [])
+        return Sums(self)
 
     @cached_property
     def jacobian_pattern(self) -> Pattern:

@@ -1,26 +1,24 @@
-"""An NLP's sums as numpy arrays: value, gradient, constraints and Hessians of several kinds.
+"""An NLP's sums as numpy arrays: value, gradient, constraints and Hessian.
 
 Every kernel is summed over its table: by vectorised machine code (`lanes`) where a C compiler is
-found, else by numpy (`vectors`). The presolve and Ipopt take these; the exports take the functions
-of `assemble`, which are CasADi's.
+found, else by numpy (`vectors`). Ipopt calls these; the exports take the functions of `assemble`,
+which are CasADi's.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.model.assemble import Entries, Pattern
-from soup_nlp.model.blocks import Elements, pattern_of
-from soup_nlp.model.kernel import Group, Table
+from soup_nlp.arrays import Float
+from soup_nlp.model.kernel import Table
 from soup_nlp.model.lanes import Lanes, NoLanesError, Summed, compile_lanes
 from soup_nlp.model.mapped import Mapped
 from soup_nlp.model.vectors import Vectors
@@ -51,52 +49,28 @@ class Sums:
     Attributes:
         theta: Values of the NLP's leading parameters; may be set to others.
         jacobian: Pattern of g's Jacobian.
-        upper: Union of the Hessians' upper triangles and of what the caller wants besides, whose
-            places are the last.
         seconds: Spent in "f", "grad_f", "jac_g" (with g) and "hess_lag".
         vectorised: Whether machine code on vectors of elements does all of it.
     """
 
-    def __init__(
-        self,
-        nlp: NLP,
-        hessians: Sequence[str],
-        besides: Elements | None = None,
-        first_order: bool = True,
-    ) -> None:
+    def __init__(self, nlp: NLP, first_order: bool = True, second_order: bool = False) -> None:
         """Compile the kernels, or take them from the cache.
 
         Args:
             nlp: The NLP.
-            hessians: Kinds of Hessian (kernel.HESSIANS).
-            besides: Elements with further nonzeros.
-            first_order: False where Hessians alone are wanted.
+            first_order: With f, g and their first derivatives.
+            second_order: With the Hessian of the NLP's kind.
         """
         self.theta, self.seconds = nlp.thetas(), Timer()
+        self._nonzeros = len(nlp.hessian_pattern.rows) if second_order else 0
         self._sizes = nlp.nx, nlp.ng, len(nlp.theta)
-        made: list[dict[str, ca.Function]] = []
+        self.jacobian = nlp.jacobian_pattern
+        jacobian_places = iter(self.jacobian.places)
+        hessian_places = iter(nlp.hessian_pattern.places if second_order else ())
+        self._terms: dict[str, list[Summed | Vectors | Mapped]] = {}
+        self.vectorised = nlp.compiled
         for group in nlp.groups:
             functions = dict(group.kernel.first_order()) if first_order else {}
-            for k, kind in enumerate(hessians):
-                hessian = group.kernel.second_order(kind, str(k))
-                functions |= {kind: hessian} if hessian else {}
-            made.append(functions)
-        unions = [
-            _union(group, [k for k in hessians if k in functions])
-            for group, functions in zip(nlp.groups, made)
-        ]
-        self.jacobian = nlp.jacobian_pattern
-        if list(hessians) == [nlp.hessian] and besides is None:
-            self.upper = nlp.hessian_pattern
-        else:
-            every = [u.elements for u in unions]
-            self.upper = pattern_of(nlp.nx, every if besides is None else [*every, besides])
-        jacobian_places = iter(self.jacobian.places)
-        self._terms: dict[str, list[Summed | Vectors | Mapped]] = {}
-        self._some: dict[str, list[Summed]] = {}
-        self._kept: Int | None = None
-        self.vectorised = nlp.compiled
-        for group, functions, union, upper in zip(nlp.groups, made, unions, self.upper.places):
             size = group.size
             place = {
                 "f": np.zeros((size, 1), int),
@@ -105,8 +79,10 @@ class Sums:
             }
             if "jac" in functions:
                 place["jac"] = next(jacobian_places).reshape(size, -1)
-            for kind, which in union.parts.items():
-                place[kind] = upper.reshape(size, -1)[:, which]
+            if second_order:
+                hessian, upper = group.kernel.second_order(nlp.hessian), next(hessian_places)
+                if hessian:
+                    functions["hess"], place["hess"] = hessian, upper.reshape(size, -1)
             for key, term in self._summed(group.table, functions, place).items():
                 self._terms.setdefault(key, []).append(term)
 
@@ -138,42 +114,10 @@ class Sums:
                 )
         return {key: interpreted(f, table, place[key]) for key, f in functions.items()}
 
-    def only(self, some: Mask | None, kept: Int | None = None) -> None:
-        """Sum f, its gradient and Hessians only over the elements that some variables are in.
-
-        Without machine code they are still summed over all elements.
-
-        Args:
-            some: (nx,) these variables; None for all.
-            kept: The nonzeros of Hessians that are returned; None for all.
-        """
-        self._some, self._kept = {}, kept
-        if some is None or not self.vectorised:
-            return
-        new = np.arange(len(self.upper.rows) + 1, dtype=np.int32)
-        if kept is not None:
-            new[:] = len(kept)
-            new[kept] = np.arange(len(kept))
-        # the functions of a kernel share its table; what fills the last block remains dropped
-        taken: dict[int, tuple[Int, Lanes]] = {}
-        for key in self._terms.keys() - {"con", "jac"}:
-            self._some[key] = []
-            for term in self._terms[key]:
-                assert isinstance(term, Summed)
-                whole = term.lanes
-                if id(whole) not in taken:
-                    blocks = whole.touched(some)
-                    taken[id(whole)] = blocks, whole.taken(blocks)
-                blocks, lanes = taken[id(whole)]
-                place = term.place[blocks]
-                place = place if key in ("f", "grad") else new[place]
-                self._some[key].append(Summed(term.call, lanes, place))
-
     def _size(self, key: str) -> int:
         nx, ng, _ = self._sizes
         sizes = {"f": 1, "grad": nx, "con": ng, "jac": len(self.jacobian.rows)}
-        kept = self._kept if key in self._some else None
-        return sizes.get(key, len(self.upper.rows if kept is None else kept))
+        return sizes.get(key, self._nonzeros)
 
     def _sum(self, key: str, x: Float, lam_g: Float | None = None, lam_f: float = 1.0) -> Float:
         nx, ng, thetas = self._sizes
@@ -181,7 +125,7 @@ class Sums:
         theta = _vector("theta", self.theta, thetas)
         # one entry more, for what fills the last block of lanes
         out = np.zeros(self._size(key) + 1)
-        for term in self._some[key] if key in self._some else self._terms.get(key, []):
+        for term in self._terms.get(key, []):
             term.add(out, x, theta, lam_f, lam)
         return out[:-1]
 
@@ -200,11 +144,10 @@ class Sums:
         with self.seconds.of("jac_g"):
             return self._sum("con", x), self._sum("jac", x)
 
-    def hessian(self, kind: str, x: Float, lam_g: Float, lam_f: float = 1.0) -> Float:
-        """Nonzeros of the Hessian of `lam_f f + lam_g . g`, in the order of `upper`."""
+    def hessian(self, x: Float, lam_g: Float, lam_f: float = 1.0) -> Float:
+        """Nonzeros of the Hessian of `lam_f f + lam_g . g`, as in `nlp.hessian_pattern`."""
         with self.seconds.of("hess_lag"):
-            out = self._sum(kind, x, lam_g, lam_f)
-            return out if self._kept is None or kind in self._some else out[self._kept]
+            return self._sum("hess", x, lam_g, lam_f)
 
 
 def interpreted(
@@ -226,22 +169,3 @@ def _vector(name: str, values: Float, size: int) -> Float:
     if len(values) != size:
         raise ValueError(f"{name} has {len(values)} entries, expected {size}")
     return np.ascontiguousarray(values, dtype=float)
-
-
-class _Union(NamedTuple):
-    """Nonzeros of an element's Hessians of several kinds.
-
-    Attributes:
-        elements: The elements with k nonzeros each.
-        parts: Which of the k are in each kind, in its storage order.
-    """
-
-    elements: Elements
-    parts: dict[str, NDArray[np.integer]]
-
-
-def _union(group: Group, kinds: Sequence[str]) -> _Union:
-    local = [group.kernel.hessian_pattern(kind) for kind in kinds]
-    union = Pattern.of((group.kernel.nx, group.kernel.nx), [Entries(*own) for own in local])
-    elements = Elements(group.table.index, union.rows, union.columns)
-    return _Union(elements, dict(zip(kinds, union.places)))

@@ -98,7 +98,7 @@ def majorant(form: Formulation) -> Formulation:
     )
 
 
-def polish_chart(data: EnergyData) -> Chart:
+def exact_chart(data: EnergyData) -> Chart:
     """Chart for the exact Hessian.
 
     On inverse depths the superpixels of a plane move with it in straight lines; reweighting on

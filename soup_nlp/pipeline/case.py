@@ -40,7 +40,7 @@ from soup_nlp.model.reweighting import (
     within_bending,
     without_flow,
 )
-from soup_nlp.model.tangent_nlp import build_tangent_nlp, polish_chart
+from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 from soup_nlp.pipeline.still_layer import see_through
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
@@ -101,7 +101,7 @@ class Case:
         own = self.data, self.weights, form
         if form.coordinates == "matrix":
             return build_matrix_nlp(self.soup, *own)
-        base = TangentLayout.about(self.start.soup, self.data, polish_chart(self.data))
+        base = TangentLayout.about(self.start.soup, self.data, exact_chart(self.data))
         return build_tangent_nlp(self.soup, *own, layout=base)
 
 

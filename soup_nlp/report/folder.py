@@ -181,7 +181,6 @@ def summary(run: Run) -> dict[str, Any]:
         "status": s.status,
         "converged": s.converged,
         "delivered": run.delivered,
-        "found_by": s.found_by,
         "energy_by_stage": dict(s.ends)
         | ({"refinement": run.energy["total"]} if run.refined is not None else {}),
         "energy": {"start": s.energy_start, "nlp": s.energy, "solution": run.energy},

@@ -133,15 +133,6 @@ _IPOPT = {
     "alpha_du": "step size, multipliers",
     "ls_trials": "trial points of the line search",
 }
-_DESCENT = {
-    "obj": "objective of the phase",
-    "inf_pr": "0: the tangent has no constraint to violate",
-    "inf_du": "largest dual infeasibility",
-    "mu": "largest complementarity of rim visibility",
-    "regularization_size": "median damping of the superpixels",
-    "alpha_pr": "smallest step size of a superpixel",
-}
-"""History of a phase of the presolve, with the keys of Ipopt."""
 _ROUNDS = {
     "mrf_energy": "energy of the chosen labels in the MRF of the particles",
     "bound": "TRW-S's lower bound on every choice among the particles",
@@ -259,9 +250,8 @@ def _constrained(key: str) -> tuple[str, str]:
 
 def _history(stage: Stage) -> dict[str, Array]:
     """Progress of a stage by iteration."""
-    known = _DESCENT if stage.name.startswith("presolve") else _IPOPT
     return {
-        key: Array(value, "1", f"{known.get(key, key)}, by iteration", "I")
+        key: Array(value, "1", f"{_IPOPT.get(key, key)}, by iteration", "I")
         for key, value in stage.history.items()
     }
 

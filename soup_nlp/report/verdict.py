@@ -48,14 +48,10 @@ PAD = " " * 12
 
 
 def _found(run: Run) -> str:
-    """Which stage found the minimum, and the exact energy at the end of each stage."""
+    """Whether a minimum was found, and the exact energy at the end of each stage."""
     s = run.solution
     ends = dict(s.ends) | ({} if run.refined is None else {"refinement": run.energy["total"]})
-    who = {
-        "presolve": "minimum found by the presolve, confirmed by Ipopt",
-        "Ipopt": "minimum found by Ipopt",
-        "nobody": "no minimum reached",
-    }[s.found_by]
+    who = "minimum found by Ipopt" if s.converged else "no minimum reached"
     return who + (": E " + ", ".join(f"{k} {e:.5g}" for k, e in ends.items()) if ends else "")
 
 

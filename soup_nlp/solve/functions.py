@@ -134,6 +134,6 @@ class Functions:
     def _hessian(self, x: Float, p: Float, lam_f: Float, lam_g: Float) -> Float:
         nlp = self._nlp
         if self._second is None:
-            self._second = Sums(nlp, [nlp.hessian], first_order=False)
+            self._second = Sums(nlp, first_order=False, second_order=True)
         self._second.theta = p.copy()
-        return self._second.hessian(nlp.hessian, x, lam_g, float(lam_f[0]))
+        return self._second.hessian(x, lam_g, float(lam_f[0]))

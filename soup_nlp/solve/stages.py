@@ -1,10 +1,10 @@
-"""Solve from an initialisation: tangent presolve with continuation, then the constrained NLP."""
+"""Solve from an initialisation: Ipopt in tangent coordinates, then on the constrained NLP."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,18 +20,16 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.tangent_nlp import polish_chart
-from soup_nlp.solve.continuation import EXACT, STOPPED, Continuation
-from soup_nlp.solve.descent import Descent
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import UNMET, feasible, residuals
-from soup_nlp.solve.phase import POLISH, Phase, polish, reweighted
+from soup_nlp.solve.presolve import EXACT, STOPPED, Presolve
 from soup_nlp.solve.solver_options import SolverOptions
-from soup_nlp.solve.tangent_problem import TangentProblem
 from soup_nlp.solve.warm import WARM, warm_start
 from soup_nlp.storage.progress import Watch
 
 _ENDS = ("start", "presolve", "constrained NLP")
+SAME = 1 + 1e-6
+"""Ratio of exact energies up to which they are the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +42,7 @@ class Solution:
             retracted.
         status: Ipopt's status of the constrained NLP, or why it was stopped.
         converged: Whether Ipopt reports success and the constraints hold.
-        stages: Phases of the presolve, then Ipopt's of the constrained NLP.
+        stages: Ipopt's of the presolve, then that of the constrained NLP.
         energy_start: Exact energy by term of the start.
         energy: Exact energy by term of the solution.
         residuals: Largest violation by kind of constraint, recomputed from the arrays, and the
@@ -75,15 +73,6 @@ class Solution:
     delivered: str = "constrained NLP"
     far: bool = False
     ends: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def found_by(self) -> str:
-        """What found the minimum: "presolve", "Ipopt", or "nobody" if none was reached."""
-        if not self.converged:
-            return "nobody"
-        # without an iteration Ipopt has confirmed the presolve's point
-        descent = any(s.name.startswith("presolve") for s in self.stages)
-        return "presolve" if descent and not self.stages[-1].iterations else "Ipopt"
 
     def __str__(self) -> str:
         return (
@@ -146,7 +135,7 @@ def _near(stage: Stage) -> bool:
 def _far(stages: Sequence[Stage]) -> bool:
     """Whether the exact Hessian ended, by itself or at its limit, far from a minimum."""
     last = stages[-1] if stages else None
-    ended = last is not None and last.name in (POLISH, EXACT) and last.status not in STOPPED
+    ended = last is not None and last.name == EXACT and last.status not in STOPPED
     return ended and not _near(stages[-1])
 
 
@@ -174,7 +163,7 @@ class _Solve:
         self.watch.say(str(nlp))
         first: dict[str, Any] = {"x0": nlp.x0}
         # the lifted truncation has another solution than the presolve's
-        if self.form.truncation == "smooth" and self.o.polish_iterations and near and not worse:
+        if self.form.truncation == "smooth" and self.o.exact_iterations and near and not worse:
             first |= warm_start(nlp, self.data, soup, rim)
         stage = self.ipopt(nlp, first, far)
         found = {"constrained NLP": layout.unpack(stage.x), "presolve": presolved}
@@ -184,6 +173,10 @@ class _Solve:
         ends = {k: s.normalised(self.data.share).retracted() for k, s in found.items()}
         held = self.held(ends)
         delivered = min(held, key=lambda k: self.energy(held[k]))
+        last = held.get("constrained NLP")
+        # energies at one minimum differ by what the smoothing hides
+        if stage.converged and last and self.energy(last) <= SAME * self.energy(held[delivered]):
+            delivered = "constrained NLP"
         final = held[delivered]
         # a reported success counts only where the constraints hold
         broken = stage.converged and "constrained NLP" not in held
@@ -214,60 +207,17 @@ class _Solve:
         return self.laps.begin + 0.7 * self.o.max_seconds
 
     def presolve(self) -> tuple[Soup, Float]:
-        """Soup and multipliers of rim visibility of the presolve or of Ipopt's continuation; the
-        start where both are off."""
+        """Soup and multipliers of rim visibility of the presolve; the start where it is off."""
         soup, rim = self.start, np.zeros(0)
         if self.o.presolve:
-            descent = self._reweighted()
-            two = self.o.untruncated and np.isfinite(self.weights.sigma_arap)
-            if two and self.stages[-1].status not in STOPPED:
-                other = self._untruncated()
-                descent = min(descent, other, key=lambda d: self.energy(d.soup))
-            if self.stages[-1].status not in STOPPED and self.o.polish_iterations:
-                descent = self._polished(descent)
-            soup, rim = descent.soup, descent.rim
-        elif self.o.continuation and self.o.max_iter:
-            way = Continuation(
+            first = Presolve(
                 soup, self.data, self.weights, self.form, self.o, self.watch, self.early()
             )
-            way.run()
-            self.stages.extend(way.stages)
-            soup, rim = way.soup, way.rim
+            first.run()
+            self.stages.extend(first.stages)
+            soup, rim = first.soup, first.rim
         self.laps.end("presolve")
         return soup, rim
-
-    def _reweighted(self) -> Descent:
-        problem = TangentProblem(self.start, self.data, self.weights, self.form, exact=False)
-        return self._run(
-            Descent(problem, watch=self.watch, deadline=self.early()), reweighted(self.o)
-        )
-
-    def _untruncated(self) -> Descent:
-        """The second strategy: without the truncation of E_arap first, then with it."""
-        whole = self.weights.replace(sigma_arap=np.inf)
-        problem = TangentProblem(self.start, self.data, whole, self.form, exact=False)
-        first = Descent(problem, watch=self.watch, deadline=self.early())
-        self._run(first, reweighted(self.o, "untruncated "))
-        if self.stages[-1].status in STOPPED:
-            return first
-        problem = TangentProblem(first.soup, self.data, self.weights, self.form, exact=False)
-        after = Descent(problem, after=first, watch=self.watch, deadline=self.early())
-        return self._run(after, [replace(reweighted(self.o)[-1], name="presolve truncated")])
-
-    def _run(self, descent: Descent, phases: Sequence[Phase]) -> Descent:
-        for phase in phases:
-            self._ended(descent.run(phase))
-            if self.stages[-1].status in STOPPED:
-                break
-        return descent
-
-    def _polished(self, before: Descent) -> Descent:
-        problem = TangentProblem(
-            before.soup, self.data, self.weights, self.form, chart=polish_chart(self.data)
-        )
-        descent = Descent(problem, after=before, watch=self.watch, deadline=self.early())
-        self._ended(descent.run(polish(self.o)))
-        return descent
 
     def constrained(self, soup: Soup) -> tuple[NLP, MatrixLayout]:
         """The constrained NLP about a soup, at the last smoothing."""

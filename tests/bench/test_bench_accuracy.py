@@ -33,7 +33,6 @@ QUICK = (
     "segmentation.superpixels=40",
     "segmentation.neighbours=6",
     "solver.presolve=false",
-    "solver.continuation=false",
     "solver.max_iter=5",
     "refine.rounds=1",
     "refine.particles=6",

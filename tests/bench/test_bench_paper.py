@@ -23,7 +23,7 @@ from soup_nlp.storage.rows import Row
 pytestmark = pytest.mark.slow
 
 TINY = ("segmentation.superpixels=40", "segmentation.neighbours=6")
-QUICK = (*TINY, "solver.polish_iterations=0", "solver.max_iter=1", "refine.rounds=1")
+QUICK = (*TINY, "solver.exact_iterations=0", "solver.max_iter=1", "refine.rounds=1")
 
 
 def item(scene: str = "street", width: int = 128, height: int = 64) -> Item:

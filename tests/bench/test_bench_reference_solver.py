@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import numpy as np
 import pytest
-from scipy import sparse
 
 from soup_nlp.bench.reference_solver import ReferenceSolve, Tangent, levenberg_marquardt
 from soup_nlp.config.problem import make_problem
@@ -14,7 +11,6 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import Case, prepare
-from soup_nlp.solve import factor
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
@@ -92,47 +88,6 @@ def test_projection_keeps_bounds_and_visibility(case):
     assert (kept <= problem.nlp.ubx).all()
     # nothing but scales and slopes moves
     np.testing.assert_array_equal(kept.reshape(-1, 9)[:, 3:], wild.reshape(-1, 9)[:, 3:])
-
-
-def test_factorisations_agree():
-    rng = np.random.default_rng(1)
-    J = sparse.random(60, 30, 0.1, "csr", rng=rng) + sparse.eye(60, 30)
-    H = sparse.triu(J.T @ J).tocsc()
-    H.sort_indices()
-    nonzeros = H.data.copy()
-    upper = sparse.csc_matrix((np.arange(H.nnz, dtype=float), H.indices, H.indptr), H.shape)
-    b = rng.normal(size=30)
-    full = (J.T @ J).toarray()
-    diagonal = factor.diagonal_places(upper)
-    methods = [factor.superlu(upper), factor.factorisation(upper)[1]]
-    with contextlib.suppress(ImportError):
-        methods.append(factor.cholmod(upper))
-    for factorise in methods:
-        for scale, damping in ((1.0, 0.1), (2.0, 0.7)):
-            expected = np.linalg.solve(scale * full + damping * np.eye(30), b)
-            damped = scale * nonzeros
-            damped[diagonal] += damping
-            back = factorise(damped)
-            np.testing.assert_allclose(back(b), expected, atol=1e-10)
-            np.testing.assert_allclose(back(2 * b), 2 * expected, atol=1e-10)
-
-
-def test_one_analysis_serves_equal_patterns_alone():
-    plain = factor.numbered(np.array([0, 1, 2]), np.array([0, 1, 2]), 3)
-    upper = factor.numbered(np.array([0, 0, 1, 2]), np.array([0, 1, 1, 2]), 3)
-    # as many nonzeros in every column
-    other = factor.numbered(np.array([0, 0, 1, 1, 2]), np.array([0, 1, 1, 2, 2]), 3)
-    third = factor.numbered(np.array([0, 0, 1, 0, 2]), np.array([0, 1, 1, 2, 2]), 3)
-    matrices = [plain, upper, other, third]
-    for i, one in enumerate(matrices):
-        assert [factor.same_pattern(one, m) for m in matrices] == [i == k for k in range(4)]
-    assert factor.same_pattern(plain, plain.copy())
-
-
-def test_a_matrix_without_its_diagonal_is_refused():
-    upper = factor.numbered(np.array([0, 0]), np.array([0, 1]), 2)
-    with pytest.raises(ValueError, match="diagonal"):
-        factor.diagonal_places(upper)
 
 
 def test_a_time_limit_ends_with_the_best_iterate(case):

@@ -201,5 +201,5 @@ def test_two_pictures_are_enough(orbit, tmp_path, capsys):
     assert [s for s in stages if s in ("load", "flow", "nlp", "files")] == [
         "load", "flow", "nlp", "files",
     ]  # fmt: skip
-    assert "presolve 0.3" not in told.err
-    assert "presolve 0.3" in (tmp_path / "out" / "log.txt").read_text()
+    assert "majorant 0.3" not in told.err
+    assert "majorant 0.3" in (tmp_path / "out" / "log.txt").read_text()

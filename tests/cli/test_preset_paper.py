@@ -19,10 +19,10 @@ from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.layout import TangentLayout
 from soup_nlp.model.reweighting import in_length
+from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.solve.stages import solve_soup
-from soup_nlp.solve.tangent_problem import TangentProblem
 from soup_nlp.start.homographies import Matches, fit_homography, in_front, plane_of
 
 PAPER = {
@@ -230,33 +230,24 @@ def test_a_pixel_of_smoothing_is_a_length_and_an_angle(case):
 
 
 def test_slanted_planes_do_not_lengthen_the_unit(case):
-    """The presolve's length unit is exact: its gradient, and every iterate's simplex."""
-    problem = TangentProblem(case.soup, case.data, case.weights, case.formulation(), exact=False)
-    rng = np.random.default_rng(0)
-    x = problem.nlp.x0 + 1e-2 * rng.normal(size=problem.nlp.nx)
-
-    def unit(x: np.ndarray) -> float:
-        lam, row = x.reshape(-1, 9)[:, :3], problem.layout
-        m = np.column_stack(
-            [lam[:, 1:], row.radius - np.sum(lam[:, 1:] * row.anchor[:, :2], axis=1)]
-        )
-        distance = row.depth * lam[:, 0] * row.radius / np.linalg.norm(m, axis=1)
-        return float(row.share @ distance)
-
-    assert unit(problem.nlp.x0) == pytest.approx(1.0, rel=1e-9)
-    assert unit(problem.normalise(x)) == pytest.approx(1.0, rel=1e-12)
-    h = 1e-6 * rng.normal(size=len(x))
-    slope = (unit(x + h) - unit(x - h)) / 2
-    # central differences of step 1e-6: their error is of third order, rounding 1e-10
-    assert problem.length(x) @ h == pytest.approx(slope, rel=1e-6, abs=1e-13)
-    assert problem.length(x) @ problem.growth(x) == pytest.approx(unit(x), rel=1e-12)
+    """The presolve's row of the length unit adds up the distances of the slanted planes."""
+    nlp, layout = build_tangent_nlp(case.soup, case.data, case.weights, case.formulation())
+    row = next(g for g in nlp.groups if g.kernel.name == "t_simplex").table.rows[0, 0]
+    x = nlp.x0 + 1e-2 * np.random.default_rng(0).normal(size=nlp.nx)
+    lam, slope = x[::9], x.reshape(-1, 9)[:, 1:3]
+    across = layout.radius - np.sum(slope * layout.anchor[:, :2], axis=1)
+    m = np.linalg.norm(np.column_stack([slope, across]), axis=1)
+    unit = layout.share @ (layout.depth * lam * layout.radius / m)
+    assert nlp.sums.constraints(x)[0][row] == pytest.approx(unit, rel=1e-9)
+    assert nlp.sums.constraints(nlp.x0)[0][row] == pytest.approx(1.0, rel=1e-9)
+    assert abs(unit - 1) > 1e-4
 
 
 def test_the_papers_nlp_has_the_minimum_of_the_presolve(case):
     """Ipopt starts where the presolve ends: with held slopes it started a fifth of E higher."""
-    options = case.options.replace(polish_iterations=20, max_iter=0)
+    options = case.options.replace(exact_iterations=20, max_iter=0)
     done = solve_soup(case.soup, case.data, case.weights, case.formulation(), options)
-    polish, last = done.stages[-2:]
+    exact, last = done.stages[-2:]
     # one energy of one soup in two sets of variables
-    assert last.history["obj"][0] == pytest.approx(polish.objective, rel=1e-7)
+    assert last.history["obj"][0] == pytest.approx(exact.objective, rel=1e-7)
     assert done.energy["total"] < 0.5 * done.energy_start["total"]

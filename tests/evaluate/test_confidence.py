@@ -27,10 +27,12 @@ from soup_nlp.evaluate.confidence import (
 from soup_nlp.evaluate.information import information, learned, marginals, spread_in_image
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.nlp import NLP
+from soup_nlp.model.sums import Sums
+from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve import selected_inverse
 from soup_nlp.solve.selected_inverse import BlockCholesky, dissect
-from soup_nlp.solve.tangent_problem import TangentProblem
 from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.components import TIES
 
@@ -179,9 +181,15 @@ def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room):
     data, n = small_room.data, len(small_room)
     free = dict.fromkeys(("sigma_proj", "sigma_cont", "sigma_cont_ref", "sigma_arap"), np.inf)
     weights = small_room.weights.replace(**free, sigma_orient=np.inf)
-    problem = TangentProblem(small_room.soup, data, weights, FORM, chart="inverse-depth")
-    problem.smoothing(wide)
-    nlp, mean = problem.nlp, np.zeros(9 * n)
+    reweighted, layout = build_tangent_nlp(
+        small_room.soup, data, weights, majorant(FORM), "inverse-depth"
+    )
+    programs = {"reweighted": reweighted, "exact": replace(reweighted, hessian="exact")}
+    sums = {kind: Sums(nlp, second_order=True) for kind, nlp in programs.items()}
+    for own in sums.values():
+        own.theta = reweighted.thetas(eps=wide, eps_pixel=wide)
+    energy = sums["exact"]
+    nlp, mean = reweighted, np.zeros(9 * n)
     mean[::9] = -small_room.segmentation.sizes / small_room.segmentation.sizes.sum()
 
     def held(matrix: np.ndarray) -> np.ndarray:
@@ -193,22 +201,21 @@ def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room):
         return np.linalg.inv(kkt)[:-1, :-1] * np.outer(scale, scale)
 
     def inverse(x: np.ndarray, kind: str) -> np.ndarray:
-        upper = problem.upper.copy()
-        upper.data = problem.hessian(x, np.zeros((n, problem.rims + 5)), kind)
-        dense = upper.toarray()
+        nonzeros = sums[kind].hessian(x, np.zeros(nlp.ng))
+        dense = programs[kind].hessian_pattern.filled(nonzeros).toarray()
         return held(dense + np.triu(dense, 1).T)
 
     x = nlp.x0.copy()
     for k in range(40):
-        step = inverse(x, "gauss-newton" if k < 30 else "exact") @ problem.gradient(x)
-        while problem.value(x - step) > problem.value(x) and np.abs(step).max() > 1e-9:
+        step = inverse(x, "reweighted" if k < 30 else "exact") @ energy.gradient(x)
+        while energy.value(x - step) > energy.value(x) and np.abs(step).max() > 1e-9:
             step = step / 2
         x = x - step
         if k >= 30 and np.abs(step).max() < 1e-12:
             break
     newton = inverse(x, "exact")
-    assert np.abs(newton @ problem.gradient(x)).max() < 1e-9
-    parameters, targets = _with_targets(problem, wide)
+    assert np.abs(newton @ energy.gradient(x)).max() < 1e-9
+    parameters, targets = _with_targets(nlp, wide)
     rng = np.random.default_rng(0)
     spread = np.empty((draws, n))
     for k in range(draws):
@@ -217,11 +224,11 @@ def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room):
         y = x - newton @ np.asarray(nlp.grad_f(x, p)[1]).ravel()
         y -= newton @ np.asarray(nlp.grad_f(y, p)[1]).ravel()
         spread[k] = -np.log(y[::9] / x[::9])
-    at = problem.layout.unpack(x)
+    at = layout.unpack(x)
     S = held(information(at, data, weights, FORM, wide).matrix.toarray())
-    own = dict.fromkeys(("arap", "cont", "orient", "prior"), 0.0)
+    other = dict.fromkeys(("arap", "cont", "orient", "prior"), 0.0)
     flow = replace(data, pixel_weight=(weights.proj * data.pixel_weight) ** 2 / wide)
-    F = information(at, flow, weights.replace(**own, proj=1.0), FORM, wide).matrix.toarray()
+    F = information(at, flow, weights.replace(**other, proj=1.0), FORM, wide).matrix.toarray()
     predicted = noise * np.sqrt((S @ F @ S).diagonal()[::9])
     ratio = spread.std(axis=0) / predicted
     # 100 draws know a standard deviation to 7 %
@@ -229,9 +236,8 @@ def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room):
     assert np.mean(np.abs(ratio - 1) < 0.2) > 0.9
 
 
-def _with_targets(problem: TangentProblem, smoothing: float) -> tuple[np.ndarray, np.ndarray]:
+def _with_targets(nlp: NLP, smoothing: float) -> tuple[np.ndarray, np.ndarray]:
     """Parameters of the NLP, and where the flow's targets stand in them: (E, 2)."""
-    nlp = problem.nlp
     p = nlp.with_theta(eps=smoothing, eps_pixel=smoothing)
     place = len(nlp.theta)
     for group in nlp.groups:

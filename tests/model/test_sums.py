@@ -12,7 +12,6 @@ import pytest
 
 from soup_nlp.model import compile as compiling
 from soup_nlp.model import vectors
-from soup_nlp.model.blocks import Elements
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.lanes import LANES, NoLanesError, compile_lanes, in_lanes
@@ -25,8 +24,6 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import Case
 from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.ipopt import Ipopt
-from soup_nlp.solve.part import Block
-from soup_nlp.solve.tangent_problem import TangentProblem
 
 pytestmark = pytest.mark.slow
 
@@ -86,56 +83,51 @@ def squares(elements: int, compiled: bool = True) -> NLP:
 
 @needs_compiler
 @pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
-def test_vectors_and_functions_give_the_same_presolve(case, chart: Chart):
-    args = case.soup, case.data, case.weights
-    fast = TangentProblem(*args, Formulation(compiled=True), chart=chart)
-    slow = TangentProblem(*args, Formulation(compiled=False), chart=chart)
-    assert fast.sums.vectorised
-    assert not slow.sums.vectorised
-    np.testing.assert_array_equal(fast.triangles, slow.triangles)
-    np.testing.assert_array_equal(fast.upper.indices, slow.upper.indices)
+@pytest.mark.parametrize("kind", ["gauss-newton+constraints", "exact"])
+def test_vectors_and_functions_give_the_same_presolve(case, chart: Chart, kind):
+    fast, slow = (
+        build_tangent_nlp(
+            case.soup,
+            case.data,
+            case.weights,
+            Formulation(compiled=compiled, hessian=kind),
+            chart,
+        )[0]
+        for compiled in (True, False)
+    )
     rng = np.random.default_rng(1)
-    x = fast.nlp.x0 * (1 + 0.01 * rng.normal(size=fast.nlp.nx))
-    z = rng.uniform(0.1, 1.0, fast.slacks(x)[0].shape)
+    x = fast.x0 * (1 + 0.01 * rng.normal(size=fast.nx))
+    lam = rng.uniform(0.1, 1.0, fast.ng)
+    one, two = Sums(fast, second_order=True), Sums(slow, second_order=True)
+    assert one.vectorised
+    assert not two.vectorised
     for eps in (0.1, 0.01):
-        fast.smoothing(eps)
-        slow.smoothing(eps)
-        assert fast.value(x) == pytest.approx(slow.value(x), rel=1e-12)
-        close(fast.gradient(x), slow.gradient(x))
-        for a, b in zip(fast.slacks(x), slow.slacks(x)):
+        one.theta = two.theta = fast.thetas(eps=eps, eps_pixel=eps)
+        assert one.value(x) == pytest.approx(two.value(x), rel=1e-12)
+        close(one.gradient(x), two.gradient(x))
+        for a, b in zip(one.constraints(x), two.constraints(x)):
             close(a, b)
-        for kind in ("gauss-newton", "exact"):
-            close(fast.hessian(x, z, kind), slow.hessian(x, z, kind))
+        close(one.hessian(x, lam), two.hessian(x, lam))
 
 
 @needs_compiler
 @pytest.mark.parametrize("elements", [1, LANES - 1, LANES, LANES + 1, 3 * LANES + 2])
 def test_tables_of_every_size(elements):
     nlp, other = squares(elements), squares(elements, compiled=False)
-    fast, slow = Sums(nlp, ["exact"]), Sums(other, ["exact"])
+    fast, slow = Sums(nlp, second_order=True), Sums(other, second_order=True)
     x, lam = nlp.x0, np.linspace(-1, 1, elements)
     assert fast.value(x) == pytest.approx(slow.value(x), rel=1e-14)
     close(fast.gradient(x), slow.gradient(x), 1e-14)
     for a, b in zip(fast.constraints(x), slow.constraints(x)):
         close(a, b, 1e-14)
-    close(fast.hessian("exact", x, lam, 0.5), slow.hessian("exact", x, lam, 0.5), 1e-14)
+    close(fast.hessian(x, lam, 0.5), slow.hessian(x, lam, 0.5), 1e-14)
     assert all(seconds > 0 for seconds in fast.seconds.values())
-
-
-@needs_compiler
-def test_what_the_caller_wants_besides_stands_in_the_pattern():
-    nlp = squares(5)
-    corner = Elements(np.array([[2, 4]]), np.array([0]), np.array([1]))
-    sums = Sums(nlp, ["exact"], corner)
-    (place,) = sums.upper.places[-1]
-    assert (sums.upper.rows[place], sums.upper.columns[place]) == (2, 4)
-    assert sums.hessian("exact", nlp.x0, np.ones(5))[place] == 0
 
 
 @needs_compiler
 def test_other_parameters_are_used():
     nlp = squares(5)
-    sums = Sums(nlp, ["exact"])
+    sums = Sums(nlp, second_order=True)
     before = sums.value(nlp.x0)
     sums.theta = np.array([6.0])
     assert sums.value(nlp.x0) == pytest.approx(2 * before, rel=1e-14)
@@ -143,11 +135,11 @@ def test_other_parameters_are_used():
 
 @needs_compiler
 def test_lengths_are_checked_before_machine_code_reads():
-    sums = Sums(squares(5), ["exact"])
+    sums = Sums(squares(5), second_order=True)
     with pytest.raises(ValueError, match="x has 2 entries, expected 6"):
         sums.value(np.zeros(2))
     with pytest.raises(ValueError, match="lam_g has 1 entries, expected 5"):
-        sums.hessian("exact", np.zeros(6), np.zeros(1))
+        sums.hessian(np.zeros(6), np.zeros(1))
 
 
 @pytest.fixture(scope="module")
@@ -192,57 +184,6 @@ def test_an_operation_without_a_twin_goes_to_casadi():
     out = np.zeros(1)
     term.add(out, np.array([0.1, 0.2, 0.3]), np.zeros(0), 1.0, None)
     assert out[0] == pytest.approx(np.sin([0.1, 0.2, 0.3]).sum(), rel=1e-14)
-
-
-@needs_compiler
-def test_sums_over_some_variables_change_as_the_whole():
-    count = 5 * LANES + 3
-    nlp = squares(count)
-    sums = Sums(nlp, ["exact"])
-    x, y, lam = nlp.x0, nlp.x0.copy(), np.linspace(0, 1, count)
-    moved = np.zeros(nlp.nx, bool)
-    # element e has the variables e + 1 and 0
-    moved[[1 + LANES, count]] = True
-    y[moved] += 0.1
-    change = sums.value(y) - sums.value(x), sums.gradient(y) - sums.gradient(x)
-    whole, g = sums.hessian("exact", y, lam), sums.constraints(y)[0]
-    sums.only(moved)
-    assert 0 < sums.value(x) < 0.6 * float(nlp.oracle(x, nlp.p)[0])
-    close(sums.value(y) - sums.value(x), change[0])
-    close(sums.gradient(y) - sums.gradient(x), change[1])
-    of_moved = moved[sums.upper.rows] & moved[sums.upper.columns]
-    close(sums.hessian("exact", y, lam)[of_moved], whole[of_moved])
-    close(sums.constraints(y)[0], g)
-    kept = np.flatnonzero(of_moved)
-    for variables in (moved, None):
-        sums.only(variables, kept)
-        close(sums.hessian("exact", y, lam), whole[kept])
-    sums.only(None)
-    close(sums.hessian("exact", y, lam), whole, 0)
-
-
-@needs_compiler
-@pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
-def test_superpixels_that_are_held_count_as_where_they_are(case, chart: Chart):
-    problem = TangentProblem(case.soup, case.data, case.weights, Formulation(), chart=chart)
-    x, some = problem.normalise(problem.nlp.x0), np.arange(len(case.data)) == 3
-    y = x.copy()
-    y.reshape(-1, 9)[some] += 0.02
-    # also those that are held are scaled
-    y = problem.normalise(y)
-    assert y[0] != x[0]
-    whole = problem.triangles
-    value, gradient = problem.value(y), problem.gradient(y)
-    z, block = np.ones_like(problem.slacks(y)[0]), Block.of(problem.upper, some)
-    H = problem.hessian(y, z, "exact")
-    assert problem.move(block, x)
-    assert not problem.move(block, y)
-    close(problem.hessian(y, z, "exact"), H[block.nonzeros])
-    np.testing.assert_array_equal(block.nonzeros[problem.triangles], whole[some])
-    assert problem.value(y) == pytest.approx(value, rel=1e-12)
-    close(problem.gradient(y), gradient)
-    assert problem.move(None, y)
-    assert problem.value(y) == value
 
 
 @needs_compiler
@@ -322,7 +263,7 @@ def test_without_a_compiler_functions_do_it(own_cache, monkeypatch, caplog):
     monkeypatch.setenv("CC", "/bin/false")
     nlp = squares(5)
     with caplog.at_level(logging.INFO):
-        sums = Sums(nlp, ["exact"])
+        sums = Sums(nlp, second_order=True)
     assert not sums.vectorised
     assert "no machine code on vectors" in caplog.text
     assert sums.value(nlp.x0) == pytest.approx(float(nlp.oracle(nlp.x0, nlp.p)[0]), rel=1e-14)
@@ -333,4 +274,4 @@ def test_a_library_that_does_not_load_is_no_way(monkeypatch, tmp_path):
     broken = tmp_path / "broken.so"
     broken.write_text("not a library")
     monkeypatch.setattr("soup_nlp.model.lanes.shared_library", lambda key, source: broken)
-    assert not Sums(squares(5), ["exact"]).vectorised
+    assert not Sums(squares(5), second_order=True).vectorised

@@ -178,7 +178,7 @@ def test_the_delivered_answer_is_ipopt_s(pair, tmp_path):
 
 @pytest.mark.parametrize(
     "place",
-    ["depth/sigma_ref", "iterations/00_presolve_0.3/obj", "truth/flow", "@name", "@machine"],
+    ["depth/sigma_ref", "iterations/00_majorant_0.3/obj", "truth/flow", "@name", "@machine"],
 )
 def test_contents_of_the_arrays_are_as_written(place, folder):
     """Changes made with HDF5 itself have valid checksums."""

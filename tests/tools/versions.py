@@ -27,7 +27,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHONS = ("3.11", "3.12", "3.13")
-RUNNERS = ("cvxopt", "pytest", "hypothesis")
+RUNNERS = ("pytest", "hypothesis")
 """What the tests need besides the dependencies."""
 NO_COMPILER = {"CC": "no-such-compiler"}
 TINY = [
@@ -57,7 +57,6 @@ class Circumstance:
 
 CIRCUMSTANCES = (
     Circumstance("no compiler", NO_COMPILER),
-    Circumstance("no cvxopt", {}, without=("cvxopt",)),
     Circumstance("read-only HOME", {"HOME": "READ_ONLY"}),
     Circumstance("no HOME", {}, unset=("HOME", "XDG_CACHE_HOME", "MPLCONFIGDIR")),
     Circumstance("LANG=C", {"LANG": "C", "LC_ALL": "C"}),
@@ -67,7 +66,6 @@ CIRCUMSTANCES = (
         "bare",
         {**NO_COMPILER, "LANG": "C", "LC_ALL": "C", "COLUMNS": "40"},
         unset=("HOME", "XDG_CACHE_HOME", "MPLCONFIGDIR"),
-        without=("cvxopt",),
         tests=True,
     ),
 )

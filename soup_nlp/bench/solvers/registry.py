@@ -119,7 +119,7 @@ def reference(task: Task) -> Answer:
 
 
 def package(task: Task) -> Answer:
-    """Solve as this package does: presolve, then Ipopt on the constrained NLP."""
+    """Solve as this package does: Ipopt's stages, then the constrained NLP."""
     begin = clock()
     m = task.limits
     options = SolverOptions(

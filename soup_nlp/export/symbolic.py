@@ -1,0 +1,127 @@
+"""The NLP of a problem for `casadi.nlpsol`: symbols, bounds, start, derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+
+from soup_nlp.arrays import Float
+from soup_nlp.config.problem import Problem, load_problem
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.kernel import Hessian
+from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.nlp import NLP
+from soup_nlp.model.tangent_nlp import build_tangent_nlp
+from soup_nlp.pipeline.case import Case, prepare
+
+Coordinates = Literal["matrix", "tangent"]
+
+
+@dataclass(frozen=True, eq=False)
+class SymbolicNLP:
+    """min f(x, p) subject to lbg <= g(x, p) <= ubg, lbx <= x <= ubx, in CasADi's words.
+
+    Attributes:
+        case: Images, flow, superpixels, initialisation and energy.
+        record: Kernels, tables, bounds and names.
+        layout: Turns x into soups.
+    """
+
+    case: Case
+    record: NLP
+    layout: MatrixLayout | TangentLayout
+
+    @cached_property
+    def _symbols(self) -> tuple[ca.MX, ca.MX, ca.MX, ca.MX]:
+        x, p = ca.MX.sym("x", self.record.nx), ca.MX.sym("p", len(self.record.p))
+        return x, p, *self.record.oracle(x, p)
+
+    @property
+    def x(self) -> ca.MX:
+        """(nx,) variables."""
+        return self._symbols[0]
+
+    @property
+    def p(self) -> ca.MX:
+        """(np,) parameters: smoothing widths, then the data of all elements."""
+        return self._symbols[1]
+
+    @property
+    def f(self) -> ca.MX:
+        """The smoothed energy, an expression of x and p."""
+        return self._symbols[2]
+
+    @property
+    def g(self) -> ca.MX:
+        """(ng,) constraints, expressions of x and p."""
+        return self._symbols[3]
+
+    @property
+    def problem(self) -> dict[str, ca.MX]:
+        """x, p, f, g: the third argument of `nlpsol`."""
+        return {"x": self.x, "p": self.p, "f": self.f, "g": self.g}
+
+    @property
+    def derivatives(self) -> dict[str, ca.Function]:
+        """Options of `nlpsol` that spare it the derivation; the Hessian is of `record.hessian`."""
+        nlp = self.record
+        return {"grad_f": nlp.grad_f, "jac_g": nlp.jac_g, "hess_lag": nlp.hess_lag}
+
+    @property
+    def start(self) -> dict[str, Float]:
+        """x0, p and the bounds: what the solver is called with."""
+        names = ("x0", "p", "lbx", "ubx", "lbg", "ubg")
+        return {name: getattr(self.record, name) for name in names}
+
+    def parameters(self, **theta: float) -> Float:
+        """(np,) values of p with other smoothing: `eps`, `eps_pixel` (pixels), `theta`, `ridge`.
+
+        Raises:
+            ModelError: another name.
+        """
+        return self.record.with_theta(**theta)
+
+    def soup(self, x: ca.DM | Float) -> Soup:
+        """Planes and motions of a point."""
+        return self.layout.unpack(np.asarray(x, float).ravel())
+
+
+def nlp(
+    problem: str | Path | Problem,
+    *,
+    superpixels: int | None = None,
+    overrides: Sequence[str] = (),
+    coordinates: Coordinates = "matrix",
+    hessian: Hessian = "exact",
+    presolve: bool = False,
+    compiled: bool = False,
+) -> SymbolicNLP:
+    """The NLP of a problem, for `casadi.nlpsol` and its plug-ins.
+
+    Args:
+        problem: Name or file of a problem, or a loaded one.
+        superpixels: N.
+        overrides: `a.b=value`, as after `--set`.
+        coordinates: "matrix": the constrained NLP (SO(3), unit normals, simplex, visibility);
+            "tangent": nine coordinates per superpixel, in which the first two hold by construction.
+        hessian: Of `derivatives`; "gauss-newton" is a majorant where its theta is 0.
+        presolve: Start at the presolve's answer instead of the initialisation.
+        compiled: Evaluate kernels in machine code; the expressions then have no second derivatives.
+
+    Raises:
+        SoupError: the problem cannot be prepared.
+    """
+    if not isinstance(problem, Problem):
+        more = () if superpixels is None else (f"segmentation.superpixels={superpixels}",)
+        problem = load_problem(problem, [*overrides, *more])
+    case = prepare(problem, presolve)
+    form = case.formulation(hessian=hessian, compiled=compiled)
+    if coordinates == "matrix":
+        return SymbolicNLP(case, *case.nlp(form))
+    return SymbolicNLP(case, *build_tangent_nlp(case.soup, case.data, case.weights, form))

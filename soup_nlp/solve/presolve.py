@@ -1,0 +1,253 @@
+"""Ipopt's stages before the constrained NLP: less smoothing, then ever more exact Hessians.
+
+The program is the whole energy in nine coordinates per superpixel, with SO(3) and unit normals by
+construction. The first stages use the majorant Hessian (theta = 0), whose model lies above every
+norm: full steps descend, and no inertia has to be corrected. The next ones leave out a growing
+share theta of the curvature along each residual, which the exact Hessian does not have either. The
+exact Hessian ends the sequence, near enough to its minimum to converge fast.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from soup_nlp.arrays import Float
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.model import oracle
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import Chart, TangentLayout
+from soup_nlp.model.nlp import NLP
+from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart, majorant
+from soup_nlp.solve.ipopt import Ipopt, Stage
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.storage.progress import Watch
+
+PUSH = 1e-8
+KEEP: Mapping[str, Any] = {
+    # the approximate minimum fill ordering, and no matching, which the constrained NLP needs
+    "mumps_pivot_order": 2,
+    "mumps_permuting_scaling": 0,
+    "mumps_mem_percent": 100,
+    "warm_start_init_point": "yes",
+    "warm_start_bound_push": PUSH,
+    "warm_start_bound_frac": PUSH,
+    "warm_start_slack_bound_push": PUSH,
+    "warm_start_slack_bound_frac": PUSH,
+    "warm_start_mult_bound_push": PUSH,
+    # the filter would take steps that raise f for a smaller violation of nearly linear rows
+    "theta_min_fact": 1e6,
+    "theta_max_fact": 1e8,
+}
+"""Ipopt options of all these stages: MUMPS, and the start from a point and its multipliers."""
+LAST: Mapping[str, Any] = {"mu_init": 1e-10}
+"""Options of the last stage. A larger barrier would push at constraints that the constrained NLP
+does not have in the same variables, and that would then have to iterate."""
+THETAS: Mapping[float, float] = {0.5: 0.1, 0.9: 1e-2, 0.98: 1e-3}
+"""Gauss-Newton stages: theta, and the share of `stagnation` that ends each."""
+RIDGE = 1e-2
+"""Added to their diagonal: theta leaves some directions without curvature."""
+UNTRUNCATED: Mapping[float, float] = {1.0: 0.3, 0.3: 1.0, 0.1: 1.0}
+"""Stages of the second strategy with the exact Hessian: smoothing widths, and the share of
+`stagnation` that ends each. So smooth, the energy is nearly convex; relief, of which each
+reweighted step brings a little, follows the curvature of the residuals at once."""
+EXACT = "exact"
+"""Name of the last stage."""
+STOPPED = ("Interrupted", "Time_Limit")
+"""Statuses of a stage after which no further stage begins."""
+
+
+@dataclass
+class Presolve:
+    """The stages before the constrained NLP.
+
+    Attributes:
+        soup: Where the last stage ended.
+        data: Pixels, graphs and weights of the pair.
+        weights: Constants of the energy.
+        form: Visibility, and whether kernels are compiled.
+        o: Widths, limits and stagnation.
+        watch: Listeners, stop event and log.
+        deadline: `time.perf_counter` at which they end.
+        rim: (N, V) multipliers of rim visibility, rows divided by the facing of the anchor, after
+            the last stage.
+        stages: Those that have ended.
+    """
+
+    soup: Soup
+    data: EnergyData
+    weights: Weights
+    form: Formulation
+    o: SolverOptions
+    watch: Watch
+    deadline: float
+    rim: Float = field(default_factory=lambda: np.zeros(0))
+    stages: list[Stage] = field(default_factory=list)
+
+    def run(self) -> None:
+        """All stages, until one of them is stopped."""
+        start, o = self.soup, self.o
+        program = self._program(start)
+        self._majorant(program, o.presolve_eps)
+        if o.untruncated and np.isfinite(self.weights.sigma_arap) and not self._stopped():
+            program = self._untruncated(start, program)
+        if o.exact_iterations and not self._stopped():
+            self._to_the_minimum(program)
+
+    def _stopped(self) -> bool:
+        return self.stages[-1].status in STOPPED
+
+    def _energy(self, soup: Soup) -> float:
+        return oracle.energy(soup, self.data, self.weights)["total"]
+
+    def _program(
+        self, soup: Soup, weights: Weights | None = None, chart: Chart = "depth"
+    ) -> _Program:
+        form = majorant(self.form)
+        nlp, layout = build_tangent_nlp(soup, self.data, weights or self.weights, form, chart)
+        if chart == "inverse-depth":
+            # visibility bounds inverse depths and slopes by itself
+            free = np.full(nlp.nx, np.inf)
+            nlp = replace(nlp, lbx=-free, ubx=free)
+        return _Program(nlp, layout, nlp.x0, np.zeros(nlp.nx), np.zeros(nlp.ng))
+
+    def _untruncated(self, start: Soup, before: _Program) -> _Program:
+        """The second strategy: E_arap without its truncation first, then with it.
+
+        Returns:
+            The program of the strategy whose soup has the lower energy, which is `soup` then.
+        """
+        first, o = self.soup, self.o
+        program = self._program(start, self.weights.replace(sigma_arap=np.inf))
+        self._majorant(program, list(UNTRUNCATED)[:1], "untruncated ", 10 * o.stagnation)
+        exact = replace(program, nlp=replace(program.nlp, hessian="exact"))
+        for eps, share in UNTRUNCATED.items():
+            if self._stopped():
+                break
+            self._stage(
+                exact,
+                Ipopt(exact.nlp, {**KEEP, **o.ipopt}),
+                eps=eps,
+                max_iter=o.presolve_iterations,
+                stagnation=o.stagnation * share,
+                stage=f"untruncated exact {eps:g}",
+            )
+        if not self._stopped():
+            other = self._program(self.soup)
+            other = replace(other, lam_x=exact.lam_x, lam_g=exact.lam_g)
+            self._majorant(other, o.presolve_eps[-2:], "truncated ")
+            if self._energy(self.soup) < self._energy(first):
+                return other
+        self.soup = min(self.soup, first, key=self._energy)
+        return before
+
+    def _majorant(
+        self,
+        program: _Program,
+        widths: Sequence[float],
+        kind: str = "",
+        stagnation: float | None = None,
+    ) -> None:
+        """Stages with theta = 0 of decreasing smoothing."""
+        o, solver = self.o, Ipopt(program.nlp, {**KEEP, **self.o.ipopt})
+        for eps in widths:
+            self._stage(
+                program,
+                solver,
+                eps=eps,
+                max_iter=o.presolve_iterations,
+                stagnation=o.stagnation if stagnation is None else stagnation,
+                stage=f"majorant {kind}{eps:g}",
+            )
+            if self._stopped():
+                break
+
+    def _to_the_minimum(self, before: _Program) -> None:
+        """Gauss-Newton stages with growing theta, then the exact Hessian, at the final smoothing.
+
+        On inverse depths if the energy's units allow it; at their base, charts agree to first
+        order, so that the multipliers serve both.
+
+        Args:
+            before: The last program, whose multipliers are the first ones here.
+        """
+        o = self.o
+        program = self._program(self.soup, chart=exact_chart(self.data))
+        program.lam_g = before.lam_g
+        if program.layout.chart == "depth":
+            program.lam_x = before.lam_x
+        solver = Ipopt(program.nlp, {**KEEP, "mu_init": 1e-6, **o.ipopt})
+        for theta, share in THETAS.items():
+            self._stage(
+                program,
+                solver,
+                eps=o.eps,
+                more={"theta": theta, "ridge": RIDGE},
+                max_iter=o.presolve_iterations,
+                stagnation=o.stagnation * share,
+                stage=f"Gauss-Newton {theta:g}",
+            )
+            if self._stopped():
+                return
+        solver = Ipopt(replace(program.nlp, hessian="exact"), {**KEEP, **LAST, **o.ipopt})
+        limit = o.exact_iterations
+        stage = self._stage(program, solver, eps=o.eps, max_iter=limit, stage=EXACT)
+        self.rim = _rim(program.nlp, program.layout, stage)
+
+    def _stage(
+        self,
+        program: _Program,
+        solver: Ipopt,
+        *,
+        eps: float,
+        more: Mapping[str, float] | None = None,
+        **limits: Any,
+    ) -> Stage:
+        """Run a stage from where the program stands; `soup` is where it ends."""
+        stage = solver(
+            x0=program.x,
+            lam_x0=program.lam_x,
+            lam_g0=program.lam_g,
+            p=program.nlp.thetas(eps=eps, eps_pixel=eps, **(more or {})),
+            tol=self.o.presolve_tol,
+            seconds=max(1.0, self.deadline - time.perf_counter()),
+            watch=self.watch,
+            **limits,
+        )
+        program.x, program.lam_x, program.lam_g = stage.x, stage.lam_x, stage.lam_g
+        self.soup = program.layout.unpack(stage.x)
+        self.stages.append(stage)
+        self.watch.say(str(stage))
+        return stage
+
+
+@dataclass
+class _Program:
+    """The energy in nine coordinates about a soup, and where its stages stand.
+
+    Attributes:
+        nlp: The program.
+        layout: Turns x into soups.
+        x: (9 N,) where the last stage ended.
+        lam_x: (9 N,) multipliers of the bounds there.
+        lam_g: (ng,) multipliers of the constraints there.
+    """
+
+    nlp: NLP
+    layout: TangentLayout
+    x: Float
+    lam_x: Float
+    lam_g: Float
+
+
+def _rim(nlp: NLP, layout: TangentLayout, stage: Stage) -> Float:
+    """(N, V) multipliers of rim visibility, its rows divided by the facing of the anchor."""
+    rows = next(g for g in nlp.groups if g.kernel.name == "t_visible").table.rows
+    own = -stage.lam_g[rows]
+    return own if layout.chart == "depth" else own * stage.x[::9, None]
