@@ -31,7 +31,6 @@ from soup_nlp.start.settle import (
     MOST_SYSTEMATIC_PX,
     RELIEF,
     SYSTEMATIC,
-    improbable,
     most_probable,
 )
 from soup_nlp.start.start_options import SeededStart
@@ -349,8 +348,7 @@ def _component(seen: _Seen, soup: Soup, c: int, prior: Float, sigma: float) -> t
     error = min(SYSTEMATIC * start.noise, MOST_SYSTEMATIC_PX)
     rest = views.anchor[use], seen.centre[use], np.ones(len(use)), views.focal[0], error
     tried = Motion(soup.R[at[0]], T / length), Motion(R, T_prior / np.linalg.norm(T_prior))
-    found = [most_probable(m, *rest, prior[use], sigma) for m in tried]
-    best = min(found, key=lambda m: float(np.sum(improbable(m, *rest, prior[use], sigma) ** 2)))
+    best = most_probable(tried, *rest, prior[use], sigma)
     planes = part.fit([best])
     mu, cost = planes.inverse_depth[:, 0], planes.cost[:, 0]
     strong = (mu > 0) & (planes.parallax[:, 0] * mu > LEAST_PARALLAX_PX) & (cost < CLIP)

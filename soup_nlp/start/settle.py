@@ -8,6 +8,8 @@ depths vary as scenes do is the most probable.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -49,14 +51,14 @@ def settle(views: Views, choice: Choice, centre: Float, usable: Float, noise: fl
             continue
         motion = Motion(choice.R[at[0]], choice.t[at[0]])
         own = views.anchor[seen], centre[seen], usable[seen], views.focal[0]
-        found = most_probable(motion, *own, min(SYSTEMATIC * noise, MOST_SYSTEMATIC_PX))
+        found = most_probable([motion], *own, min(SYSTEMATIC * noise, MOST_SYSTEMATIC_PX))
         fit = views.some(at).fit([found])
         choice = choice.taking(at, found.R, found.t, fit, int(c))
     return choice
 
 
 def most_probable(
-    motion: Motion,
+    motions: Sequence[Motion],
     r: Float,
     q: Float,
     weight: Float,
@@ -71,7 +73,7 @@ def most_probable(
     Sampson distance and rho(x, c) = c^2 log(1 + x^2 / c^2) the Cauchy loss.
 
     Args:
-        motion: Where to begin.
+        motions: Where to begin; the best of the ends is taken.
         r: (M, 3) reference rays.
         q: (M, 3) next rays.
         weight: (M,) confidence.
@@ -80,34 +82,23 @@ def most_probable(
         expected: (M,) log depth by a depth prior, from which relief is counted.
         spread: Standard deviation of the relief.
     """
-    basis = np.linalg.svd(motion.t[None])[2][1:]
+    root, found = np.sqrt(weight / weight.sum()), []
+    for begin in motions:
+        basis = np.linalg.svd(begin.t[None])[2][1:]
 
-    def unpack(x: Float) -> Motion:
-        t = motion.t + x[3:] @ basis
-        return Motion(rotation.exp(x[:3]) @ motion.R, t / np.linalg.norm(t))
+        def unpack(x: Float, begin: Motion = begin, basis: Float = basis) -> Motion:
+            t = begin.t + x[3:] @ basis
+            return Motion(rotation.exp(x[:3]) @ begin.R, t / np.linalg.norm(t))
 
-    def residual(x: Float) -> Float:
-        return improbable(unpack(x), r, q, weight, focal, error, expected, spread)
+        def residual(x: Float, unpack: Callable[[Float], Motion] = unpack) -> Float:
+            own = unpack(x)
+            distance = cauchy(sampson(own.essential(), r, q, focal), CLIP_PX)
+            depth = cauchy(relief(own, r, q, expected), spread)
+            return np.concatenate([root * distance / error, root * depth / spread])
 
-    x = least_squares(residual, np.zeros(5), x_scale=[0.01] * 3 + [0.1] * 2, max_nfev=30).x
-    return unpack(x)
-
-
-def improbable(
-    motion: Motion,
-    r: Float,
-    q: Float,
-    weight: Float,
-    focal: float,
-    error: float,
-    expected: Float | float = 0.0,
-    spread: float = RELIEF,
-) -> Float:
-    """(2 M,) whose sum of squares is the objective of `most_probable`."""
-    root = np.sqrt(weight / weight.sum())
-    distance = cauchy(sampson(motion.essential(), r, q, focal), CLIP_PX)
-    depth = cauchy(relief(motion, r, q, expected), spread)
-    return np.concatenate([root * distance / error, root * depth / spread])
+        end = least_squares(residual, np.zeros(5), x_scale=[0.01] * 3 + [0.1] * 2, max_nfev=30)
+        found.append((float(end.cost), unpack(end.x)))
+    return min(found, key=lambda one: one[0])[1]
 
 
 def cauchy(x: Float, scale: float) -> Float:
