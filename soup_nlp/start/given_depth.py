@@ -7,8 +7,7 @@ the flow says nothing, it counts as a guess if its steps lie on edges of the ima
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -175,12 +174,14 @@ class _Seen:
         views: What planes are fitted to.
         centre: (N, 3) rays to which the anchors move, by an affine flow.
         usable: (N,) True where that is known.
+        known: What `relief` has computed, by component.
     """
 
     start: Start
     views: Views
     centre: Float
     usable: Mask
+    known: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, start: Start, seg: Segmentation, flow: Flow, pair: Pair, o: SeededStart) -> _Seen:
@@ -216,14 +217,15 @@ class _Seen:
         mean = float(np.mean(error[: int(np.ceil(0.9 * len(error)))]))
         return mean, rotation.exp(x[:3]), x[3:6] / middle, middle * x[6] if shifted else 0.0
 
-    @cache  # noqa: B019 - one record a pair
     def relief(self, c: int) -> tuple[float, float]:
         """Error of the flow of a component at one depth, above the noise, and the noise; pixels."""
-        at = self.members(c)
-        if len(at) < FEWEST or self.start.at_rest:
-            return 0.0, self.start.noise
-        floor = min(self.start.noise, float(np.median(self.start.error[at])))
-        return self.motion(at, np.ones(len(at)))[0] - floor, floor
+        if c not in self.known:
+            at, noise = self.members(c), self.start.noise
+            if len(at) < FEWEST or self.start.at_rest:
+                return 0.0, noise
+            floor = min(noise, float(np.median(self.start.error[at])))
+            self.known[c] = self.motion(at, np.ones(len(at)))[0] - floor, floor
+        return self.known[c]
 
     @property
     def tells(self) -> float:
