@@ -156,7 +156,8 @@ def written(tmp_path_factory):
     form = Formulation(gauge="free", norm="epigraph", truncation="lifted", hessian="exact")
     nlp, layout = Tiny().nlp(TRUNCATED, form)
     folder = tmp_path_factory.mktemp("foreign")
-    return nlp, layout, write_nl(folder / "soup.nl", nlp, names=readable_names(nlp, layout))
+    lam_g = np.full(nlp.ng, -1.0)
+    return nlp, layout, write_nl(folder / "soup.nl", nlp, readable_names(nlp, layout), lam_g)
 
 
 def test_ampls_own_library_agrees(written):
@@ -192,6 +193,15 @@ def test_ampls_own_library_agrees(written):
     for key, v in _section(said, "gradient").items():
         g[cols.index(key.removeprefix("E_"))] = v
     np.testing.assert_allclose(g, grad, rtol=1e-10, atol=1e-10)
+    # the Hessian of f + y g at the duals of the file
+    assert said["supplied starting points"]["dual"] == dict.fromkeys(rows[:-1], 1)
+    H = np.zeros((nlp.nx, nlp.nx))
+    places = {f"{a}_{b}": (i, j) for i, a in enumerate(cols) for j, b in enumerate(cols)}
+    for key, v in _section(said, "lagrangian hessian").items():
+        i, j = places[key]
+        H[i, j] = H[j, i] = v
+    expected = hessian(nlp, nlp.x0, 1.0, np.ones(nlp.ng))[np.ix_(file.variables, file.variables)]
+    np.testing.assert_allclose(H, expected, rtol=1e-8, atol=1e-8)
 
 
 def _section(tree: dict, name: str) -> dict:
