@@ -90,6 +90,9 @@ BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 UNKNOWN = np.log(100.0)
 """If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
+FAST, NEARER = 1.5, 1 / 3
+"""Log ratio of displacements from which contact makes a component too fast to be trusted, and the
+share of it by which the component comes nearer."""
 TIES = (
     "reference",
     "contact below",
@@ -227,6 +230,9 @@ def contact_scales(
         nearer = nearer_where_cut_off(soup, label, log_scale, seg, K_ref, at_camera)
         log_scale -= nearer
         tie[nearer > 0] = TIES.index("cut off below")
+    far = displacement(soup, rays(K_ref, seg.anchors), label) * np.exp(log_scale)[label]
+    stays = at_camera | (tie == TIES.index("cut off below"))
+    log_scale -= np.where(stays, 0.0, nearer_where_fast(far, label))
     tie[at_camera] = FIXED
     return np.exp(log_scale)[label], tie[label]
 
@@ -268,6 +274,25 @@ def nearer_where_cut_off(
         own = float(np.median(far[group == g]))
         if pace < own < pace * np.exp(UNKNOWN):
             nearer[group_of == g] = 0.5 * np.log(own / pace)
+    return nearer
+
+
+def nearer_where_fast(far: Float, label: Int) -> Float:
+    """(C,) log factor by which components come nearer that contact makes too fast.
+
+    Contact puts what hangs in the air on the surface behind it.
+
+    Args:
+        far: (N,) displacement relative to the camera (`displacement`).
+        label: (N,) index of the component.
+    """
+    scene = int(np.argmax(np.bincount(label)))
+    pace = float(np.median(far[label == scene]))
+    nearer = np.zeros(int(label.max()) + 1)
+    for c in range(len(nearer)):
+        own = float(np.median(far[label == c]))
+        if pace > 0 and pace * np.exp(FAST) < own < pace * np.exp(UNKNOWN):
+            nearer[c] = NEARER * np.log(own / pace)
     return nearer
 
 

@@ -25,7 +25,14 @@ from soup_nlp.start.choice import (
     of_pieces,
     select,
 )
-from soup_nlp.start.components import TIES, borrow, contact_scales, depth_from_inside
+from soup_nlp.start.components import (
+    FAST,
+    TIES,
+    borrow,
+    contact_scales,
+    depth_from_inside,
+    nearer_where_fast,
+)
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.propose import propose
 from soup_nlp.start.start_options import SeededStart
@@ -295,3 +302,11 @@ def test_only_a_piece_with_usable_flow_moves():
     part = proposing.moving_parts(component, views, seg, component == 4)
     expected = np.where(np.isin(np.arange(32), (16, 17, 22, 23)), 0, component)
     np.testing.assert_array_equal(part, expected)
+
+
+def test_what_contact_makes_too_fast_comes_a_third_nearer():
+    label = np.repeat([0, 1, 2, 3], [6, 3, 3, 3])
+    far = np.array([1.0, np.exp(0.9 * FAST), np.exp(2.0 * FAST), 1e3])[label]
+    # beyond a hundredfold the camera is at rest, and nothing is known
+    np.testing.assert_allclose(nearer_where_fast(far, label), [0, 0, 2 * FAST / 3, 0])
+    assert not nearer_where_fast(np.where(label == 0, 0.0, far), label).any()
