@@ -226,11 +226,10 @@ def _summary(shown: Result) -> str:
 
 
 def _energy(shown: Result) -> str:
-    """Exact energy by stage, with a bar for each total."""
+    """Exact energy by stage, with a bar for each total, or for what the refinement minimises."""
     stages = {"start": "start", "nlp": "NLP", "solution": "solution"}
     known = {k: shown.summary["energy"][k] for k in stages if k in shown.summary["energy"]}
     terms = list(known["solution"])
-    most = max(float(e["total"] or 0) for e in known.values()) or 1.0
     refinement = shown.summary.get("refinement")
     lowered, note = {}, ""
     if refinement and "photo" in refinement["end"]:
@@ -240,9 +239,12 @@ def _energy(shown: Result) -> str:
             " images outweigh the flow where they contradict it (at"
             f" {refinement['contradicted']} superpixels). E may rise there.</p>"
         )
+    # the bars are of E + E_photo where there is one
+    lengths = {key: float((lowered or known)[key]["total"] or 0) for key in known}
+    most = max(lengths.values()) or 1.0
     rows = []
     for key, energy in known.items():
-        width = 100 * float(energy["total"] or 0) / most
+        width = 100 * lengths[key] / most
         bar = f'<div class="length" style="width:{width:.1f}%"></div>'
         cells = [_number(energy.get(t)) for t in terms]
         cells += [_number(lowered[key]["total"])] if lowered else []
