@@ -166,6 +166,9 @@ DEPARTURES = (
         needs="on: with the start that finds them, pixel units and all weights",
     ),
     Departure("prior on relief", ("energy.weights.prior",)),
+    Departure(
+        "depth prior", ("energy.weights.depth",), needs="a file: without one it has no elements"
+    ),
     Departure("borders that follow the flow", ("segmentation.follow_flow_px",)),
     Departure("confidence of the flow", ("flow.dis.tau", "flow.dis.limit")),
     Departure("flow seen through reflections", ("flow.see_through",)),

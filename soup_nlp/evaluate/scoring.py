@@ -162,7 +162,11 @@ def _map(given: object, what: str) -> Float:
     Raises:
         DataError: it is something else.
     """
-    array = np.asarray(given)
+    try:
+        array = np.asarray(given)
+    except ValueError:
+        # rows of different lengths
+        array = np.empty(0, object)
     if array.ndim != 2 or array.dtype.kind not in "fiu":
         raise DataError(
             f"{what} is no map",

@@ -98,6 +98,7 @@ def api_cases() -> Iterator[Case]:
     }
     fine = {
         ("run pair", "None"),
+        ("Pair K_ref", "None"),
         ("Pair K_next", "None"),
         # a picture has the shape of a scene flow
         ("Truth scene_flow", "image"),

@@ -63,6 +63,7 @@ FINE = {
     ("make_problem where", "text"),
     ("with_flow", "None"),
     ("evaluate depth_scale", "int"),
+    ("evaluate depth_scale", "None"),
     ("camera", "vector"),
     ("camera", "image"),
 }
