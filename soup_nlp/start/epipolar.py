@@ -200,25 +200,3 @@ def repeated(
         out.append(motion)
         left &= ~inlier
     return out
-
-
-def motion_of_points(
-    points: Float, target: Float, K_next: Float, threshold: float = 1.0
-) -> Float | None:
-    """(4, 4) rigid motion next_from_ref of known points by robust PnP; None if none fits.
-
-    Args:
-        points: (M, 3) in the reference frame.
-        target: (M, 2) their projections in the next frame, pixels.
-        K_next: (3, 3) its intrinsics.
-        threshold: Inlier distance, pixels.
-    """
-    cv2.setRNGSeed(0)
-    good, turn, shift, _ = cv2.solvePnPRansac(
-        points, target, K_next, None, reprojectionError=threshold, iterationsCount=200
-    )
-    if not good:
-        return None
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-    return out
