@@ -203,10 +203,12 @@ def stored_scores():
         for part in re.split(r"^## ", text, flags=re.MULTILINE):
             if part.startswith(("MRE, paper", "MRE, kitti")):
                 rows = [[c.strip() for c in line.split("|")[1:-1]] for line in part.splitlines()]
-                head = next(row for row in rows if row[:2] == ["pair", "flow"])
+                head = next(row for row in rows if row[:1] == ["pair, flow"])
                 at = [head.index("solution"), head.index("constant")]
                 own = [row for row in rows if len(row) == len(head)]
-                out |= {(r[0], r[1]): [r[k] for k in at] for r in own if r[1] in ("truth", "dis")}
+                flows = (", truth", ", dis")
+                cells = {r[0]: [r[k] for k in at] for r in own if r[0].endswith(flows)}
+                out |= {tuple(pair.rsplit(", ", 1)): found for pair, found in cells.items()}
     return out
 
 
