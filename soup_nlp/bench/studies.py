@@ -189,7 +189,7 @@ DEPARTURES = (
     Departure("gauge: d constant", ("formulation.gauge",)),
     Departure("visibility", ("formulation.min_facing", "formulation.depth_ratio")),
     Departure(
-        "presolve before Ipopt",
+        "stages before the constrained NLP",
         (),
         with_off={"solver.presolve": False},
         with_on={"solver.presolve": False},

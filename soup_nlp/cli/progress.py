@@ -99,7 +99,7 @@ class SolveLog(logging.Handler):
         if progress.stage != self._step:
             self._done += bool(self._step)
             self._step = progress.stage
-        # the number of iterations of a phase is unknown; most take fewer than 15
+        # the number of iterations of a stage is unknown; most take fewer than 15
         part = progress.iteration / (progress.iteration + 7)
         words = f"{progress.stage}, iteration {progress.iteration}"
         self._bars.update(self._task, completed=self._done + part, it=words)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -31,36 +30,19 @@ class SymbolicNLP:
         case: Images, flow, superpixels, initialisation and energy.
         record: Kernels, tables, bounds and names.
         layout: Turns x into soups.
+        x: (nx,) variables.
+        p: (np,) parameters: smoothing widths, then the data of all elements.
+        f: The smoothed energy, an expression of x and p.
+        g: (ng,) constraints, expressions of x and p.
     """
 
     case: Case
     record: NLP
     layout: MatrixLayout | TangentLayout
-
-    @cached_property
-    def _symbols(self) -> tuple[ca.MX, ca.MX, ca.MX, ca.MX]:
-        x, p = ca.MX.sym("x", self.record.nx), ca.MX.sym("p", len(self.record.p))
-        return x, p, *self.record.oracle(x, p)
-
-    @property
-    def x(self) -> ca.MX:
-        """(nx,) variables."""
-        return self._symbols[0]
-
-    @property
-    def p(self) -> ca.MX:
-        """(np,) parameters: smoothing widths, then the data of all elements."""
-        return self._symbols[1]
-
-    @property
-    def f(self) -> ca.MX:
-        """The smoothed energy, an expression of x and p."""
-        return self._symbols[2]
-
-    @property
-    def g(self) -> ca.MX:
-        """(ng,) constraints, expressions of x and p."""
-        return self._symbols[3]
+    x: ca.MX
+    p: ca.MX
+    f: ca.MX
+    g: ca.MX
 
     @property
     def problem(self) -> dict[str, ca.MX]:
@@ -123,5 +105,9 @@ def nlp(
     case = prepare(problem, presolve)
     form = case.formulation(hessian=hessian, compiled=compiled)
     if coordinates == "matrix":
-        return SymbolicNLP(case, *case.nlp(form))
-    return SymbolicNLP(case, *build_tangent_nlp(case.soup, case.data, case.weights, form))
+        made = case.nlp(form)
+    else:
+        made = build_tangent_nlp(case.soup, case.data, case.weights, form)
+    record, layout = made
+    x, p = ca.MX.sym("x", record.nx), ca.MX.sym("p", len(record.p))
+    return SymbolicNLP(case, record, layout, x, p, *record.oracle(x, p))

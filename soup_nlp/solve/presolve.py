@@ -31,9 +31,8 @@ from soup_nlp.storage.progress import Watch
 
 PUSH = 1e-8
 KEEP: Mapping[str, Any] = {
-    # the approximate minimum fill ordering, and no matching, which the constrained NLP needs
+    # the approximate minimum fill ordering
     "mumps_pivot_order": 2,
-    "mumps_permuting_scaling": 0,
     "mumps_mem_percent": 100,
     "warm_start_init_point": "yes",
     "warm_start_bound_push": PUSH,
@@ -127,12 +126,13 @@ class Presolve:
         program = self._program(start, self.weights.replace(sigma_arap=np.inf))
         self._majorant(program, list(UNTRUNCATED)[:1], "untruncated ", 10 * o.stagnation)
         exact = replace(program, nlp=replace(program.nlp, hessian="exact"))
+        solver = Ipopt(exact.nlp, {**KEEP, **o.ipopt})
         for eps, share in UNTRUNCATED.items():
             if self._stopped():
                 break
             self._stage(
                 exact,
-                Ipopt(exact.nlp, {**KEEP, **o.ipopt}),
+                solver,
                 eps=eps,
                 max_iter=o.presolve_iterations,
                 stagnation=o.stagnation * share,

@@ -37,7 +37,7 @@ class SolverOptions(Section):
     exact_iterations: Count = 100
     """Iteration limit of the stage with the exact Hessian, at `eps`; 0 omits it and those of
     Gauss-Newton."""
-    presolve_tol: Tolerance = 1e-7
+    presolve_tol: Tolerance = 1e-8
     """Dual infeasibility that ends the stages before the constrained NLP."""
     eps: Tolerance = 0.01
     """Smoothing of the constrained NLP."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, stats
 
 from soup_nlp.arrays import Float, FloatMap, Image, Labels
 
@@ -72,5 +72,4 @@ def _gradient(values: Float) -> Float:
 
 def _ranks(values: Float) -> Float:
     """Ranks of all values, from -1/2 to 1/2."""
-    order = np.argsort(np.argsort(values, axis=None, kind="stable"), kind="stable")
-    return order.reshape(values.shape) / values.size - 0.5
+    return (stats.rankdata(values, "ordinal").reshape(values.shape) - 1) / values.size - 0.5

@@ -45,7 +45,7 @@ def run() -> Run:
 
 def test_an_energy_of_rounding_size_passes_the_check(run, tmp_path):
     write_folder(prepare_folder(tmp_path), run, dump_problem(run.problem), "")
-    assert run.energy["total"] < 1e-8
+    assert run.energy["total"] < 1e-9
     assert [row.name for row in check_folder(tmp_path).rows if not row.ok] == []
     path = tmp_path / "summary.json"
     claims = json.loads(Path(path).read_text())

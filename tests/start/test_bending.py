@@ -202,7 +202,7 @@ def test_noise_where_surfaces_bend_is_that_of_affine_flows():
 
 
 def test_where_surfaces_bend_the_presolve_begins_with_narrower_norms():
-    """Also with more widths than that: those above the limit are one phase."""
+    """Also with more widths than that: those above the limit are one stage."""
     assert case("sheet").options.presolve_eps == (0.1, 0.03, 0.01)
     assert case("room").options.presolve_eps == (0.3, 0.03, 0.01)
     assert case("sheet", "solver.presolve_eps=[1.0, 0.3, 0.02]").options.presolve_eps == (0.1, 0.02)
