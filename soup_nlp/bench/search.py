@@ -48,8 +48,6 @@ DEFAULT_SPACE = (
     "energy.weights.orient=log:5e-4:5e-2",
     "energy.weights.sigma_arap=log:0.3:5.0",
     "energy.weights.sigma_cont=log:0.3:5.0",
-    "segmentation.beta=log:0.005:0.1",
-    "segmentation.beta_colour=log:0.3:10.0",
     "segmentation.neighbours=int:8:20",
     "start.smoothness=log:0.1:2.0",
 )

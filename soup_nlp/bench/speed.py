@@ -169,10 +169,10 @@ def _reference(case: Case) -> Row:
         iterations=REFERENCE_ITERATIONS,
         seconds=case.options.max_seconds,
     )
-    pair, expected = case.pair, case.problem.expected
+    pair = case.pair
     dense = reconstruct(found.soup, case.segmentation.labels, pair.K_ref, pair.K_next)
     depths = {"lm": dense.depth_ref}
-    scores = score_depths(pair.truth, depths, expected.scale, expected.cap)
+    scores = score_depths(pair.truth, depths)
     return {
         "status": found.status,
         "energy": dict(found.energy),

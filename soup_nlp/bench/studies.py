@@ -170,7 +170,7 @@ DEPARTURES = (
         "depth prior", ("energy.weights.depth",), needs="a file: without one it has no elements"
     ),
     Departure("borders that follow the flow", ("segmentation.follow_flow_px",)),
-    Departure("confidence of the flow", ("flow.dis.tau", "flow.dis.limit")),
+    Departure("confidence of the flow", ("flow.consistency",)),
     Departure("flow seen through reflections", ("flow.see_through",)),
     Departure(
         "large images at a working size",

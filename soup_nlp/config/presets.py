@@ -31,8 +31,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "follow_flow_px": None,
                 "neighbours": 15,
             },
-            # all flow vectors alike
-            "flow": {"see_through": False, "dis": {"tau": 1e6, "limit": 1e4}},
+            "flow": {"see_through": False, "consistency": False},
             "start": {
                 "method": "homography",
                 "samples": 100,

@@ -27,7 +27,7 @@ from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.schema.explain import Place, explain, nearest
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
-from soup_nlp.schema.section import NonNegative, Positive, Samples, Section, Seed, Share
+from soup_nlp.schema.section import Positive, Samples, Section, Seed, Share
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.start.start_options import StartOptions
 from soup_nlp.storage.files import as_path, is_file, read_text
@@ -48,10 +48,6 @@ class SegmentationOptions(Section):
     than this, pixels; null leaves the borders to the image alone."""
     neighbours: Annotated[int, Field(ge=1, le=MAX_NEIGHBOURS)] = 15
     """K of the K-NN graph, less than the number of superpixels."""
-    beta: NonNegative = 0.02
-    """Fall-off of w1, w2 with distance, 1/pixel."""
-    beta_colour: NonNegative = 1.0
-    """Fall-off of w4 with colour difference, colours in [0, 1]."""
     boundary_samples: Samples | Literal["all"] = 3
     """Points per shared boundary, or all."""
 
@@ -60,11 +56,8 @@ class Expected(Section):
     """What a run should score; solve exits with 1 where it does not."""
 
     mre_at_most: Positive | None = None
-    """Largest mean relative error of the solution's depth; null for no claim."""
-    scale: Literal["median", "mre", "lsq", "none"] = "median"
-    """Rule of the one global scale that depth metrics are after."""
-    cap: Positive | None = None
-    """Truth beyond this depth is left out, unit of the truth; null for none."""
+    """Largest mean relative error of the solution's depth, after one median scale; null for no
+    claim."""
 
 
 class OutputOptions(Section):
@@ -261,7 +254,7 @@ def make_problem(
 USUAL = (
     "max_size", "seed",
     "segmentation.superpixels", "segmentation.neighbours",
-    "flow.source", "flow.backward", "flow.confidence", "flow.dis.equalize",
+    "flow.source", "flow.backward", "flow.confidence",
     "depth_prior.source", "depth_prior.kind",
     "start.upright",
     "solver.max_iter", "solver.max_seconds",

@@ -180,8 +180,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
     pair = pair.with_flow(problem.flow.load(pair, problem.path))
     s = problem.segmentation
     samples = None if s.boundary_samples == "all" else s.boundary_samples
-    own = s.neighbours, s.beta, s.beta_colour, samples
-    seg = build_segmentation(record.labels, pair.image_ref, *own)
+    seg = build_segmentation(record.labels, pair.image_ref, s.neighbours, boundary_samples=samples)
     seg = replace(seg, pair_weight=record.pair_weight)
     # entries that the energy does not use are 0
     none = np.zeros(len(seg), np.int64)

@@ -11,6 +11,10 @@ from scipy.spatial import cKDTree
 from soup_nlp.arrays import Float, Image, Int
 from soup_nlp.errors import DataError
 
+BETA = 0.02
+"""Fall-off of w1 and w2 with the distance of anchors, 1/pixel; the paper does not print its own."""
+BETA_COLOUR = 1.0
+"""Fall-off of w4 with the difference of colours in [0, 1]; the paper does not print its own."""
 RIM = 8
 """Directions in which a superpixel has an extreme pixel."""
 
@@ -66,8 +70,8 @@ def build_segmentation(
     labels: NDArray[np.int32],
     image: Image,
     neighbours: int = 15,
-    beta: float = 0.02,
-    beta_colour: float = 1.0,
+    beta: float = BETA,
+    beta_colour: float = BETA_COLOUR,
     boundary_samples: int | None = 3,
 ) -> Segmentation:
     """Graphs and weights of a segmentation.

@@ -146,7 +146,7 @@ def prepare(
     assert flow is not None
     labels = superpixels(problem, pair)
     samples = None if s.boundary_samples == "all" else s.boundary_samples
-    seg = build_segmentation(labels, pair.image_ref, s.neighbours, s.beta, s.beta_colour, samples)
+    seg = build_segmentation(labels, pair.image_ref, s.neighbours, boundary_samples=samples)
     done("segmentation", seg)
     options = SeededStart(**dict(problem.start), seed=problem.seed)
     start, given = propose(seg, flow, pair.K_ref, pair.K_next, options), None

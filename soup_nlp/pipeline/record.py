@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from soup_nlp.arrays import Float, FloatMap
-from soup_nlp.config.problem import Expected, Problem, dump_problem
+from soup_nlp.config.problem import Problem, dump_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.confidence import Confidence
 from soup_nlp.evaluate.metrics import DepthMetrics
@@ -208,7 +208,7 @@ class Run:
         return solved and (self.refined is None or self.refined.status != "interrupted")
 
 
-def full_size(full: Pair, small: Pair, result: Reconstruction, expected: Expected) -> FullSize:
+def full_size(full: Pair, small: Pair, result: Reconstruction) -> FullSize:
     """Bring a reconstruction of a smaller pair to the pair's own size.
 
     Superpixels grow along the edges of the images; planes are evaluated at every pixel, in the next
@@ -225,5 +225,5 @@ def full_size(full: Pair, small: Pair, result: Reconstruction, expected: Expecte
     there = grown_labels(shown, small.image_next, full.image_next)
     depth_next = plane_depth(there, turned, moved, full.K_next)
     own = {"own": depth_ref.astype(np.float64)}
-    scores = score_depths(full.truth, own, expected.scale, expected.cap)
+    scores = score_depths(full.truth, own)
     return FullSize(depth_ref, depth_next, labels, scores.get("own"))

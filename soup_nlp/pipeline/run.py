@@ -178,7 +178,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         solution: Result of the constrained NLP.
         refined: Result of the refinement, if there is one.
     """
-    pair, labels, expected = case.pair, case.segmentation.labels, case.problem.expected
+    pair, labels = case.pair, case.segmentation.labels
     size = pair.image_next.shape[0], pair.image_next.shape[1]
 
     def dense(soup: Soup) -> Reconstruction:
@@ -191,7 +191,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     energy = case.data, case.weights, case.problem.formulation
     sure = confidence(after, pair, case.start, *energy, case.given)
     after = replace(after, sigma_ref=sure.sigma)
-    full = None if case.full is None else full_size(case.full, pair, after, expected)
+    full = None if case.full is None else full_size(case.full, pair, after)
     rigid = rigid_depth(pair) if pair.truth is not None else None
     depths = {"solution": after.depth_ref, "start": before.depth_ref}
     if between is not None:
@@ -210,7 +210,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         reconstruction=after,
         rigid=rigid,
         metrics=score_depths(
-            pair.truth, depths, expected.scale, expected.cap, after.depth_next, after.sigma_ref
+            pair.truth, depths, depth_next=after.depth_next, sigma=after.sigma_ref
         ),
         seconds={},
         confidence=sure,

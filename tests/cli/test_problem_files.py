@@ -29,9 +29,9 @@ def test_a_dumped_problem_is_the_same_problem(path, tmp_path):
 
 def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path):
     path = tmp_path / "p.yaml"
-    path.write_text(f"{MOTORCYCLE}seed: 010\nname: no\nsegmentation: {{beta: 1e-3}}\n")
+    path.write_text(f"{MOTORCYCLE}seed: 010\nname: no\noutput: {{min_confidence: 1e-3}}\n")
     problem = load_problem(path)
-    assert (problem.seed, problem.name, problem.segmentation.beta) == (10, "no", 1e-3)
+    assert (problem.seed, problem.name, problem.output.min_confidence) == (10, "no", 1e-3)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from soup_nlp.data.flow.sources import (
     resolve_flow,
 )
 from soup_nlp.data.pair import Flow, Pair, Truth
-from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.errors import DataError
 
 K = np.array([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]])
 
@@ -75,11 +75,10 @@ def test_dis_finds_a_shift_at_any_size(height: int, width: int, du: int, dv: int
 def test_dis_survives_a_change_of_exposure(gain: float, offset: float) -> None:
     first, second = shifted(80, 100, 4, -2)
     second = np.clip(second * gain + offset, 0, 255).astype(np.uint8)
-    for equalize in (False, True):
-        flow = dis_flow(first, second, equalize=equalize)
-        trusted = flow.confidence > 0.5
-        assert trusted.mean() > 0.6
-        assert np.median(np.linalg.norm(flow.uv - [4, -2], axis=2)[trusted]) < 0.2
+    flow = dis_flow(first, second)
+    trusted = flow.confidence > 0.5
+    assert trusted.mean() > 0.6
+    assert np.median(np.linalg.norm(flow.uv - [4, -2], axis=2)[trusted]) < 0.2
 
 
 @pytest.mark.parametrize("level", [0, 7, 255])
@@ -114,18 +113,16 @@ def test_dis_confidence_drops_where_nothing_matches() -> None:
     assert confidence[35:55, 45:70].mean() < 0.7 * confidence[65:85, 20:100].mean()
 
 
-@pytest.mark.parametrize(
-    "option",
-    [
-        {"tau": 0.0},
-        {"limit": -1.0},
-        {"equalize": "much"},
-    ],
-)
-def test_dis_option_errors(option: dict) -> None:
-    first, second = shifted(20, 20, 0, 0)
-    with pytest.raises(ConfigError, match=rf"does not fit[\s\S]*{next(iter(option))}"):
-        dis_flow(first, second, **option)
+def test_without_consistency_every_vector_that_stays_in_the_image_counts_alike() -> None:
+    first, second = shifted(80, 100, 4, -2)
+    second = second.copy()
+    second[30:50, 40:60] = np.dstack([texture(20, 20, seed=5)] * 3)
+    flow, alike = dis_flow(first, second), dis_flow(first, second, consistency=False)
+    np.testing.assert_array_equal(alike.uv, flow.uv)
+    assert set(np.unique(alike.confidence)) == {0, 1}
+    assert not alike.confidence[:, 98:].any()
+    assert alike.confidence[32:48, 42:58].all()
+    assert flow.confidence[32:48, 42:58].min() < 0.7
 
 
 def test_dis_image_errors() -> None:

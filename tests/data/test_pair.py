@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.data.flow.sources import dis_flow
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 
 IMAGE = np.zeros((40, 60, 3), np.uint8)
@@ -40,18 +39,6 @@ def test_a_confidence_is_between_0_and_1(bad):
     confidence[2, 3] = bad
     with pytest.raises(DataError, match="confidence is out of range"):
         Flow(np.zeros((4, 5, 2), np.float32), confidence)
-
-
-@pytest.mark.parametrize(
-    ("name", "bad"),
-    [
-        *((name, bad) for name in ("tau", "limit") for bad in (np.nan, -1.0, "much", True)),
-        ("equalize", 1.5),
-    ],
-)
-def test_dis_options_that_opencv_would_not_survive_are_refused(name, bad):
-    with pytest.raises(ConfigError, match=name):
-        dis_flow(IMAGE, IMAGE, **{name: bad})
 
 
 def test_images_are_taken_as_arrays_files_and_pictures(tmp_path):

@@ -14,6 +14,9 @@ SUPPORT = 15
 """Side of the window over which the round-trip error is averaged, pixels: a wrong flow may be
 consistent at a single pixel, but rarely in a whole window."""
 
+LIMIT = 3.0
+"""Round-trip error, pixels, above which a flow is not used: its confidence would be 0.0001."""
+
 _NOISE_CAP = 5.0  # pixels; limits the effect of an outlier on its window
 
 
@@ -65,23 +68,19 @@ def checked_flow(forward: FloatMap, backward: FloatMap, source: str) -> Flow:
     return Flow(uv, confidence, source)
 
 
-def confidence_of(
-    gap: FloatMap, tau: float = 1.0, limit: float = 3.0, support: int = SUPPORT
-) -> FloatMap:
+def confidence_of(gap: FloatMap, support: int = SUPPORT) -> FloatMap:
     """(H, W) confidence in [0, 1] of a round-trip error.
 
     With e the error and E the larger of e and the mean of min(e, 5) over a window, the confidence
-    is `exp(-(E / tau)^2)`, and 0 where E > limit.
+    is `exp(-E^2)`, E in pixels, and 0 where E > `LIMIT`.
 
     Args:
         gap: (H, W) round-trip error, pixels; infinite where the flow leaves the next image.
-        tau: Error, pixels, at which confidence is exp(-1).
-        limit: Error, pixels, above which confidence is 0.
         support: Side of the window for the mean error, odd, pixels; 1 is the pixel itself.
     """
     if support > 1:
         mean = cv2.blur(np.minimum(gap, _NOISE_CAP), (support, support))
         gap = np.maximum(gap, mean)
-    confidence = np.exp(-np.square(np.minimum(gap, limit) / tau), dtype=np.float32)
-    confidence[~(gap <= limit)] = 0.0
+    confidence = np.exp(-np.square(np.minimum(gap, LIMIT)), dtype=np.float32)
+    confidence[~(gap <= LIMIT)] = 0.0
     return np.asarray(confidence, dtype=np.float32)

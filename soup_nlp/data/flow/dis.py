@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from soup_nlp.data.flow.consistency import FloatMap, confidence_of
 from soup_nlp.data.flow.guided import guided_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
-from soup_nlp.schema.section import Section
 
 Image = NDArray[np.uint8]
 
@@ -30,21 +26,9 @@ PLANES = 4
 
 _FLAT = 1.0  # standard deviation in grey levels of an image without contrast
 _WORK_SIDE = 64  # DIS gets images of at least this side; smaller ones are padded
-_HUGE = float(np.finfo(np.float32).max)  # OpenCV's parameters are float32
 
 
-class DisOptions(Section):
-    """Options of `dis_flow`."""
-
-    equalize: bool = False
-    """Equalise local contrast (CLAHE) first; for pairs with a change of exposure."""
-    tau: Annotated[float, Field(ge=1e-6)] = 1.0
-    """Forward-backward error, pixels, at which confidence is exp(-1)."""
-    limit: Annotated[float, Field(ge=1e-6, le=_HUGE)] = 3.0
-    """Forward-backward error, pixels, above which confidence is 0."""
-
-
-def dis_flow(image_ref: Image, image_next: Image, **options: Any) -> Flow:
+def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> Flow:
     """Dense inverse search flow (Kroeger et al., ECCV 2016) with forward-backward confidence.
 
     The flow is computed in both directions, and again after each of the dominant homographies
@@ -58,21 +42,16 @@ def dis_flow(image_ref: Image, image_next: Image, **options: Any) -> Flow:
     Args:
         image_ref: (H, W, 3) or (H, W) uint8 reference image.
         image_next: (H', W', 3) or (H', W') uint8 next image; it may differ in size.
-        **options: Options of `DisOptions`.
+        consistency: If false, the confidence is 1 wherever the round trip stays in the images.
 
     Raises:
-        ConfigError: an option is unknown or out of range.
         DataError: an image is not uint8 or too small.
     """
-    o = DisOptions.make(options)
     ref, nxt = _grey(image_ref, "image_ref"), _grey(image_next, "image_next")
     height, width = ref.shape
     if min(float(ref.std()), float(nxt.std())) < _FLAT:
         zero = np.zeros((height, width), np.float32)
         return Flow(np.zeros((height, width, 2), np.float32), zero, "dis")
-    if o.equalize:
-        clahe = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8))
-        ref, nxt = clahe.apply(ref), clahe.apply(nxt)
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(FINEST_SCALE)
     dis.setPatchSize(PATCH_SIZE)
@@ -99,7 +78,8 @@ def dis_flow(image_ref: Image, image_next: Image, **options: Any) -> Flow:
         raise DataError(
             "DIS flow failed", where=f"images {width}x{height}", found=str(error).strip()
         ) from error
-    return Flow(np.ascontiguousarray(uv), confidence_of(gap, o.tau, o.limit), "dis")
+    confidence = confidence_of(gap) if consistency else np.isfinite(gap)
+    return Flow(np.ascontiguousarray(uv), confidence.astype(np.float32), "dis")
 
 
 def _grey(image: Image, where: str) -> Image:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.data.flow.common_focal import at_common_focal, in_own_pixels
 from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
-from soup_nlp.data.flow.dis import DisOptions, dis_flow
+from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.flow.plausible import check_flow
 from soup_nlp.data.formats.map_files import read_confidence, read_flow
@@ -120,8 +120,9 @@ class FlowOptions(Section):
     see_through: bool = True
     """Where flow that was computed follows a layer that stands still before a moving scene (a
     reflection in a windscreen), search for the scene's own along its epipolar lines."""
-    dis: DisOptions = DisOptions()
-    """Options of OpenCV's DIS flow and of its forward-backward check."""
+    consistency: bool = True
+    """Weight a vector of DIS, or of a file with a backward flow, by how well its round trip closes;
+    if false, all vectors that stay in the image count alike, as in the paper."""
 
     def load(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
         """The flow of a pair.
@@ -141,7 +142,7 @@ class FlowOptions(Section):
 
         def compute(pair: Pair) -> Flow:
             if source == "dis":
-                return dis_flow(pair.image_ref, pair.image_next, **dict(self.dis))
+                return dis_flow(pair.image_ref, pair.image_next, self.consistency)
             return resolve_flow(pair, source)
 
         near = at_common_focal(pair)
@@ -168,7 +169,7 @@ class FlowOptions(Section):
             gap = round_trip_error(
                 flow.uv, np.where(back.confidence[..., None] > 0, back.uv, np.nan)
             )
-            own *= confidence_of(gap, self.dis.tau, self.dis.limit)
+            own *= confidence_of(gap) if self.consistency else np.isfinite(gap)
         if self.confidence:
             given = read_confidence(path(self.confidence))
             check_size("flow confidence and flow", given.shape, flow.uv.shape, self.confidence)
