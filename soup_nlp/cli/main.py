@@ -24,7 +24,6 @@ from soup_nlp.cli.boundary import (
     report_bug,
 )
 from soup_nlp.errors import SoupError, StoppedError, printable
-from soup_nlp.storage.folders import remove_empty
 from soup_nlp.storage.system import sigterm_as_ctrl_c
 from soup_nlp.storage.versions import __version__
 
@@ -119,8 +118,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         drop_output()
         return BROKEN_PIPE
-    finally:
-        remove_empty()
     return code
 
 

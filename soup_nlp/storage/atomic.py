@@ -23,44 +23,25 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
     those of the umask.
 
     Raises:
-        DataError: the folder is missing or cannot be written, `path` is a folder, the disk is
-            full, or the block left no file at the temporary path.
+        DataError: the folder is missing or cannot be written, `path` is a folder, or the disk is
+            full.
     """
-    target = Path(path)
-    if target.is_dir():
-        raise DataError("cannot write a file over a folder", where=target, expected="a file name")
+    target, temporary = Path(path), None
     try:
         handle, name = tempfile.mkstemp(
             suffix=target.suffix, prefix=f".{target.stem[:64]}.", dir=target.parent
         )
-    except FileNotFoundError as error:
-        raise DataError(
-            "folder of an output file does not exist",
-            where=target,
-            expected=f"folder {target.parent}",
-            hint="create the folder first",
-        ) from error
-    except OSError as error:
-        raise DataError(
-            "cannot write in the folder of an output file", where=target, found=error.strerror
-        ) from error
-    os.close(handle)
-    temporary = Path(name)
-    try:
+        os.close(handle)
+        temporary = Path(name)
         yield temporary
-        if not temporary.is_file():
-            raise DataError(
-                "writer left no file", where=target, expected=f"a file at {temporary.name}"
-            )
         temporary.chmod(_mode(target))
         os.replace(temporary, target)
     except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
         if isinstance(error, OSError):
-            raise DataError(
-                "file cannot be written", where=target, found=error.strerror or error
-            ) from error
+            found = error.strerror or error
+            raise DataError("file cannot be written", where=target, found=found) from error
         raise
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -61,20 +61,31 @@ def as_path(
         raise error(f"home folder of {what} is not known", where=name, found=problem) from None
 
 
-def is_file(path: PathLike) -> bool:
-    """Whether the path is a regular file; False for an impossible path."""
-    try:
-        return stat.S_ISREG(os.stat(path).st_mode)
-    except (OSError, ValueError):
-        return False
+is_file: Callable[[PathLike], bool] = os.path.isfile
+"""Whether the path is a regular file; False for an impossible path."""
+is_folder: Callable[[PathLike], bool] = os.path.isdir
+"""Whether the path is a folder; False for an impossible path."""
 
 
-def is_folder(path: PathLike) -> bool:
-    """Whether the path is a folder; False for an impossible path."""
+def require_file(path: PathLike, what: str, *, error: type[SoupError] = DataError) -> Path:
+    """The path, if it is a regular file.
+
+    Raises:
+        SoupError: it is not.
+    """
+    path = as_path(path, what, error=error)
     try:
-        return stat.S_ISDIR(os.stat(path).st_mode)
-    except (OSError, ValueError):
-        return False
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        raise error(
+            f"{what} is missing", where=path, expected="an existing file", hint=_neighbours(path)
+        ) from None
+    except OSError as problem:
+        raise error(f"{what} cannot be read", where=path, found=problem.strerror) from None
+    if not stat.S_ISREG(mode):
+        kind = next((word for test, word in KINDS.items() if test(mode)), None)
+        raise error(f"{what} cannot be read", where=path, found=kind, expected="a readable file")
+    return path
 
 
 def read_bytes(
@@ -82,74 +93,25 @@ def read_bytes(
 ) -> bytes:
     """The content of a regular file.
 
-    It does not wait for pipes and devices, and checks the size before reading.
+    Pipes and devices, which may never end, are not opened, and the size is checked first.
 
     Raises:
         SoupError: the file is missing, not a regular one, empty, too large, or not readable.
     """
-    path = as_path(path, what, error=error)
+    path = require_file(path, what, error=error)
     try:
-        # opening a pipe would otherwise wait for a writer
-        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-    except FileNotFoundError:
-        raise error(
-            f"{what} is missing", where=path, expected="an existing file", hint=_neighbours(path)
-        ) from None
-    except OSError as problem:
-        raise error(
-            f"{what} cannot be read", where=path, found=_kind(path) or problem.strerror,
-            expected="a readable file",
-        ) from problem  # fmt: skip
-    try:
-        state = os.fstat(handle)
-        if not stat.S_ISREG(state.st_mode):
-            raise error(
-                f"{what} cannot be read", where=path, found=_kind(path), expected="a readable file"
-            )
-        if state.st_size > most:
-            raise error(
-                f"{what} is too large",
-                where=path,
-                found=f"{state.st_size} bytes",
-                expected=f"at most {most} bytes",
-            )
-        with open(handle, "rb", closefd=False) as file:
-            content = file.read(most + 1)
+        size = path.stat().st_size
+        content = b"" if size > most else path.read_bytes()
     except OSError as problem:
         raise error(f"{what} cannot be read", where=path, found=problem.strerror) from problem
-    finally:
-        os.close(handle)
-    if not content:
-        raise error(f"{what} is empty", where=path, found="0 bytes")
-    return content
-
-
-def require_file(path: PathLike, what: str) -> Path:
-    """The path, if it is a regular file.
-
-    Raises:
-        DataError: it is not.
-    """
-    path = as_path(path, what)
-    if not is_file(path):
-        kind = _kind(path)
-        raise DataError(
-            f"{what} cannot be read" if kind else f"{what} is missing",
+    if not 0 < size <= most:
+        raise error(
+            f"{what} is {'too large' if size else 'empty'}",
             where=path,
-            found=kind,
-            expected="an existing file",
-            hint=None if kind else _neighbours(path),
+            found=f"{size} bytes",
+            expected=f"1 to {most} bytes",
         )
-    return path
-
-
-def _kind(path: Path) -> str | None:
-    """Description of what is at a path instead of a regular file; None if nothing is."""
-    try:
-        mode = os.stat(path).st_mode
-    except OSError:
-        return None
-    return next((word for test, word in KINDS.items() if test(mode)), None)
+    return content
 
 
 def _neighbours(path: Path) -> str:

@@ -1,6 +1,6 @@
 """Output folders: all files of a command appear at once, and no file of the user is overwritten.
 
-A command first claims the names that it will write (`claim`). Later it writes its files into a
+A command first checks the names that it will write (`claim`). Later it writes its files into a
 hidden folder in the target (`staged`). One rename marks that folder as complete; its files are then
 renamed to their places, and a later call finishes what a kill interrupts (`recover`).
 `storage.mark` records which files the program made.
@@ -9,11 +9,14 @@ renamed to their places, and a later call finishes what a kill interrupts (`reco
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+import psutil
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.atomic import PathLike
@@ -27,15 +30,13 @@ from soup_nlp.storage.mark import (
     subject_of,
     write_mark,
 )
-from soup_nlp.storage.system import deferred_signals, is_other_process
+from soup_nlp.storage.system import deferred_signals
 
 _STAGE = f"{MARK}-"
 """First part of the names of temporary folders; the number of their process follows."""
 _COMMIT = f"{_STAGE}commit"
 """Folder of complete new files that are being moved to their places."""
 
-_made: list[Path] = []
-"""Folders that `claim` has made in this process."""
 _open: set[Path] = set()
 """Temporary folders that this process is filling."""
 
@@ -50,19 +51,13 @@ def default_folder(name: str, subject: str) -> Path:
         k += 1
 
 
-def remove_empty() -> None:
-    """Remove the folders that `claim` has made and into which nothing was written."""
-    while _made:
-        with suppress(OSError):
-            os.rmdir(_made.pop())
-
-
 def claim(
     folder: PathLike, names: Iterable[str], overwrite: bool = False, subject: str = ""
 ) -> Path:
-    """Make an output folder, check that these files may be written into it, and return it.
+    """Check that these files may be written into an output folder, and return it.
 
-    Moves that a killed process has begun are finished, and its temporary folders are removed.
+    A missing folder is not made yet. Moves that a killed process has begun are finished, and its
+    temporary folders are removed.
 
     Args:
         folder: The output folder.
@@ -77,13 +72,10 @@ def claim(
     """
     with _named_errors(folder):
         target = _resolved(folder)
-        with deferred_signals():
-            fresh = [p for p in (target, *target.parents) if not os.path.lexists(p)]
-            target.mkdir(parents=True, exist_ok=True)
-            _made.extend(reversed(fresh))
+        there = next(p for p in (target, *target.parents) if os.path.lexists(p))
+        # fails where nothing can be written
+        with tempfile.TemporaryFile(dir=there):
             recover(target)
-            # fails where nothing can be written
-            _remove(_new_folder(target, _STAGE))
         before = subject_of(target)
         if subject and before not in ("", subject) and not overwrite:
             raise DataError(
@@ -103,7 +95,7 @@ def staged(
 ) -> Iterator[Path]:
     """An empty folder whose files are moved into `folder` when the block ends without exception.
 
-    On an exception `folder` does not change.
+    On an exception the files of `folder` do not change, and no new folder is left.
 
     Args:
         folder: The output folder.
@@ -116,24 +108,14 @@ def staged(
     """
     with _named_errors(folder):
         target = _resolved(folder)
-        with deferred_signals():
-            target.mkdir(parents=True, exist_ok=True)
-            recover(target)
-            stage = _new_folder(target, _STAGE)
+        fresh = [p for p in (target, *target.parents) if not os.path.lexists(p)]
+        target.mkdir(parents=True, exist_ok=True)
+        recover(target)
         try:
-            yield stage
-            with deferred_signals():
-                new = {name: digest_of(stage / name) for name in files_in(stage)}
-                release(target, new, overwrite)
-                old = {k: v for k, v in made_files(target).items() if not is_foreign(target, k)}
-                write_mark(stage, new if whole else old | new, subject or subject_of(target))
-                for name in old.keys() & new.keys():
-                    # a file of the program may have been removed
-                    with suppress(FileNotFoundError):
-                        shutil.copymode(target / name, stage / name)
-                _sync(stage)
-                os.rename(stage, target / _COMMIT)
-                _move_in(target)
+            with _temporary(target, _STAGE) as stage:
+                yield stage
+                with deferred_signals():
+                    _commit(stage, target, whole, overwrite, subject or subject_of(target))
         except DataError as error:
             # name the final path instead of the temporary one
             if not isinstance(error.where, Path) or not error.where.is_relative_to(stage):
@@ -141,7 +123,10 @@ def staged(
             place = target / error.where.relative_to(stage)
             raise DataError(error.what, where=place, found=error.found, hint=error.hint) from error
         finally:
-            _remove(stage)
+            with suppress(OSError):
+                # fails for a folder that holds something
+                for path in fresh:
+                    path.rmdir()
 
 
 @contextmanager
@@ -151,19 +136,14 @@ def scratch() -> Iterator[Path]:
     Raises:
         DataError: the folder cannot be made.
     """
-    root, prefix = Path(tempfile.gettempdir()), f"soup_nlp-{os.getuid()}-"
+    root = Path(tempfile.gettempdir())
     try:
-        with deferred_signals():
-            _sweep(root, prefix)
-            folder = _new_folder(root, prefix)
+        with _temporary(root, f"soup_nlp-{os.getuid()}-") as folder:
+            yield folder
     except OSError as error:
         raise DataError(
             "no temporary folder can be made", where=root, found=error.strerror, hint="set TMPDIR"
         ) from error
-    try:
-        yield folder
-    finally:
-        _remove(folder)
 
 
 def recover(folder: Path) -> None:
@@ -172,25 +152,47 @@ def recover(folder: Path) -> None:
     _sweep(folder, _STAGE)
 
 
-def _new_folder(parent: Path, prefix: str) -> Path:
-    """A new temporary folder, whose name has the number of this process."""
-    folder = Path(tempfile.mkdtemp(prefix=f"{prefix}{os.getpid()}-", dir=parent))
-    _open.add(folder)
-    return folder
-
-
-def _remove(folder: Path) -> None:
+@contextmanager
+def _temporary(parent: Path, prefix: str) -> Iterator[Path]:
+    """A temporary folder, whose name has the number of this process."""
+    _sweep(parent, prefix)
     with deferred_signals():
-        shutil.rmtree(folder, ignore_errors=True)
-        _open.discard(folder)
+        folder = Path(tempfile.mkdtemp(prefix=f"{prefix}{os.getpid()}-", dir=parent))
+        _open.add(folder)
+    try:
+        yield folder
+    finally:
+        with deferred_signals():
+            shutil.rmtree(folder, ignore_errors=True)
+            _open.discard(folder)
 
 
 def _sweep(parent: Path, prefix: str) -> None:
-    """Remove temporary folders whose process has ended."""
+    """Remove temporary folders whose process has ended; another one may have had our number."""
     for path in parent.glob(f"{prefix}*"):
-        number = path.name.removeprefix(prefix).split("-")[0]
-        if number.isdecimal() and path not in _open and not is_other_process(int(number)):
+        number = re.match(r"(\d{1,9})-", path.name.removeprefix(prefix))
+        if number is None or path in _open:
+            continue
+        if int(number[1]) == os.getpid() or not psutil.pid_exists(int(number[1])):
             shutil.rmtree(path, ignore_errors=True)
+
+
+def _commit(stage: Path, target: Path, whole: bool, overwrite: bool, subject: str) -> None:
+    """Mark the files of a temporary folder as complete and move them to their places."""
+    new = {name: digest_of(stage / name) for name in files_in(stage)}
+    release(target, new, overwrite)
+    old = {k: v for k, v in made_files(target).items() if not is_foreign(target, k)}
+    write_mark(stage, new if whole else old | new, subject)
+    for name in old.keys() & new.keys():
+        # a file of the program may have been removed
+        with suppress(FileNotFoundError):
+            shutil.copymode(target / name, stage / name)
+    for name in [*new, MARK]:
+        # wait until the file is on disk: some systems report a full disk only here
+        with (stage / name).open("rb") as file:
+            os.fsync(file.fileno())
+    os.rename(stage, target / _COMMIT)
+    _move_in(target)
 
 
 def _move_in(target: Path) -> None:
@@ -212,13 +214,6 @@ def _move_in(target: Path) -> None:
                 (target / name).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(commit / name, target / name)
     shutil.rmtree(commit, ignore_errors=True)
-
-
-def _sync(folder: Path) -> None:
-    """Wait until the files are on disk; some systems report a full disk only here."""
-    for name in [*files_in(folder), MARK]:
-        with (folder / name).open("rb") as file:
-            os.fsync(file.fileno())
 
 
 @contextmanager

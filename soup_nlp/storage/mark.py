@@ -24,24 +24,26 @@ SUBJECT = "of"
 
 def made_files(folder: Path) -> dict[str, str]:
     """SHA-256 by name of the files that the program made in a folder; {} without a valid mark."""
-    path = folder / MARK
-    try:
-        if path.is_symlink() or not path.is_file():
-            return {}
-        listed = json.loads(path.read_text(encoding="utf-8"))["files"]
-        # a damaged mark must not name files outside the folder
-        inside = [n for n in listed if not PurePosixPath(n).is_absolute() and ".." not in n]
-        return {str(name): str(listed[name]) for name in inside}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return {}
+    return _read(folder)[0]
 
 
 def subject_of(folder: Path) -> str:
     """What a folder is the result of; nothing if its mark does not say it."""
-    if not made_files(folder):
-        return ""
-    own = json.loads((folder / MARK).read_text(encoding="utf-8")).get(SUBJECT)
-    return own if isinstance(own, str) else ""
+    return _read(folder)[1]
+
+
+def _read(folder: Path) -> tuple[dict[str, str], str]:
+    """Files and subject of the mark of a folder."""
+    path = folder / MARK
+    try:
+        if path.is_symlink() or not path.is_file():
+            return {}, ""
+        mark = json.loads(path.read_text(encoding="utf-8"))
+        # a damaged mark must not name files outside the folder
+        inside = [n for n in mark["files"] if not PurePosixPath(n).is_absolute() and ".." not in n]
+        return {str(n): str(mark["files"][n]) for n in inside}, str(mark.get(SUBJECT, ""))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return {}, ""
 
 
 def files_in(folder: Path) -> list[str]:

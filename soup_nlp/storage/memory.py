@@ -36,16 +36,7 @@ def require_memory(size: float, what: str, where: object = None, hint: str | Non
         raise DataError(
             f"{what} would take more memory than this machine has",
             where=where,
-            found=f"about {_text(size)}",
-            expected=f"at most {_text(usable)}, which are free",
+            found=f"about {size / 1e9:.3g} GB",
+            expected=f"at most {usable / 1e9:.3g} GB, which are free",
             hint=hint,
         )
-
-
-def _text(size: float) -> str:
-    """Bytes in a unit that leaves few digits."""
-    for unit in ("kB", "MB", "GB", "TB"):
-        size /= 1000
-        if size < 1000:
-            return f"{size:.3g} {unit}"
-    return f"{size:.3g} TB"

@@ -1,26 +1,14 @@
-"""Functions of the operating system: other processes, delayed signals, end with the parent."""
+"""Functions of the operating system: delayed signals, end with the parent."""
 
 from __future__ import annotations
 
 import ctypes
-import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-
-
-def is_other_process(number: int) -> bool:
-    """Whether a process of this number is running that is not this one."""
-    try:
-        os.kill(number, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass
-    return number != os.getpid()
 
 
 @contextmanager

@@ -263,7 +263,7 @@ def test_png_round_trip(tmp_path):
     write_png(tmp_path / "a.png", rgb)
     back = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png")), cv2.COLOR_BGR2RGB)
     np.testing.assert_array_equal(back, rgb)
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(DataError, match="cannot be written"):
         write_png(tmp_path / "no" / "a.png", rgb)
 
 

@@ -121,13 +121,16 @@ def test_the_result_of_something_else_is_kept(tmp_path, monkeypatch):
     claim(target, ["x"], overwrite=True, subject="frames 1 and 2")
 
 
-def test_a_claimed_folder_that_stays_empty_is_removed(tmp_path):
+def test_a_folder_into_which_nothing_is_written_is_not_made(tmp_path):
     (tmp_path / "there").mkdir()
-    for name in ("there/a/b", "there/c"):
-        claim(tmp_path / name, ["x"])
-    write(tmp_path / "there" / "c", x="1")
-    folders.remove_empty()
-    assert os.listdir(tmp_path / "there") == ["c"]
+    claim(tmp_path / "there" / "a" / "b", ["x"])
+    assert os.listdir(tmp_path / "there") == []
+    for name in ("there", "there/a/b"):
+        with pytest.raises(RuntimeError), staged(tmp_path / name):
+            raise RuntimeError
+    assert os.listdir(tmp_path / "there") == []
+    with pytest.raises(DataError, match="cannot be written"):
+        claim(__file__ + "/a", ["x"])
 
 
 @pytest.mark.parametrize("kind", ["file", "changed", "folder", "link", "dangling link"])

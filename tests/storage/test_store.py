@@ -78,13 +78,10 @@ def test_atomic_permissions(tmp_path):
         os.umask(umask)
 
 
-def test_atomic_bad_targets(tmp_path):
-    with pytest.raises(DataError, match="folder"), atomic_path(tmp_path):
+@pytest.mark.parametrize("name", ["", "no/a"])
+def test_atomic_bad_targets(name, tmp_path):
+    with pytest.raises(DataError, match="cannot be written"), atomic_path(tmp_path / name):
         pass
-    with pytest.raises(DataError, match="does not exist"), atomic_path(tmp_path / "no" / "a"):
-        pass
-    with pytest.raises(DataError, match="left no file"), atomic_path(tmp_path / "a") as temporary:
-        temporary.unlink()
     assert os.listdir(tmp_path) == []
 
 
