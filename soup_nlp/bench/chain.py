@@ -11,7 +11,7 @@ from soup_nlp.bench.study import Overrides, failures, markdown, page_text, prove
 from soup_nlp.bench.suite_pairs import Item
 from soup_nlp.errors import DataError
 from soup_nlp.sequence.chain import make_chain
-from soup_nlp.sequence.frames import FileFrames, Frames, SceneFrames, find_depths, find_images
+from soup_nlp.sequence.frames import file_frames, find_depths, find_images, scene_frames
 from soup_nlp.sequence.pairs import ROWS, solve_pairs
 from soup_nlp.sequence.score import score
 from soup_nlp.storage.folders import scratch
@@ -60,11 +60,11 @@ def measure_chain(
     Raises:
         DataError: the sequence has no truth.
     """
-    source: Frames = SceneFrames(item.sequence, frames)
+    source = scene_frames(item.sequence, frames)
     if item.needs:
         images = list(item.needs[:frames])
         camera = {"intrinsics": item.input["intrinsics"]}
-        source = FileFrames(tuple(images), camera, tuple(find_depths(images)), 256.0)
+        source = file_frames(images, camera, find_depths(images), 256.0)
     with scratch() as folder:
         which = [(k, k + 1) for k in range(len(source) - 1)]
         chain = make_chain(solve_pairs(source, which, folder, overrides))

@@ -14,9 +14,11 @@ from soup_nlp.cli.options import RowProgress
 from soup_nlp.cli.progress import SolveLog
 from soup_nlp.errors import StoppedError
 from soup_nlp.sequence.frames import Frames
-from soup_nlp.sequence.report import table
+from soup_nlp.sequence.score import chain_lines
 from soup_nlp.sequence.solve import AUTO, named, solve_chain
+from soup_nlp.sequence.stored import CHAIN
 from soup_nlp.sequence.write import SINGLE
+from soup_nlp.storage.files import read_json
 from soup_nlp.storage.folders import default_folder
 
 
@@ -66,7 +68,7 @@ def chain(
 
     def begin(found: Frames, pairs: int) -> None:
         count = len(found)
-        names = ", ".join(Path(found.source(k)).name for k in range(count))
+        names = ", ".join(Path(one).name for one in found.names)
         apart = f", far enough apart: {names}" if stride == AUTO else ""
         if not quiet:
             print(f"{count} frames{apart}; {pairs} pairs to solve", file=sys.stderr)
@@ -101,5 +103,5 @@ def chain(
             where=f"{out}/pairs",
             hint="the same command goes on",
         ) from None
-    print(table(done))
+    print("\n".join(chain_lines(done, read_json(out / CHAIN, CHAIN))))
     print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "points/", "pairs/"]))

@@ -17,7 +17,7 @@ from soup_nlp.sequence.fused import Cloud, fuse, movers, shown_tracks
 from soup_nlp.storage.atomic import PathLike, write_bytes
 
 RATE = 5.0
-"""Frames a second."""
+"""Frames a second, of the video too."""
 FLOAT, UBYTE = 5126, 5121
 """glTF's numbers of the types."""
 

@@ -1,4 +1,4 @@
-"""A chain of solved pairs with a common scale and frame of reference."""
+"""A chain of solved pairs with a common scale and frame of reference, and tracks of what moves."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from soup_nlp.arrays import Float, Image, Mask
+from soup_nlp.arrays import Float, Image
 from soup_nlp.errors import DataError, expect
+from soup_nlp.evaluate.metrics import overlap_shares
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.superpixels import Labels
-from soup_nlp.sequence.pairs import SolvedPair
-from soup_nlp.sequence.scales import Link, link, solve_scales
-from soup_nlp.sequence.tracks import carried, follow, number
+from soup_nlp.sequence.pairs import SolvedPair, carried
+from soup_nlp.sequence.scales import Link, find_links, solve_scales
+
+SAME = 0.3
+"""Smallest intersection over union of two components of one track."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,28 +48,32 @@ class Chain:
 
     __repr__ = __str__
 
+    def seen(self, frame: int) -> tuple[int, int]:
+        """A pair that holds a frame, and the frame's number in it: 0, and 1 for the last frame."""
+        last = int(frame == len(self.pairs))
+        return frame - last, last
+
     def depth(self, frame: int) -> Float:
-        """(H, W) z of a frame in the unit of the chain; the last frame is a next frame."""
-        if frame == len(self.pairs):
-            return self.scales[-1] * self.pairs[-1].result.depths[1]
-        return self.scales[frame] * self.pairs[frame].result.depths[0]
+        """(H, W) z of a frame in the unit of the chain."""
+        pair, place = self.seen(frame)
+        return self.scales[pair] * self.pairs[pair].result.depths[place]
 
     def image(self, frame: int) -> Image:
         """(H, W, 3) uint8 RGB of a frame."""
-        last = frame == len(self.pairs)
-        return self.pairs[frame - last].result.images[int(last)]
+        pair, place = self.seen(frame)
+        return self.pairs[pair].result.images[place]
 
     def camera(self, frame: int) -> Float:
         """(3, 3) intrinsics of a frame, pixels."""
-        last = frame == len(self.pairs)
-        return self.pairs[frame - last].result.K[int(last)]
+        pair, place = self.seen(frame)
+        return self.pairs[pair].result.K[place]
 
     def labels(self, frame: int) -> Labels:
         """(H, W) components of a frame; -1 where the last one shows what the others do not."""
-        last = frame == len(self.pairs)
-        result = self.pairs[frame - last].result
-        own = result.components.of_pixel
-        return np.asarray(carried(own, result.reconstruction) if last else own, np.int32)
+        pair, place = self.seen(frame)
+        result = self.pairs[pair].result
+        labels = result.components.of_pixel
+        return np.asarray(carried(labels, result.reconstruction) if place else labels, np.int32)
 
     def points(self, frame: int) -> Float:
         """(H, W, 3) points of a frame but the last, in world coordinates."""
@@ -124,47 +131,45 @@ def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> 
     return Chain(tuple(pairs), scales, tuple(links), tuple(poses), tuple(tracks))
 
 
-def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
-    """Links of all pairs that share a frame, from static pixels that are confident in both.
+def follow(before: Labels, after: Labels) -> dict[int, int]:
+    """Matches of the components of consecutive pairs by overlap in their common frame.
 
-    The depth of a pair without parallax is a guess, so its links are flagged, as are those of pairs
-    without a pixel that is confident in both. The pairs before and after a run of pairs without
-    parallax are linked directly, with the depth of the former moved by the flow of the run.
+    Args:
+        before: (H, W) labels of the first pair in the common frame; -1 unknown, 0 background.
+        after: (H, W) labels of the second pair.
+
+    Returns:
+        Label after by label before, matched greedily by overlap.
     """
-    out: list[Link | None] = []
-    for b, second in enumerate(pairs):
-        for a, first in enumerate(pairs[:b]):
-            for frame in {first.first, first.second} & {second.first, second.second}:
-                z1, keep1 = _view(first, frame)
-                z2, keep2 = _view(second, frame)
-                guess = first.still or second.still
-                found = link(a, b, z1, z2, keep1 & keep2, flagged=guess)
-                every = np.ones_like(keep1)
-                out.append(found or link(a, b, z1, z2, every, flagged=True))
-    # consecutive pairs are the first of those that start at a frame
-    at = {pair.first: b for b, pair in reversed([*enumerate(pairs)])}
-    for a, pair in enumerate(pairs):
-        frame, (z, keep) = pair.second, _view(pair, pair.second)
-        while not pair.still and frame in at and pairs[at[frame]].still:
-            z, keep = _carry(z, keep, pairs[at[frame]])
-            frame = pairs[at[frame]].second
-        if frame > pair.second and frame in at:
-            other, sure = _view(pairs[at[frame]], frame)
-            out.append(link(a, at[frame], z, other, keep & sure, bridge=True))
-    return [found for found in out if found]
+    known = before >= 0
+    share = overlap_shares(before[known], after[known])
+    # the background has no track
+    share[0], share[:, 0] = 0, 0
+    out: dict[int, int] = {}
+    while share.max(initial=0.0) >= SAME:
+        i, k = (int(x) for x in np.unravel_index(int(share.argmax()), share.shape))
+        out[i] = k
+        share[i], share[:, k] = 0, 0
+    return out
 
 
-def _view(pair: SolvedPair, frame: int) -> tuple[Float, Mask]:
-    """(H, W) z of a frame of a pair, and the mask of confident pixels of the static scene."""
-    result = pair.result
-    keep = result.sure & (result.components.of_pixel == 0)
-    if frame == pair.first:
-        return result.depths[0], keep
-    return result.depths[1], carried(keep, result.reconstruction) > 0
+def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dict[int, int]]:
+    """Number of the track by label of the component, for every pair; 0 is the background.
 
-
-def _carry(z: Float, keep: Mask, still: SolvedPair) -> tuple[Float, Mask]:
-    """z (H, W) and mask of the reference frame of a pair without parallax, in its next frame."""
-    source = still.result.reconstruction.source_next
-    there = (source >= 0) & (keep & (still.result.components.of_pixel == 0)).ravel()[source]
-    return np.where(there, z.ravel()[source], np.nan), there
+    Args:
+        matches: Results of `follow` for consecutive pairs.
+        counts: Number of components of every pair, with the background.
+    """
+    out: list[dict[int, int]] = []
+    fresh = 1
+    for k, count in enumerate(counts):
+        own = {0: 0}
+        back = {new: old for old, new in matches[k - 1].items()} if k else {}
+        for label in range(1, count):
+            if label in back:
+                own[label] = out[k - 1][back[label]]
+            else:
+                own[label] = fresh
+                fresh += 1
+        out.append(own)
+    return out

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import re
-import warnings
-from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
@@ -15,11 +14,9 @@ from typing import Any
 import cv2
 from PIL import Image
 
-from soup_nlp.config.problem import make_problem
-from soup_nlp.data.formats.images import DataWarning, read_image
 from soup_nlp.errors import DataError
 from soup_nlp.report.figures import write_png
-from soup_nlp.sequence.key_frames import continues, key_frames
+from soup_nlp.sequence.key_frames import continues
 from soup_nlp.storage.files import as_path, require_file
 from soup_nlp.storage.folders import staged
 
@@ -37,100 +34,58 @@ LAYOUT = "frame_*"
 """Pattern of the images in a folder that also holds other images, such as depth."""
 
 
-class Frames(ABC):
-    """A sequence of frames."""
-
-    @abstractmethod
-    def __len__(self) -> int:
-        """Number of frames."""
-
-    @abstractmethod
-    def pair(self, first: int, second: int) -> Raw:
-        """Section `input` of the problem of two frames."""
-
-    @abstractmethod
-    def source(self, frame: int) -> str:
-        """Path or description of a frame."""
-
-
 @dataclass(frozen=True)
-class FileFrames(Frames):
-    """Image files of one camera.
+class Frames:
+    """A sequence of frames.
 
     Attributes:
+        names: Path or description of every frame.
+        pair: Section `input` of the problem of two frames, by their numbers.
+    """
+
+    names: tuple[str, ...]
+    pair: Callable[[int, int], Raw]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def file_frames(
+    paths: Sequence[Path],
+    camera: Raw,
+    depths: Sequence[Path] = (),
+    depth_scale: float | None = None,
+) -> Frames:
+    """Image files of one camera as frames.
+
+    Args:
         paths: Images in order.
         camera: Key `intrinsics` or `fov` of an input of files.
         depths: True depth of every frame, for evaluation only; empty if unknown.
         depth_scale: Values per unit of length of a 16-bit .png depth.
     """
 
-    paths: tuple[Path, ...]
-    camera: Raw
-    depths: tuple[Path, ...] = ()
-    depth_scale: float | None = None
-
-    def __len__(self) -> int:
-        return len(self.paths)
-
-    def pair(self, first: int, second: int) -> Raw:
-        """See `Frames`."""
-        ref, following = str(self.paths[first]), str(self.paths[second])
-        out = {"kind": "files", "ref": ref, "next": following, **self.camera}
-        if self.depths:
-            truth = {"depth": str(self.depths[first]), "depth_next": str(self.depths[second])}
-            out.update(truth, depth_scale=self.depth_scale)
+    def pair(first: int, second: int) -> Raw:
+        out = {"kind": "files", "ref": str(paths[first]), "next": str(paths[second]), **camera}
+        if depths:
+            truth = {"depth": str(depths[first]), "depth_next": str(depths[second])}
+            out.update(truth, depth_scale=depth_scale)
         return out
 
-    def source(self, frame: int) -> str:
-        """See `Frames`."""
-        return str(self.paths[frame])
-
-    def check(self) -> None:
-        """Read every frame.
-
-        Raises:
-            DataError: a frame is damaged, or it is stored turned and its camera is given.
-        """
-        for path in self.paths:
-            # every solve gives the warnings too
-            with warnings.catch_warnings(action="ignore", category=DataWarning):
-                read_image(path, turn="intrinsics" not in self.camera)
-
-    def apart(self, most: int | None = None) -> FileFrames:
-        """The frames with enough parallax, see `key_frames`."""
-        # every solve gives this warning too
-        with warnings.catch_warnings(action="ignore", category=DataWarning):
-            first = make_problem({"input": self.pair(0, 1)}, where="sequence").load_pair()
-        keep = key_frames(self.paths, first.K_ref, most)
-        paths, depths = (tuple(x[k] for k in keep) if x else () for x in (self.paths, self.depths))
-        return replace(self, paths=paths, depths=depths)
+    return Frames(tuple(map(str, paths)), pair)
 
 
-@dataclass(frozen=True)
-class SceneFrames(Frames):
+def scene_frames(scene: str, count: int) -> Frames:
     """Frames of a rendered scene, whose camera and bodies repeat their first motion."""
 
-    scene: str
-    count: int
-    seed: int = 0
-    width: int = 1024
-    height: int = 436
-
-    def __len__(self) -> int:
-        return self.count
-
-    def pair(self, first: int, second: int) -> Raw:
-        """See `Frames`."""
+    def pair(first: int, second: int) -> Raw:
         if second != first + 1:
             raise DataError(
                 "frames of a scene are solved one after the other", found=second - first
             )
-        own = {"scene": self.scene, "seed": self.seed, "width": self.width, "height": self.height}
-        return {"kind": "scene", "frame": first, **own}
+        return {"kind": "scene", "frame": first, "scene": scene}
 
-    def source(self, frame: int) -> str:
-        """See `Frames`."""
-        return f"{self.scene}-{self.seed}: frame {frame}"
+    return Frames(tuple(f"{scene}: frame {k}" for k in range(count)), pair)
 
 
 def find_images(source: Path) -> list[Path]:

@@ -46,6 +46,10 @@ class Cloud:
         parts = (self.points, self.colours, self.sigma, self.label)
         return Cloud(*(part[keep] for part in parts))
 
+    def thinned(self, most: int) -> Cloud:
+        """At most so many points: each k-th one."""
+        return self.kept(np.arange(0, len(self), max(1, -(-len(self) // most))))
+
 
 def fuse(chain: Chain) -> Cloud:
     """The static scene of all frames: guesses left out, conflicts resolved, one point per voxel.

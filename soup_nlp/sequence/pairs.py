@@ -7,12 +7,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import SolverError
+from soup_nlp.geometry.soup import Reconstruction
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.result import Result, load
 from soup_nlp.sequence.frames import Frames, Raw
@@ -129,3 +132,9 @@ def read_pair(first: int, second: int, place: Path) -> SolvedPair:
     # a chain holds many pairs, whose other arrays it does not need
     kept = replace(result, tree={})
     return SolvedPair(first, second, kept, dict(tree.get("truth", {})), parallax)
+
+
+def carried(of_pixel: NDArray[np.generic], rec: Reconstruction) -> NDArray[Any]:
+    """(H', W') labels of the reference frame in the next frame; -1 where not visible."""
+    source = rec.source_next
+    return np.where(source >= 0, of_pixel.ravel()[source], -1)

@@ -78,8 +78,51 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
 _KEYS = ("mre_own_scale", "mre_one_scale")
 
 
+LINK_HEADS = ["pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", ""]
+"""Heads of the columns of `link_rows`."""
+
+
+def link_rows(contents: Mapping[str, Any]) -> list[list[str]]:
+    """The links of a chain.json as rows of a table."""
+    true = {tuple(k["pairs"]): k["true"] for k in (contents["score"] or {}).get("links", ())}
+    rows = []
+    for k in contents["links"]:
+        a, b = k["pairs"]
+        known = f"{true[a, b]:.3f}" if (a, b) in true else ""
+        note = "bridge" if k["bridge"] else "a guess" if k["flagged"] else ""
+        numbers = [f"{k['ratio']:.3f}", f"{k['spread']:.3f}", known, str(k["pixels"])]
+        rows.append([f"{a}, {b}", *numbers, note])
+    return rows
+
+
+def score_text(found: Mapping[str, Any]) -> str:
+    """The scores of a sequence in one sentence."""
+    text = (
+        f"MRE {found['mre_own_scale']:.4f} with a scale for every frame,"
+        f" {found['mre_one_scale']:.4f} with one for the sequence ({found['cost']:+.1%})"
+    )
+    if path := found["path"]:
+        text += f"; camera path off by {path['share']:.2%} of its length after a similarity"
+    return text
+
+
+def chain_lines(chain: Chain, contents: Mapping[str, Any]) -> list[str]:
+    """Scales, links and, with a truth, errors of a chain for the terminal."""
+    widths = (10, 16, 13, 11, 9, 8)
+    rows = [LINK_HEADS, *link_rows(contents)]
+    lines = [str(chain)]
+    for first, *rest in rows:
+        cells = "".join(f"{cell:>{width}}" for cell, width in zip(rest, widths[1:]))
+        lines.append(f"{first:<{widths[0]}}{cells}".rstrip())
+    long = [own for own in contents["tracks"] if len(own["path"]) > 2]
+    lines.append(f"tracks      {len(long)} components followed over two pairs or more")
+    if contents["score"]:
+        lines.append(f"accuracy    {score_text(contents['score'])}")
+    return lines
+
+
 def score_lines(found: Mapping[str, Any] | None) -> list[str]:
-    """Scores as lines of text."""
+    """Scores by frame as lines of text."""
     if found is None:
         return ["the truth knows no pixel of any frame"]
     rows = [
@@ -88,10 +131,7 @@ def score_lines(found: Mapping[str, Any] | None) -> list[str]:
         for f in found["frames"]
     ]
     head = f"{'frame':>5}{'own scale':>12}{'one scale':>12}{'coverage':>10}"
-    means = f"{'mean':>5}{found[_KEYS[0]]:>12.4f}{found[_KEYS[1]]:>12.4f}"
-    path = found["path"]
-    rest = [] if path is None else [f"path   off by {path['share']:.2%} of its length"]
-    return ["MRE of the depth, median scales, no depth cap", head, *rows, means, *rest]
+    return ["MRE of the depth, median scales, no depth cap", head, *rows, score_text(found)]
 
 
 def path_error(chain: Chain) -> dict[str, float] | None:

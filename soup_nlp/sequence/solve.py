@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from soup_nlp.config.problem import title
+from soup_nlp.config.problem import make_problem, title
 from soup_nlp.data.accept import ImageLike, image_of, is_path
+from soup_nlp.data.formats.images import DataWarning, read_image
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence.chain import Chain, make_chain
 from soup_nlp.sequence.frames import (
     VIDEOS,
-    FileFrames,
     Frames,
     Raw,
-    SceneFrames,
     check_sequence,
+    file_frames,
     find_depths,
     find_images,
+    scene_frames,
     video_frames,
 )
-from soup_nlp.sequence.key_frames import MAX_STEP
+from soup_nlp.sequence.key_frames import MAX_STEP, key_frames
 from soup_nlp.sequence.pairs import solve_pairs
 from soup_nlp.sequence.write import chain_files, write_chain
 from soup_nlp.storage.files import as_path
@@ -100,9 +102,8 @@ def solve_chain(
         begin(found, len(which) + len(over))
     pairs = solve_pairs(found, [*which, *over], folder, overrides, workers, say)
     chain = make_chain(pairs[: len(which)], pairs[len(which) :])
-    sources = [found.source(k) for k in range(count)]
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
-        write_chain(new, chain, name, sources, over)
+        write_chain(new, chain, name, found.names, over)
     return chain
 
 
@@ -153,7 +154,7 @@ def _frames(
     if isinstance(source, str) and source.startswith(SCENE):
         if step != 1 or camera:
             raise ConfigError("a rendered scene has its own camera and steps", found=source)
-        return SceneFrames(source.removeprefix(SCENE), most or 10)
+        return scene_frames(source.removeprefix(SCENE), most or 10)
     depths: list[Path] = []
     # with AUTO the limit applies to the chosen frames
     end = most if step else None
@@ -178,9 +179,17 @@ def _frames(
     beside = images[0].parent / "K.txt"
     if not camera.keys() & {"intrinsics", "fov"} and os.path.lexists(beside):
         camera = {"intrinsics": str(beside), **camera}
-    found = FileFrames(tuple(images), camera, tuple(depths), depth_scale)
-    found.check()
-    return found if step else found.apart(most)
+    frames = file_frames(images, camera, depths, depth_scale)
+    # every solve gives these warnings too
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
+        for image in images:
+            read_image(image, turn="intrinsics" not in camera)
+        if step:
+            return frames
+        first = make_problem({"input": frames.pair(0, 1)}, where="sequence").load_pair()
+    keep = key_frames(images, first.K_ref, most)
+    images, depths = ([own[k] for k in keep] if own else [] for own in (images, depths))
+    return file_frames(images, camera, depths, depth_scale)
 
 
 def _files(frames: Sequence[ImageLike], folder: Path) -> list[Path]:

@@ -96,8 +96,7 @@ def _write_glb(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> str:
 
 def _write_colmap(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> str:
     """COLMAP's model of the sequence: all frames and the fused cloud."""
-    cloud = fuse(chain)
-    cloud = cloud.kept(np.arange(0, len(cloud), max(1, -(-len(cloud) // COLMAP_POINTS))))
+    cloud = fuse(chain).thinned(COLMAP_POINTS)
     frames, seen = range(len(chain)), []
     for k in frames:
         inside, v, u, z = projected(chain, cloud.points, k)

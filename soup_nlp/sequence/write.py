@@ -14,6 +14,7 @@ from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.figures import depth_png_scale, write_clipped_depth_png16
 from soup_nlp.report.motions import tum_text
 from soup_nlp.report.pointcloud import AXES, write_ply
+from soup_nlp.sequence.animation import RATE
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.page import chain_page
 from soup_nlp.sequence.score import score
@@ -27,8 +28,6 @@ SINGLE = "chain.json", "trajectory.tum", "depth.mp4", CHAIN_PAGE, "scene.ply"
 """Files of a chain that are not made for each frame."""
 POINTS = 100_000
 """Largest number of points in the cloud of a frame."""
-RATE = 5.0
-"""Frames a second of the video."""
 UNIT = "the first pair's soup unit (free scale: its planes are at mean distance 1)"
 
 

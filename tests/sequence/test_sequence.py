@@ -22,21 +22,21 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence import pairs
-from soup_nlp.sequence.chain import make_chain
+from soup_nlp.sequence.chain import follow, make_chain, number
 from soup_nlp.sequence.frames import (
-    FileFrames,
-    SceneFrames,
+    file_frames,
     find_depths,
     find_images,
+    scene_frames,
     video_frames,
 )
 from soup_nlp.sequence.fused import fuse, movers
 from soup_nlp.sequence.key_frames import key_frames, parallax
-from soup_nlp.sequence.pairs import SolvedPair
+from soup_nlp.sequence.pairs import SolvedPair, carried
 from soup_nlp.sequence.scales import Link, link, solve_scales
 from soup_nlp.sequence.score import aligned
+from soup_nlp.sequence.solve import _frames
 from soup_nlp.sequence.stored import COLMAP_POINTS
-from soup_nlp.sequence.tracks import carried, follow, number
 from soup_nlp.sequence.write import chain_files, write_chain
 
 pytestmark = pytest.mark.slow
@@ -256,7 +256,7 @@ def test_frames_of_a_folder_a_pattern_and_a_video(tmp_path):
     assert [p.name for p in depths] == ["depth_9.npy", "depth_10.npy", "depth_100.npy"]
     (tmp_path / "depth_9.npy").unlink()
     assert find_depths(images) == []
-    own = FileFrames(tuple(images), {"fov": 60}, tuple(depths), 256.0).pair(0, 2)
+    own = file_frames(images, {"fov": 60}, depths, 256.0).pair(0, 2)
     assert own["next"] == str(images[2])
     assert own["depth_next"] == str(depths[2])
     with pytest.raises(DataError, match="two images"):
@@ -352,9 +352,9 @@ def test_duplicate_frames_are_bridged(order, tmp_path):
 
 
 def test_frames_of_a_scene_follow_each_other():
-    assert SceneFrames("street", 4).pair(2, 3)["frame"] == 2
+    assert scene_frames("street", 4).pair(2, 3)["frame"] == 2
     with pytest.raises(DataError):
-        SceneFrames("street", 4).pair(0, 2)
+        scene_frames("street", 4).pair(0, 2)
 
 
 SMALL = [
@@ -433,7 +433,7 @@ def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch)
     monkeypatch.setattr(pairs, "_solve", solve)
     monkeypatch.setattr(pairs, "read_pair", lambda first, second, place: (first, second))
     for own in (["a"], ["a"], ["b"], ["a"]):
-        assert pairs.solve_pairs(SceneFrames("street", 3), [(0, 1)], tmp_path, own) == [(0, 1)]
+        assert pairs.solve_pairs(scene_frames("street", 3), [(0, 1)], tmp_path, own) == [(0, 1)]
     assert seen == [(*pairs.OF_PAIRS, own) for own in "aba"]
 
 
@@ -482,8 +482,8 @@ def test_frames_are_as_far_apart_as_their_parallax_asks(tmp_path):
     assert chosen[1] in (3, 4)
     assert chosen[-3:] == [5, 6, 7]
     assert key_frames(images, K, most=2) == chosen[:2]
-    own = FileFrames(tuple(images), {"intrinsics": [160, 160, 79.5, 59.5]}).apart(most=2)
-    assert own.paths == tuple(images[k] for k in chosen[:2])
+    own = _frames(images, tmp_path, {"intrinsics": [160, 160, 79.5, 59.5]}, None, 2, None)
+    assert own.names == tuple(str(images[k]) for k in chosen[:2])
 
 
 @pytest.mark.parametrize("stride", ["0", "-1", "often"])
