@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-import casadi as ca
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
@@ -24,7 +23,6 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.nlp import to_scipy
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
 EPS = (1.0, 0.3, 0.1, 0.03, 0.01)
@@ -66,15 +64,14 @@ class Tangent:
     ) -> None:
         # theta = 0 and no ridge: the Hessian is that of reweighted least squares, sum w/s J^T J
         form = (form or Formulation()).replace(
-            norm="smooth", truncation="smooth", hessian="gauss-newton", theta=0.0, ridge=0.0
+            norm="smooth", hessian="gauss-newton", theta=0.0, ridge=0.0
         )
         self.nlp, self.layout = build_tangent_nlp(start, data, weights, form)
         nlp = self.nlp
-        self.p = ca.DM(nlp.p)
+        self.theta = nlp.thetas()
         # every constraint is linear: g = A x + g0
-        g, A = nlp.jac_g(nlp.x0, nlp.p)
-        A = to_scipy(A).tocsr()
-        constant = np.asarray(g).ravel() - A @ nlp.x0
+        A = nlp.jacobian(nlp.x0)
+        constant = nlp.constraints(nlp.x0) - A @ nlp.x0
         equal = nlp.lbg == nlp.ubg
         self.simplex = A[np.flatnonzero(equal)].toarray().sum(axis=0)
         rows = np.flatnonzero(~equal)
@@ -84,21 +81,19 @@ class Tangent:
 
     def smoothing(self, eps: float) -> None:
         """Set both smoothing widths."""
-        self.p = ca.DM(self.nlp.with_theta(eps=eps, eps_pixel=eps, theta=0.0, ridge=0.0))
+        self.theta = self.nlp.thetas(eps=eps, eps_pixel=eps, theta=0.0, ridge=0.0)
 
     def value(self, x: Float) -> float:
         """Smoothed energy."""
-        return float(self.nlp.oracle(x, self.p)[0])
+        return self.nlp.value(x, self.theta)
 
     def gradient(self, x: Float) -> tuple[float, Float]:
         """Smoothed energy and its gradient (9 N,)."""
-        f, gradient = self.nlp.grad_f(x, self.p)
-        return float(f), np.asarray(gradient).ravel()
+        return self.value(x), self.nlp.gradient(x, self.theta)
 
     def normal_matrix(self, x: Float) -> sparse.csc_matrix:
-        """(9 N, 9 N) matrix of the reweighted least squares; CasADi gives its upper triangle."""
-        upper = to_scipy(self.nlp.hess_lag(x, self.p, 1.0, np.zeros(self.nlp.ng)))
-        return sparse.csc_matrix(upper + sparse.triu(upper, 1).T)
+        """(9 N, 9 N) matrix of the reweighted least squares."""
+        return self.nlp.hessian(x, np.zeros(self.nlp.ng), theta=self.theta)
 
     def project(self, x: Float) -> Float:
         """The point clipped to the bounds, its slopes shrunk until every rim pixel is visible."""

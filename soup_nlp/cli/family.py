@@ -40,7 +40,7 @@ def family(
     scenes: Annotated[str, typer.Option(help="Rendered scenes.")] = _list(SCENES),
     formulation: Annotated[
         list[str] | None,
-        typer.Option("--formulation", help="gauge/norm/truncation; may be repeated."),
+        typer.Option("--formulation", help="gauge/norm; may be repeated."),
     ] = None,
     coordinates: Coordinates = "matrix",
     starts: Annotated[

@@ -41,7 +41,7 @@ Presolve = Annotated[
 Formulations = Annotated[
     list[str] | None,
     typer.Option(
-        "--formulation", help="gauge/norm/truncation, e.g. free/epigraph/lifted; may be repeated."
+        "--formulation", help="gauge/norm, e.g. unit-translation/epigraph; may be repeated."
     ),
 ]
 Coordinates = Annotated[

@@ -19,7 +19,6 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation, FormulationOptions
 from soup_nlp.model.layout import TangentLayout
-from soup_nlp.model.sums import Sums
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
 from soup_nlp.solve.selected_inverse import BlockCholesky
 
@@ -66,10 +65,8 @@ def information(
     """
     whole = majorant(Formulation.make(dict(form)))
     nlp, layout = build_tangent_nlp(soup, data, weights, whole, "inverse-depth")
-    sums, x = Sums(nlp, first_order=False, second_order=True), nlp.x0
-    sums.theta = nlp.thetas(eps=smoothing, eps_pixel=smoothing)
-    upper = nlp.hessian_pattern.filled(sums.hessian(x, np.zeros(nlp.ng)))
-    matrix = (upper + sparse.triu(upper, 1).T).tocsr()
+    x, theta = nlp.x0, nlp.thetas(eps=smoothing, eps_pixel=smoothing)
+    matrix = nlp.hessian(x, np.zeros(nlp.ng), theta=theta).tocsr()
     plane, growth = x.reshape(-1, 9)[:, :3], np.zeros((len(data), 9))
     growth[:, :3] = -plane
     return Information(matrix, growth.ravel(), plane, layout)

@@ -19,7 +19,6 @@ from soup_nlp.export.manifest import (
     MANIFEST,
     NORMS,
     STUB,
-    TRUNCATIONS,
     kept_best,
 )
 from soup_nlp.export.names import readable_names, suffixes_of
@@ -28,7 +27,7 @@ from soup_nlp.export.verify import examine
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Coordinates, Formulation
 from soup_nlp.model.layout import GAUGES, MatrixLayout, TangentLayout
-from soup_nlp.model.nlp import NLP, to_scipy
+from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline import Case
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import claim, staged
@@ -44,12 +43,12 @@ INFORMATION = (
 )
 TANGENT = "tangent"
 """Stands in the place of a gauge for tangent coordinates, which have none."""
-CHOICES = {"gauge": (*GAUGES, TANGENT), "norm": NORMS, "truncation": TRUNCATIONS}
+CHOICES = {"gauge": (*GAUGES, TANGENT), "norm": NORMS}
 """Values of each part of a formulation, in the order of its label."""
 
 
 def parse_formulation(text: str) -> dict[str, str]:
-    """Parse `gauge/norm/truncation`; missing parts are those of the problem file.
+    """Parse `gauge/norm`; missing parts are those of the problem file.
 
     "tangent" in the place of a gauge becomes `coordinates`.
 
@@ -96,9 +95,9 @@ def parse_formulations(texts: Sequence[str] | None, coordinates: str) -> list[di
 
 
 def form_label(form: Formulation) -> str:
-    """`gauge/norm/truncation`, with "tangent" in the place of a gauge."""
+    """`gauge/norm`, with "tangent" in the place of a gauge."""
     first = TANGENT if form.coordinates == TANGENT else form.gauge
-    return f"{first}/{form.norm}/{form.truncation}"
+    return f"{first}/{form.norm}"
 
 
 def export_case(
@@ -116,7 +115,7 @@ def export_case(
 
     Args:
         case: Problem with its start.
-        form: Gauge, norm and truncation; the Hessian in the files is exact.
+        form: Gauge and norm; the Hessian in the files is exact.
         folder: Output folder.
         formats: Some of FORMATS; nl is always written, and casadi includes h5.
         presolved: The case starts at the answer of the presolve (for the manifest).
@@ -203,7 +202,7 @@ def _description(
             **file.counts(),
         },
         "nl": {"file": f"{STUB}.nl", "bytes": file.size, "sha256": file.sha256},
-        "objective_at_start": float(nlp.oracle(nlp.x0, nlp.p)[0]),
+        "objective_at_start": nlp.value(nlp.x0),
         "exact_energy_at_start": oracle.energy(case.soup, case.data, case.weights),
         "fingerprint": fingerprint(case, nlp, layout),
     }
@@ -213,8 +212,10 @@ def fingerprint(case: Case, nlp: NLP, layout: MatrixLayout | TangentLayout) -> d
     """f and |g| at the proposal with all slack variables and switches at 1/2."""
     x = np.full(nlp.nx, 0.5)
     x[: layout.size] = layout.pack(case.start.soup)
-    f, g = nlp.oracle(x, nlp.p)
-    return {"objective": float(f), "constraints": float(np.linalg.norm(np.asarray(g)))}
+    return {
+        "objective": nlp.value(x),
+        "constraints": float(np.linalg.norm(nlp.constraints(x))),
+    }
 
 
 def _write_start_h5(
@@ -229,9 +230,8 @@ def _write_start_h5(
     The Hessian is that of the NLP with lam_f = 1 and lam_g = 1; `info` is the Gauss-Newton
     information at the start.
     """
-    f, grad = nlp.grad_f(nlp.x0, nlp.p)
-    g, jac = nlp.jac_g(nlp.x0, nlp.p)
-    hess = nlp.hess_lag(nlp.x0, nlp.p, 1.0, np.ones(nlp.ng))
+    x = nlp.x0
+    upper = sparse.triu(nlp.hessian(x, np.ones(nlp.ng)))
 
     def vector(value: object, text: str, letter: str) -> Array:
         return Array(np.asarray(value, float).ravel(), "1", text, letter)
@@ -255,11 +255,11 @@ def _write_start_h5(
         "x_names": Array(np.array(names[0]), "1", "variables", "X"),
         "g_names": Array(np.array(names[1]), "1", "constraints", "G"),
         "at_start": {
-            "f": Array(np.float64(f), "1", "objective"),
-            "g": vector(g, "constraints", "G"),
-            "grad_f": vector(grad, "gradient of the objective", "X"),
-            "jac_g": matrix(to_scipy(jac), "Jacobian of g"),
-            "hess_lag": matrix(to_scipy(hess), f"triu Hessian, lam_f = lam_g = 1 ({nlp.hessian})"),
+            "f": Array(np.float64(nlp.value(x)), "1", "objective"),
+            "g": vector(nlp.constraints(x), "constraints", "G"),
+            "grad_f": vector(nlp.gradient(x), "gradient of the objective", "X"),
+            "jac_g": matrix(nlp.jacobian(x), "Jacobian of g"),
+            "hess_lag": matrix(upper, f"triu Hessian, lam_f = lam_g = 1 ({nlp.hessian_kind})"),
             "information": matrix(sparse.triu(info.matrix), INFORMATION),
         },
     }

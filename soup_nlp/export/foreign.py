@@ -158,7 +158,6 @@ def foreign_run(
     """
     found = examine(nlp, answer.x, answer.lam_g)
     r = found.residuals
-    f = nlp.oracle(answer.x, nlp.p)[0]
     own = layout.unpack(answer.x)
     soup = own.retracted()
     start, energy = (oracle.energy(s, case.data, case.weights) for s in (case.start.soup, soup))
@@ -177,7 +176,7 @@ def foreign_run(
         x=answer.x,
         lam_x=found.lam_x,
         lam_g=found.lam_g,
-        objective=float(f),
+        objective=nlp.value(answer.x),
         iterations=0,
         seconds=0.0,
         history={},

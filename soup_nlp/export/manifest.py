@@ -15,7 +15,6 @@ from soup_nlp.storage.files import read_json
 STUB = "soup"
 MANIFEST = "manifest.json"
 NORMS = ("smooth", "epigraph")
-TRUNCATIONS = ("smooth", "lifted")
 FUNCTIONS = ("oracle", "grad_f", "jac_g", "hess_lag")
 """Functions of the NLP in the format casadi."""
 EXPORT_FILES = (
@@ -40,7 +39,6 @@ _Manifest = _record(
         "Formulation",
         gauge=Literal[GAUGES],
         norm=Literal[NORMS],
-        truncation=Literal[TRUNCATIONS],
         coordinates=Coordinates,
     ),
     smoothing=_record("Smoothing", eps=FiniteFloat, eps_pixel=FiniteFloat),

@@ -51,7 +51,7 @@ class SymbolicNLP:
 
     @property
     def derivatives(self) -> dict[str, ca.Function]:
-        """Options of `nlpsol` that spare it the derivation; the Hessian is of `record.hessian`."""
+        """Options of `nlpsol` that spare it the derivation."""
         nlp = self.record
         return {"grad_f": nlp.grad_f, "jac_g": nlp.jac_g, "hess_lag": nlp.hess_lag}
 
@@ -82,7 +82,6 @@ def nlp(
     coordinates: Coordinates = "matrix",
     hessian: Hessian = "exact",
     presolve: bool = False,
-    compiled: bool = False,
 ) -> SymbolicNLP:
     """The NLP of a problem, for `casadi.nlpsol` and its plug-ins.
 
@@ -94,7 +93,6 @@ def nlp(
             "tangent": nine coordinates per superpixel, in which the first two hold by construction.
         hessian: Of `derivatives`; "gauss-newton" is a majorant where its theta is 0.
         presolve: Start at the presolve's answer instead of the initialisation.
-        compiled: Evaluate kernels in machine code; the expressions then have no second derivatives.
 
     Raises:
         SoupError: the problem cannot be prepared.
@@ -103,7 +101,7 @@ def nlp(
         more = () if superpixels is None else (f"segmentation.superpixels={superpixels}",)
         problem = load_problem(problem, [*overrides, *more])
     case = prepare(problem, presolve)
-    form = case.formulation(hessian=hessian, compiled=compiled)
+    form = case.formulation(hessian=hessian)
     if coordinates == "matrix":
         made = case.nlp(form)
     else:

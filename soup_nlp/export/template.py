@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ExportError
-from soup_nlp.export.opcodes import COMMUTATIVE, NAMES, OPS, PLUS, SUM, number
+from soup_nlp.export.opcodes import COMMUTATIVE, OPS, PLUS, SUM, number
 from soup_nlp.model.kernel import Group
+from soup_nlp.model.operations import NAMES, OPERATIONS
 
 WORTH_NAMING = 4
 """Smallest number of operations and leaves of a defined variable."""
@@ -70,7 +71,7 @@ class _Graph:
         if not all(a in self.number for a in args):
             return self._add(key, op, args)
         with np.errstate(all="ignore"):
-            return self.leaf(key, OPS[op].fold(*(self.number[a] for a in args)))
+            return self.leaf(key, OPERATIONS[op].numpy(*(self.number[a] for a in args)))
 
     def _add(self, key: object, op: int, args: tuple[int, ...]) -> int:
         self.op.append(op)

@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from soup_nlp.arrays import Float
-from soup_nlp.model.nlp import NLP, to_scipy
+from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.kkt import optimality
 
 SLACK = 10.0
@@ -88,7 +88,7 @@ class Optimality:
 def violations(nlp: NLP, x: Float) -> dict[str, Float]:
     """Violations of "bounds" (nx,) and "rows" (ng,); infinite for NaN."""
     with np.errstate(all="ignore"):
-        g = np.asarray(nlp.oracle(x, nlp.p)[1]).ravel()
+        g = nlp.constraints(x)
         outside = {
             "bounds": np.maximum(nlp.lbx - x, x - nlp.ubx),
             "rows": np.maximum(nlp.lbg - g, g - nlp.ubg),
@@ -104,8 +104,8 @@ def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Optimality:
     """
     primal = max(float(v.max(initial=0.0)) for v in violations(nlp, x).values())
     nothing = np.zeros(nlp.ng)
-    values = (*nlp.grad_f(x, nlp.p), *nlp.jac_g(x, nlp.p))
-    if not all(np.isfinite(np.array(v.nonzeros(), float)).all() for v in values):
+    values = nlp.value(x), nlp.gradient(x), nlp.constraints(x), nlp.jacobian_nonzeros(x)
+    if not all(np.isfinite(v).all() for v in values):
         return Optimality(Residuals(primal, np.inf, np.inf, "none"), np.zeros(nlp.nx), nothing)
     candidates = {"least squares": least_squares_multipliers(nlp, x)}
     if lam_g is not None:
@@ -130,7 +130,7 @@ def bound_multipliers(nlp: NLP, x: Float, lam_g: Float) -> Float:
     The rest of the gradient, r = -(grad f + J' lam_g), acts on the bound in its direction. The
     multiplier lam = r / (1 + gap) makes dual infeasibility and complementarity equal.
     """
-    r = -(_gradient(nlp, x) + _jacobian(nlp, x).T @ lam_g)
+    r = -(nlp.gradient(x) + nlp.jacobian(x).T @ lam_g)
     with np.errstate(invalid="ignore"):
         gap = np.where(r > 0, nlp.ubx - x, x - nlp.lbx)
     # a point outside its bounds has no gap
@@ -145,8 +145,8 @@ def least_squares_multipliers(nlp: NLP, x: Float) -> Float:
     Minimises |grad f + J_A' lam_A| over the active rows A, in the variables that are not on their
     bounds. Multipliers with a wrong sign are set to 0 and the others are solved again.
     """
-    J, grad = _jacobian(nlp, x), _gradient(nlp, x)
-    g = np.asarray(nlp.oracle(x, nlp.p)[1]).ravel()
+    J, grad = nlp.jacobian(x), nlp.gradient(x)
+    g = nlp.constraints(x)
     at_lower = np.isfinite(nlp.lbg) & (g - nlp.lbg <= ACTIVE * (1 + np.abs(nlp.lbg)))
     at_upper = np.isfinite(nlp.ubg) & (nlp.ubg - g <= ACTIVE * (1 + np.abs(nlp.ubg)))
     inside = (x - nlp.lbx > ACTIVE) & (nlp.ubx - x > ACTIVE)
@@ -175,11 +175,3 @@ def _least_squares(A: sparse.csr_matrix, b: Float) -> Float:
     for _ in range(3):
         x += solve(np.concatenate([b - A @ x, np.zeros(n)]))[k:]
     return x
-
-
-def _gradient(nlp: NLP, x: Float) -> Float:
-    return np.asarray(nlp.grad_f(x, nlp.p)[1]).ravel()
-
-
-def _jacobian(nlp: NLP, x: Float) -> sparse.csr_matrix:
-    return sparse.csr_matrix(to_scipy(nlp.jac_g(x, nlp.p)[1]))

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from soup_nlp.arrays import Float
 from soup_nlp.export.nl import NLFile
 from soup_nlp.export.verify import ACTIVE
-from soup_nlp.model.nlp import NLP, to_scipy
+from soup_nlp.model.nlp import NLP
 
 CLASSES = {0: "constant", 1: "linear", 2: "quadratic", 3: "general"}
 LETTERS = {0: "C", 1: "L", 2: "Q", 3: "O"}
@@ -59,7 +59,7 @@ def classification(nlp: NLP, found: dict[str, Any]) -> str:
     """
     place = {word: number for number, word in CLASSES.items()}
     rows = max(place[c["class"]] for c in found["constraint_classes"].values())
-    internal = any(s.startswith(("s_", "z_")) for s in nlp.x_names()[-1:])
+    internal = nlp.x_names()[-1].startswith("s_")
     letters = LETTERS[place[found["objective_class"]]] + LETTERS[max(rows, 1)]
     return f"{letters}R2-M{'Y' if internal else 'N'}-{nlp.nx}-{nlp.ng}"
 
@@ -99,9 +99,7 @@ def rank(matrix: sparse.csr_matrix) -> int:
 
 def qualification(nlp: NLP, x: Float) -> dict[str, Any]:
     """Rank of the Jacobian and of its active rows, and LICQ, at a feasible point x (nx,)."""
-    g, jacobian = nlp.jac_g(x, nlp.p)
-    J = sparse.csr_matrix(to_scipy(jacobian))
-    g = np.asarray(g).ravel()
+    g, J = nlp.constraints(x), nlp.jacobian(x)
     active = np.zeros(nlp.ng, bool)
     for bound in (nlp.lbg, nlp.ubg):
         near = np.isfinite(bound)

@@ -11,6 +11,7 @@ import numpy as np
 from soup_nlp.config.problem import Problem, dump_problem, make_problem
 from soup_nlp.family.frozen import Frozen, encoded, save_frozen
 from soup_nlp.family.instances import case_of, rounded
+from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.progress import Watch
@@ -39,13 +40,12 @@ def freeze(scene: str, size: int, path: Path, say: Callable[[str], None]) -> Non
     # solve the numbers of the record, which are rounded
     case = case_of(proposed)
     own = case.data, case.weights, case.formulation(), case.options
-    # with true flow the proposal may have the lower exact energy and would be delivered; a start
-    # beside it gives the minimum of the smoothed energy, which the record needs
-    noise = np.random.default_rng(0).standard_normal(len(case.soup))
-    beside = replace(case.soup, lam=case.soup.lam * np.exp(0.01 * noise))
-    answer = solve_soup(beside, *own, watch=Watch(say=say))
-    say(str(answer))
-    save_frozen(path, replace(proposed, minimum=encoded(answer.soup)))
+    solution = solve_soup(case.soup, *own, watch=Watch(say=say))
+    say(str(solution))
+    # Ipopt's answer, a minimum of the smoothed energy, even where the proposal is delivered, whose
+    # exact energy may be lower with true flow
+    answer = MatrixLayout(case.data.share, case.formulation().gauge).unpack(solution.stages[-1].x)
+    save_frozen(path, replace(proposed, minimum=encoded(answer.retracted())))
 
 
 def record_of(case: Case) -> Frozen:

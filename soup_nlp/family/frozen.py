@@ -44,7 +44,7 @@ class Frozen:
         prior_weight: (E,) weight of E_prior of every edge. It is stored, so that the rules for it
             can change without a new version of the family.
         proposal: (N, 10) the proposal.
-        minimum: (N, 10) the best known point of the smooth truncation.
+        minimum: (N, 10) the best known point, an answer of Ipopt.
     """
 
     text: str

@@ -31,22 +31,20 @@ from soup_nlp.pipeline.case import Case, build_energy, solver_options
 from soup_nlp.start.choice import limited_noise
 from soup_nlp.start.propose import Start
 
-VERSION = 3
+VERSION = 4
 """Version of the family; instances of one version have the same bytes everywhere."""
 SCENES = ("orbit", "street", "room", "sheet")
 SIZES = (100, 250, 500, 1000, 2000)
 """Wanted numbers of superpixels."""
 STARTS = ("easy", "hard", "cold")
-STANDARD = "unit-offset/smooth/smooth"
+STANDARD = "unit-offset/smooth"
 """Default formulation of the family."""
 INITIALS = {
     "unit-offset": "o",
     "unit-translation": "t",
-    "free": "f",
     "tangent": "n",
     "smooth": "s",
     "epigraph": "e",
-    "lifted": "l",
 }
 """Letter of every word of a formulation."""
 BITS = 20
@@ -63,9 +61,9 @@ class Instance:
 
     Attributes:
         scene: One of SCENES.
-        formulation: gauge/norm/truncation, or tangent/norm/truncation.
+        formulation: gauge/norm, or tangent/norm.
         size: Wanted number of superpixels, one of SIZES; the actual number may differ a little.
-        start: easy (presolved), hard (the proposal) or cold (constant depth, true flow).
+        start: easy (Ipopt's answer), hard (the proposal) or cold (constant depth, true flow).
     """
 
     scene: str
@@ -80,9 +78,8 @@ class Instance:
 
     @property
     def short(self) -> str:
-        """The same in at most 24 characters, such as `SOUP-street-oss-100h`: initials of gauge,
-        norm and truncation ("n" for tangent coordinates, of which there are nine), and of the
-        start."""
+        """The same in at most 24 characters, such as `SOUP-street-os-100h`: initials of gauge and
+        norm ("n" for tangent coordinates, of which there are nine), and of the start."""
         form = "".join(INITIALS[word] for word in self.formulation.split("/"))
         return f"SOUP-{self.scene}-{form}-{self.size}{self.start[0]}"
 
@@ -98,7 +95,7 @@ def parse_name(name: str) -> Instance:
     Raises:
         ConfigError: the name is not one of the family.
     """
-    found = re.fullmatch(r"SOUP-([a-z]+)-([a-z]{3})-(\d+)([a-z])", name)
+    found = re.fullmatch(r"SOUP-([a-z]+)-([a-z]{2})-(\d+)([a-z])", name)
     for form, start in product(formulations(), STARTS) if found else ():
         one = Instance(found[1], form, int(found[3]), start)  # type: ignore[index]
         if one.short == name and one.scene in SCENES and one.size in SIZES:
@@ -113,7 +110,7 @@ def parse_name(name: str) -> Instance:
     raise ConfigError(
         "no instance of the family",
         found=name,
-        expected=f"SOUP-SCENE-GAUGE-NORM-TRUNCATION-NSIZE-START, such as {example().name}",
+        expected=f"SOUP-SCENE-GAUGE-NORM-NSIZE-START, such as {example().name}",
     )
 
 
@@ -123,7 +120,7 @@ def example() -> Instance:
 
 
 def formulations() -> list[str]:
-    """Every formulation, as gauge/norm/truncation."""
+    """Every formulation, as gauge/norm."""
     return ["/".join(words) for words in product(*CHOICES.values())]
 
 
@@ -165,7 +162,7 @@ def select(
 def _whole(form: str) -> str:
     """A formulation completed by the parts of STANDARD."""
     own = dict(zip(CHOICES, STANDARD.split("/"))) | parse_formulation(form)
-    return "/".join([own.pop("coordinates", own["gauge"]), own["norm"], own["truncation"]])
+    return "/".join([own.pop("coordinates", own["gauge"]), own["norm"]])
 
 
 def case_of(record: Frozen, pair: Pair | None = None) -> Case:
@@ -225,7 +222,7 @@ def build_instance(
     Args:
         case: Case of the record.
         record: The record.
-        formulation: gauge/norm/truncation.
+        formulation: gauge/norm.
         start: One of STARTS; "best" is the best known point without rounding.
         hessian: Kind of the Hessian.
     """
@@ -235,10 +232,6 @@ def build_instance(
     soup = constant_depth(case.data) if start == "cold" else soups[start]
     nlp, layout = _program(case, record, soup, form)
     x0 = nlp.x0 if start == "best" else rounded(nlp.x0)
-    if start == "best":
-        # optimal switches are at one of their bounds
-        switch = np.array([s.startswith("z_") for s in nlp.x_names()])
-        x0 = np.where(switch, np.round(x0), x0)
     nlp = replace(nlp, x0=np.clip(x0, nlp.lbx, nlp.ubx))
     return nlp, layout, form
 

@@ -37,9 +37,9 @@ is general. All functions are twice differentiable at every point with lam > 0 a
 | | |
 |---|---|
 | family | {scenes}; names are `SOUP-<scene>-<formulation>-N<size>-<start>` |
-| short names | at most 24 characters, in `instancedata.csv`: `SOUP-street-oss-100h` |
+| short names | at most 24 characters, in `instancedata.csv`: `SOUP-street-os-100h` |
 | sizes | N = {sizes} superpixels asked for; 16 variables each in the standard formulation |
-| start `easy` | the best known point, rounded to 20 significant bits |
+| start `easy` | the best known point, an answer of Ipopt, rounded to 20 significant bits |
 | start `hard` | an initial proposal, made from the true flow |
 | start `cold` | planes at one depth, shifted as the true flow says, without rotation |
 | generator | `soup-nlp family` of soup_nlp {package}; family version {version} |
@@ -80,8 +80,7 @@ tried. To send results, write a JSON object with a list `results` of objects wit
 `<name without start>.sol` is the best known point (primal). `index.json` and `index.csv` have its
 objective, its unscaled KKT residuals, who found it and who reached it: with a verified point at
 most 1e-4 relative above. `instancedata.csv` has the columns of MINLPLib; its dual bound is 0, as
-every term of the objective is at least 0. Of formulations whose truncation is `lifted` the point
-is feasible, not optimal: it is the minimum of the smooth truncation.
+every term of the objective is at least 0.
 """
 
 COLUMNS: Mapping[str, Callable[[Entry], str]] = {

@@ -83,8 +83,8 @@ def check_sol(path: Path) -> Verdict:
     with np.errstate(all="ignore"):
         return Verdict(
             sol,
-            float(nlp.oracle(sol.x, nlp.p)[0]),
-            float(nlp.oracle(best, nlp.p)[0]),
+            nlp.value(sol.x),
+            nlp.value(best),
             examine(nlp, sol.x, sol.lam_g).residuals,
             [kind(k, v, FEASIBLE, False) for k, v in violations(nlp, sol.x).items()],
             nlp.nx,

@@ -126,7 +126,7 @@ def _solved(
         "classification": classification(nlp, found),
         **qualification(nlp, x),
         "best_known": {
-            "objective": _short(nlp.oracle(x, nlp.p)[0]),
+            "objective": _short(nlp.value(x)),
             "sol": f"{instance.problem}.sol",
             **{k: _short(getattr(r, k), 2) for k in ("primal", "dual", "complementarity")},
             "found_by": None,
@@ -154,7 +154,7 @@ def _entry(
         "start": instance.start,
         **shared,
         "runs": shared["runs"].get(instance.start, {}),
-        "objective_at_start": _short(nlp.oracle(nlp.x0, nlp.p)[0]),
+        "objective_at_start": _short(nlp.value(nlp.x0)),
         "bytes": file.size,
         "sha256": file.sha256,
         "published": None if sha is None else sha == file.sha256,

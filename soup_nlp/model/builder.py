@@ -15,7 +15,7 @@ from soup_nlp.model.elements import Element, Norms
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.norms import NormForm, TruncationForm, solver_form
+from soup_nlp.model.norms import NormForm, solver_form
 from soup_nlp.model.superpixel import View
 
 THETA = ("eps", "eps_pixel", "theta", "ridge")
@@ -50,7 +50,7 @@ class Builder:
     """Collects groups, slack variables and constraint rows.
 
     Attributes:
-        form: Norm, truncation, Hessian and smoothing.
+        form: Norm, Hessian and smoothing.
         own: Variables that are no slack variables.
     """
 
@@ -60,10 +60,10 @@ class Builder:
     slacks: list[Block] = field(default_factory=list)
     rows: list[Block] = field(default_factory=list)
 
-    def new_variables(self, label: str, count: int, upper: float) -> Int:
-        """Indices of `count` fresh slack variables, at least 0 and at most `upper`."""
+    def new_slacks(self, label: str, count: int) -> Int:
+        """Indices of `count` fresh slack variables, at least 0."""
         first = self.own + sum(b.size for b in self.slacks)
-        self.slacks.append(Block(label, count, 0.0, upper))
+        self.slacks.append(Block(label, count, 0.0, np.inf))
         return first + np.arange(count)
 
     def new_rows(self, label: str, count: int, lower: float, upper: float = np.inf) -> Int:
@@ -87,10 +87,9 @@ class Builder:
             return
         fields = tuple(element.fields.items())
         term = name, element.norms, fields, element.arity, view, own
-        kernel, slacks, constraints = _kernel(*term, self.form.norm, self.form.truncation)
-        index = [element.index]
-        index += [self.new_variables(label, size, upper)[:, None] for label, upper in slacks]
-        rows = [self.new_rows(f"epigraph_{label}", size, 0.0) for label in constraints]
+        kernel, slacks = _kernel(*term, self.form.norm)
+        index = [element.index, *(self.new_slacks(f"s_{k}", size)[:, None] for k in slacks)]
+        rows = [self.new_rows(f"epigraph_{k}", size, 0.0) for k in slacks]
         data = np.column_stack([c.reshape(size, -1) for c in element.columns.values()])
         table = Table(
             np.concatenate(index, axis=1), data, np.array(rows, np.int64).reshape(-1, size).T
@@ -166,7 +165,7 @@ class Builder:
             lbg=lbg,
             ubg=ubg,
             theta=dict(zip(THETA, (f.eps, f.eps_pixel, f.theta, f.ridge))),
-            hessian=f.hessian,
+            hessian_kind=f.hessian,
             x_names=lambda: names() + _names(self.slacks),
             g_names=lambda: _names(self.rows),
             compiled=f.compiled,
@@ -183,67 +182,43 @@ def _kernel(
     view: Callable[..., View],
     own: int,
     norm: NormForm,
-    truncation: TruncationForm,
-) -> tuple[Kernel, list[tuple[str, float]], list[str]]:
-    """Kernel of a term's norms in solver form, made once.
-
-    Returns:
-        The kernel; names and upper bounds of its slack variables; names of its constraints.
-    """
+) -> tuple[Kernel, list[str]]:
+    """Kernel of a term's norms in solver form, made once, and the names of norms with a slack."""
     x = ca.SX.sym("x", own * arity)
     row = {k: ca.SX.sym(k, c) for k, c in fields}
     views = [view(x[own * a : own * (a + 1)], row, a) for a in range(arity)]
-    local, slacks = [x], []
-
-    def extra(label: str, upper: float) -> ca.SX:
-        local.append(ca.SX.sym(label))
-        slacks.append((label, upper))
-        return local[-1]
-
-    found = norms(views, row, _SYMBOLS[0], _SYMBOLS[1])
-    epigraph, lifted = norm == "epigraph", truncation == "lifted"
-    extras = [
-        (
-            extra(f"s_{n.name}", np.inf) if epigraph and n.kind == "norm" else None,
-            extra(f"z_{n.name}", 1.0) if lifted and n.sigma is not None else None,
-        )
-        for n in found
-    ]
-    everything = ca.vertcat(*local)
-    forms = [solver_form(n, everything, _SYMBOLS[2], *e) for n, e in zip(found, extras)]
-    cons = {n.name: f.constraint for n, f in zip(found, forms) if f.constraint is not None}
+    every = norms(views, row, _SYMBOLS[0], _SYMBOLS[1])
+    named = [n.name for n in every if norm == "epigraph" and n.kind == "norm"]
+    slacks = {k: ca.SX.sym(f"s_{k}") for k in named}
+    local = ca.vertcat(x, *slacks.values())
+    forms = [solver_form(n, local, _SYMBOLS[2], slacks.get(n.name)) for n in every]
     kernel = Kernel(
         name,
-        everything,
+        local,
         ca.vertcat(*row.values()),
         _SYMBOLS,
         objective=sum((f.objective for f in forms), ca.SX(0)),
-        constraints=ca.vertcat(*cons.values()) if cons else None,
+        constraints=ca.vertcat(*(f.constraint for f in forms if f.constraint is not None))
+        if slacks
+        else None,
         curvature=sum((f.curvature for f in forms), ca.SX(0)),
     )
-    return kernel, slacks, list(cons)
+    return kernel, named
 
 
 def _with_slacks(nlp: NLP) -> NLP:
-    """The NLP with slack variables at the norms' values and switches where they are best."""
+    """The NLP with slack variables at the norms' values."""
     x0 = nlp.x0.copy()
     for group in nlp.groups:
         kernel, table = group.kernel, group.table
-        size, names = len(table), [kernel.x[j].name() for j in range(kernel.nx)]
-        slacks = [j for j, s in enumerate(names) if s.startswith("s_")]
-        switches = [j for j, s in enumerate(names) if s.startswith("z_")]
-        symbols = [kernel.x, kernel.row, kernel.theta]
-        theta = np.repeat(nlp.p[: len(nlp.theta), None], size, axis=1)
+        slacks = [j for j in range(kernel.nx) if kernel.x[j].name().startswith("s_")]
         if slacks:
             # the constraint is s^2 - |v|^2 - eps^2, so at s = 0 its negative is s^2 at the best s
             local = x0[table.index].copy()
             local[:, slacks] = 0.0
-            con = ca.Function("c", symbols, [kernel.constraints]).map(size)
-            value = np.asarray(con(local.T, table.data.T, theta)).reshape(len(slacks), size)
+            symbols = [kernel.x, kernel.row, kernel.theta]
+            con = ca.Function("c", symbols, [kernel.constraints]).map(group.size)
+            theta = np.repeat(nlp.thetas()[:, None], group.size, axis=1)
+            value = np.asarray(con(local.T, table.data.T, theta)).reshape(len(slacks), -1)
             x0[table.index[:, slacks]] = np.sqrt(np.maximum(-value, 1e-12)).T
-        if switches:
-            # the objective is linear in a switch: its slope says which end is better
-            slope = ca.Function("s", symbols, [ca.gradient(kernel.objective, kernel.x)]).map(size)
-            value = np.asarray(slope(x0[table.index].T, table.data.T, theta))[switches]
-            x0[table.index[:, switches]] = np.where(value < 0, 0.99, 0.01).T
     return replace(nlp, x0=x0)

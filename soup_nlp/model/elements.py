@@ -11,7 +11,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.model import terms
-from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_data import PAPER_TERMS, EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.norms import Norm
@@ -79,19 +79,10 @@ def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]
         layout: Whose variables the views are made of.
 
     Returns:
-        "arap", "proj", "cont", "orient", and "prior" and "depth" where they have a weight.
+        The paper's terms, and those of `data.terms` that have a factor.
     """
-    kinds = {
-        "arap": _arap(data, w),
-        "proj": _proj(data, w),
-        "cont": _cont(data, w),
-        "orient": _orient(data, w),
-    }
-    if w.prior > 0:
-        kinds["prior"] = _prior(data, w)
-    if w.depth > 0 and data.depth_weight.any():
-        kinds["depth"] = _depth(data, w)
-    return {name: element.placed(layout) for name, element in kinds.items()}
+    used = [k for k in data.terms if k in PAPER_TERMS or getattr(w, k) > 0]
+    return {name: ELEMENTS[name](data, w).placed(layout) for name in used}
 
 
 def _full(count: int, value: float) -> Float:
@@ -199,3 +190,14 @@ def _orient(data: EnergyData, w: Weights) -> Element:
     }
 
     return Element(data.pairs, columns, Norms(terms.orientation, (truncated,)), 2)
+
+
+ELEMENTS: Mapping[str, Callable[[EnergyData, Weights], Element]] = {
+    "arap": _arap,
+    "proj": _proj,
+    "cont": _cont,
+    "orient": _orient,
+    "prior": _prior,
+    "depth": _depth,
+}
+"""Elements of every term of `energy_data.TERMS`, before they are placed in a layout."""

@@ -12,10 +12,13 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 
-TERMS = ("arap", "proj", "cont", "orient", "prior")
-"""Terms that every energy has."""
-GIVEN = "depth"
-"""The term of a given depth prior, which is absent without one."""
+PAPER_TERMS = ("arap", "proj", "cont", "orient")
+"""The paper's terms, in its order."""
+GIVEN_TERMS = {"depth": "depth_weight"}
+"""Terms of data that few pairs have, and the weights in `EnergyData` that are 0 without them."""
+TERMS = (*PAPER_TERMS, "prior", *GIVEN_TERMS)
+"""All terms of the energy. A term is a key of `Weights` (its factor), of `oracle.ENERGIES` (its
+value) and of `elements.ELEMENTS` (its kernel)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +94,12 @@ class EnergyData:
         )
 
     __repr__ = __str__
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Terms that the energy of this pair has."""
+        absent = {k for k, weight in GIVEN_TERMS.items() if not getattr(self, weight).any()}
+        return tuple(k for k in TERMS if k not in absent)
 
     def visibility_ray(self, depth_ratio: float) -> Float:
         """(N, V, 3) rays v with `-n . v >= c` for visibility: the anchor, then r_rim - r_a / ratio.

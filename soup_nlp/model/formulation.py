@@ -1,4 +1,4 @@
-"""How the energy is written for a solver: gauge, norm, truncation, Hessian, smoothing."""
+"""How the energy is written for a solver: gauge, norm, Hessian, smoothing."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import Field
 
 from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Gauge
-from soup_nlp.model.norms import NormForm, TruncationForm
+from soup_nlp.model.norms import NormForm
 from soup_nlp.schema.limits import MOST
 from soup_nlp.schema.section import NonNegative, Section, Share
 
@@ -17,13 +17,11 @@ class FormulationOptions(Section):
     """Formulation of the NLP for a solver."""
 
     gauge: Gauge = "unit-offset"
-    """unit-offset, unit-translation or free."""
+    """unit-offset or unit-translation."""
     norm: NormForm = "smooth"
     """smooth (sqrt(|v|^2 + eps^2) - eps) or epigraph (s - eps in the objective, with a slack
     variable s and |v|^2 + eps^2 <= s^2). Both have the same minimum. With eps = 0 the epigraph is
     the exact norm, but its constraint gradients vanish where the norm is 0."""
-    truncation: TruncationForm = "smooth"
-    """smooth or lifted (z in [0, 1], exact)."""
     hessian: Hessian = "exact"
     """exact, gauss-newton or gauss-newton+constraints."""
     theta: Share = 0.9

@@ -8,11 +8,10 @@ take a fifth of the time.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float
 from soup_nlp.model.compile import shared_library
 from soup_nlp.model.kernel import Table
+from soup_nlp.model.operations import OPERATIONS, instructions
 
 LANES = 8
 
@@ -39,10 +39,14 @@ static inline real root(real a) {{
   for (int i = 0; i < L; i++) b[i] = sqrt(a[i]);
   return b;
 }}
-static inline real logarithm(real a) {{
+static inline real each(double (*f)(double), real a) {{
   real b;
-  for (int i = 0; i < L; i++) b[i] = log(a[i]);
+  for (int i = 0; i < L; i++) b[i] = f(a[i]);
   return b;
+}}
+static inline real both(double (*f)(double, double), real a, real b) {{
+  for (int i = 0; i < L; i++) a[i] = f(a[i], b[i]);
+  return a;
 }}
 """
 
@@ -67,40 +71,16 @@ void {name}_sum(long blocks, const double *x, const int *index, const double *ta
 }}
 """
 
-_OPERATIONS: Mapping[int, str] = {
-    ca.OP_ASSIGN: "{0}",
-    ca.OP_ADD: "{0} + {1}",
-    ca.OP_SUB: "{0} - {1}",
-    ca.OP_MUL: "{0} * {1}",
-    ca.OP_DIV: "{0} / {1}",
-    ca.OP_NEG: "-{0}",
-    ca.OP_SQ: "{0} * {0}",
-    ca.OP_TWICE: "{0} + {0}",
-    ca.OP_INV: "one / {0}",
-    ca.OP_SQRT: "root({0})",
-    ca.OP_LOG: "logarithm({0})",
-    ca.OP_FMAX: "choose({0} > {1}, {0}, {1})",
-    ca.OP_FMIN: "choose({0} < {1}, {0}, {1})",
-    ca.OP_FABS: "choose({0} < zero, -{0}, {0})",
-    ca.OP_LT: "choose({0} < {1}, one, zero)",
-    ca.OP_LE: "choose({0} <= {1}, one, zero)",
-    ca.OP_NOT: "choose({0} == zero, one, zero)",
-    ca.OP_IF_ELSE_ZERO: "choose({0} != zero, {1}, zero)",
-}
 
-
-class NoLanesError(Exception):
-    """A function cannot be vectorised; `vectors` or `mapped` replaces it."""
+class NoCompilerError(Exception):
+    """There is no compiler that works; `vectors` replaces it."""
 
 
 def c_source(function: ca.Function) -> str:
     """C of an SX function with one output, on vectors, and the loop over its table.
 
     Args:
-        function: (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,).
-
-    Raises:
-        NoLanesError: It has an operation that is not among the ones the energy needs.
+        function: (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,), of `OPERATIONS` only.
     """
     f, name = function, function.name()
     lines = []
@@ -111,11 +91,9 @@ def c_source(function: ca.Function) -> str:
             lines.append(f"out[{to[1]}] = a{source[0]};")
         elif op == ca.OP_CONST:
             lines.append(f"a{to[0]} = zero + ({constant!r});")
-        elif op in _OPERATIONS:
-            term = _OPERATIONS[op].format(*(f"a{i}" for i in source))
-            lines.append(f"a{to[0]} = {term};")
         else:
-            raise NoLanesError(f"{name}: operation {op}")
+            term = OPERATIONS[op].c.format(*(f"a{i}" for i in source))
+            lines.append(f"a{to[0]} = {term};")
     used = f.sz_w()
     size = [f.nnz_in(i) if i < f.n_in() else 0 for i in range(5)]
     head = (
@@ -125,40 +103,6 @@ def c_source(function: ca.Function) -> str:
     declared = f"  real {', '.join(f'a{i}' for i in range(used))};" if used else ""
     loop = _LOOP.format(name=name, nx=size[0], np=size[1], nt=size[2], nc=size[4], no=f.nnz_out(0))
     return "\n".join([head, declared, *lines, "}", loop])
-
-
-class Instruction(NamedTuple):
-    """One of an SX function: operation, where its result goes, operands; or a constant."""
-
-    operation: int
-    output: list[int]
-    inputs: list[int]
-    constant: float
-
-
-def instructions(function: ca.Function) -> tuple[Instruction, ...]:
-    """What an SX function computes, step by step."""
-    return (_of_small if function.n_instructions() < LARGE else _of_large)(function)
-
-
-LARGE = 20_000
-"""Instructions from which a function's list takes megabytes: only those of one solve are kept."""
-
-
-def _instructions(f: ca.Function) -> tuple[Instruction, ...]:
-    return tuple(
-        Instruction(
-            f.instruction_id(k),
-            f.instruction_output(k),
-            f.instruction_input(k),
-            f.instruction_constant(k) if f.instruction_id(k) == ca.OP_CONST else 0.0,
-        )
-        for k in range(f.n_instructions())
-    )
-
-
-_of_small = lru_cache(maxsize=200)(_instructions)
-_of_large = lru_cache(maxsize=16)(_instructions)
 
 
 @lru_cache(maxsize=100)
@@ -171,18 +115,18 @@ def compile_lanes(functions: Sequence[ca.Function]) -> ctypes.CDLL:
     """Machine code of functions with distinct names, cached by content.
 
     Raises:
-        NoLanesError: There is no compiler, it fails, or an operation has no C code here.
+        NoCompilerError: There is no compiler, or it fails.
     """
     # what the source depends on, in a tenth of the time that writing it takes
-    translation = Path(__file__).read_text(encoding="utf-8")
+    translation = "".join(op.c for op in OPERATIONS.values()) + _HEAD + _LOOP
     key = "\0".join([translation, *map(_text, functions)])
     path = shared_library(key, lambda: "\n".join([_HEAD, *(c_source(f) for f in functions)]))
     if path is None:
-        raise NoLanesError("no working C compiler")
+        raise NoCompilerError("no working C compiler")
     try:
         return ctypes.CDLL(str(path))
     except OSError as error:
-        raise NoLanesError(str(error)) from error
+        raise NoCompilerError(str(error)) from error
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from soup_nlp.geometry.plane import about_anchor, at_anchor, inverse_depth, norm
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 
-Gauge = Literal["unit-offset", "unit-translation", "free"]
+Gauge = Literal["unit-offset", "unit-translation"]
 GAUGES: tuple[Gauge, ...] = get_args(Gauge)
 Chart = Literal["depth", "inverse-depth"]
 
@@ -73,10 +73,9 @@ class MatrixLayout:
         """Solver vector (size,) of a soup, brought to this gauge and length unit."""
         s = soup.normalised(self.share)
         D, T, R = s.distance, s.translation, s.R.transpose(0, 2, 1).reshape(-1, 9)
-        if self.gauge != "unit-translation":
+        if self.gauge == "unit-offset":
             lam = self.count * s.lam
-            offset = [] if self.gauge == "unit-offset" else [self.offset]
-            return np.column_stack([lam, s.n, *offset, R, T / lam[:, None]]).ravel()
+            return np.column_stack([lam, s.n, R, T / lam[:, None]]).ravel()
         length = np.linalg.norm(T, axis=1)
         # a superpixel at rest has no direction in this gauge: give it a tiny one
         floor = 1e-3 * max(float(np.median(length)), 1e-6)

@@ -39,7 +39,7 @@ def build_matrix_nlp(
         soup: Start; SO(3) and unit normals should hold.
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
-        form: Gauge, norm, truncation, Hessian, smoothing.
+        form: Gauge, norm, Hessian, smoothing.
 
     Returns:
         The NLP and the layout that turns its vectors into soups.
@@ -56,9 +56,8 @@ def build_matrix_nlp(
     b.add_ridge(_metric(layout, x0, data))
     lbx, ubx = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
     lbx[np.arange(n) * own] = MIN_SCALE
-    if form.gauge != "unit-offset":
-        lbx[np.arange(n) * own + 4] = MIN_SCALE
     if form.gauge == "unit-translation":
+        lbx[np.arange(n) * own + 4] = MIN_SCALE
         lbx[layout.tau] = 1e-8
     return b.finish("soup", x0, lbx, ubx, layout.names), layout
 
@@ -84,7 +83,7 @@ def _add_constraints(b: Builder, layout: MatrixLayout, data: EnergyData, form: F
         data=data.visibility_ray(form.depth_ratio).reshape(n, -1),
     )
     b.add_constraint("simplex", x, v.lam / n, every, lower=1.0, upper=1.0, total=True)
-    if form.gauge != "unit-offset":
+    if form.gauge == "unit-translation":
         # the length unit: sum_i c_i D_i = 1 (in gauge unit-offset the simplex says it)
         c = ca.SX.sym("share")
         b.add_constraint(
@@ -98,7 +97,6 @@ def _add_constraints(b: Builder, layout: MatrixLayout, data: EnergyData, form: F
             data=data.share[:, None],
             total=True,
         )
-    if form.gauge == "unit-translation":
         tau = ca.SX.sym("tau")
         index = np.column_stack([every, np.full(n, layout.tau)])
         body = ca.sumsqr(v.t) - tau**2

@@ -1,4 +1,4 @@
-"""The NLP record: kernels, tables, bounds; its functions are assembled when first asked for."""
+"""The NLP record: kernels, tables, bounds; its functions are made when first asked for."""
 
 from __future__ import annotations
 
@@ -12,16 +12,10 @@ from scipy import sparse
 
 from soup_nlp.arrays import Float
 from soup_nlp.errors import ModelError
-from soup_nlp.model.assemble import (
-    Assembled,
-    Pattern,
-    assemble_functions,
-    assemble_hessian,
-    jacobian_entries,
-)
-from soup_nlp.model.blocks import hessian_pattern
 from soup_nlp.model.kernel import Group, Hessian
-from soup_nlp.model.sums import Sums
+from soup_nlp.model.pattern import Pattern, hessian_pattern, jacobian_entries
+from soup_nlp.model.sums import Sum, summed
+from soup_nlp.model.symbolic import Symbolic
 
 
 @dataclass(frozen=True)
@@ -34,7 +28,7 @@ class NLP:
         x0, lbx, ubx: (nx,) start and bounds.
         lbg, ubg: (ng,) constraint bounds.
         theta: Values of the parameters that all kernels share, by name in the kernels' order.
-        hessian: Kind of the Hessian (kernel.HESSIANS).
+        hessian_kind: Kind of the Hessian (kernel.HESSIANS).
         x_names, g_names: Functions that make the readable names, on demand.
         compiled: Use the C compiler where there is one.
     """
@@ -47,26 +41,83 @@ class NLP:
     lbg: Float
     ubg: Float
     theta: Mapping[str, float]
-    hessian: Hessian
+    hessian_kind: Hessian
     x_names: Callable[[], list[str]]
     g_names: Callable[[], list[str]]
     compiled: bool = True
 
-    @cached_property
-    def p(self) -> Float:
-        """(np,) parameter values: theta, then the data of every group, element by element."""
-        data = [g.table.data.ravel() for g in self.groups]
-        return np.concatenate([np.array(list(self.theta.values()), float), *data])
+    # --- numbers: what Ipopt and all reports are computed with ---
+
+    def value(self, x: Float, theta: Float | None = None) -> float:
+        """f at x (nx,); theta (nt,) of another smoothing."""
+        return float(self._first["f"](x, self._theta(theta))[0])
+
+    def gradient(self, x: Float, theta: Float | None = None) -> Float:
+        """Gradient of f (nx,)."""
+        return self._first["grad"](x, self._theta(theta))
+
+    def constraints(self, x: Float, theta: Float | None = None) -> Float:
+        """g (ng,)."""
+        return self._first["con"](x, self._theta(theta))
+
+    def jacobian_nonzeros(self, x: Float, theta: Float | None = None) -> Float:
+        """Nonzeros of g's Jacobian, in the order of `jacobian_pattern`."""
+        return self._first["jac"](x, self._theta(theta))
+
+    def jacobian(self, x: Float) -> sparse.csr_matrix:
+        """(ng, nx) Jacobian of g."""
+        return self.jacobian_pattern.filled(self.jacobian_nonzeros(x)).tocsr()
+
+    def hessian_nonzeros(
+        self, x: Float, lam_g: Float, lam_f: float = 1.0, theta: Float | None = None
+    ) -> Float:
+        """Nonzeros of the upper triangle of `lam_f f + lam_g . g`, in the order of
+        `hessian_pattern`."""
+        return self._second["hess"](x, self._theta(theta), lam_f, lam_g)
+
+    def hessian(
+        self, x: Float, lam_g: Float, lam_f: float = 1.0, theta: Float | None = None
+    ) -> sparse.csc_matrix:
+        """(nx, nx) Hessian of `lam_f f + lam_g . g`, both triangles."""
+        upper = self.hessian_pattern.filled(self.hessian_nonzeros(x, lam_g, lam_f, theta))
+        return sparse.csc_matrix(upper + sparse.triu(upper, 1).T)
+
+    def _theta(self, theta: Float | None) -> Float:
+        return self.thetas() if theta is None else theta
 
     @cached_property
-    def functions(self) -> Assembled:
-        """What a solver calls but the Hessian; assembled (a second) by the first access."""
-        return assemble_functions(self.groups, self.nx, self.ng, len(self.theta), self.compiled)
+    def _first(self) -> Mapping[str, Sum]:
+        """f, its gradient, g, its Jacobian."""
+        sizes = {"f": 1, "grad": self.nx, "con": self.ng, "jac": self.nnzj}
+        jacobian = iter(self.jacobian_pattern.places)
+        places = []
+        for group in self.groups:
+            size, own = group.size, group.table
+            place = {"f": np.zeros((size, 1), int), "grad": own.index, "con": own.rows}
+            if group.kernel.nc:
+                place["jac"] = next(jacobian).reshape(size, -1)
+            places.append(place)
+        functions = [g.kernel.first_order() for g in self.groups]
+        return summed(self.groups, functions, places, self._sums(sizes), self.compiled)
 
     @cached_property
-    def sums(self) -> Sums:
-        """f, g and their first derivatives as numpy arrays, at the NLP's own theta."""
-        return Sums(self)
+    def _second(self) -> Mapping[str, Sum]:
+        """The Hessian; by itself, since a start at a KKT point needs none."""
+        pattern = self.hessian_pattern
+        functions = [g.kernel.second_order(self.hessian_kind) for g in self.groups]
+        places = [{"hess": p.reshape(g.size, -1)} for g, p in zip(self.groups, pattern.places)]
+        sums = self._sums({"hess": len(pattern.rows)})
+        every = [{"hess": f} if f else {} for f in functions]
+        return summed(self.groups, every, places, sums, self.compiled)
+
+    def _sums(self, sizes: Mapping[str, int]) -> dict[str, Sum]:
+        given = self.nx, len(self.theta), self.ng
+        return {key: Sum(given, size) for key, size in sizes.items()}
+
+    def evaluated(self) -> NLP:
+        """The same, with all its functions made now, so that later timings exclude it."""
+        _ = self._first, self._second
+        return self
 
     @cached_property
     def jacobian_pattern(self) -> Pattern:
@@ -77,40 +128,47 @@ class NLP:
     @cached_property
     def hessian_pattern(self) -> Pattern:
         """Of the Hessian's upper triangle; places for every group."""
-        return hessian_pattern(self.groups, self.nx, self.hessian)
+        return hessian_pattern(self.groups, self.nx, self.hessian_kind)
 
     @cached_property
-    def hessian_nonzeros(self) -> Pattern:
+    def hessian_sparsity(self) -> Pattern:
         """`hessian_pattern` without places, a third of the work."""
-        return hessian_pattern(self.groups, self.nx, self.hessian, placed=False)
+        return hessian_pattern(self.groups, self.nx, self.hessian_kind, placed=False)
+
+    # --- CasADi's graph: what the exports write and `nlpsol` may differentiate ---
 
     @cached_property
-    def hess_lag(self) -> ca.Function:
-        """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian; by itself, since
-        assembling it takes seconds at real sizes."""
-        sizes = self.ng, len(self.theta)
-        pattern = self.hessian_pattern
-        return assemble_hessian(self.groups, pattern, *sizes, self.hessian, self.compiled)
+    def p(self) -> Float:
+        """(np,) parameters of the graph: theta, then the data of every group, by elements."""
+        return np.concatenate([self.thetas(), *(g.table.data.ravel() for g in self.groups)])
 
-    def assembled(self) -> NLP:
-        """The same, with all its functions assembled now, so that later timings exclude it."""
-        _ = self.functions, self.hess_lag
-        return self
+    def with_theta(self, **values: float) -> Float:
+        """p with other theta entries."""
+        return np.concatenate([self.thetas(**values), self.p[len(self.theta) :]])
+
+    @cached_property
+    def _symbolic(self) -> Symbolic:
+        return Symbolic(self.groups, self.nx, self.ng, len(self.theta))
 
     @property
     def oracle(self) -> ca.Function:
         """(x, p) -> f, g."""
-        return self.functions.oracle
+        return self._symbolic.oracle
 
     @property
     def grad_f(self) -> ca.Function:
         """(x, p) -> f, gradient."""
-        return self.functions.grad_f
+        return self._symbolic.grad_f
 
-    @property
+    @cached_property
     def jac_g(self) -> ca.Function:
         """(x, p) -> g, Jacobian (ng x nx sparse)."""
-        return self.functions.jac_g
+        return self._symbolic.jac_g(self.jacobian_pattern)
+
+    @cached_property
+    def hess_lag(self) -> ca.Function:
+        """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian."""
+        return self._symbolic.hess_lag(self.hessian_pattern, self.hessian_kind)
 
     @property
     def nx(self) -> int:
@@ -130,13 +188,7 @@ class NLP:
     @property
     def nnzh(self) -> int:
         """Nonzeros of the Hessian's upper triangle."""
-        return len(self.hessian_nonzeros.rows)
-
-    def with_theta(self, **values: float) -> Float:
-        """p with other theta entries."""
-        p = self.p.copy()
-        p[: len(self.theta)] = self.thetas(**values)
-        return p
+        return len(self.hessian_sparsity.rows)
 
     def thetas(self, **values: float) -> Float:
         """(nt,) values of theta, with other ones for some of its entries."""
@@ -166,7 +218,7 @@ class NLP:
         ):
             share = nnz / cells if cells else 0.0
             lines.append(f"  {label:<11} {nnz:>9} nonzeros, {share:.3%} of {cells}")
-        lines.append(f"  Hessian kind: {self.hessian}")
+        lines.append(f"  Hessian kind: {self.hessian_kind}")
         lines += [f"  {g.kernel.name:<12} {g.size:>7} x {g.kernel}" for g in self.groups]
         return "\n".join(lines)
 
@@ -187,8 +239,3 @@ def _bound_bars(label: str, lower: Float, upper: Float) -> list[str]:
     counts = {kind: int(mask.sum()) for kind, mask in kinds.items() if mask.any()}
     bars = {kind: "#" * max(1, round(20 * c / len(lower))) for kind, c in counts.items()}
     return [f"  {label:<11} {kind:<6} {bars[kind]:<20} {c}" for kind, c in counts.items()]
-
-
-def to_scipy(matrix: ca.DM) -> sparse.csc_matrix:
-    """scipy's CSC matrix of a CasADi one."""
-    return matrix.sparse()

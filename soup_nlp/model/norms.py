@@ -1,7 +1,7 @@
 """Un-squared norms and truncations in the forms that a solver can take.
 
 A term of the energy is a sum of `weight * ((1 - leak) min(|vector|, sigma) + leak |vector|)`. The
-exact sum is the energy that is reported; a solver gets a smooth, an epigraph or a lifted form.
+exact sum is the energy that is reported; a solver gets a smooth or an epigraph form.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import Literal
 import casadi as ca
 
 NormForm = Literal["smooth", "epigraph"]
-TruncationForm = Literal["smooth", "lifted"]
 Kind = Literal["norm", "half_square"]
 
 
@@ -70,18 +69,15 @@ def _corner(eps: ca.SX, sigma: ca.SX) -> ca.SX:
     return ca.fmax(eps, 0.3 * sigma)
 
 
-def solver_form(
-    norm: Norm, x: ca.SX, theta: ca.SX, slack: ca.SX | None, switch: ca.SX | None
-) -> Form:
+def solver_form(norm: Norm, x: ca.SX, theta: ca.SX, slack: ca.SX | None) -> Form:
     """The norm as a solver sees it.
 
     Args:
         norm: The robust norm.
-        x: All local variables of the kernel (slack and switch among them).
+        x: All local variables of the kernel, the slack among them.
         theta: Share of the curvature along the residual that is removed (0: reweighted least
             squares, 1: Newton's; see docs/solving.md).
         slack: Variable s >= 0 of the epigraph form, None for the smooth form.
-        switch: Variable z in [0, 1] of the lifted truncation, None for the smooth one.
     """
     v = norm.vector
     J = ca.jacobian(v, x)
@@ -99,17 +95,13 @@ def solver_form(
         root = ca.sqrt(square + norm.eps**2)
         y, dy = root - norm.eps, 1 / root
         along = ca.mtimes(J.T, v / root)
-        if norm.sigma is not None and switch is None:
+        if norm.sigma is not None:
             # near its corner a truncated norm is concave along the residual: there only the full
             # reweighted curvature still bounds it from above
             theta = theta * smooth_min(y, norm.sigma, _corner(norm.eps, norm.sigma))[1] ** 2
         outer = ca.mtimes(J.T, J) - theta * ca.mtimes(along, along.T)
-    if norm.sigma is None:
-        value, slope = y, ca.SX(1.0)
-    elif switch is not None:
-        value, slope = switch * y + (1 - switch) * norm.sigma, switch
-    else:
-        value, slope = smooth_min(y, norm.sigma, _corner(norm.eps, norm.sigma))
+    value, slope = y, ca.SX(1.0)
     if norm.sigma is not None:
+        value, slope = smooth_min(y, norm.sigma, _corner(norm.eps, norm.sigma))
         value, slope = (1 - norm.leak) * value + norm.leak * y, norm.leak + (1 - norm.leak) * slope
     return Form(norm.weight * value, norm.weight * slope * dy * outer, constraint)

@@ -7,11 +7,13 @@ of the free global scale.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import numpy as np
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy_data import GIVEN, EnergyData
+from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 
 
@@ -24,18 +26,12 @@ def energy(soup: Soup, data: EnergyData, weights: Weights) -> dict[str, float]:
         weights: alpha1 to alpha4 and the truncations.
 
     Returns:
-        {"total", "arap", "proj", "cont", "orient", "prior"}, and "depth" with a depth prior; the
-        terms include their factors.
+        "total" and every one of `data.terms`, which include their factors.
     """
     terms = {
-        "arap": weights.arap * float(arap(soup, data, weights).sum()),
-        "proj": weights.proj * float(reprojection(soup, data, weights).sum()),
-        "cont": weights.cont * float(continuity(soup, data, weights).sum()),
-        "orient": weights.orient * float(orientation(soup, data, weights).sum()),
-        "prior": weights.prior * float(prior(soup, data).sum()),
+        name: getattr(weights, name) * float(ENERGIES[name](soup, data, weights).sum())
+        for name in data.terms
     }
-    if data.depth_weight.any():
-        terms[GIVEN] = weights.depth * float(depth(soup, data).sum())
     return {"total": sum(terms.values()), **terms}
 
 
@@ -114,7 +110,7 @@ def orientation(soup: Soup, data: EnergyData, weights: Weights) -> Float:
     return data.orient_weight * np.minimum(turn, weights.sigma_orient)
 
 
-def prior(soup: Soup, data: EnergyData) -> Float:
+def prior(soup: Soup, data: EnergyData, weights: Weights | None = None) -> Float:
     """(E,) E_prior of every edge: slope of the inverse depth between its anchors, relative to it.
 
     `|(1 / Z_i - 1 / Z_k) / m - relief| / |r_i - r_k|` with anchor rays r and m the mean of both
@@ -131,7 +127,18 @@ def relief(soup: Soup, data: EnergyData) -> Float:
     return (inverse[:, 0] - inverse[:, 1]) / np.mean(inverse**4, axis=1) ** 0.25
 
 
-def depth(soup: Soup, data: EnergyData) -> Float:
+def depth(soup: Soup, data: EnergyData, weights: Weights | None = None) -> Float:
     """(E,) E_depth of every edge: `|log(Z_i / Z_k) - change|` of the depths Z of its anchors."""
     Zi, Zk = soup.depth_at(data.anchor_ray)[data.edges.T]
     return data.depth_weight * np.abs(np.log(Zi / Zk) - data.depth_change)
+
+
+ENERGIES: Mapping[str, Callable[[Soup, EnergyData, Weights], Float]] = {
+    "arap": arap,
+    "proj": reprojection,
+    "cont": continuity,
+    "orient": orientation,
+    "prior": prior,
+    "depth": depth,
+}
+"""Values of every term of `energy_data.TERMS`, without their factors."""

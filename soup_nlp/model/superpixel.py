@@ -1,7 +1,7 @@
 """A superpixel in symbols: the same expressions for every choice of variables.
 
 The energy terms are written once against `View`; a parametrisation (matrix rotations in one of
-three gauges, or tangent coordinates about a base) says how its variables make one.
+two gauges, or tangent coordinates about a base) says how its variables make one.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def matrix_view(x: ca.SX, gauge: str, offset: ca.SX) -> View:
     Args:
         x: (16x1) `lam n R t` for gauge "unit-offset", else (17x1) `lam n d R t`; R by
             columns; lam, d and t scaled by N, 1/N and 1/N so that numbers are near 1.
-        gauge: "unit-offset", "unit-translation" or "free".
+        gauge: "unit-offset" or "unit-translation".
         offset: d of gauge "unit-offset", a constant of the superpixel.
     """
     lam, n = x[0], x[1:4]

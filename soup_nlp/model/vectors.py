@@ -7,7 +7,7 @@ by element, a kernel takes four times as long.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -17,40 +17,10 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
 from soup_nlp.model.kernel import Table
-from soup_nlp.model.lanes import NoLanesError, instructions
+from soup_nlp.model.operations import OPERATIONS, instructions
 
 BLOCK = 2048
 """Elements of a block: more cost fewer calls, fewer fit into the cache."""
-
-
-def _if_else_zero(a: Float, b: Float, out: Float) -> None:
-    # not a product: what is left out may be infinite
-    out[...] = np.where(a != 0, b, 0.0)
-
-
-_ONE = np.array(1.0)
-_OPERATIONS: Mapping[int, Callable[..., Any]] = {
-    ca.OP_ASSIGN: np.positive,
-    ca.OP_ADD: np.add,
-    ca.OP_SUB: np.subtract,
-    ca.OP_MUL: np.multiply,
-    ca.OP_DIV: np.divide,
-    ca.OP_NEG: np.negative,
-    ca.OP_SQ: np.square,
-    ca.OP_TWICE: lambda a, out: np.add(a, a, out),
-    ca.OP_INV: lambda a, out: np.divide(_ONE, a, out),
-    ca.OP_SQRT: np.sqrt,
-    ca.OP_LOG: np.log,
-    # an output as third argument is deprecated in these two
-    ca.OP_FMAX: lambda a, b, out: np.maximum(a, b, out=out),
-    ca.OP_FMIN: lambda a, b, out: np.minimum(a, b, out=out),
-    ca.OP_FABS: np.abs,
-    ca.OP_LT: np.less,
-    ca.OP_LE: np.less_equal,
-    ca.OP_NOT: lambda a, out: np.equal(a, 0.0, out),
-    ca.OP_IF_ELSE_ZERO: _if_else_zero,
-}
-_OTHERS = frozenset((ca.OP_INPUT, ca.OP_CONST, ca.OP_OUTPUT))
 
 
 class Vectors:
@@ -63,18 +33,12 @@ class Vectors:
             function: (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,).
             table: The kernel's table, E elements.
             place: (E, k) where each entry is added.
-
-        Raises:
-            NoLanesError: It has an operation that is not among the ones the energy needs.
         """
         size = max(1, min(BLOCK, len(table)))
         count = [function.nnz_in(i) if i < function.n_in() else 0 for i in range(5)]
         self._x, self._data = np.empty((count[0], size)), np.empty((count[1], size))
         self._theta, self._lam_f = np.empty(count[2]), np.empty(1)
         self._lam_c, self._out = np.empty((count[4], size)), np.empty((function.nnz_out(0), size))
-        unknown = {i.operation for i in instructions(function)} - _OPERATIONS.keys() - _OTHERS
-        if unknown:
-            raise NoLanesError(f"{function.name()}: operation {min(unknown)}")
         self._function = function
         starts = range(0, len(table), size)
         # the last block is filled with its last element, whose entries are then left out
@@ -113,9 +77,9 @@ class Vectors:
             elif op == ca.OP_OUTPUT:
                 calls.append((np.copyto, (out[to[1]], held[source[0]])))
             else:
-                given = [held[i] for i in source[: 1 if op in _UNARY else 2]]
+                given = [held[i] for i in source[: OPERATIONS[op].operands]]
                 held[to[0]] = work[to[0]]
-                calls.append((_OPERATIONS[op], (*given, work[to[0]])))
+                calls.append((OPERATIONS[op].numpy, (*given, work[to[0]])))
         return calls
 
     def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
@@ -132,8 +96,3 @@ class Vectors:
                     call(*given)
                 entries = self._out if k < last else self._out[:, : self._full]
                 out += np.bincount(self._place[k], entries.ravel(), len(out))
-
-
-_UNARY = frozenset(
-    (ca.OP_ASSIGN, ca.OP_NEG, ca.OP_SQ, ca.OP_TWICE, ca.OP_INV, ca.OP_SQRT, ca.OP_FABS, ca.OP_NOT)
-)

@@ -1,32 +1,23 @@
-"""An NLP's functions for Ipopt: sums of machine code over its tables, behind CasADi's interface.
+"""What `nlpsol` calls: an NLP's functions and the callback of its iterations, as CasADi callbacks.
 
-CasADi's own functions of an NLP (`assemble`) take the data of all tables as a parameter, which they
-copy at every call, and take seconds to build at real sizes. Only the parameters theta are passed
-here, the data stay in the tables.
+CasADi's own graph of an NLP (`model.symbolic`) takes the data of all tables as a parameter,
+which it copies at every call, and takes seconds to build at real sizes. Only theta is one here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from soup_nlp.arrays import Float
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.sums import Sums
 
 
-@dataclass(frozen=True)
-class Output:
-    """One output of a `Buffered` function.
-
-    Attributes:
-        sparsity: Its nonzeros.
-        evaluate: Their values from the function's inputs.
-    """
+class Output(NamedTuple):
+    """An output of a `Buffered` function: its nonzeros, and their values from its inputs."""
 
     sparsity: ca.Sparsity
     evaluate: Callable[..., Float | float]
@@ -95,9 +86,7 @@ def _array(buffer: memoryview | None) -> Float:
 
 
 class Functions:
-    """What Ipopt calls; theta is their only parameter p.
-
-    The first call of the Hessian compiles it, because a start at a KKT point needs none.
+    """The functions of an NLP; theta is their only parameter p. Keep this while they are in use.
 
     Attributes:
         oracle: (x, p) -> f, g.
@@ -107,19 +96,16 @@ class Functions:
     """
 
     def __init__(self, nlp: NLP) -> None:
-        """Find the patterns; the Hessian is not compiled."""
-        self._nlp = nlp
-        # a copy, since theta is set here and the NLP's own sums keep theirs
-        self._first = copy(nlp.sums)
-        self._second: Sums | None = None
+        """Find the patterns; kernels are compiled by the first call."""
         at = {"x": nlp.nx, "p": len(nlp.theta)}
-        f = Output(ca.Sparsity.dense(1, 1), lambda x, p: self._at(p).value(x))
-        g = Output(ca.Sparsity.dense(nlp.ng, 1), lambda x, p: self._at(p).constraints(x)[0])
-        gradient = Output(ca.Sparsity.dense(nlp.nx, 1), lambda x, p: self._at(p).gradient(x))
-        jacobian = Output(
-            nlp.jacobian_pattern.sparsity(), lambda x, p: self._at(p).constraints(x)[1]
+        f = Output(ca.Sparsity.dense(1, 1), nlp.value)
+        g = Output(ca.Sparsity.dense(nlp.ng, 1), nlp.constraints)
+        gradient = Output(ca.Sparsity.dense(nlp.nx, 1), nlp.gradient)
+        jacobian = Output(nlp.jacobian_pattern.sparsity(), nlp.jacobian_nonzeros)
+        hessian = Output(
+            nlp.hessian_sparsity.sparsity(),
+            lambda x, p, lam_f, lam_g: nlp.hessian_nonzeros(x, lam_g, float(lam_f[0]), p),
         )
-        hessian = Output(nlp.hessian_nonzeros.sparsity(), self._hessian)
         self.oracle = Buffered("nlp", at, {"f": f, "g": g})
         self.grad_f = Buffered("nlp_grad_f", at, {"f": f, "grad_f_x": gradient})
         self.jac_g = Buffered("nlp_jac_g", at, {"g": g, "jac_g_x": jacobian})
@@ -127,13 +113,36 @@ class Functions:
             "nlp_hess_l", {**at, "lam_f": 1, "lam_g": nlp.ng}, {"triu_hess_gamma_x_x": hessian}
         )
 
-    def _at(self, theta: Float) -> Sums:
-        self._first.theta = theta.copy()
-        return self._first
 
-    def _hessian(self, x: Float, p: Float, lam_f: Float, lam_g: Float) -> Float:
-        nlp = self._nlp
-        if self._second is None:
-            self._second = Sums(nlp, first_order=False, second_order=True)
-        self._second.theta = p.copy()
-        return self._second.hessian(x, lam_g, float(lam_f[0]))
+class IterationCallback(ca.Callback):
+    """Called at every iteration: `eval` gets nlpsol's outputs and returns 1 to stop.
+
+    A subclass sets what its `eval` needs and then calls `start`.
+    """
+
+    def start(self, name: str, nx: int, ng: int, parameters: int = 0) -> None:
+        """Make the CasADi function of it."""
+        sizes = {"f": 1, "x": nx, "lam_x": nx, "g": ng, "lam_g": ng, "lam_p": parameters}
+        self._sizes = [sizes[ca.nlpsol_out(i)] for i in range(ca.nlpsol_n_out())]
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        """Outputs of nlpsol."""
+        return len(self._sizes)
+
+    def get_n_out(self) -> int:
+        """Whether to stop."""
+        return 1
+
+    def get_name_in(self, i: int) -> str:
+        """Name of nlpsol's output i."""
+        return str(ca.nlpsol_out(i))
+
+    def get_name_out(self, i: int) -> str:
+        """The name that nlpsol asks for."""
+        return "ret"
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Dense; empty outputs are 0 x 1."""
+        size = self._sizes[i]
+        return ca.Sparsity.dense(size) if size else ca.Sparsity(0, 1)

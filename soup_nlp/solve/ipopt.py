@@ -14,8 +14,7 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
-from soup_nlp.solve.callback import IterationCallback
-from soup_nlp.solve.functions import Functions
+from soup_nlp.solve.functions import Functions, IterationCallback
 from soup_nlp.solve.interrupt import raised_at_the_end
 from soup_nlp.storage.progress import Progress, Watch
 

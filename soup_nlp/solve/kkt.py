@@ -65,8 +65,8 @@ def optimality(nlp: NLP, x: Float, lam_x: Float, lam_g: Float) -> dict[str, floa
         lam_x: (nx,) multipliers of the bounds (positive at upper bounds).
         lam_g: (ng,) multipliers of the constraints (positive at upper bounds).
     """
-    g, jacobian = nlp.sums.constraints(x)
-    dual = nlp.sums.gradient(x) + nlp.jacobian_pattern.filled(jacobian).T @ lam_g + lam_x
+    g = nlp.constraints(x)
+    dual = nlp.gradient(x) + nlp.jacobian(x).T @ lam_g + lam_x
     products = [0.0]
     for value, lower, upper, lam in ((x, nlp.lbx, nlp.ubx, lam_x), (g, nlp.lbg, nlp.ubg, lam_g)):
         open_ = lower < upper
@@ -83,7 +83,7 @@ def residuals(
     nlp: NLP, soup: Soup, stage: Stage, data: EnergyData, min_facing: float
 ) -> dict[str, float]:
     """Constraint residuals of the delivered soup; violation and optimality of Ipopt's answer."""
-    g, _ = nlp.sums.constraints(stage.x)
+    g = nlp.constraints(stage.x)
     outside = np.maximum(nlp.lbg - g, g - nlp.ubg).max(initial=0.0)
     return {
         **constraint_residuals(soup, data.rim_ray, min_facing),

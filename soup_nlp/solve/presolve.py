@@ -125,7 +125,7 @@ class Presolve:
         first, o = self.soup, self.o
         program = self._program(start, self.weights.replace(sigma_arap=np.inf))
         self._majorant(program, list(UNTRUNCATED)[:1], "untruncated ", 10 * o.stagnation)
-        exact = replace(program, nlp=replace(program.nlp, hessian="exact"))
+        exact = replace(program, nlp=replace(program.nlp, hessian_kind="exact"))
         solver = Ipopt(exact.nlp, {**KEEP, **o.ipopt})
         for eps, share in UNTRUNCATED.items():
             if self._stopped():
@@ -195,7 +195,7 @@ class Presolve:
             )
             if self._stopped():
                 return
-        solver = Ipopt(replace(program.nlp, hessian="exact"), {**KEEP, **LAST, **o.ipopt})
+        solver = Ipopt(replace(program.nlp, hessian_kind="exact"), {**KEEP, **LAST, **o.ipopt})
         limit = o.exact_iterations
         stage = self._stage(program, solver, eps=o.eps, max_iter=limit, stage=EXACT)
         self.rim = _rim(program.nlp, program.layout, stage)

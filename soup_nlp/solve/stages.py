@@ -162,8 +162,7 @@ class _Solve:
         nlp, layout = self.constrained(soup)
         self.watch.say(str(nlp))
         first: dict[str, Any] = {"x0": nlp.x0}
-        # the lifted truncation has another solution than the presolve's
-        if self.form.truncation == "smooth" and self.o.exact_iterations and near and not worse:
+        if self.o.exact_iterations and near and not worse:
             first |= warm_start(nlp, self.data, soup, rim)
         stage = self.ipopt(nlp, first, far)
         found = {"constrained NLP": layout.unpack(stage.x), "presolve": presolved}

@@ -38,7 +38,7 @@ def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, 
         data: Numbers of the energy.
         soup: The presolve's answer.
         rim: (N, V) multipliers of visibility of the rim pixels, rows divided by the anchor's facing
-            (`Descent.rim`).
+            (`Presolve.rim`).
 
     Returns:
         lam_x0, lam_g0. The equalities' multipliers are the least squares of stationarity.
@@ -47,14 +47,14 @@ def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, 
     facing = -np.einsum("nc,nc->n", soup.n, data.anchor_ray)
     visible = next(g for g in nlp.groups if g.kernel.name == "visible").table.rows
     lam_g[visible[:, 1:]] = -rim / facing[:, None]
-    gradient = nlp.sums.gradient(nlp.x0)
+    gradient = nlp.gradient(nlp.x0)
     # an epigraph's slack s is in no other row than s^2 >= |v|^2 + eps^2
     for group in nlp.groups:
         slacks = [i for i in range(group.kernel.nx) if group.kernel.x[i].name().startswith("s_")]
         for slack, row in zip(slacks, group.table.rows.T):
             s = group.table.index[:, slack]
             lam_g[row] = -gradient[s] / (2 * nlp.x0[s])
-    J = nlp.jacobian_pattern.filled(nlp.sums.constraints(nlp.x0)[1]).tocsr()
+    J = nlp.jacobian(nlp.x0)
     force = gradient + J.T @ lam_g
     equal = np.flatnonzero(nlp.lbg == nlp.ubg)
     A = J[equal]

@@ -35,7 +35,7 @@ LABEL = {
     "problem": "tiny",
     "problem_hash": "0",
     "superpixels": 12,
-    "formulation": "unit-offset/smooth/smooth",
+    "formulation": "unit-offset/smooth",
     "start": "proposal",
     "energy_limit": np.finfo(float).max,
 }

@@ -68,7 +68,7 @@ def problem_of(folder: Path):
 
 
 def test_several_sizes_and_formulations_are_exported_and_read_back(tmp_path):
-    forms = ["unit-translation/smooth/lifted", "free/epigraph/lifted"]
+    forms = ["unit-translation/smooth", "unit-offset/epigraph"]
     words = [w for f in forms for w in ("--formulation", f)]
     sizes = ["--superpixels", "9", "--superpixels", "12"]
     assert write(tmp_path, *words, *sizes, "-q", scene="street") == 0
@@ -83,11 +83,10 @@ def test_several_sizes_and_formulations_are_exported_and_read_back(tmp_path):
         close(back.x0, nlp.x0[v])
         rng = np.random.default_rng(0)
         x = np.clip(nlp.x0 + 0.05 * rng.normal(size=nlp.nx), nlp.lbx, nlp.ubx)
-        f, g = nlp.oracle(x, nlp.p)
-        close(back.values(x[v])[0], f)
-        close(back.values(x[v])[1], np.asarray(g).ravel()[r])
-        close(back.values(x[v])[2], np.asarray(nlp.grad_f(x, nlp.p)[1]).ravel()[v])
-        assert manifest["objective_at_start"] == float(nlp.oracle(nlp.x0, nlp.p)[0])
+        close(back.values(x[v])[0], nlp.value(x))
+        close(back.values(x[v])[1], nlp.constraints(x)[r])
+        close(back.values(x[v])[2], nlp.gradient(x)[v])
+        assert manifest["objective_at_start"] == nlp.value(nlp.x0)
         exact = oracle.energy(case.soup, case.data, case.weights)["total"]
         assert manifest["exact_energy_at_start"]["total"] == pytest.approx(exact, rel=1e-12)
     hashes = {json.loads((f / "manifest.json").read_text())["nl"]["sha256"] for f in folders}
@@ -260,8 +259,10 @@ def test_a_changed_export_is_refused(exported, tmp_path):
 
 
 def test_options_are_checked(tmp_path, capsys):
-    assert parse_formulation("free/epigraph") == {"gauge": "free", "norm": "epigraph"}
-    for text in ("fre", "free/smoth", "free/smooth/smooth/exact"):
+    assert parse_formulation("unit-offset") == {"gauge": "unit-offset"}
+    both = {"gauge": "unit-translation", "norm": "epigraph"}
+    assert parse_formulation("unit-translation/epigraph") == both
+    for text in ("free", "unit-offset/smoth", "unit-offset/smooth/smooth"):
         with pytest.raises(ConfigError, match="formulation"):
             parse_formulation(text)
     assert write(tmp_path, "--formulation", "nothing") == 2
@@ -280,9 +281,8 @@ def test_a_presolved_start_has_multipliers(tmp_path):
     x, lam = np.empty(nlp.nx), np.empty(nlp.ng)
     x[v], lam[r] = builder.x_init, builder.lambda_init
     # the multipliers make the start stationary, in AMPL's sign
-    gradient, J = nlp.grad_f(x, nlp.p)[1], nlp.jac_g(x, nlp.p)[1]
-    force = np.array(gradient).ravel() - np.array(J.T @ lam).ravel()
-    assert np.abs(force).max() < 1e-3 < np.abs(np.array(gradient)).max()
+    gradient = nlp.gradient(x)
+    assert np.abs(gradient - nlp.jacobian(x).T @ lam).max() < 1e-3 < np.abs(gradient).max()
 
 
 def test_no_multipliers_where_the_start_is_not_stationary(exported):

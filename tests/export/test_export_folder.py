@@ -56,10 +56,12 @@ def test_sizes_of_equal_number_have_their_own_folders(tmp_path, capsys):
     words = [w for n in ("15", "16", "16") for w in ("--superpixels", n)]
     assert write(tmp_path, *words) == 0
     folders = {p.parent.name for p in tmp_path.rglob("soup.nl")}
-    assert folders == {f"orbit-{n}-unit-offset-smooth-smooth" for n in (15, 16)}
+    assert folders == {f"orbit-{n}-unit-offset-smooth" for n in (15, 16)}
     assert len(capsys.readouterr().out.splitlines()) == 2
     # two ways to ask for the same formulation
-    words = [w for f in ("free", "free/smooth/smooth") for w in ("--formulation", f)]
+    words = [
+        w for f in ("unit-translation", "unit-translation/smooth") for w in ("--formulation", f)
+    ]
     assert write(tmp_path / "f", "--superpixels", "9", *words) == 0
     assert len(capsys.readouterr().out.splitlines()) == 1
 
@@ -108,9 +110,9 @@ def small(tmp_path_factory) -> Path:
         ("fingerprint", {}),
         ("fingerprint", {"objective": "many", "constraints": 0.0}),
         ("fingerprint", None),
-        ("formulation", {"gauge": "free"}),
-        ("formulation", {"gauge": ["free"], "norm": "smooth", "truncation": "smooth"}),
-        ("formulation", {"gauge": "free", "norm": "rough", "truncation": "smooth"}),
+        ("formulation", {"gauge": "unit-offset"}),
+        ("formulation", {"gauge": ["unit-offset"], "norm": "smooth", "coordinates": "matrix"}),
+        ("formulation", {"gauge": "unit-offset", "norm": "rough", "coordinates": "matrix"}),
         ("smoothing", {"eps": None, "eps_pixel": 1.0}),
         ("exact_energy_at_start", {"total": None}),
         ("nl", []),

@@ -9,17 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_model import (
-    GAUGES,
-    PAPER,
-    TRUNCATED,
-    Tiny,
-    gradient,
-    hessian,
-    jacobian,
-    value,
-    wiggle,
-)
+from helpers_formulation import NORMS
+from helpers_model import GAUGES, PAPER, TRUNCATED, Tiny, value, wiggle
 from helpers_nl import ReadBack, close
 
 from soup_nlp.export.names import readable_names
@@ -29,20 +20,11 @@ from soup_nlp.model.nlp import NLP
 
 pytestmark = pytest.mark.slow
 
-FORMS = [
-    Formulation(gauge=g, norm=n, truncation=t, hessian="exact", compiled=False)
-    for k, g in enumerate(GAUGES)
-    for n, t in (
-        (("smooth", "lifted"), ("epigraph", "smooth"))
-        if k == 1
-        else (("smooth", "smooth"), ("epigraph", "lifted"))
-    )
-]
-"""Every pair of values of gauge, norm and truncation: 6 of 12 formulations."""
+FORMS = [Formulation(gauge=g, norm=n, compiled=False) for g in GAUGES for n in NORMS]
 
 
 def form_id(form: Formulation) -> str:
-    return f"{form.gauge}-{form.norm}-{form.truncation}"
+    return f"{form.gauge}-{form.norm}"
 
 
 def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> None:
@@ -56,11 +38,11 @@ def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> 
     f0, g0 = value(nlp, x)
     close(f, f0)
     close(g, g0[r])
-    close(grad, gradient(nlp, x)[v])
-    close(J, jacobian(nlp, x)[np.ix_(r, v)])
+    close(grad, nlp.gradient(x)[v])
+    close(J, nlp.jacobian(x).toarray()[np.ix_(r, v)])
     rng = np.random.default_rng(seed)
     lam_f, lam_g = rng.normal(), rng.normal(size=nlp.ng)
-    close(back.hess(x[v], lam_f, lam_g[r]), hessian(nlp, x, lam_f, lam_g)[np.ix_(v, v)])
+    close(back.hess(x[v], lam_f, lam_g[r]), nlp.hessian(x, lam_g, lam_f).toarray()[np.ix_(v, v)])
 
 
 # --- the soup ------------------------------------------------------------------------------------
@@ -69,7 +51,7 @@ def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> 
 @pytest.mark.parametrize("form", FORMS, ids=form_id)
 def test_casadi_reads_back_every_formulation(form, tmp_path):
     tiny = Tiny()
-    nlp, layout = tiny.nlp(TRUNCATED if form.truncation == "lifted" else PAPER, form)
+    nlp, layout = tiny.nlp(TRUNCATED if form.norm == "epigraph" else PAPER, form)
     file = write_nl(tmp_path / "soup.nl", nlp, names=readable_names(nlp, layout))
     back = ReadBack(file.path)
     for seed, size in ((0, 0.02), (1, 0.2)):
@@ -80,13 +62,12 @@ def test_casadi_reads_back_every_formulation(form, tmp_path):
 
 def test_parameters_and_start_are_written(tmp_path):
     nlp, _ = Tiny().nlp(PAPER, FORMS[0])
-    p = nlp.with_theta(eps=0.5)
     other = replace(nlp, theta={**nlp.theta, "eps": 0.5}, x0=nlp.x0 + 0.25)
     back = ReadBack(write_nl(tmp_path / "a.nl", other).path)
     file = write_nl(tmp_path / "b.nl", nlp)
     assert np.array_equal(back.x0, (nlp.x0 + 0.25)[file.variables])
     f = float(back.values(nlp.x0[file.variables])[0])
-    assert f == pytest.approx(float(nlp.oracle(nlp.x0, p)[0]), rel=1e-13)
+    assert f == pytest.approx(nlp.value(nlp.x0, nlp.thetas(eps=0.5)), rel=1e-13)
     assert abs(f - value(nlp, nlp.x0)[0]) > 1e-3
 
 
@@ -139,7 +120,7 @@ def test_names_are_unique_and_point_to_their_rows(form):
     assert {"R[7,2,1]", "lam[3]", "n[11,3]"} <= set(x_names)
     # moving R[7] changes rows of superpixel 7 alone, but for edges
     column = x_names.index("R[7,2,1]")
-    hit = np.flatnonzero(jacobian(nlp, nlp.x0)[:, column])
+    hit = np.flatnonzero(nlp.jacobian(nlp.x0).toarray()[:, column])
     touched = [g_names[k] for k in hit]
     assert {"so3[7,1]", "so3[7,2]", "so3[7,4]"} <= set(touched)
     for name in touched:
@@ -153,7 +134,7 @@ def test_names_are_unique_and_point_to_their_rows(form):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    form = Formulation(gauge="free", norm="epigraph", truncation="lifted", hessian="exact")
+    form = Formulation(gauge="unit-translation", norm="epigraph")
     nlp, layout = Tiny().nlp(TRUNCATED, form)
     folder = tmp_path_factory.mktemp("foreign")
     lam_g = np.full(nlp.ng, -1.0)
@@ -181,8 +162,8 @@ def test_ampls_own_library_agrees(written):
     assert stats["no. of nonzeros in constraints' Jacobian"] == nlp.nnzj
     cols = stub.with_suffix(".col").read_text().split()
     rows = stub.with_suffix(".row").read_text().split()
-    J = jacobian(nlp, nlp.x0)[np.ix_(file.rows, file.variables)]
-    grad = gradient(nlp, nlp.x0)[file.variables]
+    J = nlp.jacobian(nlp.x0).toarray()[np.ix_(file.rows, file.variables)]
+    grad = nlp.gradient(nlp.x0)[file.variables]
     found = np.zeros_like(J)
     place = {f"{r}_{c}": (i, j) for i, r in enumerate(rows[:-1]) for j, c in enumerate(cols)}
     flat = _section(said, "constraints' jacobian")
@@ -200,7 +181,9 @@ def test_ampls_own_library_agrees(written):
     for key, v in _section(said, "lagrangian hessian").items():
         i, j = places[key]
         H[i, j] = H[j, i] = v
-    expected = hessian(nlp, nlp.x0, 1.0, np.ones(nlp.ng))[np.ix_(file.variables, file.variables)]
+    expected = nlp.hessian(nlp.x0, np.ones(nlp.ng)).toarray()[
+        np.ix_(file.variables, file.variables)
+    ]
     np.testing.assert_allclose(H, expected, rtol=1e-8, atol=1e-8)
 
 
@@ -231,16 +214,16 @@ def test_pounce_agrees(written):
     f, g = value(nlp, x)
     close(back.objective(x[v]), f)
     close(np.array(back.constraints(x[v])), g[r])
-    close(np.array(back.gradient(x[v])), gradient(nlp, x)[v])
+    close(np.array(back.gradient(x[v])), nlp.gradient(x)[v])
     J = np.zeros((nlp.ng, nlp.nx))
     i, j = back.jacobian_structure()
     J[np.array(i), np.array(j)] = back.jacobian(x[v])
-    close(J, jacobian(nlp, x)[np.ix_(r, v)])
+    close(J, nlp.jacobian(x).toarray()[np.ix_(r, v)])
     lam = np.random.default_rng(0).normal(size=nlp.ng)
     H = np.zeros((nlp.nx, nlp.nx))
     i, j = (np.array(k) for k in back.hessian_structure())
     H[i, j] = back.hessian(x[v], lam[r], 0.7)
-    close(H + np.tril(H, -1).T, hessian(nlp, x, 0.7, lam)[np.ix_(v, v)])
+    close(H + np.tril(H, -1).T, nlp.hessian(x, lam, 0.7).toarray()[np.ix_(v, v)])
 
 
 def test_scip_reads_it(written):

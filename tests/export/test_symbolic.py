@@ -48,7 +48,7 @@ def test_casadi_derives_the_constrained_nlp_by_itself():
     assert solver.stats()["success"]
     found = constraint_residuals(nlp.soup(answer["x"]), nlp.case.data.rim_ray, 1e-3)
     assert max(found.values()) < 1e-6
-    first = float(nlp.record.oracle(nlp.record.x0, nlp.record.p)[0])
+    first = nlp.record.value(nlp.record.x0)
     assert float(answer["f"]) == pytest.approx(first, rel=1e-4)
 
 
@@ -58,9 +58,8 @@ def test_the_symbols_are_the_program():
     assert nlp.x.numel() == nlp.record.nx == 16 * n
     f = ca.Function("f", [nlp.x, nlp.p], [nlp.f, nlp.g])
     value, g = f(nlp.start["x0"], nlp.start["p"])
-    assert float(value) == pytest.approx(nlp.record.sums.value(nlp.start["x0"]), rel=1e-12)
-    np.testing.assert_allclose(
-        np.asarray(g).ravel(), nlp.record.sums.constraints(nlp.start["x0"])[0], atol=1e-12
-    )
+    assert float(value) == pytest.approx(nlp.record.value(nlp.start["x0"]), rel=1e-12)
+    constraints = nlp.record.constraints(nlp.start["x0"])
+    np.testing.assert_allclose(np.asarray(g).ravel(), constraints, atol=1e-12)
     with pytest.raises(ModelError, match="unknown parameter"):
         nlp.parameters(width=0.1)

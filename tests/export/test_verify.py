@@ -11,9 +11,7 @@ from helpers_formulation import form, tiny
 from helpers_model import PAPER
 from scipy import sparse
 
-from soup_nlp.errors import ConfigError
 from soup_nlp.export import verify
-from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.program import make_program
 from soup_nlp.export.residuals import kind
@@ -21,42 +19,41 @@ from soup_nlp.export.sol import Sol
 from soup_nlp.model.kernel import Group, Kernel, Table
 
 
-def least_squares(monkeypatch, x, gradient, jacobian, **bounds):
-    """Least-squares multipliers of a program that is given by its numbers at a point."""
-    g = np.array(bounds.pop("g"))
-    monkeypatch.setattr(verify, "_gradient", lambda *_: np.array(gradient))
-    monkeypatch.setattr(verify, "_jacobian", lambda *_: sparse.csr_matrix(np.array(jacobian)))
-    own = {k: np.array(v, float) for k, v in bounds.items()}
-    n = len(x)
-    nlp = SimpleNamespace(
-        oracle=lambda *_: (0.0, g), p=None, ng=len(g),
-        lbx=np.full(n, -np.inf), ubx=np.full(n, np.inf), **own,
-    )  # fmt: skip
-    return verify.least_squares_multipliers(nlp, np.array(x, float))
+def program(gradient, jacobian, g, **bounds):
+    """A program that is given by its numbers at a point."""
+    n = len(gradient)
+    every = {"lbx": np.full(n, -np.inf), "ubx": np.full(n, np.inf), **bounds}
+    return SimpleNamespace(
+        gradient=lambda x: np.array(gradient),
+        jacobian=lambda x: sparse.csr_matrix(jacobian),
+        constraints=lambda x: np.array(g),
+        ng=len(g),
+        **{k: np.array(v, float) for k, v in every.items()},
+    )
 
 
-def test_only_signs_that_a_bound_can_have_are_multipliers(monkeypatch):
+def test_only_signs_that_a_bound_can_have_are_multipliers():
     rows = {"jacobian": np.eye(4), "g": [1.0, 2.0, 1.0, 2.0]}
     bounds = {"lbg": [1, -np.inf, 1, -np.inf], "ubg": [np.inf, 2, np.inf, 2]}
     # grad f + lam = 0: a lower bound pushes with lam < 0, an upper one with lam > 0
-    lam = least_squares(monkeypatch, np.zeros(4), [3.0, -4.0, -5.0, 6.0], **rows, **bounds)
+    nlp = program([3.0, -4.0, -5.0, 6.0], **rows, **bounds)
+    lam = verify.least_squares_multipliers(nlp, np.zeros(4))
     np.testing.assert_allclose(lam, [-3, 4, 0, 0], atol=1e-9)
 
 
-def test_rows_near_a_bound_of_zero_are_active(monkeypatch):
+def test_rows_near_a_bound_of_zero_are_active():
     near, far = 0.5 * verify.ACTIVE, 2 * verify.ACTIVE
     rows = {"jacobian": np.eye(4), "g": [-near, -far, near, far]}
     bounds = {"lbg": [-np.inf, -np.inf, 0, 0], "ubg": [0, 0, np.inf, np.inf]}
-    lam = least_squares(monkeypatch, np.zeros(4), [-1.0, -1.0, 1.0, 1.0], **rows, **bounds)
+    nlp = program([-1.0, -1.0, 1.0, 1.0], **rows, **bounds)
+    lam = verify.least_squares_multipliers(nlp, np.zeros(4))
     np.testing.assert_allclose(lam, [1, 0, -1, 0], atol=1e-9)
 
 
-def test_a_variable_at_its_bound_takes_the_whole_gradient(monkeypatch):
+def test_a_variable_at_its_bound_takes_the_whole_gradient():
     """One at each bound, one in the middle of a distance 4 to the bound that it is pushed to."""
-    gradient = np.array([-2.0, 3.0, -5.0])
-    monkeypatch.setattr(verify, "_gradient", lambda *_: gradient)
-    monkeypatch.setattr(verify, "_jacobian", lambda *_: sparse.csr_matrix((1, 3)))
-    nlp = SimpleNamespace(lbx=np.array([-1.0, 2.0, 0.0]), ubx=np.array([3.0, 9.0, 8.0]))
+    none = {"jacobian": np.zeros((1, 3)), "g": [0.0]}
+    nlp = program([-2.0, 3.0, -5.0], **none, lbx=[-1.0, 2.0, 0.0], ubx=[3.0, 9.0, 8.0])
     lam = verify.bound_multipliers(nlp, np.array([3.0, 2.0, 4.0]), np.zeros(1))
     np.testing.assert_allclose(lam, [2.0, -3.0, 1.0], rtol=1e-15)
 
@@ -87,14 +84,6 @@ def test_rows_of_one_superpixel_are_named_by_it_alone():
     nlp, layout = tiny().nlp(PAPER, form(gauge="unit-translation"))
     _, names = readable_names(nlp, layout)
     assert {"so3[0,1]", "so3[11,6]", "normal[3]", "visible[5,1]", "translation[4]"} <= set(names)
-
-
-def test_a_formulation_has_up_to_three_words():
-    choices = {"gauge": "free", "norm": "epigraph", "truncation": "lifted"}
-    assert parse_formulation("free/epigraph/lifted") == choices
-    assert parse_formulation("free") == {"gauge": "free"}
-    with pytest.raises(ConfigError, match="too many"):
-        parse_formulation("free/epigraph/lifted/exact")
 
 
 def test_a_row_of_residuals_says_whether_it_holds():

@@ -12,7 +12,7 @@ from soup_nlp.family.instances import STANDARD, select
 from soup_nlp.family.write import write_family
 from soup_nlp.pipeline.case import prepare
 
-LIFTED = "free/epigraph/lifted"
+EPIGRAPH = "unit-translation/epigraph"
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def folder(record, tmp_path_factory):
     patch = pytest.MonkeyPatch()
     for module in (write, results):
         patch.setattr(module, "load_frozen", lambda scene, size: record)
-    chosen = select([100], ["room"], [STANDARD]) + select([100], ["room"], [LIFTED], ["hard"])
+    chosen = select([100], ["room"], [STANDARD]) + select([100], ["room"], [EPIGRAPH], ["hard"])
     lines: list[str] = []
     write_family(out, chosen, lines.append)
     assert len(lines) == len(chosen) == 4

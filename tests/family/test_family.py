@@ -46,18 +46,18 @@ from soup_nlp.geometry.soup import Soup
 
 pytestmark = pytest.mark.slow
 
-LIFTED = "free/epigraph/lifted"
+EPIGRAPH = "unit-translation/epigraph"
 
 
 # --- names ---------------------------------------------------------------------------------------
 
 
 def test_a_name_says_which_instance_it_is():
-    one = Instance("street", "free/epigraph/lifted", 250, "cold")
-    assert one.name == "SOUP-street-free-epigraph-lifted-N250-cold"
+    one = Instance("street", EPIGRAPH, 250, "cold")
+    assert one.name == "SOUP-street-unit-translation-epigraph-N250-cold"
     assert parse_name(one.name) == one
     assert parse_name(one.problem).start == "easy"
-    assert one.short == "SOUP-street-fel-250c"
+    assert one.short == "SOUP-street-te-250c"
     every = select(SIZES, SCENES, formulations())
     short = {i.short: i for i in every}
     assert len(short) == len(every)
@@ -66,7 +66,7 @@ def test_a_name_says_which_instance_it_is():
     # the gauge has a dash of its own
     standard = Instance("orbit", STANDARD, 250, "hard")
     assert parse_name(standard.name) == standard
-    for wrong in ("SOUP-moon-free-smooth-smooth-N100-easy", "SOUP-street-free-N100-easy", "x"):
+    for wrong in ("SOUP-moon-unit-offset-smooth-N100-easy", "SOUP-street-smooth-N100-easy", "x"):
         with pytest.raises(ConfigError, match="SOUP-SCENE"):
             parse_name(wrong)
 
@@ -130,8 +130,8 @@ from soup_nlp.family.frozen import read_frozen
 from soup_nlp.family.instances import STARTS, build_instance, case_of
 record = read_frozen(Path(sys.argv[1]))
 case = case_of(record)
-chosen = [("unit-offset/smooth/smooth", start) for start in (*STARTS, "best")]
-for form, start in [*chosen, ("unit-translation/epigraph/lifted", STARTS[0])]:
+chosen = [("unit-offset/smooth", start) for start in (*STARTS, "best")]
+for form, start in [*chosen, ("unit-translation/epigraph", STARTS[0])]:
     nlp = build_instance(case, record, form, start)[0]
     print(write_nl(sys.argv[2], nlp).sha256)
 """
@@ -167,7 +167,7 @@ def test_the_package_has_a_record_of_every_size():
         for scene in SCENES:
             record = load_frozen(scene, size)
             assert len(record.minimum) == record.labels.max() + 1
-            assert f"SOUP-{scene}-unit-offset-smooth-smooth-N{size}-easy" in known["sha256"]
+            assert f"SOUP-{scene}-unit-offset-smooth-N{size}-easy" in known["sha256"]
 
 
 @pytest.mark.slow
@@ -187,7 +187,7 @@ def test_the_index_says_what_problem_sets_say(folder):
     index = json.loads((folder / "index.json").read_text())
     assert (index["set"], index["version"]) == ("SOUP", VERSION)
     entries = {e["name"]: e for e in index["instances"]}
-    easy = entries["SOUP-room-unit-offset-smooth-smooth-N100-easy"]
+    easy = entries["SOUP-room-unit-offset-smooth-N100-easy"]
     n = easy["superpixels"]
     assert easy["variables"] == 16 * n
     assert easy["constraints"] == 16 * n + 1
@@ -200,10 +200,10 @@ def test_the_index_says_what_problem_sets_say(folder):
     assert easy["active_rank"] == easy["active_rows"] >= 7 * n + 1
     # another program under the same name
     assert easy["published"] is False
-    lifted = entries["SOUP-room-free-epigraph-lifted-N100-hard"]
-    assert lifted["classification"].startswith("OOR2-MY")
+    slack = entries["SOUP-room-unit-translation-epigraph-N100-hard"]
+    assert slack["classification"].startswith("OOR2-MY")
     # the three starts are one problem
-    starts = [entries[f"SOUP-room-unit-offset-smooth-smooth-N100-{s}"] for s in ("hard", "cold")]
+    starts = [entries[f"SOUP-room-unit-offset-smooth-N100-{s}"] for s in ("hard", "cold")]
     assert starts[1]["objective_at_start"] > 2 * starts[0]["objective_at_start"]
     assert starts[0]["best_known"] == easy["best_known"]
     rows = list(csv.DictReader((folder / "index.csv").read_text().splitlines()))
@@ -223,7 +223,7 @@ def test_the_index_says_what_problem_sets_say(folder):
 
 def test_a_best_point_is_read_back_as_an_answer(folder):
     # the proposal stands for the best point here: on the constraints, but no minimum
-    verdict = check_sol(folder / "SOUP-room-unit-offset-smooth-smooth-N100.sol")
+    verdict = check_sol(folder / "SOUP-room-unit-offset-smooth-N100.sol")
     assert verdict.objective == verdict.best
     assert verdict.residuals.primal < 1e-14
     assert verdict.residuals.dual > 1e-3
@@ -232,10 +232,10 @@ def test_a_best_point_is_read_back_as_an_answer(folder):
 
 
 def test_an_answer_off_the_constraints_is_told(folder, tmp_path, capsys):
-    text = (folder / "SOUP-room-unit-offset-smooth-smooth-N100.sol").read_text().splitlines()
+    text = (folder / "SOUP-room-unit-offset-smooth-N100.sol").read_text().splitlines()
     first = text.index("Options") + 9
     text[first] = repr(float(text[first]) + 0.5)
-    path = tmp_path / "SOUP-room-unit-offset-smooth-smooth-N100-hard.sol"
+    path = tmp_path / "SOUP-room-unit-offset-smooth-N100-hard.sol"
     path.write_text("\n".join(text) + "\n")
     assert main(["check", str(path)]) == 1
     assert "FAIL rows" in capsys.readouterr().out

@@ -19,7 +19,7 @@ from soup_nlp.export.verify import Limits
 from soup_nlp.family.freeze import record_of
 from soup_nlp.pipeline.case import prepare
 
-STUB = "SOUP-room-unit-offset-smooth-smooth-N100"
+STUB = "SOUP-room-unit-offset-smooth-N100"
 
 
 def row(solver: str, start: str, objective: float, verified: bool = True, cpu: float = 1.0) -> dict:
@@ -118,7 +118,7 @@ def test_curves_of_equal_times_are_drawn(tmp_path):
             "problem": "room hard",
             "problem_hash": "0",
             "superpixels": 100,
-            "formulation": "unit-offset/smooth/smooth",
+            "formulation": "unit-offset/smooth",
             "solver": "mine",
             "energy_start": 2.0,
             "claimed": False,

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 
 def test_what_solvers_reached_is_said_by_start():
     entry = {
-        "short": "SOUP-orbit-oss-100h",
+        "short": "SOUP-orbit-os-100h",
         "best_known": {"objective": 10.0},
         "runs": {
             "a": [10.0, 2.0, 25.0, True],
@@ -31,13 +31,13 @@ def test_what_solvers_reached_is_said_by_start():
     }
     *_, row = _reached([entry, {"runs": {}}])
     assert row == (
-        "| SOUP-orbit-oss-100h | **+0 %**, 2 of 25 s | +25 %, 25.1 of 25 s | no point, 3 of 25 s |"
+        "| SOUP-orbit-os-100h | **+0 %**, 2 of 25 s | +25 %, 25.1 of 25 s | no point, 3 of 25 s |"
     )
     assert _reached([{"runs": {}}]) == []
 
 
 def test_casadis_form_is_read_back(folder):
-    text = (folder / "SOUP-room-unit-offset-smooth-smooth-N100.casadi").read_text()
+    text = (folder / "SOUP-room-unit-offset-smooth-N100.casadi").read_text()
     data = ca.StringDeserializer(text)
     nlp, *vectors = [data.unpack() for _ in range(8)]
     lbx, ubx, lbg, ubg, *starts = (np.array(v).ravel() for v in vectors)
@@ -52,7 +52,7 @@ def test_casadis_form_is_read_back(folder):
 
 def test_casadis_form_is_read_without_casadi(folder):
     reader = pytest.importorskip("casadi_reader")
-    path = folder / "SOUP-room-unit-offset-smooth-smooth-N100.casadi"
+    path = folder / "SOUP-room-unit-offset-smooth-N100.casadi"
     found = reader.read_casadi(str(path))
     function, *vectors = found["roots"]
     fields = found["objects"][function["$ref"]]["fields"]
@@ -68,7 +68,7 @@ def test_casadis_form_is_read_without_casadi(folder):
 def test_the_runner_judges_an_answer(move, word, folder, tmp_path, capsys):
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     # a solver that returns the best known point, or one off the constraints, and claims success
-    stub = "SOUP-room-unit-offset-smooth-smooth-N100"
+    stub = "SOUP-room-unit-offset-smooth-N100"
     program = tmp_path / "mine"
     program.write_text(
         f"#!{sys.executable}\n"
@@ -82,7 +82,7 @@ def test_the_runner_judges_an_answer(move, word, folder, tmp_path, capsys):
     words = [f"{program} fast=1", "room-unit", "hard", "--folder", str(tmp_path)]
     assert run_solver.main(words) == (word == "WRONG")
     out = capsys.readouterr().out
-    assert f"SOUP-room-oss-100h       {word}" in out
+    assert f"SOUP-room-os-100h        {word}" in out
     assert f"1 {word}" in out
 
 

@@ -15,7 +15,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.reweighting import in_pixels
 
 UNITS = ("paper", "pixels")
-FORMS = [(n, t) for n in ("smooth", "epigraph") for t in ("smooth", "lifted")]
+NORMS = ("smooth", "epigraph")
 
 
 @cache

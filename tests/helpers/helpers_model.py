@@ -18,12 +18,15 @@ from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment, split_components
+from soup_nlp.model import matrix, tangent_nlp
+from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.model.layout import GAUGES as GAUGES
+from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.nlp import NLP, to_scipy
+from soup_nlp.model.nlp import NLP
 from soup_nlp.model.reweighting import in_pixels
 
 Float = NDArray[np.float64]
@@ -32,7 +35,6 @@ Float = NDArray[np.float64]
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
 
-GAUGES = ("unit-offset", "unit-translation", "free")
 WIDTH, HEIGHT = 64, 48
 K_REF = camera.intrinsics(70.0, 72.0, 31.0, 24.5)
 K_NEXT = camera.intrinsics(68.0, 69.0, 32.5, 23.0)
@@ -138,29 +140,13 @@ class Tiny:
 # --- values and finite differences of an NLP ---------------------------------------------------
 
 
-def value(nlp: NLP, x: Float, p: Float | None = None) -> tuple[float, Float]:
+def value(nlp: NLP, x: Float, theta: Float | None = None) -> tuple[float, Float]:
     """f and g."""
-    f, g = nlp.oracle(x, nlp.p if p is None else p)
-    return float(f), np.asarray(g).ravel()
-
-
-def gradient(nlp: NLP, x: Float) -> Float:
-    return np.asarray(nlp.grad_f(x, nlp.p)[1]).ravel()
-
-
-def jacobian(nlp: NLP, x: Float) -> Float:
-    return to_scipy(nlp.jac_g(x, nlp.p)[1]).toarray()
-
-
-def hessian(nlp: NLP, x: Float, lam_f: float, lam_g: Float) -> Float:
-    """Both triangles of the Lagrangian's Hessian."""
-    H = to_scipy(nlp.hess_lag(x, nlp.p, lam_f, lam_g)).toarray()
-    assert not np.tril(H, -1).any(), "hess_lag must be upper triangular"
-    return H + np.triu(H, 1).T
+    return nlp.value(x, theta), nlp.constraints(x, theta)
 
 
 def lagrangian_gradient(nlp: NLP, x: Float, lam_f: float, lam_g: Float) -> Float:
-    return lam_f * gradient(nlp, x) + to_scipy(nlp.jac_g(x, nlp.p)[1]).T @ lam_g
+    return lam_f * nlp.gradient(x) + nlp.jacobian(x).T @ lam_g
 
 
 def directional(fun: Callable[[Float], Float], x: Float, v: Float, h: float = 1e-4) -> Float:
@@ -173,33 +159,35 @@ def directional(fun: Callable[[Float], Float], x: Float, v: Float, h: float = 1e
 
 
 def wiggle(nlp: NLP, layout_size: int, seed: int, size: float) -> Float:
-    """A random point near x0, off the manifold; slacks and switches anywhere inside bounds."""
+    """A random point near x0, off the manifold; slack variables anywhere inside bounds."""
     rng = np.random.default_rng(seed)
     x = nlp.x0 * (1 + size * rng.uniform(-1, 1, nlp.nx)) + size * rng.uniform(-0.2, 0.2, nlp.nx)
     x[layout_size:] = rng.uniform(0.1, 0.9, nlp.nx - layout_size)
     return np.clip(x, nlp.lbx + 1e-3, nlp.ubx - 1e-3)
 
 
-def kernel_exact(nlp: NLP, x: Float) -> dict[str, float]:
-    """Exact energy by kernel name, of a program with smooth norms and lifted truncations.
-
-    Without smoothing the objective is `sum_j norm_j + z_j (norm_j - sigma_j)` with switches z_j, of
-    which the best are those with a negative slope.
-    """
+def exact_terms(
+    x: Float, data: EnergyData, weights: Weights, layout: MatrixLayout | TangentLayout
+) -> dict[str, float]:
+    """Exact energy by term of a solver's vector, from the norms of the symbolic terms."""
+    if isinstance(layout, MatrixLayout):
+        view = matrix._views(layout.gauge)
+    else:
+        view = tangent_nlp._views(layout.chart)
     out = {}
-    theta = nlp.with_theta(eps=0.0, eps_pixel=0.0)[: len(nlp.theta)]
-    for group in nlp.groups:
-        k, t = group.kernel, group.table
-        if k.objective is None or k.name == "ridge":
-            continue
-        z = [j for j in range(k.nx) if k.x[j].name().startswith("z_")]
-        slope = ca.gradient(k.objective, k.x)[z]
-        f = ca.Function("e", [k.x, k.row, k.theta], [k.objective, slope]).map(len(t))
-        local = x[t.index]
-        local[:, z] = 0.0
-        first, slopes = f(local.T, t.data.T, np.repeat(theta[:, None], len(t), axis=1))
-        exact = np.asarray(first).sum() + np.minimum(np.asarray(slopes), 0.0).sum()
-        out[k.name.removeprefix("t_")] = float(exact)
+    for name, element in elements(data, weights, layout).items():
+        own = ca.SX.sym("x", layout.stride * element.arity)
+        row = {k: ca.SX.sym(k, count) for k, count in element.fields.items()}
+        views = [view(part, row, a) for a, part in enumerate(ca.vertsplit(own, layout.stride))]
+        total = ca.SX(0)
+        for n in element.norms(views, row, ca.SX(0), ca.SX(0)):
+            square = ca.dot(n.vector, n.vector)
+            y = square / 2 if n.kind == "half_square" else ca.sqrt(square)
+            cut = y if n.sigma is None else ca.fmin(y, n.sigma)
+            total += n.weight * ((1 - n.leak) * cut + n.leak * y)
+        f = ca.Function("f", [own, ca.vertcat(*row.values())], [total]).map(len(element.index))
+        table = np.column_stack([c.reshape(len(c), -1) for c in element.columns.values()])
+        out[name] = float(np.asarray(f(x[element.index].T, table.T)).sum())
     return out
 
 

@@ -8,7 +8,7 @@ vector counts scales as `N lam` and lengths in `1 / N`:
     normal        1 per superpixel, |n|^2 = 1   all
     visible       anchor and rim, -n . v >= c   all; v = r_a, then r_rim - r_a / depth_ratio
     simplex       1, sum lam = 1                all
-    unit          1, sum c lam d = 1            all but unit-offset, where d = 1 / c is no variable
+    unit          1, sum c lam d = 1            unit-translation; else d = 1 / c is no variable
     translation   1 per superpixel, |t| = tau   unit-translation
     epigraph      1 per norm, s^2 >= |v|^2 + eps^2
 
@@ -24,7 +24,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers_formulation import FORMS, UNITS, form, tiny, world
+from helpers_formulation import NORMS, UNITS, form, tiny, world
 from helpers_model import GAUGES, PAPER, disturbed, random_soup, value, weights_for, wiggle
 
 from soup_nlp.config.problem import load_problem
@@ -48,9 +48,8 @@ BOUNDS = {
     "R": (-np.inf, np.inf),
     "t": (-np.inf, np.inf),
     "s": (0.0, np.inf),
-    "z": (0.0, 1.0),
 }
-"""Bounds of the variables; s are slack variables of norms, z switches of truncations."""
+"""Bounds of the variables; s are slack variables of norms."""
 RAW = 1e-8
 """Largest violation of the raw answer, by any kind. Ipopt's own tolerance is 1e-9."""
 
@@ -130,11 +129,11 @@ def violations(nlp: NLP, x: np.ndarray, data: EnergyData, f: Formulation) -> dic
 # --- every row and every bound, in every formulation --------------------------------------------
 
 
-@pytest.mark.parametrize(("norm", "truncation"), FORMS)
+@pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_every_row_and_every_bound_is_the_specified_one(gauge, norm, truncation):
+def test_every_row_and_every_bound_is_the_specified_one(gauge, norm):
     problem = tiny("pixels")
-    f = form(gauge=gauge, norm=norm, truncation=truncation, depth_ratio=4.0, min_facing=0.02)
+    f = form(gauge=gauge, norm=norm, depth_ratio=4.0, min_facing=0.02)
     nlp, layout = problem.nlp(weights_for("pixels"), f)
     # off the manifold, where no entry of any row is 0
     x = wiggle(nlp, layout.size, 1, 0.3)
@@ -168,12 +167,11 @@ def test_each_row_of_so3_sees_its_own_entry(entry):
     np.testing.assert_allclose(so3, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("truncation", ["smooth", "lifted"])
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_slack_variables_on_their_epigraph_are_the_smooth_norms(gauge, truncation):
+def test_slack_variables_on_their_epigraph_are_the_smooth_norms(gauge):
     problem, w = tiny("pixels"), weights_for("pixels")
-    smooth, layout = problem.nlp(w, form(gauge=gauge, truncation=truncation))
-    epigraph, _ = problem.nlp(w, form(gauge=gauge, truncation=truncation, norm="epigraph"))
+    smooth, layout = problem.nlp(w, form(gauge=gauge))
+    epigraph, _ = problem.nlp(w, form(gauge=gauge, norm="epigraph"))
     x = wiggle(epigraph, layout.size, 2, 0.1)
     names = epigraph.x_names()
     slack = np.array([kind_of(name) == "s" for name in names])
@@ -222,11 +220,11 @@ def test_the_coordinates_of_the_presolve_leave_scale_and_visibility_to_constrain
 # --- what the constraints mean ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("norm", "truncation"), FORMS)
+@pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_the_start_is_feasible(gauge, norm, truncation):
+def test_the_start_is_feasible(gauge, norm):
     problem = tiny("pixels")
-    f = form(gauge=gauge, norm=norm, truncation=truncation)
+    f = form(gauge=gauge, norm=norm)
     nlp, _ = problem.nlp(weights_for("pixels"), f)
     assert np.isfinite(nlp.x0).all()
     found = violations(nlp, nlp.x0, problem.data, f)
@@ -318,18 +316,11 @@ def test_the_raw_answer_keeps_every_constraint(gauge, name, ratio):
     np.testing.assert_allclose(kept.n, soup.n, atol=RAW)
 
 
-@pytest.mark.parametrize(
-    ("gauge", "norm", "truncation"),
-    [
-        ("unit-offset", "smooth", "lifted"),
-        ("free", "epigraph", "smooth"),
-        ("unit-translation", "epigraph", "lifted"),
-    ],
-)
-def test_so_it_does_with_slack_variables_and_switches(gauge, norm, truncation):
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_so_it_does_with_slack_variables(gauge):
     _, layout, x = smooth_answer("slanted", gauge, 5.0)
     _, data = world("slanted", "pixels", False)
-    f = form(gauge=gauge, norm=norm, truncation=truncation, **WIDE)
+    f = form(gauge=gauge, norm="epigraph", **WIDE)
     near = layout.unpack(x).normalised(data.share).retracted()
     nlp, _ = build_matrix_nlp(near, data, WEIGHTS, f)
     stage = Ipopt(nlp)(x0=nlp.x0, tol=1e-3)
@@ -363,7 +354,7 @@ def test_ipopt_gets_every_kind_of_bound(side):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene", "gauge"), [("orbit", "unit-offset"), ("room", "free"), ("street", "unit-translation")]
+    ("scene", "gauge"), [("orbit", "unit-offset"), ("street", "unit-translation")]
 )
 def test_the_raw_answer_of_a_default_solve_keeps_every_constraint(scene, gauge):
     small = ["input.width=96", "input.height=72", "segmentation.superpixels=30"]

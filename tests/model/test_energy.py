@@ -27,10 +27,15 @@ from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
-from soup_nlp.model.energy_data import TERMS, EnergyData, build_energy_data, sample_pixels
+from soup_nlp.model.energy_data import EnergyData, build_energy_data, sample_pixels
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.reweighting import in_noise, in_pixels
+from soup_nlp.model.reweighting import (
+    across_components,
+    across_discontinuities,
+    in_noise,
+    in_pixels,
+)
 from soup_nlp.start.choice import limited_noise
 
 # --- invariances ---------------------------------------------------------------------------------
@@ -38,7 +43,7 @@ from soup_nlp.start.choice import limited_noise
 
 def energies(soup: Soup, data: EnergyData, weights: Weights) -> np.ndarray:
     e = oracle.energy(soup, data, weights)
-    return np.array([e[k] for k in TERMS])
+    return np.array([e[k] for k in data.terms])
 
 
 @pytest.mark.parametrize("units", UNITS)
@@ -100,7 +105,8 @@ def test_the_order_of_the_superpixels_does_not_matter():
         rank[problem.seg.labels], problem.image, neighbours=11, boundary_samples=2
     )
     data = build_energy_data(seg, problem.flow, K_REF, K_NEXT, 3, 0)
-    s, own = problem.soup, replace(problem.data, prior_relief=0 * problem.data.prior_relief)
+    none = 0 * problem.data.prior_relief
+    s, own = problem.soup, replace(problem.data, prior_relief=none, depth_weight=none)
     soup = Soup(s.lam[order], s.n[order], s.d[order], s.R[order], s.t[order])
     np.testing.assert_allclose(energies(soup, data, weights), energies(s, own, weights), rtol=1e-12)
 
@@ -306,3 +312,17 @@ def test_prior_is_measured_in_the_noise_of_the_flow(error, noise):
     problem = tiny("pixels")
     data = in_noise(problem.data, limited_noise(np.full(12, error)))
     np.testing.assert_allclose(data.prior_weight, noise * problem.data.prior_weight)
+
+
+def test_ties_across_components_keep_a_share_of_weight():
+    data, count = tiny("pixels").data, len(tiny().soup)
+    part = np.arange(count) % 2
+    (a, b), (i, k) = data.edges.T, data.pairs.T
+    apart, split = part[a] != part[b], part[i] != part[k]
+    one = across_components(data, part, 0.3)
+    two = across_discontinuities(data, part, arap=0.3, cont=0.2, orient=0.1)
+    for found in (one, two):
+        expected = np.where(apart, 0.3, 1.0) * data.edge_weight
+        np.testing.assert_allclose(found.edge_weight, expected, rtol=1e-14)
+    np.testing.assert_allclose(two.pair_weight, np.where(split, 0.2, 1.0) * data.pair_weight)
+    np.testing.assert_allclose(two.orient_weight, np.where(split, 0.1, 1.0) * data.orient_weight)

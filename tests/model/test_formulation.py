@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_formulation import FORMS, UNITS, assert_same_soup, form, tiny
+from helpers_formulation import NORMS, UNITS, assert_same_soup, form, tiny
 from helpers_model import GAUGES, PAPER, random_soup, value, weights_for
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -69,21 +69,18 @@ def test_a_superpixel_at_rest_gets_a_tiny_translation():
     moved = np.linalg.norm(back.translation - truth.translation, axis=1)
     assert 0 < moved[2] < 2e-3 * np.median(length)
     np.testing.assert_allclose(np.delete(moved, 2), 0, atol=1e-12)
-    for gauge in ("unit-offset", "free"):
-        layout = MatrixLayout(np.full(6, 1 / 6), gauge)
-        np.testing.assert_array_equal(layout.unpack(layout.pack(soup)).translation[2], 0)
+    layout = MatrixLayout(np.full(6, 1 / 6), "unit-offset")
+    np.testing.assert_array_equal(layout.unpack(layout.pack(soup)).translation[2], 0)
 
 
 # --- names, sizes, print -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("norm", "truncation"), FORMS)
+@pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_names_are_unique_and_as_many_as_there_are_numbers(gauge, norm, truncation):
+def test_names_are_unique_and_as_many_as_there_are_numbers(gauge, norm):
     problem = tiny()
-    nlp, layout = problem.nlp(
-        weights_for("paper"), form(gauge=gauge, norm=norm, truncation=truncation)
-    )
+    nlp, layout = problem.nlp(weights_for("paper"), form(gauge=gauge, norm=norm))
     x, g = nlp.x_names(), nlp.g_names()
     assert len(x) == len(set(x)) == nlp.nx
     assert len(g) == len(set(g)) == nlp.ng
@@ -114,25 +111,21 @@ def test_sizes_are_those_of_the_formulation():
     assert sizes["variables"] == 16 * n
     assert sizes["equalities"] == 6 * n + n + 1
     assert sizes["inequalities"] == 9 * n
-    free, _ = problem.nlp(PAPER, form(gauge="free"))
-    assert free.sizes()["variables"] == 17 * n
-    assert free.sizes()["equalities"] == 7 * n + 2
     other, _ = problem.nlp(PAPER, form(gauge="unit-translation"))
     assert other.sizes()["variables"] == 17 * n + 1
     assert other.sizes()["equalities"] == 8 * n + 2
-    slack, _ = problem.nlp(weights_for("paper"), form(norm="epigraph", truncation="lifted"))
+    slack, _ = problem.nlp(weights_for("paper"), form(norm="epigraph"))
     e, p, pixels = len(problem.seg.edges), len(problem.seg.pairs), problem.data.pixel_weight
     given = int((problem.data.depth_weight > 0).sum())
     norms = 4 * e + given + 2 * p + int((pixels > 0).sum())
-    # orientation has no epigraph (a square is smooth) but a switch
-    # and the priors are not truncated
-    assert slack.sizes()["variables"] == 16 * n + 2 * norms - e - given + p
+    # orientation has no epigraph (a square is smooth)
+    assert slack.sizes()["variables"] == 16 * n + norms
     assert slack.sizes()["inequalities"] == 9 * n + norms
     assert sizes["jacobian_nonzeros"] == nlp.nnzj == nlp.jac_g.nnz_out(1)
 
 
 def test_the_print_shows_sizes_bound_kinds_and_sparsity():
-    nlp, _ = tiny().nlp(PAPER, form(norm="epigraph", truncation="lifted"))
+    nlp, _ = tiny().nlp(PAPER, form(norm="epigraph"))
     text = str(nlp)
     assert text.startswith(f"NLP soup: {nlp.nx} variables, {nlp.ng} constraints")
     rows = {}
@@ -142,8 +135,8 @@ def test_the_print_shows_sizes_bound_kinds_and_sparsity():
         rows[label, kind] = int(count)
     assert sum(v for (label, _), v in rows.items() if label == "variables") == nlp.nx
     assert sum(v for (label, _), v in rows.items() if label == "constraints") == nlp.ng
-    switches = sum(name.startswith("z_") for name in nlp.x_names())
-    assert rows["variables", "range"] == switches > 0
+    slacks = sum(name.startswith("s_") for name in nlp.x_names())
+    assert rows["variables", "lower"] == slacks + 12
     assert rows["constraints", "fixed"] == nlp.sizes()["equalities"]
     assert f"{nlp.nnzj} nonzeros" in text
     assert f"{nlp.nnzh} nonzeros" in text
@@ -183,13 +176,11 @@ def test_a_table_must_fit_its_kernel_and_be_finite():
 
 
 @pytest.mark.parametrize("units", UNITS)
-@pytest.mark.parametrize(("norm", "truncation"), FORMS)
-def test_the_same_soup_has_the_same_objective_in_every_gauge(norm, truncation, units):
+@pytest.mark.parametrize("norm", NORMS)
+def test_the_same_soup_has_the_same_objective_in_every_gauge(norm, units):
     problem, found = tiny(units), []
     for gauge in GAUGES:
-        nlp, _ = problem.nlp(
-            weights_for(units), form(gauge=gauge, norm=norm, truncation=truncation)
-        )
+        nlp, _ = problem.nlp(weights_for(units), form(gauge=gauge, norm=norm))
         found.append(value(nlp, nlp.x0)[0])
     assert found[0] > 0
     np.testing.assert_allclose(found, found[0], rtol=1e-12)
@@ -203,16 +194,28 @@ def test_the_presolve_has_the_same_objective_as_the_constrained_nlp(units):
     assert value(two, two.x0)[0] == pytest.approx(value(one, one.x0)[0], rel=1e-11)
 
 
-@pytest.mark.parametrize("gauge", ["free", "unit-translation"])
-def test_a_free_gauges_length_unit_weighs_distances_by_share(gauge):
+def test_the_length_unit_of_a_variable_offset_weighs_distances_by_share():
     problem = tiny()
     share = np.linspace(1.0, 4.0, len(problem.soup))
     share /= share.sum()
     data = replace(problem.data, share=share)
-    nlp, layout = build_matrix_nlp(problem.soup, data, PAPER, form(gauge=gauge))
+    nlp, layout = build_matrix_nlp(problem.soup, data, PAPER, form(gauge="unit-translation"))
     row = nlp.g_names().index(next(name for name in nlp.g_names() if name.startswith("unit")))
-    g = np.asarray(nlp.oracle(nlp.x0, nlp.p)[1]).ravel()
+    g = nlp.constraints(nlp.x0)
     assert g[row] == pytest.approx(1.0, rel=1e-12)
     # with equal shares the unit would be the mean distance, which is another one
     soup = layout.unpack(nlp.x0[: layout.size])
     assert abs(float(np.mean(soup.distance)) - 1) > 0.01
+
+
+def test_the_presolve_starts_feasible_on_inverse_depth_too():
+    problem = tiny("pixels")
+    own = problem.soup, problem.data, weights_for("pixels"), form()
+    nlp, layout = build_tangent_nlp(*own, chart="inverse-depth")
+    assert nlp.x_names()[:3] == layout.names()[:3] == ["rho[0]", "g1[0]", "g2[0]"]
+    # away from the base of the chart, where rho is 1 and 1 / rho too
+    x = nlp.x0.copy()
+    x[::9] *= np.linspace(0.8, 1.25, layout.count)
+    row = nlp.g_names().index("simplex[0]")
+    share = problem.soup.normalised(layout.share).lam
+    assert nlp.constraints(x)[row] == pytest.approx((share / x[::9]).sum(), rel=1e-12)

@@ -1,9 +1,8 @@
-"""Three faces of one NLP agree: plain numpy, CasADi kernels in tables, finite differences."""
+"""Three faces of one NLP agree: plain numpy, kernels in tables, finite differences."""
 
 from __future__ import annotations
 
 import itertools
-import logging
 from functools import cache
 
 import casadi as ca
@@ -14,10 +13,7 @@ from helpers_model import (
     K_NEXT,
     Tiny,
     directional,
-    gradient,
-    hessian,
-    jacobian,
-    kernel_exact,
+    exact_terms,
     lagrangian_gradient,
     random_soup,
     value,
@@ -25,13 +21,10 @@ from helpers_model import (
     wiggle,
 )
 
-from soup_nlp.model import compile as compiling
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.kernel import HESSIANS, Kernel
-from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.nlp import NLP, to_scipy
-from soup_nlp.model.norms import Norm, smooth_min, solver_form
+from soup_nlp.model.kernel import HESSIANS
+from soup_nlp.model.nlp import NLP
 from soup_nlp.model.superpixel import tangent_view
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
@@ -39,20 +32,13 @@ pytestmark = pytest.mark.slow
 
 UNITS = ("paper", "pixels")
 NORMS = ("smooth", "epigraph")
-TRUNCATIONS = ("smooth", "lifted")
-EXACT = {
-    "arap": 1e-11,
-    "proj": 1e-12,
-    "cont": 1e-12,
-    "orient": 1e-12,
-    "prior": 1e-12,
-    "depth": 1e-12,
-}
-"""Relative. The kernel takes distances of anchors as sqrt(|v|^2 + 1e-12): 2e-12 of E_arap."""
-FORMS = list(itertools.product(GAUGES, NORMS, TRUNCATIONS))
 DATA = list(itertools.product(UNITS, (False, True)))
-EVERY = [(*form, *DATA[(k + k // 4) % 4]) for k, form in enumerate(FORMS)]
-"""Every formulation, and every value of two of the five choices together: 12 of 48."""
+EVERY = [
+    (*form, *DATA[k])
+    for k, form in enumerate(itertools.product((*GAUGES, "tangent"), NORMS))
+    for k in ((k + k // 4) % 4, (k + k // 4 + 2) % 4)
+]
+"""Every coordinates and norm, each with both units and both ways to compare motions."""
 
 
 @cache
@@ -68,67 +54,52 @@ def form(units: str = "paper", **options) -> Formulation:
     )
 
 
-def assert_derivatives(nlp: NLP, x: np.ndarray, seed: int, exact_hessian: bool = True) -> None:
-    """Gradient, Jacobian and Lagrangian Hessian along random dense directions."""
-    rng = np.random.default_rng(seed)
-    lam_f, lam_g = rng.uniform(0.5, 2.0), rng.normal(size=nlp.ng)
-    grad, jac = gradient(nlp, x), jacobian(nlp, x)
-    f, g = value(nlp, x)
-    assert float(nlp.grad_f(x, nlp.p)[0]) == pytest.approx(f, rel=1e-13)
-    np.testing.assert_array_equal(np.asarray(nlp.jac_g(x, nlp.p)[0]).ravel(), g)
-    H = hessian(nlp, x, lam_f, lam_g) if exact_hessian else None
-    for _ in range(2):
-        v = rng.uniform(-1, 1, nlp.nx)
-        scale = np.abs(grad) @ np.abs(v)
-        found = directional(lambda y: value(nlp, y)[0], x, v)
-        assert found == pytest.approx(grad @ v, abs=1e-8 * (1 + scale))
-        found = directional(lambda y: value(nlp, y)[1], x, v)
-        np.testing.assert_allclose(found, jac @ v, atol=1e-8)
-        if H is not None:
-            found = directional(lambda y: lagrangian_gradient(nlp, y, lam_f, lam_g), x, v)
-            scale = 1 + np.abs(H) @ np.abs(v)
-            np.testing.assert_allclose(found / scale, H @ v / scale, atol=1e-7)
+def program(coordinates, norm, units, at_anchors, truncated=True, **options):
+    """The NLP and its layout in matrices of a gauge, or in tangent coordinates."""
+    problem, weights = tiny(units, at_anchors), weights_for(units, truncated)
+    if coordinates == "tangent":
+        own = form(units, norm=norm, **options)
+        return build_tangent_nlp(problem.soup, problem.data, weights, own)
+    return problem.nlp(weights, form(units, norm=norm, gauge=coordinates, **options))
 
 
-# --- plain numpy and exact kernels ---------------------------------------------------------------
+# --- plain numpy and symbolic terms --------------------------------------------------------------
 
 
 @pytest.mark.parametrize("truncated", [True, False])
 @pytest.mark.parametrize("at_anchors", [True, False])
 @pytest.mark.parametrize("units", UNITS)
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_exact_kernels_equal_plain_numpy_term_by_term(gauge, units, at_anchors, truncated):
+def test_symbolic_terms_equal_plain_numpy(gauge, units, at_anchors, truncated):
     problem, weights = tiny(units, at_anchors), weights_for(units, truncated)
-    nlp, layout = problem.nlp(weights, form(units, gauge=gauge, truncation="lifted"))
+    _, layout = problem.nlp(weights, form(units, gauge=gauge))
     for seed in range(3):
         soup = random_soup(seed, len(problem.seg))
         expected = oracle.energy(soup, problem.data, weights)
-        x = np.concatenate([layout.pack(soup), np.zeros(nlp.nx - layout.size)])
-        found = kernel_exact(nlp, x)
+        found = exact_terms(layout.pack(soup), problem.data, weights, layout)
         assert found.keys() == expected.keys() - {"total"}
         for term, e in found.items():
             assert e > 0
-            assert e == pytest.approx(expected[term], rel=EXACT[term]), term
+            # distances of anchors are sqrt(|v|^2 + 1e-12): 2e-12 of E_arap
+            assert e == pytest.approx(expected[term], rel=1e-11), term
 
 
 @pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
 @pytest.mark.parametrize("units", UNITS)
-def test_tangent_kernels_equal_plain_numpy_term_by_term(units, chart):
+def test_terms_in_tangent_coordinates_equal_plain_numpy(units, chart):
     problem, weights = tiny(units), weights_for(units)
-    lifted = form(units, truncation="lifted")
-    nlp, layout = build_tangent_nlp(problem.soup, problem.data, weights, lifted, chart)
+    own = problem.soup, problem.data, weights, form(units)
+    _, layout = build_tangent_nlp(*own, chart)
     rng = np.random.default_rng(0)
     for size in (0.0, 0.05):
-        own = layout.pack(problem.soup)
-        own *= 1 + size * rng.normal(size=own.size)
-        x = np.append(own, np.zeros(nlp.nx - own.size))
-        expected = oracle.energy(layout.unpack(own), problem.data, weights)
-        # kernels measure in the base's unit, plain in the soup's own: equal at the base, and
+        x = layout.pack(problem.soup)
+        x *= 1 + size * rng.normal(size=x.size)
+        expected = oracle.energy(layout.unpack(x), problem.data, weights)
+        # lengths are in the base's unit, in numpy in the soup's: equal at the base, and
         # everywhere once units are local
-        found = kernel_exact(nlp, x)
-        for term, e in found.items():
+        for term, e in exact_terms(x, problem.data, weights, layout).items():
             if size == 0 or units == "pixels" or term in ("proj", "orient"):
-                assert e == pytest.approx(expected[term], rel=EXACT[term]), term
+                assert e == pytest.approx(expected[term], rel=1e-11), term
 
 
 def test_truncations_of_the_tiny_problem_cut_some_and_spare_some():
@@ -148,60 +119,44 @@ def test_truncations_of_the_tiny_problem_cut_some_and_spare_some():
 # --- finite differences --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("gauge", "norm", "truncation", "units", "at_anchors"), EVERY)
-def test_derivatives_equal_finite_differences(gauge, norm, truncation, units, at_anchors):
-    problem = tiny(units, at_anchors)
-    nlp, layout = problem.nlp(
-        weights_for(units), form(units, gauge=gauge, norm=norm, truncation=truncation)
-    )
+def assert_derivatives(nlp: NLP, x: np.ndarray, seed: int) -> None:
+    """Gradient, Jacobian and Lagrangian Hessian along random dense directions."""
+    rng = np.random.default_rng(seed)
+    lam_f, lam_g = rng.uniform(0.5, 2.0), rng.normal(size=nlp.ng)
+    grad, jac, H = nlp.gradient(x), nlp.jacobian(x), nlp.hessian(x, lam_g, lam_f)
+    for _ in range(2):
+        v = rng.uniform(-1, 1, nlp.nx)
+        scale = np.abs(grad) @ np.abs(v)
+        found = directional(lambda y: value(nlp, y)[0], x, v)
+        assert found == pytest.approx(grad @ v, abs=1e-8 * (1 + scale))
+        found = directional(lambda y: value(nlp, y)[1], x, v)
+        np.testing.assert_allclose(found, jac @ v, atol=1e-8)
+        found = directional(lambda y: lagrangian_gradient(nlp, y, lam_f, lam_g), x, v)
+        scale = 1 + np.abs(H) @ np.abs(v)
+        np.testing.assert_allclose(found / scale, H @ v / scale, atol=1e-7)
+
+
+@pytest.mark.parametrize("truncated", [True, False])
+@pytest.mark.parametrize(("coordinates", "norm", "units", "at_anchors"), EVERY)
+def test_derivatives_equal_finite_differences(coordinates, norm, units, at_anchors, truncated):
+    nlp, layout = program(coordinates, norm, units, at_anchors, truncated)
     assert_derivatives(nlp, wiggle(nlp, layout.size, 1, 0.0), 2)
     assert_derivatives(nlp, wiggle(nlp, layout.size, 3, 0.05), 4)
-
-
-@pytest.mark.parametrize("units", UNITS)
-@pytest.mark.parametrize("truncation", TRUNCATIONS)
-@pytest.mark.parametrize("norm", NORMS)
-def test_untruncated_derivatives_equal_finite_differences(norm, truncation, units):
-    nlp, layout = tiny(units).nlp(
-        weights_for(units, truncated=False), form(units, norm=norm, truncation=truncation)
-    )
-    assert_derivatives(nlp, wiggle(nlp, layout.size, 5, 0.05), 6)
-
-
-@pytest.mark.parametrize("at_anchors", [True, False])
-@pytest.mark.parametrize("units", UNITS)
-@pytest.mark.parametrize("truncation", TRUNCATIONS)
-@pytest.mark.parametrize("norm", NORMS)
-def test_derivatives_of_the_presolve_equal_finite_differences(norm, truncation, units, at_anchors):
-    problem = tiny(units, at_anchors)
-    nlp, layout = build_tangent_nlp(
-        problem.soup,
-        problem.data,
-        weights_for(units),
-        form(units, norm=norm, truncation=truncation),
-    )
-    own = 9 * layout.count
-    assert_derivatives(nlp, wiggle(nlp, own, 1, 0.0), 2)
-    assert_derivatives(nlp, wiggle(nlp, own, 3, 0.05), 4)
 
 
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_every_entry_of_jacobian_and_hessian(gauge):
     """Column by column, with the name of the entry that disagrees."""
-    problem = tiny("pixels", True)
-    nlp, layout = problem.nlp(
-        weights_for("pixels"), form("pixels", gauge=gauge, truncation="lifted")
-    )
+    nlp, layout = program(gauge, "smooth", "pixels", True)
     x = wiggle(nlp, layout.size, 7, 0.03)
     lam_g = np.random.default_rng(8).normal(size=nlp.ng)
-    J, H = jacobian(nlp, x), hessian(nlp, x, 1.0, lam_g)
+    J, H = nlp.jacobian(x).toarray(), nlp.hessian(x, lam_g).toarray()
     names, rows = nlp.x_names(), nlp.g_names()
     scale = 1 + np.abs(H).max()
 
     def both(y: np.ndarray) -> np.ndarray:
         """Constraints, then the gradient of the Lagrangian."""
-        g, jac = nlp.jac_g(y, nlp.p)
-        return np.append(np.asarray(g), gradient(nlp, y) + to_scipy(jac).T @ lam_g)
+        return np.append(nlp.constraints(y), lagrangian_gradient(nlp, y, 1.0, lam_g))
 
     for j in range(0, nlp.nx, 3):
         v = np.zeros(nlp.nx)
@@ -216,189 +171,67 @@ def test_every_entry_of_jacobian_and_hessian(gauge):
 # --- kinds of Hessian ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("gauge", "norm", "truncation", "units", "at_anchors"), EVERY)
+@pytest.mark.parametrize(("coordinates", "norm", "units", "at_anchors"), EVERY)
 def test_gauss_newton_is_positive_semidefinite_whatever_the_multipliers(
-    gauge, norm, truncation, units, at_anchors
+    coordinates, norm, units, at_anchors
 ):
-    problem = tiny(units, at_anchors)
-    nlp, layout = problem.nlp(
-        weights_for(units),
-        form(units, gauge=gauge, norm=norm, truncation=truncation, hessian="gauss-newton"),
-    )
+    nlp, layout = program(coordinates, norm, units, at_anchors, hessian="gauss-newton")
     for seed in range(2):
         x = wiggle(nlp, layout.size, seed, 0.05)
         lam_g = np.random.default_rng(seed).normal(size=nlp.ng)
-        H = hessian(nlp, x, 1.0, lam_g)
-        # slacks and switches have empty rows, over which LAPACK takes seconds
+        H = nlp.hessian(x, lam_g).toarray()
+        # slack variables have empty rows, over which LAPACK takes seconds
         some = H.any(axis=0)
         eigen = np.linalg.eigvalsh(H[np.ix_(some, some)])
-        assert eigen[0] >= -1e-12 * eigen[-1]
+        least = 0.99 * form().ridge if coordinates == "tangent" and norm == "smooth" else 0.0
+        assert eigen[0] >= least - 1e-12 * eigen[-1]
         assert eigen[-1] > 0
-        np.testing.assert_array_equal(H, hessian(nlp, x, 1.0, np.zeros(nlp.ng)))
-
-
-@pytest.mark.parametrize("units", UNITS)
-def test_gauss_newton_of_the_presolve_is_positive_definite(units):
-    problem = tiny(units)
-    nlp, layout = build_tangent_nlp(
-        problem.soup, problem.data, weights_for(units), form(units, hessian="gauss-newton")
-    )
-    for seed in range(3):
-        x = wiggle(nlp, 9 * layout.count, seed, 0.05)
-        ridge = form().ridge
-        assert np.linalg.eigvalsh(hessian(nlp, x, 1.0, np.zeros(nlp.ng)))[0] >= 0.99 * ridge
+        np.testing.assert_array_equal(H, nlp.hessian(x, np.zeros(nlp.ng)).toarray())
 
 
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_kinds_of_hessian_share_the_curvature_of_the_constraints(gauge):
-    problem, H = tiny("paper"), {}
-    rng = np.random.default_rng(0)
+    H = {}
     for kind in HESSIANS:
-        nlp, layout = problem.nlp(weights_for("paper"), form(gauge=gauge, hessian=kind))
-        assert nlp.hessian == kind
+        nlp, layout = program(gauge, "smooth", "paper", False, hessian=kind)
         x = wiggle(nlp, layout.size, 1, 0.03)
         lam_g = np.random.default_rng(2).normal(size=nlp.ng)
-        H[kind] = hessian(nlp, x, 1.0, lam_g), hessian(nlp, x, 1.0, 0 * lam_g)
-    v = rng.normal(size=nlp.nx)
+        H[kind] = nlp.hessian(x, lam_g), nlp.hessian(x, 0 * lam_g)
+    v = np.random.default_rng(0).normal(size=nlp.nx)
     curvature = (H["exact"][0] - H["exact"][1]) @ v
     found = (H["gauss-newton+constraints"][0] - H["gauss-newton"][0]) @ v
     np.testing.assert_allclose(found, curvature, atol=1e-9)
     assert np.abs(curvature).max() > 1
 
 
-def test_a_linear_residual_has_its_exact_hessian_at_theta_one():
-    x, eps, theta = ca.SX.sym("x", 3), ca.SX.sym("eps"), ca.SX.sym("theta")
-    A = np.random.default_rng(0).normal(size=(4, 3))
-    norm = Norm("linear", ca.SX(1.7), A @ x - [0.1, 0.2, 0.3, 0.4], eps)
-    made = solver_form(norm, x, theta, None, None)
-    gap = ca.hessian(made.objective, x)[0] - made.curvature
-    f = ca.Function("gap", [x, eps, theta], [gap, made.curvature])
-    at = [0.3, -0.2, 0.4]
-    np.testing.assert_allclose(np.asarray(f(at, 0.3, 1.0)[0]), 0, atol=1e-12)
-    # less than Newton's along the residual is taken out below theta = 1: the majorant is larger
-    assert np.linalg.eigvalsh(-np.asarray(f(at, 0.3, 0.5)[0])).min() >= -1e-12
-
-
-@pytest.mark.parametrize("width", [1e-3, 0.1, 1.0])
-def test_smooth_min_bounds_and_slope(width):
-    y = ca.SX.sym("y")
-    f = ca.Function(
-        "f",
-        [y],
-        [
-            *smooth_min(y, ca.SX(0.5), ca.SX(width)),
-            ca.gradient(smooth_min(y, ca.SX(0.5), ca.SX(width))[0], y),
-        ],
-    )
-    assert float(f(0.0)[0]) == pytest.approx(0.0, abs=1e-15)
-    values = np.array([[float(v) for v in f(t)] for t in np.linspace(0, 5, 41)])
-    exact = np.minimum(np.linspace(0, 5, 41), 0.5)
-    # shifted up by its value at 0, at most width^2 / (4 sigma)
-    assert (np.abs(values[:, 0] - exact) <= width / 2).all()
-    np.testing.assert_allclose(values[:, 1], values[:, 2], atol=1e-12)
-    assert ((values[:, 1] > 0) & (values[:, 1] < 1)).all()
-
-
-# --- machine code and virtual machine ------------------------------------------------------------
-
-
-@pytest.fixture
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("SOUP_NLP_CACHE", str(tmp_path / "kernels"))
-    return tmp_path / "kernels"
-
-
-def assert_twins(a: NLP, b: NLP, x: np.ndarray) -> None:
-    lam_g = np.random.default_rng(0).normal(size=a.ng)
-    for one, two in (
-        (value(a, x), value(b, x)),
-        ((gradient(a, x), jacobian(a, x)), (gradient(b, x), jacobian(b, x))),
-        ((hessian(a, x, 1.0, lam_g), 0), (hessian(b, x, 1.0, lam_g), 0)),
-    ):
-        for p, q in zip(one, two):
-            np.testing.assert_allclose(p, q, rtol=1e-12, atol=1e-12 * np.abs(q).max())
-
-
-@pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
-def test_machine_code_equals_the_virtual_machine():
-    problem, weights = tiny("pixels"), weights_for("pixels")
-    options = {"gauge": "unit-translation", "norm": "epigraph", "truncation": "lifted"}
-    slow, layout = problem.nlp(weights, form("pixels", **options))
-    fast, _ = problem.nlp(weights, form("pixels", **options, compiled=True))
-    assert_twins(fast, slow, wiggle(slow, layout.size, 1, 0.05))
-
-
-@pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
-def test_machine_code_of_the_presolve_equals_the_virtual_machine():
-    problem, weights = tiny("pixels"), weights_for("pixels")
-    args = problem.soup, problem.data, weights
-    kind = {"hessian": "gauss-newton"}
-    slow, layout = build_tangent_nlp(*args, form("pixels", **kind))
-    fast, _ = build_tangent_nlp(*args, form("pixels", **kind, compiled=True))
-    assert_twins(fast, slow, wiggle(slow, 9 * layout.count, 1, 0.05))
-
-
-CUTS = [0, 3, 4, 5, 14, 17]
-"""Of the base of a tangent view: anchor, radius, depth, R0, t0."""
-
-
-def squares() -> Kernel:
-    x, theta = ca.SX.sym("x", 2), ca.SX.sym("theta", 0)
-    return Kernel("squares", x, ca.SX.sym("row", 0), theta, objective=ca.sumsqr(x))
-
-
-@pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
-def test_machine_code_is_cached(own_cache):
-    functions, stamps = list(squares().first_order().values()), []
-    for _ in range(2):
-        made = compiling.compile_functions(functions)
-        assert float(made["squares_f"]([3.0, 4.0], [], [])) == 25.0
-        stamps.append({p: p.stat().st_mtime_ns for p in own_cache.glob("*.so")})
-    assert len(stamps[0]) == 1
-    assert stamps[0] == stamps[1]
-
-
-@pytest.mark.parametrize("cc", ["/bin/false", "/no/such/compiler"])
-def test_without_a_working_compiler_kernels_run_in_the_virtual_machine(
-    cc, own_cache, monkeypatch, caplog
-):
-    monkeypatch.setenv("CC", cc)
-    with caplog.at_level(logging.DEBUG):
-        functions = list(squares().first_order().values())
-        made = compiling.compile_functions(functions)
-    assert set(made) == {f.name() for f in functions}
-    assert float(made["squares_f"]([3.0, 4.0], [], [])) == 25.0
-    assert "virtual machine" in caplog.text
-    assert not list(own_cache.glob("*"))
-
-
-def test_an_unusable_cache_folder_costs_speed_only(tmp_path, monkeypatch, caplog):
-    blocked = tmp_path / "file"
-    blocked.write_text("not a folder")
-    monkeypatch.setenv("SOUP_NLP_CACHE", str(blocked))
-    made = compiling.compile_functions(list(squares().first_order().values()), "/bin/false")
-    assert float(made["squares_f"]([3.0, 4.0], [], [])) == 25.0
-    assert "failed" in caplog.text
-
-
-def test_a_whole_nlp_is_built_without_a_compiler(own_cache, monkeypatch):
-    monkeypatch.setenv("CC", "/bin/false")
-    problem, weights = tiny("paper"), weights_for("paper")
-    nlp, layout = build_matrix_nlp(problem.soup, problem.data, weights, form(compiled=True))
-    other, _ = build_matrix_nlp(problem.soup, problem.data, weights, form(compiled=False))
-    assert_twins(nlp, other, wiggle(nlp, layout.size, 1, 0.02))
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_the_ridge_is_its_factor_times_a_natural_step(gauge):
+    """Relative 1 in scale and offset, one radian in R, one anchor depth in the translation."""
+    found = {}
+    for ridge in (0.0, 0.5):
+        nlp, layout = program(gauge, "smooth", "pixels", False, hessian="gauss-newton", ridge=ridge)
+        x = wiggle(nlp, layout.size, 1, 0.01)
+        found[ridge] = nlp.hessian(x, np.zeros(nlp.ng)).diagonal()
+    count, stride = layout.count, layout.stride
+    metric = (found[0.5] - found[0.0])[: count * stride].reshape(count, stride) / 0.5
+    own = nlp.x0[: count * stride].reshape(metric.shape)
+    np.testing.assert_allclose(metric[:, 0] * own[:, 0] ** 2, 1, rtol=1e-6)
+    np.testing.assert_allclose(metric[:, -12:-3], 1, rtol=1e-6)
+    step = layout.unpack(nlp.x0).depth_at(tiny("pixels").data.anchor_ray) / own[:, 0]
+    np.testing.assert_allclose(metric[:, -3:] * step[:, None] ** 2, 1, rtol=1e-6)
 
 
 # --- views ---------------------------------------------------------------------------------------
 
 
 def test_what_two_views_differ_by_is_the_difference_of_both():
+    # of the base of a tangent view: anchor, radius, depth, R0, t0
+    cuts = [0, 3, 4, 5, 14, 17]
     x, base = ca.SX.sym("x", 18), ca.SX.sym("base", 34)
-    views = [
-        tangent_view(x[9 * a : 9 * a + 9], *ca.vertsplit(base[17 * a : 17 * a + 17], CUTS))
-        for a in range(2)
-    ]
-    a, b = views
+    a, b = (
+        tangent_view(x[9 * k : 9 * k + 9], *ca.vertsplit(base[17 * k : 17 * k + 17], cuts))
+        for k in range(2)
+    )
     points = a.point(ca.SX([0.1, 0.2, 1])), b.point(ca.SX([0.3, -0.1, 1]))
     pairs = [
         (a.turn_from(b), a.R - b.R),
@@ -410,6 +243,5 @@ def test_what_two_views_differ_by_is_the_difference_of_both():
     bases = [np.concatenate([[0.1, -0.2, 1, 0.05, 2.0], R, rng.normal(size=3)]) for R in turns]
     values = np.tile([1.1, 0.2, -0.1] + [0.3] * 6, 2), np.concatenate(bases)
     for one, other in pairs:
-        f = ca.Function("f", [x, base], [one, other])
-        p, q = f(*values)
+        p, q = ca.Function("f", [x, base], [one, other])(*values)
         np.testing.assert_allclose(np.asarray(p), np.asarray(q), atol=1e-13)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.arrays import Int
-from soup_nlp.model.assemble import Entries, Pattern
-from soup_nlp.model.blocks import Elements, pattern_of
+from soup_nlp.model.pattern import Elements, Entries, Pattern, pattern_of
 
 
 @pytest.mark.parametrize("size", [40, 100_000])

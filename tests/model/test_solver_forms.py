@@ -1,4 +1,4 @@
-"""Smooth, epigraph and lifted forms against the exact energy, and worlds where that is zero."""
+"""Smooth and epigraph forms against the exact energy, and worlds where that is zero."""
 
 from __future__ import annotations
 
@@ -7,19 +7,62 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from helpers_formulation import FORMS, UNITS, WORLDS, form, tiny, world
-from helpers_model import GAUGES, PAPER, gradient, value, weights_for
+from helpers_formulation import NORMS, UNITS, WORLDS, form, tiny, world
+from helpers_model import GAUGES, PAPER, value, weights_for
 
 from soup_nlp.geometry import rotation
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import TERMS
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.norms import Norm, smooth_min, solver_form
+
+# --- norms and truncations -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("width", [1e-3, 0.1, 1.0])
+def test_smooth_min_bounds_and_slope(width):
+    y = ca.SX.sym("y")
+    both = smooth_min(y, ca.SX(0.5), ca.SX(width))
+    f = ca.Function("f", [y], [*both, ca.gradient(both[0], y)])
+    at = np.linspace(0, 5, 41)
+    found = np.array([[float(v) for v in f(t)] for t in at])
+    assert found[0, 0] == pytest.approx(0.0, abs=1e-15)
+    # shifted up by its value at 0, at most width^2 / (4 sigma)
+    assert (np.abs(found[:, 0] - np.minimum(at, 0.5)) <= width / 2).all()
+    np.testing.assert_allclose(found[:, 1], found[:, 2], atol=1e-12)
+    assert ((found[:, 1] > 0) & (found[:, 1] < 1)).all()
+
+
+def test_a_linear_residual_has_its_exact_hessian_at_theta_one():
+    x, eps, theta = ca.SX.sym("x", 3), ca.SX.sym("eps"), ca.SX.sym("theta")
+    A = np.random.default_rng(0).normal(size=(4, 3))
+    norm = Norm("linear", ca.SX(1.7), A @ x - [0.1, 0.2, 0.3, 0.4], eps)
+    made = solver_form(norm, x, theta, None)
+    f = ca.Function("gap", [x, eps, theta], [ca.hessian(made.objective, x)[0] - made.curvature])
+    at = [0.3, -0.2, 0.4]
+    np.testing.assert_allclose(np.asarray(f(at, 0.3, 1.0)), 0, atol=1e-12)
+    # with less of the curvature along the residual left out the matrix is a majorant
+    assert np.linalg.eigvalsh(-np.asarray(f(at, 0.3, 0.5))).min() >= -1e-12
+
+
+def test_curvature_near_a_truncation_is_kept_along_the_residual():
+    x, theta = ca.SX.sym("x", 2), 0.9
+    norm = Norm("cut", ca.SX(1.0), x, ca.SX(0.1), sigma=ca.SX(0.5))
+    at = np.array([0.4, 0.3])
+    made = solver_form(norm, x, ca.SX(theta), None)
+    found = np.asarray(ca.Function("c", [x], [made.curvature])(at))
+    root = np.sqrt(at @ at + 0.01)
+    slope = float(ca.evalf(smooth_min(ca.SX(root - 0.1), ca.SX(0.5), ca.SX(0.15))[1]))
+    assert 0.3 < slope < 0.8
+    along = theta * slope**2 * np.outer(at, at) / root**2
+    np.testing.assert_allclose(found, slope / root * (np.eye(2) - along), rtol=1e-12)
+
 
 # --- solver forms and the exact energy -----------------------------------------------------------
 
 
-def by_term(nlp: NLP, x: np.ndarray, p: np.ndarray) -> dict[str, float]:
+def by_term(nlp: NLP, x: np.ndarray, **theta: float) -> dict[str, float]:
     """Objective by kernel."""
     out = {}
     for group in nlp.groups:
@@ -27,8 +70,8 @@ def by_term(nlp: NLP, x: np.ndarray, p: np.ndarray) -> dict[str, float]:
         if k.name not in TERMS:
             continue
         f = ca.Function("f", [k.x, k.row, k.theta], [k.objective]).map(len(t))
-        theta = np.repeat(p[: len(nlp.theta), None], len(t), axis=1)
-        out[k.name] = float(np.asarray(f(x[t.index].T, t.data.T, theta)).sum())
+        shared = np.repeat(nlp.thetas(**theta)[:, None], len(t), axis=1)
+        out[k.name] = float(np.asarray(f(x[t.index].T, t.data.T, shared)).sum())
     return out
 
 
@@ -36,11 +79,11 @@ def by_term(nlp: NLP, x: np.ndarray, p: np.ndarray) -> dict[str, float]:
 def test_the_smooth_norm_tends_to_the_exact_energy(units):
     problem = tiny(units)
     weights = weights_for(units, truncated=False).replace(sigma_cont=np.inf)
-    nlp, _ = problem.nlp(weights, form(truncation="smooth"))
+    nlp, _ = problem.nlp(weights, form())
     exact = oracle.energy(problem.soup, problem.data, weights)
     gap = []
     for eps in (1e-2, 1e-3, 1e-4, 1e-7):
-        made = by_term(nlp, nlp.x0, nlp.with_theta(eps=eps, eps_pixel=eps))
+        made = by_term(nlp, nlp.x0, eps=eps, eps_pixel=eps)
         gap.append([(exact[k] - made[k]) / exact[k] for k in ("arap", "proj", "cont")])
     # sqrt(v^2 + eps^2) - eps is below |v| by less than eps, and nearer with every smaller eps
     assert (np.array(gap) > 0).all()
@@ -51,10 +94,9 @@ def test_the_smooth_norm_tends_to_the_exact_energy(units):
 @pytest.mark.parametrize("units", UNITS)
 def test_the_smooth_truncation_stays_near_the_exact_energy(units):
     """Its corner is rounded by a share of sigma, whatever eps: within a fifth of sigma a norm."""
-    problem, weights, data = tiny(units), weights_for(units), tiny(units).data
-    nlp, _ = problem.nlp(weights, form(truncation="smooth", eps=1e-7, eps_pixel=1e-7))
-    exact, made = oracle.energy(problem.soup, data, weights), by_term(nlp, nlp.x0, nlp.p)
-    w = weights
+    problem, w, data = tiny(units), weights_for(units), tiny(units).data
+    nlp, _ = problem.nlp(w, form(eps=1e-7, eps_pixel=1e-7))
+    exact, made = oracle.energy(problem.soup, data, w), by_term(nlp, nlp.x0)
     cap = {
         "arap": 3 * w.arap * w.sigma_arap * data.edge_weight.sum(),
         "proj": w.proj * w.sigma_proj * data.pixel_weight.sum(),
@@ -66,91 +108,60 @@ def test_the_smooth_truncation_stays_near_the_exact_energy(units):
     assert made["prior"] == pytest.approx(exact["prior"], rel=1e-5)
 
 
-def parts(nlp: NLP, letter: str) -> dict[str, int]:
-    """Index of every slack ("s") or switch ("z") by what it belongs to."""
-    return {name[2:]: i for i, name in enumerate(nlp.x_names()) if name.startswith(f"{letter}_")}
-
-
-def optimal_extras(nlp: NLP) -> np.ndarray:
-    """x0 with the smallest feasible slacks and the better end of every switch."""
+def optimal_slacks(nlp: NLP) -> np.ndarray:
+    """x0 with the smallest feasible slack variables."""
     x = nlp.x0.copy()
-    slack, switch = parts(nlp, "s"), parts(nlp, "z")
-    x[list(slack.values())] = 0.0
-    g = dict(zip(nlp.g_names(), value(nlp, x)[1]))
-    for name, i in slack.items():
+    slacks = {name[2:]: i for i, name in enumerate(nlp.x_names()) if name.startswith("s_")}
+    x[list(slacks.values())] = 0.0
+    g = dict(zip(nlp.g_names(), nlp.constraints(x)))
+    for name, i in slacks.items():
         # s^2 - |v|^2 - eps^2 at s = 0
         x[i] = np.sqrt(max(0.0, -g[f"epigraph_{name}"]))
-    index = list(switch.values())
-    x[index] = (gradient(nlp, x)[index] < 0).astype(float)
     return x
 
 
-@pytest.mark.parametrize("truncated", [True, False])
-@pytest.mark.parametrize("units", UNITS)
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_epigraph_and_lifted_at_their_optimum_are_the_exact_energy(gauge, units, truncated):
-    problem, weights = tiny(units), weights_for(units, truncated)
-    sharp = form(gauge=gauge, norm="epigraph", truncation="lifted", eps=0.0, eps_pixel=0.0)
-    nlp, _ = problem.nlp(weights, sharp)
-    exact = oracle.energy(problem.soup, problem.data, weights)
-    x = optimal_extras(nlp)
-    f, g = value(nlp, x)
-    assert f == pytest.approx(exact["total"], rel=1e-10)
-    assert np.maximum(nlp.lbg - g, g - nlp.ubg).max() <= 1e-9
-    for term, e in by_term(nlp, x, nlp.p).items():
-        assert e == pytest.approx(exact[term], rel=1e-10)
-    # whatever else the slacks and switches are, as long as they are feasible, f is not lower
-    rng = np.random.default_rng(0)
-    slack, switch = list(parts(nlp, "s").values()), list(parts(nlp, "z").values())
-    for _ in range(10):
-        y = x.copy()
-        y[slack] += rng.exponential(0.1, len(slack)) * (rng.random(len(slack)) < 0.5)
-        y[switch] = rng.uniform(0, 1, len(switch))
-        assert value(nlp, y)[0] > f
-    # and the start is nearly there
-    assert f <= value(nlp, nlp.x0)[0] <= 1.5 * f
-
-
-@pytest.mark.parametrize("units", UNITS)
-def test_lifted_optimum_tends_to_the_exact_energy(units):
-    problem, weights = tiny(units), weights_for(units)
-    nlp, _ = problem.nlp(weights, form(truncation="lifted", eps=1e-9, eps_pixel=1e-9))
-    exact = oracle.energy(problem.soup, problem.data, weights)["total"]
-    assert value(nlp, optimal_extras(nlp))[0] == pytest.approx(exact, rel=1e-7)
-
-
-def test_epigraph_optimum_is_the_exact_energy_without_truncations():
+def test_the_epigraph_at_its_optimum_is_the_exact_energy_without_truncations(gauge):
     problem = tiny()
     weights = PAPER.replace(sigma_cont=np.inf, orient=0.0)
-    nlp, _ = problem.nlp(weights, form(norm="epigraph", eps=0.0, eps_pixel=0.0))
+    nlp, _ = problem.nlp(weights, form(gauge=gauge, norm="epigraph", eps=0.0, eps_pixel=0.0))
     exact = oracle.energy(problem.soup, problem.data, weights)["total"]
-    assert value(nlp, optimal_extras(nlp))[0] == pytest.approx(exact, rel=1e-10)
+    x = optimal_slacks(nlp)
+    f, g = value(nlp, x)
+    assert f == pytest.approx(exact, rel=1e-10)
+    assert np.maximum(nlp.lbg - g, g - nlp.ubg).max() <= 1e-9
+    # whatever else the slack variables are, as long as they are feasible, f is not lower
+    rng, slack = np.random.default_rng(0), np.arange(nlp.nx) >= nlp.nx - len(nlp.x0[nlp.lbx == 0])
+    for _ in range(10):
+        y = x + slack * rng.exponential(0.1, nlp.nx) * (rng.random(nlp.nx) < 0.5)
+        assert nlp.value(y) > f
 
 
 @pytest.mark.parametrize("units", UNITS)
-def test_epigraph_at_its_optimum_is_the_smooth_form(units):
+def test_the_epigraph_at_its_optimum_is_the_smooth_form(units):
     problem, weights = tiny(units), weights_for(units)
     one, _ = problem.nlp(weights, form(norm="epigraph", eps=0.2, eps_pixel=0.1))
     two, _ = problem.nlp(weights, form(eps=0.2, eps_pixel=0.1))
-    smooth = value(two, two.x0)[0]
-    assert value(one, optimal_extras(one))[0] == pytest.approx(smooth, rel=1e-12)
-    # the slacks start there
-    assert value(one, one.x0)[0] == pytest.approx(smooth, rel=1e-12)
+    smooth = two.value(two.x0)
+    assert one.value(optimal_slacks(one)) == pytest.approx(smooth, rel=1e-12)
+    # the slack variables start there: every row of the epigraph form is then 0
+    assert one.value(one.x0) == pytest.approx(smooth, rel=1e-12)
+    np.testing.assert_allclose(one.x0, optimal_slacks(one), rtol=1e-12)
 
 
 def test_orientation_can_do_without_truncation():
     problem, weights = tiny(), PAPER.replace(sigma_orient=np.inf)
     nlp, _ = problem.nlp(weights, form())
     exact = oracle.energy(problem.soup, problem.data, weights)["orient"]
-    assert by_term(nlp, nlp.x0, nlp.p)["orient"] == pytest.approx(exact, rel=1e-12)
+    assert by_term(nlp, nlp.x0)["orient"] == pytest.approx(exact, rel=1e-12)
 
 
-@pytest.mark.parametrize("name", ["arap", "proj", "cont", "orient"])
+@pytest.mark.parametrize("name", TERMS)
 def test_a_weight_scales_its_term_alone(name):
-    problem = tiny()
-    nlp, _ = problem.nlp(PAPER, form())
-    twice, _ = problem.nlp(PAPER.replace(**{name: 2 * getattr(PAPER, name)}), form())
-    a, b = by_term(nlp, nlp.x0, nlp.p), by_term(twice, nlp.x0, twice.p)
+    nlp, _ = tiny().nlp(PAPER, form())
+    twice, _ = tiny().nlp(PAPER.replace(**{name: 2 * getattr(PAPER, name)}), form())
+    a, b = by_term(nlp, nlp.x0), by_term(twice, nlp.x0)
+    assert a.keys() == b.keys() == set(TERMS)
     for term in TERMS:
         assert b[term] == pytest.approx((2 if term == name else 1) * a[term], rel=1e-12)
 
@@ -171,20 +182,18 @@ def test_a_rigid_plane_has_no_energy_at_the_truth(name, units, at_anchors):
     assert e["proj"] <= 1e-10  # pixels
 
 
-@pytest.mark.parametrize(("norm", "truncation"), FORMS)
+@pytest.mark.parametrize("norm", NORMS)
+@pytest.mark.parametrize("gauge", GAUGES)
 @pytest.mark.parametrize("name", ["fronto-parallel, turning", "slanted"])
-def test_a_rigid_planes_truth_is_stationary_in_every_form(name, norm, truncation):
+def test_a_rigid_planes_truth_is_stationary_in_every_form(name, gauge, norm):
     soup, data = world(name, "pixels", False)
     # a plane that is slanted has relief
     flat = PAPER.replace(prior=0.0)
-    for gauge in GAUGES:
-        nlp, layout = build_matrix_nlp(
-            soup, data, flat, form(gauge=gauge, norm=norm, truncation=truncation, eps=0.03)
-        )
-        x = optimal_extras(nlp) if norm == "epigraph" or truncation == "lifted" else nlp.x0
-        assert value(nlp, x)[0] <= 1e-9
-        if norm == "smooth":
-            assert np.abs(gradient(nlp, x)[: layout.size]).max() <= 1e-5
+    nlp, layout = build_matrix_nlp(soup, data, flat, form(gauge=gauge, norm=norm, eps=0.03))
+    x = optimal_slacks(nlp)
+    assert nlp.value(x) <= 1e-9
+    if norm == "smooth":
+        assert np.abs(nlp.gradient(x)[: layout.size]).max() <= 1e-5
 
 
 def test_energy_is_positive_off_the_truth_and_each_term_reacts():

@@ -135,14 +135,12 @@ SOLVES: dict[str, tuple[str, ...]] = {
     "min_facing 0.3": ("formulation.min_facing=0.3", "solver.presolve=true"),
     "min_facing 0.5 presolved": ("formulation.min_facing=0.5", "solver.presolve=true"),
     **{
-        f"lifted {gauge} {norm}": (
-            f"formulation.gauge={gauge}",
-            "formulation.truncation=lifted",
+        f"unit-translation {norm}": (
+            "formulation.gauge=unit-translation",
             f"formulation.norm={norm}",
             "solver.presolve=true",
             "solver.max_iter=10",
         )
-        for gauge in ("free", "unit-translation")
         for norm in ("smooth", "epigraph")
     },
     "depth_ratio 1": ("formulation.depth_ratio=1",),

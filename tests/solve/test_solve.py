@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from helpers_model import (
     GAUGES,
     PAPER,
     disturbed,
-    gradient,
     motion,
     plane_pose,
     plane_soup,
@@ -34,7 +34,7 @@ from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.kkt import constraint_residuals, optimality
 from soup_nlp.solve.solver_options import SolverOptions
-from soup_nlp.solve.stages import Solution, solve_soup
+from soup_nlp.solve.stages import Solution, _near, solve_soup
 from soup_nlp.start.propose import propose
 from soup_nlp.storage.progress import Progress, Watch
 
@@ -206,7 +206,7 @@ def test_the_claimed_multipliers_balance_the_gradient(room, solved):
     lam_g = np.concatenate([m[f"lam_g_{k}"] for k in ("so3", "normal", "visible", "simplex")])
     near = optimality(nlp, x, m["lam_x"], lam_g)["dual_infeasibility"]
     assert near < 1e-2 < far
-    assert np.abs(gradient(nlp, x)).max() > near
+    assert np.abs(nlp.gradient(x)).max() > near
 
 
 def test_without_presolve_the_exact_hessian_converges(room, cold):
@@ -253,16 +253,7 @@ def test_the_second_strategy_keeps_the_lower_energy(room):
     assert [s.name for s in never.stages] == [s.name for s in one.stages]
 
 
-def test_the_lifted_truncation_converges(room):
-    options = OPTIONS.replace(max_iter=200, ipopt={"constr_viol_tol": 1e-9})
-    solution = room.solve(options, form(truncation="lifted"))
-    assert solution.converged, solution.status
-    assert_constraints(solution, room.data)
-    assert solution.energy["total"] < solution.energy_start["total"]
-
-
-# of the gauges, one that is not the default's; test_model_faces has every gauge with every form
-@pytest.mark.parametrize("gauge", ["unit-offset", "unit-translation"])
+@pytest.mark.parametrize("gauge", GAUGES)
 def test_the_epigraph_form_starts_at_the_presolves_kkt_point(room, solved, gauge):
     options = OPTIONS.replace(tol=1e-6)
     solution = room.solve(options, form(gauge=gauge, norm="epigraph"))
@@ -271,13 +262,6 @@ def test_the_epigraph_form_starts_at_the_presolves_kkt_point(room, solved, gauge
     assert_constraints(solution, room.data)
     # the same minimum: its norms are the smooth form's, written with slacks
     assert solution.energy["total"] == pytest.approx(solved[gauge].energy["total"], rel=1e-4)
-
-
-def test_the_epigraph_form_with_lifted_truncation_stays_feasible(room):
-    solution = room.solve(OPTIONS.replace(max_iter=40), form(norm="epigraph", truncation="lifted"))
-    assert solution.energy["total"] < solution.energy_start["total"]
-    # not converged: the best iterate is feasible to 1e-5 in the solver's own units
-    assert_constraints(solution, room.data, 2e-5)
 
 
 # --- limits and interruption of a soup -----------------------------------------------------------
@@ -446,3 +430,8 @@ def test_a_start_of_less_exact_energy_keeps_the_nlp_at_the_presolves_kkt_point(r
     assert again.delivered == "start"
     assert again.energy["total"] == pytest.approx(again.energy_start["total"], rel=1e-9)
     assert_constraints(again, room.data)
+
+
+def test_an_ipopt_without_iterations_is_not_near():
+    assert not _near(SimpleNamespace(converged=False, history={}))
+    assert _near(SimpleNamespace(converged=False, history={"inf_du": np.array([2.0, 0.5])}))

@@ -53,7 +53,7 @@ MUTANTS = [
     Mutant("simplex not held", MATRIX, "v.lam / n, every, lower=1.0, upper=1.0",
            f"v.lam / n, every, {FREE}"),
     Mutant("simplex at most 1", MATRIX, "v.lam / n, every, lower=1.0", "v.lam / n, every, lower=0"),
-    Mutant("unit not held", MATRIX, 'if form.gauge != "unit-offset":\n        # the length',
+    Mutant("unit not held", MATRIX, 'if form.gauge == "unit-translation":\n        # the length',
            "if False:\n        # the length"),
     Mutant("translation not held", MATRIX, "body, index, lower=0.0, upper=0.0",
            f"body, index, {FREE}"),

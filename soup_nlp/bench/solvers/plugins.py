@@ -11,7 +11,7 @@ import numpy as np
 from soup_nlp.bench.solvers.task import Answer, Task, Trace, clock
 from soup_nlp.export.verify import Limits
 from soup_nlp.model.nlp import NLP
-from soup_nlp.solve.callback import IterationCallback
+from soup_nlp.solve.functions import Functions, IterationCallback
 from soup_nlp.solve.ipopt import DEFAULTS
 
 Options = Mapping[str, Any]
@@ -105,6 +105,7 @@ CACHED: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "nlp_grad_f": ("grad_f_x",),
         "nlp_jac_g": ("g", "jac_g_x"),
         "nlp_hess_l": ("grad_gamma_x", "hess_gamma_x_x"),
+        "nlp_grad": ("f", "g", "grad_gamma_x", "grad_gamma_p"),
     },
     "sqpmethod": {
         "nlp_jac_fg": ("f", "grad_f_x", "g", "jac_g_x"),
@@ -138,13 +139,14 @@ def plugin(name: str, task: Task) -> Answer:
         "print_time": False,
         "show_eval_warnings": False,
         "error_on_fail": False,
-        "no_nlp_grad": library == "ipopt",
+        "no_nlp_grad": library in CACHED and "nlp_grad" not in CACHED[library],
     }
     # parameters are replaced by numbers, since bonmin has no parameters
     if library in CACHED:
         x = ca.MX.sym("x", nlp.nx)
-        f, g = nlp.oracle(x, nlp.p)
-        common["cache"] = _derivatives(nlp, CACHED[library])
+        functions = Functions(nlp)
+        f, g = functions.oracle(x, nlp.thetas())
+        common["cache"] = _derivatives(nlp, functions, CACHED[library])
     else:
         x = ca.SX.sym("x", nlp.nx)
         f, g = nlp.oracle.expand()(x, nlp.p)
@@ -170,13 +172,16 @@ def plugin(name: str, task: Task) -> Answer:
     )
 
 
-def _derivatives(nlp: NLP, wanted: Mapping[str, tuple[str, ...]]) -> dict[str, ca.Function]:
+def _derivatives(
+    nlp: NLP, functions: Functions, wanted: Mapping[str, tuple[str, ...]]
+) -> dict[str, ca.Function]:
     """Derivatives of this package with the names and outputs that a library requests."""
     x, q = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", 0)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", nlp.ng)
-    f, grad = nlp.grad_f(x, nlp.p)
-    g, jac = nlp.jac_g(x, nlp.p)
-    upper = nlp.hess_lag(x, nlp.p, lam_f, lam_g)
+    theta = nlp.thetas()
+    f, grad = functions.grad_f(x, theta)
+    g, jac = functions.jac_g(x, theta)
+    upper = functions.hess_lag(x, theta, lam_f, lam_g)
     known = {
         "f": f,
         "grad_f_x": grad,
@@ -184,12 +189,13 @@ def _derivatives(nlp: NLP, wanted: Mapping[str, tuple[str, ...]]) -> dict[str, c
         "jac_g_x": jac,
         "triu_hess_gamma_x_x": upper,
         "hess_gamma_x_x": ca.triu2symm(upper),
+        "grad_gamma_p": ca.MX(0, 1),
         "grad_gamma_x": lam_f * grad + ca.mtimes(jac.T, lam_g),
     }
     inputs = {"x": x, "p": q, "lam_f": lam_f, "lam_g": lam_g}
     out = {}
     for name, outputs in wanted.items():
-        words = list(inputs) if name == "nlp_hess_l" else ["x", "p"]
+        words = list(inputs) if name in ("nlp_hess_l", "nlp_grad") else ["x", "p"]
         values = [known[k] for k in outputs]
         out[name] = ca.Function(name, [inputs[w] for w in words], values, words, list(outputs))
     return out

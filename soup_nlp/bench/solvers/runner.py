@@ -80,8 +80,8 @@ def task_maker(case: Case, programs: Callable[[], Programs], limits: Limits) -> 
     @cache
     def built() -> Task:
         nlp, second, layout, form = programs()
-        # assemble here, so that the time of a solver does not include it
-        both = nlp.assembled(), second.assembled()
+        # made here, so that the time of a solver does not include it
+        both = nlp.evaluated(), second.evaluated()
         soup = layout.unpack(nlp.x0).retracted()
         return Task(*both, layout, soup, case.data, case.weights, form, limits, Path())
 
@@ -169,7 +169,7 @@ def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
         return row
     row["energy"] = _energy(task, answer.x)
     with np.errstate(all="ignore"):
-        value = float(task.nlp.oracle(answer.x, task.nlp.p)[0])
+        value = task.nlp.value(answer.x)
     row["objective"] = value if np.isfinite(value) else None
     if not np.isfinite(answer.x).all():
         return row

@@ -1,7 +1,7 @@
-"""The pattern of a Hessian, found by blocks of variables.
+"""Patterns of sparse matrices that are sums of small ones: where each nonzero of each element is.
 
 Elements read whole runs of variables: all of a superpixel, or a slack. The nonzeros of an element
-are then the same few sets in the blocks of the Hessian that its runs meet in. Ranking a hundred
+in a Hessian are then the same few sets in the blocks that its runs meet in. Ranking a hundred
 thousand blocks takes a fifth of the time of ranking fifty million nonzeros.
 """
 
@@ -10,12 +10,84 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
-from soup_nlp.arrays import Int, Mask
-from soup_nlp.model.assemble import Pattern, ranked
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.model.kernel import Group
+
+
+class Entries(NamedTuple):
+    """Where the nonzeros of a set of elements stand.
+
+    Attributes:
+        rows, columns: (E, k) or (k,).
+    """
+
+    rows: NDArray[np.integer]
+    columns: NDArray[np.integer]
+
+
+class Pattern(NamedTuple):
+    """Union of the nonzeros of many elements.
+
+    Attributes:
+        shape: Of the matrix.
+        rows, columns: Of every nonzero, by columns.
+        places: For each set of elements, where its nonzeros stand, element by element.
+    """
+
+    shape: tuple[int, int]
+    rows: Int
+    columns: Int
+    places: list[NDArray[np.integer]]
+
+    @classmethod
+    def of(cls, shape: tuple[int, int], sets: Sequence[Entries]) -> Pattern:
+        """Of the nonzeros of each set of elements."""
+        # half as many bytes are ranked in half the time
+        kind = np.int32 if shape[0] * shape[1] < 2**31 else np.int64
+        sizes = [e.rows.size for e in sets]
+        ends = np.cumsum(sizes[:-1], dtype=int)
+        every: NDArray[np.integer] = np.empty(sum(sizes), kind)
+        for own, e in zip(np.split(every, ends), sets):
+            np.multiply(e.columns.ravel(), shape[0], dtype=kind, out=own)
+            own += e.rows.ravel()
+        unique, place = ranked(every)
+        columns, rows = np.divmod(unique.astype(np.int64), shape[0])
+        return cls(shape, rows, columns, np.split(place, ends))
+
+    def sparsity(self) -> ca.Sparsity:
+        """For CasADi."""
+        return ca.Sparsity(*self.shape, self._start().tolist(), self.rows.tolist(), True)
+
+    def filled(self, nonzeros: Float) -> sparse.csc_matrix:
+        """The matrix with these nonzeros."""
+        return sparse.csc_matrix((nonzeros, self.rows, self._start()), self.shape)
+
+    def _start(self) -> Int:
+        """First nonzero of every column, and their number."""
+        return np.searchsorted(self.columns, np.arange(self.shape[1] + 1))
+
+
+def ranked(keys: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.int32]]:
+    """`np.unique(keys, return_inverse=True)`, two to four times as fast on keys nearly in order;
+    overwrites the keys."""
+    order = np.argsort(keys, kind="stable")
+    place = np.empty(len(keys), np.int32)
+    keys[:] = keys[order]
+    new = np.ones(len(keys), bool)
+    np.not_equal(keys[1:], keys[:-1], out=new[1:])
+    place[order] = np.cumsum(new, dtype=np.int32) - 1
+    return keys[new], place
+
+
+def jacobian_entries(group: Group) -> Entries:
+    """Nonzeros of a group's elements in g's Jacobian."""
+    r, c = group.kernel.jacobian_pattern()
+    return Entries(group.table.rows[:, r], group.table.index[:, c])
 
 
 class Elements(NamedTuple):

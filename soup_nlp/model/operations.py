@@ -1,0 +1,122 @@
+"""Operations that kernels may have: in C on vectors of elements, and in numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+
+class Operation(NamedTuple):
+    """One operation.
+
+    Attributes:
+        c: C of it, with {0} and {1} for its operands; see the functions in `lanes`.
+        numpy: Function of arrays and, last, of the array that takes the result (or None).
+    """
+
+    c: str
+    numpy: Callable[..., Any]
+
+    @property
+    def operands(self) -> int:
+        """One or two."""
+        return 1 + ("{1}" in self.c)
+
+
+def _if_else_zero(a: Any, b: Any, out: Any = None) -> Any:
+    # not a product: what is left out may be infinite
+    return np.copyto(out, np.where(a != 0, b, 0.0))
+
+
+_ONE = np.array(1.0)
+OPERATIONS: Mapping[int, Operation] = {
+    ca.OP_ASSIGN: Operation("{0}", np.positive),
+    ca.OP_ADD: Operation("{0} + {1}", np.add),
+    ca.OP_SUB: Operation("{0} - {1}", np.subtract),
+    ca.OP_MUL: Operation("{0} * {1}", np.multiply),
+    ca.OP_DIV: Operation("{0} / {1}", np.divide),
+    ca.OP_NEG: Operation("-{0}", np.negative),
+    ca.OP_SQ: Operation("{0} * {0}", np.square),
+    ca.OP_TWICE: Operation("{0} + {0}", lambda a, out=None: np.add(a, a, out)),
+    ca.OP_INV: Operation("one / {0}", lambda a, out=None: np.divide(_ONE, a, out)),
+    ca.OP_FABS: Operation("choose({0} < zero, -{0}, {0})", np.abs),
+    # an output as third argument is deprecated in these two
+    ca.OP_FMAX: Operation(
+        "choose({0} > {1}, {0}, {1})", lambda a, b, out=None: np.maximum(a, b, out=out)
+    ),
+    ca.OP_FMIN: Operation(
+        "choose({0} < {1}, {0}, {1})", lambda a, b, out=None: np.minimum(a, b, out=out)
+    ),
+    ca.OP_LT: Operation("choose({0} < {1}, one, zero)", np.less),
+    ca.OP_LE: Operation("choose({0} <= {1}, one, zero)", np.less_equal),
+    ca.OP_NOT: Operation(
+        "choose({0} == zero, one, zero)", lambda a, out=None: np.equal(a, 0.0, out)
+    ),
+    ca.OP_IF_ELSE_ZERO: Operation("choose({0} != zero, {1}, zero)", _if_else_zero),
+    ca.OP_SQRT: Operation("root({0})", np.sqrt),
+    ca.OP_POW: Operation("both(pow, {0}, {1})", np.power),
+    ca.OP_CONSTPOW: Operation("both(pow, {0}, {1})", np.power),
+    ca.OP_ATAN2: Operation("both(atan2, {0}, {1})", np.arctan2),
+    **{
+        getattr(ca, f"OP_{name.upper()}"): Operation(f"each({name}, {{0}})", function)
+        for name, function in {
+            "exp": np.exp,
+            "log": np.log,
+            "sin": np.sin,
+            "cos": np.cos,
+            "tan": np.tan,
+            "asin": np.arcsin,
+            "acos": np.arccos,
+            "atan": np.arctan,
+            "sinh": np.sinh,
+            "cosh": np.cosh,
+            "tanh": np.tanh,
+            "asinh": np.arcsinh,
+            "acosh": np.arccosh,
+            "atanh": np.arctanh,
+        }.items()
+    },
+}
+"""By CasADi's number. A kernel with another one cannot be evaluated."""
+NAMES: Mapping[int, str] = {
+    getattr(ca, n): n.removeprefix("OP_").lower() for n in dir(ca) if n.startswith("OP_")
+}
+"""Names of all operations for error messages."""
+
+
+class Instruction(NamedTuple):
+    """One of an SX function: operation, where its result goes, operands; or a constant."""
+
+    operation: int
+    output: list[int]
+    inputs: list[int]
+    constant: float
+
+
+def instructions(function: ca.Function) -> tuple[Instruction, ...]:
+    """What an SX function computes, step by step."""
+    return (_of_small if function.n_instructions() < LARGE else _of_large)(function)
+
+
+LARGE = 20_000
+"""Instructions from which a function's list takes megabytes: only those of one solve are kept."""
+
+
+def _instructions(f: ca.Function) -> tuple[Instruction, ...]:
+    return tuple(
+        Instruction(
+            f.instruction_id(k),
+            f.instruction_output(k),
+            f.instruction_input(k),
+            f.instruction_constant(k) if f.instruction_id(k) == ca.OP_CONST else 0.0,
+        )
+        for k in range(f.n_instructions())
+    )
+
+
+_of_small = lru_cache(maxsize=200)(_instructions)
+_of_large = lru_cache(maxsize=16)(_instructions)
