@@ -1,4 +1,4 @@
-"""Arguments of the Python API that are of another kind."""
+"""Arguments of the Python API that are of another kind, and odd uses of a run."""
 
 from __future__ import annotations
 
@@ -8,12 +8,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from helpers_odd_run import Case
+from helpers_odd_options import depth_png
+from helpers_odd_run import Case, every
 from helpers_odd_world import SIZE, World
 
 import soup_nlp
+from soup_nlp.cli.main import main
 from soup_nlp.data.formats import camera_files, images, map_files
+from soup_nlp.export.foreign import import_sol
+from soup_nlp.export.sol import read_sol
+from soup_nlp.report.check import check_folder
+from soup_nlp.report.result import load
+from soup_nlp.sequence.chain import make_chain
+from soup_nlp.sequence.frames import find_images, video_frames
 
+API = "5 Python API"
 THINGS: dict[str, Any] = {
     "None": None,
     "list": [],
@@ -34,96 +43,163 @@ THINGS: dict[str, Any] = {
     "image": np.zeros((*SIZE, 3), np.uint8),
     "complex": np.zeros(SIZE, complex),
 }
+STREET = {"input": {"kind": "scene", "scene": "street"}}
+TRUTH = (
+    "depth_ref", "depth_next", "flow", "occluded", "components", "motions", "points", "scene_flow",
+)  # fmt: skip
+CALLBACKS = ("listener", "stop", "log", "on_stage", "ipopt_log")
+READERS = (
+    images.read_image, map_files.read_flow, map_files.read_depth, camera_files.read_intrinsics,
+)  # fmt: skip
+
+
+def pair(w: World, **changes: Any) -> Any:
+    """A pair with other arguments."""
+    a, b = (images.read_image(w.good(name)) for name in ("a.png", "b.png"))
+    K = camera_files.intrinsics(60.0, 60.0, 32.0, 24.0)
+    return soup_nlp.Pair(**({"image_ref": a, "image_next": b, "K_ref": K, "K_next": K} | changes))
+
+
+def flow(**changes: Any) -> Any:
+    """A flow with other arguments."""
+    uv, one = np.zeros((*SIZE, 2), np.float32), np.ones(SIZE, np.float32)
+    return soup_nlp.Flow(**({"uv": uv, "confidence": one} | changes))
+
+
+Call = Callable[[World, Path, Any], Any]
+CALLS: dict[str, Call] = {
+    "run": lambda w, o, x: soup_nlp.run(x),
+    "run pair": lambda w, o, x: soup_nlp.run(soup_nlp.load_problem(w.good("p.yaml")), pair=x),
+    **{
+        f"run {name}": lambda w, o, x, n=name: soup_nlp.run(w.run.problem, **{n: x})
+        for name in CALLBACKS
+    },
+    "solve_pair": lambda w, o, x: soup_nlp.solve_pair(x),
+    "solve_pair segmentation": lambda w, o, x: soup_nlp.solve_pair(pair(w), segmentation=x),
+    "solve_pair superpixels": lambda w, o, x: soup_nlp.solve_pair(
+        pair(w), segmentation={"superpixels": x}
+    ),
+    "solve_pair preset": lambda w, o, x: soup_nlp.solve_pair(w.run.pair, preset=x),
+    "solve_pair flow": lambda w, o, x: soup_nlp.solve_pair(w.run.pair, flow=x),
+    "load_problem": lambda w, o, x: soup_nlp.load_problem(x),
+    "load_problem overrides": lambda w, o, x: soup_nlp.load_problem(w.good("p.yaml"), [x]),
+    "make_problem": lambda w, o, x: soup_nlp.make_problem(x),
+    "make_problem overrides": lambda w, o, x: soup_nlp.make_problem(STREET, x),
+    "make_problem where": lambda w, o, x: soup_nlp.make_problem(STREET, where=x),
+    "make_problem preset": lambda w, o, x: soup_nlp.make_problem(STREET | {"preset": x}),
+    "evaluate folder": lambda w, o, x: soup_nlp.evaluate(x, w.good("d.npy")),
+    "evaluate depth": lambda w, o, x: soup_nlp.evaluate(w.result, x),
+    "evaluate cap": lambda w, o, x: soup_nlp.evaluate(w.result, w.good("d.npy"), cap=x),
+    "evaluate scale": lambda w, o, x: soup_nlp.evaluate(w.result, w.good("d.npy"), scale=x),
+    "evaluate depth_scale": lambda w, o, x: soup_nlp.evaluate(
+        w.result, depth_png(o), depth_scale=x
+    ),
+    **{
+        f"Pair {key}": lambda w, o, x, key=key: pair(w, **{key: x})
+        for key in ("image_ref", "image_next", "K_ref", "K_next", "flow", "truth", "name")
+    },
+    "Flow uv": lambda w, o, x: flow(uv=x),
+    "Flow confidence": lambda w, o, x: flow(confidence=x),
+    **{
+        f"Truth {key}": lambda w, o, x, key=key: pair(w, truth=soup_nlp.Truth(**{key: x}))
+        for key in TRUTH
+    },
+    **{f"read {f.__name__}": lambda w, o, x, f=f: f(x) for f in READERS},
+    "save folder": lambda w, o, x: w.run.save(x),
+    "save formats": lambda w, o, x: w.run.save(o / "out", formats=x),
+    "save format": lambda w, o, x: w.run.save(o / "out", formats=[x]),
+    "check_folder": lambda w, o, x: check_folder(x),
+    "load": lambda w, o, x: load(x),
+    "make_chain": lambda w, o, x: make_chain(x),
+    "make_chain pair": lambda w, o, x: make_chain([x]),
+    "find_images": lambda w, o, x: find_images(x),
+    "video_frames": lambda w, o, x: video_frames(x, o / "frames"),
+    "read_sol": lambda w, o, x: read_sol(x, np.arange(2), np.arange(2)),
+    "import_sol folder": lambda w, o, x: import_sol(x, w.exported / "soup.sol"),
+    "import_sol file": lambda w, o, x: import_sol(w.exported, x),
+    "with_flow": lambda w, o, x: w.run.pair.with_flow(x),
+    "components": lambda w, o, x: w.run.components[x],
+    "own_motion": lambda w, o, x: w.run.components.own_motion(x),
+    "camera": lambda w, o, x: w.run.camera(x),
+}
+FINE = {
+    "run pair": "None",
+    "Pair K_ref": "None",
+    "Pair K_next": "None",
+    "Pair flow": "None",
+    "Pair truth": "None",
+    "Pair name": "text",
+    "Pair image_ref": "image",
+    "Pair image_next": "image",
+    "Flow confidence": "None",
+    **{f"Truth {key}": "None" for key in TRUTH},
+    # a picture has the shape of a scene flow
+    "Truth scene_flow": "None, image",
+    "evaluate cap": "None, int, huge int",
+    "evaluate depth_scale": "None, int",
+    "make_problem": "dict",
+    "make_problem preset": "None",
+    "make_problem overrides": "list",
+    "make_problem where": "text",
+    "save formats": "None, list, dict",
+    "with_flow": "None",
+    "camera": "vector, image",
+}
+"""Arguments that are right, or of no use but harmless."""
+LEFT_OUT = {
+    # these solve
+    "solve_pair segmentation": "dict",
+    "solve_pair superpixels": "int",
+    "solve_pair preset": "None",
+    "solve_pair flow": "None, dict",
+    "run stop": "None",
+    # right names of files, in the working folder
+    "run ipopt_log": "None, text",
+    "save folder": "text",
+    # what the caller's own function raises is the caller's
+    **{f"run {name}": "None, type, function" for name in ("listener", "log", "on_stage")},
+}
+
+
+def _called(do: Call) -> Any:
+    """The call without its answer, which is no command line."""
+    return lambda w, o, x: (do(w, o, x), None)[1]
+
+
+def _again(w: World, o: Path) -> None:
+    w.run.save(o / "out", formats=["npy"])
+    assert main(["check", str(o / "out")]) in (0, 1)
+
+
+def _strided(w: World, o: Path) -> None:
+    """Views that are not contiguous, read-only arrays and other byte orders are arrays."""
+    a, b = (np.asarray(x) for x in (w.run.pair.image_ref, w.run.pair.image_next))
+    K = np.asarray(w.run.pair.K_ref, ">f8")
+    made = soup_nlp.Pair(a[:, ::-1], np.asfortranarray(b), K)
+    a.flags.writeable = False
+    made.with_flow(soup_nlp.Flow(np.zeros((*SIZE, 2), ">f4"), np.ones(SIZE, np.float16)))
+
+
+USES: dict[str, Callable[[World, Path], object]] = {
+    "plot": lambda w, o: w.run.plot().savefig(o / "a.png"),
+    "repr": lambda w, o: [repr(x) for x in (w.run, w.run.components, w.run.camera)],
+    "save twice": lambda w, o: [w.run.save(o / "out") for _ in range(2)],
+    "save and check": _again,
+    "arrays of other layouts": _strided,
+    "compare records": lambda w, o: w.run.pair == w.run.pair.with_flow(w.run.pair.flow),
+    "hash of records": lambda w, o: {w.run, w.run.pair, w.run.soup, w.run.reconstruction},
+}
+"""Uses of a run, a result and a chain that are no command."""
 
 
 def api_cases() -> Iterator[Case]:
-    def images_of(w: World) -> tuple[Any, Any, Any]:
-        K = camera_files.intrinsics(60.0, 60.0, 32.0, 24.0)
-        return images.read_image(w.good("a.png")), images.read_image(w.good("b.png")), K
-
-    def pair(w: World, **changes: Any) -> Any:
-        a, b, K = images_of(w)
-        own = {"image_ref": a, "image_next": b, "K_ref": K, "K_next": K} | changes
-        return soup_nlp.Pair(**own)
-
-    def flow(w: World, **changes: Any) -> Any:
-        uv = np.zeros((*SIZE, 2), np.float32)
-        return soup_nlp.Flow(**({"uv": uv, "confidence": np.ones(SIZE, np.float32)} | changes))
-
-    calls: dict[str, Callable[[World, Path, Any], Any]] = {
-        "run": lambda w, o, x: soup_nlp.run(x),
-        "run pair": lambda w, o, x: soup_nlp.run(soup_nlp.load_problem(w.good("p.yaml")), pair=x),
-        "solve_pair": lambda w, o, x: soup_nlp.solve_pair(x),
-        "solve_pair segmentation": lambda w, o, x: soup_nlp.solve_pair(pair(w), segmentation=x),
-        "solve_pair superpixels": lambda w, o, x: soup_nlp.solve_pair(
-            pair(w), segmentation={"superpixels": x}
-        ),
-        "load_problem": lambda w, o, x: soup_nlp.load_problem(x),
-        "load_problem overrides": lambda w, o, x: soup_nlp.load_problem(w.good("p.yaml"), [x]),
-        "make_problem": lambda w, o, x: soup_nlp.make_problem(x),
-        "evaluate folder": lambda w, o, x: soup_nlp.evaluate(x, w.good("d.npy")),
-        "evaluate depth": lambda w, o, x: soup_nlp.evaluate(w.result, x),
-        "evaluate cap": lambda w, o, x: soup_nlp.evaluate(w.result, w.good("d.npy"), cap=x),
-        "evaluate scale": lambda w, o, x: soup_nlp.evaluate(w.result, w.good("d.npy"), scale=x),
-        **{
-            f"Pair {key}": lambda w, o, x, key=key: pair(w, **{key: x})
-            for key in ("image_ref", "image_next", "K_ref", "K_next", "flow", "truth", "name")
-        },
-        **{
-            f"Flow {key}": lambda w, o, x, key=key: flow(w, **{key: x})
-            for key in ("uv", "confidence")
-        },
-        **{
-            f"Truth {key}": lambda w, o, x, key=key: pair(w, truth=soup_nlp.Truth(**{key: x}))
-            for key in (
-                "depth_ref",
-                "depth_next",
-                "flow",
-                "occluded",
-                "components",
-                "motions",
-                "points",
-                "scene_flow",
-            )
-        },
-        **{
-            f"read {f.__name__}": lambda w, o, x, f=f: f(x)
-            for f in (
-                images.read_image,
-                map_files.read_flow,
-                map_files.read_depth,
-                camera_files.read_intrinsics,
-            )
-        },
-    }
-    fine = {
-        ("run pair", "None"),
-        ("Pair K_ref", "None"),
-        ("Pair K_next", "None"),
-        # a picture has the shape of a scene flow
-        ("Truth scene_flow", "image"),
-        ("Flow confidence", "None"),
-        ("evaluate cap", "huge int"),
-        ("Pair flow", "None"),
-        ("Pair truth", "None"),
-        ("Pair name", "text"),
-        ("evaluate cap", "None"),
-        ("evaluate cap", "int"),
-        ("Pair image_ref", "image"),
-        ("Pair image_next", "image"),
-        ("solve_pair segmentation", "dict"),
-        ("solve_pair superpixels", "int"),
-        ("make_problem", "dict"),
-    }
-    for name, call in calls.items():
-        for what, thing in THINGS.items():
-            allowed = (name, what) in fine or (name.startswith("Truth") and what == "None")
-            if name == "solve_pair superpixels" and what == "int":
-                continue
-            if name == "solve_pair segmentation" and what == "dict":
-                continue
-
-            def do(w: World, o: Path, call=call, thing=thing) -> None:
-                call(w, o, thing)
-
-            yield Case("5 Python API", f"api {name} {what}", do, quiet=allowed)
+    """All of these."""
+    for name, call in CALLS.items():
+        fine, left = (table.get(name, "").split(", ") for table in (FINE, LEFT_OUT))
+        for quiet in (False, True):
+            things = {k: v for k, v in THINGS.items() if k not in left and (k in fine) is quiet}
+            yield from every(API, f"api {name} {{}}", _called(call), things, quiet=quiet)
+    used = _called(lambda w, o, use: use(w, o))
+    yield from every(API, "use {}", used, USES, quiet=True)
+    huge = {"truth that overflows": np.full(SIZE, 1e300)}
+    yield from every(API, "{}", _called(lambda w, o, x: soup_nlp.Truth(depth_ref=x)), huge)

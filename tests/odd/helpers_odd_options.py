@@ -1,66 +1,196 @@
-"""Every option and argument of every command with odd values: read from the commands themselves."""
+"""Numbers beyond any use, solves at the edge of what is allowed, and odd values of every option."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
-from helpers_odd_run import Case
-from helpers_odd_world import World, settings
+import cv2
+import numpy as np
+from helpers_odd_run import ANY, DOORS, Case, every, words, write
+from helpers_odd_world import SIZE, World
 
-from soup_nlp.cli.main import BENCH, COMMANDS, _load
+from soup_nlp.cli.main import BENCH, COMMANDS, _load, main
+from soup_nlp.config.problem import Problem
+from soup_nlp.schema.section import Section
+
+
+def numeric_fields(model: type[Section], place: str = "") -> Iterator[tuple[str, bool]]:
+    """Names of options that are numbers, and whether they are whole."""
+    for key, info in model.model_fields.items():
+        kind = info.annotation
+        if place == "" and key == "input":
+            continue
+        if isinstance(kind, type) and issubclass(kind, Section):
+            yield from numeric_fields(kind, f"{place}{key}.")
+        elif "float" in str(kind):
+            yield f"{place}{key}", False
+        elif "int" in str(kind):
+            yield f"{place}{key}", True
+
+
+WITH = {
+    "solver.pre": "--set solver.presolve=true",
+    "refine": "--set refine.enabled=true --set refine.from_start=true --set refine.rounds=1"
+    " --set refine.particles=4",
+}
+"""What has to be set so that an option counts, by the beginning of its name."""
+LARGE = "1" + "0" * 30
+NUMBERS = {
+    "intrinsics 0 {}": "{solve} --intrinsics={x},60,32,24",
+    "intrinsics 1 {}": "{solve} --intrinsics=60,{x},32,24",
+    "intrinsics 2 {}": "{solve} --intrinsics=60,60,{x},24",
+    "intrinsics 3 {}": "{solve} --intrinsics=60,60,32,{x}",
+}
+SCENE = (
+    "solve {x} -q -o {out} --set flow.source=truth --set segmentation.superpixels=12"
+    " --set segmentation.neighbours=4 --set refine.enabled=false --set solver.presolve=false"
+    " --set solver.max_iter=1"
+)
+
+
+def _scene(w: World, o: Path, text: str) -> str:
+    own = {"width": "64", "height": "48", "seed": "0"} | dict([text.split("=")])
+    inside = ", ".join(f"{k}: {v}" for k, v in own.items())
+    write(o / "p.yaml", f"input: {{kind: scene, scene: street, {inside}}}\n")
+    return str(o / "p.yaml")
+
+
+def number_cases() -> Iterator[Case]:
+    for name, whole in numeric_fields(Problem):
+        more = next((text for begin, text in WITH.items() if name.startswith(begin)), "")
+        values = (LARGE, "1000000000", "-1") if whole else ("1e300", "1e9", "1e-300", "-1", ".nan")
+        form = {"solver.presolve_eps": "[{}]", "solver.ipopt": "{{tol: {}}}"}.get(name, "{}")
+        free = {form.format(v) for v in ("1e9", "1e-300")}
+        texts = [form.format(v) for v in values]
+        solves = texts if "sigma" in name or name == "solver.ipopt" else free
+        line = f"{{solve}} {more} --set {name}={{x}}"
+        yield from every("2 numbers", f"number {name}={{}}", line, texts, ANY, solves=solves)
+    scenes = [
+        *(f"width={v}" for v in ("63", LARGE, "1000000", "-5")),
+        *(f"height={v}" for v in ("47", LARGE, "1000000")),
+        *(f"seed={v}" for v in (LARGE, "-1", "5000000000")),
+    ]
+    yield from every(DOORS, "scene {}", SCENE, scenes, ANY, make=_scene)
+    free = ("1e9", "1e5", "0", "-60", "1e-300")
+    for title, line in NUMBERS.items():
+        numbers = ("nan", "inf", "1e300", *free)
+        yield from every("2 numbers", title, line, numbers, ANY, solves=free)
+    for option in ("--depth-scale", "--cap"):
+        line = f"evaluate {{result}} --depth {{o}}/d.png {option}={{x}}"
+        numbers = ("nan", "inf", "1e300", "1e-300", "-1", "0")
+        make = lambda w, o, x: depth_png(o) and x  # noqa: E731
+        yield from every("2 numbers", f"evaluate {option}={{}}", line, numbers, (0, 2), make=make)
+    for option in ("--seconds", "--iterations", "--tol", "--memory"):
+        line = f"compare {{p}} --solvers no_such_solver {option}={{x}} -o {{out}}"
+        numbers = ("nan", "inf", "1e300", "0", "-1", "x")
+        yield from every("2 numbers", f"compare {option}={{}}", line, numbers)
+    shown = ("-0.1", "1.1", ".nan", "word", "[]", "null")
+    line = "show {p} --set output.min_confidence={x}"
+    yield from every("2 numbers", "min_confidence {}", line, shown)
+
+
+def depth_png(o: Path) -> Path:
+    """A depth map of 16 bits."""
+    cv2.imwrite(str(o / "d.png"), np.full(SIZE, 2000, np.uint16))
+    return o / "d.png"
+
+
+NO_WEIGHT = " ".join(f"energy.weights.{k}=0" for k in ("arap", "proj", "cont", "orient", "prior"))
+SOLVES = {
+    "min_facing 0.5": "formulation.min_facing=0.5",
+    "min_facing 0.3": "formulation.min_facing=0.3 solver.presolve=true",
+    "min_facing 0.5 presolved": "formulation.min_facing=0.5 solver.presolve=true",
+    **{
+        f"unit-translation {norm}": f"formulation.gauge=unit-translation formulation.norm={norm}"
+        " solver.presolve=true solver.max_iter=10"
+        for norm in ("smooth", "epigraph")
+    },
+    "depth_ratio 1": "formulation.depth_ratio=1",
+    "depth_ratio 1 presolved": "formulation.depth_ratio=1 solver.presolve=true",
+    "no weight": NO_WEIGHT,
+    "no weight presolved": f"{NO_WEIGHT} solver.presolve=true",
+    "no weight refined": f"{NO_WEIGHT} refine.enabled=true refine.from_start=true refine.rounds=1",
+    **{f"seed 2^{k}": f"seed={2**k}" for k in (31, 32, 63)},
+    "one superpixel": "segmentation.superpixels=1",
+    "two superpixels": "segmentation.superpixels=2 segmentation.neighbours=1",
+    "more neighbours than superpixels": "segmentation.neighbours=12",
+    "all boundary samples": "segmentation.boundary_samples=all",
+    "all pixels": "energy.pixel_samples=all",
+    "no iterations": "solver.max_iter=0",
+    "unknown ipopt option": "solver.ipopt={no_such:1}",
+    "wrong ipopt value": "solver.ipopt={max_iter:word}",
+    "paper units": "energy.units=paper solver.presolve=true",
+}
+"""Settings of solves; what ends with 0 or 1 is checked afterwards."""
+
+
+def _checked(w: World, o: Path, argv: list[str]) -> list[str]:
+    """Solve, and return the check of the result; where the solve is refused, the solve."""
+    code = main(argv)
+    if code == 2:
+        return argv
+    assert code in (0, 1), code
+    if code == 0:
+        return ["check", str(o / "out")]
+    # what is not claimed need not hold, but the check ends well all the same
+    assert main(["check", str(o / "out")]) in (0, 1)
+    return words("show {p}", w, o)
+
+
+def _scaled(w: World, o: Path, scale: str) -> list[str]:
+    text = w.problem(depth=str(depth_png(o)), depth_scale=float(scale))
+    write(o / "p.yaml", text)
+    return _checked(w, o, words("solve {o}/p.yaml -q -o {out}", w, o))
+
+
+def solve_cases() -> Iterator[Case]:
+    def settings(w: World, o: Path, text: str) -> list[str]:
+        line = " ".join(f"--set {item}" for item in text.replace(":", ":\t").split(" "))
+        return _checked(w, o, [x.replace(":\t", ": ") for x in words(f"{{solve}} {line}", w, o)])
+
+    def focal(w: World, o: Path, x: str) -> list[str]:
+        return _checked(w, o, words(f"{{solve}} --intrinsics={x},{x},32,24", w, o))
+
+    for title, do, values in (
+        ("solve {}", settings, SOLVES),
+        ("solve focal {}", focal, ("1e5", "1e7", "1e9")),
+        ("solve depth_scale {}", _scaled, ("1e-300", "1e300", "1e-30")),
+    ):
+        yield from every("2 results", title, do, values, (0, 2), solves=True)
+
+
+# --- options -------------------------------------------------------------------------------------
 
 ODD_VALUES = (
     *("", " ", "nan", "-1", "0", "1e300", "9" * 400, "2,2,", "²", "[1, 2]", "{a: 1}"),
     *("\x1b[31m", "a\0b", "\udcff", "x" * 10_000, "~nouser_zz", "/dev/full", "=", "a.b=1"),
 )
 """A value for every kind of mistake: empty, no number, out of range, no name or path, too long."""
-
-Base = Callable[[World, Path], list[str]]
-
-
-def _taken(*words: str) -> Base:
-    """A command that would run for minutes: its target is a file, which it must refuse first."""
-    return lambda w, o: [*words, "-q", "-o", w.odd("garbage", "")]
-
-
-def _files(*words: str) -> Base:
-    """A command of the tiny problem file, with an output folder."""
-    return lambda w, o: [words[0], str(w.good("p.yaml")), *words[1:], "-o", str(o / "out")]
-
-
-BASES: dict[str, Base] = {
-    "solve": _files("solve", "-q"),
-    "demo": _taken("demo"),
-    "view": lambda w, o: ["view", str(w.result), "--no-open"],
-    "check": lambda w, o: ["check", str(w.exported / "soup.sol")],
-    "chain": lambda w, o: [
-        *("chain", str(w.good("a.png")), str(w.good("b.png")), *settings()),
-        *("-q", "-o", str(o / "out")),
-    ],
-    "convert": lambda w, o: ["convert", str(w.result), "--to", "npy", "-o", str(o / "out")],
-    "evaluate": lambda w, o: ["evaluate", str(w.result), "--depth", str(w.good("d.npy"))],
-    "show": lambda w, o: ["show", str(w.good("p.yaml"))],
-    "list": lambda w, o: ["list"],
-    "export": _files("export", "-q"),
-    "import": lambda w, o: [
-        *("import", str(w.exported), str(w.exported / "soup.sol"), "-o", str(o / "out")),
-    ],
-    "family": lambda w, o: ["family", w.odd("garbage", ""), "--sizes=100", "--scenes=orbit"],
-    "compare": _files("compare", "--solvers", "no_such_solver"),
-    "bench accuracy": lambda w, o: [
-        *("bench", "accuracy", "--suite=rendered", "--only=orbit", "--width=64", *settings()),
-        *("-q", "-o", w.odd("garbage", "")),
-    ],
-    "bench search": _taken("bench", "search", "--suite=rendered", "--only=orbit", "--width=64"),
-    "bench all": lambda w, o: ["bench", "all", "--dry", "-o", str(o / "out")],
-    **{
-        f"bench {name}": _taken("bench", name)
-        for name in BENCH
-        if name not in ("accuracy", "search", "all")
-    },
+BASES = {
+    "solve": "solve {p} -q -o {out}",
+    "view": "view {result} --no-open",
+    "check": "check {sol}",
+    "chain": "chain {a} {b} {tiny} -q -o {out}",
+    "convert": "convert {result} --to npy -o {out}",
+    "evaluate": "evaluate {result} --depth {d}",
+    "show": "show {p}",
+    "list": "list",
+    "export": "export {p} -q -o {out}",
+    "import": "import {exported} {sol} -o {out}",
+    "compare": "compare {p} --solvers no_such_solver -o {out}",
+    "bench all": "bench all --dry -o {out}",
+    # those that would run for minutes: their target is a file, which they must refuse first
+    "family": "family {odd} --sizes=100 --scenes=orbit",
+    "bench accuracy": "bench accuracy --suite=rendered --only=orbit --width=64 {tiny} -q -o {odd}",
+    "bench search": "bench search --suite=rendered --only=orbit --width=64 -q -o {odd}",
+    "demo": "demo -q -o {odd}",
 }
-"""A call of every command that ends soon."""
+"""A call of every command that ends soon; the other analyses of bench are like `demo`."""
+ENDS = ("view", "check", "convert", "import", "export", "solve", "chain", "compare", "bench all")
+"""Commands whose calls end with any folder."""
+SOLVING = ("solve", "chain", "export", "import", "compare")
+"""Commands that take a second where a value is good."""
 
 
 def option_cases(values: tuple[str, ...] = ODD_VALUES) -> Iterator[Case]:
@@ -75,29 +205,30 @@ def option_cases(values: tuple[str, ...] = ODD_VALUES) -> Iterator[Case]:
                 # a good folder would have them run to their end
                 ends = head + name in ENDS or word != "--out"
                 for value in values if ends else ("", "\x1b[31m", "/dev/full", "x" * 10_000):
-                    if (word, value) == ("--serve", "0"):
-                        # any free port, and it serves until it is stopped
-                        continue
-                    yield _case(head + name, word, parameter.name, value)
+                    # --serve 0 takes any free port, and serves until it is stopped
+                    if (word, value) != ("--serve", "0"):
+                        yield _option_case(head + name, word, parameter.name, value)
 
 
-def _case(command: str, word: str, name: str, value: str) -> Case:
+def _option_case(command: str, word: str, name: str, value: str) -> Case:
     """A command with a value of an option besides, or of an argument."""
+    line = BASES.get(command, f"{command} -q -o {{odd}}")
 
-    def words(w: World, o: Path) -> list[str]:
-        base, own = BASES[command](w, o), value
-        if word == "--out" and not value.startswith(("/", "~", "\0")):
-            own = str(o / value) if value.strip() else value
-        if word:
-            return [*base, f"{word}={own}"]
-        return [*base, own]
+    def run(w: World, o: Path) -> list[str]:
+        own = value
+        if word == "--out" and value.strip() and not value.startswith(("/", "~", "\0")):
+            own = str(o / value)
+        return [*words(line, w, o, "garbage"), f"{word}={own}" if word else own]
 
     text = value if len(value) < 12 else f"{value[:6]}... of {len(value)}"
-    title = f"{command} {word or name.upper()} {text!r}"
-    return Case("5 doors", f"option {title}", words, (0, 1, 2), solves=command in SOLVING)
+    title = f"option {command} {word or name.upper()} {text!r}"
+    return Case(DOORS, title, run, ANY, solves=command in SOLVING)
 
 
-ENDS = ("view", "check", "convert", "import", "export", "solve", "chain", "compare", "bench all")
-"""Commands whose calls end with any folder."""
-SOLVING = ("solve", "chain", "export", "import", "compare")
-"""Commands that take a second where a value is good."""
+PRESETS = ("", "Paper", "../paper", "paper,paper", "[paper]", "{a: 1}", "\x1b[31m", "3", "~")
+
+
+def preset_cases() -> Iterator[Case]:
+    yield from every(DOORS, "preset {}", "show {p} --preset={x}", PRESETS, other={"~": (0,)})
+    fine = {"~": (0,), "": (0,)}
+    yield from every(DOORS, "preset of a file {}", "show {p} --set preset={x}", PRESETS, other=fine)

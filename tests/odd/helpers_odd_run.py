@@ -1,23 +1,31 @@
-"""One odd input: given to the program in this process, and judged."""
+"""Odd inputs: one generator of cases from tables, and the judgement of the program's answer."""
 
 from __future__ import annotations
 
 import io
+import re
+import shutil
 import signal
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from helpers_odd_world import World
+import h5py
+from helpers_odd_world import CAMERA, SET, World
 
 from soup_nlp.cli.main import main
 from soup_nlp.errors import SoupError
 
 LONGEST = 6000
 """Characters that an error message may have."""
+DOORS = "5 doors"
+"""Class of most cases: whatever enters is checked where it enters."""
+ANY = (0, 1, 2)
+"""Exit codes of inputs that may be good, or may be refused."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +48,115 @@ class Case:
     codes: tuple[int, ...] = (2,)
     quiet: bool = False
     solves: bool = False
+
+
+Make = Callable[[World, Path, Any], object]
+"""Prepares the input of a case from a world, its folder and its value; returns what stands for the
+value in the command line."""
+
+
+def every(
+    group: str,
+    title: str,
+    do: str | Callable[[World, Path, Any], list[str] | None] | None,
+    values: Collection[Any] | Mapping[str, Any],
+    codes: tuple[int, ...] = (2,),
+    *,
+    make: Make | None = None,
+    other: Mapping[str, tuple[int, ...]] | None = None,
+    solves: bool | Collection[str] = False,
+    quiet: bool = False,
+) -> Iterator[Case]:
+    """A case for every value.
+
+    Args:
+        group: Class of the cases.
+        title: Their names; {} stands for that of the value.
+        do: Command line (see `words`) or function; None if the values are such.
+        values: Values by name, or values whose names are their texts.
+        codes: Exit codes that are right.
+        make: Prepares the input.
+        other: Exit codes of single values.
+        solves: Whether they may solve, or the names of those that may.
+        quiet: Whether the API may accept the value.
+    """
+    named = values if isinstance(values, Mapping) else {str(v): v for v in values}
+    for name, value in named.items():
+
+        def run(w: World, o: Path, value=value, do=do or value) -> list[str] | None:
+            x = value if make is None else make(w, o, value)
+            return words(do, w, o, str(x)) if isinstance(do, str) else do(w, o, x)
+
+        found = (other or {}).get(name, codes)
+        yield Case(
+            group, title.format(name), run, found, quiet, solves is True or name in (solves or ())
+        )
+
+
+def words(line: str, w: World, o: Path, x: str = "") -> list[str]:
+    """The words of a command line, separated by blanks, with these names replaced:
+
+    {x} the value; {odd.png} an odd file of the kind x; {out} the output folder; {o} the folder of
+    the case; {a} {b} the images, {f} the flow, {d} the depth, {p} the problem file; {result},
+    {exported} and {sol}; {tiny} settings of a quick solve; {solve} the solve of the pair.
+    """
+    solve = ["solve", *w.pair, *SET, "-q", "-o", str(o / "out")]
+    single: dict[str, Callable[[], object]] = {
+        "x": lambda: x,
+        "o": lambda: o,
+        "out": lambda: o / "out",
+        **{k: lambda k=k: w.good(f"{k}.{FILES[k]}") for k in FILES},
+        "result": lambda: w.result,
+        "exported": lambda: w.exported,
+        "sol": lambda: w.exported / "soup.sol",
+        "camera": lambda: CAMERA,
+    }
+
+    def replaced(match: re.Match[str]) -> str:
+        name, suffix = match.groups()
+        return w.odd(x, suffix or "") if name == "odd" else str(single[name]())
+
+    several = {"{solve}": solve, "{tiny}": SET}
+    out: list[str] = []
+    for word in line.split():
+        out += several[word] if word in several else [NAME.sub(replaced, word)]
+    return out
+
+
+NAME = re.compile(r"\{(\w+)(\.\w+)?\}")
+FILES = {"a": "png", "b": "png", "f": "npy", "d": "npy", "p": "yaml"}
+
+
+def written(name: str) -> Make:
+    """Writes the value to a file of the case's folder; a function of a value makes its bytes."""
+
+    def make(w: World, o: Path, value: Any) -> str:
+        write(o / name, value() if callable(value) else value)
+        return str(o / name)
+
+    return make
+
+
+def write(path: Path, value: str | bytes) -> None:
+    """Write a text or bytes."""
+    path.write_bytes(value.encode("utf-8", "surrogateescape") if isinstance(value, str) else value)
+
+
+def changed(which: str, name: str = "", damage: Callable[[Path, Any], object] = write) -> Make:
+    """Copies the result or the export, and damages a file of the copy by the value."""
+
+    def make(w: World, o: Path, value: Any) -> str:
+        copy = shutil.copytree(getattr(w, which), o / "copy")
+        damage(copy / name, value)
+        return str(copy)
+
+    return make
+
+
+def h5_damage(path: Path, value: Callable[[h5py.File], object]) -> None:
+    """Damage an HDF5 file by a function of it."""
+    with h5py.File(path, "a") as file:
+        value(file)
 
 
 class EndlessError(BaseException):

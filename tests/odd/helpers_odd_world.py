@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import socket
 import struct
 import zlib
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
@@ -23,20 +23,15 @@ SIZE = (48, 64)
 """Height and width of the tiny images."""
 CAMERA = "60,60,32,24"
 TINY = {
-    "segmentation.superpixels": "12",
+    "segmentation.superpixels": 12,
     "segmentation.method": "grid",
-    "segmentation.neighbours": "4",
-    "refine.enabled": "false",
-    "solver.presolve": "false",
-    "solver.max_iter": "2",
+    "segmentation.neighbours": 4,
+    "refine.enabled": False,
+    "solver.presolve": False,
+    "solver.max_iter": 2,
 }
 """Settings with which a solve ends in a fraction of a second, mostly not converged."""
-
-
-def settings(**changes: str) -> list[str]:
-    """`--set` of TINY, changed; a name has two underscores for a dot."""
-    own = TINY | {key.replace("__", "."): value for key, value in changes.items()}
-    return [word for key, value in own.items() for word in ("--set", f"{key}={value}")]
+SET = [word for key, value in TINY.items() for word in ("--set", f"{key}={value}".lower())]
 
 
 @dataclass
@@ -46,7 +41,7 @@ class World:
     root: Path
 
     def good(self, name: str) -> Path:
-        """A good file: a.png, b.png, f.npy, d.npy, K.txt, p.yaml."""
+        """A good file: a.png, b.png, f.npy, d.npy, p.yaml."""
         path = self.root / "good" / name
         if not path.exists():
             path.parent.mkdir(exist_ok=True)
@@ -66,43 +61,36 @@ class World:
             np.save(path, np.stack(flow, -1).astype(np.float32))
         elif path.name == "d.npy":
             np.save(path, 2 + 0.01 * u.astype(float))
-        elif path.name == "K.txt":
-            path.write_text(CAMERA.replace(",", " "))
         else:
             path.write_text(self.problem())
 
-    def problem(self, **files: str) -> str:
-        """Text of a problem file of the tiny pair; keywords replace its files."""
-        names = {"ref": "a.png", "next": "b.png", "depth": "d.npy", "flow": "f.npy"}
-        own = {key: str(self.good(name)) for key, name in names.items()} | files
-        flow = own.pop("flow")
-        lines = [f"  {key}: {_quoted(value)}" for key, value in own.items()]
-        head = ["input:", "  kind: files", f"  intrinsics: [{CAMERA}]", *lines]
-        sections: dict[str, list[str]] = {}
+    def problem(self, **options: object) -> str:
+        """Text of a problem file of the tiny pair; keywords are further keys of its input."""
+        names = {"ref": "a.png", "next": "b.png", "depth": "d.npy"}
+        files = {key: str(self.good(name)) for key, name in names.items()}
+        camera = [float(x) for x in CAMERA.split(",")]
+        tree = {
+            "input": {"kind": "files", "intrinsics": camera, **files, **options},
+            "flow": {"source": str(self.good("f.npy"))},
+        }
         for key, value in TINY.items():
             section, name = key.split(".")
-            sections.setdefault(section, []).append(f"  {name}: {value}")
-        rest = [line for name, lines in sections.items() for line in (f"{name}:", *lines)]
-        return "\n".join([*head, "flow:", f"  source: {_quoted(flow)}", *rest]) + "\n"
+            tree.setdefault(section, {})[name] = value
+        return yaml.safe_dump(tree)
 
-    def pair(self, **changes: str) -> list[str]:
-        """Options of `solve` for the tiny pair; keywords replace the files."""
-        own = {
-            "ref": str(self.good("a.png")),
-            "next": str(self.good("b.png")),
-            "intrinsics": CAMERA,
-            "flow": str(self.good("f.npy")),
-            **{key.replace("_", "-"): value for key, value in changes.items()},
-        }
-        return [word for key, value in own.items() for word in (f"--{key}", value)]
+    @cached_property
+    def pair(self) -> list[str]:
+        """Options of `solve` for the tiny pair; the last one of a repeated option counts."""
+        names = {"ref": "a.png", "next": "b.png", "flow": "f.npy"}
+        words = [w for key, name in names.items() for w in (f"--{key}", str(self.good(name)))]
+        return [*words, "--intrinsics", CAMERA]
 
     @cached_property
     def result(self) -> Path:
         """A result folder."""
         out = self.root / "result"
-        assert main(
-            ["solve", *self.pair(depth=str(self.good("d.npy"))), *settings(), "-o", str(out), "-q"]
-        ) in (0, 1)
+        depth = ["--depth", str(self.good("d.npy"))]
+        assert main(["solve", *self.pair, *depth, *SET, "-o", str(out), "-q"]) in (0, 1)
         return out
 
     @cached_property
@@ -117,45 +105,21 @@ class World:
         assert main(["export", str(self.good("p.yaml")), "-o", str(out), "-q"]) == 0
         rows, columns = (len((out / f"soup.{s}").read_text().split()) for s in ("row", "col"))
         # the .row file names the objective as well
-        rows -= 1
-        head = [
-            "tiny 1.0",
-            "",
-            "Options",
-            "3",
-            "0",
-            "1",
-            "0",
-            *map(str, (rows, 0, columns, columns)),
-        ]
-        (out / "soup.sol").write_text("\n".join([*head, *["0.5"] * columns, "objno 0 400"]) + "\n")
+        sizes = [rows - 1, 0, columns, columns]
+        lines = ["tiny 1.0", "", "Options", 3, 0, 1, 0, *sizes, *["0.5"] * columns, "objno 0 400"]
+        (out / "soup.sol").write_text("\n".join(map(str, lines)) + "\n")
         return out
 
-    def copy(self, which: str, name: str) -> Path:
-        """A copy of `result` or `exported` that a case may damage."""
-        source, target = getattr(self, which), self.root / "copies" / name
-        if not target.exists():
-            shutil.copytree(source, target)
-        return target
-
-    def odd(self, kind: str, suffix: str) -> str:
+    def odd(self, kind: str, suffix: str = "") -> str:
         """The name of an odd file."""
         folder = self.root / "odd"
         folder.mkdir(exist_ok=True)
         path = folder / f"{kind}{suffix}"
         if not os.path.lexists(path):
             made = ODD[kind](path)
-            if made is not None:
+            if isinstance(made, str):
                 return made
         return str(path)
-
-
-def _quoted(text: str) -> str:
-    return (
-        '"'
-        + "".join(c if " " <= c <= "~" and c not in '"\\' else f"\\x{ord(c):02x}" for c in text)
-        + '"'
-    )
 
 
 def _bind(path: Path) -> None:
@@ -194,51 +158,28 @@ ODD = {
     "latin": _latin,
     "newline": lambda path: f"{path.parent}/a\nb{path.suffix}",
     "escape": lambda path: f"{path.parent}/\x1b[31mred\x1b]0;t\x07{path.suffix}",
-    "garbage": lambda path: path.write_bytes(bytes(range(256)) * 16) and None,
-    "line": lambda path: path.write_bytes(b"a" * 300_000) and None,
-    "brackets": lambda path: path.write_bytes(b"[" * 100_000) and None,
-    "digits": lambda path: path.write_bytes(b"1" * 100_000) and None,
-    "braces": lambda path: path.write_bytes(b'{"a":' * 50_000) and None,
+    "garbage": lambda path: path.write_bytes(bytes(range(256)) * 16),
+    "line": lambda path: path.write_bytes(b"a" * 300_000),
+    "brackets": lambda path: path.write_bytes(b"[" * 100_000),
+    "digits": lambda path: path.write_bytes(b"1" * 100_000),
+    "braces": lambda path: path.write_bytes(b'{"a":' * 50_000),
 }
 """Kinds of odd files: makes one at the path, or returns another name."""
-
-
-def png_chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+NO_FOLDER = ("pipe", "zero", "null", "socket", "nul", "long", "deep", "loop", "garbage")
+"""Kinds that no output folder can be made at."""
 
 
 def png(width: int, height: int, depth: int = 8, colour: int = 0, rows: bytes = b"\0\0") -> bytes:
     """A PNG whose header may claim more than its rows hold."""
     head = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
-    parts = [
-        png_chunk(b"IHDR", head),
-        png_chunk(b"IDAT", zlib.compress(rows)),
-        png_chunk(b"IEND", b""),
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+    out = b"\x89PNG\r\n\x1a\n"
+    for kind, data in ((b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")):
+        out += struct.pack(">I", len(data)) + kind + data
+        out += struct.pack(">I", zlib.crc32(kind + data))
+    return out
 
 
 def encoded_noise(size: tuple[int, int], suffix: str = ".png", kind: type = np.uint8) -> bytes:
     """An image of noise."""
     values = np.random.default_rng(1).integers(0, 255, (*size, 3)).astype(kind)
     return cv2.imencode(suffix, values)[1].tobytes()
-
-
-def npy(
-    header: str | bytes, data: bytes = b"", version: int = 1, length: int | None = None
-) -> bytes:
-    """A .npy file with any header."""
-    text = header.encode() if isinstance(header, str) else header
-    size = len(text) if length is None else length
-    code = struct.pack("<H" if version == 1 else "<I", size)
-    return b"\x93NUMPY" + bytes([version, 0]) + code + text + data
-
-
-def solve(w: World, out: Path, *words: str, **changes: str) -> list[str]:
-    return ["solve", *w.pair(**changes), *settings(), *words, "-o", str(out / "out"), "-q"]
-
-
-def problem_case(w: World, out: Path, text: str | bytes) -> Path:
-    path = out / "p.yaml"
-    path.write_bytes(text.encode() if isinstance(text, str) else text)
-    return path

@@ -1,0 +1,295 @@
+"""Odd files and texts at every door of the command line."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+from helpers_odd_run import ANY, DOORS, Case, changed, every, words, write, written
+from helpers_odd_world import NO_FOLDER, ODD, World
+
+from soup_nlp.cli.main import main
+from soup_nlp.storage.rows import append_row, read_rows
+
+# --- files ---------------------------------------------------------------------------------------
+
+READ = {
+    **{
+        f"solve --{option} {suffix}": f"{{solve}} --{option} {{odd.{suffix}}}"
+        for option, suffixes in {
+            "ref": "png",
+            "next": "png",
+            "intrinsics": "txt",
+            "flow": "flo npy png onnx",
+            "flow-confidence": "npy",
+            "flow-backward": "npy",
+            "depth": "npy dpt pfm png",
+        }.items()
+        for suffix in suffixes.split()
+    },
+    "solve --ref alone": "solve --ref {odd.png} --next {b} -q -o {out}",
+    "solve PROBLEM": "solve {odd.yaml} -o {out}",
+    "view": "view {odd} --no-open",
+    "convert": "convert {odd} --to glb -o {out}",
+    "chain": "chain {odd} -q -o {out}",
+    "chain image": "chain {odd.png} {odd.png} -q -o {out}",
+    "chain video": "chain {odd.mp4} -q -o {out}",
+    "show": "show {odd.yaml}",
+    "list": "list {odd}",
+    "export": "export {odd.yaml} -o {out}",
+    "compare": "compare {odd.yaml} --solvers ipopt -o {out}",
+    "check": "check {odd}",
+    "check .sol": "check {odd.sol} --export {exported}",
+    "check --export": "check {sol} --export {odd}",
+    "evaluate": "evaluate {odd} --depth {d}",
+    "evaluate --depth": "evaluate {result} --depth {odd.npy}",
+    "import DIR": "import {odd} {sol} -o {out}",
+    "import .sol": "import {exported} {odd.sol} -o {out}",
+    "bench speed --check": "bench speed --check {odd.json} -o {out}",
+    "bench accuracy --data": "bench accuracy --suite sintel --data {odd} -o {out}",
+}
+"""Commands that read a file or folder."""
+
+DATASETS = {
+    "folder": "path: {}",
+    "tum": "path: {}",
+    "sintel": "root: {}, scene: alley_1, frame: 1",
+    "kitti2015": 'root: {}, index: "000001"',
+    "vkitti2": "root: {}, scene: Scene01, frame: 0",
+}
+SMALL_SPEED = (
+    "bench speed --scenes street --sizes 12 --neighbours 4 --seeds 0 --width 64 --height 48"
+)
+WRITE = {
+    "solve": "{solve} -o {odd}",
+    "export": "export {p} -q -o {odd}",
+    "compare": "compare {p} --solvers ipopt -o {odd}",
+    "import": "import {exported} {sol} -o {odd}",
+    "bench speed": f"{SMALL_SPEED} -o {{odd}}",
+    "chain": "chain {a} {b} {tiny} -q -o {odd}",
+    "family": "family {odd}",
+    "convert": "convert {result} --to npy -o {odd}",
+    "demo": "demo -o {odd}",
+}
+KINDS = tuple(ODD)
+INSTEAD = ("pipe", "zero", "null", "random", "socket", "folder", "dangling", "loop", "empty")
+"""Kinds of which a file of a result is replaced."""
+
+
+def _instead(path: Path, kind: str) -> None:
+    path.unlink(missing_ok=True)
+    ODD[kind](path)
+
+
+def _dataset(name: str, text: str) -> Any:
+    def make(w: World, o: Path, kind: str) -> str:
+        root = text.format(json.dumps(w.odd(kind), ensure_ascii=True))
+        write(o / "p.yaml", f"input: {{kind: {name}, {root}}}\n")
+        return str(o / "p.yaml")
+
+    return make
+
+
+def _listed(w: World, o: Path, kind: str) -> str:
+    """A folder that holds an odd file, or a link to it."""
+    name = w.odd(kind, ".yaml")
+    if kind in ("newline", "escape"):
+        (o / Path(name).name).write_text("# fine\n")
+    elif Path(name).parent == w.root / "odd" and "\0" not in name and len(name) < 250:
+        (o / "link.yaml").symlink_to(name)
+    return str(o)
+
+
+def path_cases() -> Iterator[Case]:
+    for door, line in READ.items():
+        # an empty folder lists no problem, which is no mistake
+        other = {"folder": (0,)} if door == "list" else None
+        yield from every(DOORS, f"{door} {{}}", line, KINDS, other=other)
+    for name, text in DATASETS.items():
+        make = _dataset(name, text)
+        yield from every(DOORS, f"dataset {name} {{}}", "solve {x} -o {out}", KINDS, make=make)
+    for door, line in WRITE.items():
+        yield from every(DOORS, f"{door} -o {{}}", line, NO_FOLDER)
+    yield from every(DOORS, "list of {}", "list {x}", KINDS, (0, 2), make=_listed)
+    for name in ("depth_ref.png", "points_next.ply", "overview.png", "result.h5", "summary.json"):
+        codes = (2,) if name in ("result.h5", "summary.json") else (1,)
+        make = changed("result", name, _instead)
+        yield from every("3 check", f"check {name} {{}}", "check {x}", INSTEAD, codes, make=make)
+    page = changed("result", "report.html", _instead)
+    yield from every(DOORS, "view page {}", "view {x} --no-open", INSTEAD, (0, 2), make=page)
+
+
+# --- texts ---------------------------------------------------------------------------------------
+
+TEXTS: dict[str, str | bytes] = {
+    "deep JSON": "[" * 100_000,
+    "deep mapping": '{"a":' * 100_000,
+    "deep YAML": "- " * 5_000 + "a",
+    "huge integer": '{"schema": 1' + "0" * 400 + "}",
+    "very huge integer": '{"schema": 1' + "0" * 10_000 + "}",
+    "number for text": "3",
+    "null": "null",
+    "list": "[1, 2]",
+    "text": '"word"',
+    "NaN": "NaN",
+    "binary": bytes(range(256)) * 8,
+    "latin": b'{"name": "caf\xe9"}',
+    "utf-16": '{"name": "x"}'.encode("utf-16"),
+    "nul bytes": b"\0" * 5000,
+    "control characters": '{"name": "\\u001b[31mred"}',
+    "bomb": "a: &a [1,1]\n"
+    + "".join(
+        f"{b}: &{b} [{','.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefghijkl", "bcdefghijklm")
+    ),
+    "self": "&a [*a]",
+    "tag": "!!python/object/apply:os.abort []",
+    "lone surrogate": '{"name": "\\ud800"}',
+    "one line": "a" * 2_000_000,
+    "empty": "",
+    "keys": "{[1, 2]: 3}",
+    "unhashable": "? {a: 1}\n: 2\n",
+    "binary tag": "name: !!binary 'aGVsbG8='",
+    "date": "2020-01-01",
+    "set": "!!set {a, b}",
+}
+FEW = ("deep JSON", "very huge integer", "binary", "control characters", "nul bytes")
+"""What is tried where a case takes a second: the others are left to count_odd.py."""
+USES: dict[str, tuple[str, Any, tuple[int, ...]]] = {
+    "summary": ("check {x}", changed("result", "summary.json"), (2,)),
+    "config": ("check {x}", changed("result", "config.yaml"), (1, 2)),
+    "manifest": ("import {x} {sol} -o {out}", changed("exported", "manifest.json"), (2,)),
+    "over manifest": ("export {p} -q -o {x}", changed("exported", "manifest.json"), (0, 2)),
+    "problem": ("check {x}/soup.sol", changed("exported", "problem.yaml"), (2,)),
+    "show": ("show {x}", written("p.yaml"), (2,)),
+    "list": ("list {o}", written("p.yaml"), (0, 2)),
+    "baseline": ("bench speed --check {x} -o {out}", written("p.json"), (2,)),
+}
+"""Commands that read a text, by what it stands for."""
+
+ROWS: dict[str, bytes] = {
+    "binary": bytes(range(256)) * 8,
+    "one line": b"a" * 2_000_000,
+    "deep": b"[" * 100_000 + b"\n",
+    "latin": b'{"key": "caf\xe9"}\n',
+    "huge integer": b'{"seconds": 1' + b"0" * 400 + b"}\n",
+    "very huge integer": b'{"seconds": 1' + b"0" * 10_000 + b"}\n",
+    "other keys": b'{"a": 1}\n{"b": [1]}\n',
+    "no mapping": b'3\n"x"\n[1]\nnull\n',
+    "nul bytes": b"\0" * 4096,
+    "NaN": b'{"key": NaN, "ok": NaN}\n',
+    "control": b'{"key": "\\u001b[31m", "error": "\\u001b]0;t\\u0007"}\n',
+    "cut": b'{"key": "a", "val',
+}
+
+
+def _rows(w: World, o: Path, path: str) -> None:
+    assert all(isinstance(row, dict) for row in read_rows(Path(path)))
+    append_row(Path(path), {"new": 1})
+    assert read_rows(Path(path))[-1] == {"new": 1}
+
+
+def _odd_rows(w: World, o: Path, kind: str) -> None:
+    read_rows(Path(w.odd(kind, ".jsonl")))
+
+
+def text_cases() -> Iterator[Case]:
+    for use, (line, make, codes) in USES.items():
+        solves = TEXTS.keys() - FEW if use in ("config", "over manifest") else False
+        title = f"text {use} {{}}"
+        yield from every(DOORS, title, line, TEXTS, codes, make=make, solves=solves)
+    spoken = {
+        name: text if isinstance(text, str) else text.decode("utf-8", "surrogateescape")
+        for name, text in TEXTS.items()
+    }
+    spoken = {k: v for k, v in spoken.items() if "\0" not in v and len(v) < 100_000}
+    yield from every(DOORS, "text --set {}", "show {p} --set name={x}", spoken, (0, 2))
+    # no such limit of time is enough for a run: the rows are read before
+    for verb, file, line in (
+        ("compare", "runs.jsonl", "compare {p} --solvers no_such_solver -o {o}"),
+        ("speed", "table.jsonl", f"{SMALL_SPEED} --set segmentation.superpixels=x -o {{o}}"),
+    ):
+        yield from every(DOORS, f"rows {verb} {{}}", line, ROWS, ANY, make=written(file))
+    yield from every(DOORS, "rows read {}", _rows, ROWS, make=written("r.jsonl"), quiet=True)
+    yield from every(DOORS, "rows read file {}", _odd_rows, KINDS, quiet=True)
+
+
+UNTRUSTED = {
+    "escape": "\x1b[31mred\x1b]0;title\x07\x9b5m\u202e\r\x08",
+    "long": "x" * 100_000,
+    "lines": "a\n" * 5000,
+}
+
+
+def _named(line: str) -> Any:
+    """Writes the tiny problem with a first line, in which {} stands for the value in JSON."""
+
+    def make(w: World, o: Path, text: str) -> str:
+        write(o / "p.yaml", line.replace("{}", json.dumps(text)) + "\n" + w.problem())
+        return str(o / "p.yaml")
+
+    return make
+
+
+def _answer(w: World, o: Path, text: str) -> str:
+    """An answer whose message is the text."""
+    old = (w.exported / "soup.sol").read_text().partition("\n")[2]
+    (o / "soup.sol").write_text(f"{text}\n{old}", encoding="utf-8", newline="")
+    return str(o / "soup.sol")
+
+
+def _best(path: Path, text: str) -> None:
+    best = {"exact_energy": 1e-9, "found_by": text, "objective": 0.0}
+    own = json.loads(path.read_text()) | {"best_known": best, "name": text}
+    path.write_text(json.dumps(own))
+
+
+def _status(path: Path, text: str) -> None:
+    own = json.loads(path.read_text())
+    own["status"] = own["metrics"]["solution"]["scale_rule"] = text
+    own["metrics"][text] = own["metrics"]["solution"]
+    path.write_text(json.dumps(own))
+
+
+UNTRUSTING: dict[str, tuple[str, Any, tuple[int, ...]]] = {
+    "sol message": ("check {x} --export {exported}", _answer, (1,)),
+    "sol message imported": ("import {exported} {x} -o {out}", _answer, (1, 2)),
+    "best known": ("check {x}/soup.sol", changed("exported", "manifest.json", _best), (1,)),
+    "problem name": ("solve {x} -o {out}", _named("name: {}"), ANY),
+    "problem name exported": (
+        "export {x} --superpixels 12 --superpixels 13 -o {out}", _named("name: {}"), (0, 2)
+    ),
+    "unknown key": ("show {x}", _named("{}: 1"), (2,)),
+    "wrong value": ("show {x}", _named("seed: {}"), (2,)),
+    "first line": ("list {o}", lambda w, o, t: write(o / "p.yaml", f"# {t}\n"), (0,)),
+    "option": ("solve --{x}", None, (2,)),
+    "verb": ("{x}", None, (2,)),
+    "override": ("show {p} --set {x}", None, (2,)),
+    "solver": ("compare {p} --solvers {x} -o {out}", None, (2,)),
+    "formulation": ("export {p} --formulation {x} -o {out}", None, (2,)),
+    "scale": ("evaluate {result} --depth {d} --scale {x}", None, (2,)),
+    "suite": ("bench accuracy --suite {x} -o {out}", None, (2,)),
+    "flow": ("{solve} --flow {x}", None, (2,)),
+    "summary": ("check {x}", changed("result", "summary.json", _status), (1, 2)),
+}  # fmt: skip
+"""Commands that are given a text that nobody should trust."""
+
+
+def _tags(w: World, o: Path, name: str) -> None:
+    """Names do not end the script of the page."""
+    text = io.StringIO()
+    with redirect_stdout(text):
+        assert main(words("{solve} --json --set name={x}", w, o, name)) in ANY
+    page = o / "out" / "report.html"
+    assert not page.exists() or "<img src=x" not in page.read_text()
+    assert not text.getvalue() or isinstance(json.loads(text.getvalue()), dict)
+
+
+def untrusted_cases() -> Iterator[Case]:
+    for use, (line, make, codes) in UNTRUSTING.items():
+        yield from every("6 untrusted", f"{use} {{}}", line, UNTRUSTED, codes, make=make)
+    tags = {"of tags": "a</script><img src=x onerror=alert(1)>"}
+    yield from every("6 untrusted", "name {}", _tags, tags, quiet=True, solves=True)

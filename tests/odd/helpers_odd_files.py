@@ -1,0 +1,255 @@
+"""Arrays, images and networks that hold something else than they say."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from helpers_odd_run import ANY, DOORS, Case, every, written
+from helpers_odd_world import SIZE, World, encoded_noise, png
+from PIL import ExifTags, Image
+
+# --- arrays --------------------------------------------------------------------------------------
+
+
+def npy(
+    header: str | bytes, data: bytes = b"", version: int = 1, length: int | None = None
+) -> bytes:
+    """A .npy file with any header."""
+    text = header.encode() if isinstance(header, str) else header
+    code = struct.pack("<H" if version == 1 else "<I", len(text) if length is None else length)
+    return b"\x93NUMPY" + bytes([version, 0]) + code + text + data
+
+
+def _header(shape: object = "(2, 2)", kind: str = "'<f4'", version: int = 1) -> bytes:
+    text = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}, }}"
+    return npy(text, b"\0" * 64, version)
+
+
+LIES: dict[str, bytes] = {
+    **{
+        f"shape {shape}": _header(shape)
+        for shape in (
+            "(1000000, 1000000, 2)", "(1000000, 1000000)", "(9223372036854775807, 2)",
+            f"({10**30}, 2)", "(-1, -1, 2)", "(48.0, 64.0, 2)", "()", "(0, 64, 2)", "(48, 64, 2)",
+            "48", "None", "(True, True, 2)", "(" + "1, " * 60 + ")",
+        )
+    },
+    **{
+        f"dtype {kind}": _header(kind=kind)
+        for kind in (
+            "'|O'", "'<U1000000000'", "'|V2000000000'", "'<M8[s]'", "'<c16'", "'|b1'", "'f99'",
+            "[('a', '<f4')]", "3", "'" + "x" * 9000 + "'",
+        )
+    },
+    "no dictionary": npy("[1, 2]"),
+    "code": npy("__import__('os').abort()"),
+    "nested": npy("(" * 5000 + ")" * 5000),
+    "header of 4 GB": npy("{}", version=2, length=2**32 - 1),
+    "header cut": npy("{'descr'", length=60000),
+    "version 3": _header("(2,)", version=3),
+    "version 9": npy("{}", version=9),
+    "magic only": b"\x93NUMPY",
+    "pickle": b"\x80\x04\x95\x0b\0\0\0\0\0\0\0\x8c\x07builtin.",
+    "zip": b"PK\x03\x04" + b"\0" * 60,
+}  # fmt: skip
+"""Contents of .npy files that say something else than they hold."""
+
+half = np.full(SIZE, 0.5, np.float32)
+MAPS: dict[str, Any] = {
+    "of another size": half[:20],
+    "of one number": half[0, 0],
+    "above 1": half * 4,
+    "below 0": -half,
+    "of NaN": half * np.nan,
+    "of infinity": half * np.inf,
+    "of whole numbers": (half * 510).astype(np.uint8),
+    "of truth values": half > 0,
+    "complex": half.astype(complex),
+    "of objects": np.full(SIZE, None),
+    "of text": np.full(SIZE, "a"),
+    "of colours": np.dstack([half] * 3),
+    "zero": 0 * half,
+    "turned": half.T,
+}
+"""Maps of confidence, or channels of a flow."""
+
+
+def _saved(channels: int) -> Any:
+    def make(w: World, o: Path, value: Any) -> str:
+        twice = channels == 2 and np.ndim(value) == 2
+        np.save(o / "x.npy", np.dstack([value, value]) if twice else value)
+        return str(o / "x.npy")
+
+    return make
+
+
+def array_cases() -> Iterator[Case]:
+    for door in ("flow", "depth"):
+        line = f"{{solve}} --{door} {{x}}"
+        yield from every(DOORS, f"npy {door} {{}}", line, LIES, make=written("x.npy"))
+    for option, channels, good in (
+        ("confidence", 1, ("of truth values", "zero")),
+        (
+            "backward", 2,
+            ("above 1", "below 0", "of whole numbers", "of truth values", "zero", "of NaN",
+             "of infinity"),
+        ),
+    ):  # fmt: skip
+        other, make = dict.fromkeys(good, ANY), _saved(channels)
+        line = f"{{solve}} --flow-{option} {{x}}"
+        title = f"{option} {{}}"
+        yield from every(DOORS, title, line, MAPS, make=make, other=other, solves=good)
+        line = f"{{solve}} --flow dis --flow-{option} {{d}}"
+        yield from every(DOORS, f"flow_{option} {{}}", line, ["without a flow"])
+    yield from every(DOORS, "json of {}", "{solve} --json --ref no.png", ["an error"])
+
+
+# --- images --------------------------------------------------------------------------------------
+
+
+def _jpg() -> bytes:
+    text = bytearray(cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes())
+    at = text.index(b"\xff\xc0")
+    text[at + 5 : at + 9] = struct.pack(">HH", 65000, 65000)
+    return bytes(text)
+
+
+BMP = struct.pack("<IHHIIiiHHIIiiII", 154, 0, 0, 54, 40, 30000, 30000, 1, 24, 0, 0, 0, 0, 0, 0)
+IMAGES: dict[str, Callable[[], bytes]] = {
+    "header png": lambda: png(60000, 60000),
+    "header png rows": lambda: png(2**31 - 1, 2**31 - 1),
+    "header pgm": lambda: b"P5\n40000 40000\n255\n" + b"\0" * 100,
+    "header bmp": lambda: b"BM" + BMP + b"\0" * 100,
+    "header jpg": _jpg,
+    "tall": lambda: encoded_noise((5000, 16)),
+    "wide": lambda: encoded_noise((16, 5000)),
+    "one colour 20000": lambda: png(20000, 20000, 1, 0, b"\0" * 2501 * 20000),
+    "one colour 9000": lambda: png(9000, 9000, 1, 0, b"\0" * 1126 * 9000),
+    "1 x 1": lambda: encoded_noise((1, 1)),
+    "8 x 8": lambda: encoded_noise((8, 8)),
+    "png rows missing": lambda: png(64, 48),
+    "png without size": lambda: png(0, 0),
+    "gif": lambda: b"GIF89a" + struct.pack("<HH", 65535, 65535) + b"\0\0\0;",
+    "svg": lambda: b'<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>',
+    "float tiff": lambda: encoded_noise(SIZE, ".tiff", np.float32),
+    "float64 tiff": lambda: encoded_noise(SIZE, ".tiff", np.float64),
+}
+
+FOCAL, SHOWN = ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.Orientation
+LENGTH, ACROSS = ExifTags.Base.FocalLength, ExifTags.Base.FocalPlaneXResolution
+UNIT, WIDTH = ExifTags.Base.FocalPlaneResolutionUnit, ExifTags.Base.ExifImageWidth
+EXIF: dict[str, dict[int, Any] | bytes] = {
+    **{f"orientation {k}": {SHOWN: k} for k in (0, 9, 65535)},
+    **{f"focal {k}": {FOCAL: k} for k in (0, 65535)},
+    "length of 0": {LENGTH: (0, 1), ACROSS: (1000, 1)},
+    "length of 1 / 0": {LENGTH: (1, 0), ACROSS: (1000, 1)},
+    "resolution of 0 / 0": {LENGTH: (50, 1), ACROSS: (0, 0)},
+    "unit of 99": {LENGTH: (50, 1), ACROSS: (1000, 1), UNIT: 99},
+    "width of 0": {LENGTH: (50, 1), ACROSS: (1000, 1), WIDTH: 0},
+    "huge width": {LENGTH: (50, 1), ACROSS: (1000, 1), WIDTH: 2**32 - 1},
+    "text": {0x9286: b"\xff\xfe" * 3000, FOCAL: 40},
+    "bytes cut": b"Exif\0\0II*\0",
+    "bytes empty": b"Exif\0\0",
+    "bytes loop": b"Exif\0\0II*\0\x08\0\0\0" + struct.pack("<HI", 0, 8),
+    "bytes far": b"Exif\0\0II*\0\xff\xff\xff\x7f",
+    "bytes many": b"Exif\0\0II*\0\x08\0\0\0\xff\xff" + b"\x69\x87\x04\0\x01\0\0\0\x08\0\0\0" * 9,
+    "bytes noise": bytes(range(256)) * 9,
+}
+"""Tags of a photo, or the bytes of its EXIF."""
+
+
+def _photos(w: World, o: Path, exif: dict[int, Any] | bytes) -> None:
+    for word in "ab":
+        with Image.open(w.good(f"{word}.png")) as image:
+            own: Any = exif
+            if isinstance(exif, dict):
+                own = image.getexif()
+                own.update({k: v for k, v in exif.items() if k == SHOWN})
+                inner = {k: v for k, v in exif.items() if k != SHOWN}
+                own.get_ifd(ExifTags.IFD.Exif).update(inner)
+            image.save(o / f"{word}.jpg", exif=own)
+
+
+def image_cases() -> Iterator[Case]:
+    tiffs = dict.fromkeys(("float tiff", "float64 tiff"), ANY)
+    for doors, line in {
+        "ref": "{solve} --ref {x}",
+        "next": "{solve} --next {x}",
+        "ref and next": "{solve} --flow dis --ref {x} --next {x}",
+    }.items():
+        title, make = f"image {{}} as {doors}", written("x.png")
+        yield from every("4 endless", title, line, IMAGES, make=make, other=tiffs)
+    # pictures that are read, and a flow that is not there
+    line = "solve {o}/a.jpg {o}/b.jpg --flow nothing.flo -q -o {out}"
+    yield from every(DOORS, "exif {}", line, EXIF, make=_photos)
+
+
+# --- networks ------------------------------------------------------------------------------------
+
+
+def network(path: Path, kind: str) -> None:
+    """An ONNX file that is no flow."""
+    import onnx
+    from onnx import TensorProto, helper
+
+    def whole(name: str, value: int) -> Any:
+        return helper.make_tensor(name, TensorProto.INT64, [1], [value])
+
+    shape = {"five channels": [1, 5, "h", "w"], "three axes": [1, 6, "n"]}.get(
+        kind, [1, 6, "h", "w"]
+    )
+    # a slice of the stack of images: two channels, or what is no flow
+    axis, end = {"one channel": (1, 1), "no pixel": (2, 0)}.get(kind, (1, 2))
+    out = {"one channel": [1, 1, "h", "w"], "no pixel": None}.get(kind, [1, 2, "h", "w"])
+    element = TensorProto.INT32 if kind == "whole numbers" else TensorProto.FLOAT
+    steps = {
+        "NaN": [("Mul", ["two", "minus"], "neg", {}), ("Log", ["neg"], "o", {})],
+        "infinite": [("Div", ["two", "null"], "o", {})],
+        "whole numbers": [("Cast", ["two"], "o", {"to": TensorProto.INT32})],
+    }.get(kind, [])
+    nodes = [helper.make_node("Slice", ["in", "s", "e", "x"], ["two"])]
+    nodes += [helper.make_node(op, given, [to], **more) for op, given, to, more in steps]
+    constants = [whole("s", 0), whole("e", end), whole("x", axis)]
+    constants += [
+        helper.make_tensor(name, TensorProto.FLOAT, [1], [value])
+        for name, value in (("minus", -1.0), ("null", 0.0))
+    ]
+    given = helper.make_tensor_value_info("in", TensorProto.FLOAT, shape)
+    found = helper.make_tensor_value_info("o" if steps else "two", element, out)
+    graph = helper.make_graph(nodes, "g", [given], [found], constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    if kind == "unknown range":
+        model.metadata_props.add(key="input_range", value="\x1b[31m" * 2000)
+    if kind == "elsewhere":
+        tensor = model.graph.initializer[0]
+        tensor.ClearField("int64_data")
+        tensor.data_location = TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value="../../../../etc/passwd")
+    onnx.save(model, path)
+
+
+NETWORKS = (
+    "five channels", "three axes", "NaN", "infinite", "one channel", "no pixel", "whole numbers",
+    "unknown range", "elsewhere",
+)  # fmt: skip
+
+
+def _network(w: World, o: Path, kind: str) -> str:
+    try:
+        network(o / "n.onnx", kind)
+    except ImportError:
+        return "no.onnx"
+    return str(o / "n.onnx")
+
+
+def network_cases() -> Iterator[Case]:
+    free = ("NaN", "infinite", "whole numbers")
+    yield from every(
+        DOORS, "network {}", "{solve} --flow {x}", NETWORKS, make=_network, solves=free,
+        other=dict.fromkeys(free, ANY),
+    )  # fmt: skip

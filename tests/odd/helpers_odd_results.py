@@ -1,0 +1,313 @@
+"""Results whose parts do not belong together, files of the user, sequences without an answer."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+from helpers_odd_run import ANY, DOORS, Case, changed, every, h5_damage, words, write
+from helpers_odd_world import SIZE, World, encoded_noise
+
+
+def _put(name: str, value: Any) -> Callable[[h5py.File], None]:
+    """Replaces an array of a result."""
+
+    def damage(file: h5py.File) -> None:
+        del file[name]
+        file[name] = value(file) if callable(value) else value
+
+    return damage
+
+
+def _with(name: str, change: Callable[[Any], Any]) -> Callable[[h5py.File], None]:
+    """Changes the values of an array of a result."""
+    return lambda file: _put(name, change(file[name][()]))(file)
+
+
+def _attribute(name: str, value: Any) -> Callable[[h5py.File], None]:
+    return lambda file: file.attrs.__setitem__(name, value)
+
+
+def _without(*names: str) -> Callable[[h5py.File], object]:
+    return lambda file: [file.__delitem__(name) for name in names if name in file]
+
+
+def _added(name: str, value: Any) -> Callable[[h5py.File], None]:
+    return lambda file: file.__setitem__(name, value(file) if callable(value) else value)
+
+
+def _huge(file: h5py.File) -> None:
+    del file["depth/ref"]
+    file.create_dataset("depth/ref", (10**6, 10**7), "f8", chunks=(1000, 1000))
+
+
+def _wide(file: h5py.File) -> None:
+    for k in range(2):
+        file.create_dataset(f"extra{k}", (10**5, 10**5), "f8", chunks=(1000, 1000))
+
+
+def _deep(group: h5py.Group) -> None:
+    for _ in range(3000):
+        group = group.create_group("g")
+
+
+STRUCTURE: dict[str, Callable[[h5py.File], object]] = {
+    "cycle": _added("depth/again", lambda f: f["/"]),
+    "soft cycle": _added("round", h5py.SoftLink("/round")),
+    "soft link up": _added("depth/up", h5py.SoftLink("/")),
+    "soft link dangling": _put("depth/ref", h5py.SoftLink("/nowhere")),
+    "external link": _put("depth/ref", h5py.ExternalLink("/etc/passwd", "/x")),
+    "external link of a group": _added("other", h5py.ExternalLink("other.h5", "/")),
+    "external link to itself": _added("me", h5py.ExternalLink("result.h5", "/")),
+    "huge dataset": _huge,
+    "many huge datasets": _wide,
+    "deep groups": _deep,
+    "named type": _added("kind", np.dtype("f8")),
+    "named type in place": _put("depth/ref", np.dtype("f8")),
+    "empty dataset": _put("depth/ref", h5py.Empty("f8")),
+    "text for numbers": _put("depth/ref", "text"),
+    "compound": _put("depth/ref", np.zeros(3, [("a", "f8")])),
+    "reference": _put("depth/ref", lambda f: np.array([f["depth"].ref], h5py.ref_dtype)),
+    "vlen": lambda f: f.create_dataset("ragged", (2,), h5py.vlen_dtype("f8")),
+    "complex": _put("depth/ref", np.zeros((4, 4), complex)),
+    "group for array": lambda f: (f.__delitem__("depth/ref"), f.create_group("depth/ref")),
+    "array for group": _put("depth", 1.0),
+    "no depth": _without("depth"),
+    "latin text": _added("word", np.array([b"\xe9\xff"], h5py.string_dtype("utf-8"))),
+    "attribute broken YAML": _attribute("config", "a: [1"),
+    "attribute deep YAML": _attribute("config", "[" * 20_000),
+    "attribute YAML word": _attribute("config", "word"),
+    "attribute binary": _attribute("config", np.void(b"\xff\xfe")),
+    "attribute broken JSON": _attribute("versions", "{"),
+    "attribute deep JSON": _attribute("versions", "[" * 30_000),
+    "attribute reference": lambda f: f.attrs.__setitem__("config", f["depth"].ref),
+    "attribute missing": lambda f: f.attrs.__delitem__("config"),
+}
+"""Damages of the structure of a result."""
+UNSEEN = ("vlen", "named type", "latin text", "soft link up")
+"""Damages that a check need not notice."""
+NO_DEPTH = (
+    "huge dataset", "external link", "soft link dangling", "text for numbers", "compound",
+    "empty dataset",
+)  # fmt: skip
+"""Damages without which there is no depth."""
+
+CONTENTS: dict[str, Callable[[h5py.File], object]] = {
+    "negative labels": _with("segmentation/labels", lambda x: x - 5),
+    "labels beyond": _with("segmentation/labels", lambda x: x + 10**6),
+    "labels of floats": _with("segmentation/labels", lambda x: x + 0.5),
+    "labels of one row": _with("segmentation/labels", lambda x: x[0]),
+    "images of one channel": _with("input/image_ref", lambda x: x[..., 0]),
+    "images of four channels": _with("input/image_ref", lambda x: x[..., [0, 1, 2, 0]]),
+    "images of floats": _with("input/image_ref", lambda x: x / 255.0),
+    "image of no pixel": _with("input/image_next", lambda x: x[:0]),
+    "image of another size": _with("input/image_ref", lambda x: x[:20]),
+    "singular camera": _with("input/K_ref", lambda x: 0 * x),
+    "camera of NaN": _with("input/K_next", lambda x: x * np.nan),
+    "camera of four numbers": _with("input/K_ref", lambda x: x.ravel()[:4]),
+    "soup of NaN": _with("solution/n", lambda x: x * np.nan),
+    "soup of zeros": _with("solution/lam", lambda x: 0 * x),
+    "soup too short": _with("solution/lam", lambda x: x[:-1]),
+    "soup of rotations that are none": _with("solution/R", lambda x: 0 * x),
+    "soup of text": _put("solution/d", "word"),
+    "negative components": _with("start/component", lambda x: x - 7),
+    "components of floats": _with("start/component", lambda x: x + np.nan),
+    "components too many": _with("start/component", lambda x: np.arange(len(x)) + 2**40),
+    "confidence of another size": _with("input/confidence", lambda x: x[:5]),
+    "sigma of text": _put("depth/sigma_ref", "word"),
+    "sigma of another size": _with("depth/sigma_ref", lambda x: x[:5]),
+    "sizes of zero": _with("segmentation/sizes", lambda x: 0 * x),
+    "anchors too short": _with("segmentation/anchors", lambda x: x[:3]),
+    "name of control characters": _attribute("name", "\x1b[31m\x07\n" * 50),
+    "name of tags": _attribute("name", "</script><script>alert(1)</script>"),
+    "scale of text": _attribute("scale_to_truth", "word"),
+    "scale of a list": _attribute("scale_to_truth", [1.0, 2.0]),
+    "scale of nothing": _attribute("scale_to_truth", 0.0),
+    "no name": lambda f: f.attrs.__delitem__("name"),
+    "no start": _without("start"),
+    "no truth": _without("truth"),
+    "no energy": _without("energy"),
+    "no history": _without("history", "refine"),
+}
+"""Arrays of a result that do not belong together."""
+
+
+def _flip(path: Path, where: str) -> None:
+    """Invert 3,000 bytes."""
+    data = bytearray(path.read_bytes())
+    at = {"start": 0, "middle": len(data) // 2, "end": len(data) - 4000}[where]
+    data[at : at + 3000] = bytes(255 - b for b in data[at : at + 3000])
+    path.write_bytes(data)
+
+
+def result_cases() -> Iterator[Case]:
+    broken = changed("result", "result.h5", h5_damage)
+    certain = dict.fromkeys(NO_DEPTH, (2,))
+    unsure = [*UNSEEN, "attribute broken JSON", "attribute deep JSON"]
+    unsure += [name for name in STRUCTURE if name.startswith("attribute")]
+    linked = {k: v for k, v in STRUCTURE.items() if "cycle" in k or "link" in k}
+    rest = {k: v for k, v in STRUCTURE.items() if k not in linked}
+    for verb, line, codes, other in (
+        ("check", "check {x}", (2, 1), dict.fromkeys(unsure, ANY) | certain),
+        ("evaluate", "evaluate {x} --depth {d}", ANY, certain),
+    ):
+        title = f"h5 {verb} {{}}"
+        yield from every("4 endless", title, line, linked, codes, make=broken, other=other)
+        yield from every(DOORS, title, line, rest, codes, make=broken, other=other)
+        flip = changed("result", "result.h5", _flip)
+        ends = ("start", "middle", "end")
+        yield from every(DOORS, f"h5 {verb} flipped {{}}", line, ends, ANY, make=flip)
+    formats = "ply,glb,colmap,npy,pfm,png,rrd,motions"
+    for line in (f"convert {{x}} --to {formats}", "view {x} --renew --no-open"):
+        title = f"{line.split()[0]} h5 {{}}"
+        yield from every(DOORS, title, line, CONTENTS, (0, 2), make=broken)
+    yield from every(DOORS, "convert {}", "convert {exported} --to npy -o {out}", ["an export"])
+    yield from every(DOORS, "convert {}", "convert {result} --to npy,npy -o {o}", ["twice"], (0,))
+    yield from every(DOORS, "view {}", "view {exported} --no-open", ["an export"])
+
+
+def mine(*names: str) -> Any:
+    """Writes files of the user into the folder of the case."""
+
+    def make(w: World, o: Path, value: Any) -> None:
+        for name in names or (value,):
+            (o / name).parent.mkdir(parents=True, exist_ok=True)
+            (o / name).write_text("mine")
+
+    return make
+
+
+def lost_cases() -> Iterator[Case]:
+    """Files of the user that a command would replace."""
+    line = "family {o} --sizes=100 --scenes=orbit --starts=hard"
+    names = ("notes.txt", "index.json", ".hidden")
+    yield from every(DOORS, "family over {}", line, names, make=mine())
+    over = {"mesh_ref.glb": "glb", "colmap/notes.txt": "colmap"}
+    for name, to in over.items():
+        line, codes = f"convert {{result}} --to {to} -o {{o}}", (0, 2) if to == "colmap" else (2,)
+        yield from every("1 lost", "convert over {}", line, [name], codes, make=mine(name))
+    for name, to in {"depth_ref.npy": "npy", "points_ref.ply": "ply"}.items():
+        copy = changed("result", name, lambda path, value: write(path, "mine"))
+        yield from every("1 lost", "convert over {}", f"convert {{x}} --to {to}", [name], make=copy)
+
+
+# --- sequences -----------------------------------------------------------------------------------
+
+
+def clip(*names: str, sizes: tuple[tuple[int, int], ...] = (SIZE,), more: str = "") -> Any:
+    """`chain` of a folder of images of noise, of one size or of one each."""
+
+    def do(w: World, o: Path, _: object = None) -> list[str]:
+        (o / "clip").mkdir(exist_ok=True)
+        for k, name in enumerate(names or ("frame_0.png", "frame_1.png")):
+            (o / "clip" / name).write_bytes(encoded_noise(sizes[k % len(sizes)]))
+        return words(f"chain {{o}}/clip {{tiny}} {more} -q -o {{out}}", w, o)
+
+    return do
+
+
+def beside(name: str, make: Callable[[Path], object]) -> Any:
+    """`chain` of a folder of frames beside an odd file."""
+
+    def do(w: World, o: Path, _: object) -> list[str]:
+        line = clip()(w, o)
+        make(o / "clip" / name)
+        return line
+
+    return do
+
+
+def video(frames: int, size: tuple[int, int] = SIZE, more: str = "", own: str = "") -> Any:
+    """`chain` of a video of noise, into a folder that holds a file of the user."""
+
+    def do(w: World, o: Path, _: object) -> list[str]:
+        coder = cv2.VideoWriter(str(o / "c.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, size[::-1])
+        for _ in range(frames):
+            coder.write(cv2.imdecode(np.frombuffer(encoded_noise(size), np.uint8), 1))
+        coder.release()
+        if own:
+            mine(own)(w, o, None)
+        return words(f"chain {{o}}/c.avi {more} -q -o {{out}}", w, o)
+
+    return do
+
+
+CHAIN = "chain {a} {b} {tiny} -q -o {out}"
+
+
+def into(name: str, data: bytes | None = None) -> Any:
+    """`chain` into a folder that holds a file, or a folder of this name."""
+
+    def do(w: World, o: Path, _: object) -> list[str]:
+        (o / "out" / name).parent.mkdir(parents=True, exist_ok=True)
+        (o / "out" / name).mkdir() if data is None else (o / "out" / name).write_bytes(data)
+        return words(CHAIN if data in (None, b"mine") else f"{CHAIN} --fov=400", w, o)
+
+    return do
+
+
+def _no_result(w: World, o: Path, _: object) -> list[str]:
+    """Rows of a pair whose result is none."""
+    into("pairs/000_001/result.h5", b"no HDF5")(w, o, None)
+    return into("pairs.jsonl", b'{"key": "000_001", "ok": true}\n')(w, o, None)
+
+
+CHAINS: dict[str, Any] = {
+    "stride of 5001 digits": f"{CHAIN} --stride=1{'0' * 5000}",
+    "auto of two frames alike": clip("1.png", "2.png", more="--stride=auto"),
+    "one image": "chain {a} {tiny} -q -o {out}",
+    "one frame of a folder": clip(more="--stride=3"),
+    "two cameras": f"{CHAIN} --intrinsics={{camera}} --fov=50",
+    "other input": f"{CHAIN} --set input.kind=scene",
+    "memory": f"{CHAIN} --set input.kind=memory --set input.hash=x",
+    "scene twice": "chain scene:street scene:room -o {out}",
+    "scene and image": "chain scene:street a.png -q -o {out}",
+    "scene with stride": "chain scene:orbit --stride=2 -o {out}",
+    "scene with camera": "chain scene:orbit --fov=50 -o {out}",
+    "scene over two": "chain scene:orbit --two-frame -q -o {out}",
+    "images of two sizes": clip(sizes=(SIZE, (48, 80))),
+    "images too small": clip(sizes=((8, 8),)),
+    "superscripts": clip("1²3.png", "1²4.png", more="--fov=400"),
+    "digits of other scripts": clip("\u0661.png", "\u0662.png", more="--fov=400"),
+    "images that are folders": beside("frame_1.png", lambda p: (p.unlink(), p.mkdir())),
+    "camera is a folder": beside("K.txt", Path.mkdir),
+    "camera is a pipe": beside("K.txt", os.mkfifo),
+    "camera is binary": beside("K.txt", lambda p: p.write_bytes(bytes(range(256)))),
+    "camera of three numbers": beside("K.txt", lambda p: p.write_text("1 2 3")),
+    "camera of NaN": beside("K.txt", lambda p: p.write_text("nan 60 32 24")),
+    "dangling frame": beside("frame_2.png", lambda p: p.symlink_to("nowhere")),
+    "pipe among frames": beside("frame_2.png", os.mkfifo),
+    "text among frames": beside("frame_2.png", lambda p: p.write_text("no picture")),
+    "video of one frame": video(1),
+    "video of tiny frames": video(3, (16, 16)),
+    "video over frames of the user": video(3, own="out/frames/0000.png"),
+    "video with a stride beyond": video(3, more="--stride=9"),
+    "page of the user": into("chain.html", b"mine"),
+    "clouds of the user": into("points/0000.ply", b"mine"),
+    "pairs is a file": into("pairs", b"mine"),
+    "rows are a folder": into("pairs.jsonl"),
+    "rows are binary": into("pairs.jsonl", bytes(range(256)) * 9),
+    "rows of lists": into("pairs.jsonl", b'[1]\n{"key": [1]}\n{"key": {}}\n'),
+    "rows and no result": _no_result,
+}
+"""Sequences that cannot be solved."""
+SOURCES = (
+    "scene:", "scene:nothing", "scene:../street", "scene:street ", "scene:\x1b[31m", "",
+    "/dev", "a**b/*.png", "[", "[!]", "no/such/*.png", "http://localhost:1/a.mp4",
+    "*" * 300, "rtsp://localhost:1/x.mov",
+)  # fmt: skip
+
+
+def chain_cases() -> Iterator[Case]:
+    # two sizes of images are fine, and what nothing is read with is not looked at
+    fine = ("digits of other scripts", "auto of two frames alike", "images of two sizes")
+    yield from every(DOORS, "chain {}", None, CHAINS, other=dict.fromkeys(fine, ANY))
+    yield from every(DOORS, "chain source {}", "chain {x} -q -o {out}", SOURCES)
+    empty = lambda w, o, _: (o / "clip").mkdir()  # noqa: E731
+    line = "chain {o}/clip -q -o {out}"
+    yield from every(DOORS, "chain {}", line, ["no images"], make=empty)
