@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import errno
-import functools
 import os
 import re
 import sys
 import tempfile
 import traceback
 import unicodedata
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import ParamSpec
 
-import typer
-
-from soup_nlp.errors import ConfigError, DataError, SoupError, printable
+from soup_nlp.errors import ConfigError, DataError, printable
 from soup_nlp.storage.versions import versions
 
 BUG = 70
@@ -25,42 +20,16 @@ BUG = 70
 BROKEN_PIPE = 141
 """Exit code after a broken pipe, as in shells."""
 
-SYSTEM = {
-    getattr(errno, name)
-    for name in (
-        *("ENAMETOOLONG", "ELOOP", "ENOTDIR", "EISDIR", "EACCES", "EPERM", "EROFS"),
-        *("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EMFILE"),
-    )
-    if hasattr(errno, name)
-}
+SYSTEM = (
+    *(errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM),
+    *(errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EMFILE),
+)
 """Errors of the operating system that are not bugs of the program."""
 
-P = ParamSpec("P")
 
-
-def guarded(command: Callable[P, None]) -> Callable[P, None]:
-    """The command with unexpected exceptions turned into a SoupError or a bug report."""
-
-    @functools.wraps(command)
-    def run(*args: P.args, **kwargs: P.kwargs) -> None:
-        try:
-            with warnings.catch_warnings():
-                warnings.showwarning = _say
-                command(*args, **kwargs)
-        except (SoupError, typer.Exit, typer.Abort, BrokenPipeError):
-            raise
-        except Exception as error:
-            if refused := refusal(error):
-                raise refused from error
-            # usage errors of the command line library have their own message
-            if hasattr(error, "format_message"):
-                raise
-            raise typer.Exit(report_bug(error)) from error
-
-    return run
-
-
-def _say(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+def print_warning(
+    message: Warning | str, category: type[Warning], *_: object, **__: object
+) -> None:
     """Print a warning about the input on one line; those of libraries are not printed."""
     # loaded by whoever warns, so that --help is fast
     from soup_nlp.data.formats.images import DataWarning
@@ -71,7 +40,9 @@ def _say(message: Warning | str, category: type[Warning], *_: object, **__: obje
 
 def refusal(error: Exception) -> DataError | None:
     """DataError for a lack of memory, files or disk space; None for other errors."""
-    if _out_of_memory(error):
+    # of Python and NumPy, of native code, of OpenCV
+    words = ("bad_alloc", "Insufficient memory")
+    if isinstance(error, MemoryError) or any(word in str(error) for word in words):
         return DataError(
             "the machine has not enough memory for this",
             found=error,
@@ -82,13 +53,6 @@ def refusal(error: Exception) -> DataError | None:
     if isinstance(error, OSError) and error.errno in SYSTEM:
         return DataError("the system refuses a file", where=error.filename, found=error.strerror)
     return None
-
-
-def _out_of_memory(error: Exception) -> bool:
-    """Whether Python, NumPy, OpenCV or native code ran out of memory."""
-    return isinstance(error, MemoryError) or any(
-        word in str(error) for word in ("bad_alloc", "Insufficient memory")
-    )
 
 
 def report_bug(error: BaseException) -> int:

@@ -29,13 +29,8 @@ def chain(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Output folder; default out/chain-SOURCE.")
     ] = None,
-    intrinsics: Annotated[
-        str | None,
-        typer.Option(help="fx,fy,cx,cy in pixels, or a file; default K.txt beside the images."),
-    ] = None,
-    fov: Annotated[
-        float | None, typer.Option(help="Horizontal field of view, degrees, instead.")
-    ] = None,
+    intrinsics: options.Intrinsics = None,
+    fov: options.Fov = None,
     undistort: options.Undistort = False,
     stride: Annotated[
         str, typer.Option(help="Take every so many frames; auto: until there is parallax.")
@@ -84,7 +79,7 @@ def chain(
             done = solve_chain(
                 frames_of,
                 out,
-                intrinsics=options.camera(intrinsics, "--intrinsics") if intrinsics else None,
+                intrinsics=options.camera(intrinsics, "--intrinsics"),
                 fov=fov,
                 undistort=undistort,
                 stride=stride,

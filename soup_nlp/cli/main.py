@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import import_module
@@ -17,8 +18,8 @@ from typer.core import TyperCommand, TyperGroup
 from soup_nlp.cli.boundary import (
     BROKEN_PIPE,
     drop_output,
-    guarded,
     prepare_streams,
+    print_warning,
     refusal,
     refuse_odd,
     report_bug,
@@ -123,35 +124,30 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     """Run the command line; the exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
     try:
-        words = list(sys.argv[1:] if argv is None else argv)
         refuse_odd(words)
-        code = _root()(args=words, standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.showwarning = print_warning
+            code = _root()(args=words, standalone_mode=False)
         # the command line library turns a KeyboardInterrupt into this code
         return _aborted() if code == ABORTED else int(code or 0)
-    except StoppedError as error:
-        print(error, file=sys.stderr)
-        return ABORTED
-    except SoupError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     except typer.Exit as done:
         return int(done.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return _aborted()
+    except BrokenPipeError:
+        raise
     except Exception as error:
-        # usage errors of the command line library have their own message; a bare command has its
-        # help, which is printed
-        if hasattr(error, "format_message"):
-            if said := error.format_message():
-                print(f"error: {printable(said)}", file=sys.stderr)
-            return 2
-        if isinstance(error, BrokenPipeError):
-            raise
-        if refused := refusal(error):
-            print(f"error: {refused}", file=sys.stderr)
-            return 2
-        return report_bug(error)
+        said: object = error if isinstance(error, SoupError) else refusal(error)
+        if said is None and hasattr(error, "format_message"):
+            # a usage error; it says nothing for a bare command, whose help is printed
+            said = printable(error.format_message())
+        if said is None:
+            return report_bug(error)
+        if said:
+            print(said if isinstance(said, StoppedError) else f"error: {said}", file=sys.stderr)
+        return ABORTED if isinstance(said, StoppedError) else 2
 
 
 def _aborted() -> int:
@@ -159,28 +155,24 @@ def _aborted() -> int:
     return ABORTED
 
 
-def _without_bool(params: list[Any]) -> list[Any]:
-    """Options whose flags show no type in the help."""
-    for param in params:
-        if getattr(param, "is_flag", False):
-            param.metavar = ""
-    return params
-
-
-class Command(TyperCommand):
+class _Flags:
     """A command whose flags show no type in its help."""
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Options and arguments, with that of the help."""
-        return _without_bool(super().get_params(ctx))
+        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for param in params:
+            if getattr(param, "is_flag", False):
+                param.metavar = ""
+        return params
 
 
-class LazyGroup(TyperGroup):
+class Command(_Flags, TyperCommand):
+    """A command of the program."""
+
+
+class LazyGroup(_Flags, TyperGroup):
     """A group that imports a command only when it is called, which makes `--help` fast."""
-
-    def get_params(self, ctx: Any) -> list[Any]:
-        """Options, with that of the help."""
-        return _without_bool(super().get_params(ctx))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Name, imported command and remaining arguments."""
@@ -203,7 +195,7 @@ def _load(name: str, home: str) -> Any:
     module, _, function = home.partition(":")
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     own = getattr(import_module(f"soup_nlp.cli.{module}"), function)
-    alone.command(name=name, cls=Command)(guarded(own))
+    alone.command(name=name, cls=Command)(own)
     return typer.main.get_command(alone)
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -15,23 +16,43 @@ from soup_nlp.schema.limits import MAX_SEED
 from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.rows import Row, failed, reason
 
-Set = Annotated[list[str] | None, typer.Option("--set", help="Override, e.g. solver.max_iter=200.")]
-PresetName = Annotated[
+INPUT: Mapping[str, Any] = {"rich_help_panel": "Input"}
+SIZE: Mapping[str, Any] = {"rich_help_panel": "Size"}
+METHOD: Mapping[str, Any] = {"rich_help_panel": "Method"}
+OUTPUT: Mapping[str, Any] = {"rich_help_panel": "Output"}
+
+Intrinsics = Annotated[
     str | None,
-    typer.Option("--preset", help=f"Options below the problem's own: {', '.join(PRESETS)}."),
+    typer.Option(
+        help="fx,fy,cx,cy in pixels, or a file; default K.txt of a sequence, EXIF, a guess.",
+        **INPUT,
+    ),
 ]
-Out = Annotated[Path, typer.Option("--out", "-o", help="Output folder.")]
-Wanted = Annotated[int | None, typer.Option("--superpixels", help="Wanted number N; default 1000.")]
-Neighbours = Annotated[int | None, typer.Option(help="K of the K-NN graph; default 15.")]
-MaxSize = Annotated[
-    float | None, typer.Option(help="Megapixels at which larger images are solved; 1.5.")
+Fov = Annotated[
+    float | None, typer.Option(help="Horizontal field of view, degrees, instead.", **INPUT)
 ]
 Undistort = Annotated[
-    bool, typer.Option("--undistort", help="Remove the distortion that the camera file holds.")
+    bool, typer.Option("--undistort", help="Remove the camera file's distortion.", **INPUT)
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+Wanted = Annotated[
+    int | None, typer.Option("--superpixels", help="Wanted number N; default 1000.", **SIZE)
+]
+Neighbours = Annotated[int | None, typer.Option(help="K of the K-NN graph; default 15.", **SIZE)]
+MaxSize = Annotated[
+    float | None, typer.Option(help="Megapixels for larger images; default 1.5.", **SIZE)
+]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", help="Any key, e.g. solver.max_iter=200.", **METHOD)
+]
+PresetName = Annotated[
+    str | None,
+    typer.Option(help=f"Options below the problem's own: {', '.join(PRESETS)}.", **METHOD),
+]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Output folder.", **OUTPUT)]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.", **OUTPUT)]
 Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Overwrite files that this program did not make.")
+    bool,
+    typer.Option("--overwrite", help="Also over other files, or another result.", **OUTPUT),
 ]
 PROBLEM = "Problem file, or a name that `soup-nlp list` shows."
 Problem = Annotated[Path, typer.Argument(help=PROBLEM)]
@@ -56,17 +77,20 @@ Workers = Annotated[int, typer.Option(help="Processes of this machine.", min=1)]
 AnyCode = Annotated[bool, typer.Option(help="Also take stored rows of other code versions.")]
 
 
-def preset_first(preset: str | None, overrides: list[str] | None) -> list[str]:
-    """Overrides with the preset first, so that `--set preset=null` can undo it."""
-    return [*([] if preset is None else [f"preset={preset}"]), *(overrides or [])]
-
-
 def changed(
-    preset: str | None, overrides: list[str] | None, short: Mapping[str, object]
+    preset: str | None, overrides: Sequence[str] | None, short: Mapping[str, object] | None = None
 ) -> list[str]:
-    """Overrides of a preset, of `--set`, and of the given options that stand for keys."""
-    given = [f"{key}={value}" for key, value in short.items() if value is not None]
-    return [*preset_first(preset, overrides), *given]
+    """Overrides of a preset, of `--set`, and of the options that stand for keys.
+
+    The preset is first, so that `--set preset=null` can undo it.
+    """
+    given = [f"{key}={value}" for key, value in (short or {}).items() if value is not None]
+    return [*([] if preset is None else [f"preset={preset}"]), *(overrides or []), *given]
+
+
+def located(name: str | None, what: str) -> str | None:
+    """A file of the command line as the value of a key, whose paths start at the problem file."""
+    return name and json.dumps(str(as_path(name, what, home=True).absolute()))
 
 
 def numbers(text: str, option: str, least: int = 0, most: int = MAX_SEED) -> list[int]:
@@ -104,12 +128,14 @@ def words(text: str, option: str, known: list[str]) -> list[str]:
     return names
 
 
-def camera(text: str, option: str) -> list[float] | str:
-    """Value of the key `intrinsics`: four numbers, or the name of a file.
+def camera(text: str | None, option: str) -> list[float] | str | None:
+    """Value of the key `intrinsics`: four numbers, or the name of a file; None without a text.
 
     Raises:
         ConfigError: the text is neither.
     """
+    if text is None:
+        return None
     try:
         values = [float(x) for x in text.split(",")]
     except ValueError:

@@ -20,7 +20,7 @@ from soup_nlp.cli.options import (
     Quiet,
     Set,
     Superpixels,
-    preset_first,
+    changed,
 )
 from soup_nlp.config.presets import PRESETS, dump_preset
 from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
@@ -51,7 +51,7 @@ def show(
             )
         print(dump_preset(preset), end="")
         return
-    chosen = load_problem(problem, preset_first(preset, overrides))
+    chosen = load_problem(problem, changed(preset, overrides))
     more = "" if every else "# all other options have their defaults: soup-nlp show --all\n"
     print(f"{dump_problem(chosen, every)}{more}# hash {chosen.digest()}")
 

@@ -11,9 +11,9 @@ from typing import Annotated, Any
 
 import typer
 
-from soup_nlp.cli.options import camera, changed
+from soup_nlp.cli import options
+from soup_nlp.cli.options import INPUT, METHOD, OUTPUT, camera, changed, located
 from soup_nlp.cli.progress import SolveLog
-from soup_nlp.config.presets import PRESETS
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
@@ -29,12 +29,8 @@ from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import default_folder, scratch
 
 SOURCE = "Two images, or a problem file or name (`soup-nlp list`)."
-INPUT: Mapping[str, Any] = {"rich_help_panel": "Input"}
 FLOW: Mapping[str, Any] = {"rich_help_panel": "Flow"}
 PRIOR: Mapping[str, Any] = {"rich_help_panel": "Depth prior"}
-SIZE: Mapping[str, Any] = {"rich_help_panel": "Size"}
-METHOD: Mapping[str, Any] = {"rich_help_panel": "Method"}
-OUTPUT: Mapping[str, Any] = {"rich_help_panel": "Output"}
 
 
 def solve(
@@ -43,22 +39,15 @@ def solve(
     ] = None,
     ref: Annotated[str | None, typer.Option(help="Reference image.", **INPUT)] = None,
     next_: Annotated[str | None, typer.Option("--next", help="Next image.", **INPUT)] = None,
-    intrinsics: Annotated[
-        str | None,
-        typer.Option(help="fx,fy,cx,cy in pixels, or a file; default EXIF, else a guess.", **INPUT),
-    ] = None,
-    fov: Annotated[
-        float | None, typer.Option(help="Horizontal field of view, degrees, instead.", **INPUT)
-    ] = None,
+    intrinsics: options.Intrinsics = None,
+    fov: options.Fov = None,
     intrinsics_next: Annotated[
         str | None, typer.Option(help="Camera of the next frame, if it differs.", **INPUT)
     ] = None,
     depth: Annotated[
         str | None, typer.Option(help="True depth of the reference frame, to score.", **INPUT)
     ] = None,
-    undistort: Annotated[
-        bool, typer.Option("--undistort", help="Remove the camera file's distortion.", **INPUT)
-    ] = False,
+    undistort: options.Undistort = False,
     flow: Annotated[
         str | None, typer.Option(help=".flo, KITTI .png, .npy, .onnx or a name; DIS.", **FLOW)
     ] = None,
@@ -77,23 +66,11 @@ def solve(
         str | None,
         typer.Option(help="metric, relative, inverse, ordinal; default: by the flow.", **PRIOR),
     ] = None,
-    superpixels: Annotated[
-        int | None, typer.Option(help="Wanted number N; default 1000.", **SIZE)
-    ] = None,
-    neighbours: Annotated[
-        int | None, typer.Option(help="K of the K-NN graph; default 15.", **SIZE)
-    ] = None,
-    max_size: Annotated[
-        float | None,
-        typer.Option(help="Megapixels for larger images; default 1.5.", **SIZE),
-    ] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="Any key, e.g. solver.max_iter=200.", **METHOD)
-    ] = None,
-    preset: Annotated[
-        str | None,
-        typer.Option(help=f"Options below the problem's own: {', '.join(PRESETS)}.", **METHOD),
-    ] = None,
+    superpixels: options.Wanted = None,
+    neighbours: options.Neighbours = None,
+    max_size: options.MaxSize = None,
+    overrides: options.Set = None,
+    preset: options.PresetName = None,
     no_refine: Annotated[
         bool,
         typer.Option("--no-refine", help="The NLP alone, as refine.enabled=false.", **METHOD),
@@ -106,14 +83,11 @@ def solve(
         Path | None,
         typer.Option("--out", "-o", help="Output folder; default out/NAME.", **OUTPUT),
     ] = None,
-    overwrite: Annotated[
-        bool,
-        typer.Option("--overwrite", help="Also over other files, or another result.", **OUTPUT),
-    ] = False,
+    overwrite: options.Overwrite = False,
     json_: Annotated[
         bool, typer.Option("--json", help="Print summary.json instead of the verdict.", **OUTPUT)
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Verdict only.", **OUTPUT)] = False,
+    quiet: options.Quiet = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All phases.", **OUTPUT)] = False,
 ) -> None:
     """Solve a pair of frames and write a result folder."""
@@ -123,117 +97,84 @@ def solve(
             found="--no-nlp and --no-refine",
             expected="one of them at most",
         )
-    short = {
+    keys = {
         "segmentation.superpixels": superpixels,
         "segmentation.neighbours": neighbours,
         "max_size": max_size,
         "refine.enabled": "false" if no_refine else None,
         "refine.from_start": "true" if no_nlp else None,
+        "flow.source": located(flow, "flow")
+        if flow and is_path(flow)
+        else flow and json.dumps(flow),
+        "flow.backward": located(flow_backward, "flow"),
+        "flow.confidence": located(flow_confidence, "confidence of the flow"),
+        "depth_prior.source": located(depth_prior, "depth prior"),
         "depth_prior.kind": depth_prior_kind,
     }
-    if depth_prior:
-        # relative to the working folder, unlike paths in a problem file
-        place = as_path(depth_prior, "depth prior", home=True).absolute()
-        short["depth_prior.source"] = json.dumps(str(place))
-    overrides = changed(preset, overrides, short)
-    problem, ref, next_ = _sources(source or [], ref, next_)
-    pair = {
-        "--ref": ref,
-        "--next": next_,
-        "--intrinsics": intrinsics,
-        "--intrinsics-next": intrinsics_next,
-        "--depth": depth,
-        "--fov": None if fov is None else str(fov),
-        "--undistort": "true" if undistort else None,
+    changes = changed(preset, overrides, keys)
+    given = {
+        "ref": ref,
+        "next": next_,
+        "intrinsics": camera(intrinsics, "--intrinsics"),
+        "intrinsics_next": camera(intrinsics_next, "--intrinsics-next"),
+        "fov": fov,
+        "depth": depth,
+        "undistort": undistort or None,
     }
-    flows = {"source": flow, "backward": flow_backward, "confidence": flow_confidence}
-    if problem is None:
-        chosen = _from_options(pair, flows, overrides)
+    pair = {key: value for key, value in given.items() if value is not None}
+    words = source or []
+    if len(words) == 1 and words[0].suffix.lower() not in IMAGES:
+        chosen = _from_file(words[0], pair, changes)
     else:
-        chosen = _from_file(problem, pair, flows, overrides)
+        chosen = _from_images(words, pair, changes)
     # the expected MRE is that of the problem file without overrides
-    limit = None if overrides else chosen.expected.mre_at_most
+    limit = None if changes else chosen.expected.mre_at_most
     folder = out or default_folder(chosen.name, chosen.subject)
     log = SolveLog(quiet, verbose, chosen)
     raise typer.Exit(solve_problem(chosen, folder, log, limit, json_, overwrite))
 
 
-def _sources(
-    words: Sequence[Path], ref: str | None, following: str | None
-) -> tuple[Path | None, str | None, str | None]:
-    """Problem file, reference and next image of the arguments and of --ref and --next.
-
-    Raises:
-        ConfigError: they are neither a problem nor two images.
-    """
-    pictures = [str(word) for word in words if word.suffix.lower() in IMAGES]
-    if len(words) == 1 and not pictures:
-        return words[0], ref, following
-    named = [*pictures, *(f"--ref {ref}" for _ in [ref] if ref)]
-    named += [f"--next {following}" for _ in [following] if following]
-    if len(words) == 2 and not (ref or following):
-        return None, str(words[0]), str(words[1])
-    if words or bool(ref) != bool(following):
-        raise ConfigError(
-            "a pair is two images",
-            found=", ".join([*(str(w) for w in words if str(w) not in pictures), *named]),
-            expected="soup-nlp solve REF NEXT, or soup-nlp solve PROBLEM",
-            hint="soup-nlp chain solves more than two frames" if len(words) > 2 else None,
-        )
-    return None, ref, following
-
-
-def _from_file(
-    problem: Path,
-    pair: Mapping[str, str | None],
-    flows: Mapping[str, str | None],
-    overrides: Sequence[str],
-) -> Problem:
-    """The problem of a file, with the flow of the command line."""
-    if any(pair.values()):
+def _from_file(problem: Path, pair: Mapping[str, Any], changes: Sequence[str]) -> Problem:
+    """The problem of a file, which must come without options of a pair."""
+    if pair:
+        said = ", ".join(f"--{key.replace('_', '-')}" for key in pair)
         raise ConfigError(
             "a problem file names its own pair",
-            found=f"{problem} and {', '.join(k for k, v in pair.items() if v)}",
+            found=f"{problem} and {said}",
             expected="a problem file, or the options of a pair",
             hint="--set input.KEY=VALUE changes the input of a problem file",
         )
-    for key, flow in flows.items():
-        if flow:
-            # relative to the working folder, unlike paths in a problem file
-            place = key != "source" or is_path(flow)
-            source = str(as_path(flow, "flow", home=True).absolute()) if place else flow
-            overrides = [f"flow.{key}={json.dumps(source)}", *overrides]
-    return load_problem(problem, overrides)
+    return load_problem(problem, changes)
 
 
-def _from_options(
-    pair: Mapping[str, str | None], flows: Mapping[str, str | None], overrides: Sequence[str]
-) -> Problem:
-    """The problem of the pair that the options name."""
-    ref, following, intrinsics, intrinsics_next, depth, fov, undistort = pair.values()
-    if not (ref and following):
+def _from_images(words: Sequence[Path], pair: Mapping[str, Any], changes: Sequence[str]) -> Problem:
+    """The problem of two images, which are words or the options --ref and --next."""
+    named = {key: pair[key] for key in ("ref", "next") if key in pair}
+    if len(words) == 2 and not named:
+        named = {"ref": str(words[0]), "next": str(words[1])}
+    elif words or len(named) == 1:
+        found = [*map(str, words), *(f"--{key} {image}" for key, image in named.items())]
+        raise ConfigError(
+            "a pair is two images",
+            found=", ".join(found),
+            expected="soup-nlp solve REF NEXT, or soup-nlp solve PROBLEM",
+            hint="soup-nlp chain solves more than two frames" if len(words) > 2 else None,
+        )
+    if not named:
         raise ConfigError(
             "nothing to solve",
             found="no image and no problem",
             expected="soup-nlp solve REF NEXT, or soup-nlp solve PROBLEM",
             hint="soup-nlp demo, or soup-nlp solve motorcycle --out out/motorcycle",
         )
-    source: dict[str, Any] = {"kind": "files", "ref": ref, "next": following}
-    if intrinsics:
-        source["intrinsics"] = camera(intrinsics, "--intrinsics")
-    if intrinsics_next:
-        source["intrinsics_next"] = camera(intrinsics_next, "--intrinsics-next")
-    if fov:
-        source["fov"] = float(fov)
-    if depth:
-        source["depth"] = depth
-    if undistort:
-        source["undistort"] = True
-    place = as_path(ref, "reference image", home=True).absolute()
-    name = title("-".join([place.parent.name, place.stem, Path(following).stem]).lstrip("-"))
-    raw: dict[str, Any] = {"name": name, "input": source, "base": str(Path.cwd())}
-    raw["flow"] = {key: flow for key, flow in flows.items() if flow}
-    return make_problem(raw, overrides, where="command line")
+    place = as_path(named["ref"], "reference image", home=True).absolute()
+    name = "-".join([place.parent.name, place.stem, Path(named["next"]).stem]).lstrip("-")
+    raw = {
+        "name": title(name),
+        "input": {"kind": "files", **pair, **named},
+        "base": str(Path.cwd()),
+    }
+    return make_problem(raw, changes, where="command line")
 
 
 def solve_problem(
