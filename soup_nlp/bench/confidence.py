@@ -86,8 +86,7 @@ def _calibration(result: Run) -> tuple[Float, Float, Float]:
     true = true_pixels(gt, None) & np.isfinite(z)
     bends = result.start.bends[rec.labels]
     whole = calibrated(sure.spread, sure.noise, sure.misfit[rec.labels], np.inf, bends)
-    added = sure.added[rec.labels]
-    images = whole / np.where(bends, BENDING_FACTOR, FACTOR), added, bends.astype(float)
+    images = whole / np.where(bends, BENDING_FACTOR, FACTOR), sure.added, bends.astype(float)
     unit, added, bending = (at_truth(truth, image)[0][true] for image in images)
     return unit, added, bending
 

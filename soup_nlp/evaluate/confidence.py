@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
@@ -56,6 +57,9 @@ LEAST_SPREAD = 0.1
 MOST_MISFIT, BENDING_MISFIT = 5.0, 100.0
 """Pixels beyond which a flow that the answer contradicts is as wrong as any; the latter where
 surfaces bend: what an answer with a motion for every superpixel cannot follow is far off."""
+OUTLINE, OUTLINE_REACH = 0.5, 0.005
+"""Share of a step of log depth that is the standard deviation beside it, and the distance from the
+step up to which it counts, relative to the longer side of the image."""
 LARGEST = 1e6
 """Of what is calibrated: anything above is as little."""
 NO_CONFIDENCE = 0.5
@@ -78,8 +82,8 @@ class Confidence:
         component_sigma: (C,) standard deviation of the components' log scale.
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
         evidence: What the flow says of the depth of every component.
-        added: (N,) standard deviation of log depth that does not follow the flow's random noise:
-            of scales by contact, of motions left open, of depth without evidence.
+        added: (H, W) standard deviation of log depth that does not follow the flow's random noise:
+            of scales by contact, of motions left open, of depth without evidence, beside outlines.
     """
 
     sigma: Float
@@ -109,6 +113,26 @@ def flow_misfit(rec: Reconstruction, flow: Flow, most: Float | float = MOST_MISF
     limited = np.where(np.isfinite(distance), np.minimum(distance, most), most)
     flat = rec.labels.ravel()
     return np.asarray(np.bincount(flat, limited.ravel()) / np.bincount(flat))
+
+
+def at_outlines(depth: Float) -> Float:
+    """(H, W) standard deviation of log depth by outlines of surfaces that may be misplaced.
+
+    A pixel beside a step may belong to the surface on its other side. With range(r) the range of
+    log depth within r pixels, the step is `2 range(r) - range(2 r)`, 0 on a constant slope.
+
+    Args:
+        depth: (H, W) depth.
+    """
+    # an answer of a foreign solver may have no depth at all
+    log_depth = np.log(np.clip(np.nan_to_num(depth), 1e-30, 1e30)).astype(np.float32)
+    reach = max(1, round(OUTLINE_REACH * max(depth.shape)))
+
+    def extent(r: int) -> Float:
+        window = np.ones((2 * r + 1, 2 * r + 1))
+        return np.asarray(cv2.dilate(log_depth, window) - cv2.erode(log_depth, window), float)
+
+    return OUTLINE * np.maximum(2 * extent(reach) - extent(2 * reach), 0.0)
 
 
 def calibrated(
@@ -249,7 +273,7 @@ def confidence(
         # a depth that is taken from a prior which no flow confirms is no evidence of the flow
         added[np.isfinite(given.sigma) & (given.sigma > MOST_SIGMA)] = LARGEST
         before = 1 / np.hypot(1 / SIGMA_PRIOR, 1 / given.sigma)
-    parts = misfit[rec.labels], before[rec.labels], bends, added[rec.labels]
-    sigma = calibrated(spread, noise, *parts)
+    in_image = np.hypot(added[rec.labels], at_outlines(rec.depth_ref))
+    sigma = calibrated(spread, noise, misfit[rec.labels], before[rec.labels], bends, in_image)
     component_sigma = with_prior(np.sqrt(own.component))
-    return Confidence(sigma, spread, own, noise, component_sigma, misfit, found, added)
+    return Confidence(sigma, spread, own, noise, component_sigma, misfit, found, in_image)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.camera import rays
@@ -40,47 +41,31 @@ def rigid_components(label: Int, seg: Segmentation) -> Int:
     return component
 
 
-SHORTEST = 1e-4
-"""Smallest factor by which `borrow` shortens a translation."""
-
-
 def borrow(
     mu: Float, slope: Float, label: Int, weak: Mask, seg: Segmentation
-) -> tuple[Float, Float, Float]:
+) -> tuple[Float, Float]:
     """Weak superpixels take the median inverse depth of strong neighbours of their motion.
 
-    A motion without any strong superpixel (for example the static background of a camera at rest)
-    borrows from the strong superpixels of other motions. Its translation is then shortened by the
-    ratio of its own to the borrowed inverse depths, so that it explains the same flow.
+    A motion without any strong superpixel borrows from those of other motions.
 
     Args:
         mu: (N,) inverse depth at the anchor, in units of |t|.
         slope: (N, 2) relative change of mu at the superpixel's radius; 0 where borrowed.
         label: (N,) index of the motion.
-        weak: (N,) True where the depth is not reliable.
+        weak: (N,) True where the depth is not reliable, not everywhere.
         seg: Superpixels and graphs.
 
     Returns:
-        mu and slope after borrowing, and (N,) the length of each translation.
+        mu and slope after borrowing.
     """
-    from scipy.spatial import cKDTree
-
-    mu, slope, length = mu.copy(), slope.copy(), np.ones(len(mu))
-    for c in np.unique(label[weak]) if weak.any() else []:
-        own = np.flatnonzero(weak & (label == c))
-        strong = np.flatnonzero(~weak & (label == c))
-        alone = not len(strong)
-        if alone:
-            strong = np.flatnonzero(~weak)
-        if not len(strong):
-            continue
-        k = min(5, len(strong))
-        _, near = cKDTree(seg.anchors[strong]).query(seg.anchors[own], k=k)
-        borrowed = np.median(mu[strong][near.reshape(len(own), k)], axis=1)
-        if alone:
-            length[own] = np.clip(np.median(mu[own]) / np.median(borrowed), SHORTEST, 1.0)
-        mu[own], slope[own] = borrowed, 0.0
-    return mu, slope, length
+    mu, slope = mu.copy(), slope.copy()
+    for c in np.unique(label[weak]):
+        own, strong = weak & (label == c), ~weak & (label == c)
+        known = np.flatnonzero(strong if strong.any() else ~weak)
+        near = cKDTree(seg.anchors[known]).query(seg.anchors[own], k=min(5, len(known)))[1]
+        mu[own] = np.median(mu[known][near.reshape(own.sum(), -1)], axis=1)
+        slope[own] = 0.0
+    return mu, slope
 
 
 OUTLINE, GROUND, MOST = 0.2, 0.4, 0.6
@@ -120,6 +105,7 @@ class Outlines(NamedTuple):
     Attributes:
         component: First component of the pair.
         other: Second component of the pair.
+        neighbour: Superpixel of the second component.
         contact: Length of their boundary, pixels.
         below: Whether the second lies below the first in the image.
         weight: Contact times the squared height difference to the top of the first component, since
@@ -129,6 +115,7 @@ class Outlines(NamedTuple):
 
     component: Int
     other: Int
+    neighbour: Int
     contact: Float
     below: Mask
     weight: Float
@@ -140,6 +127,7 @@ def outlines(label: Int, seg: Segmentation) -> Outlines:
     ends = label[seg.pairs]
     across = ends[:, 0] != ends[:, 1]
     component, other = np.concatenate([ends[across], ends[across, ::-1]]).T
+    neighbour = seg.pairs[across, ::-1].T.ravel()
     contact = np.tile(seg.boundary_length[across], 2).astype(float)
     way = np.diff(seg.anchors[seg.pairs[across]], axis=1)[:, 0]
     down = way[:, 1] / np.linalg.norm(way, axis=1)
@@ -147,7 +135,7 @@ def outlines(label: Int, seg: Segmentation) -> Outlines:
     np.minimum.at(top, label, seg.anchors[:, 1])
     low = np.maximum(np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) - top[component], 1.0)
     below = np.concatenate([down, -down]) > BELOW
-    return Outlines(component, other, contact, below, contact * low**2, top)
+    return Outlines(component, other, neighbour, contact, below, contact * low**2, top)
 
 
 def contact_scales(
@@ -157,6 +145,7 @@ def contact_scales(
     K_ref: Float,
     upright: bool = True,
     fixed: Mask | None = None,
+    usable: Mask | None = None,
 ) -> tuple[Float, Int]:
     """Relative scale of every component, such that components touch what is around them.
 
@@ -179,6 +168,7 @@ def contact_scales(
         K_ref: (3, 3) intrinsics of the reference frame.
         upright: Whether the image is upright.
         fixed: (N,) True in components that are fixed in the image.
+        usable: (N,) True where the flow is known; everywhere without it.
 
     Returns:
         (N,) scale of every superpixel's component, and (N,) its origin, an index of `TIES`.
@@ -227,7 +217,8 @@ def contact_scales(
             tie[c] = TIES.index("outline")
         placed[c] = True
     if upright:
-        nearer = nearer_where_cut_off(soup, label, log_scale, seg, K_ref, at_camera)
+        usable = np.ones(len(soup), bool) if usable is None else usable
+        nearer = nearer_where_cut_off(soup, label, log_scale, seg, K_ref, at_camera, usable)
         log_scale -= nearer
         tie[nearer > 0] = TIES.index("cut off below")
     far = displacement(soup, rays(K_ref, seg.anchors), label) * np.exp(log_scale)[label]
@@ -238,15 +229,22 @@ def contact_scales(
 
 
 def nearer_where_cut_off(
-    soup: Soup, label: Int, log_scale: Float, seg: Segmentation, K_ref: Float, fixed: Mask
+    soup: Soup,
+    label: Int,
+    log_scale: Float,
+    seg: Segmentation,
+    K_ref: Float,
+    fixed: Mask,
+    usable: Mask,
 ) -> Float:
-    """(C,) log factor by which components cut off by the lower image border come nearer.
+    """(C,) log factor by which components come nearer whose lower end is not seen.
 
-    What such a component stands on is not visible, and its visible neighbours are behind it, so
-    contact gives its largest depth. Its smallest plausible depth is the one at which it moves as
-    far relative to the camera as the scene does. The middle of both, in logarithms, has an error of
-    at most the square root of their ratio. Components that touch are treated as one group, since a
-    person may be cut into pieces.
+    It is not seen if the lower image border cuts it off, or if the superpixels below it have no
+    flow, so that they may belong to it. What such a component stands on is not visible, and its
+    visible neighbours are behind it, so contact gives its largest depth. Its smallest plausible
+    depth is the one at which it moves as far relative to the camera as the scene does. The middle
+    of both, in logarithms, has an error of at most the square root of their ratio. Components that
+    touch are treated as one group, since a person may be cut into pieces.
 
     Args:
         soup: Planes, every motion in its own scale.
@@ -255,6 +253,7 @@ def nearer_where_cut_off(
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
         fixed: (C,) True for components that are fixed in the image, which stay where they are.
+        usable: (N,) True where the flow is known.
     """
     count = len(log_scale)
     scene = int(np.argmax(np.bincount(label, minlength=count)))
@@ -263,14 +262,19 @@ def nearer_where_cut_off(
     group, groups = group_of[label], int(group_of.max()) + 1
     # support of a group, visible and beyond the border, weighted by the squared height difference
     around = outlines(group, seg)
-    on = around.below
-    seen = np.bincount(around.component[on], around.weight[on], minlength=groups)
+    known = usable[around.neighbour]
+    seen, unknown = (
+        np.bincount(around.component[on], around.weight[on], minlength=groups)
+        for on in (around.below & known, around.below & ~known)
+    )
     last = group[seg.labels[-1]]
-    hidden = np.bincount(last, (len(seg.labels) - around.top[last]) ** 2, minlength=groups)
+    cut_off = np.bincount(last, (len(seg.labels) - around.top[last]) ** 2, minlength=groups)
     far = displacement(soup, rays(K_ref, seg.anchors), label) * np.exp(log_scale)[label]
     pace = np.median(far[label == scene])
     nearer = np.zeros(count)
-    for g in np.setdiff1d(np.flatnonzero(hidden > seen), group_of[[scene, *np.flatnonzero(fixed)]]):
+    for g in np.setdiff1d(
+        np.flatnonzero(cut_off + unknown > seen), group_of[[scene, *np.flatnonzero(fixed)]]
+    ):
         own = float(np.median(far[group == g]))
         if pace < own < pace * np.exp(UNKNOWN):
             nearer[group_of == g] = 0.5 * np.log(own / pace)

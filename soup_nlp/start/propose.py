@@ -169,7 +169,7 @@ def propose(
         parallax, label = np.where(fixed, 0.0, parallax), np.where(fixed, -1, label)
         component = with_regions(component, fixed, seg)
         wrong |= fixed & (shift > STILL_PX)
-    scale, tie = contact_scales(soup, component, seg, K_ref, o.upright, fixed)
+    scale, tie = contact_scales(soup, component, seg, K_ref, o.upright, fixed, usable)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t)
     grounded = np.zeros(len(seg), bool)
     if o.upright and o.ground:
@@ -213,7 +213,8 @@ def _with_depth(choice: Choice, views: Views, poor: Mask, seg: Segmentation) -> 
         length = np.where(mu > 0, mu, 0.0)
         mu, slope = np.ones(len(seg)), np.zeros((len(seg), 2))
     else:
-        mu, slope, length = borrow(mu, slope, choice.label, weak, seg)
+        length = np.ones(len(seg))
+        mu, slope = borrow(mu, slope, choice.label, weak, seg)
     t = choice.t * length[:, None]
     return _soup(mu, slope, choice.R, t, views.anchor, views.radius), weak
 

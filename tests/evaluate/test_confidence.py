@@ -16,9 +16,11 @@ from soup_nlp.evaluate.confidence import (
     CONTACT,
     LEAST_SPREAD,
     MOST_SIGMA,
+    OUTLINE,
     POWER,
     SIGMA_PRIOR,
     USUAL,
+    at_outlines,
     calibrated,
     confidence,
     flow_misfit,
@@ -153,6 +155,15 @@ def test_a_superpixel_without_flow_is_less_sure(small_room, info):
     without = information(small_room.soup, data, small_room.weights, FORM)
     before, after = (marginals(i, seg.sizes, one).plane[blind, 0, 0] for i in (info, without))
     assert after > 1.5 * before
+
+
+def test_pixels_beside_a_step_may_lie_on_either_side_of_it():
+    log_depth = np.where(np.arange(400) < 200, 0.0, 0.4) * np.ones((60, 1))
+    sigma = at_outlines(np.exp(log_depth))
+    np.testing.assert_allclose(sigma[:, 198:202], 0.4 * OUTLINE, atol=1e-6)
+    assert sigma[:, :190].max() == sigma[:, 210:].max() == 0
+    slope = at_outlines(np.exp(np.linspace(0, 4, 400) * np.ones((60, 1))))
+    assert slope[:, 10:-10].max() < 1e-5
 
 
 def test_calibration_is_capped_where_nothing_is_known():

@@ -225,6 +225,9 @@ def test_components_at_the_lower_edge_are_nearer_when_faster(far, scale):
     on_ground = thrice([[4.0, 6, 4], [3, 1, 3.5], [3, 3, 3]])
     own = on_ground == 1
     assert scales(on_ground, own, far)[own] == pytest.approx(3.0)
+    # without flow, what is below it may be a part of it
+    lost = np.arange(own.size).reshape(own.shape) >= 2 * own.size // 3
+    assert scales(on_ground, own, far, usable=~lost.ravel())[own] == pytest.approx(scale)
 
 
 def test_pieces_of_what_is_cut_off_are_nearer_together():

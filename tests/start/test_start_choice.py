@@ -213,7 +213,7 @@ def test_one_wild_neighbour_does_not_decide_a_borrowed_depth():
     weak = np.arange(9) == 4
     for wild in (50.0, 1e-3):
         mu[1] = wild
-        new, _, _ = borrow(mu, np.zeros((9, 2)), np.zeros(9, int), weak, seg)
+        new, _ = borrow(mu, np.zeros((9, 2)), np.zeros(9, int), weak, seg)
         assert new[4] == 0.5
         np.testing.assert_array_equal(new[~weak], mu[~weak])
 
