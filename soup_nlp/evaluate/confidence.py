@@ -8,8 +8,8 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
+from scipy import ndimage
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Flow, Pair
@@ -125,12 +125,13 @@ def at_outlines(depth: Float) -> Float:
         depth: (H, W) depth.
     """
     # an answer of a foreign solver may have no depth at all
-    log_depth = np.log(np.clip(np.nan_to_num(depth), 1e-30, 1e30)).astype(np.float32)
+    log_depth = np.log(np.clip(np.nan_to_num(depth), 1e-30, 1e30))
     reach = max(1, round(OUTLINE_REACH * max(depth.shape)))
 
     def extent(r: int) -> Float:
-        window = np.ones((2 * r + 1, 2 * r + 1))
-        return np.asarray(cv2.dilate(log_depth, window) - cv2.erode(log_depth, window), float)
+        size = 2 * r + 1
+        most, least = (f(log_depth, size) for f in (ndimage.maximum_filter, ndimage.minimum_filter))
+        return np.asarray(most - least)
 
     return OUTLINE * np.maximum(2 * extent(reach) - extent(2 * reach), 0.0)
 
