@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.arrays import Float, Int, Labels, Mask
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import ModelError
 from soup_nlp.evaluate.evidence import Evidence, evidence
@@ -60,6 +60,11 @@ surfaces bend: what an answer with a motion for every superpixel cannot follow i
 OUTLINE, OUTLINE_REACH = 0.5, 0.005
 """Share of a step of log depth that is the standard deviation beside it, and the distance from the
 step up to which it counts, relative to the longer side of the image."""
+MIXED = 0.2
+"""Standard deviation of log depth where half of a superpixel's flow is usable."""
+MARGIN, LEAST_SEEN = 0.01, 0.3
+"""Distance from the border of the next image, relative to its width, below which a pixel leaves it,
+and the least share of a superpixel's pixels that stay."""
 LARGEST = 1e6
 """Of what is calibrated: anything above is as little."""
 NO_CONFIDENCE = 0.5
@@ -83,7 +88,8 @@ class Confidence:
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
         evidence: What the flow says of the depth of every component.
         added: (H, W) standard deviation of log depth that does not follow the flow's random noise:
-            of scales by contact, of motions left open, of depth without evidence, beside outlines.
+            of scales by contact, of motions left open, of depth without evidence, of mixed
+            superpixels, beside outlines.
     """
 
     sigma: Float
@@ -134,6 +140,28 @@ def at_outlines(depth: Float) -> Float:
         return np.asarray(most - least)
 
     return OUTLINE * np.maximum(2 * extent(reach) - extent(2 * reach), 0.0)
+
+
+def of_mixed_flow(flow: Flow, labels: Labels, size: tuple[int, int]) -> Float:
+    """(N,) standard deviation of log depth where only part of a superpixel has a usable flow.
+
+    Such a superpixel may contain two surfaces: `MIXED 4 p (1 - p)`, with p the mean confidence of
+    its pixels that do not leave the image.
+
+    Args:
+        flow: Flow with confidence.
+        labels: (H, W) superpixel of every pixel.
+        size: Height and width of the next image.
+    """
+    (height, width), at = size, labels.ravel()
+    v, u = np.indices(labels.shape)
+    end = np.stack([u, v], axis=-1) + flow.uv
+    margin = MARGIN * width
+    last = np.array([width, height]) - 1 - margin
+    stays = ((end > margin) & (end < last)).all(axis=-1).ravel()
+    count, seen = np.bincount(at), np.bincount(at, stays)
+    p = np.bincount(at, np.where(stays, flow.confidence.ravel(), 0.0)) / np.maximum(seen, 1)
+    return np.where(seen > LEAST_SEEN * count, MIXED * 4 * p * (1 - p), 0.0)
 
 
 def calibrated(
@@ -274,6 +302,7 @@ def confidence(
         # a depth that is taken from a prior which no flow confirms is no evidence of the flow
         added[np.isfinite(given.sigma) & (given.sigma > MOST_SIGMA)] = LARGEST
         before = 1 / np.hypot(1 / SIGMA_PRIOR, 1 / given.sigma)
+    added = np.hypot(added, of_mixed_flow(pair.flow, rec.labels, pair.image_next.shape[:2]))
     in_image = np.hypot(added[rec.labels], at_outlines(rec.depth_ref))
     sigma = calibrated(spread, noise, misfit[rec.labels], before[rec.labels], bends, in_image)
     component_sigma = with_prior(np.sqrt(own.component))

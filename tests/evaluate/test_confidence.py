@@ -15,6 +15,7 @@ from soup_nlp.evaluate.confidence import (
     BENDING_SIGMA,
     CONTACT,
     LEAST_SPREAD,
+    MIXED,
     MOST_SIGMA,
     OUTLINE,
     POWER,
@@ -24,6 +25,7 @@ from soup_nlp.evaluate.confidence import (
     calibrated,
     confidence,
     flow_misfit,
+    of_mixed_flow,
     scale_by_contact,
 )
 from soup_nlp.evaluate.information import information, learned, marginals, spread_in_image
@@ -164,6 +166,17 @@ def test_pixels_beside_a_step_may_lie_on_either_side_of_it():
     assert sigma[:, :190].max() == sigma[:, 210:].max() == 0
     slope = at_outlines(np.exp(np.linspace(0, 4, 400) * np.ones((60, 1))))
     assert slope[:, 10:-10].max() < 1e-5
+
+
+def test_a_superpixel_with_partly_usable_flow_is_less_sure():
+    """Superpixels of 10 columns: usable, half usable, not usable, leaving the image."""
+    labels = np.repeat(np.arange(4), 10)[None] * np.ones((20, 1), np.int32)
+    confidence = np.where(labels == 0, 1.0, 0.0)
+    confidence[:10, labels[0] == 1] = confidence[:10, labels[0] == 3] = 1.0
+    uv = np.where(labels[..., None] == 3, [30.0, 0.0], 0.0)
+    flow = Flow(uv.astype(np.float32), confidence.astype(np.float32), "test")
+    found = of_mixed_flow(flow, labels.astype(np.int32), (60, 60))
+    np.testing.assert_allclose(found, [0, MIXED, 0, 0], atol=1e-3)
 
 
 def test_calibration_is_capped_where_nothing_is_known():
