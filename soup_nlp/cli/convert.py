@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from soup_nlp.cli.options import Overwrite
+from soup_nlp.report.folder import convert as convert_folder
 from soup_nlp.report.formats import FORMATS
-from soup_nlp.report.save import convert as convert_folder
 from soup_nlp.sequence.stored import convert_chain, is_chain
 
 _NAMES = "; ".join(f"{name}: {text}" for name, (_, text) in FORMATS.items())

@@ -20,9 +20,9 @@ from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, DataError, SoupError
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run as run_problem
-from soup_nlp.report.certainty import certainty, guess_reason
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
-from soup_nlp.report.verdict import missed, verdict
+from soup_nlp.report.summary import certainty
+from soup_nlp.report.verdict import guess_reason, missed, verdict
 from soup_nlp.sequence.frames import IMAGES
 from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.storage.files import as_path

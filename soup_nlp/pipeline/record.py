@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib import import_module
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from soup_nlp.arrays import Float, FloatMap
-from soup_nlp.config.problem import Problem, dump_problem
+from soup_nlp.config.problem import Problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.confidence import Confidence
 from soup_nlp.evaluate.metrics import DepthMetrics
@@ -132,35 +129,6 @@ class Run:
         """next_from_ref of the static scene, in the unit of the reconstruction; its `centre` is the
         next camera as the reference frame sees it."""
         return self.components.camera
-
-    def save(
-        self, folder: str | Path, formats: Sequence[str] = (), overwrite: bool = False
-    ) -> list[str]:
-        """Write a result folder, as `soup-nlp solve` does.
-
-        Args:
-            folder: A new or empty folder, or that of an earlier result.
-            formats: Files for other programs beside: "glb", "colmap", "npy", "pfm", "rrd" ...
-            overwrite: Overwrite files that the program did not make.
-
-        Returns:
-            Names of the files.
-
-        Raises:
-            ConfigError: a format is not known.
-            DataError: the folder cannot be written, or holds what is not to be overwritten.
-        """
-        # the report room imports this one
-        write = import_module("soup_nlp.report.save").save
-        return list(write(self, folder, dump_problem(self.problem), formats, overwrite))
-
-    def plot(self) -> Any:
-        """The overview as a `matplotlib.figure.Figure`: notebooks show it, `.savefig` writes it."""
-        return import_module("soup_nlp.report.save").plot(self)
-
-    def _repr_html_(self) -> str:
-        """Text and overview, for notebooks."""
-        return str(import_module("soup_nlp.report.save").overview_html(self))
 
     @property
     def delivered(self) -> str:

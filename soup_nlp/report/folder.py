@@ -4,31 +4,27 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import component_overlaps, skill
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.certainty import certainty
 from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture
-from soup_nlp.report.formats import write_formats
+from soup_nlp.report.formats import check_formats, write_formats
+from soup_nlp.report.layout import record_of, recorded_files, result_tree
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import Picture, pictures
-from soup_nlp.report.record import RECORD, extended, record_of
 from soup_nlp.report.result import PAGE, load, result_of
-from soup_nlp.report.tree import attributes, result_tree
+from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
-from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.store import write_h5, write_json
-from soup_nlp.storage.versions import versions
+from soup_nlp.storage.h5_files import RECORD, read_h5
+from soup_nlp.storage.mark import digest_of, files_in
+from soup_nlp.storage.store import replace_group, write_h5, write_json
 
 FULL = {"ref_full": "depth_ref_full.png", "next_full": "depth_next_full.png"}
 """Files of the depth at the size of the images, for a pair that was solved at a smaller size."""
@@ -53,12 +49,6 @@ PICTURES = {name: f"{name}_colour.png" for name in ("depth_ref", "depth_next")} 
 
 FAILED = "failed.log"
 """Log of a solve that failed; the next result removes it."""
-
-_ROUND = (
-    *("energy", "mrf_energy", "bound", "gap", "taken", "moved", "ties", "iterations", "status"),
-    *("seconds", "proposed", "accepted"),
-)
-"""Entries of a round of the refinement in summary.json."""
 
 
 def prepare_folder(
@@ -142,9 +132,27 @@ def write_folder(
         files = [name for name in FILES if name in names] + sorted(names.difference(FILES))
         write_text(new / "log.txt", log if isinstance(log, str) else log(files))
         # written last, since it holds the hashes of the others
-        tree = {**result_tree(run), RECORD: record_of(new)}
-        write_h5(new / "result.h5", tree, attributes(run, config))
+        digests = {name: digest_of(new / name) for name in files_in(new)}
+        record = record_of(digests, (new / "summary.json").read_text(encoding="utf-8"))
+        write_h5(new / "result.h5", {**result_tree(run), RECORD: record}, _attributes(run, config))
     return files
+
+
+def _attributes(run: Run, config: str) -> dict[str, Any]:
+    """Root attributes of result.h5."""
+    return {
+        "name": run.problem.name,
+        "problem_hash": run.problem.digest(),
+        "seed": run.problem.seed,
+        "status": run.solution.status,
+        "converged": run.solution.converged,
+        "delivered": run.delivered,
+        "config": config,
+        "nlp": run.solution.description,
+        # None is left out
+        "scale_to_truth": run.metrics["solution"].scale if "solution" in run.metrics else None,
+        "truth_unit": None if run.pair.truth is None else run.pair.truth.unit,
+    }
 
 
 def write_failure(folder: Path, log: str, ipopt_log: Path) -> None:
@@ -168,91 +176,6 @@ def _write_files(
     if run.problem.output.page:
         write_text(folder / PAGE, page(result, drawn))
     write_json(folder / "summary.json", {**contents, "depth_png_scale": scales})
-
-
-def summary(run: Run) -> dict[str, Any]:
-    """Contents of summary.json; the keys are stable."""
-    s = run.solution
-    constant = run.metrics["constant"].mre if "constant" in run.metrics else np.nan
-    facing = run.problem.formulation.min_facing
-    return {
-        "name": run.problem.name,
-        "problem_hash": run.problem.digest(),
-        "status": s.status,
-        "converged": s.converged,
-        "delivered": run.delivered,
-        "energy_by_stage": dict(s.ends)
-        | ({"refinement": run.energy["total"]} if run.refined is not None else {}),
-        "energy": {"start": s.energy_start, "nlp": s.energy, "solution": run.energy},
-        "residuals": run.residuals,
-        "nlp_residuals": constraint_residuals(s.soup, run.data.rim_ray, facing),
-        "answer_residuals": constraint_residuals(run.answer, run.data.rim_ray, facing),
-        "refinement": _refinement(run),
-        "metrics": {
-            # the constant depth is scored on the reference frame only
-            k: m.as_dict() | ({} if k == "solution_next" else {"skill": skill(m.mre, constant)})
-            for k, m in run.metrics.items()
-        },
-        "components": _components(run),
-        "expected": run.problem.expected.model_dump(),
-        "seconds": run.seconds,
-        "iterations": {stage.name: stage.iterations for stage in s.stages},
-        "sizes": {
-            "superpixels": len(run.segmentation),
-            "knn_edges": len(run.segmentation.edges),
-            "neighbour_pairs": len(run.segmentation.pairs),
-            "width": run.pair.size[1],
-            "height": run.pair.size[0],
-            **s.nlp,
-        },
-        "full_size": _full_size(run),
-        "start": {
-            "motions": len(run.start.motions),
-            "borrowed": int(run.start.borrowed.sum()),
-            "median_error_px": float(np.median(run.start.error)),
-        },
-        "certainty": certainty(run),
-        "evidence": run.confidence.evidence.rows(),
-        **({} if run.given is None else {"depth_prior": run.given.as_dict()}),
-        "flow": str(run.pair.flow),
-        "versions": versions(),
-        "seed": run.problem.seed,
-    }
-
-
-def _full_size(run: Run) -> dict[str, Any] | None:
-    """Size and score of the depth at the size of the images; None if it was solved at that size."""
-    if run.full is None:
-        return None
-    height, width = run.full.depth_ref.shape
-    scores = run.full.metrics
-    return {"width": width, "height": height, "metrics": scores and scores.as_dict()}
-
-
-def _components(run: Run) -> dict[str, Any]:
-    """Number of components, and their overlap with the true ones."""
-    truth = run.pair.truth
-    out: dict[str, Any] = {"count": len(run.components)}
-    if truth is not None and truth.components is not None:
-        found = component_overlaps(run.components.of_pixel, truth.components)
-        out["truth"] = {str(k): {"component": c, "iou": iou} for k, (c, iou) in found.items()}
-    return out
-
-
-def _refinement(run: Run) -> dict[str, Any] | None:
-    """Results of the refinement by round; None if it was disabled."""
-    r = run.refined
-    if r is None:
-        return None
-    return {
-        "status": r.status,
-        "seconds": r.seconds,
-        "contradicted": r.contradicted,
-        "start": r.energy_start,
-        "begin": r.energy_begin,
-        "end": r.energy,
-        "rounds": [{key: getattr(one, key) for key in _ROUND} for one in r.rounds],
-    }
 
 
 def _pictures(folder: Path, run: Run, drawn: Mapping[str, Picture]) -> dict[str, float]:
@@ -293,3 +216,47 @@ def renew_page(folder: Path) -> Path:
     with extended(folder, overwrite=True) as new:
         write_text(new / PAGE, text)
     return folder / PAGE
+
+
+@contextmanager
+def extended(folder: Path, overwrite: bool = False) -> Iterator[Path]:
+    """An empty folder whose files are added to the result in `folder` and to its record.
+
+    Raises:
+        DataError: a file cannot be written, or one of the user has the name of a new file and
+            `overwrite` is not set.
+    """
+    with staged(folder, overwrite=overwrite) as new:
+        yield new
+        result = folder / "result.h5"
+        tree = read_h5(result)
+        files = recorded_files(tree)
+        if files:
+            files |= {name: digest_of(new / name) for name in files_in(new)}
+            record = record_of(files, str(tree[RECORD]["summary"]))
+            replace_group(result, new / "result.h5", RECORD, record)
+
+
+def convert(
+    folder: Path, formats: Sequence[str], out: Path | None = None, overwrite: bool = False
+) -> list[str]:
+    """Write a result folder in other formats.
+
+    Args:
+        folder: Result folder of `solve`, `import` or `Run.save`.
+        formats: See `formats.FORMATS`.
+        out: Output folder; None for the result folder itself.
+        overwrite: Overwrite files that the program did not make.
+
+    Returns:
+        Names of the files and folders.
+
+    Raises:
+        ConfigError: a format is not known.
+        DataError: the folder holds no result, or the other one cannot be written.
+    """
+    names = check_formats(formats)
+    result = load(folder)
+    where = extended(folder, overwrite) if out is None else staged(out, overwrite=overwrite)
+    with where as new:
+        return write_formats(new, result, names)

@@ -1,23 +1,42 @@
-"""Files for other programs, by the name of their format."""
+"""Files for other programs, by the name of their format, and the motions of a result."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from soup_nlp.errors import ConfigError, printable, repr_of
+from soup_nlp.errors import ConfigError, DataError, printable, repr_of
+from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.geometry.rotation import log
 from soup_nlp.report.colmap import write_colmap
 from soup_nlp.report.figures import write_clipped_depth_png16
-from soup_nlp.report.mesh import write_glb
-from soup_nlp.report.motions import motions, trajectory
-from soup_nlp.report.pointcloud import write_cloud
-from soup_nlp.report.rerun_file import write_rrd
+from soup_nlp.report.ply_glb import AXES, write_cloud, write_glb
 from soup_nlp.report.result import FRAMES, Result
-from soup_nlp.storage.atomic import write_bytes, write_text
+from soup_nlp.storage.atomic import atomic_path, write_bytes, write_text
 from soup_nlp.storage.store import write_json
+
+CONVENTIONS = {
+    "axes": f"of a camera: {AXES}",
+    "matrix": "row-major 4x4 of homogeneous points: X_next = next_from_ref X_ref",
+    "next_from_ref": "moves points from the reference camera's coordinates to the next camera's;"
+    " of a component it includes the motion of the camera",
+    "own_motion": "what a component does by itself, in the reference camera's coordinates:"
+    " inverse(camera.next_from_ref) component.next_from_ref",
+    "quaternion_xyzw": "of the rotation, scalar last",
+    "rotation_deg": "rotation vector: axis times angle, degrees",
+    "position_in_ref": "where the next camera is, in the reference camera's coordinates",
+    "label": "value in components/of_superpixel of result.h5; 0 is the background",
+    "residual_px": "median distance in the next image between this one motion and those of the"
+    " superpixels; large where the component is not rigid",
+    "borrowed": "share of its pixels whose depth is a guess from neighbours",
+    "scale": "a component that moves by itself has a scale of its own, which no flow determines:"
+    " its translation is as good as its depth",
+}
+"""Meaning of the entries of motions.json."""
 
 Writer = Callable[[Path, Result], list[str]]
 """Writes files into a folder and returns their names."""
@@ -67,8 +86,109 @@ def _png(folder: Path, result: Result) -> list[str]:
 
 
 def _rrd(folder: Path, result: Result) -> list[str]:
-    write_rrd(folder / "scene.rrd", result)
+    """Write images, depth, cameras, points and components of both frames, on a timeline `frame`.
+
+    The world is the reference camera (x right, y down, z ahead); the static scene does not move.
+
+    Raises:
+        DataError: the package rerun-sdk is not installed.
+    """
+    try:
+        import rerun as rr
+    except ImportError as error:
+        raise DataError(
+            "recordings need the package rerun-sdk",
+            where=folder,
+            hint="pip install 'soup-nlp[rerun]'",
+        ) from error
+    path = folder / "scene.rrd"
+    poses = np.eye(4), result.components.camera.inverse.matrix
+    with atomic_path(path) as temporary:
+        out = rr.RecordingStream("soup_nlp")
+        out.save(temporary)
+        out.log("world", rr.ViewCoordinates.RDF, static=True)
+        for frame in (0, 1):
+            out.set_time("frame", sequence=frame)
+            pose, image = poses[frame], result.images[frame]
+            camera = rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
+            out.log("world/camera", camera)
+            size = [image.shape[1], image.shape[0]]
+            out.log(
+                "world/camera/image", rr.Pinhole(image_from_camera=result.K[frame], resolution=size)
+            )
+            out.log("world/camera/image/rgb", rr.Image(image).compress(jpeg_quality=92))
+            depth = np.nan_to_num(result.depths[frame]).astype(np.float32)
+            out.log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))
+            points = result.points[frame] @ pose[:3, :3].T + pose[:3, 3]
+            of_pixel = result.components.of_pixel
+            for part in result.components:
+                own = result.sure & (of_pixel == part.label)
+                name = "background" if part.label == 0 else f"component_{part.label}"
+                cloud = rr.Points3D(points[own], colors=result.images[0][own])
+                out.log(f"world/{name}", cloud)
+        out.flush()
+        out.disconnect()
     return ["scene.rrd"]
+
+
+def motions(result: Result) -> dict[str, Any]:
+    """Contents of motions.json."""
+    parts = result.components
+    camera = parts.camera
+    return {
+        "name": result.name,
+        "unit": result.unit,
+        "conventions": CONVENTIONS,
+        "camera": {**_motion(camera), "position_in_ref": camera.centre},
+        "components": [
+            {
+                "label": part.label,
+                "background": part.label == 0,
+                "superpixels": part.superpixels,
+                "pixels": part.pixels,
+                "share": part.pixels / parts.of_pixel.size,
+                "centre_ref": part.centre,
+                "centre_next": part.motion(part.centre),
+                **_motion(part.motion),
+                "own_motion": {
+                    **_turn(parts.own_motion(part.label)),
+                    "matrix": parts.own_motion(part.label).matrix,
+                    "displacement": parts.own_motion(part.label)(part.centre) - part.centre,
+                },
+                "residual_px": part.residual_px,
+                "borrowed": part.borrowed,
+            }
+            for part in parts
+        ],
+    }
+
+
+def trajectory(result: Result) -> str:
+    """Poses of the camera in the format of the TUM benchmark, ref_from_camera, frames 0 and 1."""
+    still = RigidMotion(np.eye(3), np.zeros(3))
+    lines = [
+        "# timestamp tx ty tz qx qy qz qw: position and orientation of the camera in the"
+        " reference frame's camera coordinates",
+        f"# axes: {AXES}; timestamp: frame number; unit: {result.unit}",
+    ]
+    return tum_text(lines, (still, result.components.camera.inverse))
+
+
+def tum_text(comments: Sequence[str], poses: Sequence[RigidMotion]) -> str:
+    """Poses in the format of the TUM benchmark, below some comments."""
+    lines = [
+        f"{k} " + " ".join(f"{x:.9g}" for x in (*pose.t, *pose.quaternion))
+        for k, pose in enumerate(poses)
+    ]
+    return "\n".join([*comments, *lines]) + "\n"
+
+
+def _motion(motion: RigidMotion) -> dict[str, Any]:
+    return {"next_from_ref": motion.matrix, "translation": motion.t, **_turn(motion)}
+
+
+def _turn(motion: RigidMotion) -> dict[str, Any]:
+    return {"rotation_deg": np.degrees(log(motion.R)), "quaternion_xyzw": motion.quaternion}
 
 
 def _motions(folder: Path, result: Result) -> list[str]:

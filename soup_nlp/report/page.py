@@ -17,14 +17,11 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Image
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import skill
 from soup_nlp.report.colour import component_colours
-from soup_nlp.report.limits import limits
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.report.result import Result
-from soup_nlp.report.scene3d import PageScene, make_scene
-from soup_nlp.report.verdict import TITLES
-from soup_nlp.start.components import TIES
+from soup_nlp.report.scene3d import make_scene
+from soup_nlp.report.verdict import energy_table, limits, score_rows
 from soup_nlp.storage.store import plain
 
 MODES = {
@@ -50,9 +47,11 @@ SIDE = 1600
 
 def page(shown: Result, found: Mapping[str, Picture]) -> str:
     """The page of a result: HTML that holds everything it shows."""
-    scene = make_scene(shown)
     data = {
-        "scene": _scene(shown, scene),
+        "scene": {
+            key: packed(value) if isinstance(value, np.ndarray) else value
+            for key, value in make_scene(shown).items()
+        },
         "modes": [
             {"name": name, "word": word, "title": found[name].title,
              "legend": _legend(found[name]) + NOTES.get(name, "")}
@@ -89,51 +88,9 @@ def web_file(name: str) -> str:
     return (files("soup_nlp.report") / "web" / name).read_text(encoding="utf-8")
 
 
-def _scene(shown: Result, scene: PageScene) -> dict[str, Any]:
-    """The 3D view as numbers, lists and packed arrays."""
-    height, width = shown.labels.shape
-    arrays = {
-        "labels": (scene.labels, np.uint16),
-        "planes": (scene.planes, np.float32),
-        "motion": (scene.motion, np.float32),
-        "motionCamera": (scene.motion_camera, np.float32),
-        "guess": (scene.guess, np.uint8),
-        "seen": (scene.seen, np.uint8),
-        "sigma": (scene.sigma, np.uint8),
-        "component": (shown.components.of_superpixel, np.uint16),
-        "tie": (np.asarray(shown.tree["start"]["tie"]), np.uint8),
-        "surface": (np.packbits(scene.surface, bitorder="little"), np.uint8),
-    }
-    return {
-        **{key: packed(array, kind) for key, (array, kind) in arrays.items()},
-        "count": len(scene.planes),
-        "step": scene.step,
-        "size": [width, height],
-        "grid": [scene.labels.shape[1], scene.labels.shape[0]],
-        "sizeNext": _next_size(shown),
-        "K": shown.array("input/K_ref"),
-        "KNext": shown.array("input/K_next"),
-        "camera": scene.camera,
-        "middle": scene.middle,
-        "far": scene.far,
-        "deepest": scene.deepest,
-        "unit": shown.length,
-        "ties": TIES,
-    }
-
-
-def _next_size(shown: Result) -> list[int]:
-    depth = shown.array("depth/next")
-    assert depth is not None
-    return [depth.shape[1], depth.shape[0]]
-
-
-def packed(array: NDArray[Any], kind: type) -> str:
+def packed(array: NDArray[Any]) -> str:
     """An array's numbers, deflated, as base64."""
-    if np.issubdtype(kind, np.floating):
-        # limits values of a diverged solve
-        array = np.clip(array, np.finfo(kind).min, np.finfo(kind).max)
-    little = np.ascontiguousarray(array, np.dtype(kind).newbyteorder("<"))
+    little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     return base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
 
 
@@ -199,8 +156,8 @@ def _figure(picture: Picture, source: str) -> str:
     )
 
 
-def _number(value: Any, form: str = ".4g") -> str:
-    return "" if value is None else format(float(value), form)
+def _number(value: Any) -> str:
+    return "" if value is None else f"{float(value):.4g}"
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -227,48 +184,39 @@ def _summary(shown: Result) -> str:
 
 def _energy(shown: Result) -> str:
     """Exact energy by stage, with a bar for each total, or for what the refinement minimises."""
-    stages = {"start": "start", "nlp": "NLP", "solution": "solution"}
-    known = {k: shown.summary["energy"][k] for k in stages if k in shown.summary["energy"]}
-    terms = list(known["solution"])
     refinement = shown.summary.get("refinement")
-    lowered, note = {}, ""
+    columns, rows = energy_table(shown.summary["energy"], refinement)
+    note = ""
     if refinement and "photo" in refinement["end"]:
-        lowered = dict(zip(stages, (refinement[k] for k in ("start", "begin", "end"))))
         note = (
             "<p>The NLP minimises E, its total; the refinement minimises E + E_photo, in which the"
             " images outweigh the flow where they contradict it (at"
             f" {refinement['contradicted']} superpixels). E may rise there.</p>"
         )
     # the bars are of E + E_photo where there is one
-    lengths = {key: float((lowered or known)[key]["total"] or 0) for key in known}
-    most = max(lengths.values()) or 1.0
-    rows = []
-    for key, energy in known.items():
-        width = 100 * lengths[key] / most
+    at = -1 if note else columns.index("total")
+    most = max(float(row[at] or 0) for row in rows.values()) or 1.0
+    cells = []
+    for title, row in rows.items():
+        width = 100 * float(row[at] or 0) / most
         bar = f'<div class="length" style="width:{width:.1f}%"></div>'
-        cells = [_number(energy.get(t)) for t in terms]
-        cells += [_number(lowered[key]["total"])] if lowered else []
-        rows.append([stages[key], *cells, bar])
-    return table(["stage", *terms, *["E + E_photo"] * bool(lowered), ""], rows) + note
+        cells.append([title, *map(_number, row), bar])
+    return table(["stage", *columns, ""], cells) + note
 
 
 def _accuracy(shown: Result) -> str:
     """Scores of the solution and of the baselines."""
-    metrics: Mapping[str, Any] = shown.summary["metrics"]
-    if not metrics:
+    if not shown.metrics:
         return "<p>There is no truth to compare with.</p>"
-    worst = (metrics.get("constant") or {}).get("mre") or float("nan")
-    order = ("solution", "nlp", "start", "rigid", "constant", "solution_next")
     rows = [
         [
-            escape({"solution_next": "solution, next frame"}.get(name, TITLES.get(name, name))),
-            _number(m["mre"]),
-            _number(m["median_relative"]),
-            "" if name == "solution_next" else _number(skill(m["mre"] or np.nan, worst), ".3f"),
-            _number(100 * m["coverage"], ".1f") + " %",
+            escape(title),
+            f"{m.mre:.4g}",
+            f"{m.median_relative:.4g}",
+            "" if np.isnan(gain) else f"{gain:.3f}",
+            f"{100 * m.coverage:.1f} %",
         ]
-        for name in order
-        if (m := metrics.get(name))
+        for title, m, gain in score_rows(shown.metrics)
     ]
     return table(["depth", "MRE", "median error", "skill", "coverage"], rows)
 

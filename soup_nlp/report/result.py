@@ -24,8 +24,7 @@ from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.surface import at_jumps, hidden, joined
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.check_arrays import require_layout
-from soup_nlp.report.tree import result_tree
+from soup_nlp.report.layout import require_layout, result_tree
 from soup_nlp.storage.files import as_path, is_file, read_json, read_text
 from soup_nlp.storage.h5_files import ReadTree, read_attrs, read_h5
 from soup_nlp.storage.store import Array, Tree, plain, require

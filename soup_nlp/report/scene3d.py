@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,53 +11,35 @@ from soup_nlp.arrays import Float, Mask
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.rotation import log, nearest
-from soup_nlp.geometry.surface import hidden, joined, triangles
+from soup_nlp.geometry.surface import hidden, triangles
 from soup_nlp.report.result import Result
-
-Int = NDArray[np.integer]
+from soup_nlp.start.components import TIES
 
 MOST_PIXELS = 600_000
 """Larger images are subsampled for the view."""
 
 
-@dataclass(frozen=True)
-class PageScene:
-    """The 3D view of a result, lengths in the shown unit, camera frame (x right, y down, z ahead).
+def make_scene(shown: Result) -> dict[str, Any]:
+    """The 3D view of a result, in the shown unit and the reference camera's axes.
 
-    Attributes:
-        step: Every step-th pixel in both directions is shown.
-        labels: (h, w) superpixel of the shown pixels.
-        planes: (N, 3) m with depth 1 / (m . ray).
-        motion: (N, 9) motion of every superpixel relative to the background: rotation vector w,
+    Returns:
+        Arrays, numbers and lists by the names that page.js reads. The arrays have the types in
+        which they are packed:
+
+        "labels": (h, w) superpixel of the shown pixels, every "step"-th in both directions.
+        "planes": (N, 3) m with depth 1 / (m . ray).
+        "motion": (N, 9) motion of every superpixel relative to the background: rotation vector w,
             pivot p and shift s; at time t a point X is at exp(t w) (X - p) + p + t s.
-        motion_camera: (N, 9) the same relative to the camera.
-        guess: (N,) the depth comes from neighbours.
-        seen: (h, w) pixels that are visible in the next frame.
-        sigma: (h, w) standard deviation of log depth, 0 to 254 for 0 to 0.5; 255 where unknown.
-        surface: (h - 1, w - 1) cells of four pixels without a jump of the depth.
-        camera: (4, 4) pose of the next camera, reference_from_next; the identity if surfaces bend.
-        middle: Median depth.
-        far: Depth beyond which points are hidden at first.
-        deepest: Largest depth.
+        "motionCamera": (N, 9) the same relative to the camera.
+        "guess": (N,) the depth comes from neighbours.
+        "component": (N,) what moves as one. "tie": (N,) index in "ties", the source of its scale.
+        "seen": (h, w) pixels that are visible in the next frame.
+        "sigma": (h, w) standard deviation of log depth, 0 to 254 for 0 to 0.5; 255 where unknown.
+        "surface": bits of the (h - 1, w - 1) cells of four pixels without a jump of the depth.
+        "camera": (4, 4) reference_from_next; the identity if surfaces bend.
+        "middle", "far", "deepest": median depth, depth beyond which points are hidden at first,
+            largest depth.
     """
-
-    step: int
-    labels: Int
-    planes: Float
-    motion: Float
-    motion_camera: Float
-    guess: Mask
-    surface: Mask
-    seen: Mask
-    sigma: Int
-    camera: Float
-    middle: float
-    far: float
-    deepest: float
-
-
-def make_scene(shown: Result) -> PageScene:
-    """The 3D view of a result."""
     rec = shown.reconstruction
     step = int(np.ceil(np.sqrt(max(rec.labels.size / MOST_PIXELS, 1.0))))
     every = slice(None, None, step)
@@ -70,29 +52,46 @@ def make_scene(shown: Result) -> PageScene:
         camera = RigidMotion(own.R, scale * own.t)
     z = scale * rec.depth_ref[np.isfinite(rec.depth_ref)]
     far, deepest = _far(z)
-    return PageScene(
-        step=step,
-        labels=rec.labels[every, every],
-        planes=inverse_depth(n, scale * lam * shown.soup("d")),
-        motion=_motion(camera.R @ R, camera(T), pivot),
-        motion_camera=_motion(R, T, pivot),
-        guess=np.asarray(shown.tree["start"]["borrowed"], bool) & ~shown.bends,
-        surface=_surface(shown, step),
-        seen=~hidden(rec)[every, every],
-        sigma=_sigma(shown)[every, every],
-        camera=camera.matrix,
-        middle=float(np.median(z)) if z.size else 1.0,
-        far=far,
-        deepest=deepest,
-    )
+    labels, start = rec.labels[every, every], shown.tree["start"]
+    surface = np.packbits(surface_cells(shown, step), bitorder="little")
+    return {
+        "labels": labels.astype(np.uint16),
+        "planes": _single(inverse_depth(n, scale * lam * shown.soup("d"))),
+        "motion": _single(_motion(camera.R @ R, camera(T), pivot)),
+        "motionCamera": _single(_motion(R, T, pivot)),
+        "guess": (np.asarray(start["borrowed"], bool) & ~shown.bends).astype(np.uint8),
+        "seen": (~hidden(rec)[every, every]).astype(np.uint8),
+        "sigma": _sigma(shown)[every, every],
+        "component": shown.components.of_superpixel.astype(np.uint16),
+        "tie": np.asarray(start["tie"], np.uint8),
+        "surface": surface,
+        "count": len(n),
+        "step": step,
+        "size": rec.labels.shape[::-1],
+        "grid": labels.shape[::-1],
+        "sizeNext": rec.depth_next.shape[::-1],
+        "K": shown.K[0].tolist(),
+        "KNext": shown.K[1].tolist(),
+        "camera": camera.matrix.tolist(),
+        "middle": float(np.median(z)) if z.size else 1.0,
+        "far": far,
+        "deepest": deepest,
+        "unit": shown.length,
+        "ties": TIES,
+    }
 
 
-def _surface(shown: Result, step: int) -> Mask:
-    """Cells of the surface, see `PageScene.surface`."""
-    rec, K = shown.reconstruction, np.asarray(shown.array("input/K_ref"), float)
-    right, below = joined(rec, K, shown.components.of_pixel)
+def _single(values: Float) -> NDArray[np.float32]:
+    """Numbers in single precision; those of a diverged solve are limited to its range."""
+    limits = np.finfo(np.float32)
+    return np.clip(values, limits.min, limits.max).astype(np.float32)
+
+
+def surface_cells(shown: Result, step: int) -> Mask:
+    """(h - 1, w - 1) cells of four shown pixels without a jump of the depth."""
+    rec = shown.reconstruction
     height, width = rec.labels.shape
-    found = triangles(right, below, np.isfinite(rec.depth_ref), step)
+    found = triangles(*shown.surface, np.isfinite(rec.depth_ref), step)
     # every cell has two triangles; the first begins at its upper left pixel
     v, u = np.divmod(found[: len(found) // 2, 0], width)
     out = np.zeros(((height - 1) // step, (width - 1) // step), bool)
@@ -100,13 +99,13 @@ def _surface(shown: Result, step: int) -> Mask:
     return out
 
 
-def _sigma(shown: Result) -> Int:
-    """(H, W) sigma as a byte, see `PageScene.sigma`."""
+def _sigma(shown: Result) -> NDArray[np.uint8]:
+    """(H, W) sigma as a byte, see `make_scene`."""
     sigma = shown.array("depth/sigma_ref")
     if sigma is None:
-        return np.zeros(shown.labels.shape, np.int64)
+        return np.zeros(shown.labels.shape, np.uint8)
     byte = np.rint(np.clip(sigma / 0.5, 0, 1) * 254)
-    return np.where(np.isfinite(sigma), byte, 255).astype(np.int64)
+    return np.where(np.isfinite(sigma), byte, 255).astype(np.uint8)
 
 
 def _far(z: Float) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
 from soup_nlp.geometry.motion import RigidMotion
-from soup_nlp.report.mesh import GLTF
+from soup_nlp.report.ply_glb import GLTF
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.fused import Cloud, fuse, movers, shown_tracks
 from soup_nlp.storage.atomic import PathLike, write_bytes

@@ -98,7 +98,7 @@ def _scene(chain: Chain) -> dict[str, Any]:
 
 
 def _cloud(cloud: Cloud) -> dict[str, str]:
-    points, colours = packed(cloud.points, np.float32), packed(cloud.colours, np.uint8)
+    points, colours = packed(cloud.points.astype(np.float32)), packed(cloud.colours)
     return {"points": points, "colours": colours}
 
 

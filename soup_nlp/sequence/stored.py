@@ -12,7 +12,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.colmap import write_model
-from soup_nlp.report.pointcloud import AXES, write_ply
+from soup_nlp.report.ply_glb import AXES, write_ply
 from soup_nlp.sequence.animation import write_animation
 from soup_nlp.sequence.chain import Chain, make_chain
 from soup_nlp.sequence.fused import fuse, projected

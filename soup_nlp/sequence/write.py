@@ -12,8 +12,8 @@ import numpy as np
 from soup_nlp.arrays import Image
 from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.figures import depth_png_scale, write_clipped_depth_png16
-from soup_nlp.report.motions import tum_text
-from soup_nlp.report.pointcloud import AXES, write_ply
+from soup_nlp.report.formats import tum_text
+from soup_nlp.report.ply_glb import AXES, write_ply
 from soup_nlp.sequence.animation import RATE
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.page import chain_page

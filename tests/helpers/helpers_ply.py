@@ -1,4 +1,4 @@
-"""A reader of the PLY files that `report.pointcloud` writes."""
+"""A reader of the PLY files that `report.ply_glb` writes."""
 
 from __future__ import annotations
 

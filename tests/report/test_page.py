@@ -18,12 +18,13 @@ from soup_nlp.config.problem import dump_problem, make_problem
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report import scene3d
-from soup_nlp.report.folder import summary, write_folder
-from soup_nlp.report.limits import limits
+from soup_nlp.report.folder import write_folder
 from soup_nlp.report.page import MODES, page
 from soup_nlp.report.pictures import _enlarged, pictures
 from soup_nlp.report.result import result_of
-from soup_nlp.report.scene3d import make_scene
+from soup_nlp.report.scene3d import make_scene, surface_cells
+from soup_nlp.report.summary import summary
+from soup_nlp.report.verdict import limits
 
 
 @pytest.fixture(scope="module")
@@ -124,35 +125,36 @@ def test_curtains_are_cut(shown, small_run):
     members = (found[0], replace(found[0], label=1))
     part = half[labels].astype(np.int32)
     two = replace(found, of_superpixel=half, of_pixel=part, members=members)
-    scene = make_scene(replace(shown, components=two))
+    surface = surface_cells(replace(shown, components=two), 1)
 
     def alike(values):
         first = values[:-1, :-1]
         others = (values[1:, :-1], values[:-1, 1:], values[1:, 1:])
         return np.all([first == other for other in others], axis=0)
 
-    assert scene.surface.shape == (labels.shape[0] - 1, labels.shape[1] - 1)
+    assert surface.shape == (labels.shape[0] - 1, labels.shape[1] - 1)
     known = np.isfinite(small_run.reconstruction.depth_ref)
     whole = alike(known) & known[:-1, :-1]
-    assert scene.surface[alike(labels) & whole].all()
-    assert not scene.surface[~whole].any()
-    assert not scene.surface[~alike(part)].any()
+    assert surface[alike(labels) & whole].all()
+    assert not surface[~whole].any()
+    assert not surface[~alike(part)].any()
     # and the surface goes on where planes meet
-    assert scene.surface[~alike(labels) & alike(part)].mean() > 0.5
+    assert surface[~alike(labels) & alike(part)].mean() > 0.5
 
 
 def test_large_images_are_thinned(shown, monkeypatch):
     monkeypatch.setattr(scene3d, "MOST_PIXELS", 256 * 128 / 8)
     scene = make_scene(shown)
-    assert scene.step == 3
-    assert scene.labels.shape == (43, 86)
-    assert scene.surface.shape == (42, 85)
-    assert 0.5 < scene.surface.mean() < 1
+    assert scene["step"] == 3
+    assert scene["labels"].shape == (43, 86)
+    surface = surface_cells(shown, 3)
+    assert surface.shape == (42, 85)
+    assert 0.5 < surface.mean() < 1
 
 
 def test_a_far_sky_is_left_out_at_first(shown):
     scene = make_scene(shown)
-    assert scene.middle < scene.far <= scene.deepest
+    assert scene["middle"] < scene["far"] <= scene["deepest"]
     z = np.concatenate([np.full(900, 2.0), np.full(100, 1e6)])
     assert scene3d._far(z) == (8.0, 1e6)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers_ply import read_ply
 
-from soup_nlp.report.pointcloud import write_ply
+from soup_nlp.report.ply_glb import write_ply
 
 
 def cloud(m=50):

@@ -17,8 +17,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.report.certainty import certainty
-from soup_nlp.report.folder import summary
+from soup_nlp.report.summary import certainty, summary
 from soup_nlp.start.components import TIES
 from soup_nlp.start.edges import follows_edges
 from soup_nlp.start.given_depth import CONFIRMED, Given, by_prior

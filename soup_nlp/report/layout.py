@@ -1,0 +1,344 @@
+"""result.h5: one table of its arrays, from which it is written, read and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from soup_nlp.errors import DataError
+from soup_nlp.pipeline.record import Run
+from soup_nlp.storage.h5_files import RECORD, ReadTree
+from soup_nlp.storage.store import Array, Tree
+
+
+class Row(NamedTuple):
+    """Unit, axes ("N,3"; "" for a number) and description of an array."""
+
+    unit: str
+    axes: str
+    text: str
+
+
+TABLE = """
+input/image_ref           1     H,W,3   reference image, 8-bit RGB
+input/image_next          1     H,W,3   next image, 8-bit RGB
+input/K_ref               px    3,3     intrinsics of the reference frame
+input/K_next              px    3,3     intrinsics of the next frame
+input/flow                px    H,W,2   flow from reference to next
+input/confidence          1     H,W     of the flow, 0 is unused
+
+segmentation/labels       1     H,W     superpixel of every pixel
+segmentation/anchors      px    N,2     centroids (u, v)
+segmentation/sizes        px    N       pixels of every superpixel
+segmentation/radius       px    N       root mean square distance from the anchor
+segmentation/knn          1     N,K     nearest anchors, nearest first
+segmentation/edge_multiplicity  1  E    directions in which an edge of energy/edges occurs
+segmentation/boundary     px    P,B,2   sampled shared boundary points (u, v)
+segmentation/boundary_length  px  P     shared boundary before sampling
+segmentation/pair_weight  1     P       w4 of the pairs, of the image alone
+segmentation/rim          px    N,V,2   extreme pixels (u, v) by direction
+
+energy/K_next             px    3,3     intrinsics of the next frame
+energy/anchor_ray         1     N,3     ray of every anchor, third component 1
+energy/radius             1     N       largest distance of a rim pixel from the anchor, ray units
+energy/pixel_ray          1     N,S,3   rays of the sampled pixels of E_proj
+energy/pixel_target       px    N,S,2   where the flow brings the sampled pixels
+energy/pixel_weight       1     N,S     confidence x usable share / sample size; 0 drops a pixel
+energy/edges              1     E,2     K-NN edges i < k
+energy/edge_weight        1     E       w1 = w2 of both directions, less between two components
+energy/prior_weight       1     E       weight of E_prior: flow noise / K for each direction
+energy/prior_relief       1     E       relative difference of 1/z that costs nothing in E_prior
+energy/depth_weight       1     E       weight of E_depth, 0 without a depth prior
+energy/depth_change       1     E       difference of log depth by the depth prior
+energy/edge_unit          1     E       length unit of an edge, see local_units
+energy/rotation_scale     1     E       factor of |R_i - R_k|
+energy/pairs              1     P,2     neighbours i < k that share boundary
+energy/boundary_ray       1     P,B,3   rays of the sampled shared boundary points
+energy/pair_weight        1     P       w4 of both directions, less where a component is hidden
+energy/pair_factor        1     P       sqrt(boundary length / B): stands for the whole boundary
+energy/pair_unit          1     P       length unit of a pair, see local_units
+energy/orient_weight      1     P       weight of E_orient: 2 directions, other where regions bend
+energy/rim_ray            1     N,V,3   rays where visibility is imposed, the anchor first
+energy/share              1     N       weights c of the length unit sum_i c_i D_i = 1
+energy/local_units        1     -       units are shares of the depths of two anchors, power mean -4
+energy/arap_at_anchors    1     -       motion difference at the anchors, not at the camera
+
+weights/sigma_proj        px    -       weight sigma_proj
+weights/min_facing        1     -       visibility: -n . r >= c
+weights/depth_ratio       1     -       depth at a rim pixel is at most this x the anchor's
+weights/*                 1     -       weight *
+
+start|solution|nlp|answer/lam  1  N     scales, on the simplex
+start|solution|nlp|answer/n  1  N,3     unit normals that face the camera
+start|solution|nlp|answer/d  soup  N    plane offsets; lam d is the plane's distance
+start|solution|nlp|answer/R  1  N,3,3   rotations, next_from_ref
+start|solution|nlp|answer/t  soup  N,3  translations; lam t is next_from_ref
+
+start/error               px    N       mean re-projection error
+start/parallax            px    N       displacement that the translation causes
+start/borrowed            1     N       plane or motion from neighbours
+start/grounded            1     N       borrowed, and below the horizon of a known ground
+start/motion              1     N       dominant motion, -1 for its own
+start/component           1     N       rigid component
+start/part                1     N       what moves as one: its component, or the largest one \
+without usable flow
+start/surface             1     N       region without a flow discontinuity
+start/tie                 1     N       what gives its component a scale: 0 largest, \
+1 contact below, 2 outline, 3 cut off below, 4 nothing, 5 ground, 6 fixed in image, 7 given depth
+start/bends               1     N       in a region with the energy for surfaces that bend
+start/bending             1     -       a region bends
+start/at_rest             1     -       the camera is taken to be at rest, or to turn only
+start/noise               px    -       median error of the flow; if all bends, of affine flows
+
+refine/energy_*           1     T       exact E, *, by round
+refine/mrf_energy         1     T       energy of the chosen labels in the MRF of the particles
+refine/bound              1     T       TRW-S's lower bound on every choice among the particles
+refine/gap                1     T       largest excess over the best choice among the particles
+refine/moved              1     T       superpixels that left their belief
+refine/ties               1     T       superpixels whose label was a tie when decoded
+refine/iterations         1     T       iterations of TRW-S
+refine/taken              1     T       whether the choice lowered the exact E
+refine/seconds            s     T       wall time
+refine/proposed           1     T,C     feasible particles by round and kind
+refine/accepted           1     T,C     chosen particles by round and kind
+refine/kinds              text  C       kinds of particles
+
+multipliers/lam_x         1     X       of the bounds of the variables, in the order of the NLP
+multipliers/lam_g_*       1     G       of the constraints *, in the order of the NLP
+
+iterations/*/obj          1     I       objective of the solver's form, by iteration
+iterations/*/inf_pr       1     I       largest constraint violation, by iteration
+iterations/*/inf_du       1     I       largest dual infeasibility, scaled by Ipopt, by iteration
+iterations/*/mu           1     I       barrier parameter, by iteration
+iterations/*/d_norm       1     I       largest entry of the step, by iteration
+iterations/*/regularization_size  1  I  inertia correction, by iteration
+iterations/*/alpha_pr     1     I       step size, variables, by iteration
+iterations/*/alpha_du     1     I       step size, multipliers, by iteration
+iterations/*/ls_trials    1     I       trial points of the line search, by iteration
+
+depth/ref                 soup  H,W     z of the reference frame, NaN if none
+depth/next                soup  H,W     z of the next frame, NaN if none
+depth/start_ref           soup  H,W     the start's z, reference frame
+depth/rigid_ref           translations  H,W  z by one rigid motion, reference frame
+depth/nlp_ref             soup  H,W     the NLP's z, reference frame
+depth/sigma_ref           1     H,W     standard deviation of log z, global scale left out
+depth/sigma_next          1     H,W     the same of the next frame, NaN where nothing is seen
+
+confidence/plane          1     N,3,3   marginal covariance of relative inverse depth at the \
+anchor and of its slopes over the radius, not calibrated
+confidence/spread         1     H,W     standard deviation of log z by the marginals, not calibrated
+confidence/component_sigma  1   C       standard deviation of a rigid component's log scale
+confidence/misfit         px    N       mean distance of the flow from that of the answer
+confidence/noise          px    -       noise of the flow that the calibration uses
+
+components/of_superpixel  1     N       what moves as one in the solution; 0 is the background
+components/motion         soup  C,4,4   next_from_ref, the camera's motion included
+components/residual_px    px    C       median distance from where the superpixels' motions lead
+components/borrowed       1     C       share of the pixels whose depth is a guess
+
+truth/depth_ref           truth  H,W    true z of the reference frame, NaN where unknown
+truth/depth_next          truth  H,W    true z of the next frame, NaN where unknown
+truth/flow                px    H,W,2   true flow, NaN where unknown
+truth/occluded            1     H,W     reference pixel is not visible in the next frame
+truth/components          1     H,W     component of a reference pixel, -1 for none
+truth/motions             truth  B,4,4  next_from_ref of each component
+truth/scene_flow          truth  H,W,3  true X' - X, each in its own frame's camera
+truth/points              truth  M,3    sparse truth: u and v in px, z in the unit of length
+
+record/files              text  F       names of the other files
+record/sha256             text  F       their SHA-256
+record/summary            text  -       summary.json
+"""
+"""Place, unit, axes and description of every array.
+
+"|" separates groups with the same arrays, "*" stands for any name. "soup" and "truth" are the units
+of length of the reconstruction and of the truth; "text" is text.
+"""
+
+
+def _parsed() -> dict[str, Row]:
+    out = {}
+    for line in TABLE.strip().splitlines():
+        if line:
+            places, unit, axes, text = line.split(maxsplit=3)
+            groups, _, name = places.rpartition("/")
+            for group in groups.split("|"):
+                out[f"{group}/{name}"] = Row(unit, axes.strip("-"), text)
+    return out
+
+
+LAYOUT: Mapping[str, Row] = _parsed()
+"""`TABLE` by place, "group/name"."""
+
+INDICES = ("segmentation/labels", "segmentation/knn", "energy/edges", "energy/pairs")
+"""Arrays of superpixels, 0 to N - 1."""
+SHARED = ("N", "E", "P", "H", "W")
+"""Axes with one size in all arrays: superpixels, edges, pairs, rows and columns."""
+FREE = ("depth/next", "depth/sigma_next", "input/image_next", "truth/depth_next")
+"""Maps of the next frame, whose size may differ."""
+
+
+def described(values: Mapping[str, Any], truth_unit: str = "", place: str = "") -> Tree:
+    """Values of nested mappings with their rows of `TABLE`; what it does not name is left out.
+
+    Args:
+        values: Arrays, numbers or None (left out) by group and name.
+        truth_unit: Unit of length of the truth.
+        place: Group of the values.
+    """
+    out: dict[str, Any] = {}
+    for name, value in values.items():
+        here = f"{place}{name}"
+        if isinstance(value, Mapping):
+            out[name] = described(value, truth_unit, f"{here}/")
+        elif value is not None and (row := _row(here)) is not None:
+            number = np.float64(value) if isinstance(value, bool | int | float) else value
+            unit = {"truth": truth_unit, "text": "1"}.get(row.unit, row.unit)
+            out[name] = Array(number, unit, row.text, row.axes)
+    return out
+
+
+def _row(place: str) -> Row | None:
+    """The row of a place; None if there is none. In a description "*" becomes the name."""
+    if place in LAYOUT:
+        return LAYOUT[place]
+    for pattern, row in LAYOUT.items():
+        if fnmatchcase(place, pattern):
+            start = pattern.partition("*")[0]
+            return row._replace(text=row.text.replace("*", place.removeprefix(start)))
+    return None
+
+
+def result_arrays(run: Run) -> dict[str, Any]:
+    """Every array of a run by group and name; records hold more than `TABLE` names."""
+    pair, rec, nlp, sure = run.pair, run.reconstruction, run.nlp_reconstruction, run.confidence
+    form, parts, refined = run.problem.formulation, run.components, run.refined
+    assert pair.flow is not None
+    rounds = () if refined is None else refined.rounds
+    by_round = {
+        key: np.array([getattr(one, key) for one in rounds])
+        for key in ["mrf_energy", "bound", "gap", "moved", "ties", "iterations", "taken", "seconds"]
+    }
+    by_kind = {
+        key: np.array([list(getattr(one, key).values()) for one in rounds])
+        for key in ("proposed", "accepted")
+    }
+    return {
+        "input": {**vars(pair), "flow": pair.flow.uv, "confidence": pair.flow.confidence},
+        "segmentation": vars(run.segmentation),
+        "energy": run.data.arrays(),
+        "weights": {
+            **vars(run.weights),
+            "min_facing": form.min_facing,
+            "depth_ratio": form.depth_ratio,
+        },
+        "start": {**vars(run.start.soup), **vars(run.start), "bending": run.start.bending},
+        "solution": vars(run.soup),
+        "nlp": vars(run.solution.soup),
+        "refine": {
+            **{
+                f"energy_{k}": np.array([one.energy[k] for one in rounds]) for k in rounds[0].energy
+            },
+            **by_round,
+            **by_kind,
+            "kinds": np.array(list(rounds[0].proposed)),
+        }
+        if rounds
+        else {},
+        "answer": vars(run.answer),
+        "multipliers": dict(run.solution.multipliers),
+        "iterations": {
+            f"{k:02d}_{stage.name.replace(' ', '_').replace('/', '_')}": dict(stage.history)
+            for k, stage in enumerate(run.solution.stages)
+        },
+        "depth": {
+            "ref": rec.depth_ref,
+            "next": rec.depth_next,
+            "start_ref": run.start_reconstruction.depth_ref,
+            "rigid_ref": run.rigid,
+            "nlp_ref": None if nlp is None else nlp.depth_ref,
+            "sigma_ref": rec.sigma_ref,
+            "sigma_next": rec.sigma_next,
+        },
+        "confidence": {**vars(sure), "plane": sure.marginals.plane},
+        "components": {
+            "of_superpixel": parts.of_superpixel,
+            "motion": np.stack([c.motion.matrix for c in parts]),
+            "residual_px": np.array([c.residual_px for c in parts]),
+            "borrowed": np.array([c.borrowed for c in parts]),
+        },
+        "truth": {} if pair.truth is None else vars(pair.truth),
+    }
+
+
+def result_tree(run: Run) -> Tree:
+    """Every array of a run with its description, as `store.write_h5` takes it."""
+    truth = run.pair.truth
+    return described(result_arrays(run), "" if truth is None else truth.unit)
+
+
+def require_layout(tree: ReadTree) -> None:
+    """Check every stored array against its row of `TABLE`.
+
+    Raises:
+        DataError: an array has a wrong shape or type, or indices out of range.
+    """
+    sizes: dict[str, int] = {}
+    for place, row in LAYOUT.items():
+        group, _, name = place.partition("/")
+        values = tree.get(group, {})
+        if not isinstance(values, Mapping):
+            raise _wrong(group, "an array", "a group")
+        if name in values and row.unit != "text":
+            _require_row(place, row, values[name], sizes)
+    for place in INDICES:
+        group, name = place.split("/")
+        found, count = tree.get(group, {}).get(name), sizes.get("N", 0)
+        if found is not None and (
+            found.dtype.kind not in "iu"
+            or (found.size and not 0 <= found.min() <= found.max() < count)
+        ):
+            raise _wrong(place, "other values", f"whole numbers from 0 to {count - 1}")
+
+
+def _require_row(place: str, row: Row, value: Any, sizes: dict[str, int]) -> None:
+    """Check type and shape of an array; `sizes` collects the sizes of the shared axes."""
+    if isinstance(value, Mapping) or value.dtype.kind not in "biuf":
+        raise _wrong(place, "a group or text", "numbers")
+    if "/image_" in place and value.dtype != np.uint8:
+        raise _wrong(place, value.dtype, "uint8")
+    axes = row.axes.split(",") if row.axes else []
+    if len(axes) != value.ndim:
+        raise _wrong(place, value.shape, f"axes ({row.axes})")
+    for axis, size in zip(axes, value.shape, strict=True):
+        expected = int(axis) if axis.isdigit() else size
+        if axis in SHARED and place not in FREE:
+            expected = sizes.setdefault(axis, size)
+        if size != expected or (axis in ("H", "W") and not size):
+            raise _wrong(place, value.shape, f"({row.axes}) with {axis} = {expected}")
+
+
+def _wrong(place: str, found: object, expected: str) -> DataError:
+    return DataError(
+        "array of a result does not fit the others",
+        where=f"result.h5, {place}",
+        found=found,
+        expected=expected,
+    )
+
+
+def record_of(digests: Mapping[str, str], summary: str) -> Tree:
+    """The record of the other files: their SHA-256 by name, and the text of summary.json."""
+    files = {"files": np.array(list(digests)), "sha256": np.array(list(digests.values()))}
+    return described({**files, "summary": summary}, place=f"{RECORD}/")
+
+
+def recorded_files(tree: Mapping[str, Any]) -> dict[str, str]:
+    """SHA-256 of the files of a result by name, from its record; {} without a record."""
+    own = tree.get(RECORD, {})
+    if not {"files", "sha256"} <= own.keys():
+        return {}
+    return dict(zip(map(str, own["files"]), map(str, own["sha256"]), strict=True))
