@@ -104,11 +104,9 @@ def depth_metrics(
             protocol does; None leaves them as they are.
 
     Raises:
-        DataError: shapes differ, the rule is unknown, the cap is not positive, the clamp is not
-            0 < low < high, or no pixel has a truth to compare with.
+        DataError: shapes differ, the rule is unknown, the cap is not positive, or no pixel has a
+            truth to compare with.
     """
-    if clamp is not None and not 0 < clamp[0] < clamp[1]:
-        raise DataError("clamp is no range of depths", found=clamp, expected="0 < low < high")
     if scale not in get_args(Scale):
         raise DataError("unknown scale rule", found=repr(scale), expected=list(get_args(Scale)))
     z, gt, coverage = _compared(estimate, truth, cap, mask)
@@ -174,33 +172,18 @@ def _compared(
 ) -> tuple[Float, Float, float]:
     """Vectors of estimate and truth where both count, and the share of the truth they cover."""
     z, gt = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
-    if z.shape != gt.shape:
+    keep = np.ones(gt.shape, bool) if mask is None else np.asarray(mask, bool)
+    if not z.shape == gt.shape == keep.shape:
         raise DataError(
-            "estimated and true depth differ in shape",
-            found=f"estimate {z.shape}, truth {gt.shape}",
+            "estimate, truth and mask of a depth differ in shape",
+            found=f"estimate {z.shape}, truth {gt.shape}, mask {keep.shape}",
             hint="sample a dense estimate at sparse points with sample_at_points",
         )
-    true = _masked(true_pixels(gt, cap), mask, "depth")
+    true = true_pixels(gt, cap) & keep
+    if not true.any():
+        raise DataError("no pixel has a true depth to compare with, within cap and mask")
     both = true & np.isfinite(z) & (z > 0)
     return z[both], gt[both], float(np.count_nonzero(both) / np.count_nonzero(true))
-
-
-def _masked(true: Mask, mask: ArrayLike | None, what: str) -> Mask:
-    """The true pixels that are in the mask.
-
-    Raises:
-        DataError: the mask has another shape, or no pixel is left.
-    """
-    if mask is not None:
-        keep = np.asarray(mask, bool)
-        if keep.shape != true.shape:
-            raise DataError(
-                f"mask and {what} differ in shape", found=keep.shape, expected=true.shape
-            )
-        true = true & keep
-    if not true.any():
-        raise DataError(f"no pixel has a true {what} to compare with, within cap and mask")
-    return true
 
 
 def _scale(z: Float, gt: Float, rule: Scale) -> float:
@@ -237,17 +220,8 @@ def sample_at_points(depth: ArrayLike, points: ArrayLike) -> tuple[Float, Float]
     Returns:
         (estimate, truth), each (M,). The estimate is NaN where a point lies outside the image or
         is not finite, so that it costs coverage.
-
-    Raises:
-        DataError: the arrays have the wrong shape.
     """
     z, at = np.asarray(depth, np.float64), np.asarray(points, np.float64)
-    if z.ndim != 2 or at.ndim != 2 or at.shape[1] != 3:
-        raise DataError(
-            "cannot sample a depth at points",
-            found=f"depth {z.shape}, points {at.shape}",
-            expected="depth (H, W), points (M, 3) of u, v, z",
-        )
     height, width = z.shape
     u, v = np.floor(at[:, 0] + 0.5), np.floor(at[:, 1] + 0.5)
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)  # NaN is outside
@@ -263,32 +237,26 @@ def scene_flow_epe(
 
     Args:
         estimate: (..., 3) X' - X; NaN where unknown.
-        truth: (..., 3) true X' - X, same shape; NaN where unknown.
+        truth: (..., 3) true X' - X; NaN where unknown, but known somewhere.
         scale: The factor s; use `DepthMetrics.scale` so that depth and motion share one scale.
 
     Returns:
         mean, median, mean_truth_length (unit of the truth), coverage, n_pixels. The errors are
         NaN when nothing can be compared.
-
-    Raises:
-        DataError: shapes do not fit, or no pixel has a true scene flow.
     """
     est, gt = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
-    if est.shape != gt.shape or gt.ndim < 1 or gt.shape[-1] != 3:
-        raise DataError(
-            "estimated and true scene flow do not fit",
-            found=f"estimate {est.shape}, truth {gt.shape}",
-            expected="the same shape (..., 3)",
-        )
-    true = _masked(np.asarray(np.isfinite(gt).all(axis=-1)), None, "scene flow")
-    both = np.asarray(true & np.isfinite(est).all(axis=-1))
-    error = np.linalg.norm(scale * est[both] - gt[both], axis=-1)
-    length = np.linalg.norm(gt[both], axis=-1)
-    n, nan = int(both.sum()), float("nan")
+    true = np.isfinite(gt).all(axis=-1)
+    both = true & np.isfinite(est).all(axis=-1)
+    n = int(both.sum())
+    # one NaN in place of no pixel makes every mean NaN
+    error, length = (
+        np.linalg.norm(v[both], axis=-1) if n else np.array([np.nan])
+        for v in (scale * est - gt, gt)
+    )
     return {
-        "mean": float(np.mean(error)) if n else nan,
-        "median": float(np.median(error)) if n else nan,
-        "mean_truth_length": float(np.mean(length)) if n else nan,
+        "mean": float(np.mean(error)),
+        "median": float(np.median(error)),
+        "mean_truth_length": float(np.mean(length)),
         "coverage": n / int(true.sum()),
         "n_pixels": n,
     }
@@ -300,13 +268,8 @@ def component_overlaps(found: ArrayLike, true: ArrayLike) -> dict[int, tuple[int
     Args:
         found: (H, W) labels from 0.
         true: (H, W) true labels from 0; negative where unknown, which counts nowhere.
-
-    Raises:
-        DataError: the shapes differ.
     """
     a, b = np.asarray(found), np.asarray(true)
-    if a.shape != b.shape:
-        raise DataError("maps of components differ in size", found=a.shape, expected=b.shape)
     known = b >= 0
     if not known.any():
         return {}

@@ -84,9 +84,6 @@ class Preset:
 _PRESETS = (
     Preset("paper", text="the paper's MRE: every true pixel, one global scale"),
     Preset("best", "mre", text="the scale that minimises the MRE itself, no cap"),
-    Preset("lsq", "lsq", text="least-squares scale, no cap"),
-    Preset("metric", "none", text="as it is, no scale"),
-    Preset("near20", cap=20.0, text="median scale, depth cap 20"),
     Preset(
         "sintel70",
         cap=70.0,

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from soup_nlp.arrays import Float
-from soup_nlp.errors import DataError
 
 STEPS = 50
 """Points of a sparsification curve."""
@@ -41,21 +40,10 @@ def sparsification(error: ArrayLike, uncertainty: ArrayLike) -> Sparsification:
     Pixels of equal uncertainty are removed in an arbitrary order: each counts as their mean error.
 
     Args:
-        error: (M,) errors, not negative.
+        error: (M,) errors, not negative; M at least 1.
         uncertainty: (M,) larger where the error is expected to be larger.
-
-    Raises:
-        DataError: lengths differ, there is no pixel, or an error is negative or not finite.
     """
     e, s = np.asarray(error, float), np.asarray(uncertainty, float)
-    if e.ndim != 1 or e.shape != s.shape or not len(e):
-        raise DataError(
-            "errors and uncertainties do not fit",
-            found=f"{e.shape} and {s.shape}",
-            expected="two vectors of one length, at least 1",
-        )
-    if not (np.isfinite(e).all() and (e >= 0).all()) or np.isnan(s).any():
-        raise DataError("errors must be finite and not negative, uncertainties not NaN")
     kept = np.linspace(1.0, LAST, STEPS)
     last = np.maximum((kept * len(e)).astype(int) - 1, 0)
     _, group = np.unique(s, return_inverse=True)

@@ -35,35 +35,15 @@ def made(
     return Pair(image, image, K, K_next, flow), z, R, t
 
 
-def test_recovers_a_rigid_scene(orbit):
-    m = depth_metrics(rigid_depth(orbit), orbit.truth.depth_ref)
-    assert m.mre < 1e-4
-    assert m.coverage == 1.0
-
-
 def test_same_seed_same_answer(orbit):
     a, b = (rigid_depth(orbit, seed=3) for _ in range(2))
     np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize(
-    "K_next",
-    [
-        np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]]),
-        np.array([[90.0, 0, 72.0], [0, 92.0, 28.0], [0, 0, 1]]),
-        np.array([[140.0, 1.5, 30.0], [0, 120.0, 35.0], [0, 0, 1]]),
-    ],
-)
-def test_each_frame_has_its_own_camera(K_next):
-    pair, z, _, t = made(K_next)
-    found = rigid_depth(pair)
-    np.testing.assert_allclose(found * np.linalg.norm(t), z, rtol=5e-3)
-
-
-@pytest.mark.parametrize("cx", [41.0, 72.0])
-def test_exact_flow_gives_exact_depth(cx):
+@pytest.mark.parametrize(("fx", "skew", "cx"), [(90, 0, 41), (90, 0, 72), (140, 1.5, 30)])
+def test_exact_flow_gives_exact_depth_whatever_the_second_camera(fx, skew, cx):
     """With a flow in double precision nothing but rounding is left."""
-    K_next = np.array([[90.0, 0, cx], [0, 110.0, 28.0], [0, 0, 1]])
+    K_next = np.array([[fx, skew, cx], [0, 110.0, 28.0], [0, 0, 1]])
     pair, z, _, t = made(K_next, dtype=np.float64)
     found = rigid_depth(pair)
     np.testing.assert_allclose(found * np.linalg.norm(t), z, rtol=1e-6)
@@ -95,6 +75,7 @@ def test_flow_without_confidence_is_ignored(orbit):
     np.testing.assert_array_equal(np.isnan(found), bad)
     assert np.isfinite(found).mean() == pytest.approx(1 - bad.mean())
     assert depth_metrics(found, orbit.truth.depth_ref).mre < 1e-4
+    # every other pixel takes the depth of the nearest one
     filled = fill_nearest(found)
     assert np.isfinite(filled).all()
     np.testing.assert_array_equal(filled[~bad], found[~bad])
@@ -132,22 +113,9 @@ def test_dynamic_scene_is_not_rigid():
     assert static.mre < m.mre < 0.05
 
 
-def test_fill_nearest():
-    z = np.array([[1.0, np.nan, np.nan, 4.0]])
-    np.testing.assert_array_equal(fill_nearest(z), [[1, 1, 4, 4]])
-    full = np.ones((2, 2))
-    assert fill_nearest(full) is not full
-
-
 def test_without_flow_or_motion_there_is_no_baseline(orbit, monkeypatch):
     assert rigid_depth(replace(orbit, flow=None)) is None
     none = Flow(orbit.flow.uv, np.zeros_like(orbit.flow.confidence))
     assert rigid_depth(orbit.with_flow(none)) is None
     monkeypatch.setattr("soup_nlp.start.epipolar.estimate", lambda *_: None)
     assert rigid_depth(orbit) is None
-
-
-def test_zero_flow_gives_no_baseline_or_a_depth_map(orbit):
-    still = Flow(np.zeros_like(orbit.flow.uv), np.ones_like(orbit.flow.confidence), "still")
-    found = rigid_depth(orbit.with_flow(still))
-    assert found is None or found.shape == orbit.size

@@ -10,7 +10,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from soup_nlp.report.layout import record_of
 
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.pair import Pair
@@ -20,6 +19,7 @@ from soup_nlp.evaluate import recompute
 from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import WRITTEN, CheckReport, check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.report.layout import record_of
 from soup_nlp.storage import store
 from soup_nlp.storage.h5_files import DIGEST, RECORD, read_digest
 from soup_nlp.storage.mark import MARK, digest_of, files_in
