@@ -17,7 +17,7 @@ import yaml
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.pipeline.record import Run
-from soup_nlp.pipeline.run import run
+from soup_nlp.report.api import run
 
 SIZE = (48, 64)
 """Height and width of the tiny images."""
