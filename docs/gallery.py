@@ -36,7 +36,11 @@ def made(scene: str) -> str:
         "MRE": [", ".join(scores)],
         "exit code": [f"{0 if run.good else 1}"],
     }
-    return "".join(f"{title:<12}{line}\n" for title, lines in sections.items() for line in lines)
+    return "".join(
+        f"{'' if k else title:<12}{line}\n"
+        for title, lines in sections.items()
+        for k, line in enumerate(lines)
+    )
 
 
 if __name__ == "__main__":
