@@ -68,11 +68,11 @@ class Case:
         start: The unorganised soup.
         data: Numbers of the energy.
         weights: Constants of the energy.
-        soup: Where solvers start: the start, or the presolve's answer.
+        soup: The best soup so far, where solvers start: the start, or the presolve's answer.
         options: Stages and limits of the problem.
         seen: The pair as the photometric term sees it: without a layer that stands still before
             the scene, where there is one.
-        full: The pair at its own size, where it was larger than `max_size`; else None.
+        original: The pair at its own size, where it was larger than `max_size`; else None.
         given: What was made of a depth prior; None without one.
     """
 
@@ -85,7 +85,7 @@ class Case:
     soup: Soup
     options: SolverOptions
     seen: Pair
-    full: Pair | None = None
+    original: Pair | None = None
     given: Given | None = None
 
     def __len__(self) -> int:

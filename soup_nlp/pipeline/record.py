@@ -3,31 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from soup_nlp.arrays import Float, FloatMap
-from soup_nlp.config.problem import Problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.confidence import Confidence
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.full_size import Labels, grown_labels, plane_depth
-from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup
 from soup_nlp.model import oracle
-from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.layout import MatrixLayout
+from soup_nlp.pipeline.case import Case
 from soup_nlp.refine.records import Refined
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.stages import Solution
-from soup_nlp.start.given_depth import Given
-from soup_nlp.start.propose import Start
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,17 +46,11 @@ class FullSize:
         return f"FullSize(reference {w}x{h}, next {w2}x{h2})"
 
 
-@dataclass(frozen=True, eq=False)
-class Run:
-    """Inputs and results of a solve.
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Run(Case):
+    """A case with the results of its solve; `soup` is the delivered one.
 
     Attributes:
-        problem: The merged problem.
-        pair: Images, cameras, flow, truth.
-        segmentation: Superpixels and graphs.
-        start: The unorganised soup.
-        data: Numbers of the energy.
-        weights: Constants of the energy.
         solution: Result of the constrained NLP, before any refinement.
         start_reconstruction: Dense 3D of the start.
         reconstruction: Dense 3D of `soup`.
@@ -74,26 +63,18 @@ class Run:
         refined: Result of the refinement of `solution`; None where it is off.
         nlp_reconstruction: Dense 3D of `solution`, where there is an NLP and it was refined.
         full: Depth at the images' own size, where the pair was solved at a smaller one.
-        given: What was made of a depth prior; None without one.
     """
 
-    problem: Problem
-    pair: Pair
-    segmentation: Segmentation
-    start: Start
-    data: EnergyData
-    weights: Weights
     solution: Solution
     start_reconstruction: Reconstruction
     reconstruction: Reconstruction
     rigid: Float | None
-    metrics: Mapping[str, DepthMetrics] = field(repr=False)
+    metrics: Mapping[str, DepthMetrics]
     seconds: Mapping[str, float]
     confidence: Confidence
     refined: Refined | None = None
     nlp_reconstruction: Reconstruction | None = None
     full: FullSize | None = None
-    given: Given | None = None
 
     def __str__(self) -> str:
         h, w = self.pair.size
@@ -146,16 +127,11 @@ class Run:
         return layout.unpack(self.solution.stages[-1].x)
 
     @property
-    def soup(self) -> Soup:
-        """The delivered soup: the refined one, or the NLP's where there is no refinement."""
-        return self.refined.soup if self.refined else self.solution.soup
-
-    @property
     def energy(self) -> Mapping[str, float]:
         """Exact energy E by term of `soup`; E_photo of the refinement is not part of it."""
         if self.refined is None:
             return self.solution.energy
-        return oracle.energy(self.refined.soup, self.data, self.weights)
+        return oracle.energy(self.soup, self.data, self.weights)
 
     @property
     def residuals(self) -> dict[str, float]:

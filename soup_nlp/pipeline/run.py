@@ -191,20 +191,16 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     energy = case.data, case.weights, case.problem.formulation
     sure = confidence(after, pair, case.start, *energy, case.given)
     after = replace(after, sigma_ref=sure.sigma)
-    full = None if case.full is None else full_size(case.full, pair, after)
+    full = None if case.original is None else full_size(case.original, pair, after)
     rigid = rigid_depth(pair) if pair.truth is not None else None
     depths = {"solution": after.depth_ref, "start": before.depth_ref}
     if between is not None:
         depths["nlp"] = between.depth_ref
     if rigid is not None:
         depths["rigid"] = rigid
+    own = vars(case) | {"soup": solution.soup if refined is None else refined.soup}
     return Run(
-        problem=case.problem,
-        pair=pair,
-        segmentation=case.segmentation,
-        start=case.start,
-        data=case.data,
-        weights=case.weights,
+        **own,
         solution=solution,
         start_reconstruction=before,
         reconstruction=after,
@@ -217,7 +213,6 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         refined=refined,
         nlp_reconstruction=between,
         full=full,
-        given=case.given,
     )
 
 

@@ -112,4 +112,4 @@ def test_a_large_pair_comes_back_at_its_size():
     # finer edges lose nothing
     assert done.full.metrics.mre < 1.1 * done.metrics["solution"].mre
     assert "brought to 256x128" in facts(done)
-    assert prepare(make_problem({**settings, "max_size": None})).full is None
+    assert prepare(make_problem({**settings, "max_size": None})).original is None
