@@ -169,6 +169,12 @@ DEPARTURES = (
     Departure(
         "depth prior", ("energy.weights.depth",), needs="a file: without one it has no elements"
     ),
+    Departure(
+        "order by occlusion",
+        ("energy.weights.order",),
+        with_on=_SHARED,
+        needs="on: with the start that finds components",
+    ),
     Departure("borders that follow the flow", ("segmentation.follow_flow_px",)),
     Departure("confidence of the flow", ("flow.consistency",)),
     Departure("flow seen through reflections", ("flow.see_through",)),

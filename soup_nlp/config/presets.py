@@ -53,6 +53,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                     "orient": 0.1,
                     "prior": 0.0,
                     "depth": 0.0,
+                    "order": 0.0,
                     "sigma_cont": 0.02,
                     "sigma_cont_ref": _INF,
                     "sigma_orient": 0.5,

@@ -42,6 +42,8 @@ FLOW_SHARE = 0.01
 CONTACT = 0.2
 """Standard deviation of the log scale of a component by what it stands on or touches, beside that
 of the marginals: what moves need not touch what is below it in the image."""
+COVERING = 0.5
+"""The same for one that is only known to cover what is behind it (`start.occlusion`)."""
 USUAL = 0.5
 """Log ratio of displacements relative to the camera up to which what moves is as fast as usual: see
 docs/confidence.md."""
@@ -207,7 +209,8 @@ def scale_by_contact(
     """(N,) standard deviation of log depth by the scales of components.
 
     That of a component which has its scale from contact is the marginal and `CONTACT`, in squares;
-    one that has it from a depth prior has the prior's.
+    one that has it from a depth prior has the prior's; to one that is placed in front of what it
+    covers `COVERING` is added.
     It also moves the mean of the image, to which all depths refer, by the component's area.
     Where contact makes a component move `log_pace` times as far as the scene does, more than is
     `USUAL`, it may lie anywhere from there to where it moves as far: that ratio is added.
@@ -221,6 +224,7 @@ def scale_by_contact(
     """
     contact = (start.tie != TIES.index("reference")) & (start.tie != FIXED)
     scale = np.where(contact, np.hypot(np.sqrt(own.component)[start.component], CONTACT), 0.0)
+    scale = np.where(start.tie == TIES.index("occlusion"), np.hypot(scale, COVERING), scale)
     if given is not None:
         by_prior = (start.tie == TIES.index("given depth")) & np.isfinite(given.sigma)
         scale = np.where(by_prior, given.sigma, scale)
@@ -272,7 +276,7 @@ def confidence(
         given: A depth prior, a measurement with an error of its own.
     """
     assert pair.flow is not None
-    weak = weights.replace(prior=PRIOR_SHARE * weights.prior, depth=0.0)
+    weak = weights.replace(prior=PRIOR_SHARE * weights.prior, depth=0.0, order=0.0)
     blind = weak.replace(proj=FLOW_SHARE * weights.proj)
     try:
         (own, seen), (without, guessed) = (

@@ -46,7 +46,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
             return np.asarray((1 / A[pairs, 2] ** 4).mean(axis=1) ** -0.25)
         return np.full(len(pairs), scene)
 
-    arap = cont = orient = prior = depth = 0.0
+    arap = cont = orient = prior = depth = order = 0.0
     if len(e["edges"]):
         i, k = e["edges"].T
         length = unit(e["edges"]) * e["edge_unit"]
@@ -86,9 +86,19 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
         cont = float((e["pair_weight"] * gap).sum())
         turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
         orient = float((e["orient_weight"] * np.minimum(turn, w["sigma_orient"])).sum())
+        middle = e["boundary_ray"].mean(axis=1, keepdims=True)
+        rhos = [1 / lift(s, middle, who)[0][:, 0, 2] for who in (i, k)]
+        sign = np.sign(e["order_weight"])
+        behind, front = np.where(sign > 0, rhos, rhos[::-1])
+        near = ((A[i, 2] ** -4 + A[k, 2] ** -4) / 2) ** 0.25
+        lack = ((1 + e["order_step"]) * behind - front) / near
+        hinge = (lack + np.sqrt(lack**2 + 0.01**2)) / 2
+        order = float((sign * e["order_weight"] * hinge).sum())
     terms = {"arap": arap, "proj": proj, "cont": cont, "orient": orient, "prior": prior}
     if e["depth_weight"].any():
         terms["depth"] = depth
+    if e["order_weight"].any():
+        terms["order"] = order
     terms = {name: w[name] * value for name, value in terms.items()}
     return {"total": sum(terms.values()), **terms}
 

@@ -182,6 +182,21 @@ def _depth(data: EnergyData, w: Weights) -> Element:
     return Element(edges, columns, Norms(terms.depth), 2)
 
 
+def _order(data: EnergyData, w: Weights) -> Element:
+    used = np.flatnonzero(data.order_weight)
+    pairs, sign = data.pairs[used], np.sign(data.order_weight[used])
+    # the covered superpixel first
+    pairs = np.where(sign[:, None] > 0, pairs, pairs[:, ::-1])
+    columns = {
+        "weight": w.order * np.abs(data.order_weight[used]),
+        "step": data.order_step[used],
+        "ray": data.boundary_ray[used].mean(axis=1),
+        "ray_i": data.anchor_ray[pairs[:, 0]],
+        "ray_k": data.anchor_ray[pairs[:, 1]],
+    }
+    return Element(pairs, columns, Norms(terms.order), 2)
+
+
 def _orient(data: EnergyData, w: Weights) -> Element:
     truncated = bool(np.isfinite(w.sigma_orient))
     columns = {
@@ -199,5 +214,6 @@ ELEMENTS: Mapping[str, Callable[[EnergyData, Weights], Element]] = {
     "orient": _orient,
     "prior": _prior,
     "depth": _depth,
+    "order": _order,
 }
 """Elements of every term of `energy_data.TERMS`, before they are placed in a layout."""

@@ -14,11 +14,13 @@ from soup_nlp.geometry.graph import Segmentation
 
 PAPER_TERMS = ("arap", "proj", "cont", "orient")
 """The paper's terms, in its order."""
-GIVEN_TERMS = {"depth": "depth_weight"}
+GIVEN_TERMS = {"depth": "depth_weight", "order": "order_weight"}
 """Terms of data that few pairs have, and the weights in `EnergyData` that are 0 without them."""
 TERMS = (*PAPER_TERMS, "prior", *GIVEN_TERMS)
 """All terms of the energy. A term is a key of `Weights` (its factor), of `oracle.ENERGIES` (its
 value) and of `elements.ELEMENTS` (its kernel)."""
+HINGE = 0.01
+"""Width of the corner of the hinge of E_order, relative inverse depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,10 @@ class EnergyData:
             in E_prior: the initialisation's where both ends borrow their depth, else 0.
         depth_weight: (E,) weight of E_depth; 0 without a depth prior, and where it is not reliable.
         depth_change: (E,) difference of log depth along each edge by the depth prior.
+        order_weight: (P,) weight of E_order: positive where the second superpixel of a pair covers
+            the first, negative where the first covers the second, 0 where neither is known.
+        order_step: (P,) difference of inverse depth, relative to that of the covered superpixel, by
+            which the other is at least in front.
         rotation_scale: (E,) factor of |R_i - R_k| (1 in the paper's units, focal in pixel units).
         pairs: (P, 2) neighbours i < k.
         boundary_ray: (P, B, 3) sampled shared boundary points.
@@ -72,6 +78,8 @@ class EnergyData:
     prior_relief: Float
     depth_weight: Float
     depth_change: Float
+    order_weight: Float
+    order_step: Float
     rotation_scale: Float
     pairs: Int
     boundary_ray: Float
@@ -189,6 +197,8 @@ def build_energy_data(
         prior_relief=np.zeros(len(seg.edges)),
         depth_weight=np.zeros(len(seg.edges)),
         depth_change=np.zeros(len(seg.edges)),
+        order_weight=np.zeros(len(seg.pairs)),
+        order_step=np.zeros(len(seg.pairs)),
         rotation_scale=np.ones(len(seg.edges)),
         pairs=seg.pairs,
         boundary_ray=rays(K_ref, seg.boundary),

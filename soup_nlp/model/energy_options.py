@@ -37,6 +37,9 @@ class Weights(Section):
     depth: NonNegative = 10.0
     """Factor of E_depth, differences of log depth from those of a given depth prior in units of its
     error, times the flow's noise: neighbours share most of that error. 0 ignores a prior."""
+    order: NonNegative = 10.0
+    """Factor of E_order, by how much inverse depths along outlines lack the order that occlusion
+    shows, relative to them, times the flow's noise; 0 leaves it out."""
     sigma_cont: Truncation = 1.0
     """Truncation of E_cont's second-frame gap (rho), length."""
     sigma_cont_ref: Truncation = np.inf

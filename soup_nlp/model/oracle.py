@@ -13,7 +13,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_data import HINGE, EnergyData
 from soup_nlp.model.energy_options import Weights
 
 
@@ -133,6 +133,20 @@ def depth(soup: Soup, data: EnergyData, weights: Weights | None = None) -> Float
     return data.depth_weight * np.abs(np.log(Zi / Zk) - data.depth_change)
 
 
+def order(soup: Soup, data: EnergyData, weights: Weights | None = None) -> Float:
+    """(P,) E_order of every neighbour pair: smooth hinge of the inverse depth that the covering
+    superpixel f lacks on the boundary before the covered one b.
+
+    `(x + sqrt(x^2 + HINGE^2)) / 2` with `x = ((1 + step) / Z_b - 1 / Z_f) / m` and m the mean of
+    both anchors' inverse depths that is near the larger.
+    """
+    z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
+    behind, front = np.where(data.order_weight > 0, 1 / z, 1 / z[::-1])
+    near = np.mean(soup.depth_at(data.anchor_ray)[data.pairs] ** -4.0, axis=1) ** 0.25
+    lack = ((1 + data.order_step) * behind - front) / near
+    return np.abs(data.order_weight) * (lack + np.hypot(lack, HINGE)) / 2
+
+
 ENERGIES: Mapping[str, Callable[[Soup, EnergyData, Weights], Float]] = {
     "arap": arap,
     "proj": reprojection,
@@ -140,5 +154,6 @@ ENERGIES: Mapping[str, Callable[[Soup, EnergyData, Weights], Float]] = {
     "orient": orientation,
     "prior": prior,
     "depth": depth,
+    "order": order,
 }
 """Values of every term of `energy_data.TERMS`, without their factors."""

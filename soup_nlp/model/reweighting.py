@@ -13,6 +13,9 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.oracle import relief
 
+STEPS = 0.05, 0.35
+"""Least and largest step of inverse depth that E_order asks for, relative."""
+
 
 def across_components(data: EnergyData, component: Int, factor: float) -> EnergyData:
     """The same data with E_arap and E_prior times `factor` on edges between two components.
@@ -83,6 +86,22 @@ def with_prior(
         prior_weight=(1 - between) * data.prior_weight,
         orient_weight=slopes * data.orient_weight,
     )
+
+
+def with_order(data: EnergyData, soup: Soup, order: Float, weight: float) -> EnergyData:
+    """The same data with E_order where occlusion shows which superpixel of a pair is in front.
+
+    The step that is asked for is that of the start, within `STEPS`.
+
+    Args:
+        data: Data of the pair.
+        soup: Start.
+        order: (P,) probability of the order, signed as `EnergyData.order_weight`.
+        weight: Of a sure order.
+    """
+    z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
+    step = np.where(order > 0, z[0] / z[1], z[1] / z[0]) - 1
+    return replace(data, order_weight=weight * order, order_step=np.clip(step, *STEPS))
 
 
 def in_noise(data: EnergyData, noise: float) -> EnergyData:

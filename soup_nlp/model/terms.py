@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import casadi as ca
 
+from soup_nlp.model.energy_data import HINGE
 from soup_nlp.model.norms import Norm
 from soup_nlp.model.superpixel import View
 
@@ -118,6 +119,15 @@ def depth(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     """E_depth of an edge: difference of the anchors' log depths from that of a depth prior."""
     Za, Zb = a.anchor(row["ray_i"])[2], b.anchor(row["ray_k"])[2]
     return [Norm("given", row["weight"], ca.log(Za / Zb) - row["change"], eps)]
+
+
+def order(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
+    """E_order of a neighbour pair whose second superpixel covers the first: smooth hinge of what
+    its inverse depth lacks on their boundary, relative to the anchors'."""
+    near = _nearness(a.anchor(row["ray_i"]), b.anchor(row["ray_k"]))
+    behind, front = 1 / a.point(row["ray"])[2], 1 / b.point(row["ray"])[2]
+    lack = ((1 + row["step"]) * behind - front) / near
+    return [Norm("order", row["weight"], (lack + ca.sqrt(lack**2 + HINGE**2)) / 2, eps)]
 
 
 def so3(a: View) -> ca.SX:

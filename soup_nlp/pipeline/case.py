@@ -36,6 +36,7 @@ from soup_nlp.model.reweighting import (
     in_noise,
     in_pixels,
     over_ground,
+    with_order,
     with_prior,
     within_bending,
     without_flow,
@@ -45,6 +46,7 @@ from soup_nlp.pipeline.still_layer import see_through
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.given_depth import Given, by_prior
+from soup_nlp.start.occlusion import in_order
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.storage.memory import require_memory
@@ -150,6 +152,8 @@ def prepare(
     done("segmentation", seg)
     options = SeededStart(**dict(problem.start), seed=problem.seed)
     start, given = propose(seg, flow, pair.K_ref, pair.K_next, options), None
+    if problem.energy.weights.order > 0:
+        start = in_order(start, seg, pair, options)
     if pair.depth_prior is not None and problem.energy.weights.depth > 0:
         start, given = by_prior(start, seg, pair, problem.depth_prior.kind, options)
         if log:
@@ -244,6 +248,8 @@ def build_energy(
     data = across_components(data, start.component, e.arap_across)
     data = over_ground(data, start.soup, start.grounded, PRIOR_OVER_GROUND * free)
     parts = start.component
+    if start.order is not None:
+        data = with_order(data, start.soup, start.order, start.noise)
     if given is not None and given.used:
         # no flow holds slopes where the prior decides: they are held as those that bend
         stiffer = np.where(bends, 1.0, bent.orient / max(e.weights.orient, 1e-12))
@@ -253,7 +259,8 @@ def build_energy(
         parts = np.arange(len(seg))
     data = at_occlusions(data, start.soup, parts, OCCLUSION_GAP, e.cont_occluded)
     if whole:
-        data = across_discontinuities(data, start.surface, **ACROSS_DISCONTINUITIES)
+        apart = start.surface * (int(start.component.max()) + 1) + start.component
+        data = across_discontinuities(data, apart, **ACROSS_DISCONTINUITIES)
     if e.units == "pixel":
         rotation = BENDING_ROTATION_PX if whole else e.rotation_px
         data = in_pixels(data, start.soup, seg, rotation)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_data import HINGE, EnergyData
 from soup_nlp.model.energy_options import Weights
 
 BLOCK_BYTES = 1 << 18  # one of the half dozen buffers of a block of edges
@@ -247,7 +247,23 @@ class PairCosts:
         np.minimum(x, w.sigma_orient, out=x)
         x *= s.factor(w.orient * d.orient_weight[rows])
         total += x
+        if d.order_weight[rows].any():
+            total += self._order(s, rows, x)
         return total
+
+    def _order(self, s: _State, rows: Int, out: Floats) -> Floats:
+        d = self.data
+        i, k = d.pairs[rows].T
+        ray, sign = d.boundary_ray[rows].mean(axis=1), np.sign(d.order_weight[rows])
+        # larger by the step where it is covered
+        more = [s.factor(np.where(sign * one > 0, 1 + d.order_step[rows], 1.0)) for one in (1, -1)]
+        rho_i, rho_k = (s.inverse_along(who, ray).astype(s.dtype) for who in (i, k))
+        lack = rho_i[:, :, None] * more[0] - rho_k[:, None, :] * more[1]
+        lack *= s.factor(sign)
+        lack /= _nearness(s, i, k, out)
+        lack += np.hypot(lack, HINGE)
+        lack *= s.factor(0.5 * self.weights.order * np.abs(d.order_weight[rows]))
+        return lack
 
 
 def _leaky(y: Floats, sigma: float, leak: float) -> Floats:
@@ -286,6 +302,11 @@ class _State:
     def factor(self, values: Float) -> Floats:
         """Numbers of the edges of a block, (b, 1, 1)."""
         return values.astype(self.dtype)[:, None, None]
+
+    def inverse_along(self, who: Int, ray: Float) -> Float:
+        """(b, L) inverse depths along one ray (b, 3) each."""
+        (*n, D) = self.plane[:, who]
+        return np.asarray(-sum(n[c] * ray[:, c, None] for c in range(3)) / D)
 
     def boundary(self, who: Int, ray: Float) -> tuple[Floats, Floats]:
         """Distances along boundary rays (b, B, 3), and next-frame points.

@@ -53,6 +53,8 @@ energy/prior_weight       1     E       weight of E_prior: flow noise / K for ea
 energy/prior_relief       1     E       relative difference of 1/z that costs nothing in E_prior
 energy/depth_weight       1     E       weight of E_depth, 0 without a depth prior
 energy/depth_change       1     E       difference of log depth by the depth prior
+energy/order_weight       1     P       weight of E_order, > 0 where the second covers the first
+energy/order_step         1     P       relative step of inverse depth that E_order asks for
 energy/edge_unit          1     E       length unit of an edge, see local_units
 energy/rotation_scale     1     E       factor of |R_i - R_k|
 energy/pairs              1     P,2     neighbours i < k that share boundary
@@ -87,7 +89,8 @@ start/part                1     N       what moves as one: its component, or the
 without usable flow
 start/surface             1     N       region without a flow discontinuity
 start/tie                 1     N       what gives its component a scale: 0 largest, \
-1 contact below, 2 outline, 3 cut off below, 4 nothing, 5 ground, 6 fixed in image, 7 given depth
+1 contact below, 2 outline, 3 cut off below, 4 nothing, 5 ground, 6 fixed in image, \
+7 given depth, 8 occlusion
 start/bends               1     N       in a region with the energy for surfaces that bend
 start/bending             1     -       a region bends
 start/at_rest             1     -       the camera is taken to be at rest, or to turn only

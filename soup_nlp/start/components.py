@@ -87,12 +87,14 @@ TIES = (
     "ground",
     "fixed in the image",
     "given depth",
+    "occlusion",
 )
 """What gives a component its scale. reference: it is the largest component and defines the scale.
 contact below: it stands on its lower neighbours. outline: it touches its neighbours. cut off below:
 the lower image border hides what it stands on. nothing: it has no neighbour with a scale. ground:
 it was lifted to the ground. fixed in the image: it stands still there, though the camera moves,
-and is placed by its outline. given depth: a depth prior says it."""
+and is placed by its outline. given depth: a depth prior says it. occlusion: it covers what is
+behind it, and is placed in front of it by a guess."""
 FIXED = TIES.index("fixed in the image")
 UNSUPPORTED = 1e-6
 """Added to the placed share of a component's support, so that the longest contact goes first where

@@ -77,6 +77,9 @@ class Start:
             wrong.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
         noise: Noise of the flow, pixels, see `limited_noise`.
+        order: (P,) probability that the second superpixel of a neighbour pair covers the first one,
+            negative if the first covers the second, 0 where neither is known (`start.occlusion`);
+            None where nothing is known.
     """
 
     soup: Soup
@@ -94,6 +97,7 @@ class Start:
     wrong: Mask
     at_rest: bool = False
     noise: float = LEAST_NOISE
+    order: Float | None = None
 
     def __str__(self) -> str:
         return (

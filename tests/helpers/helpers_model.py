@@ -45,6 +45,7 @@ PAPER = Weights(
     orient=0.9,
     prior=0.6,
     depth=0.8,
+    order=0.5,
     sigma_cont=0.4,
     sigma_cont_ref=np.inf,
     sigma_orient=0.05,
@@ -128,6 +129,10 @@ class Tiny:
         # and a depth prior knows two of three
         change, known = np.log(rng.uniform(0.7, 1.4, len(relief))), rng.random(len(relief)) < 0.7
         given = {"depth_weight": 0.4 * known, "depth_change": change}
+        # occlusion tells the order of two of three pairs
+        pairs = len(self.data.pairs)
+        given["order_weight"] = rng.choice([-0.7, 0.0, 1.0], pairs)
+        given["order_step"] = rng.uniform(0.0, 0.4, pairs)
         self.data = replace(self.data, prior_relief=relief, **given)
         if units == "pixels":
             self.data = in_pixels(self.data, self.soup, self.seg)

@@ -27,7 +27,12 @@ from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
-from soup_nlp.model.energy_data import EnergyData, build_energy_data, sample_pixels
+from soup_nlp.model.energy_data import (
+    HINGE,
+    EnergyData,
+    build_energy_data,
+    sample_pixels,
+)
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.reweighting import (
@@ -107,6 +112,7 @@ def test_the_order_of_the_superpixels_does_not_matter():
     data = build_energy_data(seg, problem.flow, K_REF, K_NEXT, 3, 0)
     none = 0 * problem.data.prior_relief
     s, own = problem.soup, replace(problem.data, prior_relief=none, depth_weight=none)
+    own = replace(own, order_weight=0 * own.order_weight)
     soup = Soup(s.lam[order], s.n[order], s.d[order], s.R[order], s.t[order])
     np.testing.assert_allclose(energies(soup, data, weights), energies(s, own, weights), rtol=1e-12)
 
@@ -158,6 +164,16 @@ def test_two_superpixels_by_hand():
     w4 = 2 * 4  # one colour: four neighbours, both directions
     assert e["cont"] == pytest.approx(w4 * (gap + min(after, 0.2)))
     assert e["orient"] == 0
+    assert "order" not in e
+    # the second covers the first, by 20 %: its inverse depth lacks 1.2 - 1/3; then the other way
+    near = ((1 + 3.0**-4) / 2) ** 0.25
+    for sign, lack in ((1.0, 1.2 - 1 / 3), (-1.0, 1.2 / 3 - 1.0)):
+        ordered = replace(data, order_weight=np.array([0.5 * sign]), order_step=np.array([0.2]))
+        x = lack / near
+        hinge = (x + np.hypot(x, HINGE)) / 2
+        assert (hinge > 0.1) == (sign > 0)
+        priced = oracle.energy(soup, ordered, w.replace(order=3))["order"]
+        assert priced == pytest.approx(3 * 0.5 * hinge)
 
 
 def test_pixel_units_by_hand():

@@ -116,7 +116,7 @@ def test_sizes_are_those_of_the_formulation():
     assert other.sizes()["equalities"] == 8 * n + 2
     slack, _ = problem.nlp(weights_for("paper"), form(norm="epigraph"))
     e, p, pixels = len(problem.seg.edges), len(problem.seg.pairs), problem.data.pixel_weight
-    given = int((problem.data.depth_weight > 0).sum())
+    given = int((problem.data.depth_weight > 0).sum() + (problem.data.order_weight != 0).sum())
     norms = 4 * e + given + 2 * p + int((pixels > 0).sum())
     # orientation has no epigraph (a square is smooth)
     assert slack.sizes()["variables"] == 16 * n + norms

@@ -388,6 +388,8 @@ def test_few_particles_and_isolated_superpixels_work(particles):
                 "pair_factor",
                 "pair_unit",
                 "orient_weight",
+                "order_weight",
+                "order_step",
             )
         },
     )

@@ -104,6 +104,8 @@ def test_every_entry_is_the_energy_of_its_pair():
                     "pair_factor",
                     "pair_unit",
                     "orient_weight",
+                    "order_weight",
+                    "order_step",
                 )
             },
         )
@@ -120,8 +122,8 @@ def test_alike_motions_and_planes_cost_exactly_nothing():
     one = Particles.of(tiny.soup)
     n = len(tiny.soup)
     same = Particles(*(np.repeat(v[:1], n, axis=0) for v in (one.n, one.D, one.R, one.T)))
-    # their anchors differ in depth
-    weights = weights_for("pixels").replace(prior=0.0, depth=0.0)
+    # their anchors differ in depth, and none is in front
+    weights = weights_for("pixels").replace(prior=0.0, depth=0.0, order=0.0)
     table = PairCosts(tiny.data, weights).tables(same.joined(one))
     # rotation, translation, gaps and turn vanish; the distances are kept up to rounding
     assert np.abs(table[:, 0, 0]).max() < 1e-12 * table.max()
@@ -258,7 +260,7 @@ def test_no_particle_runs_away_but_the_current_one_may_stay():
 
 def test_turns_between_neighbours_count_in_both_directions():
     problem = Tiny("pixels", samples=None)
-    names = ("arap", "proj", "cont", "prior", "depth")
+    names = ("arap", "proj", "cont", "prior", "depth", "order")
     weights = weights_for("pixels", False).replace(**dict.fromkeys(names, 0.0), orient=1.0)
     costs = PairCosts(problem.data, weights)
     found = costs.tables(Particles.of(problem.soup))[:, 0, 0].sum()

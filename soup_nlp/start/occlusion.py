@@ -1,0 +1,260 @@
+"""Which side of an outline covers the other, and components placed in that order.
+
+Where two regions move differently, one covers the other along their outline. If they close in on
+each other, pixels of the farther region are covered in the next frame: followed with the flow of
+their own region they do not look as before. If they part, what appears between them belongs to the
+farther region, and looks like the pixels of that region beside the outline.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from soup_nlp.arrays import Float, Image, Int, Mask
+from soup_nlp.data.pair import Pair
+from soup_nlp.geometry.camera import rays
+from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.start.bending import affine_flow, fit_turn, flow_jump
+from soup_nlp.start.components import FIXED, TIES, connected_labels, depth_from_inside, quantile
+from soup_nlp.start.propose import Start, look
+from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import Views
+
+WIDEST = 8
+"""Largest width of a strip beside an outline, pixels."""
+FEWEST = 3
+"""Least number of pixels of a strip."""
+CLOSING_PX = 1.0
+"""Least speed at which two regions close in on each other or part, pixels per frame."""
+CONTRAST = 8.0
+"""Difference of the mean costs of both strips from which it tells the order, grey levels."""
+MOST_GREY = 40.0
+"""Limit of the cost of a pixel, grey levels."""
+SURE = 0.8
+"""Probability from which the order along an outline counts."""
+LEAST_STEP, IN_FRONT = 0.1, 0.35
+"""Median step of log depth along the outline of a region in order: below the first the order does
+not hold, and the region is placed so that the step is the second, a guess. True steps along such
+outlines have medians of 0.2 to 1.9."""
+
+
+def covering(seg: Segmentation, pair: Pair, views: Views, affine: Float, jump: Float) -> Float:
+    """(P,) contrast in grey levels of every neighbour pair: positive where the second covers.
+
+    It is 0 without a flow discontinuity, and where too little is visible. With a strip S of each
+    superpixel along the boundary, the affine flow u of that superpixel, and the speed
+    `v = (u_i - u_k) . n` at which the boundary closes (n points from i to k), it is
+
+        v > 1 px:   c_i - c_k   with  c = mean over x in S of |I_ref(x) - I_next(x + u(x))|
+        v < -1 px:  c_k - c_i   with  c = mean over y in G of min over x in S |I_next(y) - I_ref(x)|
+
+    where G is what lies between the boundary moved by u_i and moved by u_k in the next frame.
+
+    Args:
+        seg: Superpixels and graphs.
+        pair: Images and cameras.
+        views: Anchors and radii of every superpixel.
+        affine: (N, 3, 2) flow of every superpixel, see `affine_flow`.
+        jump: (P,) jump of the flow on every boundary, pixels.
+    """
+    out = np.zeros(len(seg.pairs))
+    rows = np.flatnonzero(jump >= CLOSING_PX)
+    if not len(rows):
+        return out
+    blurred = [
+        cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8)
+        for image in (pair.image_ref, pair.image_next)
+    ]
+    ends, edge = seg.pairs[rows], seg.boundary[rows]
+    normal = _normals(edge, seg.anchors[ends[:, 1]] - seg.anchors[ends[:, 0]])
+
+    def target(who: Int, at: Float) -> Float:
+        # (M, ..., 2) pixels of the next frame, by the affine flow of superpixels (M,)
+        wide = (slice(None), *(None,) * (at.ndim - 2))
+        off = (rays(pair.K_ref, at) - views.anchor[who][wide])[..., :2]
+        off = off / views.radius[who][(*wide, None)]
+        return affine[who, 0][wide] + np.einsum("m...c,mcd->m...d", off, affine[who, 1:]) + centre
+
+    centre = pair.K_next[:2, 2]
+    landed = [target(ends[:, e], edge) for e in (0, 1)]
+    closing = np.einsum("mbc,mc->mb", landed[0] - landed[1], normal).mean(axis=1)
+    step = np.arange(1.0, WIDEST + 1)
+    inside = step <= np.clip(np.abs(closing) + 1.5, 2, WIDEST)[:, None, None]
+    share = (np.arange(WIDEST) + 0.5)[:, None] / WIDEST
+    between = landed[0][:, :, None] + (landed[1] - landed[0])[:, :, None] * share
+    gap = _flat(_look_up(blurred[1], between))
+    there = _within(between, pair.image_next).reshape(len(rows), -1)
+    covered, alike = np.full((2, len(rows), 2), np.nan)
+    for e, side in ((0, -1.0), (1, 1.0)):
+        at = edge[:, :, None] + side * normal[:, None, None] * step[:, None]
+        own = _within(at, pair.image_ref) & inside
+        own[own] &= (
+            seg.labels[tuple(np.rint(at[own]).astype(int).T[::-1])]
+            == np.broadcast_to(ends[:, e, None, None], own.shape)[own]
+        )
+        colour, after = _look_up(blurred[0], at), target(ends[:, e], at)
+        change = np.abs(colour - _look_up(blurred[1], after)).mean(axis=-1)
+        covered[:, e] = _mean(change, own & _within(after, pair.image_next))
+        off = np.abs(gap[:, :, None] - _flat(colour)[:, None]).mean(axis=-1)
+        nearest = np.where(own.reshape(len(own), 1, -1), off, MOST_GREY).min(axis=2)
+        enough = there & (own.sum(axis=(1, 2)) >= FEWEST)[:, None]
+        alike[:, e] = _mean(nearest, enough)
+    contrast = np.where(closing > 0, covered @ [1.0, -1.0], alike @ [-1.0, 1.0])
+    out[rows] = np.where(np.abs(closing) > CLOSING_PX, np.nan_to_num(contrast), 0.0)
+    return out
+
+
+def _normals(edge: Float, way: Float) -> Float:
+    """(M, 2) normals of boundaries (M, B, 2) that point along `way` (M, 2)."""
+    off = edge - edge.mean(axis=1, keepdims=True)
+    (xx, xy), (_, yy) = np.moveaxis(np.einsum("mbi,mbj->mij", off, off), 0, -1)
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+    normal = np.where((xx + yy < 1)[:, None], way, np.stack([-np.sin(angle), np.cos(angle)], 1))
+    normal = normal * np.where(np.sum(normal * way, axis=1) < 0, -1.0, 1.0)[:, None]
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def _look_up(image: Image, at: Float) -> Float:
+    """(M, B, T, 3) values of an image between its pixels, at (M, B, T, 2)."""
+    u, v = np.moveaxis(at.astype(np.float32).reshape(len(at), -1, 2), -1, 0)
+    found = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found.reshape(*at.shape[:-1], -1), float)
+
+
+def _within(at: Float, image: Image) -> Mask:
+    """Whether pixels (..., 2) lie in an image."""
+    return np.asarray(((at >= 0) & (at <= np.array(image.shape[1::-1]) - 1.0)).all(axis=-1))
+
+
+def _flat(values: Float) -> Float:
+    """(M, B T, C) of (M, B, T, C)."""
+    return values.reshape(len(values), -1, values.shape[-1])
+
+
+def _mean(cost: Float, used: Mask) -> Float:
+    """(M,) mean of limited costs where they are used; NaN for too few."""
+    cost = np.minimum(cost, MOST_GREY).reshape(len(cost), -1)
+    used = used.reshape(len(used), -1)
+    count = used.sum(axis=1)
+    return np.where(count >= FEWEST, (cost * used).sum(axis=1) / np.maximum(count, 1), np.nan)
+
+
+def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
+    """(P,) probability that the order of a pair is right, positive where the second covers, else 0.
+
+    All pairs along the outline of two regions have one order, that of the majority of the pairs
+    that tell one. With m of n votes for it the probability is `(m + 1) / (n + 2)`. Pairs that say
+    otherwise, or nothing, and outlines of a probability up to `SURE`, are left out.
+
+    Args:
+        contrast: (P,) see `covering`.
+        region: (N,) region of every superpixel.
+        seg: Superpixels and graphs.
+    """
+    ends = region[seg.pairs]
+    a, b = ends.min(axis=1), ends.max(axis=1)
+    turned = np.where(ends[:, 0] == a, 1.0, -1.0)
+    says = np.where((a != b) & (np.abs(contrast) > CONTRAST), np.sign(contrast) * turned, 0.0)
+    outline = np.unique(a * (int(region.max()) + 1) + b, return_inverse=True)[1].ravel()
+    total = np.bincount(outline, np.abs(says))
+    lead = np.bincount(outline, says)
+    sure = ((total + np.abs(lead)) / 2 + 1) / (total + 2)
+    holds = (says * lead[outline] > 0) & (sure[outline] > SURE)
+    return np.where(holds, says * turned * sure[outline], 0.0)
+
+
+def in_order(start: Start, seg: Segmentation, pair: Pair, o: SeededStart) -> Start:
+    """The start with its components in the order that their outlines show.
+
+    Only scales that neither flow nor parallax determines change. A region before a camera at rest,
+    or one that bends, becomes a component of its own if it is placed.
+
+    Args:
+        start: Start without it.
+        seg: Superpixels and graphs.
+        pair: Images, cameras and flow.
+        o: Numbers of samples, seed.
+    """
+    assert pair.flow is not None
+    views, _ = look(seg, pair.flow, pair.K_ref, pair.K_next, o)
+    affine, _ = affine_flow(views)
+    jump = flow_jump(affine, views, seg.pairs, rays(pair.K_ref, seg.boundary))
+    region = regions(start, views, jump, seg, o)
+    order = vote(covering(seg, pair, views, affine, jump), region, seg)
+    if not order.any():
+        return start
+    factor = placed(start.soup, region, order, start.tie == FIXED, seg, pair.K_ref)
+    moved = factor != 1
+    soup = replace(start.soup, lam=start.soup.lam * factor).normalised()
+    tie = np.where(moved, TIES.index("occlusion"), start.tie)
+    own = np.where(moved & start.bends, len(seg) + region, start.component)
+    component = np.unique(own, return_inverse=True)[1].ravel()
+    part = np.where(start.bends.all(), component, start.part)
+    return replace(start, soup=soup, tie=tie, component=component, part=part, order=order)
+
+
+def regions(start: Start, views: Views, jump: Float, seg: Segmentation, o: SeededStart) -> Int:
+    """(N,) what has one scale by the flow: rigid components; surfaces where these bend.
+
+    Before a camera at rest these are what does not move, and each connected piece of the rest.
+    """
+    if not start.at_rest:
+        return np.where(start.bends, len(seg) + start.surface, start.component)
+    still = fit_turn(views)[1] < o.discontinuity_px
+    i, k = seg.pairs.T
+    alike = (still[i] == still[k]) & (jump < o.discontinuity_px)
+    return np.where(still, 0, 1 + connected_labels(alike, seg))
+
+
+def placed(
+    soup: Soup, region: Int, order: Float, fixed: Mask, seg: Segmentation, K_ref: Float
+) -> Float:
+    """(N,) factor of the scale of every superpixel, with which regions are in order.
+
+    The largest region stays, and so does what is fixed in the image. The others follow one after
+    the other, the one with the most votes against placed regions first. Where the median step of
+    log depth along its outlines is below `LEAST_STEP`, it comes nearer or recedes until it is
+    `IN_FRONT`. A region without an order moves with the one that it touches most.
+
+    Args:
+        soup: Planes.
+        region: (N,) region of every superpixel.
+        order: (P,) see `vote`.
+        fixed: (N,) True where a superpixel stays.
+        seg: Superpixels and graphs.
+        K_ref: (3, 3) intrinsics of the reference frame.
+    """
+    region = np.unique(region, return_inverse=True)[1].ravel()
+    count = int(region.max()) + 1
+    shift, done = np.zeros(count), np.zeros(count, bool)
+    done[[np.argmax(np.bincount(region)), *region[fixed]]] = True
+    across = region[seg.pairs[:, 0]] != region[seg.pairs[:, 1]]
+    ends, says = region[seg.pairs[across]], order[across]
+    a, b = np.concatenate([ends, ends[:, ::-1]]).T
+    behind = np.concatenate([says, -says])
+    step = np.log(depth_from_inside(soup, region, seg, K_ref))
+    step = np.concatenate([step[0] - step[1], step[1] - step[0]])
+    length = np.tile(seg.boundary_length[across], 2).astype(float)
+    touch = np.zeros((count, count))
+    np.add.at(touch, (a, b), length)
+    free = np.ones(count, bool)
+    free[a[behind != 0]] = False
+    while (use := ~done[a] & done[b] & (behind != 0)).any():
+        c = int(np.argmax(np.bincount(a[use], np.abs(behind[use]), minlength=count)))
+        # by how much it recedes, as a region that is covered and as one that covers
+        lacks = []
+        for sign in (1.0, -1.0):
+            some = use & (a == c) & (sign * behind > 0)
+            now = sign * (step - shift[b])[some]
+            gap = quantile(now, length[some], 0.5) if some.any() else IN_FRONT
+            lacks.append(sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0)
+        # no scale is right for both
+        shift[c] = sum(lacks) if min(map(abs, lacks)) == 0 else 0.0
+        done[c] = True
+    follows = free & ~done & (touch.max(axis=1) > 0)
+    shift[follows] = shift[np.argmax(touch, axis=1)[follows]]
+    return np.exp(shift)[region]

@@ -1,0 +1,191 @@
+"""Which side of an outline covers the other, and what is placed in that order."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.flow.sources import flow_from_truth
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.evaluate.confidence import MOST_SIGMA
+from soup_nlp.geometry import camera
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.superpixels import segment
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.run import run
+from soup_nlp.solve.stages import solve_soup
+from soup_nlp.start.bending import affine_flow, flow_jump
+from soup_nlp.start.components import TIES
+from soup_nlp.start.occlusion import IN_FRONT, SURE, covering, in_order, vote
+from soup_nlp.start.propose import look, propose
+from soup_nlp.start.start_options import SeededStart
+
+HEIGHT, WIDTH, CELL = 96, 128, 16
+K = camera.intrinsics(120.0, 120.0, 63.5, 47.5)
+SHIFT = 5
+"""By which parts of an image move, pixels."""
+
+
+def textured(seed: int) -> np.ndarray:
+    """(H, W, 3) noise, grey levels; two seeds differ in their mean."""
+    rng = np.random.default_rng(seed)
+    return (60 + 90 * (seed % 2) + rng.integers(0, 60, (HEIGHT, WIDTH, 3))).astype(np.uint8)
+
+
+def sliding(covers: bool) -> tuple[Pair, Segmentation]:
+    """Two parts of 3 x 2 cells that approach each other before a wall, or behind holes in it."""
+    labels = np.arange(HEIGHT * WIDTH // CELL**2, dtype=np.int32)
+    labels = np.kron(labels.reshape(HEIGHT // CELL, WIDTH // CELL), np.ones((CELL, CELL), np.int32))
+    wall, inside = textured(0), textured(1)
+    before, after, uv = wall.copy(), wall.copy(), np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    for left, shift in ((CELL, SHIFT), (5 * CELL, -SHIFT)):
+        part = np.zeros((HEIGHT, WIDTH), bool)
+        part[CELL : 4 * CELL, left : left + 2 * CELL] = True
+        before[part], uv[part] = inside[part], (shift, 0)
+        seen = np.roll(part, shift, axis=1) if covers else part
+        after[seen] = np.roll(inside, shift, axis=1)[seen]
+    flow = Flow(uv, np.ones((HEIGHT, WIDTH), np.float32), "made")
+    pair = Pair(before, after, K, K).with_flow(flow)
+    return pair, build_segmentation(labels, before)
+
+
+def contrasts(pair: Pair, seg: Segmentation) -> np.ndarray:
+    views, _ = look(seg, pair.flow, K, K, SeededStart())
+    affine, _ = affine_flow(views)
+    jump = flow_jump(affine, views, seg.pairs, camera.rays(K, seg.boundary))
+    return covering(seg, pair, views, affine, jump)
+
+
+@pytest.mark.parametrize("covers", [True, False])
+def test_the_side_that_loses_or_gains_pixels_is_behind(covers):
+    pair, seg = sliding(covers)
+    contrast = contrasts(pair, seg)
+    moves = pair.flow.uv[..., 0].ravel()[np.unique(seg.labels, return_index=True)[1]] != 0
+    i, k = seg.pairs.T
+    # upper and lower edges slide along each other: neither closes nor opens
+    upright = (moves[i] != moves[k]) & (np.ptp(seg.boundary[..., 0], axis=1) < 1)
+    assert upright.sum() == 12
+    assert not contrast[~upright].any()
+    front = np.where(covers, moves, ~moves)
+    assert (np.sign(contrast[upright]) == np.where(front[k], 1, -1)[upright]).all()
+    assert np.abs(contrast[upright]).min() > 8
+    order = vote(contrast, moves.astype(int), seg)
+    np.testing.assert_allclose(np.abs(order[upright]), 13 / 14)
+
+
+def test_a_vote_needs_several_strips_and_agreement():
+    _, seg = sliding(True)
+    region = (seg.anchors[:, 0] > WIDTH / 2).astype(int)
+    across = np.flatnonzero(region[seg.pairs[:, 0]] != region[seg.pairs[:, 1]])
+    assert len(across) == 6
+    says = np.zeros(len(seg.pairs))
+    says[across[:3]] = 20.0
+    assert not vote(says, region, seg).any()
+    says[across[:5]] = 20.0
+    np.testing.assert_allclose(vote(says, region, seg)[across[:5]], 6 / 7)
+    says[across[5]] = -20.0
+    assert SURE > 6 / 8
+    assert not vote(says, region, seg).any()
+    # inside a region, parallax orders depth
+    assert not vote(np.full(len(seg.pairs), 20.0), 0 * region, seg).any()
+
+
+@pytest.mark.parametrize("covers", [True, False])
+def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
+    pair, seg = sliding(covers)
+    before = propose(seg, pair.flow, K, K, SeededStart())
+    start = in_order(before, seg, pair, SeededStart())
+    assert before.at_rest
+    z = np.log(start.soup.depth_at(camera.rays(K, seg.anchors)))
+    moves = start.tie == TIES.index("occlusion")
+    assert moves.sum() == 12
+    step = np.median(z[~moves]) - np.median(z[moves])
+    assert step == pytest.approx(IN_FRONT if covers else -IN_FRONT, rel=1e-6)
+    # the flow is explained as before, and the mover is a component
+    np.testing.assert_allclose(start.error, before.error)
+    np.testing.assert_allclose(
+        start.soup.homographies(K, K), before.soup.homographies(K, K), atol=1e-9
+    )
+    assert len(np.unique(start.component)) == 3
+
+
+@pytest.fixture(scope="module")
+def swing() -> tuple[Pair, Segmentation]:
+    pair = render_scene("swing", 1, 320, 240)
+    return pair.with_flow(flow_from_truth(pair)), build_segmentation(
+        segment(pair.image_ref, 150), pair.image_ref
+    )
+
+
+def test_what_swings_comes_before_the_wall(swing):
+    pair, seg = swing
+    before = propose(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
+    start = in_order(before, seg, pair, SeededStart())
+    u, v = np.rint(seg.anchors).astype(int).T
+    truth = np.log(pair.truth.depth_ref[v, u])
+    known = start.order != 0
+    i, k = np.where(start.order > 0, seg.pairs.T, seg.pairs.T[::-1])[:, known]
+    assert known.sum() > 10
+    assert np.mean(truth[i] > truth[k]) > 0.9
+
+    def right(s) -> float:
+        z = s.soup.depth_at(camera.rays(pair.K_ref, seg.anchors))
+        return float(np.mean(z[i] > z[k]))
+
+    assert right(start) > right(before) + 0.2
+    # what parallax determines keeps its shape
+    main = start.component == np.argmax(np.bincount(start.component))
+    ratio = start.soup.distance[main] / before.soup.distance[main]
+    np.testing.assert_allclose(ratio, ratio[0])
+    assert not (start.tie[main] == TIES.index("occlusion")).any()
+
+
+def test_an_image_without_discontinuities_keeps_its_start(swing):
+    pair, seg = swing
+    still = pair.with_flow(Flow(0 * pair.flow.uv, pair.flow.confidence, "zero"))
+    start = propose(seg, still.flow, pair.K_ref, pair.K_next, SeededStart())
+    assert in_order(start, seg, still, SeededStart()) is start
+
+
+OPTIONS = ("segmentation.superpixels=48", "segmentation.neighbours=6", "refine.enabled=false")
+
+
+def made(covers: bool, *options: str):
+    pair, _ = sliding(covers)
+    raw = {"name": "sliding", "input": {"kind": "scene", "scene": "swing"}}
+    problem = make_problem(raw, [*OPTIONS, "segmentation.method=grid", *options], where="test")
+    return problem, pair
+
+
+@pytest.mark.parametrize("covers", [True, False])
+def test_the_nlp_keeps_the_order_and_marks_it_a_guess(covers):
+    problem, pair = made(covers)
+    case = prepare(problem, pair=pair)
+    assert (case.start.tie == TIES.index("occlusion")).any()
+    done = run(problem, pair=pair)
+    known = case.start.order != 0
+    z = done.soup.depth_across(done.segmentation.pairs, case.data.boundary_ray.mean(axis=1))
+    step = (np.log(z[0] / z[1]) * np.sign(case.start.order))[known]
+    assert np.median(step) > 0.2
+    assert done.energy["order"] >= 0
+    assert (done.reconstruction.sigma_ref > MOST_SIGMA).all()
+
+
+def test_without_its_factor_nothing_is_placed_and_no_term_is_left():
+    problem, pair = made(True, "energy.weights.order=0")
+    case = prepare(problem, pair=pair)
+    assert case.start.order is None
+    assert not case.data.order_weight.any()
+    answer = solve_soup(case.start.soup, case.data, case.weights, case.formulation(), case.options)
+    assert "order" not in answer.energy
+
+
+def test_the_preset_of_the_paper_has_no_order():
+    problem = make_problem(
+        {"name": "p", "preset": "paper", "input": {"kind": "scene", "scene": "swing"}},
+        [],
+        where="t",
+    )
+    assert problem.energy.weights.order == 0
