@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from soup_nlp.config.problem import Problem, make_problem
-from soup_nlp.data.datasets.sintel import DEFAULT_SCENE
+from soup_nlp.data.datasets.benchmarks import DEFAULT_SCENE
 from soup_nlp.data.scenes.everyday import LAYOUTS
 from soup_nlp.storage.files import is_folder
 

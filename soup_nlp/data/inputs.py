@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from soup_nlp.data.datasets.driving import load_kitti, load_vkitti
-from soup_nlp.data.datasets.folders import load_folder, load_motorcycle, load_tum
-from soup_nlp.data.datasets.layout import make_pair
-from soup_nlp.data.datasets.sintel import load_sintel
+from soup_nlp.data.datasets.benchmarks import KittiInput, SintelInput, VkittiInput
+from soup_nlp.data.datasets.folders import FolderInput, MotorcycleInput, TumInput
+from soup_nlp.data.datasets.layout import FramesInput, PairInput, Resolve, make_pair
 from soup_nlp.data.formats.camera_files import read_camera, read_intrinsics
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Float, Pair, Truth
@@ -23,38 +20,9 @@ from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.limits import MAX_SIDE
-from soup_nlp.schema.section import Finite, Index, Positive, Section, Seed, Whole
+from soup_nlp.schema.section import Finite, Index, Positive, Seed
 
-Resolve = Callable[[str], Path]
-"""Full path of a name in the problem file."""
 Camera = Annotated[list[Finite], Field(min_length=4, max_length=4)]
-White = Annotated[int, Field(ge=1, le=65535)]
-
-
-class PairInput(Section, ABC):
-    """Base of every kind of input."""
-
-    @abstractmethod
-    def load(self, path: Resolve) -> Pair:
-        """The pair, without its flow; `path` resolves the names of files."""
-
-    def files(self) -> list[str]:
-        """Names of the files and folders that are read."""
-        return [getattr(self, name) for name in ("root", "path") if name in type(self).model_fields]
-
-
-class FramesInput(PairInput):
-    """Base of inputs of image files, which say nothing of their truth and pixels themselves."""
-
-    depth_scale: Positive | None = None
-    """Values per unit of length of a 16-bit .png depth; null for 1000, with a warning."""
-    unit: str = "m"
-    """Unit of the true depth."""
-    white: White | None = None
-    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for the values that
-    occur."""
-    cropped: bool = False
-    """The images are parts of larger ones: the principal point may be anywhere."""
 
 
 class FilesInput(FramesInput):
@@ -126,31 +94,6 @@ class FilesInput(FramesInput):
         return [x for x in (*named, self.depth, self.depth_next) if isinstance(x, str)]
 
 
-class FolderInput(FramesInput):
-    """A folder with frame_0, frame_1, K.txt and optional truth."""
-
-    kind: Literal["folder"]
-    """Kind of input."""
-    path: str
-    """The folder."""
-
-    def load(self, path: Resolve) -> Pair:
-        """See `PairInput`."""
-        scale, unit = self.depth_scale, self.unit
-        return load_folder(path(self.path), scale, unit, self.white, self.cropped)
-
-
-class MotorcycleInput(PairInput):
-    """The Middlebury motorcycle pair that scikit-image ships."""
-
-    kind: Literal["motorcycle"]
-    """Kind of input."""
-
-    def load(self, path: Resolve) -> Pair:
-        """See `PairInput`."""
-        return load_motorcycle()
-
-
 class SceneInput(PairInput):
     """A rendered dynamic scene with exact truth."""
 
@@ -184,85 +127,6 @@ class SceneInput(PairInput):
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
         return render_scene(self.scene, self.seed, self.width, self.height, self.frame)
-
-
-class SintelInput(PairInput):
-    """MPI Sintel, official layout."""
-
-    kind: Literal["sintel"]
-    """Kind of input."""
-    root: str
-    """Folder that holds training/."""
-    scene: str
-    """Such as alley_1."""
-    frame: Index
-    """Number of the reference frame."""
-    render: Literal["clean", "final", "albedo"] = "clean"
-    """Rendering pass."""
-    step: Whole = 1
-    """Distance of the next frame."""
-
-    def load(self, path: Resolve) -> Pair:
-        """See `PairInput`."""
-        return load_sintel(path(self.root), self.scene, self.frame, self.render, self.step)
-
-
-class KittiInput(PairInput):
-    """KITTI 2012 or 2015, official layout."""
-
-    kind: Literal["kitti2012", "kitti2015"]
-    """Kind of input."""
-    root: str
-    """Folder that holds training/."""
-    index: str
-    """Six digits in quotes, such as "000138"."""
-    occ: bool = True
-    """Truth with occluded pixels (true) or without."""
-
-    def load(self, path: Resolve) -> Pair:
-        """See `PairInput`."""
-        return load_kitti(self.kind, path(self.root), self.index, self.occ)
-
-
-class VkittiInput(PairInput):
-    """Virtual KITTI 1 (scene is the world, such as "0001") or 2, official layout."""
-
-    kind: Literal["vkitti1", "vkitti2"]
-    """Kind of input."""
-    root: str
-    """Root folder of the dataset."""
-    scene: str
-    """Such as "0001" (1) or Scene01 (2)."""
-    frame: Index
-    """Number of the reference frame."""
-    variation: str = "clone"
-    """Weather or camera variation."""
-    step: Whole = 1
-    """Distance of the next frame."""
-
-    def load(self, path: Resolve) -> Pair:
-        """See `PairInput`."""
-        root, scene = path(self.root), self.scene
-        return load_vkitti(self.kind, root, scene, self.frame, self.variation, self.step)
-
-
-class TumInput(PairInput):
-    """TUM RGB-D, official layout."""
-
-    kind: Literal["tum"]
-    """Kind of input."""
-    path: str
-    """Folder of the sequence."""
-    frame: Index = 0
-    """Index of the reference image in rgb.txt."""
-    step: Whole = 1
-    """Distance of the next image."""
-    depth_scale: Positive | None = None
-    """Values per metre of the depth images; null for the 5000 of TUM, with a warning."""
-
-    def load(self, path: Resolve) -> Pair:
-        """See `PairInput`."""
-        return load_tum(path(self.path), self.frame, self.step, self.depth_scale)
 
 
 class MemoryInput(PairInput):

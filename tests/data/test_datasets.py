@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from helpers_files import write_cam, write_dpt, write_flo, write_kitti_flow
 
-from soup_nlp.data.datasets.driving import load_kitti, load_vkitti
-from soup_nlp.data.datasets.folders import load_folder, load_motorcycle, load_tum
-from soup_nlp.data.datasets.sintel import load_sintel
+from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.formats.map_files import KITTI_DISPARITY, read_depth_png16
 from soup_nlp.errors import DataError
@@ -31,6 +29,13 @@ def png16(path: Path, values: np.ndarray) -> None:
     cv2.imwrite(str(path), values.astype(np.uint16))
 
 
+def load(kind: str, where: Path, **options: object):
+    """The pair of an input at a folder."""
+    key = "path" if kind in ("folder", "tum") else "root"
+    own = {} if kind == "motorcycle" else {key: str(where)}
+    return make_problem({"input": {"kind": kind, **own, **options}}).input.load(Path)
+
+
 def raises(match: str):
     return pytest.raises(DataError, match=match)
 
@@ -47,7 +52,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_folder_minimal(folder: Path) -> None:
-    pair = load_folder(folder)
+    pair = load("folder", folder)
     assert (pair.name, pair.size, pair.truth, pair.flow) == ("pair", (H, W), None, None)
     np.testing.assert_array_equal(pair.K_next, K)
 
@@ -65,24 +70,17 @@ def test_folder_with_everything(folder: Path) -> None:
     cv2.imwrite(str(folder / "moving.png"), moving)
     xyz = np.array([[1.0, 2.0, 550.0], [1.0, 2.0, np.nan]])
     np.savez(folder / "points.npz", uv_0=np.array([[3.5, 2.5], [1, 1]]), xyz_mm_0=xyz)
-    pair = load_folder(folder, depth_scale=1000.0)
+    pair = load("folder", folder, depth_scale=1000.0)
     truth = pair.truth
-    assert truth is not None
     assert pair.K_next[1, 1] == 91
-    assert truth.depth_ref is not None
-    assert truth.depth_next is not None
     assert truth.depth_ref[0, 0] == 1.5
     assert truth.depth_next[0, 0] == 2.5
-    assert truth.flow is not None
     assert np.isnan(truth.flow).all()
-    assert truth.occluded is not None
     assert truth.occluded.all()
-    assert truth.components is not None
     # the static scene and two connected regions
     assert sorted(np.bincount(truth.components.ravel())) == [4, 10, H * W - 14]
     np.testing.assert_allclose(truth.points, [[3.5, 2.5, 0.55]])
-    millimetres = load_folder(folder, depth_scale=1.0, unit="mm").truth
-    assert millimetres is not None
+    millimetres = load("folder", folder, depth_scale=1.0, unit="mm").truth
     assert millimetres.unit == "mm"
     np.testing.assert_allclose(millimetres.points, [[3.5, 2.5, 550.0]])
 
@@ -90,9 +88,7 @@ def test_folder_with_everything(folder: Path) -> None:
 def test_folder_array_depth_wins_over_png(folder: Path) -> None:
     png16(folder / "depth.png", np.full((H, W), 1))
     np.save(folder / "depth.npy", np.full((H, W), 7.0))
-    truth = load_folder(folder).truth
-    assert truth is not None
-    assert truth.depth_ref is not None
+    truth = load("folder", folder).truth
     assert truth.depth_ref[0, 0] == 7.0
 
 
@@ -100,13 +96,13 @@ def test_folder_array_depth_wins_over_png(folder: Path) -> None:
 def test_folder_missing(folder: Path, name: str) -> None:
     (folder / name).unlink()
     with raises(rf"dataset is missing[\s\S]*{name}[\s\S]*expected: frame_0\.png"):
-        load_folder(folder)
+        load("folder", folder)
 
 
 def test_folder_bad_truth(folder: Path) -> None:
     np.save(folder / "depth.npy", np.ones((H, W + 1)))
     with raises("truth and reference image differ in size"):
-        load_folder(folder)
+        load("folder", folder)
     (folder / "depth.npy").unlink()
     for arrays, match in [
         ({"uv_0": np.zeros((2, 2))}, "lacks an array"),
@@ -114,15 +110,15 @@ def test_folder_bad_truth(folder: Path) -> None:
     ]:
         np.savez(folder / "points.npz", **arrays)
         with raises(match):
-            load_folder(folder)
+            load("folder", folder)
     with raises("millimetres"):
         np.savez(folder / "points.npz", uv_0=np.zeros((2, 2)), xyz_mm_0=np.ones((2, 3)))
-        load_folder(folder, unit="feet")
+        load("folder", folder, unit="feet")
     (folder / "points.npz").write_bytes(b"PK no zip")
     with raises(r"is no \.npz"):
-        load_folder(folder)
+        load("folder", folder)
     with raises("dataset folder is missing"):
-        load_folder(folder / "nowhere")
+        load("folder", folder / "nowhere")
 
 
 # --- KITTI --------------------------------------------------------------------------------------
@@ -150,43 +146,37 @@ def kitti2012(root: Path) -> Path:
 
 
 @pytest.mark.parametrize("below", ["", "training"])
-@pytest.mark.parametrize("index", [7, "7", "000007"])
-def test_kitti2012(tmp_path: Path, below: str, index: int | str) -> None:
-    pair = load_kitti("kitti2012", kitti2012(tmp_path) / below, index)
+@pytest.mark.parametrize("index", ["7", "000007"])
+def test_kitti2012(tmp_path: Path, below: str, index: str) -> None:
+    pair = load("kitti2012", kitti2012(tmp_path) / below, index=index)
     truth = pair.truth
-    assert truth is not None
-    assert truth.depth_ref is not None
-    assert truth.occluded is not None
-    assert truth.flow is not None
     assert pair.name == "kitti2012_000007"
     assert pair.K_ref[0, 2] == 4.0
     assert np.isnan(truth.depth_ref[0, 0])
     np.testing.assert_allclose(truth.depth_ref[1:], 54 / 10)
     assert truth.occluded.sum(axis=1).tolist() == [0, W, 0, 0, 0, 0]
-    visible = load_kitti("kitti2012", tmp_path, index, occ=False).truth
-    assert visible is not None
-    assert visible.flow is not None
+    visible = load("kitti2012", tmp_path, index=index, occ=False).truth
     assert np.isnan(visible.flow[1]).all()
 
 
 def test_kitti2012_errors(tmp_path: Path) -> None:
     root = kitti2012(tmp_path)
     with raises(r"000008_10\.png[\s\S]*expected: training/image_0"):
-        load_kitti("kitti2012", root, 8)
+        load("kitti2012", root, index="8")
     with raises("index is not a number"):
-        load_kitti("kitti2012", root, "seven")
+        load("kitti2012", root, index="seven")
     calib = root / "training" / "calib" / "000007.txt"
     calib.write_text("P0: 100 0 4 0 0 100 3 0 0 0 1 0\n")
     with raises(r"lacks P1"):
-        load_kitti("kitti2012", root, 7)
+        load("kitti2012", root, index="7")
     calib.write_text("P0: 1 2 3\nP1: 1 2 3\n")
     with raises(r"P0 is no projection"):
-        load_kitti("kitti2012", root, 7)
+        load("kitti2012", root, index="7")
     calib.write_text("P0: 100 0 4 0 0 100 3 0 0 0 1 0\nP1: 100 0 4 0 0 100 3 0 0 0 1 0\n")
     with raises("no baseline"):
-        load_kitti("kitti2012", root, 7)
+        load("kitti2012", root, index="7")
     with raises(r"has no training|has no image_0|nothing"):
-        load_kitti("kitti2012", tmp_path / "nowhere", 7)
+        load("kitti2012", tmp_path / "nowhere", index="7")
 
 
 def test_kitti2015(tmp_path: Path) -> None:
@@ -204,20 +194,17 @@ def test_kitti2015(tmp_path: Path) -> None:
     write_kitti_flow(base / "flow_occ" / "000001_10.png", np.full((H, W, 2), 2.0))
     (base / "obj_map").mkdir()
     cv2.imwrite(str(base / "obj_map" / "000001_10.png"), np.eye(H, W, dtype=np.uint8))
-    truth = load_kitti("kitti2015", tmp_path, 1).truth
-    assert truth is not None
+    truth = load("kitti2015", tmp_path, index="1").truth
     assert truth.depth_next is None
     assert truth.occluded is None
     np.testing.assert_allclose(truth.depth_ref, 5.4)
-    assert truth.scene_flow is not None
     u, v = 5, 2
     before = np.array([(u - 4) / 100, (v - 3) / 100, 1]) * 5.4
     after = np.array([(u + 2 - 4) / 100, (v + 2 - 3) / 100, 1]) * 4.5
     np.testing.assert_allclose(truth.scene_flow[v, u], after - before)
-    assert truth.components is not None
     assert truth.components.sum() == H
     with raises(r"image_2[\s\S]*calib_cam_to_cam"):
-        load_kitti("kitti2015", tmp_path, 2)
+        load("kitti2015", tmp_path, index="2")
 
 
 # --- Virtual KITTI ------------------------------------------------------------------------------
@@ -230,23 +217,21 @@ def vkitti_flow(path: Path) -> None:
 
 
 def test_vkitti1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("soup_nlp.data.datasets.driving.VKITTI1_CAMERA", (725, 725, 4, 2.5))
+    monkeypatch.setattr("soup_nlp.data.datasets.benchmarks.VKITTI1_CAMERA", (725, 725, 4, 2.5))
     for number in (0, 1):
         name = f"0001/clone/{number:05d}.png"
         picture(tmp_path / "vkitti_1.3.1_rgb" / name, number)
         png16(tmp_path / "vkitti_1.3.1_depthgt" / name, np.full((H, W), 1234))
     vkitti_flow(tmp_path / "vkitti_1.3.1_flowgt" / "0001/clone/00000.png")
     with pytest.warns(DataWarning, match="assumed: fx,fy,cx,cy 725.* of 1242 x 375"):
-        pair = load_vkitti("vkitti1", tmp_path, "0001", 0)
-    assert pair.truth is not None
+        pair = load("vkitti1", tmp_path, scene="0001", frame=0)
     np.testing.assert_allclose(pair.truth.depth_next, 12.34)
-    assert pair.truth.flow is not None
     assert pair.truth.flow[1, 1].tolist() == [W - 1, H - 1]
     assert pair.K_ref[0, 0] == 725
     with raises(r"00002\.png"):
-        load_vkitti("vkitti1", tmp_path, "0001", 1)
+        load("vkitti1", tmp_path, scene="0001", frame=1)
     with raises(r"vkitti_\*_rgb"):
-        load_vkitti("vkitti1", tmp_path / "vkitti_1.3.1_rgb", "0001", 1)
+        load("vkitti1", tmp_path / "vkitti_1.3.1_rgb", scene="0001", frame=1)
 
 
 def test_vkitti2(tmp_path: Path) -> None:
@@ -257,28 +242,26 @@ def test_vkitti2(tmp_path: Path) -> None:
     vkitti_flow(base / "frames" / "forwardFlow" / "Camera_0" / "flow_00003.png")
     rows = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]\n3 0 725 725 4 2.5\n"
     (base / "intrinsic.txt").write_text(rows + "4 0 726 726 4 2.5\n")
-    pair = load_vkitti("vkitti2", tmp_path, "Scene01", 3)
+    pair = load("vkitti2", tmp_path, scene="Scene01", frame=3)
     assert (pair.K_ref[0, 0], pair.K_next[0, 0]) == (725, 726)
-    assert pair.truth is not None
-    assert pair.truth.depth_ref is not None
     assert np.isnan(pair.truth.depth_ref).all()
     (base / "intrinsic.txt").write_text(rows)
     with raises(r"intrinsics of the frame are missing[\s\S]*frame 4, camera 0"):
-        load_vkitti("vkitti2", tmp_path, "Scene01", 3)
+        load("vkitti2", tmp_path, scene="Scene01", frame=3)
     with raises(r"Scene01/clone has no|Scene01 has no fog"):
-        load_vkitti("vkitti2", tmp_path, "Scene01", 3, "fog")
+        load("vkitti2", tmp_path, scene="Scene01", frame=3, variation="fog")
 
 
 # --- Sintel, TUM, Motorcycle --------------------------------------------------------------------
 
 
 def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("soup_nlp.data.datasets.sintel.DEFAULT_CAMERA", (688, 688, 4, 2.5))
+    monkeypatch.setattr("soup_nlp.data.datasets.benchmarks.DEFAULT_CAMERA", (688, 688, 4, 2.5))
     base = tmp_path / "training"
     for number in (1, 2):
         picture(base / "final" / "cave_2" / f"frame_{number:04d}.png", number)
     with pytest.warns(DataWarning, match=r"cave_2/frame_0001\.cam.*alley_1"):
-        pair = load_sintel(tmp_path, "cave_2", 1, "final")
+        pair = load("sintel", tmp_path, scene="cave_2", frame=1, render="final")
     assert pair.K_ref[0, 0] == 688
     for number in (1, 2):
         picture(base / "final" / "alley_1" / f"frame_{number:04d}.png", number)
@@ -286,7 +269,7 @@ def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.warns(
         DataWarning, match=r"camdata_left.*assumed: the focal length of alley_1, 688 pixels$"
     ):
-        assert load_sintel(tmp_path, "alley_1", 1, "final").K_ref[0, 0] == 688
+        assert load("sintel", tmp_path, scene="alley_1", frame=1, render="final").K_ref[0, 0] == 688
     for kind in ("camdata_left", "depth", "flow", "occlusions", "invalid"):
         (base / kind / "cave_2").mkdir(parents=True)
     for number, focal in ((1, 100.0), (2, 120.0)):
@@ -301,21 +284,17 @@ def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mask[0, 5] = 255
     cv2.imwrite(str(base / "occlusions" / "cave_2" / "frame_0001.png"), mask)
     cv2.imwrite(str(base / "invalid" / "cave_2" / "frame_0001.png"), np.roll(mask, 1, axis=0))
-    pair = load_sintel(tmp_path, "cave_2", 1, "final")
+    pair = load("sintel", tmp_path, scene="cave_2", frame=1, render="final")
     truth = pair.truth
-    assert truth is not None
     assert (pair.K_ref[0, 0], pair.K_next[0, 0]) == (100.0, 120.0)
-    assert truth.depth_next is not None
     assert truth.depth_next[0, 0] == 120.0
-    assert truth.occluded is not None
     assert truth.occluded.sum() == H + 1
-    assert truth.flow is not None
     assert np.isnan(truth.flow).any(axis=2).sum() == 1
     cv2.imwrite(str(base / "invalid" / "cave_2" / "frame_0001.png"), mask[1:])
     with raises("mask and flow differ in size"):
-        load_sintel(tmp_path, "cave_2", 1, "final")
+        load("sintel", tmp_path, scene="cave_2", frame=1, render="final")
     with raises(r"clean/cave_2|has no clean"):
-        load_sintel(tmp_path, "cave_2", 1)
+        load("sintel", tmp_path, scene="cave_2", frame=1)
 
 
 def test_tum(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,30 +309,28 @@ def test_tum(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.warns(
         DataWarning, match=r"assumed: the intrinsics of freiburg3, 535.4,539.2,4,2.5"
     ):
-        pair = load_tum(root, frame=0, step=2, scale=5000)
-    assert pair.truth is not None
+        pair = load("tum", root, frame=0, step=2, depth_scale=5000.0)
     assert pair.K_ref[0, 0] == 535.4
     np.testing.assert_array_equal(pair.truth.depth_ref, 1.0)
     np.testing.assert_array_equal(pair.truth.depth_next, 3.0)
     (root / "camera.txt").write_text("90 91 4 3")
-    pair_1 = load_tum(root, frame=1, scale=5000)
+    pair_1 = load("tum", root, frame=1, depth_scale=5000.0)
     assert pair_1.truth.depth_ref is None
     assert (pair_1.K_ref[0, 0], pair_1.K_next[1, 1]) == (90, 91)
     with raises(r"not in the sequence[\s\S]*0 to 2"):
-        load_tum(root, frame=2, scale=5000)
+        load("tum", root, frame=2, depth_scale=5000.0)
     (root / "rgb" / "1.png").unlink()
     with raises(r"1\.png"):
-        load_tum(root, scale=5000)
+        load("tum", root, depth_scale=5000.0)
     (root / "rgb.txt").write_text("1.0\n")
     with raises("line of a file list"):
-        load_tum(root, scale=5000)
+        load("tum", root, depth_scale=5000.0)
     png16(folder / "depth_0.png", np.full((H, W), 5000))
-    plain = load_tum(folder, scale=5000).truth
-    assert plain is not None
+    plain = load("tum", folder, depth_scale=5000.0).truth
     np.testing.assert_array_equal(plain.depth_ref, 1.0)
     (folder / "frame_0.png").unlink()
     with raises(r"rgb\.txt[\s\S]*expected: rgb\.txt, depth\.txt"):
-        load_tum(folder)
+        load("tum", folder)
 
 
 def test_motorcycle_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -362,13 +339,8 @@ def test_motorcycle_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
     disparity[:, 20:30] = 12.0
     disparity[0, 0], disparity[0, 1] = np.inf, 0.0
     monkeypatch.setattr("skimage.data.stereo_motorcycle", lambda: (image, image, disparity))
-    pair = load_motorcycle()
+    pair = load("motorcycle", Path())
     truth = pair.truth
-    assert truth is not None
-    assert truth.depth_ref is not None
-    assert truth.flow is not None
-    assert truth.scene_flow is not None
-    assert truth.occluded is not None
     assert np.isnan(truth.depth_ref[0, :2]).all()
     v, u = np.mgrid[:4, :40].astype(float)
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(pair.K_ref).T
@@ -386,7 +358,7 @@ def test_motorcycle_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("skimage.data.stereo_motorcycle", offline)
     with raises(r"not available[\s\S]*no network"):
-        load_motorcycle()
+        load("motorcycle", Path())
 
 
 # --- real pairs ---------------------------------------------------------------------------------
@@ -394,10 +366,7 @@ def test_motorcycle_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.shared
 def test_real_pairs(shared_data: Path) -> None:
-    pair = load_kitti("kitti2012", shared_data / "kitti2012", 27)
-    assert pair.truth is not None
-    assert pair.truth.depth_ref is not None
-    assert pair.truth.occluded is not None
+    pair = load("kitti2012", shared_data / "kitti2012", index="27")
     depth = pair.truth.depth_ref
     disparity = read_depth_png16(
         shared_data / "kitti2012" / "training" / "disp_occ" / "000027_10.png",
@@ -408,19 +377,15 @@ def test_real_pairs(shared_data: Path) -> None:
     np.testing.assert_allclose(depth[known] * disparity[known], 718.856 * 0.53717, rtol=1e-4)
     assert 0.01 < pair.truth.occluded.mean() < 0.1
     with pytest.warns(DataWarning, match="688 pixels"):
-        sintel = load_sintel(shared_data / "sintel", "alley_1", 2)
+        sintel = load("sintel", shared_data / "sintel", scene="alley_1", frame=2)
     with pytest.warns(DataWarning, match="688 pixels"):
-        far = load_sintel(shared_data / "sintel", "alley_1", 20, step=5)
+        far = load("sintel", shared_data / "sintel", scene="alley_1", frame=20, step=5)
     assert "flow, occluded" in str(sintel)
     assert "depth_ref" in str(far)
-    driving = load_folder(shared_data / "driving_synthetic")
+    driving = load("folder", shared_data / "driving_synthetic")
     assert "depth_ref, flow" in str(driving)
-    paper = load_folder(shared_data / "kinect_paper" / "pair_049")
-    assert paper.truth is not None
-    assert paper.truth.points is not None
+    paper = load("folder", shared_data / "kinect_paper" / "pair_049")
     assert 0.3 < np.median(paper.truth.points[:, 2]) < 1.0
     with pytest.warns(DataWarning, match="5000 values per unit"):
-        desk = load_tum(shared_data / "tum_fr1").truth
-    assert desk is not None
-    assert desk.depth_ref is not None
+        desk = load("tum", shared_data / "tum_fr1").truth
     assert 0.5 < np.nanmedian(desk.depth_ref) < 3.0

@@ -14,7 +14,7 @@ from helpers_files import write_flo, write_kitti_flow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soup_nlp.data.datasets.driving import load_kitti
+from soup_nlp.data.datasets.benchmarks import KittiInput
 from soup_nlp.data.flow import sources as flow_module
 from soup_nlp.data.flow.consistency import leaves, round_trip_error
 from soup_nlp.data.flow.sources import (
@@ -233,7 +233,7 @@ def test_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.shared
 def test_dis_on_kitti(shared_data: Path) -> None:
-    whole = load_kitti("kitti2012", shared_data / "kitti2012", 27)
+    whole = KittiInput(kind="kitti2012", root=str(shared_data / "kitti2012"), index="27").load(Path)
     # the columns in the middle
     pair = helpers_truth.cropped(whole, 350, 0, 350, 0)
     assert pair.truth is not None

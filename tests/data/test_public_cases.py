@@ -16,7 +16,7 @@ from helpers_files import write_flo, write_kitti_flow, write_pfm
 from PIL import ExifTags, Image, features
 
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.datasets.folders import load_tum
+from soup_nlp.data.datasets.folders import TumInput
 from soup_nlp.data.flow.common_focal import at_common_focal
 from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.sources import FlowOptions, resolve_flow
@@ -345,6 +345,10 @@ def test_lenses_that_are_not_distorted_or_of_another_model(folder: Path) -> None
 # --- 5 layouts beside the one --------------------------------------------------------------------
 
 
+def tum(folder: Path, **options):
+    return TumInput(kind="tum", path=str(folder), **options).load(Path)
+
+
 @pytest.mark.parametrize("name", ["K.txt", "camera.txt", None])
 def test_tum_format_of_other_sensors(name: str | None, tmp_path: Path) -> None:
     (tmp_path / "rgb").mkdir()
@@ -354,20 +358,25 @@ def test_tum_format_of_other_sensors(name: str | None, tmp_path: Path) -> None:
     (tmp_path / "rgb.txt").write_text("0.0 rgb/0.png\n0.1 rgb/1.png\n")
     if name is None:
         with pytest.warns(DataWarning, match="assumed: the intrinsics of the default camera"):
-            assert load_tum(tmp_path).K_ref[0, 0] == 525
+            assert tum(tmp_path).K_ref[0, 0] == 525
         return
     (tmp_path / name).write_text("# fx fy cx cy\n542.8 542.6 315.6 237.8\n")
-    assert load_tum(tmp_path).K_next[0, 0] == 542.8
+    assert tum(tmp_path).K_next[0, 0] == 542.8
     # the scale of depth is said too
     cv2.imwrite(str(tmp_path / "d.png"), np.full((480, 640), 1000, np.uint16))
     (tmp_path / "depth.txt").write_text("0.0 d.png\n")
     with pytest.warns(DataWarning, match="depth is not given; assumed: 5000 values"):
-        assert load_tum(tmp_path).truth.depth_ref[0, 0] == 0.2  # type: ignore[union-attr,index]
-    assert load_tum(tmp_path, scale=1000).truth.depth_ref[0, 0] == 1  # type: ignore[union-attr,index]
+        assert tum(tmp_path).truth.depth_ref[0, 0] == 0.2
+    assert (
+        TumInput(kind="tum", path=str(tmp_path), depth_scale=1000.0)
+        .load(Path)
+        .truth.depth_ref[0, 0]
+        == 1
+    )
     # a camera whose y axis points up
     (tmp_path / name).write_text("481.2 0 319.5\n0 -480 239.5\n0 0 1\n")
     with pytest.raises(DataError, match="fy without its sign"):
-        load_tum(tmp_path)
+        tum(tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["files", "folder"])

@@ -1,20 +1,28 @@
-"""Loaders of pairs with truth: plain folders, TUM RGB-D and the Motorcycle pair.
+"""Inputs with truth: plain folders, TUM RGB-D and the Motorcycle pair.
 
-Every loader returns a `Pair` without a flow; the true flow is `pair.truth.flow` if it is known. A
-loader needs the two images and the camera. The truth is None without its file, and NaN where
-unknown.
+Each needs the two images and the camera. The truth is None without its file, and NaN where unknown.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import label
 
-from soup_nlp.data.datasets.layout import is_result, make_pair, need, need_folder, read_if
+from soup_nlp.data.datasets.layout import (
+    FramesInput,
+    PairInput,
+    Resolve,
+    is_result,
+    make_pair,
+    need,
+    need_folder,
+    read_if,
+)
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_intrinsics
 from soup_nlp.data.formats.images import assumed, read_mask
@@ -23,6 +31,7 @@ from soup_nlp.data.formats.npy_files import read_npz
 from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.schema.section import Index, Positive, Whole
 from soup_nlp.storage.files import PathLike, is_file, read_text
 from soup_nlp.storage.mark import MARK
 
@@ -60,15 +69,8 @@ def _find(folder: Path, stems: tuple[str, ...], suffixes: tuple[str, ...]) -> Pa
     return None
 
 
-def load_folder(
-    folder: PathLike,
-    depth_scale: float | None = None,
-    unit: str = "m",
-    white: int | None = None,
-    cropped: bool = False,
-    usual: float = MILLIMETRES,
-) -> Pair:
-    """Load a pair from a plain folder.
+class FolderInput(FramesInput):
+    """A folder with two images, `K.txt` and optional truth.
 
     Files, of which the first existing one is used (images may also be jpg, tif, ppm, bmp):
 
@@ -79,20 +81,25 @@ def load_folder(
       `moving.png` (white = moves by itself; every connected region is one component)
     - optional sparse truth `points.npz`: `uv_0` (M, 2) pixels and `xyz_mm_0` (M, 3) millimetres in
       the reference camera; z is converted to `unit` when that is "m" and kept when it is "mm".
-
-    Args:
-        folder: The folder.
-        depth_scale: Values per `unit` of a 16-bit depth image, e.g. 1000 for mm read as metres;
-            None for the usual ones, with a warning.
-        unit: Unit of length of the truth.
-        white: Value of white in 16-bit images, see `read_images`.
-        cropped: The images are parts of larger ones, see `make_pair`.
-        usual: Usual values per `unit`.
-
-    Raises:
-        DataError: a required file is missing, a file is malformed or has a wrong size, or the
-            folder holds the result of a solve.
     """
+
+    kind: Literal["folder"]
+    """Kind of input."""
+    path: str
+    """The folder."""
+
+    def load(self, path: Resolve) -> Pair:
+        """See `PairInput`.
+
+        Raises:
+            DataError: a required file is missing, a file is malformed or has a wrong size, or the
+                folder holds the result of a solve.
+        """
+        return _plain_folder(path(self.path), self)
+
+
+def _plain_folder(folder: Path, own: FolderInput, usual: float = MILLIMETRES) -> Pair:
+    """The pair of a plain folder; `usual` are the values per unit of a depth without a scale."""
     folder = need_folder(folder, LAYOUT)
     if is_result(folder):
         marked = is_file(folder / MARK)
@@ -113,16 +120,17 @@ def load_folder(
     depth = _find(folder, ("depth", "depth_0", "depth_ref"), _DEPTHS)
     depth_next = _find(folder, ("depth_next", "depth_1"), _DEPTHS)
     truth = Truth(
-        depth_ref=read_if(read_depth, depth, depth_scale, usual),
-        depth_next=read_if(read_depth, depth_next, depth_scale, usual),
+        depth_ref=read_if(read_depth, depth, own.depth_scale, usual),
+        depth_next=read_if(read_depth, depth_next, own.depth_scale, usual),
         flow=read_if(read_flow, _find(folder, ("flow",), _FLOWS)),
         occluded=read_if(read_mask, _find(folder, ("occluded",), _IMAGES)),
         components=read_if(_moving_components, _find(folder, ("moving",), _IMAGES)),
-        points=read_if(_read_points, folder / "points.npz", unit),
-        unit=unit,
+        points=read_if(_read_points, folder / "points.npz", own.unit),
+        unit=own.unit,
     )
     cameras = [K, K if K_next is None else K_next]
-    return make_pair(images, cameras, truth, folder.resolve().name, white, cropped=cropped)
+    name = folder.resolve().name
+    return make_pair(images, cameras, truth, name, own.white, cropped=own.cropped)
 
 
 def _moving_components(path: PathLike) -> NDArray[np.int32]:
@@ -148,51 +156,59 @@ def _read_points(path: Path, unit: str) -> Float:
     return np.asarray(points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)])
 
 
-def load_tum(folder: PathLike, frame: int = 0, step: int = 1, scale: float | None = None) -> Pair:
-    """Load a pair of a TUM RGB-D sequence, depth in metres.
+class TumInput(PairInput):
+    """TUM RGB-D, official layout, depth in metres.
 
-    Two layouts are supported: the original one (`rgb.txt` and `depth.txt` list time stamps and
-    files; a depth image belongs to a colour image within 20 ms), and the plain folder of
-    `load_folder` with 16-bit `depth_0.png` and `depth_1.png`.
-
-    Args:
-        folder: The sequence.
-        frame: Index of the reference image in rgb.txt (original layout only).
-        step: Distance of the next image (original layout only).
-        scale: Values per metre of the depth images; None for 5000, with a warning.
-
-    Returns:
-        Pair with the true depth of both frames, if known. In the original layout the intrinsics are
-        those published for the sensor in the name of the folder (freiburg1, 2 or 3), else 525, 525,
-        319.5, 239.5; lens distortion is not removed.
-
-    Raises:
-        DataError: the layout is unknown, a file is missing or the frame does not exist.
+    `rgb.txt` and `depth.txt` list time stamps and files; a depth image belongs to a colour image
+    within 20 ms. Without `K.txt` or `camera.txt` the intrinsics are those published for the sensor
+    in the name of the folder (freiburg1, 2 or 3), else 525, 525, 319.5, 239.5; lens distortion is
+    not removed. A plain folder (`FolderInput`) with 16-bit `depth_0.png` and `depth_1.png` is
+    loaded as well.
     """
-    folder = need_folder(folder, TUM_LAYOUT)
-    if _find(folder, ("frame_0", "image_ref"), _IMAGES) and not is_file(folder / "rgb.txt"):
-        return load_folder(folder, scale, usual=TUM_SCALE)
-    images = _tum_list(need(folder / "rgb.txt", TUM_LAYOUT))
-    depths = read_if(_tum_list, folder / "depth.txt") or []
-    for index in (frame, frame + step):
-        if not 0 <= index < len(images):
-            raise DataError(
-                "frame is not in the sequence",
-                where=folder / "rgb.txt",
-                found=index,
-                expected=f"0 to {len(images) - 1}",
-            )
-    beside = _find(folder, ("K", "camera"), (".txt",))
-    K = _tum_camera(folder) if beside is None else read_intrinsics(beside)
-    (time_ref, ref), (time_next, following) = images[frame], images[frame + step]
-    maps = (
-        read_if(read_depth, _tum_depth(depths, time), scale, TUM_SCALE)
-        for time in (time_ref, time_next)
-    )
-    truth = Truth(depth_ref=next(maps), depth_next=next(maps))
-    name = f"{folder.resolve().name}_{frame}"
-    files = [need(path, TUM_LAYOUT) for path in (ref, following)]
-    return make_pair(files, [K, K], truth, name)
+
+    kind: Literal["tum"]
+    """Kind of input."""
+    path: str
+    """Folder of the sequence."""
+    frame: Index = 0
+    """Index of the reference image in rgb.txt."""
+    step: Whole = 1
+    """Distance of the next image."""
+    depth_scale: Positive | None = None
+    """Values per metre of the depth images; null for the 5000 of TUM, with a warning."""
+
+    def load(self, path: Resolve) -> Pair:
+        """See `PairInput`.
+
+        Raises:
+            DataError: the layout is unknown, a file is missing or the frame does not exist.
+        """
+        folder = need_folder(path(self.path), TUM_LAYOUT)
+        if _find(folder, ("frame_0", "image_ref"), _IMAGES) and not is_file(folder / "rgb.txt"):
+            own = FolderInput(kind="folder", path=self.path, depth_scale=self.depth_scale)
+            return _plain_folder(folder, own, TUM_SCALE)
+        images = _tum_list(need(folder / "rgb.txt", TUM_LAYOUT))
+        depths = read_if(_tum_list, folder / "depth.txt") or []
+        numbers = self.frame, self.frame + self.step
+        for index in numbers:
+            if not 0 <= index < len(images):
+                raise DataError(
+                    "frame is not in the sequence",
+                    where=folder / "rgb.txt",
+                    found=index,
+                    expected=f"0 to {len(images) - 1}",
+                )
+        beside = _find(folder, ("K", "camera"), (".txt",))
+        K = _tum_camera(folder) if beside is None else read_intrinsics(beside)
+        (time_ref, ref), (time_next, following) = (images[k] for k in numbers)
+        maps = (
+            read_if(read_depth, _tum_depth(depths, time), self.depth_scale, TUM_SCALE)
+            for time in (time_ref, time_next)
+        )
+        truth = Truth(depth_ref=next(maps), depth_next=next(maps))
+        name = f"{folder.resolve().name}_{self.frame}"
+        files = [need(path, TUM_LAYOUT) for path in (ref, following)]
+        return make_pair(files, [K, K], truth, name)
 
 
 def _tum_camera(folder: Path) -> Float:
@@ -235,7 +251,7 @@ def _tum_depth(depths: list[tuple[float, Path]], time: float) -> Path | None:
     return path if abs(stamp - time) <= _TUM_SLACK else None
 
 
-def load_motorcycle() -> Pair:
+class MotorcycleInput(PairInput):
     """The Middlebury 2014 Motorcycle stereo pair of scikit-image, as a pair of frames in metres.
 
     The rectified cameras differ in their principal points, so a disparity d means
@@ -243,45 +259,52 @@ def load_motorcycle() -> Pair:
     camera has cx + doffs. The motion of every pixel is the translation (-B, 0, 0); the true flow
     is (-d, 0). A pixel is occluded if it leaves the right image, or if a nearer pixel of the same
     row lands on it or beyond it.
-
-    Raises:
-        DataError: the images are not available (scikit-image fetches them once).
     """
-    from skimage import data
 
-    try:
-        left, right, disparity = data.stereo_motorcycle()
-    except Exception as error:  # pooch, requests and OSError, by version
-        raise DataError(
-            "the Motorcycle pair is not available",
-            where="skimage.data.stereo_motorcycle",
-            found=str(error).strip().splitlines()[0] if str(error) else type(error).__name__,
-            expected="the images in scikit-image's cache, or a connection to fetch them",
-            hint="install pooch and call skimage.data.stereo_motorcycle() once online",
-        ) from error
-    focal, cx, cy, doffs, baseline = 994.978, 311.193, 254.877, 31.086, 0.193001
-    d = np.asarray(disparity, dtype=np.float64)
-    d = np.where(np.isfinite(d) & (d > 0), d, np.nan)
-    known = np.isfinite(d)
-    flow = np.dstack([-d, np.where(known, 0.0, np.nan)])
-    target = np.where(known, np.arange(d.shape[1]) - d, np.inf)
-    right_of = np.full_like(target, np.inf)
-    right_of[:, :-1] = np.minimum.accumulate(target[:, :0:-1], axis=1)[:, ::-1]
-    motion = np.eye(4)
-    motion[0, 3] = -baseline
-    truth = Truth(
-        depth_ref=focal * baseline / (d + doffs),
-        flow=flow,
-        occluded=known & ((target >= right_of) | leaves(flow, right.shape[:2])),
-        components=np.where(known, 0, -1).astype(np.int32),
-        motions=motion[None],
-        scene_flow=np.where(known[:, :, None], [-baseline, 0.0, 0.0], np.nan),
-    )
-    return Pair(
-        image_ref=np.ascontiguousarray(left[:, :, :3]),
-        image_next=np.ascontiguousarray(right[:, :, :3]),
-        K_ref=intrinsics(focal, focal, cx, cy),
-        K_next=intrinsics(focal, focal, cx + doffs, cy),
-        truth=truth,
-        name="motorcycle",
-    )
+    kind: Literal["motorcycle"]
+    """Kind of input."""
+
+    def load(self, path: Resolve) -> Pair:
+        """See `PairInput`.
+
+        Raises:
+            DataError: the images are not available (scikit-image fetches them once).
+        """
+        from skimage import data
+
+        try:
+            left, right, disparity = data.stereo_motorcycle()
+        except Exception as error:  # pooch, requests and OSError, by version
+            raise DataError(
+                "the Motorcycle pair is not available",
+                where="skimage.data.stereo_motorcycle",
+                found=str(error).strip().splitlines()[0] if str(error) else type(error).__name__,
+                expected="the images in scikit-image's cache, or a connection to fetch them",
+                hint="install pooch and call skimage.data.stereo_motorcycle() once online",
+            ) from error
+        focal, cx, cy, doffs, baseline = 994.978, 311.193, 254.877, 31.086, 0.193001
+        d = np.asarray(disparity, dtype=np.float64)
+        d = np.where(np.isfinite(d) & (d > 0), d, np.nan)
+        known = np.isfinite(d)
+        flow = np.dstack([-d, np.where(known, 0.0, np.nan)])
+        target = np.where(known, np.arange(d.shape[1]) - d, np.inf)
+        right_of = np.full_like(target, np.inf)
+        right_of[:, :-1] = np.minimum.accumulate(target[:, :0:-1], axis=1)[:, ::-1]
+        motion = np.eye(4)
+        motion[0, 3] = -baseline
+        truth = Truth(
+            depth_ref=focal * baseline / (d + doffs),
+            flow=flow,
+            occluded=known & ((target >= right_of) | leaves(flow, right.shape[:2])),
+            components=np.where(known, 0, -1).astype(np.int32),
+            motions=motion[None],
+            scene_flow=np.where(known[:, :, None], [-baseline, 0.0, 0.0], np.nan),
+        )
+        return Pair(
+            image_ref=np.ascontiguousarray(left[:, :, :3]),
+            image_next=np.ascontiguousarray(right[:, :, :3]),
+            K_ref=intrinsics(focal, focal, cx, cy),
+            K_next=intrinsics(focal, focal, cx + doffs, cy),
+            truth=truth,
+            name="motorcycle",
+        )

@@ -1,10 +1,13 @@
-"""Helpers of dataset loaders: required and optional files, recognition of result folders."""
+"""What the kinds of input share: their base, required and optional files, the pair of images."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
+
+from pydantic import Field
 
 from soup_nlp.data.camera_check import check_cameras
 from soup_nlp.data.formats.camera_files import undistorted
@@ -12,10 +15,40 @@ from soup_nlp.data.formats.exif import estimated_cameras
 from soup_nlp.data.formats.images import read_images
 from soup_nlp.data.pair import Float, Pair, Truth
 from soup_nlp.errors import DataError
+from soup_nlp.schema.section import Positive, Section
 from soup_nlp.storage.files import PathLike, as_path, is_file, is_folder, read_json
 from soup_nlp.storage.mark import MARK
 
 T = TypeVar("T")
+Resolve = Callable[[str], Path]
+"""Full path of a name in the problem file."""
+White = Annotated[int, Field(ge=1, le=65535)]
+
+
+class PairInput(Section, ABC):
+    """Base of every kind of input."""
+
+    @abstractmethod
+    def load(self, path: Resolve) -> Pair:
+        """The pair, without its flow; `path` resolves the names of files."""
+
+    def files(self) -> list[str]:
+        """Names of the files and folders that are read."""
+        return [getattr(self, name) for name in ("root", "path") if name in type(self).model_fields]
+
+
+class FramesInput(PairInput):
+    """Base of inputs of image files, which say nothing of their truth and pixels themselves."""
+
+    depth_scale: Positive | None = None
+    """Values per unit of length of a 16-bit .png depth; null for 1000, with a warning."""
+    unit: str = "m"
+    """Unit of the true depth."""
+    white: White | None = None
+    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for the values that
+    occur."""
+    cropped: bool = False
+    """The images are parts of larger ones: the principal point may be anywhere."""
 
 
 def need(path: PathLike, layout: str) -> Path:

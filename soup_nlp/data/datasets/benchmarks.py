@@ -1,0 +1,317 @@
+"""KITTI stereo/flow 2012 and scene flow 2015, Virtual KITTI 1 and 2, MPI Sintel, in metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from soup_nlp.arrays import Mask
+from soup_nlp.data.datasets.layout import (
+    PairInput,
+    Resolve,
+    make_pair,
+    need,
+    need_folder,
+    read_if,
+    training_folder,
+)
+from soup_nlp.data.flow.consistency import leaves
+from soup_nlp.data.formats.camera_files import (
+    read_cam,
+    read_kitti_projections,
+    read_vkitti2_intrinsics,
+)
+from soup_nlp.data.formats.images import assumed, decode, read_mask
+from soup_nlp.data.formats.map_files import (
+    KITTI_DISPARITY,
+    read_depth_png16,
+    read_dpt,
+    read_flo,
+    read_kitti_flow,
+    read_vkitti_depth,
+    read_vkitti_flow,
+)
+from soup_nlp.data.pair import Float, Pair, Truth, check_size
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import intrinsics, pixel_grid, rays
+from soup_nlp.schema.section import Index, Whole
+from soup_nlp.storage.files import is_file
+
+
+class _Kitti(NamedTuple):
+    """Folders and names of one KITTI benchmark; {} stands for occ or noc."""
+
+    images: str
+    calibration: str
+    projections: tuple[str, str]
+    disparities: tuple[str, str]
+    layout: str
+
+
+_KITTI = {
+    "kitti2012": _Kitti(
+        "image_0",
+        "calib",
+        ("P0", "P1"),
+        ("disp_{}", "none"),
+        "training/image_0/NNNNNN_10.png and _11.png, training/calib/NNNNNN.txt (P0, P1); optional "
+        "disp_occ, disp_noc, flow_occ, flow_noc with NNNNNN_10.png",
+    ),
+    "kitti2015": _Kitti(
+        "image_2",
+        "calib_cam_to_cam",
+        ("P_rect_02", "P_rect_03"),
+        ("disp_{}_0", "disp_{}_1"),
+        "training/image_2/NNNNNN_10.png and _11.png, training/calib_cam_to_cam/NNNNNN.txt "
+        "(P_rect_02, P_rect_03); optional disp_occ_0, disp_occ_1, flow_occ, flow_noc, obj_map with "
+        "NNNNNN_10.png",
+    ),
+}
+
+_VKITTI = {
+    "vkitti1": (
+        "vkitti_*_rgb/{}/{}/{:05d}.png",
+        "vkitti_*_depthgt/{}/{}/{:05d}.png",
+        "vkitti_*_flowgt/{}/{}/{:05d}.png",
+    ),
+    "vkitti2": (
+        "{}/{}/frames/rgb/Camera_0/rgb_{:05d}.jpg",
+        "{}/{}/frames/depth/Camera_0/depth_{:05d}.png",
+        "{}/{}/frames/forwardFlow/Camera_0/flow_{:05d}.png",
+    ),
+}
+"""Paths of image, depth and flow; {} stands for scene, variation and frame, * for a version."""
+
+VKITTI1_CAMERA = (725.0, 725.0, 620.5, 187.0)
+"""fx, fy, cx, cy of every Virtual KITTI 1 image, pixels."""
+VKITTI1_TEXT = "fx,fy,cx,cy 725,725,620.5,187, of its images of 1242 x 375"
+
+
+SINTEL_LAYOUT = (
+    "training/{clean,final,albedo}/SCENE/frame_NNNN.png; optional "
+    "camdata_left/SCENE/frame_NNNN.cam, depth/SCENE/frame_NNNN.dpt, "
+    "flow/SCENE/frame_NNNN.flo, occlusions/SCENE/frame_NNNN.png, invalid/SCENE/frame_NNNN.png"
+)
+
+DEFAULT_CAMERA = (688.00006, 688.00006, 511.5, 217.5)
+"""fx, fy, cx, cy of `DEFAULT_SCENE`, pixels; other scenes differ (some have 1120)."""
+
+DEFAULT_SCENE = "alley_1"
+
+
+class KittiInput(PairInput):
+    """KITTI 2012 (grey camera 0) or 2015 (colour camera 2): frames 10 and 11 of a sequence.
+
+    Depth is f B / disparity. disp_occ_1 of 2015 has the disparity of the second frame at the pixels
+    of the first, so with the flow it gives the scene flow, not a depth map of the next frame. A
+    pixel is occluded where the flow is known but absent from flow_noc. The moving objects of the
+    obj_map of 2015 are components; 0 is the static scene.
+    """
+
+    kind: Literal["kitti2012", "kitti2015"]
+    """Kind of input."""
+    root: str
+    """Folder that holds training/."""
+    index: str
+    """Six digits in quotes, such as "000138"."""
+    occ: bool = True
+    """Truth with occluded pixels (true) or without."""
+
+    def load(self, path: Resolve) -> Pair:
+        """See `PairInput`.
+
+        Raises:
+            DataError: an image or the calibration is missing, or a file is malformed.
+        """
+        own = _KITTI[self.kind]
+        base = training_folder(path(self.root), own.layout)
+        if not self.index.isdecimal():
+            raise DataError(
+                "KITTI pair index is not a number",
+                found=repr(self.index),
+                expected="'27' or '000027'",
+            )
+        stem, suffix = f"{int(self.index):06d}", "occ" if self.occ else "noc"
+        name = f"{stem}_10.png"
+        images = [need(base / own.images / f"{stem}_{k}.png", own.layout) for k in (10, 11)]
+        calibration = need(base / own.calibration / f"{stem}.txt", own.layout)
+        left, right = read_kitti_projections(calibration, own.projections)
+        K = left[:, :3].copy()
+        focal_baseline = K[0, 0] * _baseline(left, right, calibration)
+        disparities = (
+            read_if(read_depth_png16, base / folder.format(suffix) / name, KITTI_DISPARITY)
+            for folder in own.disparities
+        )
+        depth, depth_after = (None if d is None else focal_baseline / d for d in disparities)
+        objects = read_if(decode, base / "obj_map" / name, "object map")
+        flow, occluded = _kitti_flow(base, name, suffix)
+        truth = Truth(
+            depth_ref=depth,
+            flow=flow,
+            occluded=occluded,
+            components=None if objects is None else objects.astype(np.int32),
+            scene_flow=_scene_flow(K, depth, depth_after, flow, f"{base}, pair {stem}"),
+        )
+        return make_pair(images, [K, K], truth, f"{self.kind}_{stem}")
+
+
+def _baseline(left: Float, right: Float, path: Path) -> float:
+    """Baseline of two rectified projections (3, 4), metres."""
+    baseline = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
+    if not baseline > 0:
+        raise DataError(
+            "calibration gives no baseline between the stereo cameras",
+            where=path,
+            found=f"{baseline:g} m",
+            expected="a positive length (0.53 to 0.55 m in KITTI)",
+        )
+    return baseline
+
+
+def _kitti_flow(base: Path, name: str, suffix: str) -> tuple[Float | None, Mask | None]:
+    """True flow, and where it is known but not in the non-occluded version."""
+    flow = read_if(read_kitti_flow, base / f"flow_{suffix}" / name)
+    visible_file = base / "flow_noc" / name
+    visible = None if flow is None else read_if(read_kitti_flow, visible_file)
+    if flow is None or visible is None:
+        return flow, None
+    check_size("flow_noc and flow_occ", visible.shape, flow.shape, visible_file)
+    return flow, np.isfinite(flow[:, :, 0]) & ~np.isfinite(visible[:, :, 0])
+
+
+def _scene_flow(
+    K: Float, depth: Float | None, depth_after: Float | None, flow: Float | None, where: str
+) -> Float | None:
+    """(H, W, 3) difference of the points of a pixel, metres, where all three parts are known."""
+    if depth is None or depth_after is None or flow is None:
+        return None
+    for disparity in (depth, depth_after):
+        check_size("disparity and flow", disparity.shape, flow.shape, where)
+    uv = pixel_grid(*depth.shape)
+    return np.asarray(
+        rays(K, uv + flow) * depth_after[:, :, None] - rays(K, uv) * depth[:, :, None]
+    )
+
+
+class VkittiInput(PairInput):
+    """Virtual KITTI 1 (scene is the world, such as "0001") or 2 (left camera); no depth of the sky.
+
+    The root holds vkitti_1.3.1_rgb and, for truth, _depthgt and _flowgt (1), or Scene01 and so on
+    (2).
+    """
+
+    kind: Literal["vkitti1", "vkitti2"]
+    """Kind of input."""
+    root: str
+    """Root folder of the dataset."""
+    scene: str
+    """Such as "0001" (1) or Scene01 (2)."""
+    frame: Index
+    """Number of the reference frame."""
+    variation: str = "clone"
+    """Weather or camera variation."""
+    step: Whole = 1
+    """Distance of the next frame; a true flow exists for 1 only."""
+
+    def load(self, path: Resolve) -> Pair:
+        """See `PairInput`.
+
+        Raises:
+            DataError: an image or the intrinsics are missing, or a file is malformed.
+        """
+        image, depth, flow = _VKITTI[self.kind]
+        layout = f"{image}; optional {depth}, {flow}"
+        layout = layout.replace("{:05d}", "NNNNN").format(*["SCENE", "VARIATION"] * 3)
+        root = need_folder(path(self.root), layout)
+
+        def file(pattern: str, number: int) -> Path:
+            head, rest = pattern.format(self.scene, self.variation, number).split("/", 1)
+            return max(root.glob(head), default=root / head) / rest
+
+        numbers = (self.frame, self.frame + self.step)
+        images = [need(file(image, number), layout) for number in numbers]
+        if self.kind == "vkitti1":
+            cameras = [intrinsics(*VKITTI1_CAMERA)] * 2
+            assumed(root, "Virtual KITTI 1 has no file of its camera", VKITTI1_TEXT)
+        else:
+            table = need(root / self.scene / self.variation / "intrinsic.txt", layout)
+            cameras = read_vkitti2_intrinsics(table, numbers)
+        truth = Truth(
+            depth_ref=read_if(read_vkitti_depth, file(depth, numbers[0])),
+            depth_next=read_if(read_vkitti_depth, file(depth, numbers[1])),
+            flow=read_if(read_vkitti_flow, file(flow, self.frame) if self.step == 1 else None),
+        )
+        name = f"{self.kind}_{self.scene}_{self.variation}_{self.frame:05d}"
+        return make_pair(images, cameras, truth, name)
+
+
+class SintelInput(PairInput):
+    """MPI Sintel with its depth and camera extension; depth is in the scene's unit.
+
+    A pixel is occluded by the occlusion mask, or if its flow leaves the image; pixels of the mask
+    `invalid` have no true flow. Without `camdata_left` the camera is `DEFAULT_CAMERA`, with a
+    warning.
+    """
+
+    kind: Literal["sintel"]
+    """Kind of input."""
+    root: str
+    """Folder that holds training/."""
+    scene: str
+    """Such as alley_1."""
+    frame: Index
+    """Number of the reference frame as in its file name; the first is 1."""
+    render: Literal["clean", "final", "albedo"] = "clean"
+    """Rendering pass."""
+    step: Whole = 1
+    """Distance of the next frame; a true flow exists for 1 only."""
+
+    def load(self, path: Resolve) -> Pair:
+        """See `PairInput`.
+
+        Raises:
+            DataError: an image is missing, or a file is malformed or has a wrong size.
+        """
+        base = training_folder(path(self.root), SINTEL_LAYOUT)
+        names = [f"{self.scene}/frame_{k:04d}" for k in (self.frame, self.frame + self.step)]
+        images = [need(base / self.render / f"{name}.png", SINTEL_LAYOUT) for name in names]
+        depths = [read_if(read_dpt, base / "depth" / f"{name}.dpt") for name in names]
+        flow, occluded = _sintel_flow(base, names[0]) if self.step == 1 else (None, None)
+        return make_pair(
+            images,
+            _sintel_cameras([base / "camdata_left" / f"{name}.cam" for name in names], self.scene),
+            Truth(depths[0], depths[1], flow, occluded),
+            f"sintel_{self.scene}_{self.frame:04d}",
+        )
+
+
+def _sintel_flow(base: Path, name: str) -> tuple[Float | None, Mask | None]:
+    """True flow and occlusion of a frame; None without their files."""
+    flow = read_if(read_flo, base / "flow" / f"{name}.flo")
+    files = [base / kind / f"{name}.png" for kind in ("occlusions", "invalid")]
+    occluded, invalid = (read_if(read_mask, file) for file in files)
+    if flow is None:
+        return None, occluded
+    for mask, file in zip((occluded, invalid), files, strict=True):
+        if mask is not None:
+            check_size("mask and flow", mask.shape, flow.shape, file)
+    if occluded is not None:
+        occluded |= np.isfinite(flow[:, :, 0]) & leaves(flow, flow.shape[:2])
+    if invalid is not None:
+        flow[invalid] = np.nan
+    return flow, occluded
+
+
+def _sintel_cameras(paths: list[Path], scene: str) -> list[Float]:
+    """Intrinsics of the frames; `DEFAULT_CAMERA` with a warning if a file is missing."""
+    absent = [path for path in paths if not is_file(path)]
+    if absent:
+        doubt = "" if scene == DEFAULT_SCENE else f", which may be wrong for {scene}"
+        assumed(
+            absent[0],
+            "no such camera file (camdata_left comes with Sintel's depth training data)",
+            f"the focal length of {DEFAULT_SCENE}, {DEFAULT_CAMERA[0]:g} pixels{doubt}",
+        )
+    return [intrinsics(*DEFAULT_CAMERA) if p in absent else read_cam(p) for p in paths]
