@@ -141,7 +141,7 @@ def flow_of(given: FlowLike, confidence: object, source: str) -> tuple[NDArray[A
         )
     if uv.ndim == 3 and uv.shape[0] == 2 and uv.shape[2] != 2:
         uv = np.moveaxis(uv, 0, 2)
-    if uv.ndim != 3:
+    if uv.ndim != 3 or uv.shape[2] != 2:
         batch = uv.ndim == 4 and len(uv) == 1
         raise DataError(
             "flow has the wrong shape",
@@ -157,11 +157,11 @@ def flow_of(given: FlowLike, confidence: object, source: str) -> tuple[NDArray[A
         known = (np.abs(uv) < 1e9).all(axis=2)
         return np.where(known[..., None], uv, 0), known.astype(np.float32), source
     sure = _array(confidence, "flow confidence", source, "numbers (H, W) from 0 to 1")
-    if sure.dtype.kind not in "fiub":
+    if sure.dtype.kind not in "fiub" or sure.ndim != 2:
         raise DataError(
-            "flow confidence does not hold numbers",
+            "flow confidence is no map of numbers",
             where=source,
-            found=sure.dtype,
+            found=f"{sure.dtype} {sure.shape}",
             expected="numbers (H, W) from 0 to 1",
         )
     return uv, sure if sure.dtype.kind == "f" else sure.astype(np.float32), source

@@ -80,13 +80,6 @@ class Flow:
             ("uv", "confidence", "source"), flow_of(self.uv, self.confidence, self.source)
         ):
             object.__setattr__(self, name, value)
-        if self.uv.shape[2:] != (2,) or self.confidence.ndim != 2:
-            raise DataError(
-                "flow has the wrong shape",
-                where=self.source,
-                found=f"{self.uv.shape}, confidence {self.confidence.shape}",
-                expected="(H, W, 2), confidence (H, W)",
-            )
         check_size("flow confidence and flow", self.confidence.shape, self.uv.shape, self.source)
         # False for NaN
         fits = (self.confidence >= 0) & (self.confidence <= 1)

@@ -1,8 +1,9 @@
-"""Reduction of a pair to a working size: images, cameras, flow and truth."""
+"""Pairs at other sizes: a working size, and frames of different focal lengths at one scale."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,9 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
+from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.pair import Flow, Pair, Truth
 
 Size = tuple[int, int]
+
+ALIKE = 1.1
+"""Largest ratio of two focal lengths of which flow methods find displacements reliably."""
+FEW = 0.2
+"""Share of usable pixels below which the focal lengths are doubted."""
 
 
 def working_size(pair: Pair, megapixels: float | None) -> Pair:
@@ -103,3 +110,57 @@ def _truth(truth: Truth, pair: Pair, ref: Size, following: Size) -> Truth:
         scale = np.array([following[1], following[0]]) / pair.image_next.shape[1::-1]
         changed["flow"] = changed["flow"] * scale
     return replace(truth, **changed)
+
+
+def at_common_focal(pair: Pair) -> Pair:
+    """The pair with one image reduced to the focal lengths of the other one.
+
+    The finer one is reduced, since a blurred image shifts against a sharp one. It is the same pair
+    if the focal lengths differ by less than a tenth.
+    """
+    ratio = np.diag(pair.K_next)[1::-1] / np.diag(pair.K_ref)[1::-1]
+    if 1 / ALIKE <= np.sqrt(ratio.prod()) <= ALIKE:
+        return pair
+    shapes = np.array([pair.image_ref.shape[:2], pair.image_next.shape[:2]])
+    factors = np.minimum([ratio, 1 / ratio], 1.0)
+    sizes = np.maximum(1, np.rint(shapes * factors)).astype(int)
+    (ref, following), cameras = sizes, (pair.K_ref, pair.K_next)
+    K_ref, K_next = (scaled_camera(*own) for own in zip(cameras, shapes, sizes))
+    return replace(
+        pair,
+        image_ref=resized(pair.image_ref, ref),
+        image_next=resized(pair.image_next, following),
+        K_ref=K_ref,
+        K_next=K_next,
+        flow=None,
+        truth=None,
+    )
+
+
+def in_own_pixels(flow: Flow, near: Pair, pair: Pair, compute: Callable[[Pair], Flow]) -> Flow:
+    """The flow of `near`, which is `at_common_focal(pair)`, in the pixels of both frames.
+
+    Where hardly any of it is usable, but the images match as they are, that flow (of `compute`) is
+    taken.
+
+    Warns:
+        DataWarning: the images match as they are, which the focal lengths contradict.
+    """
+    found = resized_flow(flow, near, pair)
+    if _usable(found) >= FEW:
+        return found
+    plain = compute(pair)
+    if _usable(plain) < 2 * FEW:
+        return found
+    warnings.warn(
+        f"the images match as they are ({_usable(plain):.0%} of the pixels), but not at their focal"
+        f" lengths, {pair.K_ref[0, 0]:g} and {pair.K_next[0, 0]:g} px ({_usable(found):.0%}): these"
+        " are probably wrong",
+        DataWarning,
+        stacklevel=2,
+    )
+    return plain
+
+
+def _usable(flow: Flow) -> float:
+    return float((flow.confidence > 0).mean())

@@ -157,8 +157,10 @@ def test_read_flow_npy_and_suffixes(tmp_path: Path) -> None:
     np.save(tmp_path / "b.npy", np.array(["x"]))
     with raises("does not hold numbers"):
         fmt.read_flow(tmp_path / "b.npy")
-    with raises("flow file is truncated"):
-        fmt.read_flow(put(tmp_path / "c.npy", (tmp_path / "a.npy").read_bytes()[:-9]))
+    whole = (tmp_path / "a.npy").read_bytes()
+    for content, match in ((whole[:-9], "not a readable .npy"), (whole + b"x", "left over")):
+        with raises(match):
+            fmt.read_flow(put(tmp_path / "c.npy", content))
     np.save(tmp_path / "d.npy", np.zeros((3, 4)))
     with raises("wrong shape"):
         fmt.read_flow(tmp_path / "d.npy")

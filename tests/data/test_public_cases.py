@@ -17,7 +17,6 @@ from PIL import ExifTags, Image, features
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.datasets.folders import TumInput
-from soup_nlp.data.flow.common_focal import at_common_focal
 from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.sources import FlowOptions, resolve_flow
 from soup_nlp.data.formats.camera_files import read_camera, read_intrinsics
@@ -25,7 +24,7 @@ from soup_nlp.data.formats.images import DataWarning, read_image, read_images
 from soup_nlp.data.formats.map_files import read_depth, read_flow
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.data.working_size import resized_flow, scaled_camera
+from soup_nlp.data.working_size import at_common_focal, resized_flow, scaled_camera
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.pipeline.run import solve_pair
 

@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.data.flow.common_focal import at_common_focal, in_own_pixels
 from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
 from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.flow.plausible import check_flow
 from soup_nlp.data.formats.map_files import read_confidence, read_flow
 from soup_nlp.data.pair import Flow, Pair, check_size
+from soup_nlp.data.working_size import at_common_focal, in_own_pixels
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.schema.section import Section
 from soup_nlp.storage.files import PathLike, is_file
@@ -35,20 +35,13 @@ NOISE = "truth+noise:"
 """Prefix of the source "true flow with noise", followed by the standard deviation in pixels."""
 
 
-def flow_from_array(uv: NDArray[np.floating], source: str) -> Flow:
-    """A Flow of displacements (H, W, 2), pixels, with confidence 1 where finite and 0 elsewhere."""
-    known = np.isfinite(uv).all(axis=2)
-    filled = np.where(known[:, :, None], uv, 0.0).astype(np.float32)
-    return Flow(filled, known.astype(np.float32), source)
-
-
 def load_flow(path: PathLike) -> Flow:
     """A Flow of a file (.flo, KITTI .png, .npy) with confidence 1 where known, else 0.
 
     Raises:
         DataError: the file is malformed, or all pixels are unknown.
     """
-    flow = flow_from_array(read_flow(path), Path(path).name)
+    flow = Flow(read_flow(path).astype(np.float32), source=Path(path).name)
     if not flow.confidence.any():
         raise DataError("flow file marks every pixel as unknown", where=path)
     return flow
@@ -67,7 +60,7 @@ def flow_from_truth(pair: Pair) -> Flow:
             found=pair.truth or "no truth",
             hint="use the flow source 'dis' or give a flow file",
         )
-    return flow_from_array(pair.truth.flow, "truth")
+    return Flow(pair.truth.flow.astype(np.float32), source="truth")
 
 
 def add_noise(flow: Flow, sigma: float, correlation: float = 5.0) -> Flow:

@@ -10,21 +10,23 @@ impossible size, or longer or shorter than its header says.
 
 from __future__ import annotations
 
+import io
 import re
 import struct
+import zipfile
 from collections.abc import Callable, Mapping
 from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap
 from soup_nlp.data.formats.images import assumed, check_body, decode, decode_png16
-from soup_nlp.data.formats.npy_files import read_npy
 from soup_nlp.errors import DataError, repr_of
-from soup_nlp.schema.limits import check_image_size
+from soup_nlp.schema.limits import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, as_path, read_bytes
 
 Reader = Callable[[PathLike], Float]
@@ -78,6 +80,50 @@ def _read_pieh(path: PathLike, channels: tuple[int, ...], what: str) -> FloatMap
     check_body(min(len(content) - 4, 8), 8, path, f"{what} header")
     width, height = struct.unpack("<ii", content[4:12])
     return _raster(content, 12, (height, width, *channels), "<", path, what)
+
+
+def read_npy(path: PathLike, what: str) -> NDArray[Any]:
+    """One array of real numbers from a .npy file, without pickles."""
+    return _array(read_bytes(path, what), path, what)
+
+
+def _array(content: bytes, path: PathLike, what: str) -> NDArray[Any]:
+    stream = io.BytesIO(content)
+    try:
+        array = npy.read_array(stream, allow_pickle=False)
+    except Exception as error:  # parsing the header, a Python literal, raises many types
+        raise DataError(
+            f"{what} is not a readable .npy file", where=path, found=str(error)
+        ) from error
+    if array.dtype.kind not in "fiu":
+        raise DataError(
+            f"{what} does not hold numbers",
+            where=path,
+            found=array.dtype,
+            expected="one array of real numbers",
+        )
+    if stream.read(1):
+        raise DataError(f"{what} has bytes left over", where=path)
+    return np.asarray(array)
+
+
+def read_npz(path: PathLike, what: str) -> dict[str, NDArray[Any]]:
+    """The arrays of a .npz file by name, see `read_npy`."""
+    content, most = read_bytes(path, what), 32 * MAX_PIXELS
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            # a small file may be large when unpacked
+            size = sum(entry.file_size for entry in archive.infolist())
+            if size > most:
+                raise DataError(
+                    f"{what} is too large", where=path, found=f"{size} bytes", expected=most
+                )
+            return {
+                name.removesuffix(".npy"): _array(archive.read(name), path, f"{what}, {name}")
+                for name in archive.namelist()
+            }
+    except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, ValueError) as error:
+        raise DataError(f"{what} is no .npz", where=path, found=str(error)) from error
 
 
 def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> Float:
