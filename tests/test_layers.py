@@ -58,7 +58,7 @@ DOORS = {
 
 LIBRARIES = {
     "casadi": {"model", "solve", "export", "family", "bench"},
-    "matplotlib": {"report", "bench"},
+    "matplotlib": {"bench"},
     "h5py": {"storage", "data"},
     "typer": {"cli"},
     "rich": {"cli", "report"},

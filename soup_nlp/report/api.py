@@ -9,11 +9,11 @@ from io import BytesIO
 from pathlib import Path
 from typing import ParamSpec
 
-from matplotlib.figure import Figure
+from PIL.Image import Image, fromarray
 
 from soup_nlp import pipeline
 from soup_nlp.config.problem import dump_problem
-from soup_nlp.report.figures import strip_figure, without_gaps
+from soup_nlp.report.figures import strip, without_gaps
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.formats import check_formats
 from soup_nlp.report.pictures import pictures
@@ -51,15 +51,15 @@ class WritableRun(pipeline.Run):
         target = prepare_folder(folder, inputs, overwrite, self.problem.subject)
         return write_folder(target, self, dump_problem(self.problem), f"{self}\n", formats=names)
 
-    def plot(self) -> Figure:
-        """The overview as a figure: notebooks show it, `.savefig` writes it."""
+    def plot(self) -> Image:
+        """The overview as a picture: notebooks show it, `.save` writes it."""
         drawn = pictures(result_of(self, summary(self)))
-        return strip_figure(without_gaps(drawn), self.problem.name)
+        return fromarray(strip(without_gaps(drawn), self.problem.name))
 
     def _repr_html_(self) -> str:
         """Text and overview, for notebooks."""
         picture = BytesIO()
-        self.plot().savefig(picture, format="png", dpi=80)
+        self.plot().save(picture, format="png")
         return html(str(self), picture.getvalue())
 
 

@@ -5,8 +5,7 @@ Unknown values are grey, which none of the colour scales contains; unusable flow
 
 from __future__ import annotations
 
-from functools import cache
-
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +21,12 @@ UNKNOWN = 150
 
 SIGMA_LIMIT = 0.3
 """Standard deviation of log depth at the upper end of the colours."""
+
+VIVID = (
+    *((255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (140, 86, 75)),
+    *((227, 119, 194), (188, 189, 34), (23, 190, 207), (31, 119, 180)),
+)
+"""Colours of tab10 without its grey, which means unknown."""
 
 _WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 
@@ -77,9 +82,7 @@ def colourise_sigma(sigma: Float) -> Image:
 
 def component_colours(count: int) -> Image:
     """(count, 3) colours of components: slate for the first, vivid colours for the others."""
-    vivid = _map("tab10", 10).astype(float)
-    # without the grey of tab10, which means unknown
-    vivid = np.delete(vivid, 7, axis=0)[[1, 2, 3, 4, 5, 6, 7, 8, 0]]
+    vivid = np.array(VIVID, float)
     turns = np.arange(max(count - 1, 0))
     faded = 0.75 ** (turns // len(vivid))[:, None]
     return np.vstack([[[126, 150, 190]], vivid[turns % len(vivid)] * faded]).astype(np.uint8)[
@@ -103,19 +106,10 @@ def _paint_up_to(limit: float, value: Float, name: str) -> Image:
 
 
 def _paint(level: NDArray[np.float64], known: Mask, name: str) -> Image:
-    """(H, W, 3) colours of levels (H, W) in [0, 1] by a matplotlib map, grey where not known."""
-    out = _map(name, 256)[(level * 255).round().astype(np.intp)]
-    out[~known] = UNKNOWN
-    return np.asarray(out)
-
-
-@cache
-def _map(name: str, count: int) -> Image:
-    """(count, 3) colours of a map of matplotlib, whose import takes half a second."""
-    import matplotlib
-
-    colours = matplotlib.colormaps[name](np.arange(count))[:, :3]
-    return np.asarray((colours * 255).round(), np.uint8)
+    """(H, W, 3) colours of levels (H, W) in [0, 1] by a map of OpenCV, grey where not known."""
+    steps = (level * 255).round().astype(np.uint8)
+    out = cv2.applyColorMap(steps, getattr(cv2, f"COLORMAP_{name.upper()}"))[..., ::-1]
+    return np.where(known[..., None], out, np.uint8(UNKNOWN))
 
 
 def colour_wheel() -> NDArray[np.float64]:

@@ -6,9 +6,9 @@ Every writer raises `DataError` if the file cannot be written.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
-from pathlib import Path
-from typing import TYPE_CHECKING
+from functools import cache, lru_cache
+from importlib.resources import files
+from io import BytesIO
 
 import cv2
 import numpy as np
@@ -20,9 +20,6 @@ from soup_nlp.arrays import Image
 from soup_nlp.errors import DataError
 from soup_nlp.report.pictures import Bar, Legend, Picture, Swatches, Wheel
 from soup_nlp.storage.atomic import PathLike, write_bytes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Float = NDArray[np.floating]
 
@@ -38,7 +35,7 @@ _SPARE = ("depth_start", "normals")
 def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: int = 420) -> Image:
     """(H, W, 3) uint8: titled pictures with their legends in a grid, under a title.
 
-    Panels keep their aspect ratio. PIL draws them, since matplotlib takes five times as long.
+    Panels keep their aspect ratio.
     `columns` is the largest number of panels in a row, `panel_width` is in pixels.
     """
     columns = min(columns, len(panels))
@@ -50,26 +47,13 @@ def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: 
     head = _HEAD if title else _GAP
     size = columns * (panel_width + _GAP) + _GAP, head + sum(heights)
     sheet = Pil.new("RGB", (size[0], size[1] + len(rows) * (_CAPTION + _GAP)), "white")
-    _write(sheet, _GAP, head // 2, title, size[0] - 2 * _GAP, points=13, bold=True)
+    _write(sheet, _GAP, head // 2, title, size[0] - 2 * _GAP, points=13)
     top = head
     for row, height in zip(rows, heights, strict=True):
         for k, panel in enumerate(row):
             _draw_panel(sheet, panel, _GAP + k * (panel_width + _GAP), top, panel_width)
         top += height + _CAPTION + _GAP
     return np.array(sheet)
-
-
-def strip_figure(panels: Sequence[Picture], title: str) -> Figure:
-    """The image of `strip` as a figure of matplotlib, without changing its global state."""
-    # the import takes half a second, which result folders do not need
-    from matplotlib.figure import Figure
-
-    image = strip(panels, title)
-    figure = Figure(figsize=(image.shape[1] / _DPI, image.shape[0] / _DPI), dpi=_DPI)
-    axes = figure.add_axes((0, 0, 1, 1))
-    axes.set_axis_off()
-    axes.imshow(image)
-    return figure
 
 
 def write_picture(path: PathLike, picture: Picture) -> None:
@@ -118,7 +102,7 @@ def _draw_bar(sheet: Pil.Image, bar: Bar, left: int, bottom: int, width: int) ->
 def _draw_swatches(sheet: Pil.Image, key: Swatches, left: int, bottom: int, width: int) -> None:
     x, y, last = float(left), bottom + 13, len(key.entries) - 1
     for i, (colour, name) in enumerate(key.entries):
-        end = x + 16 + _font(8, False).getlength(name)
+        end = x + 16 + _font(8).getlength(name)
         # room for the dots where more follow
         if end + (20 if i < last else 0) > left + width:
             _write(sheet, x, y, "...", points=8)
@@ -129,13 +113,14 @@ def _draw_swatches(sheet: Pil.Image, key: Swatches, left: int, bottom: int, widt
 
 
 @lru_cache(maxsize=100)
-def _font(points: float, bold: bool) -> ImageFont.FreeTypeFont:
-    """The font that comes with matplotlib."""
-    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-    import matplotlib
+def _font(points: float) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which has more letters than the font that comes with Pillow."""
+    return ImageFont.truetype(BytesIO(_font_file()), points * _DPI / 72)
 
-    path = Path(matplotlib.get_data_path(), "fonts", "ttf", name)
-    return ImageFont.truetype(path, points * _DPI / 72)
+
+@cache
+def _font_file() -> bytes:
+    return (files("soup_nlp.report") / "font" / "DejaVuSans.ttf").read_bytes()
 
 
 def _write(
@@ -146,12 +131,11 @@ def _write(
     room: float = np.inf,
     *,
     points: float = 10,
-    bold: bool = False,
     side: str = "l",
 ) -> None:
     """Draw text with its left end, middle or right end (`side`) at (x, y), shrunk to `room`."""
-    wide = _font(points, bold).getlength(text)
-    font = _font(points * min(1.0, room / max(wide, 1.0)), bold)
+    wide = _font(points).getlength(text)
+    font = _font(points * min(1.0, room / max(wide, 1.0)))
     ImageDraw.Draw(sheet).text((x, y), text, fill="black", font=font, anchor=f"{side}m")
 
 

@@ -110,7 +110,7 @@ def test_a_run_saves_itself_and_is_converted(run, saved, tmp_path, capsys):
 
 
 def test_a_run_plots_its_overview(run, saved, tmp_path):
-    run.plot().savefig(tmp_path / "a.png")
+    run.plot().save(tmp_path / "a.png")
     shown, written = imread(tmp_path / "a.png"), imread(saved[0] / "overview.png")
     np.testing.assert_array_equal(shown[..., :3], written[..., :3])
 

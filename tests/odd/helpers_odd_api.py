@@ -181,7 +181,7 @@ def _strided(w: World, o: Path) -> None:
 
 
 USES: dict[str, Callable[[World, Path], object]] = {
-    "plot": lambda w, o: w.run.plot().savefig(o / "a.png"),
+    "plot": lambda w, o: w.run.plot().save(o / "a.png"),
     "repr": lambda w, o: [repr(x) for x in (w.run, w.run.components, w.run.camera)],
     "save twice": lambda w, o: [w.run.save(o / "out") for _ in range(2)],
     "save and check": _again,

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import os
-
 import cv2
 import matplotlib
 import numpy as np
@@ -24,7 +22,6 @@ from soup_nlp.report.colour import (
 from soup_nlp.report.figures import (
     overview,
     strip,
-    strip_figure,
     write_clipped_depth_png16,
     write_picture,
     write_png,
@@ -183,19 +180,6 @@ def test_strip():
     assert image.shape == (42 + 400 + 100 + 2 * 36, 2 * 208 + 8, 3)
     assert area(image, RED) == pytest.approx(2 * 200 * 100, rel=0.05)
     assert area(image, BLUE) == pytest.approx(200 * 400, rel=0.05)
-
-
-def test_a_figure_of_the_strip_does_not_touch_global_state(tmp_path):
-    import sys
-
-    before = dict(matplotlib.rcParams)
-    figure = strip_figure([flat(RED)], "a title")
-    figure.savefig(tmp_path / "a.png")
-    np.testing.assert_array_equal(read(tmp_path / "a.png"), strip([flat(RED)], "a title"))
-    assert os.listdir(tmp_path) == ["a.png"]
-    assert dict(matplotlib.rcParams) == before
-    if "matplotlib.pyplot" in sys.modules:
-        assert not sys.modules["matplotlib.pyplot"].get_fignums()
 
 
 @pytest.mark.parametrize(

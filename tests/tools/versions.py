@@ -27,7 +27,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHONS = ("3.11", "3.12", "3.13")
-RUNNERS = ("pytest", "hypothesis")
+RUNNERS = ("pytest", "hypothesis", "matplotlib")
 """What the tests need besides the dependencies."""
 NO_COMPILER = {"CC": "no-such-compiler"}
 TINY = [
