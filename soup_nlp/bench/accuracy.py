@@ -13,8 +13,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.bench.study import Overrides
-from soup_nlp.bench.suite_pairs import Item
-from soup_nlp.bench.suites import SUITES
+from soup_nlp.bench.suites import SUITES, Item
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
@@ -28,7 +27,7 @@ from soup_nlp.evaluate.metrics import (
 )
 from soup_nlp.evaluate.protocols import Preset, preset
 from soup_nlp.evaluate.scoring import at_truth, surest
-from soup_nlp.evaluate.sparsification import coverage
+from soup_nlp.evaluate.sparsification import coverage, sparsification
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
@@ -107,54 +106,63 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
     truth has sparse points. "guess" is the share of the image that is marked as a guess, "within"
     has the shares of the pixels whose log depth is within one and two sigma.
     """
-    maps = depth_maps(result)
+    maps, truth, solution = depth_maps(result), result.pair.truth, result.solution
     sigma = result.reconstruction.sigma_ref
-    tables = {name: _metrics(result.pair.truth, maps, preset(name), sigma) for name in presets}
-    metrics = {name: table for name, table in tables.items() if table}
+    metrics: dict[str, dict[str, dict[str, float]]] = {}
+    if truth is not None and "constant" in maps:
+        scored = {method: at_truth(truth, depth) for method, depth in maps.items()}
+        if sigma is not None:
+            estimate, gt = scored["solution"]
+            kept = surest(gt, at_truth(truth, sigma)[0])
+            scored |= {name: (estimate, values) for name, values in kept.items()}
+        for name in presets:
+            if _applies(truth, preset(name)):
+                metrics[name] = _metrics(scored, preset(name))
     main = next(iter(metrics), "")
-    errors = pixel_errors(result)
+    energy = {"start": solution.energy_start, "solution": result.energy}
+    if result.refined is not None:
+        energy["nlp"] = solution.energy
     return {
-        "status": result.solution.status,
+        "status": solution.status,
         "good": result.solved,
         "superpixels": len(result.segmentation),
         "size": list(result.pair.size),
         "stages": dict(result.seconds),
-        "iterations": sum(stage.iterations for stage in result.solution.stages),
+        "iterations": sum(stage.iterations for stage in solution.stages),
         "parallax_px": float(np.median(result.start.parallax)),
         "bending_share": float(result.start.bends.mean()),
         "guess": result.confidence.guessed,
-        "within": None if errors is None else coverage(errors[1], errors[2]),
+        **_sigma(result),
         "flow_error": flow_error(result.pair),
         "metrics": metrics,
-        "energy": _energies(result),
+        "energy": {name: dict(terms) for name, terms in energy.items()},
         "scene_flow": _scene_flow(result, metrics[main]["solution"]["scale"]) if main else None,
         "moving": moving(result.pair, maps["solution"], preset(main)) if main else None,
     }
 
 
-def pixel_errors(result: Run) -> tuple[Float, Float, Float] | None:
-    """Relative errors, errors of log depth and sigma of the true pixels (M,) after a median scale.
-
-    None without a true depth.
-    """
+def _sigma(result: Run) -> Row:
+    """ "within" and "sparsification" of sigma, of the true pixels after a median scale."""
     truth, sigma = result.pair.truth, result.reconstruction.sigma_ref
-    if truth is None or (truth.depth_ref is None and truth.points is None) or sigma is None:
-        return None
+    if truth is None or not has_depth(truth) or sigma is None:
+        return {"within": None}
     z, gt = at_truth(truth, result.reconstruction.depth_ref)
     true = true_pixels(gt, None) & np.isfinite(z)
     if not true.any():
-        return None
+        return {"within": None}
     z, gt = z[true] * float(np.median(gt[true] / z[true])), gt[true]
-    return np.abs(z - gt) / gt, np.abs(np.log(z / gt)), at_truth(truth, sigma)[0][true]
+    uncertain = at_truth(truth, sigma)[0][true]
+    found = sparsification(np.abs(z - gt) / gt, uncertain)
+    curve = [[round(float(v), 5) for v in line] for line in (found.kept, found.error, found.oracle)]
+    return {
+        "within": coverage(np.abs(np.log(z / gt)), uncertain),
+        "sparsification": {"ause": found.ause, "curve": curve},
+    }
 
 
-def _energies(result: Run) -> dict[str, dict[str, float]]:
-    """Exact energies by soup and term."""
-    energy: dict[str, Mapping[str, float]] = {"start": result.solution.energy_start}
-    if result.refined is not None:
-        energy["nlp"] = result.solution.energy
-    energy["solution"] = result.energy
-    return {name: dict(terms) for name, terms in energy.items()}
+def has_depth(truth: Truth | None) -> bool:
+    """Whether there is a depth to compare with."""
+    return truth is not None and (truth.depth_ref is not None or truth.points is not None)
 
 
 def _applies(truth: Truth | None, convention: Preset) -> bool:
@@ -169,21 +177,14 @@ def _applies(truth: Truth | None, convention: Preset) -> bool:
 
 
 def _metrics(
-    truth: Truth | None, maps: Mapping[str, Float], convention: Preset, sigma: Float | None = None
+    scored: Mapping[str, tuple[Float, Float]], convention: Preset
 ) -> dict[str, dict[str, float]]:
-    """Metrics of every method under one convention; {} where it does not apply."""
-    if truth is None or "constant" not in maps or not _applies(truth, convention):
-        return {}
-    scored = {method: at_truth(truth, depth) for method, depth in maps.items()}
-    if sigma is not None:
-        estimate, gt = scored["solution"]
-        for name, kept in surest(gt, at_truth(truth, sigma)[0]).items():
-            if convention.counts(kept):
-                scored[name] = estimate, kept
-    out: dict[str, dict[str, float]] = {}
-    for method, (estimate, gt) in scored.items():
-        m = convention.score(estimate, gt).as_dict()
-        out[method] = {k: m[k] for k in KEPT_METRICS}
+    """Metrics under one convention of estimate and truth by method, and their skill."""
+    out = {
+        method: {k: convention.score(*pair).as_dict()[k] for k in KEPT_METRICS}
+        for method, pair in scored.items()
+        if convention.counts(pair[1])
+    }
     for m in out.values():
         m["skill"] = skill(m["mre"], out["constant"]["mre"])
     return out
@@ -246,22 +247,14 @@ def _scene_flow(result: Run, scale: float) -> dict[str, float | int] | None:
 
 
 def flow_error(pair: Pair) -> dict[str, float] | None:
-    """End-point error in pixels of the flow that was used; None without a true flow."""
+    """Mean and median end-point error of the flow, pixels; None without a true flow."""
     if pair.flow is None or pair.truth is None or pair.truth.flow is None:
         return None
-    known = np.isfinite(pair.truth.flow).all(axis=2)
-    used = known & (pair.flow.confidence > 0)
+    used = np.isfinite(pair.truth.flow).all(axis=2) & (pair.flow.confidence > 0)
     if not used.any():
         return None
     gap = np.linalg.norm(pair.flow.uv[used] - pair.truth.flow[used], axis=1)
-    weight = pair.flow.confidence[used].astype(np.float64)
-    return {
-        "mean": float(gap.mean()),
-        "weighted_mean": float(np.sum(weight * gap) / weight.sum()),
-        "median": float(np.median(gap)),
-        "over_3px": float(np.mean(gap > 3)),
-        "used": float(used.sum() / known.sum()),
-    }
+    return {"mean": float(gap.mean()), "median": float(np.median(gap))}
 
 
 def unorganised(soup: Soup) -> Soup:
@@ -296,7 +289,6 @@ def depth_maps(run: Run) -> dict[str, Float]:
         out["rigid"] = run.rigid
         if np.isfinite(run.rigid).any():
             out["rigid_filled"] = fill_nearest(run.rigid)
-    truth = run.pair.truth
-    if truth is not None and (truth.depth_ref is not None or truth.points is not None):
+    if has_depth(pair.truth):
         out["constant"] = np.ones(pair.size)
     return out

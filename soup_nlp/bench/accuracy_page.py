@@ -16,14 +16,18 @@ from soup_nlp.bench.study import (
     main_metric,
     markdown,
     page_text,
+    panels,
     pivot,
     plot_lines,
     provenance,
+    save,
     show,
     table,
+    titled,
 )
 from soup_nlp.evaluate.metrics import ERRORS
 from soup_nlp.evaluate.protocols import preset
+from soup_nlp.evaluate.scoring import SURE
 
 MEASURES = {
     "mre": ("MRE", ".4f"),
@@ -32,6 +36,11 @@ MEASURES = {
     "energy.solution.total": ("Exact energy of the solution", ".1f"),
 }
 """Title and format of every table of a study, by column."""
+CONFIDENCE = (
+    "AUSE is the area between the sparsification curve and the oracle's, over the mean relative"
+    " error: 0 is perfect, 0.8 to 1 is chance. Within k: share of the pixels whose log depth is"
+    " within k sigma, one median scale a pair. Guess: share of the image."
+)
 
 
 def suite_page(title: str, frame: pd.DataFrame, note: str = "") -> str:
@@ -65,31 +74,32 @@ def beating(frame: pd.DataFrame) -> pd.DataFrame:
 
     The baseline `rigid` is compared on the pixels where it has a depth.
     """
-    parts = [pd.DataFrame(columns=["title", "main", "baseline", "theirs", "mre", "pixels"])]
+    parts = []
     for baseline in BASELINES:
-        theirs, ours = main_metric(frame, baseline), frame["mre"]
+        part = frame[["title", "main"]].assign(baseline=baseline, mre=frame["mre"])
         if baseline == "rigid":
-            ours = main_metric(frame, "solution_rigid").fillna(ours)
-        part = frame[["title", "main"]].assign(
-            baseline=baseline,
-            theirs=theirs,
-            mre=ours,
-            pixels=main_metric(frame, baseline, "coverage"),
-        )
-        parts.append(part[theirs <= ours])
-    return pd.concat([p for p in parts if len(p)] or parts[:1], ignore_index=True)
+            part["mre"] = main_metric(frame, "solution_rigid").fillna(frame["mre"])
+        part["theirs"] = main_metric(frame, baseline)
+        part["pixels"] = main_metric(frame, baseline, "coverage")
+        parts.append(part[part["theirs"] <= part["mre"]])
+    return pd.concat(parts, ignore_index=True)
 
 
 def _better_baselines(frame: pd.DataFrame) -> list[str]:
     found = beating(frame)
     if found.empty:
         return []
-    found["difference"] = [show(v, "+.4f") for v in found["theirs"] - found["mre"]]
-    found["pixels"] = [show(v, ".1%") for v in found["pixels"]]
-    head = ["pair, flow", "convention", "baseline", "its MRE", "the solution's", "its pixels"]
-    found.columns = pd.Index([*head, "difference"])
+    found["difference"] = found["theirs"] - found["mre"]
+    columns = {
+        "main": ("convention", ""),
+        "baseline": ("baseline", ""),
+        "theirs": ("its MRE", ".4f"),
+        "mre": ("the solution's", ".4f"),
+        "pixels": ("its pixels", ".1%"),
+        "difference": ("difference", "+.4f"),
+    }
     text = "The solution's MRE is on the pixels that the baseline has a depth for."
-    lines = markdown(found.set_index("pair, flow"))
+    lines = titled(found.set_axis(pd.Index(found["title"], name="pair, flow")), columns)
     return ["## Baselines that are better", "", text, "", *lines, ""]
 
 
@@ -128,8 +138,7 @@ def _families(frame: pd.DataFrame) -> list[str]:
     own["skill"] = main_metric(frame, name="skill")
     for column, name in {"moving.mre": "MRE moving", "moving.rest": "MRE of the rest"}.items():
         own[name] = frame[column].astype(float) if column in frame else np.nan
-    own["guess"] = frame["guess"].astype(float) if "guess" in frame else np.nan
-    own["within 1"], own["within 2"] = _within(frame)
+    own["guess"], own["within 1"], own["within 2"] = _sure(frame)
     groups = own.groupby(["sequence", "flow"], sort=False)
     means = groups[[c for c in own.columns if c not in ("sequence", "flow", "title")]].mean()
     means.insert(0, "pairs", groups.size())
@@ -142,11 +151,11 @@ def _families(frame: pd.DataFrame) -> list[str]:
     return ["## By family", "", text, "", *markdown(means, _forms(means)), ""]
 
 
-def _within(frame: pd.DataFrame) -> tuple[list[float], list[float]]:
-    """Shares of the pixels within one and within two sigma, by row."""
-    both = frame["within"] if "within" in frame else [None] * len(frame)
-    pairs = [v if isinstance(v, list) else (np.nan, np.nan) for v in both]
-    return [v[0] for v in pairs], [v[1] for v in pairs]
+def _sure(frame: pd.DataFrame) -> tuple[pd.Series, pd.Series, pd.Series]:
+    """Share of guesses, and shares of the pixels within one and within two sigma, by row."""
+    guess, within = (frame.get(c, pd.Series(np.nan, frame.index)) for c in ("guess", "within"))
+    one, two = ([v[k] if isinstance(v, list) else np.nan for v in within] for k in (0, 1))
+    return guess.astype(float), pd.Series(one, frame.index), pd.Series(two, frame.index)
 
 
 def _details(convention: str, frame: pd.DataFrame) -> list[str]:
@@ -160,11 +169,11 @@ def _details(convention: str, frame: pd.DataFrame) -> list[str]:
         "scene_flow.mean": "3D EPE",
         "scene_flow.mean_truth_length": "of length",
         "bending_share": "bending",
-        "guess": "guess",
     }.items():
         if column in frame:
             out[head] = frame[column].astype(float).to_numpy()
-    out["within 1"], out["within 2"] = _within(frame)
+    for head, values in zip(("guess", "within 1", "within 2"), _sure(frame), strict=True):
+        out[head] = values.to_numpy()
     out["status"], out["s"] = frame["status"].to_numpy(), frame["cpu_seconds"].to_numpy()
     forms = dict.fromkeys(out.columns, ".4f") | {"s": ".0f"}
     return [f"## The solution, {preset(convention)}", "", *markdown(out, forms), ""]
@@ -211,11 +220,59 @@ def published_lines(study: str) -> list[str]:
     return []
 
 
+def confidence_page(study: Study, frame: pd.DataFrame, note: str = "") -> str:
+    """Page of the study of sigma: tables by pair and by family."""
+    head = f"{study.text[0].upper()}{study.text[1:]}. {note} {provenance(frame)}."
+    lines = ["# Study: confidence", "", head, ""]
+    good = _with_curve(frame)
+    if len(good):
+        table = pd.DataFrame({"MRE": good["mre"]})
+        for name in SURE:
+            table[name.replace("solution_", "surest ") + " %"] = main_metric(good, name)
+        table["AUSE"] = good["sparsification.ause"].astype(float)
+        table["guess"], table["within 1"], table["within 2"] = _sure(good)
+        by_family = table.groupby(good["sequence"], sort=False).mean().rename_axis("family")
+        by_family.loc[f"mean of {len(by_family)} families"] = by_family.mean()
+        by_pair = table.set_axis(pd.Index(good["title"], name="pair, flow"))
+        lines += [CONFIDENCE, "", *markdown(by_pair), "", "## By family", ""]
+        lines += markdown(by_family)
+    return page_text([*lines, *failures(frame)])
+
+
+def _with_curve(frame: pd.DataFrame) -> pd.DataFrame:
+    """The rows that have a sparsification curve."""
+    known = "sparsification.ause" in frame
+    return frame[frame["sparsification.ause"].notna()] if known else frame.iloc[:0]
+
+
+def plot_confidence(path: Path, frame: pd.DataFrame) -> None:
+    """Sparsification curves of sigma and of the oracle, one panel for each family."""
+    families = _with_curve(frame).groupby("sequence", sort=False)
+    out, axes = panels(families.ngroups, 4, 3.0, 2.4)
+    for ax, (family, group) in zip(axes, families, strict=True):
+        for curve in group["sparsification.curve"]:
+            kept, by_sigma, oracle = np.array(curve)
+            ax.plot(100 * (1 - kept), by_sigma / by_sigma[0], color="#4477aa", lw=1)
+            ax.plot(100 * (1 - kept), oracle / by_sigma[0], color="#bbbbbb", lw=1)
+        ax.axhline(1.0, color="#cc6677", lw=0.8, ls="--")
+        ax.set(ylim=(0, 1.3), xlim=(0, 100))
+        ax.set_title(str(family), fontsize=9)
+    out.supxlabel("most uncertain % removed")
+    out.supylabel("MRE of the rest / MRE")
+    out.suptitle("Sparsification: sigma (blue), oracle (grey), chance (dashed)", fontsize=10)
+    save(out, path)
+
+
 def write_study(
     folder: Path, name: str, study: Study, frame: pd.DataFrame, note: str = ""
 ) -> Sequence[Path]:
     """Write the page and the picture of a study."""
     page, picture = folder / f"{name}.md", folder / f"{name}.png"
-    page.write_text(study_page(name, study, frame, note), encoding="utf-8")
-    plot_lines(picture, {"": pivot(frame)}, name, study.text)
+    if name == "confidence":
+        text = confidence_page(study, frame, note)
+        plot_confidence(picture, frame)
+    else:
+        text = study_page(name, study, frame, note)
+        plot_lines(picture, {"": pivot(frame)}, name, study.text)
+    page.write_text(text, encoding="utf-8")
     return page, picture

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from soup_nlp.bench.study import Overrides, failures, markdown, page_text, provenance
-from soup_nlp.bench.suite_pairs import Item
+from soup_nlp.bench.study import Overrides, failures, page_text, provenance, titled
+from soup_nlp.bench.suites import Item
 from soup_nlp.errors import DataError
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import file_frames, find_depths, find_images, scene_frames
@@ -88,9 +88,7 @@ def chain_page(frame: pd.DataFrame) -> str:
     lines = [NOTE, "", f"{provenance(frame)}.", ""]
     good = frame[frame["ok"].eq(True)]
     if len(good):
-        shown = good[list(COLUMNS)].astype(float).set_axis(pd.Index(good["pair"], name="sequence"))
-        titles = {column: title for column, (title, _) in COLUMNS.items()}
-        lines += markdown(shown.rename(columns=titles), dict(COLUMNS.values()))
+        lines += titled(good.set_axis(pd.Index(good["pair"], name="sequence")), COLUMNS)
         lines += [
             "",
             f"Mean cost of one scale: {good['cost'].astype(float).mean():+.2%} of the MRE.",

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
-from soup_nlp.bench.accuracy import scores, solved
+from soup_nlp.bench.accuracy import has_depth, scores, solved
 from soup_nlp.bench.studies import DEPARTURES, PAPER, STUDIES, without
 from soup_nlp.bench.study import Cell, Overrides
-from soup_nlp.bench.suite_pairs import RENDERED, Item, Options, spread
-from soup_nlp.bench.suites import list_suite
+from soup_nlp.bench.suites import RENDERED, Item, Options, list_suite, spread
 from soup_nlp.config.presets import overrides_of
 from soup_nlp.errors import DataError, SoupError
-from soup_nlp.evaluate.metrics import depth_metrics
-from soup_nlp.evaluate.scoring import at_truth
 from soup_nlp.pipeline.record import Run
 from soup_nlp.storage.atomic import atomic_path
 from soup_nlp.storage.rows import Row
@@ -43,13 +41,19 @@ FAMILIES = (*RENDERED, *SHARED, "deepdeform", *DATASETS)
 SECTIONS = ("ablation", "superpixels", "neighbours", "pattern", "flow", "stages")
 """Studies that the page repeats for both methods."""
 ALL_SECTIONS = (*SECTIONS, "departures")
+BASE = "as they are"
+"""Name of the methods without a change, among the departures."""
 PRINTED_SUPERPIXELS = 1000
 """Number of superpixels for which the preset gives its weights."""
 MAP_WIDTH = 240
 """Columns of a small depth map, at most."""
 
-_LENGTHS = tuple(f"energy.weights.{term}" for term in ("arap", "cont"))
-_PRINTED: Overrides = tuple(o for o in overrides_of("paper") if o.partition("=")[0] in _LENGTHS)
+_LENGTHS = tuple(f"energy.weights.{term}=" for term in ("arap", "cont"))
+PRINTED: Mapping[str, Overrides] = {
+    "preset: paper": tuple(o for o in overrides_of("paper") if o.startswith(_LENGTHS)),
+    "defaults": (),
+}
+"""Weights of a method that are given for PRINTED_SUPERPIXELS."""
 
 
 @dataclass(frozen=True)
@@ -79,23 +83,28 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Plan:
-    """Cells of the benchmark by section, name of the change, method and pair.
+    """Cells of the benchmark.
 
     Attributes:
         sizes: See Sizes.
         datasets: Available pairs with truth by dataset.
-        sections: Cells by section ("comparison", a study, or "departures"), and by (method, name
-            of the variant, pair).
+        table: A line for each cell of each section, with the columns section ("comparison", a
+            study, or "departures"), method, change (variant), name (of the pair), cell and key.
     """
 
     sizes: Sizes
     datasets: Mapping[str, tuple[Item, ...]]
-    sections: Mapping[str, Mapping[tuple[str, str, str], Cell]]
+    table: pd.DataFrame
 
     def cells(self) -> list[Cell]:
         """All cells without duplicates."""
-        every = (c for cells in self.sections.values() for c in cells.values())
-        return list({(c.item.key, c.overrides): c for c in every}.values())
+        return list(self.table.drop_duplicates("key")["cell"])
+
+    def sections(self, frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
+        """The table with the measured rows, by section; NaN where not measured."""
+        rows = frame.drop_duplicates("key").set_index("key")
+        whole = self.table.join(rows.drop(columns=["variant"]), on="key")
+        return {str(name): own for name, own in whole.groupby("section", sort=False)}
 
 
 def make_plan(data: Path | None, sizes: Sizes, folder: Path) -> Plan:
@@ -105,64 +114,52 @@ def make_plan(data: Path | None, sizes: Sizes, folder: Path) -> Plan:
     """
     datasets = {name: _dataset(name, data, sizes.limit) for name in DATASETS}
     analysed = _families(sizes.families, datasets, data, sizes.width)
-    compared = list(
-        {i.key: i for i in [*(i for group in datasets.values() for i in group), *analysed]}.values()
-    )
-    sections: dict[str, dict[tuple[str, str, str], Cell]] = {"comparison": {}}
-    for item in compared:
-        for method in METHODS:
-            name = item.key.replace("/", "-").replace(" ", "_")
-            maps = folder / "maps" / f"{name}-{method.replace(': ', '_')}.npz"
-            own = _at_size(METHODS[method], sizes.superpixels, sizes.overrides)
-            cell = Cell(item, own, ", ".join(own), maps)
-            sections["comparison"][method, "", item.name] = cell
+    departing = _families(sizes.departures, datasets, data, sizes.width)
+    compared = {i.key: i for i in (*(i for group in datasets.values() for i in group), *analysed)}
+    lines: list[dict[str, Any]] = []
+
+    def add(section: str, items: Iterable[Item], n: int = sizes.analysis) -> None:
+        for item in items:
+            for method, base in METHODS.items():
+                for change, own in _variants(section, method).items():
+                    count = int(change) if section == "superpixels" else n
+                    size = f"segmentation.superpixels={count}", *_scaled(PRINTED[method], count)
+                    every = (*base, *size, *sizes.overrides, *_scaled(own, count))
+                    maps = None
+                    if section == "comparison":
+                        name = f"{item.key}-{method}".replace(": ", "_")
+                        maps = folder / "maps" / f"{name.replace('/', '-').replace(' ', '_')}.npz"
+                    cell = Cell(item, every, ", ".join(every), maps)
+                    line = {"section": section, "method": method, "change": change}
+                    lines.append(
+                        {**line, "name": item.name, "cell": cell, "key": cell.identity()["key"]}
+                    )
+
+    add("comparison", compared.values(), sizes.superpixels)
     for section in SECTIONS:
         if section in sizes.sections:
-            sections[section] = _section(section, analysed, sizes)
+            rendered = (i for i in analysed if i.suite == "rendered")
+            add(section, rendered if section == "flow" else analysed)
     if "departures" in sizes.sections:
-        departing = _families(sizes.departures, datasets, data, sizes.width)
-        sections["departures"] = _departures(departing, sizes)
-    return Plan(sizes, datasets, sections)
+        add("departures", departing)
+    columns = ["section", "method", "change", "name", "cell", "key"]
+    return Plan(sizes, datasets, pd.DataFrame(lines, columns=columns))
 
 
-def _section(name: str, items: tuple[Item, ...], sizes: Sizes) -> dict[tuple[str, str, str], Cell]:
-    """Cells of a study by both methods; `flow` has the rendered pairs only."""
-    out = {}
-    for item in items:
-        for method, base in METHODS.items():
-            variants = dict(STUDIES[name].variants)
-            if name == "ablation" and method != "defaults":
-                # the paper has no prior
-                del variants["+ prior"]
-                variants["+ orient"] = without("prior")
-            for variant, changes in variants.items():
-                n = int(variant) if name == "superpixels" else sizes.analysis
-                own = _at_size(base, n, (*sizes.overrides, *changes))
-                if name != "flow" or item.suite == "rendered":
-                    out[method, variant, item.name] = Cell(item, own, ", ".join(own))
-    return out
-
-
-def _departures(items: tuple[Item, ...], sizes: Sizes) -> dict[tuple[str, str, str], Cell]:
-    """Cells of the departures: both methods as they are, each one undone or made alone."""
-    out = {}
-    for item in items:
-        for method, base in METHODS.items():
-            own = _at_size(base, sizes.analysis, sizes.overrides)
-            out[method, "as they are", item.name] = Cell(item, own, ", ".join(own))
-            for d in DEPARTURES:
-                changes = d.off_alone() if method == "defaults" else d.on_alone()
-                if changes is not None:
-                    change = _scaled(tuple(o for o in changes if o not in PAPER), sizes.analysis)
-                    whole = (*own, *change)
-                    out[method, d.name, item.name] = Cell(item, whole, ", ".join(whole))
-    return out
-
-
-def _at_size(method: Overrides, n: int, more: Overrides) -> Overrides:
-    """Overrides of a method with n superpixels, and further ones."""
-    weights = _PRINTED if method == PAPER else ()
-    return (*method, f"segmentation.superpixels={n}", *_scaled(weights, n), *more)
+def _variants(section: str, method: str) -> Mapping[str, Overrides]:
+    """Changes of a method in a section."""
+    if section == "comparison":
+        return {"": ()}
+    if section == "departures":
+        off = method == "defaults"
+        changes = {d.name: d.off_alone() if off else d.on_alone() for d in DEPARTURES}
+        return {BASE: (), **changes}
+    variants = dict(STUDIES[section].variants)
+    if section == "ablation" and method != "defaults":
+        # the paper has no prior
+        del variants["+ prior"]
+        variants["+ orient"] = without("prior")
+    return variants
 
 
 def _scaled(overrides: Overrides, n: int) -> Overrides:
@@ -173,7 +170,7 @@ def _scaled(overrides: Overrides, n: int) -> Overrides:
     out = []
     for o in overrides:
         key, _, value = o.partition("=")
-        scaled = o in _PRINTED and n != PRINTED_SUPERPIXELS
+        scaled = o in PRINTED["preset: paper"] and n != PRINTED_SUPERPIXELS
         out.append(f"{key}={float(value) * n / PRINTED_SUPERPIXELS:g}" if scaled else o)
     return tuple(out)
 
@@ -191,41 +188,40 @@ def _families(
         elif name in RENDERED:
             out += list_suite("rendered", None, Options(("dis",), width, (0,), None, (name,))).items
         else:
-            listed = (i for i in _listed("shared", data) if i.sequence == name and _has_truth(i))
-            out += [i.scored_by(("paper", "best")) for i in listed][:1]
+            out += [i for i in _with_truth("shared", data) if i.sequence == name][:1]
     return tuple(out)
 
 
 def _dataset(name: str, data: Path | None, limit: int | None) -> tuple[Item, ...]:
     """At most `limit` pairs of a dataset that have a truth, evenly spaced."""
     _, suites, cap = DATASETS[name]
-    listed = [i for suite in suites for i in _listed(suite, data) if _has_truth(i)]
-    if not listed:
-        shared = [i for i in _listed("shared", data) if i.sequence in suites]
-        listed = [i for i in shared if _has_truth(i)]
+    listed = [i for suite in suites for i in _with_truth(suite, data)]
+    listed = listed or [i for i in _with_truth("shared", data) if i.sequence in suites]
     if limit is not None and listed:
         listed = [listed[k] for k in spread(len(listed), limit)]
-    return tuple(i.scored_by(("paper", "best", *([cap] if cap else []))) for i in listed)
+    return tuple(i.scored_by((*i.presets, cap)) if cap else i for i in listed)
 
 
-def _listed(name: str, data: Path | None) -> tuple[Item, ...]:
+def _with_truth(suite: str, data: Path | None) -> list[Item]:
+    """The pairs of a suite that can be loaded and have a depth to compare with."""
     try:
-        return () if data is None else list_suite(name, data, Options(("dis",))).items
+        items = () if data is None else list_suite(suite, data, Options(("dis",))).items
     except DataError:
-        return ()
-
-
-def _has_truth(item: Item) -> bool:
-    """Whether the pair can be loaded and has a depth to compare with."""
-    try:
-        truth = item.problem().load_pair().truth
-    except SoupError:
-        return False
-    return truth is not None and (truth.depth_ref is not None or truth.points is not None)
+        return []
+    out = []
+    for item in items:
+        with suppress(SoupError):
+            if has_depth(item.problem().load_pair().truth):
+                out.append(item.scored_by(("paper", "best")))
+    return out
 
 
 def measure_paper(item: Item, overrides: Overrides = (), maps: Path | None = None) -> Row:
     """The row of `measure_pair` with energies on the way; small depth maps go to a file.
+
+    "curve" has "names" and "values", the smoothed energy by stage and iteration, "exact", the exact
+    energies of start and NLP, and "rounds", the objective of the refinement before its rounds and
+    after each.
 
     Raises:
         SoupError: the pair cannot be solved or scored.
@@ -233,46 +229,26 @@ def measure_paper(item: Item, overrides: Overrides = (), maps: Path | None = Non
     result = solved(item, overrides)
     if maps is not None:
         write_maps(maps, result)
-    truth, rmse = result.pair.truth, None
-    if truth is not None and (truth.depth_ref is not None or truth.points is not None):
-        rmse = depth_metrics(*at_truth(truth, result.reconstruction.depth_ref), scale="lsq").rmse
-    return {**scores(result, item.presets), "curve": _curve(result), "rmse": rmse}
-
-
-def _curve(result: Run) -> Row:
-    """Energies on the way.
-
-    "names" and "values" have the smoothed energy by stage and iteration, "exact" the exact energies
-    of start and NLP, "rounds" the objective of the refinement before its rounds and after each.
-    """
     s, refined = result.solution, result.refined
-    rounds = []
-    if refined is not None:
-        rounds = [refined.energy_begin["total"], *(r.energy["total"] for r in refined.rounds)]
-    return {
+    rounds = [refined.energy_begin, *(r.energy for r in refined.rounds)] if refined else []
+    curve = {
         "names": [stage.name for stage in s.stages],
         "values": [[float(f) for f in stage.history.get("obj", ())] for stage in s.stages],
         "exact": [s.energy_start["total"], s.energy["total"]],
-        "rounds": rounds,
+        "rounds": [energy["total"] for energy in rounds],
     }
+    return {**scores(result, item.presets), "curve": curve}
 
 
 def write_maps(path: Path, result: Run) -> None:
     """Write image, truth, start and solution as .npz, subsampled to MAP_WIDTH columns."""
     pair = result.pair
     step = max(1, -(-pair.size[1] // MAP_WIDTH))
-
-    def small(values: NDArray[Any]) -> NDArray[Any]:
-        return np.ascontiguousarray(values[::step, ::step])
-
-    maps: dict[str, Any] = {
-        "image": small(pair.image_ref),
-        "start": small(result.start_reconstruction.depth_ref).astype(np.float32),
-        "solution": small(result.reconstruction.depth_ref).astype(np.float32),
-    }
-    truth = pair.truth
-    if truth is not None and truth.depth_ref is not None:
-        maps["truth"] = small(truth.depth_ref).astype(np.float32)
+    depths = {"start": result.start_reconstruction, "solution": result.reconstruction}
+    maps = {name: r.depth_ref.astype(np.float32) for name, r in depths.items()}
+    if pair.truth is not None and pair.truth.depth_ref is not None:
+        maps["truth"] = pair.truth.depth_ref.astype(np.float32)
+    small = {name: m[::step, ::step] for name, m in {"image": pair.image_ref, **maps}.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **maps)
+        np.savez_compressed(file, allow_pickle=False, **small)

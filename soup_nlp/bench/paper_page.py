@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from soup_nlp.bench.accuracy_page import published_lines
-from soup_nlp.bench.paper import ALL_SECTIONS, DATASETS, METHODS, Plan
+from soup_nlp.bench.paper import ALL_SECTIONS, BASE, DATASETS, METHODS, Plan
 from soup_nlp.bench.processes import processor
 from soup_nlp.bench.published import COMPARISON, DATA, SOURCE
 from soup_nlp.bench.studies import DEPARTURES, STUDIES
@@ -20,11 +20,13 @@ from soup_nlp.bench.study import (
     figure,
     markdown,
     page_text,
+    pivot,
     plot_lines,
     provenance,
     save,
     show,
     table,
+    titled,
 )
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.evaluate.protocols import preset
@@ -33,6 +35,8 @@ PAGE = "README.md"
 PICTURES = ("comparison", "depth_maps", "convergence", *ALL_SECTIONS)
 FILES = (PAGE, *(f"{name}.png" for name in PICTURES))
 """Names of all files that `write_page` may write."""
+STAGES = ("flow", "segmentation", "start", "nlp", "refine")
+"""Stages of the table of time."""
 WITHOUT_TRUTH = {
     "Back sequence": "no true depth is published with it, nor its intrinsics (Garg et al., CVPR"
     " 2013); the paper shows pictures only",
@@ -53,11 +57,11 @@ SAID = {
 
 def write_page(folder: Path, plan: Plan, frame: pd.DataFrame, command: str) -> None:
     """Write the page and its figures into a folder."""
-    sections = {name: _of_section(plan, frame, name) for name in plan.sections}
-    compared = sections.pop("comparison")
-    lines = [*_head(plan, frame, command), *_comparison(folder, plan, compared)]
-    lines += _pictures(folder, plan)
+    sections = plan.sections(frame)
+    compared = sections.pop("comparison", plan.table.iloc[:0])
     departures = sections.pop("departures", None)
+    lines = [*_head(plan, frame, command), *_comparison(folder, plan, compared)]
+    lines += _pictures(folder, compared)
     for name, rows in sections.items():
         lines += _study(folder, name, rows)
     lines += [*_convergence(folder, compared), *_time(compared)]
@@ -65,16 +69,6 @@ def write_page(folder: Path, plan: Plan, frame: pd.DataFrame, command: str) -> N
         lines += _departures(folder, departures)
     text = page_text([*lines, *_missing(plan), *failures(frame)])
     (folder / PAGE).write_text(text, encoding="utf-8")
-
-
-def _of_section(plan: Plan, frame: pd.DataFrame, name: str) -> pd.DataFrame:
-    """Rows of a section with the columns method, change and name; NaN where not measured."""
-    cells = plan.sections[name]
-    rows = frame.drop_duplicates("key").set_index("key")
-    keys = [cell.identity()["key"] for cell in cells.values()]
-    out = rows.reindex(keys).reset_index()
-    out["method"], out["change"], out["name"] = zip(*cells, strict=True) if cells else ((), (), ())
-    return out
 
 
 def _figure(name: str, text: str) -> list[str]:
@@ -111,23 +105,23 @@ def _comparison(folder: Path, plan: Plan, rows: pd.DataFrame) -> list[str]:
     """Tables by dataset and by pair, and the figure of the errors."""
     caps = dict.fromkeys(cap for _, _, cap in DATASETS.values() if cap)
     lines = ["## Mean relative error per dataset", ""]
-    entries: dict[str, dict[str, Any]] = {}
-    bars: dict[str, dict[str, Any]] = {}
+    entries, bars = {}, {}
     for name, (title, _, cap) in DATASETS.items():
         own = rows[rows["name"].isin([i.name for i in plan.datasets[name]])]
         line: dict[str, Any] = {f"{m} (published)": v for m, v in COMPARISON[name].items()}
         line["pairs here"] = str(own["name"].nunique())
-        bar = {"published": COMPARISON[name]["Superpixel Soup"]}
         for method in METHODS:
             here = own[own["method"] == method]
-            bar[method] = line[f"{method}: median"] = _mre(here).mean()
+            line[f"{method}: median"] = _mre(here).mean()
             line[f"{method}: best"] = _mre(here, "best").mean()
             line[f"{method}: cap"] = _mre(here, cap).mean() if cap else np.nan
-        bar["constant depth"] = line["constant depth"] = _mre(here, "paper", "constant").mean()
+        line["constant depth"] = _mre(here, "paper", "constant").mean()
         line["one rigid motion"] = _mre(here, "paper", "rigid").mean()
         entries[title] = line
         if len(own):
-            bars[title] = bar
+            shown = {"published": line["Superpixel Soup (published)"]}
+            shown |= {method: line[f"{method}: median"] for method in METHODS}
+            bars[title] = {**shown, "constant depth": line["constant depth"]}
     data = pd.DataFrame.from_dict(entries, orient="index").rename_axis("dataset")
     lines += [*markdown(data), ""]
     lines += ["Columns: " + "; ".join(str(preset(n)) for n in ("paper", "best", *caps)) + ".", ""]
@@ -165,13 +159,13 @@ def _plot_bars(path: Path, bars: pd.DataFrame, text: str, log: bool = False) -> 
     save(picture, path)
 
 
-def _pictures(folder: Path, plan: Plan) -> list[str]:
+def _pictures(folder: Path, rows: pd.DataFrame) -> list[str]:
     """Figure of image, truth and depths of start, preset and defaults."""
     maps: dict[str, dict[str, Mapping[str, np.ndarray]]] = {}
-    for (method, _, name), cell in plan.sections["comparison"].items():
+    for name, method, cell in zip(rows["name"], rows["method"], rows["cell"], strict=True):
         if cell.keep is not None and cell.keep.is_file():
             with np.load(cell.keep) as file:
-                maps.setdefault(name, {})[method] = {k: file[k] for k in file.files}
+                maps.setdefault(name, {})[method] = dict(file)
     shown = {name: own for name, own in maps.items() if len(own) == len(METHODS)}
     heads = ("image", "truth", "paper's start", "preset: paper", "defaults")
     picture = figure(2.0 * len(heads), 1.15 * max(1, len(shown)) + 0.4)
@@ -203,12 +197,7 @@ def _study(folder: Path, name: str, rows: pd.DataFrame) -> list[str]:
     drawn = {}
     for method in METHODS:
         own = rows[rows["method"] == method].assign(value=_mre(rows))
-        values = own.pivot(index="name", columns="change", values="value")
-        values = values.reindex(index=own["name"].unique(), columns=own["change"].unique())
-        whole = values.dropna()
-        if len(whole) > 1:
-            values.loc[f"mean of {len(whole)}"] = whole.mean()
-        drawn[method] = values.rename_axis(index="pair")
+        drawn[method] = pivot(own, "value", "name", "change").rename_axis(index="pair")
         lines += [f"{method}, MRE after median scale, no cap:", "", *markdown(drawn[method]), ""]
     lines += published_lines(name) + ([SAID[name], ""] if name in SAID else [])
     plot_lines(folder / f"{name}.png", drawn, name, text)
@@ -246,15 +235,13 @@ def _convergence(folder: Path, rows: pd.DataFrame) -> list[str]:
 
 def _time(rows: pd.DataFrame) -> list[str]:
     """Table of seconds by stage."""
-    stages = [f"stages.{s}" for s in ("flow", "segmentation", "start", "nlp", "refine")]
-    seconds = rows.reindex(columns=[*stages, "cpu_seconds"]).astype(float)
-    seconds.columns = pd.Index([c.removeprefix("stages.") for c in seconds.columns])
-    index = pd.MultiIndex.from_frame(rows[["name", "method"]])
+    columns = {f"stages.{s}": (s, ".1f") for s in STAGES} | {"cpu_seconds": ("cpu_seconds", ".1f")}
+    runs = rows.set_axis(pd.MultiIndex.from_frame(rows[["name", "method"]]))
     text = (
         "Wall seconds by stage, the machine shared with other work, and CPU seconds of the whole"
         " row. Published: 15 to 20 minutes for 1024 x 436 in MATLAB and C++ on an i7."
     )
-    return ["## Time", "", text, "", *markdown(seconds.set_axis(index), ".1f"), ""]
+    return ["## Time", "", text, "", *titled(runs, columns), ""]
 
 
 def _departures(folder: Path, rows: pd.DataFrame) -> list[str]:
@@ -273,16 +260,14 @@ def _departures(folder: Path, rows: pd.DataFrame) -> list[str]:
     bars = {}
     for method, text in titles.items():
         own = rows[rows["method"] == method].assign(value=_mre(rows))
-        values = own.pivot(index="change", columns="name", values="value")
-        values = values.reindex(index=own["change"].unique(), columns=own["name"].unique())
-        values = values.dropna(axis=1, how="all")
-        ratios = values / values.loc["as they are"] if len(values) else values
+        values = pivot(own, "value", "change", "name", average=False).dropna(axis=1, how="all")
+        ratios = values / values.loc[BASE] if len(values) else values
         mean = np.exp(np.log(ratios).mean(axis=1))
         counts = zip((ratios > 1.01).sum(axis=1), (ratios < 0.99).sum(axis=1), strict=True)
         values.insert(0, "worse / better", [f"{a} / {b}" for a, b in counts])
         values.insert(0, "median", ratios.median(axis=1))
         values.insert(0, "mean", mean)
-        bars[method] = mean.drop("as they are", errors="ignore")
+        bars[method] = mean.drop(BASE, errors="ignore")
         lines += [text, "", *markdown(values.rename_axis("departure")), ""]
     lines += [f"- {d.name}: {d.needs}." for d in DEPARTURES if d.needs]
     text = "MRE relative to all others as they are (geometric mean of the pairs)"
@@ -297,6 +282,6 @@ def _missing(plan: Plan) -> list[str]:
             suite = SUITES[suites[0]]
             entries.append([title, f"no pair was given; from {suite.source}, as {suite.layout}"])
     entries += [[name, text] for name, text in WITHOUT_TRUTH.items()]
-    left = [name for name in ALL_SECTIONS if name not in plan.sections]
+    left = [name for name in ALL_SECTIONS if name not in plan.sizes.sections]
     entries += [[f"section {name}", "left out of this run (`--sections`)"] for name in left]
     return ["## What is not here", "", *table(["data", "why, and where from"], entries), ""]

@@ -27,7 +27,7 @@ from soup_nlp.bench.study import (
     page_text,
     provenance,
 )
-from soup_nlp.bench.suite_pairs import Item
+from soup_nlp.bench.suites import Item
 from soup_nlp.errors import ConfigError
 from soup_nlp.storage.rows import MeasureRows
 

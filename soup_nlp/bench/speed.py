@@ -1,64 +1,102 @@
-"""A timed solve: seconds, energy and memory by stage, with the reference solver beside it."""
+"""`bench speed`: seconds, energy and memory of solves by stage, their growth with N, and a gate."""
 
 from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
+from datetime import date
 from itertools import product
 from pathlib import Path
-from typing import Any
 
+import numpy as np
+import pandas as pd
+from scipy.stats import linregress
+
+from soup_nlp.bench.processes import machine
 from soup_nlp.bench.reference_solver import levenberg_marquardt
-from soup_nlp.bench.study import Cell, Overrides
-from soup_nlp.bench.suite_pairs import Item
+from soup_nlp.bench.study import (
+    Cell,
+    Overrides,
+    failures,
+    figure,
+    markdown,
+    page_text,
+    save,
+    titled,
+)
+from soup_nlp.bench.suites import Item
 from soup_nlp.config.problem import dump_problem
+from soup_nlp.errors import DataError
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.pipeline import Case, make_run, prepare
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
+from soup_nlp.storage.files import require_file
 from soup_nlp.storage.folders import scratch
-from soup_nlp.storage.rows import Row
+from soup_nlp.storage.rows import Row, read_rows
 
 REFERENCE_ITERATIONS = 100
 """Limit of the steps of Levenberg-Marquardt for every smoothing width."""
+OUTSIDE = ("flow", "segmentation", "start", "weights", "evaluation", "output")
+"""All stages but the NLP and the loading or rendering of the frames."""
+PHASES = ("load", *OUTSIDE[:4], "build", "functions", "linear algebra", *OUTSIDE[4:])
+"""Stages of a run; build, functions and linear algebra are the NLP."""
+RUN = {"sequence": "pair", "n": "N", "k": "K"}
+COLUMNS = {
+    "cpu.nlp": ("CPU s", ".1f"),
+    "wall.nlp": ("wall s", ".1f"),
+    "iterations": ("its", ".0f"),
+    "energy_start.total": ("E start", ".2f"),
+    "energy.total": ("E", ".3f"),
+    "reference.energy.total": ("E LM", ".3f"),
+    "energy_to_reference": ("E / LM", ".4f"),
+    "time_to_reference": ("CPU / LM", ".2f"),
+    "reference.iterations": ("LM its", ".0f"),
+    "errors.start": ("MRE start", ".4f"),
+    "errors.solution": ("MRE", ".4f"),
+    "reference.mre": ("MRE LM", ".4f"),
+    "residuals.dual_infeasibility": ("dual inf.", ".1e"),
+    "residuals.nlp_infeasibility": ("constraints", ".1e"),
+    "sizes.hessian_nonzeros": ("nnz H", ".0f"),
+    "GB": ("GB", ".2f"),
+    "outside": ("outside, CPU s", ".1f"),
+    "status": ("status", ""),
+}
+"""Title and format of every column of the main table, by column of the frame."""
+COSTS = {
+    "cpu.nlp": "NLP, CPU s",
+    "cpu an iteration": "CPU s an iteration",
+    "outside": "outside the NLP, CPU s",
+    "sizes.hessian_nonzeros": "Hessian nonzeros",
+    "GB": "peak memory",
+}
+"""Costs whose growth with N is fitted."""
+NOTE = (
+    "CPU s and wall s: the whole NLP. LM: Levenberg-Marquardt on the manifold with reweighting,"
+    " from the same start on the same smoothing widths, in the same process. E: exact energy. MRE"
+    " after median scale, no cap. dual inf., constraints: recomputed at Ipopt's answer. GB: peak of"
+    " the process before LM runs. Outside: flow, segmentation, start, weights, evaluation, output"
+    " with every picture, point cloud and HDF5. Wall times of a shared machine vary with its load;"
+    " CPU times less so. One thread."
+)
+LIMITS = {
+    "iterations": (1.3, 3.0),
+    "energy.total": (1.005, 0.0),
+    "energy_to_reference": (1.005, 0.0),
+    "sizes.hessian_nonzeros": (1.01, 0.0),
+    "time_to_reference": (1.5, 0.0),
+    "not converged": (1.0, 0.0),
+}
+"""(factor, addition) by column: a value above factor x earlier value + addition fails the gate.
+Iterations and energies may change a little, since rounding differs between machines. Times are
+compared relative to the reference solver in the same process, so that the machine cancels out."""
 
 
-def speed_cell(
-    scene: str,
-    superpixels: int,
-    neighbours: int,
-    seed: int = 0,
-    width: int = 1024,
-    height: int = 436,
-    overrides: Sequence[str] = (),
-) -> Cell:
-    """The cell of a timed run: DIS flow, the NLP without refinement.
-
-    Args:
-        scene: A rendered scene, or motorcycle.
-        superpixels: Wanted number N.
-        neighbours: K of the K-NN graph.
-        seed: Of the scene.
-        width: Columns of the rendered image.
-        height: Its rows.
-        overrides: Further overrides.
-
-    Raises:
-        ConfigError: an override is wrong.
-    """
-    source: dict[str, Any] = {"kind": "motorcycle"}
-    if scene != "motorcycle":
-        source = {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height}
-    item = Item("speed", scene, f"{scene}, seed {seed}", "dis", source)
-    size = f"segmentation.superpixels={superpixels}", f"segmentation.neighbours={neighbours}"
-    own = (*size, f"seed={seed}", "refine.enabled=false", *overrides)
-    item.problem(own)
-    return Cell(item, own, f"N {superpixels}, K {neighbours}")
+# --- the measurement ------------------------------------------------------------------------------
 
 
 def speed_cells(
@@ -66,38 +104,42 @@ def speed_cells(
     sizes: Sequence[int],
     neighbours: Sequence[int],
     seeds: Sequence[int],
-    **others: Any,
-) -> list[dict[str, Any]]:
-    """Arguments of `speed_cell` for all runs, small sizes first; the motorcycle has one seed."""
-    every = product(sorted(sizes), sorted(neighbours), scenes, seeds)
-    return [
-        {"scene": scene, "superpixels": n, "neighbours": k, "seed": seed, **others}
-        for n, k, scene, seed in every
-        if scene != "motorcycle" or seed == seeds[0]
-    ]
+    width: int = 1024,
+    height: int = 436,
+    overrides: Sequence[str] = (),
+) -> list[Cell]:
+    """Timed runs, small sizes first: DIS flow, the NLP without refinement.
 
+    Args:
+        scenes: Rendered scenes, and motorcycle, which has one seed.
+        sizes: Wanted numbers of superpixels N.
+        neighbours: K of the K-NN graph.
+        seeds: Of the scenes.
+        width: Columns of the rendered images.
+        height: Their rows.
+        overrides: Further overrides.
 
-class Clocks:
-    """Wall and CPU seconds by stage."""
-
-    def __init__(self) -> None:
-        self.wall: dict[str, float] = {}
-        self.cpu: dict[str, float] = {}
-        self.last = time.perf_counter(), time.process_time()
-
-    def lap(self, stage: str) -> None:
-        """Add the time since the last call to a stage."""
-        now = time.perf_counter(), time.process_time()
-        for clock, begin, end in zip((self.wall, self.cpu), self.last, now, strict=True):
-            clock[stage] = clock.get(stage, 0.0) + end - begin
-        self.last = now
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time the block as a stage."""
-        self.last = time.perf_counter(), time.process_time()
-        yield
-        self.lap(name)
+    Raises:
+        ConfigError: an override is wrong.
+    """
+    cells = []
+    for n, k, scene, seed in product(sorted(sizes), sorted(neighbours), scenes, seeds):
+        if scene == "motorcycle" and seed != seeds[0]:
+            continue
+        size = {"width": width, "height": height}
+        source = {"kind": "scene", "scene": scene, "seed": seed, **size}
+        source = {"kind": scene} if scene == "motorcycle" else source
+        item = Item("speed", scene, f"{scene}, seed {seed}", "dis", source)
+        own = (
+            f"segmentation.superpixels={n}",
+            f"segmentation.neighbours={k}",
+            f"seed={seed}",
+            "refine.enabled=false",
+            *overrides,
+        )
+        item.problem(own)
+        cells.append(Cell(item, own, f"N {n}, K {k}"))
+    return cells
 
 
 def measure_speed(item: Item, overrides: Overrides = (), keep: Path | None = None) -> Row:
@@ -112,23 +154,32 @@ def measure_speed(item: Item, overrides: Overrides = (), keep: Path | None = Non
     Raises:
         SoupError: the input cannot be used.
     """
-    clocks = Clocks()
+    wall: dict[str, float] = {}
+    cpu: dict[str, float] = {}
+    last = [time.perf_counter(), time.process_time()]
+
+    def lap(stage: str) -> None:
+        now = [time.perf_counter(), time.process_time()]
+        wall[stage], cpu[stage] = (a - b for a, b in zip(now, last, strict=True))
+        last[:] = now
+
     problem = item.problem(overrides)
-    case = prepare(problem, on_stage=clocks.lap)
-    clocks.lap("weights")
-    with clocks.stage("nlp"):
-        solution = solve_soup(case.soup, case.data, case.weights, case.formulation(), case.options)
-    with clocks.stage("evaluation"):
-        run = make_run(case, solution)
-    run = replace(run, seconds=dict(clocks.wall))
-    with clocks.stage("output"), scratch() as folder:
+    case = prepare(problem, on_stage=lap)
+    lap("weights")
+    solution = solve_soup(case.soup, case.data, case.weights, case.formulation(), case.options)
+    lap("nlp")
+    run = make_run(case, solution)
+    lap("evaluation")
+    run = replace(run, seconds=dict(wall))
+    with scratch() as folder:
         write_folder(prepare_folder(folder / "result"), run, dump_problem(problem), "")
+    lap("output")
     return {
         "n": len(case),
         "k": problem.segmentation.neighbours,
         "sizes": solution.nlp,
-        "wall": {**clocks.wall, **_parts(clocks.wall["nlp"], solution)},
-        "cpu": {**clocks.cpu, **solution.cpu_seconds, "compiler": solution.seconds["compile"]},
+        "wall": {**wall, **_parts(wall["nlp"], solution)},
+        "cpu": {**cpu, **solution.cpu_seconds, "compiler": solution.seconds["compile"]},
         "iterations": sum(s.iterations for s in solution.stages),
         "status": solution.status,
         "converged": solution.converged,
@@ -180,3 +231,140 @@ def _reference(case: Case) -> Row:
         "cpu_seconds": found.cpu_seconds,
         "mre": scores["lm"].mre if scores else None,
     }
+
+
+# --- the page and the gate ------------------------------------------------------------------------
+
+
+def with_costs(frame: pd.DataFrame) -> pd.DataFrame:
+    """The good rows of a frame with the costs and ratios that tables and gate need."""
+    if "cpu.nlp" not in frame:
+        return frame.iloc[:0]
+    out = frame[frame["ok"].eq(True)].copy()
+    out["outside"] = out.reindex(columns=[f"cpu.{s}" for s in OUTSIDE]).astype(float).sum(axis=1)
+    out["GB"] = out["peak_bytes"].astype(float) / 2**30
+    out["cpu an iteration"] = out["cpu.nlp"] / out["iterations"].clip(lower=1)
+    out["energy_to_reference"] = out["energy.total"] / out["reference.energy.total"]
+    out["time_to_reference"] = out["cpu.nlp"] / out["reference.cpu_seconds"]
+    return out
+
+
+def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
+    """p of the fit log cost = log factor + p log N; NaN for sizes that hardly vary."""
+    n, c = np.asarray(sizes, float), np.asarray(costs, float)
+    x, y = np.log(n[c > 0]), np.log(c[c > 0])
+    # actual numbers of superpixels differ a little between seeds of one size
+    return float(linregress(x, y).slope) if len(x) and np.ptp(x) >= 0.2 else np.nan
+
+
+def growth(frame: pd.DataFrame) -> pd.DataFrame:
+    """Exponent of every cost by pair and K, of those that were run at several sizes."""
+    groups = frame.groupby(["sequence", "k"])
+    lines = {
+        key: {title: exponent(group["n"], group[column]) for column, title in COSTS.items()}
+        for key, group in groups
+    }
+    table = pd.DataFrame.from_dict(lines, orient="index", columns=list(COSTS.values()))
+    return table.rename_axis(["pair", "K"] if lines else None).dropna(how="all")
+
+
+def speed_page(frame: pd.DataFrame) -> str:
+    """The page of all rows."""
+    good = with_costs(frame)
+    lines = ["# Speed and growth", "", _conclusion(good), ""]
+    if len(good):
+        runs = good.set_axis(pd.MultiIndex.from_frame(good[list(RUN)].rename(columns=RUN)))
+        lines += titled(runs, COLUMNS)
+        lines += ["", NOTE, "", "## Growth: cost = factor N^p", "", *markdown(growth(good), ".2f")]
+        stages = {f"wall.{phase}": (phase, ".2f") for phase in PHASES}
+        lines += ["", "## Wall seconds by stage", "", *titled(runs, stages)]
+    facts = {"date": date.today(), **machine()}.items()
+    lines += ["", "## Machine", "", *(f"- {k}: {v}" for k, v in facts)]
+    return page_text([*lines, *failures(frame)])
+
+
+def _conclusion(frame: pd.DataFrame) -> str:
+    """Summary of the table in sentences."""
+    if frame.empty:
+        return "No run ended with a result."
+    large = frame[frame["n"] > 0.8 * frame["n"].max()]
+    costs, energies, times = (
+        f"{values.min():.{digits}f} to {values.max():.{digits}f}"
+        for values, digits in (
+            (large["cpu.nlp"], 1),
+            (frame["energy_to_reference"], 4),
+            (frame["time_to_reference"], 2),
+        )
+    )
+    return (
+        f"{int(frame['converged'].sum())} of {len(frame)} runs converged to their tolerance."
+        f" With the most superpixels (about {large['n'].max()}) the NLP takes {costs} CPU s"
+        f" ({len(large)} runs). Its energy is {energies} times that of Levenberg-Marquardt on the"
+        f" same smoothing, its CPU time {times} times."
+    )
+
+
+def plot_growth(path: Path, frame: pd.DataFrame) -> None:
+    """CPU seconds of NLP, reference solver and other stages, and peak memory, over N (log-log)."""
+    picture = figure(11, 4)
+    left, right = picture.subplots(1, 2)
+    good = with_costs(frame)
+    groups = good.sort_values("n").groupby(["sequence", "k"]) if len(good) else ()
+    for index, ((scene, k), group) in enumerate(groups):
+        style = {"color": f"C{index % 10}"}
+        slope = exponent(group["n"], group["cpu.nlp"])
+        label = f"{scene}, K {k}" + (f": N^{slope:.2f}" if np.isfinite(slope) else "")
+        left.loglog(group["n"], group["cpu.nlp"], "o-", label=label, **style)
+        left.loglog(group["n"], group["outside"], ".:", alpha=0.6, **style)
+        left.loglog(group["n"], group["reference.cpu_seconds"], "x", alpha=0.7, **style)
+        right.loglog(group["n"], group["GB"], "o-", **style)
+    left.set(xlabel="superpixels N", ylabel="CPU s")
+    left.set_title("NLP (o), reference solver (x), all stages outside (.)", fontsize=10)
+    right.set(xlabel="superpixels N", ylabel="GB", title="peak memory")
+    if len(good):
+        left.legend(fontsize=8)
+    save(picture, path)
+
+
+def gate_values(frame: pd.DataFrame) -> pd.DataFrame:
+    """The columns of LIMITS of the good rows, by key."""
+    good = with_costs(frame)
+    if good.empty:
+        return pd.DataFrame(columns=list(LIMITS))
+    good["not converged"] = 1.0 - good["converged"].astype(float)
+    return good.set_index("key")[list(LIMITS)].astype(float)
+
+
+def read_gate(path: Path) -> pd.DataFrame:
+    """The `gate_values` of the rows of an earlier run.
+
+    Raises:
+        DataError: the file is missing or has no such rows.
+    """
+    rows = read_rows(require_file(path, "file of rows"))
+    try:
+        values = gate_values(pd.json_normalize(rows))
+    except (KeyError, TypeError, ValueError):
+        values = pd.DataFrame()
+    if values.empty:
+        expected = "table.jsonl of an earlier `soup-nlp bench speed`"
+        raise DataError("no rows of bench speed", where=path, expected=expected)
+    return values
+
+
+def gate(frame: pd.DataFrame, old: pd.DataFrame) -> pd.DataFrame:
+    """Value, earlier value, limit and whether it holds, by run and column of LIMITS.
+
+    The runs are those that both have; a run that failed now has NaN, which does not hold.
+
+    Raises:
+        DataError: they have no run in common.
+    """
+    old = old[old.index.isin(frame["key"])]
+    if old.empty:
+        raise DataError("the earlier rows have none of these runs", where="--check")
+    factor, addition = (pd.Series({k: v[j] for k, v in LIMITS.items()}) for j in (0, 1))
+    limit, new = old * factor + addition, gate_values(frame).reindex(old.index)
+    index = pd.MultiIndex.from_product([old.index, LIMITS], names=["run", "value"])
+    columns = {"old": old, "new": new, "limit": limit, "holds": new <= limit}
+    return pd.DataFrame({k: v.to_numpy().ravel() for k, v in columns.items()}, index)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from operator import attrgetter
 from types import MappingProxyType
 from typing import Any
 
@@ -34,14 +35,11 @@ STUDIES: Mapping[str, Study] = MappingProxyType(
             },
         ),
         "superpixels": Study(
-            "number of superpixels",
-            over("segmentation.superpixels", (100, 250, 500, 1000, 2000)),
-            key="segmentation.superpixels",
+            "number of superpixels", over("segmentation.superpixels", (100, 250, 500, 1000, 2000))
         ),
         "neighbours": Study(
             "K of the K-NN graph",
             over("segmentation.neighbours", (4, 8, 12, 15, 20)),
-            key="segmentation.neighbours",
         ),
         "pattern": Study(
             "SLIC against a regular grid", over("segmentation.method", ("slic", "grid"))
@@ -49,7 +47,6 @@ STUDIES: Mapping[str, Study] = MappingProxyType(
         "flow": Study(
             "flow: the truth, the truth with noise of 0.1 to 2 pixels, DIS",
             over("flow.source", ["truth", *(f"truth+noise:{px}" for px in NOISE_PX), "dis"]),
-            key="flow.source",
             true_flow=True,
         ),
         "stages": Study(
@@ -63,7 +60,7 @@ STUDIES: Mapping[str, Study] = MappingProxyType(
         "confidence": Study("how well sigma of log depth sorts errors, and its calibration"),
     }
 )
-"""Studies by name; `confidence` has a measurement and a page of its own."""
+"""Studies by name; `confidence` has a page of its own."""
 
 
 # --- departures of the defaults from the paper ----------------------------------------------------
@@ -83,38 +80,32 @@ class Departure:
         name: Title of its row.
         keys: Dotted names of the options.
         with_off: Further options that "off alone" needs.
-        with_on: Further options that "on alone" needs; None if "on alone" has no meaning.
+        with_on: Further options that "on alone" needs.
         needs: Explanation of the further options, for the table.
     """
 
     name: str
-    keys: tuple[str, ...]
+    keys: tuple[str, ...] = ()
     with_off: Mapping[str, Any] = field(default_factory=dict)
-    with_on: Mapping[str, Any] | None = field(default_factory=dict)
+    with_on: Mapping[str, Any] = field(default_factory=dict)
     needs: str = ""
 
-    def off_alone(self) -> tuple[str, ...]:
-        """Overrides of "off alone"."""
+    def off_alone(self) -> Overrides:
+        """Overrides of the defaults for "off alone"."""
         printed = dict(leaves(PRESETS["paper"]))
         return _overrides({**{k: printed[k] for k in self.keys}, **self.with_off})
 
-    def on_alone(self) -> tuple[str, ...] | None:
-        """Overrides of "on alone", the preset first; None if it has no meaning."""
-        if self.with_on is None:
-            return None
-        ours = {**{k: default(k) for k in self.keys}, **self.with_on}
-        return (*PAPER, *_overrides(ours))
+    def on_alone(self) -> Overrides:
+        """Overrides of the preset for "on alone"."""
+        return _overrides({**{k: default(k) for k in self.keys}, **self.with_on})
 
 
 def default(key: str) -> Any:
     """The default of an option."""
-    value: Any = make_problem({"input": {"kind": "motorcycle"}})
-    for name in key.split("."):
-        value = getattr(value, name)
-    return value
+    return attrgetter(key)(make_problem({"input": {"kind": "motorcycle"}}))
 
 
-def _overrides(values: Mapping[str, Any]) -> tuple[str, ...]:
+def _overrides(values: Mapping[str, Any]) -> Overrides:
     return tuple(
         f"{key}={'.inf' if value == float('inf') else json.dumps(value)}"
         for key, value in values.items()
@@ -187,7 +178,6 @@ DEPARTURES = (
     ),
     Departure(
         "samples of pixels and boundaries",
-        (),
         with_off=_MORE,
         with_on=_MORE,
         needs="off in both: 64 pixels a superpixel, 12 points a boundary (default 16 and 3)",
@@ -196,7 +186,6 @@ DEPARTURES = (
     Departure("visibility", ("formulation.min_facing", "formulation.depth_ratio")),
     Departure(
         "stages before the constrained NLP",
-        (),
         with_off={"solver.presolve": False},
         with_on={"solver.presolve": False},
         needs="off in both; the preset has it, since it is a way to the minimum of the same energy",

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from soup_nlp.bench.processes import alone
-from soup_nlp.bench.suite_pairs import Item
+from soup_nlp.bench.suites import Item
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import ConfigError
 from soup_nlp.storage.atomic import atomic_path
@@ -103,51 +103,27 @@ class Study:
     Attributes:
         text: The question.
         variants: Overrides by name of a variant, in the order of the tables.
-        key: Option of which the user may ask for other values; empty if there is none.
         true_flow: Only pairs that are listed with their true flow are measured.
     """
 
     text: str
     variants: Mapping[str, Overrides] = field(default_factory=lambda: {"": ()})
-    key: str = ""
     true_flow: bool = False
 
-    def restricted(self, values: Sequence[str] | None) -> Mapping[str, Overrides]:
-        """The variants of these names, or of these values of the option `key`; all without names.
-
-        Raises:
-            ConfigError: a variant is unknown or empty.
-        """
-        if values is None:
-            return self.variants
-        known = over(self.key, values) if self.key else self.variants
-        wrong = [v for v in values if not v or v not in known]
-        if wrong:
-            raise ConfigError(
-                "unknown variant",
-                where="--values",
-                found=repr(wrong[0]),
-                expected=", ".join(self.variants),
-            )
-        return {v: known[v] for v in values}
-
-    def cells(
-        self, items: Sequence[Item], overrides: Overrides = (), values: Sequence[str] | None = None
-    ) -> list[Cell]:
+    def cells(self, items: Sequence[Item], overrides: Overrides = ()) -> list[Cell]:
         """A cell for every pair and variant.
 
         Raises:
-            ConfigError: no pair is left, a variant is unknown, or an override is wrong.
+            ConfigError: no pair is left, or an override is wrong.
         """
         left = [i for i in items if i.flow == "truth" or not self.true_flow]
         if not left:
             hint = "give --flow truth" if items else None
             raise ConfigError("no pair is left for the study", found=self.text, hint=hint)
-        variants = self.restricted(values)
-        for own in variants.values():
-            # report a wrong value now, not in the row of every pair
-            left[0].problem((*overrides, *own))
-        return [Cell(i, (*overrides, *own), v) for i in left for v, own in variants.items()]
+        # report a wrong override now, not in the row of every pair
+        left[0].problem(overrides)
+        variants = self.variants.items()
+        return [Cell(i, (*overrides, *own), name) for i in left for name, own in variants]
 
 
 def over(key: str, values: Sequence[object]) -> dict[str, Overrides]:
@@ -208,15 +184,21 @@ def main_metric(frame: pd.DataFrame, method: str = "solution", name: str = "mre"
     return out
 
 
-def pivot(frame: pd.DataFrame, values: str = "mre", average: bool = True) -> pd.DataFrame:
+def pivot(
+    frame: pd.DataFrame,
+    values: str = "mre",
+    index: str = "title",
+    columns: str = "variant",
+    average: bool = True,
+) -> pd.DataFrame:
     """A line for each pair, a column for each variant; then the mean of the complete lines."""
-    table = frame.pivot(index="title", columns="variant", values=values)
-    table = table.reindex(index=frame["title"].unique(), columns=frame["variant"].unique())
+    table = frame.pivot(index=index, columns=columns, values=values)
+    table = table.reindex(index=frame[index].unique(), columns=frame[columns].unique())
     table = table.astype(float)
     whole = table.dropna()
     if average and len(whole) > 1:
         table.loc[f"mean of {len(whole)}"] = whole.mean()
-    return table.rename_axis(index="pair, flow")
+    return table.rename_axis(index="pair, flow" if index == "title" else index)
 
 
 def show(value: Any, form: str = ".4f") -> str:
@@ -239,6 +221,14 @@ def markdown(frame: pd.DataFrame, forms: Forms = ".4f") -> list[str]:
     form = {c: forms if isinstance(forms, str) else forms.get(c, "") for c in flat.columns}
     columns = [[show(v, form[c]) for v in flat[c].tolist()] for c in flat.columns]
     return table([str(c) for c in flat.columns], zip(*columns, strict=True))
+
+
+def titled(frame: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> list[str]:
+    """Columns of a frame as a Markdown table under other titles: (title, format) by column."""
+    shown = frame.reindex(columns=list(columns))
+    return markdown(
+        shown.set_axis([t for t, _ in columns.values()], axis=1), dict(columns.values())
+    )
 
 
 def provenance(frame: pd.DataFrame) -> str:

@@ -1,26 +1,213 @@
-"""Suites of pairs, with the source and the folder layout of their data."""
+"""Suites of pairs: rendered scenes, real pairs, the paper's sequences; where their data are."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any, NamedTuple
 
-from soup_nlp.bench import suite_pairs as pairs
-from soup_nlp.bench.suite_pairs import KITTI_PRESETS, RENDERED, Entry, Item, Options, spread
+from soup_nlp.config.problem import Problem, make_problem
+from soup_nlp.data.datasets.benchmarks import DEFAULT_SCENE
+from soup_nlp.data.scenes.everyday import LAYOUTS
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import as_path, is_file, is_folder
 
-_KINECT_LAYOUT = (
-    "pair_NNN/ with frame_0.png, frame_1.png, K.txt and points.npz (uv_0 in pixels, xyz_mm_0) or"
-    " depth.png (16 bit, millimetres), one folder a pair of frames of the sequence"
+RENDERED = ("street", "room", "sheet", "orbit", "still", "banner")
+PAPER, SINTEL = ("paper", "best"), ("sintel70", "paper", "best")
+KITTI, KITTI_SHARED = ("kitti", "eigen80", "best"), ("kitti", "best", "eigen80")
+"""Metric conventions, the main one first."""
+SINTEL_FRAMES = MappingProxyType(
+    {"alley_1": 50, "ambush_4": 33, "mountain_1": 50, "sleeping_1": 50, "temple_2": 50}
 )
-_KINECT_SOURCE = (
-    "EPFL CVLab, deformable surface reconstruction, https://www.epfl.ch/labs/cvlab/data/data-dsr/"
-)
+"""Number of frames of the paper's sequences."""
+VKITTI_FRAMES = MappingProxyType({"0001": 447, "0002": 233, "0006": 270, "0018": 339})
+"""Number of frames of the paper's worlds."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """A pair of a suite with one flow source.
+
+    Attributes:
+        suite: Name of the suite.
+        sequence: Sequence or family, over which tables average first.
+        name: Name, unique in the suite.
+        flow: Flow source.
+        input: Section `input` of the problem.
+        presets: Metric conventions of the scores, the main one first.
+        needs: Files that must exist.
+    """
+
+    suite: str
+    sequence: str
+    name: str
+    flow: str
+    input: Mapping[str, Any] = field(repr=False)
+    presets: tuple[str, ...] = ("paper",)
+    needs: tuple[Path, ...] = field(default=(), repr=False)
+
+    @property
+    def key(self) -> str:
+        """Unique among all suites."""
+        return f"{self.suite}/{self.name}/{self.flow}"
+
+    def scored_by(self, presets: Sequence[str] | None) -> Item:
+        """The item with other metric conventions; unchanged if none are given."""
+        return replace(self, presets=tuple(presets)) if presets else self
+
+    def problem(self, overrides: Sequence[str] = ()) -> Problem:
+        """The problem of the pair with default options and overrides.
+
+        Raises:
+            ConfigError: an override is wrong.
+        """
+        raw = {"name": self.name, "input": dict(self.input), "flow": {"source": self.flow}}
+        return make_problem(raw, overrides, where=self.key)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Filters and variants of the list of a suite.
+
+    Attributes:
+        flows: Flow sources; None for those of the suite.
+        width: Columns of suite rendered, 436 rows per 1024; everyday is 640 x 480 at 1024.
+        seeds: Seeds of rendered scenes.
+        limit: Most pairs, evenly spaced, each with every flow; None for all.
+        only: Keep pairs whose names contain one of these words; empty for all.
+    """
+
+    flows: tuple[str, ...] | None = None
+    width: int = 1024
+    seeds: tuple[int, ...] = (0,)
+    limit: int | None = None
+    only: tuple[str, ...] = ()
+
+
+class Entry(NamedTuple):
+    """A pair of a suite with fields of `Item`; empty `presets` stand for those of the suite.
+
+    `true_flow` says whether the pair has a true flow that it may be solved with.
+    """
+
+    sequence: str
+    name: str
+    input: Mapping[str, Any]
+    needs: tuple[Path, ...] = ()
+    true_flow: bool = True
+    presets: tuple[str, ...] = ()
+
+
+Entries = Iterator[Entry]
+
+
+def spread(count: int, wanted: int, first: int = 0) -> list[int]:
+    """`wanted` of the numbers first .. first + count - 1, evenly spaced, without repeats."""
+    wanted = min(wanted, count)
+    return [first + (2 * k + 1) * count // (2 * wanted) for k in range(wanted)]
+
+
+# --- pairs ----------------------------------------------------------------------------------------
+
+
+def _scenes(scenes: Sequence[str], columns: float, rows: float, root: Path, o: Options) -> Entries:
+    """Rendered scenes with all seeds; columns and rows are relative to the width."""
+    width, height = max(64, int(o.width * columns)), max(48, round(o.width * rows))
+    for seed in o.seeds:
+        for scene in scenes:
+            raw = {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height}
+            yield Entry(scene, f"{scene}-s{seed}-{width}x{height}", raw)
+
+
+def _folder(family: str, path: Path, true_flow: bool = False, **more: Any) -> Entry:
+    """A pair in a folder with frame_0.png, named by its family and folder."""
+    name = " ".join(dict.fromkeys([family, path.name.removeprefix("pair_")]))
+    presets = KITTI_SHARED if family == "kitti2015" else ()
+    raw = {"kind": "folder", "path": str(path), **more}
+    return Entry(family, name, raw, (path / "frame_0.png",), true_flow, presets)
+
+
+def _shared(root: Path, o: Options) -> Entries:
+    """The real pairs that development used, by family, the motorcycle first."""
+    yield Entry("motorcycle", "motorcycle", {"kind": "motorcycle"})
+    for index in ("000138", "000027"):
+        raw = {"kind": "kitti2012", "root": str(root / "kitti2012"), "index": index}
+        image = root / "kitti2012" / "training" / "image_0" / f"{index}_10.png"
+        yield Entry("kitti2012", f"kitti2012 {index}", raw, (image,), True, KITTI_SHARED)
+    yield _folder("driving_synthetic", root / "driving_synthetic", True)
+    for path in sorted((root / "kinect_paper").glob("pair_*")):
+        yield _folder("kinect_paper", path, unit="mm")
+    raw = {"kind": "sintel", "root": str(root / "sintel"), "scene": "alley_1"}
+    image = root / "sintel" / "training" / "clean" / "alley_1" / "frame_0020.png"
+    alley = {**raw, "frame": 20, "step": 5}
+    yield Entry("sintel", "sintel alley_1-0020+5", alley, (image,), False, SINTEL)
+    tum = _folder("tum_fr1", root / "tum_fr1")
+    yield tum._replace(input={**tum.input, "kind": "tum"})
+    for path in sorted((root / "kitti2015").glob("pair_*")):
+        yield _folder("kitti2015", path, True)
+    track = root / "kitti_tracking"
+    for k in range(4):
+        names = {"ref": f"frame_{k}.png", "next": f"frame_{k + 1}.png", "intrinsics": "K.txt"}
+        names |= {"depth": f"depth_{k}.png", "depth_next": f"depth_{k + 1}.png"}
+        files = {key: str(track / name) for key, name in names.items()}
+        own = {"kind": "files", **files, "depth_scale": 256.0}
+        needs = (track / names["next"],)
+        yield Entry("kitti_tracking", f"kitti_tracking {k}", own, needs, False)
+    for family, pattern, scale in (("rgbd", "*", 5000.0), ("deepdeform", "pair_*", 1000.0)):
+        for path in sorted((root / family).glob(pattern)):
+            yield _folder(family, path, depth_scale=scale)
+
+
+def _sintel(root: Path, o: Options) -> Entries:
+    """Pairs of the five sequences: the paper has 120 but does not name them, so 24 of each."""
+    base = root / "training" if is_folder(root / "training") else root
+    for scene, frames in SINTEL_FRAMES.items():
+        for frame in spread(frames - 1, 24, 1):
+            raw = {"kind": "sintel", "root": str(root), "scene": scene, "frame": frame}
+            names = [f"{scene}/frame_{frame + k:04d}" for k in (0, 1)]
+            needs = [base / "clean" / f"{name}.png" for name in names]
+            if scene != DEFAULT_SCENE:
+                # the loader has a default camera for one scene only
+                needs += [base / "camdata_left" / f"{name}.cam" for name in names]
+            yield Entry(scene, f"{scene}-{frame:04d}", raw, tuple(needs))
+
+
+def _kitti(kind: str, camera: str, count: int, root: Path, o: Options) -> Entries:
+    """Training pairs of KITTI 2012 or 2015."""
+    base = root / "training" if is_folder(root / "training") else root
+    for index in (f"{k:06d}" for k in range(count)):
+        needs = tuple(base / camera / f"{index}_{frame}.png" for frame in (10, 11))
+        yield Entry(kind, index, {"kind": kind, "root": str(root), "index": index}, needs)
+
+
+def _vkitti(root: Path, o: Options) -> Entries:
+    """Morning pairs of version 1 or 2: the paper has 120 but does not name them, so 30 a world."""
+    second = is_folder(root / "Scene01") or is_folder(root / "Scene02")
+    parts = sorted(root.glob("vkitti_*_rgb")) or [root / "vkitti_1.3.1_rgb"]
+    raw = {"kind": "vkitti2" if second else "vkitti1", "root": str(root), "variation": "morning"}
+    for world, frames in VKITTI_FRAMES.items():
+        scene = f"Scene{world[2:]}" if second else world
+        folder, name = parts[-1] / world / "morning", "{:05d}.png"
+        if second:
+            folder, name = root / scene / "morning/frames/rgb/Camera_0", "rgb_{:05d}.jpg"
+        for frame in spread(frames - 1, 30):
+            needs = tuple(folder / name.format(frame + k) for k in (0, 1))
+            own = {**raw, "scene": scene, "frame": frame}
+            yield Entry(f"{world}_morning", f"{world}_morning-{frame:05d}", own, needs)
+
+
+def _kinect(root: Path, o: Options) -> Entries:
+    """Every folder pair_*."""
+    for pair in sorted(root.glob("pair_*")):
+        raw = {"kind": "folder", "path": str(pair), "unit": "mm", "depth_scale": 1.0}
+        yield Entry("", pair.name, raw, (pair / "frame_0.png",))
+
+
+# --- suites ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -42,7 +229,7 @@ class Suite:
     text: str
     entries: Callable[[Path, Options], Iterable[Entry]]
     flows: tuple[str, ...] = ("dis",)
-    presets: tuple[str, ...] = ("paper", "best")
+    presets: tuple[str, ...] = PAPER
     folders: tuple[str, ...] = (".",)
     layout: str = ""
     source: str = ""
@@ -59,16 +246,21 @@ class Suite:
 
 
 _ALL = (
-    Suite("rendered", f"{len(RENDERED)} rendered dynamic scenes", pairs.rendered, ("truth", "dis")),
+    Suite(
+        "rendered",
+        f"{len(RENDERED)} rendered dynamic scenes",
+        partial(_scenes, RENDERED, 1, 436 / 1024),
+        ("truth", "dis"),
+    ),
     Suite(
         "everyday",
-        f"{len(pairs.EVERYDAY)} rendered scenes of everyday kinds, most with little or no parallax",
-        pairs.everyday,
+        f"{len(LAYOUTS)} rendered scenes of everyday kinds, most with little or no parallax",
+        partial(_scenes, tuple(LAYOUTS), 5 / 8, 15 / 32),
     ),
     Suite(
         "shared",
         "the real pairs that development was done with",
-        pairs.shared,
+        _shared,
         ("truth", "dis"),
         folders=(".", "../shared/data"),
         layout=(
@@ -80,8 +272,8 @@ _ALL = (
     Suite(
         "sintel",
         "MPI Sintel, the paper's five sequences, 24 pairs each",
-        pairs.sintel,
-        presets=("sintel70", "paper", "best"),
+        _sintel,
+        presets=SINTEL,
         folders=(".", "sintel", "MPI-Sintel-complete"),
         layout=(
             "training/clean/SCENE/frame_NNNN.png, training/depth/SCENE/frame_NNNN.dpt,"
@@ -92,8 +284,8 @@ _ALL = (
     Suite(
         "kitti2012",
         "KITTI stereo and flow 2012, 194 training pairs",
-        partial(pairs.kitti, "kitti2012", "image_0", 194),
-        presets=KITTI_PRESETS,
+        partial(_kitti, "kitti2012", "image_0", 194),
+        presets=KITTI,
         folders=(".", "kitti2012", "data_stereo_flow"),
         layout="training/image_0, training/calib, training/disp_occ, training/flow_occ",
         source="https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php (data_stereo_flow.zip)",
@@ -101,8 +293,8 @@ _ALL = (
     Suite(
         "kitti2015",
         "KITTI scene flow 2015, 200 training pairs",
-        partial(pairs.kitti, "kitti2015", "image_2", 200),
-        presets=KITTI_PRESETS,
+        partial(_kitti, "kitti2015", "image_2", 200),
+        presets=KITTI,
         folders=(".", "kitti2015", "data_scene_flow"),
         layout="training/image_2, training/calib_cam_to_cam, training/disp_occ_0, disp_occ_1",
         source=(
@@ -113,8 +305,8 @@ _ALL = (
     Suite(
         "vkitti",
         "Virtual KITTI 1 or 2, the paper's four worlds, 30 morning pairs each",
-        pairs.vkitti,
-        presets=KITTI_PRESETS,
+        _vkitti,
+        presets=KITTI,
         folders=(".", "vkitti", "vkitti1", "vkitti2"),
         layout=(
             "vkitti_1.3.1_rgb/WORLD/morning and _depthgt, _flowgt (version 1), or"
@@ -126,10 +318,17 @@ _ALL = (
         Suite(
             f"kinect_{thing}",
             f"bending {text} of EPFL",
-            pairs.kinect,
+            _kinect,
             folders=(f"kinect_{thing}", "."),
-            layout=_KINECT_LAYOUT,
-            source=_KINECT_SOURCE,
+            layout=(
+                "pair_NNN/ with frame_0.png, frame_1.png, K.txt and points.npz (uv_0 in pixels,"
+                " xyz_mm_0) or depth.png (16 bit, millimetres), one folder a pair of frames of the"
+                " sequence"
+            ),
+            source=(
+                "EPFL CVLab, deformable surface reconstruction,"
+                " https://www.epfl.ch/labs/cvlab/data/data-dsr/"
+            ),
         )
         for thing, text in (("paper", "paper"), ("tshirt", "T-shirt"))
     ),
@@ -155,7 +354,7 @@ class Listing:
     missing: int = 0
 
     def __str__(self) -> str:
-        pairs = len(_names(self.items))
+        pairs = len({i.name for i in self.items})
         rows = f" ({len(self.items)} rows)" if len(self.items) > pairs else ""
         limit = f", {self.left_out} left out by the limit" if self.left_out else ""
         lack = f", {self.missing} of the list are not in the folder" if self.missing else ""
@@ -180,10 +379,10 @@ def list_suite(name: str, data: Path | None = None, options: Options | None = No
         listed = list(suite.items(Path(os.path.realpath(root / folder)), o))
         here = [i for i in listed if all(is_file(f) for f in i.needs)]
         if any(i.needs for i in here) or (here and not suite.layout):
-            names = _names(here)
+            names = list(dict.fromkeys(i.name for i in here))
             kept = names if o.limit is None else [names[k] for k in spread(len(names), o.limit)]
             items = tuple(i for i in here if i.name in kept)
-            missing = len(_names(listed)) - len(names)
+            missing = len({i.name for i in listed}) - len(names)
             return Listing(suite, items, len(names) - len(kept), missing)
     if o.only and not listed and (not suite.layout or is_folder(root)):
         raise DataError(
@@ -196,8 +395,3 @@ def list_suite(name: str, data: Path | None = None, options: Options | None = No
         expected=suite.layout,
         hint=f"get it from {suite.source}, lay it out so, and give its root as --data",
     )
-
-
-def _names(items: Iterable[Item]) -> list[str]:
-    """Different names of the pairs, in order."""
-    return list(dict.fromkeys(i.name for i in items))

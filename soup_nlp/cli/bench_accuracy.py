@@ -15,11 +15,9 @@ import typer
 from soup_nlp.bench import search as searching
 from soup_nlp.bench.accuracy import measure_pair
 from soup_nlp.bench.accuracy_page import suite_page, write_study
-from soup_nlp.bench.confidence import confidence_page, measure_confidence, plot_confidence
 from soup_nlp.bench.studies import STUDIES
 from soup_nlp.bench.study import Cell, measure_cells
-from soup_nlp.bench.suite_pairs import Options
-from soup_nlp.bench.suites import SUITES, Listing, list_suite
+from soup_nlp.bench.suites import SUITES, Listing, Options, list_suite
 from soup_nlp.cli import options
 from soup_nlp.cli.options import RowProgress, numbers, words
 from soup_nlp.errors import ConfigError
@@ -52,9 +50,6 @@ def accuracy(
     out: options.Out = Path("out/bench/accuracy"),
     analysis: Annotated[
         str | None, typer.Option(help="A declared study instead of the table; `list` names them.")
-    ] = None,
-    values: Annotated[
-        str | None, typer.Option(help="Variants of the study, such as 100,250,500.")
     ] = None,
     overrides: options.Set = None,
     flow: Flow = None,
@@ -91,8 +86,7 @@ def accuracy(
     if analysis:
         items = [i.scored_by(conventions) for listing in listings for i in listing.items]
         chosen = words(analysis, "--analysis", list(STUDIES))[0]
-        wanted_values = None if values is None else [v.strip() for v in values.split(",")]
-        cells = STUDIES[chosen].cells(items, changes, wanted_values)
+        cells = STUDIES[chosen].cells(items, changes)
         _study(chosen, cells, out, changes, measure_rows, overwrite)
     else:
         pages = [out / f"{name or listing.suite.name}.md" for listing in listings]
@@ -138,15 +132,9 @@ def _study(
 ) -> None:
     """Measure a study, and write and print its page and its picture."""
     claim(out, (f"{name}.md", f"{name}.png"), overwrite)
-    study, special = STUDIES[name], name == "confidence"
-    measure = measure_confidence if special else measure_pair
-    frame = measure_cells(cells, measure, out / f"{name}.jsonl", measure_rows)
+    frame = measure_cells(cells, measure_pair, out / f"{name}.jsonl", measure_rows)
     with staged(out) as new:
-        if special:
-            write_text(new / f"{name}.md", confidence_page(study, frame, _note(changes)))
-            plot_confidence(new / f"{name}.png", frame)
-        else:
-            write_study(new, name, study, frame, _note(changes))
+        write_study(new, name, STUDIES[name], frame, _note(changes))
     _print_page(out / f"{name}.md")
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -11,9 +9,8 @@ from typing import Annotated
 import pandas as pd
 import typer
 
-from soup_nlp.bench import speed_page
+from soup_nlp.bench import speed as timing
 from soup_nlp.bench.chain import chain_page, measure_chain, sequences
-from soup_nlp.bench.speed import measure_speed, speed_cell, speed_cells
 from soup_nlp.bench.study import Cell, measure_cells, show
 from soup_nlp.cli.bench_accuracy import Only, Width
 from soup_nlp.cli.options import Data, Out, Overwrite, Quiet, RowProgress, Set, numbers, words
@@ -41,48 +38,37 @@ def speed(
     overrides: Set = None,
     gate: Annotated[
         Path | None,
-        typer.Option("--check", help="Measure the runs of this baseline and compare ratios."),
-    ] = None,
-    write_baseline: Annotated[
-        Path | None, typer.Option(help="Write the measurement as a baseline.")
+        typer.Option("--check", help="Compare with the rows (.jsonl) of an earlier measurement."),
     ] = None,
     out: Out = Path("out/bench/speed"),
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
-    kept = [] if gate is None else speed_page.read_baseline(gate)
-    settings = [own for own, _ in kept] or speed_cells(
+    earlier = None if gate is None else timing.read_gate(gate)
+    cells = timing.speed_cells(
         words(scenes, "--scenes", [*SCENES, "motorcycle"]),
         numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS),
         numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS),
         numbers(seeds, "--seeds"),
-        width=width,
-        height=height,
-        overrides=overrides or [],
+        width,
+        height,
+        overrides or [],
     )
-    cells = [speed_cell(**own) for own in settings]
-    if write_baseline is not None and os.path.lexists(write_baseline) and not overwrite:
-        # raises an error if the file is no baseline
-        speed_page.read_baseline(write_baseline)
-    names = () if kept else ("table.md", "growth.png")
-    claim(out, names, overwrite)
+    claim(out, ("table.md", "growth.png"), overwrite)
     run = partial(measure_all, say=RowProgress(quiet, _result_of))
-    frame = measure_cells(cells, measure_speed, out / "table.jsonl", run, own_process=True)
-    if write_baseline is not None:
-        text = json.dumps(speed_page.baseline(frame, settings), indent=1) + "\n"
-        write_text(write_baseline, text)
-    if kept:
-        found = speed_page.check(frame, kept)
-        print(found.to_string(index=False))
-        bad = int((~found["ok"].astype(bool)).sum())
-        print(f"{bad} of {len(found)} values are WORSE" if bad else "the gate holds")
-    else:
-        with staged(out) as new:
-            write_text(new / "table.md", speed_page.speed_page(frame))
-            speed_page.plot_growth(new / "growth.png", frame)
-        bad = _failed(frame)
-        print(f"{len(frame)} runs, {bad} failed, in {out / 'table.md'}")
+    frame = measure_cells(cells, timing.measure_speed, out / "table.jsonl", run, own_process=True)
+    with staged(out) as new:
+        write_text(new / "table.md", timing.speed_page(frame))
+        timing.plot_growth(new / "growth.png", frame)
+    bad = _failed(frame)
+    print(f"{len(frame)} runs, {bad} failed, in {out / 'table.md'}")
+    if earlier is not None:
+        found = timing.gate(frame, earlier)
+        print(found.to_string())
+        worse = int((~found["holds"]).sum())
+        print(f"{worse} of {len(found)} values are WORSE" if worse else "the gate holds")
+        bad += worse
     raise typer.Exit(1 if bad else 0)
 
 

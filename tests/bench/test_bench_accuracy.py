@@ -17,8 +17,7 @@ from soup_nlp.bench.accuracy import BASELINES, METHODS, measure_pair, moving
 from soup_nlp.bench.accuracy_page import suite_page
 from soup_nlp.bench.published import COMPARISON, published
 from soup_nlp.bench.study import Cell, frame_of, input_hash, settings_hash
-from soup_nlp.bench.suite_pairs import Item
-from soup_nlp.bench.suites import SUITES
+from soup_nlp.bench.suites import SUITES, Item
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Pair, Truth

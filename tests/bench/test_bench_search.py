@@ -27,8 +27,7 @@ from soup_nlp.bench.search import (
 )
 from soup_nlp.bench.studies import STUDIES
 from soup_nlp.bench.study import Cell, frame_of, measure_cells
-from soup_nlp.bench.suite_pairs import RENDERED, Item, Options
-from soup_nlp.bench.suites import list_suite
+from soup_nlp.bench.suites import RENDERED, Item, Options, list_suite
 from soup_nlp.cli import bench_accuracy
 from soup_nlp.cli.bench_all import COMMANDS
 from soup_nlp.cli.main import app, main

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from soup_nlp.bench.suite_pairs import Options, spread
-from soup_nlp.bench.suites import SUITES, list_suite
+from soup_nlp.bench.suites import SUITES, Options, list_suite, spread
 from soup_nlp.cli.main import main
 
 

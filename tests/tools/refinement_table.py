@@ -12,8 +12,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from soup_nlp.bench.suite_pairs import Item, Options
-from soup_nlp.bench.suites import list_suite
+from soup_nlp.bench.suites import Item, Options, list_suite
 from soup_nlp.pipeline.run import run
 
 HEAD = (

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from soup_nlp.bench.solvers.profiles import PROBLEM, cost_table
-from soup_nlp.bench.study import markdown, page_text, show
+from soup_nlp.bench.study import markdown, page_text, show, titled
 from soup_nlp.family.write import REACHED
 
 Row = Mapping[str, Any]
@@ -160,9 +160,8 @@ def _by_run(frame: pd.DataFrame) -> list[str]:
     if frame.empty:
         return []
     order = frame.assign(failed=~frame["verified"].astype(bool))
-    order = order.sort_values([*PROBLEM, "failed", "seconds"])[list(COLUMNS)]
-    order = order.rename(columns={c: title for c, (title, _) in COLUMNS.items()})
-    return markdown(order.set_index("problem"), dict(COLUMNS.values()))
+    order = order.sort_values([*PROBLEM, "failed", "seconds"])
+    return titled(order.set_index("problem"), {k: v for k, v in COLUMNS.items() if k != "problem"})
 
 
 def reached(frame: pd.DataFrame) -> pd.Series:
