@@ -1,62 +1,50 @@
-"""The page of a suite and of a study: tables by pair, family and dataset, with their protocol."""
+"""The page of a suite: tables by pair, family and dataset, with their protocol; a picture."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from soup_nlp.bench.accuracy import BASELINES, METHODS
-from soup_nlp.bench.published import ABLATION, GRID_AGAINST_SLIC, PROTOCOL, SOURCE, published
 from soup_nlp.bench.study import (
-    Study,
     failures,
     main_metric,
     markdown,
     page_text,
     panels,
-    pivot,
-    plot_lines,
     provenance,
     save,
-    show,
-    table,
     titled,
 )
 from soup_nlp.evaluate.metrics import ERRORS
 from soup_nlp.evaluate.protocols import preset
-from soup_nlp.evaluate.scoring import SURE
 
-MEASURES = {
-    "mre": ("MRE", ".4f"),
-    "median": ("Median relative error", ".4f"),
-    "cpu_seconds": ("CPU seconds (shared machines count too)", ".1f"),
-    "energy.solution.total": ("Exact energy of the solution", ".1f"),
-}
-"""Title and format of every table of a study, by column."""
-CONFIDENCE = (
-    "AUSE is the area between the sparsification curve and the oracle's, over the mean relative"
-    " error: 0 is perfect, 0.8 to 1 is chance. Within k: share of the pixels whose log depth is"
-    " within k sigma, one median scale a pair. Guess: share of the image."
-)
+SURENESS = ("AUSE", "guess", "within 1", "within 2")
+"""Columns on sigma."""
 
 
-def suite_page(title: str, frame: pd.DataFrame, note: str = "") -> str:
-    """The page of the rows of one suite."""
+def write_suite(folder: Path, name: str, frame: pd.DataFrame, note: str = "") -> None:
+    """Write the page NAME.md of the rows of one suite, and the picture NAME.png."""
+    picture = _plot_sparsification(folder / f"{name}.png", frame)
+    (folder / f"{name}.md").write_text(suite_page(name, frame, note, picture), encoding="utf-8")
+
+
+def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = False) -> str:
+    """The page of the rows of one suite, with or without its picture."""
     good = frame[frame["ok"].eq(True)].copy()
     known = good[good["mre"].notna()]
     settings = ", ".join(sorted(frame["settings"].astype(str).unique()))
-    lines = [f"# {title}", "", note, "", _verdict(good, known, len(frame)), ""]
+    lines = [f"# Accuracy on {name}", "", note, "", _verdict(good, known, len(frame)), ""]
     lines += [f"{provenance(frame)}; settings {settings} (one a flow source).", ""]
-    for name in dict.fromkeys(p for presets in known["presets"] for p in presets):
-        lines += _convention(name, known)
+    for convention in dict.fromkeys(p for presets in known["presets"] for p in presets):
+        lines += _convention(convention, known)
     lines += [*_families(known), *_better_baselines(known)]
-    for name, group in known.groupby("main", sort=False):
-        lines += _details(str(name), group)
-    for suite, group in known.groupby("suite", sort=False):
-        lines += _published(str(suite), group)
+    for convention, group in known.groupby("main", sort=False):
+        lines += _details(str(convention), group)
+    if picture:
+        lines += ["## Sigma", "", f"![Sparsification by sigma, by family]({name}.png)", ""]
     return page_text([*lines[:-1], *failures(frame)])
 
 
@@ -138,24 +126,28 @@ def _families(frame: pd.DataFrame) -> list[str]:
     own["skill"] = main_metric(frame, name="skill")
     for column, name in {"moving.mre": "MRE moving", "moving.rest": "MRE of the rest"}.items():
         own[name] = frame[column].astype(float) if column in frame else np.nan
-    own["guess"], own["within 1"], own["within 2"] = _sure(frame)
+    own[list(SURENESS)] = _sureness(frame)
     groups = own.groupby(["sequence", "flow"], sort=False)
     means = groups[[c for c in own.columns if c not in ("sequence", "flow", "title")]].mean()
     means.insert(0, "pairs", groups.size())
     means["worst pair"] = [own.loc[i, "title"] for i in groups["mre"].idxmax()]
     text = (
         "Means over the pairs, each under its own convention. Moving: pixels that move by"
-        " themselves, where a mask or the true motion is known. Guess: share of the image. Within"
-        " k: share of the pixels whose log depth is within k sigma."
+        " themselves, where a mask or the true motion is known. AUSE: area between the"
+        " sparsification curve of sigma and the oracle's, over the MRE; 0 is perfect, 0.8 to 1 is"
+        " chance. Guess: share of the image. Within k: share of the pixels whose log depth is"
+        " within k sigma."
     )
     return ["## By family", "", text, "", *markdown(means, _forms(means)), ""]
 
 
-def _sure(frame: pd.DataFrame) -> tuple[pd.Series, pd.Series, pd.Series]:
-    """Share of guesses, and shares of the pixels within one and within two sigma, by row."""
-    guess, within = (frame.get(c, pd.Series(np.nan, frame.index)) for c in ("guess", "within"))
-    one, two = ([v[k] if isinstance(v, list) else np.nan for v in within] for k in (0, 1))
-    return guess.astype(float), pd.Series(one, frame.index), pd.Series(two, frame.index)
+def _sureness(frame: pd.DataFrame) -> pd.DataFrame:
+    """SURENESS by row; "within" of a row has the shares within one and within two sigma."""
+    out = frame.reindex(columns=["sparsification.ause", "guess"]).astype(float)
+    for k in (0, 1):
+        values = [v[k] if isinstance(v, list) else np.nan for v in frame.get("within", [])]
+        out[f"within {k + 1}"] = values or np.nan
+    return out.set_axis(list(SURENESS), axis=1)
 
 
 def _details(convention: str, frame: pd.DataFrame) -> list[str]:
@@ -172,82 +164,22 @@ def _details(convention: str, frame: pd.DataFrame) -> list[str]:
     }.items():
         if column in frame:
             out[head] = frame[column].astype(float).to_numpy()
-    for head, values in zip(("guess", "within 1", "within 2"), _sure(frame), strict=True):
-        out[head] = values.to_numpy()
+    out[list(SURENESS)] = _sureness(frame).to_numpy()
     out["status"], out["s"] = frame["status"].to_numpy(), frame["cpu_seconds"].to_numpy()
     forms = dict.fromkeys(out.columns, ".4f") | {"s": ".0f"}
     return [f"## The solution, {preset(convention)}", "", *markdown(out, forms), ""]
 
 
-def _published(suite: str, frame: pd.DataFrame) -> list[str]:
-    """Published numbers of a dataset beside the measured means."""
-    numbers, about = published(suite)
-    if not numbers:
-        return []
-    lines = [[f"{m} (published)", show(v)] for m, v in numbers.items()]
-    for (flow, name), group in frame.groupby(["flow", "main"], sort=False):
-        count = f"{len(group)} pair{'' if len(group) == 1 else 's'}"
-        text = f"this program, flow {flow}, {name}, {count} (measured)"
-        lines.append([text, show(float(group["mre"].mean()))])
-    text = f"Published rows are copied, not measured: {SOURCE}. {PROTOCOL}. {about}."
-    head = f"## {suite} beside published numbers"
-    return [head, "", *table(["method", "MRE"], lines), "", text, ""]
+def _plot_sparsification(path: Path, frame: pd.DataFrame) -> bool:
+    """Sparsification curves of sigma and of the oracle, a panel for each family; False if none.
 
-
-def study_page(name: str, study: Study, frame: pd.DataFrame, note: str = "") -> str:
-    """Page of a study: a table for each measure with pairs as lines and variants as columns."""
-    used = "; ".join(str(preset(p)) for p in frame["main"].unique())
-    lines = [f"# Study: {name}", "", f"{study.text[0].upper()}{study.text[1:]}. {note}", ""]
-    lines += [f"{provenance(frame)}. Depth of the reference frame; {used}.", ""]
-    frame = frame.assign(median=main_metric(frame, name="median_relative"))
-    for column, (title, form) in MEASURES.items():
-        if column in frame:
-            lines += [f"## {title}", "", *markdown(pivot(frame, column), form), ""]
-    lines += published_lines(name)
-    return page_text([*lines, *failures(frame)])
-
-
-def published_lines(study: str) -> list[str]:
-    """The paper's numbers of a study; none for most."""
-    copied = f"Copied, not measured: {SOURCE}."
-    if study == "ablation":
-        lines = [[f"{k} (published)", *(show(v) for v in row)] for k, row in ABLATION.items()]
-        head = ["sequence", "arap", "+ proj", "+ cont", "+ orient"]
-        return ["## Published MRE", "", *table(head, lines), "", copied, ""]
-    if study == "pattern":
-        both = ", ".join(f"{k} {v:.4f}" for k, v in GRID_AGAINST_SLIC.items())
-        return [f"Published for one frame with 1,000 superpixels: {both}. {copied}", ""]
-    return []
-
-
-def confidence_page(study: Study, frame: pd.DataFrame, note: str = "") -> str:
-    """Page of the study of sigma: tables by pair and by family."""
-    head = f"{study.text[0].upper()}{study.text[1:]}. {note} {provenance(frame)}."
-    lines = ["# Study: confidence", "", head, ""]
-    good = _with_curve(frame)
-    if len(good):
-        table = pd.DataFrame({"MRE": good["mre"]})
-        for name in SURE:
-            table[name.replace("solution_", "surest ") + " %"] = main_metric(good, name)
-        table["AUSE"] = good["sparsification.ause"].astype(float)
-        table["guess"], table["within 1"], table["within 2"] = _sure(good)
-        by_family = table.groupby(good["sequence"], sort=False).mean().rename_axis("family")
-        by_family.loc[f"mean of {len(by_family)} families"] = by_family.mean()
-        by_pair = table.set_axis(pd.Index(good["title"], name="pair, flow"))
-        lines += [CONFIDENCE, "", *markdown(by_pair), "", "## By family", ""]
-        lines += markdown(by_family)
-    return page_text([*lines, *failures(frame)])
-
-
-def _with_curve(frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows that have a sparsification curve."""
-    known = "sparsification.ause" in frame
-    return frame[frame["sparsification.ause"].notna()] if known else frame.iloc[:0]
-
-
-def plot_confidence(path: Path, frame: pd.DataFrame) -> None:
-    """Sparsification curves of sigma and of the oracle, one panel for each family."""
-    families = _with_curve(frame).groupby("sequence", sort=False)
+    Rows with the true flow are left out where there are others.
+    """
+    shown = frame[frame.get("sparsification.ause", pd.Series(np.nan, frame.index)).notna()]
+    computed = shown[~shown["flow"].str.startswith("truth")]
+    families = (computed if len(computed) else shown).groupby("sequence", sort=False)
+    if not len(families):
+        return False
     out, axes = panels(families.ngroups, 4, 3.0, 2.4)
     for ax, (family, group) in zip(axes, families, strict=True):
         for curve in group["sparsification.curve"]:
@@ -261,18 +193,4 @@ def plot_confidence(path: Path, frame: pd.DataFrame) -> None:
     out.supylabel("MRE of the rest / MRE")
     out.suptitle("Sparsification: sigma (blue), oracle (grey), chance (dashed)", fontsize=10)
     save(out, path)
-
-
-def write_study(
-    folder: Path, name: str, study: Study, frame: pd.DataFrame, note: str = ""
-) -> Sequence[Path]:
-    """Write the page and the picture of a study."""
-    page, picture = folder / f"{name}.md", folder / f"{name}.png"
-    if name == "confidence":
-        text = confidence_page(study, frame, note)
-        plot_confidence(picture, frame)
-    else:
-        text = study_page(name, study, frame, note)
-        plot_lines(picture, {"": pivot(frame)}, name, study.text)
-    page.write_text(text, encoding="utf-8")
-    return page, picture
+    return True

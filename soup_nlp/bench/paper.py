@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -188,7 +187,7 @@ def _families(
         elif name in RENDERED:
             out += list_suite("rendered", None, Options(("dis",), width, (0,), None, (name,))).items
         else:
-            out += [i for i in _with_truth("shared", data) if i.sequence == name][:1]
+            out += _with_truth("shared", data, (name,))[:1]
     return tuple(out)
 
 
@@ -196,24 +195,27 @@ def _dataset(name: str, data: Path | None, limit: int | None) -> tuple[Item, ...
     """At most `limit` pairs of a dataset that have a truth, evenly spaced."""
     _, suites, cap = DATASETS[name]
     listed = [i for suite in suites for i in _with_truth(suite, data)]
-    listed = listed or [i for i in _with_truth("shared", data) if i.sequence in suites]
+    listed = listed or _with_truth("shared", data, suites)
     if limit is not None and listed:
         listed = [listed[k] for k in spread(len(listed), limit)]
     return tuple(i.scored_by((*i.presets, cap)) if cap else i for i in listed)
 
 
-def _with_truth(suite: str, data: Path | None) -> list[Item]:
-    """The pairs of a suite that can be loaded and have a depth to compare with."""
+def _with_truth(suite: str, data: Path | None, sequences: tuple[str, ...] = ()) -> list[Item]:
+    """The pairs of a suite, or of some of its sequences, that have a depth to compare with."""
     try:
         items = () if data is None else list_suite(suite, data, Options(("dis",))).items
     except DataError:
         return []
-    out = []
-    for item in items:
-        with suppress(SoupError):
-            if has_depth(item.problem().load_pair().truth):
-                out.append(item.scored_by(("paper", "best")))
-    return out
+    wanted = [i for i in items if not sequences or i.sequence in sequences]
+    return [i.scored_by(("paper", "best")) for i in wanted if _has_truth(i)]
+
+
+def _has_truth(item: Item) -> bool:
+    try:
+        return has_depth(item.problem().load_pair().truth)
+    except SoupError:
+        return False
 
 
 def measure_paper(item: Item, overrides: Overrides = (), maps: Path | None = None) -> Row:
@@ -245,10 +247,13 @@ def write_maps(path: Path, result: Run) -> None:
     pair = result.pair
     step = max(1, -(-pair.size[1] // MAP_WIDTH))
     depths = {"start": result.start_reconstruction, "solution": result.reconstruction}
-    maps = {name: r.depth_ref.astype(np.float32) for name, r in depths.items()}
+    maps: dict[str, np.ndarray] = {
+        name: r.depth_ref.astype(np.float32) for name, r in depths.items()
+    }
     if pair.truth is not None and pair.truth.depth_ref is not None:
         maps["truth"] = pair.truth.depth_ref.astype(np.float32)
-    small = {name: m[::step, ::step] for name, m in {"image": pair.image_ref, **maps}.items()}
+    maps["image"] = pair.image_ref
+    small = {name: m[::step, ::step] for name, m in maps.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **small)

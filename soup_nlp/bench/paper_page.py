@@ -10,11 +10,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from soup_nlp.bench.accuracy_page import published_lines
 from soup_nlp.bench.paper import ALL_SECTIONS, BASE, DATASETS, METHODS, Plan
 from soup_nlp.bench.processes import processor
-from soup_nlp.bench.published import COMPARISON, DATA, SOURCE
-from soup_nlp.bench.studies import DEPARTURES, STUDIES
+from soup_nlp.bench.studies import (
+    ABLATION,
+    COMPARISON,
+    DATA,
+    DEPARTURES,
+    GRID_AGAINST_SLIC,
+    SOURCE,
+    STUDIES,
+)
 from soup_nlp.bench.study import (
     failures,
     figure,
@@ -50,9 +56,12 @@ WITHOUT_TRUTH = {
 SAID = {
     "superpixels": "Published as a figure: the error hardly falls beyond 1,000 superpixels.",
     "neighbours": "Published as pictures of one pair (K = 4 and 20); K from 15 to 20 is used.",
+    "pattern": "Published for one frame with 1,000 superpixels: "
+    + ", ".join(f"{k} {v:.4f}" for k, v in GRID_AGAINST_SLIC.items())
+    + f". Copied, not measured: {SOURCE}.",
     "flow": "Published as a figure of RMSE in metres on Sintel.",
 }
-"""Sentences on the paper's results that have no printed numbers, by section."""
+"""Sentences on the paper's results, by section."""
 
 
 def write_page(folder: Path, plan: Plan, frame: pd.DataFrame, command: str) -> None:
@@ -199,7 +208,12 @@ def _study(folder: Path, name: str, rows: pd.DataFrame) -> list[str]:
         own = rows[rows["method"] == method].assign(value=_mre(rows))
         drawn[method] = pivot(own, "value", "name", "change").rename_axis(index="pair")
         lines += [f"{method}, MRE after median scale, no cap:", "", *markdown(drawn[method]), ""]
-    lines += published_lines(name) + ([SAID[name], ""] if name in SAID else [])
+    copied = f"Copied, not measured: {SOURCE}."
+    if name == "ablation":
+        printed = [[f"{k} (published)", *(show(v) for v in row)] for k, row in ABLATION.items()]
+        head = ["sequence", "arap", "+ proj", "+ cont", "+ orient"]
+        lines += ["Published MRE:", "", *table(head, printed), "", copied, ""]
+    lines += [SAID[name], ""] if name in SAID else []
     plot_lines(folder / f"{name}.png", drawn, name, text)
     return [*lines, *_figure(name, text)]
 

@@ -1,8 +1,7 @@
-"""Search for better default options by Optuna, with two checks of the result.
+"""Search for better default options by Optuna; every family judges what the others choose.
 
-Trial t000 is the default. Two checks follow the search: one family of pairs at a time is held out
-of the choice, and the best trials are scored on validation pairs. The same seed, pairs and code
-give the same trials, and an interrupted search can be continued.
+Trial t000 is the default. The same seed, pairs and code give the same trials, and an interrupted
+search can be continued.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from soup_nlp.bench.study import (
     markdown,
     measure_cells,
     page_text,
+    pivot,
     provenance,
 )
 from soup_nlp.bench.suites import Item
@@ -114,95 +114,57 @@ def pair_loss(frame: pd.DataFrame) -> pd.Series:
 
 def search(
     space: Space,
-    train: Sequence[Item],
-    validation: Sequence[Item],
+    items: Sequence[Item],
     path: Path,
     measure_rows: MeasureRows,
     *,
     trials: int = 24,
-    finalists: int = 3,
     seed: int = 0,
     overrides: Overrides = (),
     measure: Measure = measure_pair,
 ) -> pd.DataFrame:
-    """Search and validate.
+    """Measure trials that Optuna's TPE sampler suggests.
 
     Args:
         space: Parameters that are varied.
-        train: Training pairs.
-        validation: Validation pairs; none of them may be a training pair.
+        items: Pairs.
         path: JSON-lines file of rows.
         measure_rows: `storage.rows.measure_all` with its options.
         trials: Number of configurations beside the default.
-        finalists: Number of best trials that are validated beside the default.
         seed: Seed of the sampler.
         overrides: Overrides of every problem; those of a trial come after them.
         measure: Makes the row of a pair.
 
     Returns:
-        The frame of all rows: "variant" is the trial, "side" is "train" or "validation", "loss"
-        that of the pair, "settings" the overrides of the trial as text.
+        The frame of all rows: "variant" is the trial, "loss" that of the pair, "settings" the
+        overrides of the trial as text.
 
     Raises:
-        ConfigError: there is no training pair, a pair is in both sets, or a parameter is wrong.
+        ConfigError: there is no pair, or a parameter is wrong.
     """
-    _check(space, train, validation)
+    if not items:
+        raise ConfigError("no pair is left", where="search")
+    for key, distribution in space.items():
+        ends = getattr(distribution, "choices", None) or (distribution.low, distribution.high)
+        for value in ends:
+            items[0].problem([f"{key}={as_yaml(value)}"])
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed))
-    chosen: dict[str, Overrides] = {DEFAULT: ()}
     frames = []
-
-    def scored(name: str, items: Sequence[Item], side: str) -> float:
-        cells = [Cell(i, (*overrides, *chosen[name]), name) for i in items]
+    for k in range(trials + 1):
+        trial = study.ask(dict(space)) if k else None
+        chosen = {} if trial is None else trial.params
+        own = tuple(f"{key}={as_yaml(v)}" for key, v in chosen.items())
+        cells = [Cell(i, (*overrides, *own), f"t{k:03d}") for i in items]
         frame = measure_cells(cells, measure, path, measure_rows)
-        frame["side"], frame["loss"] = side, pair_loss(frame)
-        frame["settings"] = " ".join(f"`{o}`" for o in chosen[name]) or "-"
+        frame["loss"] = pair_loss(frame)
+        frame["settings"] = " ".join(f"`{o}`" for o in own) or "-"
         frames.append(frame)
-        return float(frame["loss"].mean())
-
-    losses = {DEFAULT: scored(DEFAULT, train, "train")}
-    for k in range(1, trials + 1):
-        trial, name = study.ask(dict(space)), f"t{k:03d}"
-        chosen[name] = tuple(f"{key}={as_yaml(v)}" for key, v in trial.params.items())
-        losses[name] = scored(name, train, "train")
-        study.tell(trial, losses[name])
-    best = sorted(list(losses)[1:], key=lambda name: losses[name])[:finalists]
-    for name in [DEFAULT, *best] if validation else []:
-        scored(name, validation, "validation")
+        if trial is not None:
+            study.tell(trial, float(frame["loss"].mean()))
     return pd.concat(frames, ignore_index=True)
-
-
-def _check(space: Space, train: Sequence[Item], validation: Sequence[Item]) -> None:
-    if not train:
-        raise ConfigError("no training pair", where="search")
-    both = {(i.suite, i.name) for i in train} & {(i.suite, i.name) for i in validation}
-    if both:
-        raise ConfigError("a pair both trains and validates", found="/".join(min(both)))
-    for key, distribution in space.items():
-        ends = getattr(distribution, "choices", None) or (distribution.low, distribution.high)
-        for value in ends:
-            train[0].problem([f"{key}={as_yaml(value)}"])
-
-
-def split(
-    items: Sequence[Item], seeds: Sequence[int], validation_seeds: Sequence[int]
-) -> tuple[list[Item], list[Item]]:
-    """(training, validation) pairs: rendered scenes by seed, real pairs alternately by name.
-
-    All flows of a pair are in the same set.
-    """
-    real = sorted({i.name for i in items if "seed" not in i.input})
-    train: list[Item] = []
-    validation: list[Item] = []
-    for item in items:
-        seed = item.input.get("seed")
-        if seed in validation_seeds or (seed is None and real.index(item.name) % 2):
-            validation.append(item)
-        elif seed is None or seed in seeds:
-            train.append(item)
-    return train, validation
 
 
 def leave_one_family_out(frame: pd.DataFrame) -> pd.DataFrame:
@@ -212,8 +174,7 @@ def leave_one_family_out(frame: pd.DataFrame) -> pd.DataFrame:
         By family: "trial", the best one on all other families, and "change", that of the geometric
         mean of the MRE over the held-out family, relative to the default.
     """
-    train = frame[frame["side"] == "train"]
-    losses = train.groupby(["variant", "sequence"])["loss"].agg(["sum", "size"])
+    losses = frame.groupby(["variant", "sequence"])["loss"].agg(["sum", "size"])
     sums, sizes = losses["sum"].unstack(), losses["size"].unstack()
     lines = {}
     for family in sums.columns if len(sums.columns) > 1 else []:
@@ -232,28 +193,34 @@ def accepted(left_out: pd.DataFrame) -> bool:
 
 
 def search_page(frame: pd.DataFrame, space: Sequence[str], command: str) -> str:
-    """Page of a search: verdict, trials, one family left out at a time, every pair."""
-    train = _trials(frame[frame["side"] == "train"])
-    validated = _trials(frame[frame["side"] == "validation"])
-    best = str(train.index[0])
-    loss, default = train["score"][best], train["score"][DEFAULT]
-    verdict = (
-        f"{len(train) - 1} trials; the best on the training pairs is {best}: {loss:.3f} against"
-        f" {default:.3f} of the default."
+    """Page of a search: trials, one family left out at a time, every pair."""
+    groups = frame.groupby("variant")
+    trials = pd.DataFrame(
+        {
+            "score": groups["loss"].mean(),
+            "mean MRE": groups["mre"].mean(),
+            "failed": groups["ok"].agg(lambda ok: str(int(ok.ne(True).sum()))),
+            "settings": groups["settings"].first(),
+        }
     )
-    if best != DEFAULT and len(validated):
-        after, before = validated["score"][best], validated["score"][DEFAULT]
-        word = "holds" if after < before else "does not hold"
-        verdict += f" On the validation pairs {after:.3f} against {before:.3f}: the gain {word}."
-    score = (
+    trials = trials.sort_values("score", kind="stable").rename_axis("trial")
+    best = str(trials.index[0])
+    lines = ["# Search for defaults", ""]
+    lines += [
+        f"{len(trials) - 1} trials; the best is {best}: {trials['score'][best]:.3f} against"
+        f" {trials['score'][DEFAULT]:.3f} of the default.",
+        "",
+        f"{provenance(frame)}.",
+        "",
+        f"    {command}",
+        "",
         "Score: mean over pairs of ln(MRE / MRE of a constant depth), MRE under the pair's own"
         f" convention and at least {MIN_MRE:g}; {FAILED_LOSS:.2f} for a pair that fails. Lower is"
-        " better; -0.69 is half the error of a constant depth."
-    )
-    lines = ["# Search for defaults", "", verdict, "", f"{provenance(frame)}.", ""]
-    lines += [f"    {command}", "", score, "", "## What was varied", ""]
-    lines += [*(f"- `{text}`" for text in space), "", "## Trials on the training pairs", ""]
-    lines += [*markdown(train.head(TOP), ".3f"), ""]
+        " better; -0.69 is half the error of a constant depth.",
+        "",
+    ]
+    lines += ["## What was varied", "", *(f"- `{text}`" for text in space), ""]
+    lines += ["## Trials", "", *markdown(trials.head(TOP), ".3f"), ""]
     left_out = leave_one_family_out(frame)
     if len(left_out):
         met = "met" if accepted(left_out) else "not met"
@@ -263,23 +230,6 @@ def search_page(frame: pd.DataFrame, space: Sequence[str], command: str) -> str:
         )
         lines += ["## One family left out at a time", "", about, ""]
         lines += [*markdown(left_out, {"change": "+.1%"}), ""]
-    if len(validated):
-        lines += ["## Validation pairs", "", *markdown(validated, ".3f"), ""]
     both = frame[frame["variant"].isin([DEFAULT, best])]
-    pairs = both.pivot(index=["title", "side"], columns="variant", values="mre").astype(float)
-    lines += ["## By pair, MRE", "", *markdown(pairs.reset_index("side"))]
+    lines += ["## By pair, MRE", "", *markdown(pivot(both, average=False))]
     return page_text([*lines, *failures(frame)])
-
-
-def _trials(frame: pd.DataFrame) -> pd.DataFrame:
-    """Score, mean MRE, failures and settings by trial, the best first."""
-    groups = frame.groupby("variant")
-    table = pd.DataFrame(
-        {
-            "score": groups["loss"].mean(),
-            "mean MRE": groups["mre"].mean(),
-            "failed": groups["ok"].agg(lambda ok: str(int(ok.ne(True).sum()))),
-            "settings": groups["settings"].first(),
-        }
-    )
-    return table.sort_values("score", kind="stable").rename_axis("trial")

@@ -1,4 +1,4 @@
-"""`bench speed`: seconds, energy and memory of solves by stage, their growth with N, and a gate."""
+"""`bench speed`: seconds, energy and memory of solves by stage, and their growth with N."""
 
 from __future__ import annotations
 
@@ -28,16 +28,14 @@ from soup_nlp.bench.study import (
 )
 from soup_nlp.bench.suites import Item
 from soup_nlp.config.problem import dump_problem
-from soup_nlp.errors import DataError
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.pipeline import Case, make_run, prepare
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
-from soup_nlp.storage.files import require_file
 from soup_nlp.storage.folders import scratch
-from soup_nlp.storage.rows import Row, read_rows
+from soup_nlp.storage.rows import Row
 
 REFERENCE_ITERATIONS = 100
 """Limit of the steps of Levenberg-Marquardt for every smoothing width."""
@@ -83,17 +81,6 @@ NOTE = (
     " with every picture, point cloud and HDF5. Wall times of a shared machine vary with its load;"
     " CPU times less so. One thread."
 )
-LIMITS = {
-    "iterations": (1.3, 3.0),
-    "energy.total": (1.005, 0.0),
-    "energy_to_reference": (1.005, 0.0),
-    "sizes.hessian_nonzeros": (1.01, 0.0),
-    "time_to_reference": (1.5, 0.0),
-    "not converged": (1.0, 0.0),
-}
-"""(factor, addition) by column: a value above factor x earlier value + addition fails the gate.
-Iterations and energies may change a little, since rounding differs between machines. Times are
-compared relative to the reference solver in the same process, so that the machine cancels out."""
 
 
 # --- the measurement ------------------------------------------------------------------------------
@@ -233,11 +220,11 @@ def _reference(case: Case) -> Row:
     }
 
 
-# --- the page and the gate ------------------------------------------------------------------------
+# --- the page ---------------------------------------------------------------------------------
 
 
 def with_costs(frame: pd.DataFrame) -> pd.DataFrame:
-    """The good rows of a frame with the costs and ratios that tables and gate need."""
+    """The good rows of a frame with the costs and ratios that the tables need."""
     if "cpu.nlp" not in frame:
         return frame.iloc[:0]
     out = frame[frame["ok"].eq(True)].copy()
@@ -324,47 +311,3 @@ def plot_growth(path: Path, frame: pd.DataFrame) -> None:
     if len(good):
         left.legend(fontsize=8)
     save(picture, path)
-
-
-def gate_values(frame: pd.DataFrame) -> pd.DataFrame:
-    """The columns of LIMITS of the good rows, by key."""
-    good = with_costs(frame)
-    if good.empty:
-        return pd.DataFrame(columns=list(LIMITS))
-    good["not converged"] = 1.0 - good["converged"].astype(float)
-    return good.set_index("key")[list(LIMITS)].astype(float)
-
-
-def read_gate(path: Path) -> pd.DataFrame:
-    """The `gate_values` of the rows of an earlier run.
-
-    Raises:
-        DataError: the file is missing or has no such rows.
-    """
-    rows = read_rows(require_file(path, "file of rows"))
-    try:
-        values = gate_values(pd.json_normalize(rows))
-    except (KeyError, TypeError, ValueError):
-        values = pd.DataFrame()
-    if values.empty:
-        expected = "table.jsonl of an earlier `soup-nlp bench speed`"
-        raise DataError("no rows of bench speed", where=path, expected=expected)
-    return values
-
-
-def gate(frame: pd.DataFrame, old: pd.DataFrame) -> pd.DataFrame:
-    """Value, earlier value, limit and whether it holds, by run and column of LIMITS.
-
-    The runs are those that both have; a run that failed now has NaN, which does not hold.
-
-    Raises:
-        DataError: they have no run in common.
-    """
-    old = old[old.index.isin(frame["key"])]
-    if old.empty:
-        raise DataError("the earlier rows have none of these runs", where="--check")
-    factor, addition = (pd.Series({k: v[j] for k, v in LIMITS.items()}) for j in (0, 1))
-    limit, new = old * factor + addition, gate_values(frame).reindex(old.index)
-    index = pd.MultiIndex.from_product([old.index, LIMITS], names=["run", "value"])
-    columns = {"old": old, "new": new, "limit": limit, "holds": new <= limit}
-    return pd.DataFrame({k: v.to_numpy().ravel() for k, v in columns.items()}, index)

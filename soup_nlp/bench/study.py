@@ -23,7 +23,6 @@ import pandas as pd
 from soup_nlp.bench.processes import alone
 from soup_nlp.bench.suites import Item
 from soup_nlp.config.problem import Problem
-from soup_nlp.errors import ConfigError
 from soup_nlp.storage.atomic import atomic_path
 from soup_nlp.storage.rows import Job, MeasureRows, Row, attempt, reason
 
@@ -94,41 +93,6 @@ def input_hash(problem: Problem) -> str:
 def _hash(section: Any, exclude: set[str]) -> str:
     tree = section.model_dump(mode="json", exclude=exclude)
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
-
-
-@dataclass(frozen=True)
-class Study:
-    """Variants of the options that are measured on the same pairs.
-
-    Attributes:
-        text: The question.
-        variants: Overrides by name of a variant, in the order of the tables.
-        true_flow: Only pairs that are listed with their true flow are measured.
-    """
-
-    text: str
-    variants: Mapping[str, Overrides] = field(default_factory=lambda: {"": ()})
-    true_flow: bool = False
-
-    def cells(self, items: Sequence[Item], overrides: Overrides = ()) -> list[Cell]:
-        """A cell for every pair and variant.
-
-        Raises:
-            ConfigError: no pair is left, or an override is wrong.
-        """
-        left = [i for i in items if i.flow == "truth" or not self.true_flow]
-        if not left:
-            hint = "give --flow truth" if items else None
-            raise ConfigError("no pair is left for the study", found=self.text, hint=hint)
-        # report a wrong override now, not in the row of every pair
-        left[0].problem(overrides)
-        variants = self.variants.items()
-        return [Cell(i, (*overrides, *own), name) for i in left for name, own in variants]
-
-
-def over(key: str, values: Sequence[object]) -> dict[str, Overrides]:
-    """Variants of one option, named by its values."""
-    return {str(v): (f"{key}={v}",) for v in values}
 
 
 def measure_cells(

@@ -1,4 +1,4 @@
-"""Commands bench accuracy and bench search: suites, declared studies, better defaults."""
+"""Commands bench accuracy and bench search: suites, better defaults."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ import typer
 
 from soup_nlp.bench import search as searching
 from soup_nlp.bench.accuracy import measure_pair
-from soup_nlp.bench.accuracy_page import suite_page, write_study
-from soup_nlp.bench.studies import STUDIES
+from soup_nlp.bench.accuracy_page import write_suite
 from soup_nlp.bench.study import Cell, measure_cells
-from soup_nlp.bench.suites import SUITES, Listing, Options, list_suite
+from soup_nlp.bench.suites import SUITES, Options, list_suite
 from soup_nlp.cli import options
-from soup_nlp.cli.options import RowProgress, numbers, words
+from soup_nlp.cli.options import RowProgress, numbers
 from soup_nlp.errors import ConfigError
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.schema.limits import MAX_SIDE
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.rows import MeasureRows, Row, measure_all
+from soup_nlp.storage.rows import Row, measure_all
 
 SuiteName = Annotated[
     list[str] | None, typer.Option("--suite", help=f"{', '.join(SUITES)}; may be repeated.")
@@ -48,9 +47,6 @@ def accuracy(
     suite: SuiteName = None,
     data: options.Data = None,
     out: options.Out = Path("out/bench/accuracy"),
-    analysis: Annotated[
-        str | None, typer.Option(help="A declared study instead of the table; `list` names them.")
-    ] = None,
     overrides: options.Set = None,
     flow: Flow = None,
     width: Width = 1024,
@@ -70,90 +66,37 @@ def accuracy(
     quiet: options.Quiet = False,
 ) -> None:
     """Depth against truth on a suite of pairs; interrupted runs can be continued."""
-    if analysis == "list":
-        print("\n".join(f"{known:<12} {study.text}" for known, study in STUDIES.items()))
-        return
-    if not suite and not analysis:
+    if not suite:
         print("\n".join(f"{entry.name:<14} {entry.text}" for entry in SUITES.values()))
         raise ConfigError("no suite was named", where="--suite", expected=", ".join(SUITES))
     for convention in conventions or []:
         preset(convention)
-    _check_names(analysis, folders, name, suite or [])
+    if name and len(suite) > 1:
+        raise ConfigError("one name for several suites", where="--name", found=", ".join(suite))
     wanted = _wanted(flow, width, numbers(seeds, "--seeds"), only, limit)
-    listings = [list_suite(known, data, wanted) for known in suite or ["rendered"]]
+    listings = [list_suite(known, data, wanted) for known in suite]
     progress, changes = RowProgress(quiet, mre_of), tuple(overrides or ())
     measure_rows = partial(measure_all, workers=workers, say=progress, any_code=any_code)
-    if analysis:
-        items = [i.scored_by(conventions) for listing in listings for i in listing.items]
-        chosen = words(analysis, "--analysis", list(STUDIES))[0]
-        cells = STUDIES[chosen].cells(items, changes)
-        _study(chosen, cells, out, changes, measure_rows, overwrite)
-    else:
-        pages = [out / f"{name or listing.suite.name}.md" for listing in listings]
-        claim(out, [page.name for page in pages], overwrite)
-        for listing, page in zip(listings, pages, strict=True):
-            if not quiet:
-                print(listing, file=sys.stderr)
-            _suite(listing, page, changes, measure_rows, conventions, folders)
+    names = [name or listing.suite.name for listing in listings]
+    claim(out, [f"{own}.{kind}" for own in names for kind in ("md", "png")], overwrite)
+    for listing, own in zip(listings, names, strict=True):
+        if not quiet:
+            print(listing, file=sys.stderr)
+        cells = [
+            Cell(
+                item.scored_by(conventions),
+                changes,
+                keep=folders / item.key.replace(" ", "_") if folders else None,
+            )
+            for item in listing.items
+        ]
+        frame = measure_cells(cells, measure_pair, out / f"{own}.jsonl", measure_rows)
+        note = f"Suite `{listing.suite.name}`: {listing.suite.text}. Overrides of every pair: "
+        note += f"{', '.join(f'`{o}`' for o in changes) or 'none'}."
+        with staged(out) as new:
+            write_suite(new, own, frame, note)
+        _print_page(out / f"{own}.md")
     raise typer.Exit(1 if progress.failed else 0)
-
-
-def _suite(
-    listing: Listing,
-    page: Path,
-    changes: tuple[str, ...],
-    measure_rows: MeasureRows,
-    conventions: list[str] | None,
-    folders: Path | None,
-) -> None:
-    """Measure the pairs of a suite, and write and print their page."""
-    cells = [
-        Cell(
-            item.scored_by(conventions),
-            changes,
-            keep=folders / item.key.replace(" ", "_") if folders else None,
-        )
-        for item in listing.items
-    ]
-    frame = measure_cells(cells, measure_pair, page.with_suffix(".jsonl"), measure_rows)
-    note = f"Suite `{listing.suite.name}`: {listing.suite.text}. {_note(changes)}"
-    with staged(page.parent) as new:
-        write_text(new / page.name, suite_page(f"Accuracy on {page.stem}", frame, note))
-    _print_page(page)
-
-
-def _study(
-    name: str,
-    cells: Sequence[Cell],
-    out: Path,
-    changes: tuple[str, ...],
-    measure_rows: MeasureRows,
-    overwrite: bool,
-) -> None:
-    """Measure a study, and write and print its page and its picture."""
-    claim(out, (f"{name}.md", f"{name}.png"), overwrite)
-    frame = measure_cells(cells, measure_pair, out / f"{name}.jsonl", measure_rows)
-    with staged(out) as new:
-        write_study(new, name, STUDIES[name], frame, _note(changes))
-    _print_page(out / f"{name}.md")
-
-
-def _note(changes: tuple[str, ...]) -> str:
-    return f"Overrides of every pair: {', '.join(f'`{o}`' for o in changes) or 'none'}."
-
-
-def _check_names(
-    analysis: str | None, folders: Path | None, name: str, suites: Sequence[str]
-) -> None:
-    if analysis and (folders or name):
-        raise ConfigError(
-            "result folders and names are of suites, not of studies",
-            where="--folders" if folders else "--name",
-            found=f"--analysis {analysis}",
-            hint="give one without the other",
-        )
-    if name and len(suites) > 1:
-        raise ConfigError("one name for several suites", where="--name", found=", ".join(suites))
 
 
 def _wanted(
@@ -181,12 +124,8 @@ def search(
         typer.Option("--param", help="KEY=log|linear|int:LOW:HIGH or KEY=choice:A:B instead."),
     ] = None,
     trials: Annotated[int, typer.Option(help="Configurations beside the default.", min=1)] = 24,
-    finalists: Annotated[int, typer.Option(help="Best trials that are validated.", min=1)] = 3,
     seed: Annotated[int, typer.Option(help="Of the trials.", min=0)] = 0,
     seeds: Seeds = "0,1",
-    validation_seeds: Annotated[
-        str, typer.Option(help="Seeds of rendered scenes that only validate.")
-    ] = "2,3",
     overrides: options.Set = None,
     flow: Flow = None,
     width: Width = 512,
@@ -196,29 +135,24 @@ def search(
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Search for better defaults and check them on pairs and families that did not choose."""
-    train_seeds, others = numbers(seeds, "--seeds"), numbers(validation_seeds, "--validation-seeds")
-    wanted = _wanted(flow, width, (*train_seeds, *others), only)
+    """Search for better defaults and check them on the families that did not choose them."""
+    wanted = _wanted(flow, width, numbers(seeds, "--seeds"), only)
     texts = params or searching.DEFAULT_SPACE
     space = searching.parse_space(texts)
     items = [i for name in suite or ["rendered"] for i in list_suite(name, data, wanted).items]
-    train, validation = searching.split(items, train_seeds, others)
     claim(out, ["search.md"], overwrite)
     progress = RowProgress(quiet, mre_of)
     frame: pd.DataFrame = searching.search(
         space,
-        train,
-        validation,
+        items,
         out / "search.jsonl",
         partial(measure_all, workers=workers, say=progress, any_code=any_code),
         trials=trials,
-        finalists=finalists,
         seed=seed,
         overrides=tuple(overrides or ()),
     )
     said = [f"--suite {s}" for s in suite or ["rendered"]] + (["--data DIR"] if data else [])
-    said += [f"--trials {trials} --seed {seed} --seeds {seeds}"]
-    said += [f"--validation-seeds {validation_seeds} --width {width}"]
+    said += [f"--trials {trials} --seed {seed} --seeds {seeds} --width {width}"]
     said += [f"--flow {f}" for f in flow or []] + [f"--only {shlex.quote(o)}" for o in only or []]
     said += [f"--set {shlex.quote(o)}" for o in overrides or []]
     command = f"soup-nlp bench search {' '.join(said)}"

@@ -14,29 +14,22 @@ from soup_nlp.errors import ConfigError
 from soup_nlp.storage.files import is_folder
 from soup_nlp.storage.folders import claim, staged
 
-TERSE = "--set segmentation.superpixels=500"
 THREE = "--suite rendered --only street --only room --only orbit"
 NLP = "--set refine.enabled=false"
-STUDY = "bench accuracy -o {out}/accuracy --analysis"
 COMMANDS = (
     "solve problems/motorcycle.yaml -o out/motorcycle",
     "bench accuracy -o {out}/accuracy --suite rendered --suite shared --data {data}",
-    *(
-        f"{STUDY} {name} {THREE} --flow dis {TERSE} {NLP}"
-        for name in ("ablation", "superpixels", "neighbours", "pattern")
-    ),
-    f"{STUDY} flow {THREE} {TERSE} {NLP}",
-    f"{STUDY} stages {THREE} --flow dis {TERSE}",
-    f"{STUDY} confidence --suite rendered --suite shared --data {{data}} --flow dis",
     f"bench search -o {{out}}/accuracy {THREE} --flow dis --trials 8 --seeds 0"
-    f" --validation-seeds 1,2 --width 512 --set segmentation.superpixels=300 {NLP}",
+    f" --width 512 --set segmentation.superpixels=300 {NLP}",
     "bench accuracy -o {out}/accuracy --name banner --suite rendered --only banner"
     " --seeds 0,1,2,3,4,5 --flow truth --flow dis",
     "bench chain -o {out}/accuracy --data {data}",
     "bench paper -o {out}/paper --data {data} --limit 2 --superpixels 500 --analysis 250",
     "bench speed -o {out}/speed --superpixels 500,1000,2000 --neighbours 20",
-    "compare problems/orbit.yaml problems/street.yaml -o {out}/solvers --superpixels 100"
-    " --seconds 45 --set flow.source=truth",
+    "family out/matrix --sizes 100 --starts hard",
+    "family out/tangent --sizes 100,250 --starts hard --coordinates tangent",
+    "compare out/matrix out/tangent -o {out}/solvers --seconds 20 --iterations 500"
+    " --solvers ipopt,ipopt-soup,ipopt-lbfgs,sqpmethod,uno,fatrop,pounce,lm,soup-nlp",
 )
 """Commands in the order in which they run."""
 LONGEST_PATH = 4_096

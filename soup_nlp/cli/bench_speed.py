@@ -1,4 +1,4 @@
-"""Commands bench speed and bench chain: seconds and growth with a gate, one scale of a sequence."""
+"""Commands bench speed and bench chain: seconds and growth, one scale of a sequence."""
 
 from __future__ import annotations
 
@@ -36,16 +36,11 @@ def speed(
         int, typer.Option(help="Rows of rendered scenes.", min=48, max=MAX_SIDE)
     ] = 436,
     overrides: Set = None,
-    gate: Annotated[
-        Path | None,
-        typer.Option("--check", help="Compare with the rows (.jsonl) of an earlier measurement."),
-    ] = None,
     out: Out = Path("out/bench/speed"),
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
-    earlier = None if gate is None else timing.read_gate(gate)
     cells = timing.speed_cells(
         words(scenes, "--scenes", [*SCENES, "motorcycle"]),
         numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS),
@@ -63,12 +58,6 @@ def speed(
         timing.plot_growth(new / "growth.png", frame)
     bad = _failed(frame)
     print(f"{len(frame)} runs, {bad} failed, in {out / 'table.md'}")
-    if earlier is not None:
-        found = timing.gate(frame, earlier)
-        print(found.to_string())
-        worse = int((~found["holds"]).sum())
-        print(f"{worse} of {len(found)} values are WORSE" if worse else "the gate holds")
-        bad += worse
     raise typer.Exit(1 if bad else 0)
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from soup_nlp.arrays import Float
-from soup_nlp.refine.records import Round
 
 WALKS = ("walk_plane", "walk_motion", "walk_pivot", "walk_scale", "walk_all")
 COMMON = ("common_motion",)
@@ -97,9 +96,11 @@ def counts(shares: Mapping[str, float], total: int, near: int) -> dict[str, int]
     return out
 
 
-def relearn(shares: dict[str, float], done: Round) -> None:
+def relearn(
+    shares: dict[str, float], proposed: Mapping[str, int], accepted: Mapping[str, int]
+) -> None:
     """Give kinds whose proposals were accepted larger shares."""
-    rate = {k: done.accepted[k] / max(1, done.proposed[k]) for k in shares}
+    rate = {k: accepted[k] / max(1, proposed[k]) for k in shares}
     mean = sum(rate.values()) / len(rate)
     if mean > 0:
         whole = sum(SHARES[k] for k in shares) / len(shares)

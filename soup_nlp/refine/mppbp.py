@@ -29,7 +29,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.mrf.trws import TRWSResult, solve_trws
+from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.refine.anchored import neighbours
 from soup_nlp.refine.costs import PairCosts, Particles, feasible, unary_costs
 from soup_nlp.refine.kinds import COMMON, KINDS, SHARES, WALKS, counts, relearn
@@ -130,31 +130,6 @@ def objective(
     proj = float(photo.costs_of_flow(Particles.of(soup), data, weights)[0].sum())
     seen = photo.energy(soup)
     return {**own, "proj": proj, "total": own["total"] - own["proj"] + proj + seen, "photo": seen}
-
-
-def _draw(
-    proposer: Proposer,
-    best: Soup,
-    kept: Particles | None,
-    o: RefineOptions,
-    shares: Mapping[str, float],
-) -> Proposals:
-    """The current belief, the kept particles and new proposals, `o.particles` in all."""
-    n = len(best)
-    current = Particles.of(best)
-    fixed = current if kept is None else current.joined(kept)
-    have = fixed.shape[1]
-    count = counts(shares, max(0, o.particles - have), proposer.near.shape[1])
-    kind = np.full(have, KEPT)
-    kind[0] = CURRENT
-    if not sum(count.values()):
-        return Proposals(fixed, kind, np.full((n, have), np.nan))
-    new = proposer.propose(best, count)
-    return Proposals(
-        fixed.joined(new.particles),
-        np.concatenate([kind, new.kind]),
-        np.hstack([np.full((n, have), np.nan), new.step]),
-    )
 
 
 @dataclass(frozen=True)
@@ -266,10 +241,24 @@ class _Rounds:
         """Whether the stop event is set or the time limit has passed."""
         return self.watch.stop.is_set() or time.perf_counter() > self.deadline
 
+    def _draw(self) -> Proposals:
+        """The current belief, the kept particles and new proposals, `particles` in all."""
+        current, near = Particles.of(self.best), self.proposer.near
+        fixed = current if self.kept is None else current.joined(self.kept)
+        have = fixed.shape[1]
+        count = counts(self.shares, max(0, self.costs.options.particles - have), near.shape[1])
+        kind, step = np.full(have, KEPT), np.full((len(near), have), np.nan)
+        kind[0] = CURRENT
+        if not sum(count.values()):
+            return Proposals(fixed, kind, step)
+        new = self.proposer.propose(self.best, count)
+        kinds, steps = np.concatenate([kind, new.kind]), np.hstack([step, new.step])
+        return Proposals(fixed.joined(new.particles), kinds, steps)
+
     def _round(self) -> bool:
         """One round; whether TRW-S was interrupted, after which there is no further round."""
         mark, costs, o = time.perf_counter(), self.costs, self.costs.options
-        drawn = _draw(self.proposer, self.best, self.kept, o, self.shares)
+        drawn = self._draw()
         p, edges, none = drawn.particles, costs.pairs.edges, np.zeros(len(self.best), np.int64)
         unary, pairwise = costs.of(self.best, p)
         result = solve_trws(
@@ -293,10 +282,27 @@ class _Rounds:
             self.best, self.energy = new, energy
         cost = conditional_costs(labels, unary, edges, pairwise)
         self.kept = p.take(diverse(p, labels, cost, round(KEPT_SHARE * o.particles), costs.data))
-        spread = spread_of(p, result.min_marginals, costs.data.anchor_ray)
-        done = _record(result, drawn, unary, labels, self.energy, taken, mark, spread)
+        proposed = _by_kind(drawn.kind, np.isfinite(unary).sum(axis=0))
+        kind, step = drawn.kind[labels], drawn.step[np.arange(len(labels)), labels]
+        accepted = _by_kind(kind, np.ones(len(labels), np.int64))
+        done = Round(
+            energy=dict(self.energy),
+            mrf_energy=result.energy,
+            bound=result.lower_bound,
+            iterations=result.iterations,
+            status=result.status,
+            ties=result.ties,
+            taken=taken,
+            moved=int((labels > 0).sum()),
+            proposed=proposed,
+            accepted=accepted,
+            seconds=time.perf_counter() - mark,
+            spread=spread_of(p, result.min_marginals, costs.data.anchor_ray),
+        )
         self.done.append(done)
-        _learn(self.proposer, self.shares, drawn, labels, done)
+        for name in (*WALKS, *COMMON):
+            self.proposer.spread.learn(name, step[kind == KINDS.index(name)])
+        relearn(self.shares, proposed, accepted)
         return interrupted
 
     def _follow(self, mark: float, k: int, bound: float, energy: float, least: float) -> bool:
@@ -307,41 +313,7 @@ class _Rounds:
         return self._over()
 
 
-def _record(
-    result: TRWSResult,
-    drawn: Proposals,
-    unary: Float,
-    labels: Int,
-    energy: Mapping[str, float],
-    taken: bool,
-    mark: float,
-    spread: Float,
-) -> Round:
-    possible = np.isfinite(unary)
-    proposed = {k: int(possible[:, drawn.kind == c].sum()) for c, k in enumerate(KINDS)}
-    chosen = np.bincount(drawn.kind[labels], minlength=len(KINDS))
-    return Round(
-        energy=dict(energy),
-        mrf_energy=result.energy,
-        bound=result.lower_bound,
-        iterations=result.iterations,
-        status=result.status,
-        ties=result.ties,
-        taken=taken,
-        moved=int((labels > 0).sum()),
-        proposed=proposed,
-        accepted={k: int(chosen[c]) for c, k in enumerate(KINDS)},
-        seconds=time.perf_counter() - mark,
-        spread=spread,
-    )
-
-
-def _learn(
-    proposer: Proposer, shares: dict[str, float], drawn: Proposals, labels: Int, done: Round
-) -> None:
-    """Adapt steps and shares of the kinds to the accepted proposals."""
-    own = np.arange(len(labels))
-    kind, step = drawn.kind[labels], drawn.step[own, labels]
-    for name in (*WALKS, *COMMON):
-        proposer.spread.learn(name, step[kind == KINDS.index(name)])
-    relearn(shares, done)
+def _by_kind(kind: Int, count: Int) -> dict[str, int]:
+    """Sums of counts by kind."""
+    total = np.bincount(kind, count, len(KINDS))
+    return {k: int(total[c]) for c, k in enumerate(KINDS)}

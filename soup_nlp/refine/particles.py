@@ -9,7 +9,6 @@ re-projection, so that one number fits every scene and every superpixel.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +21,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.refine.anchored import Local, fit_motion
 from soup_nlp.refine.costs import Particles
-from soup_nlp.refine.kinds import KINDS, WALKS, Spread
+from soup_nlp.refine.kinds import COMMON, KINDS, WALKS, Spread
 
 
 @dataclass(frozen=True)
@@ -71,9 +70,13 @@ class Proposer:
         for kind, count in counts.items():
             if count < 1:
                 continue
-            make: Callable[[Soup, Local, str, int], tuple[Local, Float | None]]
-            make = getattr(self, "_walk" if kind in WALKS else f"_{kind}")
-            made, step = make(soup, now, kind, count)
+            step: Float | None = None
+            if kind in WALKS:
+                made, step = self._walk(now, kind, count)
+            elif kind in COMMON:
+                made, step = self._common_motion(soup, now, count)
+            else:
+                made = self._borrowed(soup, now, kind, count)
             parts.append(made.particles(self.data.anchor_ray))
             number = made.Z.shape[1]
             kinds.append(np.full(number, KINDS.index(kind)))
@@ -95,8 +98,8 @@ class Proposer:
         per = 1.0 / np.maximum(parallax, 0.5)
         return per, per, z / self.focal
 
-    def _walk(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, Float]:
-        n, rng = len(soup), self.rng
+    def _walk(self, now: Local, kind: str, count: int) -> tuple[Local, Float]:
+        n, rng = len(now.Z), self.rng
         step = self.spread.draw(kind, (n, count), rng)
         depth, slope, shift = self._units(now)
         w, dT = np.zeros((2, n, count, 3))
@@ -131,14 +134,14 @@ class Proposer:
     # --- motions that are proposed to all superpixels, so that a component can move as one ------
     # (no common scale: E hardly depends on the scale of a component, and is lower at wrong depths)
 
-    def _common_motion(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, Float]:
+    def _common_motion(self, soup: Soup, now: Local, count: int) -> tuple[Local, Float]:
         """Motions that many share, fitted again to the flow of their superpixels' present planes.
 
         A superpixel alone pays for a motion that differs from the one it shares with others;
         together they do not. Every third candidate is the fit itself, the others are steps around
         it.
         """
-        step = self.spread.draw(kind, (count,), self.rng)
+        step = self.spread.draw("common_motion", (count,), self.rng)
         step[::3] = 0.0
         R, T = self._shared(soup, now, (count + 2) // 3)
         R, T = (np.repeat(v, 3, axis=0)[:count] for v in (R, T))
@@ -191,40 +194,32 @@ class Proposer:
         g = np.where(bad[..., None], 0.0, m[..., :2] * Z[..., None])
         return Z, g
 
-    def _neighbour_plane(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, None]:
-        who = self._some(count)
-        Z, g = self._extrapolated(soup, who, now)
-        # every other one keeps its motion, the rest take the scale along with the depth
-        scale = np.where(np.arange(who.shape[1]) % 2, 1.0, Z / now.Z)
-        current = now.repeated(who.shape[1])
-        return Local(Z, g, current.R, current.T * scale[..., None]), None
+    def _borrowed(self, soup: Soup, now: Local, kind: str, count: int) -> Local:
+        """States that take plane, motion or both from neighbours, or fit the plane again.
 
-    def _neighbour_both(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, None]:
-        who = self._some(count)
-        Z, g = self._extrapolated(soup, who, now)
-        return Local(Z, g, soup.R[who], soup.translation[who]), None
-
-    def _neighbour_motion(
-        self, soup: Soup, now: Local, kind: str, count: int
-    ) -> tuple[Local, None]:
-        who = self._some(count)
-        R, T = soup.R[who], soup.translation[who]
-        return self._with_motion(now, R, T, slopes=False), None
-
-    def _neighbour_refit(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, None]:
+        "own_refit" fits the plane to the flow under the own motion, "neighbour_refit" under the
+        motions of neighbours; "neighbour_motion" and "dominant" fit its depth alone, under motions
+        of neighbours and under those that explain most superpixels with their present planes.
+        """
+        if kind == "mean":
+            return self._mean(soup, now, count)
+        if kind == "own_refit":
+            return self._with_motion(now, now.R, now.T, slopes=True)
+        if kind == "dominant":
+            R, T, _ = self._explaining(soup, now, count)
+            R, T = (np.broadcast_to(v, (len(soup), *v.shape)) for v in (R, T))
+            return self._with_motion(now, R, T, slopes=False)
         who = self._some(count)
         R, T = soup.R[who], soup.translation[who]
-        return self._with_motion(now, R, T, slopes=True), None
-
-    def _own_refit(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, None]:
-        return self._with_motion(now, now.R, now.T, slopes=True), None
-
-    def _dominant(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, None]:
-        """Motions that explain most superpixels together with their present planes."""
-        n = len(soup)
-        R, T, _ = self._explaining(soup, now, count)
-        R, T = (np.broadcast_to(v, (n, *v.shape)) for v in (R, T))
-        return self._with_motion(now, R, T, slopes=False), None
+        if kind in ("neighbour_motion", "neighbour_refit"):
+            return self._with_motion(now, R, T, slopes=kind == "neighbour_refit")
+        Z, g = self._extrapolated(soup, who, now)
+        if kind == "neighbour_plane":
+            # every other one keeps its motion, the rest take the scale along with the depth
+            scale = np.where(np.arange(who.shape[1]) % 2, 1.0, Z / now.Z)
+            current = now.repeated(who.shape[1])
+            R, T = current.R, current.T * scale[..., None]
+        return Local(Z, g, R, T)
 
     def commonest(self, soup: Soup, count: int) -> tuple[Float, Float]:
         """(C, 3, 3), (C, 3) few present motions that explain most superpixels, C <= count."""
@@ -254,7 +249,7 @@ class Proposer:
             best = np.minimum(best, error[:, c])
         return R[kept], T[kept], error[:, kept]
 
-    def _mean(self, soup: Soup, now: Local, kind: str, count: int) -> tuple[Local, None]:
+    def _mean(self, soup: Soup, now: Local, count: int) -> Local:
         """Means of the own state and a few neighbours, which the smoothness terms favour."""
         parts = []
         for c in range(count):
@@ -269,9 +264,7 @@ class Proposer:
                 # the plane alone, the motion scaled with it
                 R, T = now.R, now.T / (inverse * now.Z)[..., None]
             parts.append(Local(1 / inverse, slope, R, T))
-        return Local(
-            *(np.concatenate([getattr(p, k) for p in parts], axis=1) for k in "ZgRT")
-        ), None
+        return Local(*(np.concatenate([getattr(p, k) for p in parts], axis=1) for k in "ZgRT"))
 
     def _with_motion(self, now: Local, R: Float, T: Float, slopes: bool) -> Local:
         """Own plane under given motions: depth (and slope) that explain the flow best.

@@ -14,12 +14,11 @@ import pytest
 from helpers_rows import fake_row
 
 from soup_nlp.bench.accuracy import BASELINES, METHODS, measure_pair, moving
-from soup_nlp.bench.accuracy_page import suite_page
-from soup_nlp.bench.published import COMPARISON, published
-from soup_nlp.bench.study import Cell, frame_of, input_hash, settings_hash
+from soup_nlp.bench.accuracy_page import suite_page, write_suite
+from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.bench.suites import SUITES, Item
+from soup_nlp.cli import bench_accuracy
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.protocols import preset
@@ -76,58 +75,41 @@ def test_a_row_has_every_number(orbit_row):
     assert set(row["energy"]) == {"start", "nlp", "solution"}
     assert 0 <= row["guess"] <= 1
     assert 0 <= row["within"][0] <= row["within"][1] <= 1
+    assert row["sparsification"]["curve"][0][0] == 1.0
 
 
-def test_a_pair_that_fails_is_a_row():
+def test_a_pair_that_cannot_be_measured_is_a_row_with_the_reason(tmp_path):
     row = row_of(item(), (*QUICK, "segmentation.neighbours=99"))
     assert not row["ok"]
     assert "K-NN" in row["error"]
-    wrong = row_of(item(), ("segmentation.superpixel=3",))
-    assert not wrong["ok"]
-    assert wrong["settings"] == "wrong"
     text = text_of(row)
     assert "0 of 1 pairs measured" in text
     assert "K-NN" in text
-
-
-def test_a_pair_without_truth_is_a_row_that_failed(tmp_path):
-    """A pair without truth is not solved; it is measured once the truth exists."""
+    wrong = row_of(item(), ("segmentation.superpixel=3",))
+    assert not wrong["ok"]
+    assert wrong["settings"] == "wrong"
+    # a pair without a truth is not solved
     for k in (0, 1):
         cv2.imwrite(str(tmp_path / f"frame_{k}.png"), np.zeros((48, 64, 3), np.uint8))
     np.savetxt(tmp_path / "K.txt", K)
     raw = {"kind": "folder", "path": str(tmp_path)}
-    needs = (tmp_path / "frame_0.png",)
-    pair = Item("kinect_paper", "s", "p", "dis", raw, ("eigen80", "paper"), needs)
-    row = row_of(pair, QUICK)
+    row = row_of(Item("kinect_paper", "s", "p", "dis", raw, ("eigen80", "paper")), QUICK)
     assert not row["ok"]
-    assert "pair has no true depth" in row["error"]
-    assert SUITES["kinect_paper"].layout in row["error"]
-    assert SUITES["kinect_paper"].source in row["error"]
+    for words in ("pair has no true depth", SUITES["kinect_paper"].layout):
+        assert words in row["error"]
 
 
-def test_settings_hash_is_the_same_on_every_pair():
-    a = make_problem({"input": {"kind": "motorcycle"}, "name": "a"})
-    b = item().problem(["flow.source=dis"])
-    assert settings_hash(a) == settings_hash(b)
-    assert settings_hash(a) != settings_hash(item().problem(["flow.source=truth"]))
-    assert settings_hash(a) != settings_hash(item().problem(["energy.weights.cont=9.0"]))
-
-
-def test_input_hash_is_of_the_frames_not_of_their_place():
-    def head_at(root: str, *overrides: str) -> Row:
+def test_a_row_is_identified_by_settings_and_input_without_its_folder():
+    def identity(root: str, *overrides: str) -> Row:
         raw = {"kind": "sintel", "root": root, "scene": "alley_1", "frame": 2}
-        pair = Item("sintel", "alley_1", "alley_1-0002", "dis", raw)
-        return Cell(pair, overrides).identity()
+        return Cell(Item("sintel", "alley_1", "alley_1-0002", "dis", raw), overrides).identity()
 
-    here, final = head_at("/a"), head_at("/a", "input.render=final")
-    assert here == head_at("/b")
+    here, final = identity("/a"), identity("/a", "input.render=final")
+    assert here == identity("/b")
     assert here["settings"] == final["settings"]
     assert here["input"] != final["input"]
-    first, second = (
-        Item("vkitti", "w", "w", "dis", {"kind": k, "root": "r", "scene": s, "frame": 1}).problem()
-        for k, s in (("vkitti1", "0001"), ("vkitti2", "Scene01"))
-    )
-    assert input_hash(first) != input_hash(second)
+    assert here["settings"] == Cell(item(), ("flow.source=dis",)).identity()["settings"]
+    assert here["settings"] != identity("/a", "energy.weights.cont=9.0")["settings"]
 
 
 def test_a_row_is_plain_json():
@@ -189,20 +171,13 @@ def test_rows_are_kept_and_failed_ones_measured_again(tmp_path):
     assert tables == [3, 4]
     measure_all(jobs(), path)
     assert seen[4:] == ["sheet"]
-    # another name is another row, a stale one is measured again
+    # another name is another row; one whose folder is gone is measured again
     measure_all(jobs(1)[:1], path)
     assert seen[5:] == ["orbit"]
     measure_all([replace(jobs(1)[0], stale=True)], path)
     assert seen[6:] == ["orbit"]
-
-
-def test_a_job_whose_folder_is_gone_is_stale(tmp_path):
-    def stale(keep: Path | None) -> bool:
-        return Cell(item(), keep=keep).job(measure_pair).stale
-
-    assert stale(tmp_path / "gone")
-    assert not stale(tmp_path)
-    assert not stale(None)
+    stale = [Cell(item(), keep=p).job(measure_pair).stale for p in (None, tmp_path, path / "gone")]
+    assert stale == [False, False, True]
 
 
 def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
@@ -239,7 +214,11 @@ def test_parallel_processes_and_one_that_dies(tmp_path):
     assert [r["ok"] for r in rows] == [True, True]
 
 
-def test_command_line(tmp_path, capsys):
+def broken(item: Item, overrides: tuple[str, ...] = (), keep: Path | None = None) -> Row:
+    raise DataError("image is missing", where="a/0.png", found="nothing", expected="a file")
+
+
+def test_command_line(tmp_path, capsys, monkeypatch):
     words = ["bench", "accuracy", "--suite", "rendered", "--only", "orbit", "--flow", "truth"]
     words += ["--width", "128", "--out", str(tmp_path), "--folders", str(tmp_path / "runs")]
     words += [w for o in QUICK for w in ("--set", o)]
@@ -258,6 +237,9 @@ def test_command_line(tmp_path, capsys):
     assert main(["bench", "accuracy", "--suite", "imagenet"]) == 2
     assert main([*words, "--preset", "eigen"]) == 2
     assert main(["bench", "accuracy", "--suite", "rendered", "--seeds", "a"]) == 2
+    monkeypatch.setattr(bench_accuracy, "measure_pair", broken)
+    assert main([*words, "--width", "64", "-q"]) == 1
+    assert "image is missing, where: a/0.png, found: nothing" in capsys.readouterr().out
 
 
 def solved(suite: str, convention: str = "paper", pair: str = "p") -> Row:
@@ -283,22 +265,6 @@ def test_every_pair_is_in_the_details_of_its_own_convention():
     assert "the scale is the median of z_gt / z" in text_of(solved("kitti2015", "eigen80"))
 
 
-def test_published_numbers_are_marked():
-    assert published("kitti2015")[0] == dict(COMPARISON["kitti"])
-    assert published("rendered") == ({}, "")
-    row = solved("kinect_paper")
-    text = text_of(row)
-    assert "| BMM (published) | 0.0322 |" in text
-    assert "(measured) | 0.0300 |" in text
-    assert "beats every baseline on 1 of 1" in text
-    # of the pairs that have a number, under the name of the convention, on what data
-    failed = {**solved("kitti2015", "kitti"), "metrics": {}, "ok": False, "error": "out of luck"}
-    text = text_of(solved("kitti2015", "kitti"), failed)
-    assert "| this program, flow dis, kitti, 1 pair (measured) | 0.0300 |" in text
-    assert "odometry set 00-09 with LiDAR truth" in text
-    assert "\n\n## Failed\n" in text
-
-
 def test_one_rigid_motion_is_compared_on_its_own_pixels():
     row = solved("shared")
     metrics = row["metrics"]["paper"]
@@ -309,3 +275,18 @@ def test_one_rigid_motion_is_compared_on_its_own_pixels():
     assert "beats every baseline on 0 of 1" in text
     assert "| p, dis | paper | rigid | 0.0250 | 0.0260 | 60.0% | -0.0010 |" in text
     assert set(BASELINES) <= set(METHODS)
+
+
+def test_sigma_has_columns_and_a_picture_of_its_curves(tmp_path):
+    rows = [solved("shared", pair=p) | {"sequence": p, "guess": 0.1} for p in ("a", "b")]
+    write_suite(tmp_path, "without", frame_of(rows))
+    assert not (tmp_path / "without.png").exists()
+    for row in rows:
+        curve = [[1.0, 0.5], [0.05, 0.02], [0.05, 0.01]]
+        row |= {"within": [0.7, 0.9], "sparsification": {"ause": 0.2, "curve": curve}}
+    write_suite(tmp_path, "shared", frame_of(rows))
+    text = (tmp_path / "shared.md").read_text()
+    assert "| AUSE | guess | within 1 | within 2 | worst pair |" in text
+    assert "| 0.2000 | 0.1000 | 0.7000 | 0.9000 | a, dis |" in text
+    assert "](shared.png)" in text
+    assert (tmp_path / "shared.png").stat().st_size > 5000

@@ -1,8 +1,7 @@
-"""bench speed: plan, exponents, page and gate on artificial rows; one tiny real run."""
+"""bench speed: plan, exponents and page on artificial rows; one tiny real run."""
 
 from __future__ import annotations
 
-import json
 import os
 from functools import partial
 
@@ -12,10 +11,7 @@ from helpers_rows import square
 
 from soup_nlp.bench.processes import alone, machine
 from soup_nlp.bench.speed import (
-    LIMITS,
     exponent,
-    gate,
-    gate_values,
     growth,
     measure_speed,
     plot_growth,
@@ -26,7 +22,6 @@ from soup_nlp.bench.speed import (
 )
 from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.cli.main import main
-from soup_nlp.errors import DataError
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.storage.rows import read_rows
 
@@ -122,34 +117,6 @@ def test_page_and_picture(tmp_path):
     assert "No run" in speed_page(frame_of(rows[-1:]))
 
 
-def worse(row: dict) -> set[str]:
-    """Values that fail the gate of the row without changes."""
-    found = gate(frame_of([row]), gate_values(frame_of([made()])))
-    assert set(found.index.get_level_values("value")) == set(LIMITS)
-    return set(found.index[~found["holds"]].get_level_values("value"))
-
-
-def test_the_gate_sees_what_is_worse():
-    assert not worse(made())
-    assert not worse(made(energy={"total": 40.0}, iterations=10))
-    assert worse(made(iterations=140)) == {"iterations"}
-    assert worse(made(converged=False)) == {"not converged"}
-    assert worse(made(energy={"total": 51.0 * 1.01})) == {"energy.total", "energy_to_reference"}
-    assert worse(made(sizes={"hessian_nonzeros": 2600 * 250})) == {"sizes.hessian_nonzeros"}
-    assert worse(failed("no answer")) == set(LIMITS)
-    with pytest.raises(DataError, match="none of these runs"):
-        worse(made("room"))
-
-
-def test_the_gate_looks_at_ratios():
-    """A machine that is ten times slower at everything is as good."""
-    slow = made()
-    slow["cpu"]["nlp"] *= 10
-    assert worse(slow) == {"time_to_reference"}
-    slow["reference"]["cpu_seconds"] *= 10
-    assert not worse(slow)
-
-
 def test_the_reference_solver_ends_at_the_solvers_smoothing():
     assert schedule(SolverOptions(presolve_eps=(0.1, 0.03), eps=0.03)) == (0.1, 0.03)
     assert schedule(SolverOptions(presolve_eps=(0.1, 0.03), eps=0.01))[-1] == 0.01
@@ -165,8 +132,6 @@ def test_the_reference_solver_ends_at_the_solvers_smoothing():
         ["--seeds", "-1"],
         ["--neighbours", ""],
         ["--set", "solver.tolerance=1"],
-        ["--check", "missing.jsonl"],
-        ["--check", __file__],
     ],
 )
 def test_bad_input_ends_with_2(tmp_path, capsys, words):
@@ -175,8 +140,8 @@ def test_bad_input_ends_with_2(tmp_path, capsys, words):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_real_run_its_table_and_its_gate(tmp_path, capsys):
-    out, earlier = tmp_path / "out", tmp_path / "earlier.jsonl"
+def test_a_real_run_and_its_table(tmp_path):
+    out = tmp_path / "out"
     size = ["--scenes", "street", "--sizes", "24", "--neighbours", "4", "--seeds", "0"]
     small = ["--width", "128", "--height", "96", "--set", "solver.max_iter=5"]
     small += ["--set", "formulation.compiled=false", "--set", "solver.eps=0.3"]
@@ -192,9 +157,3 @@ def test_a_real_run_its_table_and_its_gate(tmp_path, capsys):
     assert {"load", "flow", "segmentation", "start", "output"} <= set(row["cpu"])
     assert "| street |" in (out / "table.md").read_text()
     assert (out / "growth.png").is_file()
-    # the rows are stored: the gate compares the same numbers, then with a lower energy
-    for energy, code, word in ((1.0, 0, "the gate holds"), (0.5, 1, "WORSE")):
-        row["energy"]["total"] *= energy
-        earlier.write_text(json.dumps(row))
-        assert main([*words, "--check", str(earlier)]) == code
-        assert word in capsys.readouterr().out

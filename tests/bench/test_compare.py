@@ -1,12 +1,12 @@
-"""Comparison of solvers: isolation, verification, resuming, profiles; real solvers, tiny soup."""
+"""Comparison of solvers: isolation, verification, resuming; real solvers on a tiny soup."""
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import time
-from dataclasses import asdict, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -15,21 +15,18 @@ import pytest
 from helpers_model import PAPER, Tiny
 
 from soup_nlp.bench.processes import isolated
-from soup_nlp.bench.solvers.page import frame_of_runs
-from soup_nlp.bench.solvers.page import page as page_of
+from soup_nlp.bench.solvers import runner
 from soup_nlp.bench.solvers.plugins import PLUGINS
-from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profiles, profile
-from soup_nlp.bench.solvers.registry import available, find_solver
+from soup_nlp.bench.solvers.registry import available, executable, find_solver, reference
 from soup_nlp.bench.solvers.runner import compare
 from soup_nlp.bench.solvers.task import Answer, Task, Trace
-from soup_nlp.cli.main import main
 from soup_nlp.errors import SolverError
-from soup_nlp.export.verify import Limits, examine
+from soup_nlp.export.sol import write_sol
+from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.model.formulation import Formulation
 
 pytestmark = pytest.mark.slow
 
-PROBLEMS = Path(__file__).parents[2] / "problems"
 MANY = 1 << 30
 LABEL = {
     "problem": "tiny",
@@ -39,20 +36,54 @@ LABEL = {
     "start": "proposal",
     "energy_limit": np.finfo(float).max,
 }
+Solve = Callable[[Task], Answer]
 
 
-@pytest.fixture(scope="module")
-def task(tmp_path_factory) -> Task:
+def make_task(folder: Path, **form: str) -> Task:
     tiny = Tiny(neighbours=2, samples=3, boundary_samples=1)
     # wide smoothing: with 0.2 the way from a cold start is so long that rounding decides its end
     # (a length of 1, which is the focal length in pixels)
     wide = float(tiny.data.K_next[0, 0])
-    form = Formulation(hessian="exact", eps=wide, eps_pixel=1.0, compiled=False)
-    nlp, layout = tiny.nlp(PAPER, form)
-    other, _ = tiny.nlp(PAPER, form.replace(hessian="gauss-newton+constraints"))
+    style = Formulation(hessian="exact", eps=wide, eps_pixel=1.0, compiled=False, **form)
+    nlp, layout = tiny.nlp(PAPER, style)
+    other, _ = tiny.nlp(PAPER, style.replace(hessian="gauss-newton+constraints"))
     limits = Limits(seconds=20, iterations=200, tol=1e-5)
-    folder = tmp_path_factory.mktemp("task")
-    return Task(nlp, other, layout, tiny.soup, tiny.data, PAPER, form, limits, folder)
+    return Task(nlp, other, layout, tiny.soup, tiny.data, PAPER, style, limits, folder)
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory) -> Task:
+    return make_task(tmp_path_factory.mktemp("task"))
+
+
+@pytest.fixture(scope="module")
+def exact(task) -> Answer:
+    """The answer of a solver that converges."""
+    return find_solver("ipopt-tuned")(task)
+
+
+def run(task: Task, names: list[str], folder: Path, say=lambda line: None, after=None) -> list:
+    made = [(LABEL, lambda where: replace(task, folder=where))]
+    return compare(made, names, task.limits, folder / "r.jsonl", folder / "s", say, after)
+
+
+@pytest.fixture
+def stub(monkeypatch) -> Callable[[Solve], list[str]]:
+    """Takes a function as the only solver; returns the list of the names that are looked up."""
+
+    def take(solver: Solve) -> list[str]:
+        names: list[str] = []
+        monkeypatch.setattr(runner, "find_solver", lambda name: names.append(name) or solver)
+        return names
+
+    return take
+
+
+def program(folder: Path, text: str) -> Path:
+    path = folder / "my solver"
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return path
 
 
 def die() -> None:
@@ -63,32 +94,30 @@ def die() -> None:
 
 
 def test_a_function_returns_from_its_process(tmp_path):
-    here = os.getpid()
     ended = isolated(lambda: (os.getpid(), np.arange(3)), tmp_path, 20, MANY)
     assert ended.how == "returned"
-    assert ended.value[0] != here
+    assert ended.value[0] != os.getpid()
     assert ended.value[1].tolist() == [0, 1, 2]
     assert ended.peak_bytes > 0
 
 
-def test_crashes_are_answers(tmp_path):
-    assert isolated(die, tmp_path, 20, MANY).how == "crashed: SIGKILL"
+def test_crashes_and_errors_are_answers(tmp_path):
     assert isolated(lambda: os._exit(3), tmp_path, 20, MANY).how == "crashed: exit code 3"
 
     def bad() -> None:
-        raise ValueError("no such option")
+        raise SolverError("no licence", where="server", found="expired", hint="ask for one")
 
     ended = isolated(bad, tmp_path, 20, MANY)
-    assert (ended.how, ended.value) == ("raised", "ValueError: no such option")
+    assert (ended.how, ended.value) == ("raised", "SolverError: no licence, found expired")
+    ended = isolated(die, tmp_path, 20, MANY)
+    # the answer of an earlier run is not taken for that of a later one
+    assert (ended.how, ended.value) == ("crashed: SIGKILL", None)
 
 
 def test_time_and_memory_are_limited(tmp_path, monkeypatch):
     monkeypatch.setattr("soup_nlp.bench.processes.GRACE", 0.2)
     assert isolated(lambda: time.sleep(60), tmp_path, 0.1, MANY).how == "killed: time"
-    ended = isolated(lambda: np.ones(10**9), tmp_path, 20, MANY)
-    assert ended.how == "killed: memory"
-    # an answer of an earlier run is not taken for this one's
-    assert isolated(die, tmp_path, 20, MANY).value is None
+    assert isolated(lambda: np.ones(10**9), tmp_path, 20, MANY).how == "killed: memory"
 
 
 def test_a_trace_survives_a_kill(tmp_path):
@@ -108,18 +137,23 @@ def test_a_trace_survives_a_kill(tmp_path):
     assert (np.diff(seconds) >= 0).all()
 
 
-# --- solvers and verification --------------------------------------------------------------------
+def test_a_curve_has_the_first_and_the_last_iterate(monkeypatch):
+    monkeypatch.setattr(runner, "_energy", lambda _, x: float(x[0]))
+    for count in (0, 1, 2, 500):
+        at = np.arange(float(count))
+        curve = runner._curve(None, at, at[:, None])
+        assert len(curve) == min(count, runner.CURVE_POINTS)
+        assert count == 0 or (curve[0], curve[-1]) == ([0, 0], [count - 1, count - 1])
+
+
+# --- solvers -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["ipopt-tuned", "fatrop", "pounce"])
 def test_solvers_reach_a_verified_point(name, task, tmp_path):
     if name not in available():
         pytest.skip(f"{name} is not installed")
-    rows = compare(
-        [(LABEL, lambda folder: replace(task, folder=folder))],
-        [name], task.limits, tmp_path / "runs.jsonl", tmp_path, lambda line: None,
-    )  # fmt: skip
-    row = rows[0]
+    (row,) = run(task, [name], tmp_path)
     assert row["how"] == "returned", row["status"]
     assert row["verified"], row
     assert row["status"] != "Time_Limit"
@@ -129,29 +163,59 @@ def test_solvers_reach_a_verified_point(name, task, tmp_path):
 
 def test_a_claim_with_the_gauss_newton_hessian_is_true(task, tmp_path):
     # whether it converges in 200 iterations depends on rounding; what it claims must hold
-    rows = compare(
-        [(LABEL, lambda folder: replace(task, folder=folder))],
-        ["ipopt-soup"], task.limits, tmp_path / "runs.jsonl", tmp_path, lambda line: None,
-    )  # fmt: skip
-    assert rows[0]["how"] == "returned", rows[0]["status"]
-    assert rows[0]["iterations"] > 10
-    assert rows[0]["verified"] == rows[0]["claimed"]
+    (row,) = run(task, ["ipopt-soup"], tmp_path)
+    assert row["how"] == "returned", row["status"]
+    assert row["iterations"] > 10
+    assert row["verified"] == row["claimed"]
 
 
-def test_a_false_claim_is_seen(task, tmp_path, monkeypatch):
-    def liar(given: Task) -> Answer:
-        return Answer(given.nlp.x0 + 1e-3, None, "optimal!", True, 1, 0.5)
+def test_a_reference_solver_returns_a_point_of_the_epigraph_form(tmp_path):
+    task = make_task(tmp_path, norm="epigraph")
+    task = replace(task, limits=replace(task.limits, seconds=2.0))
+    x = reference(task).x
+    assert x is not None
+    size = task.layout.size
+    assert np.abs(x[size:] - task.nlp.x0[size:]).max() > 1e-3
+    assert violations(task.nlp, x)["rows"].max() < 1e-6
+    # with the slack variables of the start it is off the constraints
+    stale = np.concatenate([x[:size], task.nlp.x0[size:]])
+    assert violations(task.nlp, stale)["rows"].max() > 1e-3
 
-    monkeypatch.setattr("soup_nlp.bench.solvers.runner.find_solver", lambda name: liar)
-    rows = compare(
-        [(LABEL, lambda folder: replace(task, folder=folder))],
-        ["liar"], task.limits, tmp_path / "runs.jsonl", tmp_path, lambda line: None,
-    )  # fmt: skip
-    assert rows[0]["claimed"]
-    assert not rows[0]["verified"]
-    assert rows[0]["primal"] > 1e-4
-    assert "| liar | 1 | 1 | 0 | 0 of 1 |" in page(rows)
-    assert "not always those of liar" in page(rows)
+
+def test_names_of_solvers(tmp_path):
+    with pytest.raises(SolverError, match="not here"):
+        find_solver("knitro_that_is_not_installed")
+    assert set(available()) >= {n for n, r in PLUGINS.items() if ca.has_nlpsol(r.library)}
+    assert callable(find_solver(str(program(tmp_path, "exit 0"))))
+
+
+def test_a_program_runs_in_a_folder_of_its_own(task, tmp_path, monkeypatch):
+    mine = program(tmp_path, "exit 3")
+    monkeypatch.chdir(tmp_path)
+    for name in (str(mine), f"./{mine.name}"):
+        (row,) = run(task, [name], tmp_path / str(len(name)))
+        assert (row["solver"], row["how"], row["iterations"]) == (name, "raised", -1)
+        assert row["status"] == "SolverError: solver wrote no .sol, found exit 3"
+    # nothing of the runs beside the program
+    assert not list(tmp_path.glob("*.pickle"))
+    # an answer to an earlier problem is not read
+    order = np.arange(task.nlp.nx), np.arange(task.nlp.ng)
+    write_sol(tmp_path / "soup.sol", task.nlp.x0, None, *order, "earlier", 0)
+    with pytest.raises(SolverError, match="wrote no"):
+        executable(str(mine), replace(task, folder=tmp_path))
+
+
+def test_a_program_that_only_waits_has_no_answer(task, tmp_path, monkeypatch):
+    # it uses no CPU time, so that wall time ends it
+    monkeypatch.setattr("soup_nlp.bench.solvers.registry.WALL_PER_CPU", 1.0)
+    mine = program(tmp_path, "exec sleep 30")
+    (row,) = run(replace(task, limits=replace(task.limits, seconds=1.0)), [str(mine)], tmp_path)
+    assert row["status"] == "Time_Limit"
+    assert not row["claimed"]
+    assert not {"energy", "primal", "dual", "complementarity"} & set(row)
+
+
+# --- verification --------------------------------------------------------------------------------
 
 
 def test_residuals_of_known_points(task):
@@ -165,112 +229,59 @@ def test_residuals_of_known_points(task):
     assert found.multipliers == "least squares"
 
 
-def test_runs_resume_and_a_cut_line_is_run_again(task, tmp_path, monkeypatch):
-    calls = []
+@pytest.mark.parametrize(
+    ("changes", "claimed", "verified"),
+    [
+        ({}, True, True),
+        ({"claimed": False}, False, True),
+        ({"seconds": 19.0}, True, True),
+        # after the time limit
+        ({"seconds": 21.0}, False, False),
+    ],
+)
+def test_one_tolerance_decides_within_the_limit(
+    changes, claimed, verified, exact, task, tmp_path, stub
+):
+    stub(lambda given: replace(exact, **changes))
+    (row,) = run(task, ["some"], tmp_path)
+    assert (row["claimed"], row["verified"]) == (claimed, verified)
+    late = changes.get("seconds", 0) > 20
+    assert row["status"].startswith("over the time limit") == late
 
-    def solver(given: Task) -> Answer:
-        return Answer(given.nlp.x0, None, "start", False, 0, 0.1)
 
-    def find(name: str) -> object:
-        calls.append(name)
-        return solver
+def test_a_false_claim_is_seen(task, tmp_path, stub):
+    stub(lambda given: Answer(given.nlp.x0 + 1e-3, None, "optimal!", True, 1, 0.5))
+    (row,) = run(task, ["liar"], tmp_path)
+    assert row["claimed"]
+    assert not row["verified"]
+    assert row["primal"] > 1e-4
 
-    monkeypatch.setattr("soup_nlp.bench.solvers.runner.find_solver", find)
-    path = tmp_path / "runs.jsonl"
-    args = [(LABEL, lambda folder: replace(task, folder=folder))]
 
-    def go(names: list[str], limits: Limits) -> int:
-        return len(compare(args, names, limits, path, tmp_path, lambda line: None))
+# --- rows ----------------------------------------------------------------------------------------
 
-    assert go(["a", "b"], task.limits) == 2
-    assert go(["a", "b", "c"], task.limits) == 3
+
+def test_runs_resume_and_a_cut_line_is_run_again(task, tmp_path, stub):
+    calls = stub(lambda given: Answer(given.nlp.x0, None, "start", False, 0, 0.1))
+
+    def go(*names: str, given: Task = task) -> int:
+        return len(run(given, list(names), tmp_path))
+
+    assert go("a", "b", "a") == 2
+    assert go("a", "b", "c") == 3
     assert calls == ["a", "b", "c"]
-    text = path.read_text()
-    path.write_text(text[:-20])
-    assert go(["a", "b", "c"], task.limits) == 3
+    path = tmp_path / "r.jsonl"
+    path.write_text(path.read_text()[:-20])
+    assert go("a", "b", "c") == 3
     assert calls == ["a", "b", "c", "c"]
     # other limits, other runs
-    assert go(["a"], replace(task.limits, tol=1e-3)) == 1
+    assert go("a", given=replace(task, limits=replace(task.limits, tol=1e-3))) == 1
     assert calls == ["a", "b", "c", "c", "a"]
 
 
-def test_names_of_solvers(tmp_path):
-    with pytest.raises(SolverError, match="not here"):
-        find_solver("knitro_that_is_not_installed")
-    assert set(available()) >= {n for n, r in PLUGINS.items() if ca.has_nlpsol(r.library)}
-    program = tmp_path / "mine"
-    program.write_text("#!/bin/sh\ncp answer.sol soup.sol\n")
-    program.chmod(0o755)
-    assert callable(find_solver(str(program)))
-
-
-# --- profiles ------------------------------------------------------------------------------------
-
-
-def row(problem: str, solver: str, seconds: float, energy: float, verified: bool = True) -> dict:
-    return {
-        "problem": problem, "superpixels": 10, "formulation": "f", "solver": solver,
-        "seconds": seconds, "energy": energy, "verified": verified, "claimed": True,
-        "energy_start": 9.0, "curve": [[0.1, 5.0], [seconds, energy]], "iterations": 3,
-        "cpu_seconds": 1.0, "peak_bytes": 1 << 20, "status": "a | b", "machine": "m",
-        "versions": {"casadi": "3"}, "code": "1", "problem_hash": "0", "start": "presolve",
-        "limits": asdict(Limits()),
-    }  # fmt: skip
-
-
-def page(rows: list[dict]) -> str:
-    return page_of(frame_of_runs(rows))
-
-
-ROWS = [
-    row("a", "one", 1.0, 4.0), row("a", "two", 2.0, 3.0), row("a", "three", 0.1, 1.0, False),
-    row("b", "one", 6.0, 4.0), row("b", "two", 3.0, 4.0),
-]  # fmt: skip
-
-
-def test_profiles_by_hand():
-    cost = cost_table(frame_of_runs(ROWS), "seconds")
-    assert (len(cost), list(cost)) == (2, ["one", "three", "two"])
-    share = profile(cost)
-    assert share.index.tolist() == [1, 2]
-    # each wins one problem; both solve all within twice the best; a false claim solves none
-    assert share.to_numpy().tolist() == [[0.5, 0, 0.5], [1, 0, 1]]
-    share = profile(cost_table(frame_of_runs(ROWS), "energy"))
-    assert share.index.tolist() == [1, 4 / 3]
-    assert share.to_numpy().tolist() == [[0.5, 0, 1], [1, 0, 1]]
-
-
-def test_profile_of_nothing_solved():
-    failed = [row("a", "one", 1.0, 2.0, False)]
-    share = profile(cost_table(frame_of_runs(failed), "seconds"))
-    assert share.index.tolist() == [1]
-    assert share.to_numpy().tolist() == [[0]]
-    assert "none is verified" in page(failed)
-
-
-def test_page_and_pictures(tmp_path):
-    text = page(ROWS)
-    assert text.index("**2 problems") < text.index("## Confirmation") < text.index("## Limits")
-    assert "a / b" in text
-    frame = frame_of_runs(ROWS)
-    draw_profiles(tmp_path / "p.png", {"": frame}, ("seconds", "energy"))
-    draw_curves(tmp_path / "c.png", frame)
-    assert (tmp_path / "p.png").stat().st_size > 5000
-    assert (tmp_path / "c.png").stat().st_size > 5000
-
-
-def test_command(tmp_path, capsys):
-    words = [
-        "compare", str(PROBLEMS / "orbit.yaml"), "-o", str(tmp_path), "--superpixels", "12",
-        "--solvers", "ipopt-soup", "--seconds", "20", "--presolve", "--set", "input.width=96",
-        "--set", "input.height=64", "--set", "flow.source=truth",
-        "--set", "segmentation.neighbours=4", "--set", "energy.pixel_samples=4",
-    ]  # fmt: skip
-    assert main(words) == 0
-    rows = [json.loads(x) for x in (tmp_path / "runs.jsonl").read_text().splitlines()]
-    assert rows[0]["verified"]
-    assert "1 verified" in capsys.readouterr().out
-    for name in ("README.md", "profile.png", "curves.png"):
-        assert (tmp_path / name).stat().st_size > 0
-    assert main([*words, "--tol", "-1"]) == 2
-    assert main(["compare", str(PROBLEMS / "orbit.yaml"), "--solvers", "nothing"]) == 2
+def test_rows_are_told_after_every_run_and_names_before(exact, task, tmp_path, stub):
+    stub(lambda given: exact)
+    seen: list[int] = []
+    said: list[str] = []
+    run(task, ["a", "b"], tmp_path, said.append, lambda rows: seen.append(len(rows)))
+    assert seen == [1, 2]
+    assert [line.split()[-3] for line in said[::2]] == ["a", "b"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.errors import DataError
 from soup_nlp.evaluate.sparsification import LAST, STEPS, coverage, sparsification
 
 ERROR = np.linspace(0.0, 1.0, 1001)
@@ -47,21 +46,6 @@ def test_equal_uncertainties_are_chance_in_whatever_order_they_come():
 
 def test_no_error_has_no_area():
     assert sparsification(np.zeros(5), np.arange(5.0)).ause == 0.0
-
-
-@pytest.mark.parametrize(
-    ("error", "uncertainty", "words"),
-    [
-        ([1.0, 2.0], [1.0], "do not fit"),
-        ([], [], "do not fit"),
-        ([-1.0], [1.0], "not negative"),
-        ([np.nan], [1.0], "finite"),
-        ([1.0], [np.nan], "not NaN"),
-    ],
-)
-def test_what_cannot_be_sorted_is_refused(error, uncertainty, words):
-    with pytest.raises(DataError, match=words):
-        sparsification(error, uncertainty)
 
 
 def test_coverage_counts_what_lies_within():

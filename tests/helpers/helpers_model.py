@@ -297,3 +297,15 @@ def cut_by_part(
     np.minimum.at(low, labels.ravel(), part.ravel())
     np.maximum.at(high, labels.ravel(), part.ravel())
     return labels, low == high
+
+
+EDGE_FIELDS = ("edges", "edge_weight", "edge_unit", "rotation_scale", "prior_weight")
+EDGE_FIELDS += ("prior_relief", "depth_weight", "depth_change")
+PAIR_FIELDS = ("pairs", "boundary_ray", "pair_weight", "pair_factor", "pair_unit")
+PAIR_FIELDS += ("orient_weight", "order_weight", "order_step")
+
+
+def with_graph(data: EnergyData, edges: list[int], pairs: list[int]) -> EnergyData:
+    """The data with some rows of the K-NN graph and of the neighbour graph."""
+    rows = {**dict.fromkeys(EDGE_FIELDS, edges), **dict.fromkeys(PAIR_FIELDS, pairs)}
+    return replace(data, **{k: getattr(data, k)[np.array(v, int)] for k, v in rows.items()})

@@ -49,7 +49,6 @@ READ = {
     "evaluate --depth": "evaluate {result} --depth {odd.npy}",
     "import DIR": "import {odd} {sol} -o {out}",
     "import .sol": "import {exported} {odd.sol} -o {out}",
-    "bench speed --check": "bench speed --check {odd.json} -o {out}",
     "bench accuracy --data": "bench accuracy --suite sintel --data {odd} -o {out}",
 }
 """Commands that read a file or folder."""
@@ -166,7 +165,6 @@ USES: dict[str, tuple[str, Any, tuple[int, ...]]] = {
     "problem": ("check {x}/soup.sol", changed("exported", "problem.yaml"), (2,)),
     "show": ("show {x}", written("p.yaml"), (2,)),
     "list": ("list {o}", written("p.yaml"), (0, 2)),
-    "baseline": ("bench speed --check {x} -o {out}", written("p.json"), (2,)),
 }
 """Commands that read a text, by what it stands for."""
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_model import K_NEXT, K_REF, Tiny, random_soup, weights_for
+from helpers_model import K_NEXT, K_REF, Tiny, random_soup, weights_for, with_graph
 
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
@@ -20,7 +20,7 @@ from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.refine import mppbp
-from soup_nlp.refine.anchored import Local, fit_motion, neighbours
+from soup_nlp.refine.anchored import Local, neighbours
 from soup_nlp.refine.costs import Particles, anchor_depth
 from soup_nlp.refine.kinds import BORROWED, COMMON, KINDS, WALKS
 from soup_nlp.refine.mppbp import refine_soup
@@ -168,18 +168,6 @@ def test_a_refit_under_the_true_motion_finds_the_true_plane():
     assert np.abs(Z / true - 1)[bad].max() < 0.02
 
 
-def test_a_motion_is_fitted_to_its_points():
-    rng = np.random.default_rng(0)
-    X = rng.uniform([-1, -1, 2], [1, 1, 4], (60, 3))
-    R, T = rotation.exp([0.03, -0.02, 0.05]), np.array([0.1, -0.05, 0.2])
-    Y = X @ R.T + T
-    target = Y / Y[:, 2:]
-    target[:5, :2] += 0.3  # outliers
-    R1, T1 = fit_motion(np.eye(3), np.zeros(3), X, target, np.ones(60), 500.0, rounds=15)
-    assert np.abs(R1 - R).max() < 1e-3
-    assert np.abs(T1 - T).max() < 5e-3
-
-
 def test_neighbours_come_nearest_first():
     tiny = Tiny()
     near = neighbours(tiny.data.edges, tiny.data.anchor_ray)
@@ -283,71 +271,34 @@ def test_interruption_and_time_limit_keep_the_best():
     assert not late.rounds
 
 
-@pytest.fixture
-def never_near(monkeypatch):
-    """TRW-S does not stop at a gap."""
+@pytest.mark.parametrize(
+    ("what", "status"),
+    [("stop", "interrupted"), ("interrupt", "interrupted"), ("wait", "time limit")],
+)
+def test_a_listener_can_end_a_round(what, status, monkeypatch):
+    """By the stop event or a KeyboardInterrupt, which TRW-S keeps to itself; or it takes long."""
+    # TRW-S does not stop at a gap
     monkeypatch.setattr(mppbp, "TRWS_GAP", -1.0)
-
-
-@pytest.mark.usefixtures("never_near")
-def test_a_listener_can_stop_within_a_round():
-    tiny = Tiny("pixels", samples=6)
-    stop = threading.Event()
-    heard: list[str] = []
+    tiny, stop, heard = Tiny("pixels", samples=6), threading.Event(), []
 
     def listener(progress: object) -> None:
         heard.append(str(progress))
-        if len(heard) == 2:
+        if what == "wait":
+            time.sleep(0.55)
+        elif len(heard) == 2:
             stop.set()
+            if what == "interrupt":
+                stop.clear()
+                raise KeyboardInterrupt
 
-    done = refine_soup(
-        tiny.soup,
-        tiny.data,
-        weights_for("pixels"),
-        FEW,
-        seed=1,
-        watch=Watch(listener, stop),
-    )
-    assert done.status == "interrupted"
-    assert len(heard) == 2
+    o = FEW.replace(max_seconds=0.5 if what == "wait" else 300.0)
+    watch = Watch(listener, stop)
+    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, seed=1, watch=watch)
+    assert done.status == status
+    assert [r.status for r in done.rounds] == ["interrupted"]
+    assert done.rounds[0].iterations == len(heard) == (1 if what == "wait" else 2)
     assert heard[0].startswith("refine 1")
-    assert done.rounds[0].iterations == 2
     assert done.energy["total"] <= done.energy_begin["total"]
-
-
-@pytest.mark.usefixtures("never_near")
-def test_an_interrupt_within_a_round_ends_the_refinement():
-    """TRW-S keeps a KeyboardInterrupt to itself: the rounds must not go on after it."""
-    tiny = Tiny("pixels", samples=6)
-    heard: list[str] = []
-
-    def listener(progress: object) -> None:
-        heard.append(str(progress))
-        if len(heard) == 2:
-            raise KeyboardInterrupt
-
-    stop = threading.Event()
-    done = refine_soup(
-        tiny.soup, tiny.data, weights_for("pixels"), FEW, watch=Watch(listener, stop)
-    )
-    assert done.status == "interrupted"
-    assert len(heard) == 2
-    assert [r.status for r in done.rounds] == ["interrupted"]
-    assert done.energy["total"] <= done.energy_begin["total"]
-    assert not stop.is_set()
-
-
-@pytest.mark.usefixtures("never_near")
-def test_a_time_limit_within_a_round_is_no_interruption():
-    tiny = Tiny("pixels", samples=6)
-    o = FEW.replace(max_seconds=0.5)
-
-    def listener(progress: object) -> None:
-        time.sleep(0.55)
-
-    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, watch=Watch(listener))
-    assert done.status == "time limit"
-    assert [r.status for r in done.rounds] == ["interrupted"]
 
 
 def test_stagnation_ends_the_rounds():
@@ -364,34 +315,6 @@ def test_few_particles_and_isolated_superpixels_work(particles):
     o = FEW.replace(particles=particles)
     done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o)
     assert done.energy["total"] <= done.energy_begin["total"]
-    alone = replace(
-        tiny.data,
-        **{
-            k: getattr(tiny.data, k)[:0]
-            for k in (
-                "edges",
-                "edge_weight",
-                "edge_unit",
-                "rotation_scale",
-                "prior_weight",
-                "prior_relief",
-                "depth_weight",
-                "depth_change",
-            )
-        },
-        **{
-            k: getattr(tiny.data, k)[:0]
-            for k in (
-                "pairs",
-                "boundary_ray",
-                "pair_weight",
-                "pair_factor",
-                "pair_unit",
-                "orient_weight",
-                "order_weight",
-                "order_step",
-            )
-        },
-    )
+    alone = with_graph(tiny.data, [], [])
     done = refine_soup(tiny.soup, alone, weights_for("pixels"), o)
     assert done.energy["total"] <= done.energy_begin["total"]

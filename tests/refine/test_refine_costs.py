@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_model import Tiny, random_soup, weights_for
+from helpers_model import Tiny, random_soup, weights_for, with_graph
 
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.refine.costs import PairCosts, Particles, anchor_depth, feasible, unary_costs
@@ -79,36 +78,11 @@ def test_every_entry_is_the_energy_of_its_pair():
     )
     costs = PairCosts(tiny.data, weights)
     table = costs.tables(p)
-    only_pairs = {"proj": 0.0}
-    w = weights.replace(**only_pairs)
+    w = weights.replace(proj=0.0)
     for e in (0, len(costs.edges) // 2, len(costs.edges) - 1):
         i, k = costs.edges[e]
-        data = replace(
-            tiny.data,
-            edges=np.array([[i, k]]) if costs.arap_row[e] >= 0 else np.zeros((0, 2), int),
-            edge_weight=tiny.data.edge_weight[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
-            edge_unit=tiny.data.edge_unit[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
-            rotation_scale=tiny.data.rotation_scale[costs.arap_row[e]][None][
-                : costs.arap_row[e] + 1
-            ],
-            prior_relief=tiny.data.prior_relief[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
-            prior_weight=tiny.data.prior_weight[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
-            depth_weight=tiny.data.depth_weight[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
-            depth_change=tiny.data.depth_change[costs.arap_row[e]][None][: costs.arap_row[e] + 1],
-            pairs=np.array([[i, k]]) if costs.cont_row[e] >= 0 else np.zeros((0, 2), int),
-            **{
-                key: getattr(tiny.data, key)[[max(costs.cont_row[e], 0)]]
-                for key in (
-                    "boundary_ray",
-                    "pair_weight",
-                    "pair_factor",
-                    "pair_unit",
-                    "orient_weight",
-                    "order_weight",
-                    "order_step",
-                )
-            },
-        )
+        rows = ([r] if r >= 0 else [] for r in (costs.arap_row[e], costs.cont_row[e]))
+        data = with_graph(tiny.data, *rows)
         for a in range(p.shape[1]):
             for b in range(p.shape[1]):
                 labels = np.zeros(n, int)
@@ -216,27 +190,6 @@ def test_kept_particles_are_cheap_feasible_and_different():
     # with nothing else left: the repeated one, then the infeasible one
     every = diverse(p, labels, cost, 20, tiny.data)
     assert np.array_equal(every[:, 4:], np.tile([6, 4], (n, 1)))
-
-
-def test_planes_that_turn_away_are_tilted_about_their_anchor():
-    tiny = Tiny()
-    data, soup = tiny.data, tiny.soup
-    n = soup.n.copy()
-    rays = data.visibility_ray(5.0)
-    # nearly edge-on at its anchor, so that its far rim is beyond the horizon
-    a = data.anchor_ray[4]
-    steep = np.array([1.0, 0.0, -a[0] - 0.02])
-    n[4] = steep / np.linalg.norm(steep)
-    broken = Soup(soup.lam, n, soup.d, soup.R, soup.t)
-    assert not feasible(Particles.of(broken), rays, 1e-3)[4, 0]
-    good = tilt_to_camera(broken, data.anchor_ray, rays, 1e-3)
-    assert feasible(Particles.of(good), rays, 1e-3).all()
-    before, after = broken.depth_at(data.anchor_ray), good.depth_at(data.anchor_ray)
-    assert before[4] > 0
-    assert after[4] == pytest.approx(before[4])
-    others = np.arange(len(soup)) != 4
-    assert np.array_equal(good.n[others], soup.n[others])
-    assert np.allclose(good.translation, soup.translation)
 
 
 def test_no_particle_runs_away_but_the_current_one_may_stay():

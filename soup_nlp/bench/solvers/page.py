@@ -72,10 +72,11 @@ def page(frame: pd.DataFrame, family: bool = False) -> str:
     )
     begun = frame["start"].isin(CONFIRMATIONS)
     facts = [*sorted(frame["machine"].unique()), ", ".join(sorted(packages)), f"code {code}"]
-    lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(frame, not family), ""]
+    lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(frame), ""]
     lines += ["![performance profiles](profile.png)", "", "![energy against time](curves.png)"]
     sections = {
         "By start and size": _by_start(frame) if family else [],
+        "By problem": _by_problem(frame),
         "By solver": [note, "", *_by_solver(frame)],
         "By run": _by_run(frame[~begun]),
         "Confirmation: runs that begin at a solution": _by_run(frame[begun]),
@@ -98,44 +99,50 @@ def _limits(frame: pd.DataFrame) -> str:
     )
 
 
-def conclusion(frame: pd.DataFrame, each: bool = True) -> list[str]:
-    """Conclusion in sentences; `each` adds lines on each problem."""
-    time, energy = cost_table(frame, "seconds"), cost_table(frame, "energy")
-    solved = np.isfinite(time).sum()
-    some = solved[solved > 0].index
+def conclusion(frame: pd.DataFrame) -> list[str]:
+    """Conclusion in two sentences."""
+    solved = np.isfinite(cost_table(frame, "seconds")).sum()
+    some = solved[solved > 0].sort_values(ascending=False, kind="stable")
+    problems = frame.groupby(PROBLEM).ngroups
+    told = ", ".join(f"{name} {count}" for name, count in some.items()) or "none"
     out = [
-        f"**{len(time)} problems, {len(solved)} solvers, {len(frame)} runs:"
-        f" {int(frame['verified'].sum())} verified, by {len(some)} solvers"
-        f" ({', '.join(some) or 'none'}).**"
+        f"**{problems} problems, {len(solved)} solvers, {len(frame)} runs:"
+        f" {int(frame['verified'].sum())} verified.** Verified problems by solver: {told}."
     ]
-    if len(some):
-        best = solved[solved == solved.max()].index
-        out[0] += f" Most problems ({solved.max()}): {', '.join(best)}."
-    for key, group in frame.groupby(PROBLEM) if each else ():
-        name = "{}, N = {}, {}".format(*key[:3])
-        feasible = group[group["energy"].notna() & (group["primal"] <= FEASIBLE)]
-        if len(feasible):
-            low = feasible.loc[feasible["energy"].astype(float).idxmin()]
-            out.append(
-                f"- {name}: lowest exact energy of any run {low['energy']:.6g} by {low['solver']}"
-                f" ({low['seconds']:.1f} s)."
-            )
-        if not np.isfinite(time.loc[key]).any():
-            out.append(f"- {name}: none is verified.")
-            continue
-        quick, low = time.loc[key].idxmin(), energy.loc[key].idxmin()
-        out.append(
-            f"- {name}: quickest {quick} ({time.loc[key, quick]:.2f} s, E"
-            f" {energy.loc[key, quick]:.6g}); lowest energy {low} (E {energy.loc[key, low]:.6g} in"
-            f" {time.loc[key, low]:.2f} s)."
-        )
     claims = frame[frame["claimed"].astype(bool)]
     if len(claims):
-        false = sorted(claims.loc[~claims["verified"].astype(bool), "solver"].unique())
+        true = claims["verified"].astype(bool)
+        false = sorted(claims.loc[~true, "solver"].unique())
         more = f"; not always those of {', '.join(false)}" if false else ""
-        true = int(claims["verified"].astype(bool).sum())
-        out.append(f"- Claims of an optimum that were true: {true} of {len(claims)}{more}.")
+        count = f"{int(true.sum())} of {len(claims)}"
+        out.append(f"Claims of an optimum that were true: {count}{more}.")
     return out
+
+
+def _by_problem(frame: pd.DataFrame) -> list[str]:
+    """Exact energy that every solver reached, by problem; brackets where it is not verified."""
+    shown = frame.assign(
+        energy=[
+            "-" if not np.isfinite(e) else f"{e:.6g}" if good else f"({e:.6g})"
+            for e, good in zip(
+                frame["energy"].where(frame["primal"] <= FEASIBLE).astype(float),
+                frame["verified"].astype(bool),
+                strict=True,
+            )
+        ]
+    )
+    # problems of one name may have different contents
+    keys = [*PROBLEM, "energy_start"]
+    table = shown.pivot_table(
+        index=keys, columns="solver", values="energy", aggfunc="last", fill_value="-", sort=False
+    )
+    table = table.reset_index("energy_start").droplevel("problem_hash")
+    table.index.names = ["problem", "N", "formulation"]
+    text = (
+        "Exact energy of the point that each solver reached, in brackets where it is feasible (to"
+        f" {FEASIBLE:g}) but not verified."
+    )
+    return [text, "", *markdown(table.rename(columns={"energy_start": "start"}), ".6g")]
 
 
 def _by_solver(frame: pd.DataFrame) -> list[str]:

@@ -1,0 +1,144 @@
+"""Page and pictures of a comparison of solvers from artificial rows; its command."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from soup_nlp.bench.solvers.page import frame_of_runs
+from soup_nlp.bench.solvers.page import page as page_of
+from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profiles, profile
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import Problem
+from soup_nlp.errors import DataError
+from soup_nlp.export.verify import Limits
+from soup_nlp.pipeline.case import Case, prepare
+
+pytestmark = pytest.mark.slow
+
+PROBLEMS = Path(__file__).parents[2] / "problems"
+SMALL = [
+    "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",
+    "--set", "segmentation.neighbours=4", "--set", "energy.pixel_samples=4",
+]  # fmt: skip
+
+
+def row(problem: str, solver: str, seconds: float, energy: float, verified: bool = True) -> dict:
+    return {
+        "problem": problem, "superpixels": 10, "formulation": "f", "solver": solver,
+        "seconds": seconds, "energy": energy, "verified": verified, "claimed": True,
+        "energy_start": 9.0, "curve": [[0.1, 5.0], [seconds, energy]], "iterations": 3,
+        "cpu_seconds": 1.0, "peak_bytes": 1 << 20, "status": "a | b", "machine": "m",
+        "versions": {"casadi": "3"}, "code": "1", "problem_hash": "0", "start": "presolve",
+        "primal": 0.0, "limits": asdict(Limits()),
+    }  # fmt: skip
+
+
+def page(rows: list[dict]) -> str:
+    return page_of(frame_of_runs(rows))
+
+
+ROWS = [
+    row("a", "one", 1.0, 4.0), row("a", "two", 2.0, 3.0), row("a", "three", 0.1, 1.0, False),
+    row("b", "one", 6.0, 4.0), row("b", "two", 3.0, 4.0),
+]  # fmt: skip
+
+
+def test_profiles_by_hand():
+    cost = cost_table(frame_of_runs(ROWS), "seconds")
+    assert (len(cost), list(cost)) == (2, ["one", "three", "two"])
+    share = profile(cost)
+    assert share.index.tolist() == [1, 2]
+    # each wins one problem; both solve all within twice the best; a false claim solves none
+    assert share.to_numpy().tolist() == [[0.5, 0, 0.5], [1, 0, 1]]
+    share = profile(cost_table(frame_of_runs(ROWS), "energy"))
+    assert share.index.tolist() == [1, 4 / 3]
+    assert share.to_numpy().tolist() == [[0.5, 0, 1], [1, 0, 1]]
+    # nothing is solved
+    share = profile(cost_table(frame_of_runs(ROWS[2:3]), "seconds"))
+    assert share.index.tolist() == [1]
+    assert share.to_numpy().tolist() == [[0]]
+
+
+@pytest.mark.parametrize("rows", [ROWS, [ROWS[2] | {"curve": []}]], ids=["some", "none"])
+def test_pictures_of_runs(rows, tmp_path):
+    frame = frame_of_runs(rows)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        draw_profiles(tmp_path / "p.png", {"": frame}, ("seconds", "energy"))
+        draw_curves(tmp_path / "c.png", frame)
+    assert all((tmp_path / name).stat().st_size > 5000 for name in ("p.png", "c.png"))
+
+
+def test_a_page_has_problems_solvers_and_runs():
+    text = page(ROWS)
+    assert "**2 problems, 3 solvers, 5 runs: 4 verified.**" in text
+    assert "one 2, two 2." in text
+    assert "4 of 5; not always those of three." in text
+    assert text.index("**2 problems") < text.index("## Confirmation") < text.index("## Limits")
+    assert "a / b" in text
+    assert "| a | 10 | f | 9 | 4 | 3 | (1) |" in text
+    assert "| b | 10 | f | 9 | 4 | 4 | - |" in text
+    assert "| three | 1 | 1 | 0 | 0 of 1 |" in text
+    # one of another content
+    other = row("b", "two", 9.0, 2.0) | {"problem_hash": "1"}
+    assert "**3 problems" in page([*ROWS, other])
+    # a solver without an answer
+    nothing = {k: v for k, v in ROWS[0].items() if k not in ("energy", "primal", "curve")}
+    text = page([nothing | {"verified": False, "claimed": False, "curve": []}])
+    assert "| a | 10 | f | one | no | - | 9 | - |" in text
+
+
+def test_runs_that_begin_at_a_solution_are_headed_confirmation():
+    text = page([row(start, "one", 1.0, 4.0) | {"start": start} for start in ("hard", "easy")])
+    first, second = text.index("## By run"), text.index("## Confirmation")
+    assert first < text.index("| hard |", first) < second < text.index("| easy |", second)
+
+
+# --- the command ---------------------------------------------------------------------------------
+
+
+def test_command(tmp_path, capsys):
+    words = ["compare", str(PROBLEMS / "orbit.yaml"), "-o", str(tmp_path), "--superpixels", "12"]
+    words += ["--solvers", "ipopt-soup", "--seconds", "20", "--presolve", *SMALL]
+    assert main(words) == 0
+    rows = [json.loads(x) for x in (tmp_path / "runs.jsonl").read_text().splitlines()]
+    assert rows[0]["verified"]
+    assert "1 verified" in capsys.readouterr().out
+    for name in ("README.md", "profile.png", "curves.png"):
+        assert (tmp_path / name).stat().st_size > 0
+    assert main([*words, "--tol", "-1"]) == 2
+    assert main(["compare", str(PROBLEMS / "orbit.yaml"), "--solvers", "nothing"]) == 2
+
+
+def test_files_are_read_before_anything_runs(tmp_path, capsys):
+    words = ["-o", str(tmp_path), "--solvers", "lm,lm", "--seconds", "5", *SMALL]
+    orbit = str(PROBLEMS / "orbit.yaml")
+    assert main(["compare", orbit, "orbitt.yaml", "--superpixels", "9", *words]) == 2
+    assert main(["compare", orbit, "--superpixels", "9", "--superpixels", "0", *words]) == 2
+    assert "superpixels" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_input_that_cannot_be_used_leaves_the_others_page(tmp_path, monkeypatch, capsys):
+    calls = []
+
+    def second_fails(problem: Problem, presolve: bool) -> Case:
+        calls.append(problem)
+        if len(calls) == 2:
+            raise DataError("image is gone")
+        return prepare(problem, presolve)
+
+    monkeypatch.setattr("soup_nlp.cli.compare.prepare", second_fails)
+    orbit = str(PROBLEMS / "orbit.yaml")
+    words = ["--superpixels", "9", "--solvers", "lm,lm", "--seconds", "5", "--no-presolve"]
+    out = tmp_path / "out"
+    assert main(["compare", orbit, orbit, "-o", str(out), *words, *SMALL]) == 2
+    assert "1 runs" in (out / "README.md").read_text()
+    assert "image is gone" in capsys.readouterr().err
+    assert np.isfinite([json.loads((out / "runs.jsonl").read_text())["energy"]]).all()
