@@ -149,49 +149,52 @@ def scales(z, own, far=0.01, **options):
     return found.reshape(rows, columns)
 
 
-def test_a_component_in_pieces_is_placed_from_the_ground_up():
-    """A tall piece before a far wall, with the longer outline, on a low one on the ground."""
-    own = thrice([[0, 0, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0], [0, 0, 0]])
-    z = thrice([[8.0, 8, 8], [8, 1, 8], [8, 1, 8], [8, 1, 8], [2, 2, 2]])
-    found = scales(z, own)
-    np.testing.assert_allclose(found, np.where(own > 0, 2.0, 1.0), rtol=1e-12)
-    # what stands on nothing in the image, cut off by its lower edge, waits for nothing
-    own = thrice([[0, 0, 0, 0, 0], [0, 2, 2, 0, 0], *[[0, 0, 1, 0, 0]] * 3])
-    z = thrice([[8.0] * 5, [8, 1, 1, 8, 8], [8, 8, 1, 2, 2], *[[2, 2, 1, 2, 2]] * 2])
-    np.testing.assert_allclose(scales(z, own), np.where(own > 0, 2.0, 1.0), rtol=1e-12)
-
-
-def test_a_component_on_its_own_filling_is_still_placed():
-    """All that is below the arch is a component that touches nothing else: neither can wait."""
-    own = thrice([[0, 0, 0, 0, 0], [0, 2, 2, 2, 0], [0, 2, 1, 2, 0]])
-    z = thrice([[4.0] * 5, [4, 1, 1, 1, 4], [4, 1, 1, 1, 4]])
-    np.testing.assert_allclose(scales(z, own), np.where(own > 0, 4.0, 1.0), rtol=1e-12)
-
-
-def test_without_a_vertical_the_longest_contact_comes_first():
-    own = thrice([[0, 0, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0], [0, 0, 0]])
-    z = thrice([[8.0, 8, 8], [8, 1, 8], [8, 1, 8], [8, 1, 8], [2, 2, 2]])
-    # which way is down is not known: the wall, which the tall one touches first
-    np.testing.assert_allclose(scales(z, own, upright=False)[own == 2], 8.0, rtol=1e-12)
-
-
 def thrice(cells):
     """Three superpixels of each, both ways: all have some behind them."""
     return np.repeat(np.repeat(cells, 3, axis=0), 3, axis=1)
 
 
-@pytest.mark.parametrize(
-    ("upright", "ground", "scale"), [(True, 2.0, 2.0), (False, 2.0, 1.0), (True, 40.0, 4.0)]
-)
-def test_a_component_stands_on_what_is_below_it(upright, ground, scale):
-    """Amid a wall, on the ground, half behind a near thing.
+TOWER = [[8.0, 8, 8], [8, 1, 8], [8, 1, 8], [8, 1, 8], [2, 2, 2]]
+TOWER_OF = [[0, 0, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0], [0, 0, 0]]
+CORNER = [[0, 0, 0], [0, 1, 0], [0, 0, 0]]
+CONTACTS = {
+    # a tall piece before a far wall, with the longer outline, on a low one on the ground
+    "pieces": (TOWER, TOWER_OF, 2.0),
+    # what stands on nothing in the image, cut off by its lower edge, waits for nothing
+    "cut off": (
+        [[8.0] * 5, [8, 1, 1, 8, 8], [8, 8, 1, 2, 2], *[[2, 2, 1, 2, 2]] * 2],
+        [[0, 0, 0, 0, 0], [0, 2, 2, 0, 0], *[[0, 0, 1, 0, 0]] * 3],
+        2.0,
+    ),
+    # all that is below the arch is a component that touches nothing else: neither can wait
+    "arch": (
+        [[4.0] * 5, [4, 1, 1, 1, 4], [4, 1, 1, 1, 4]],
+        [[0, 0, 0, 0, 0], [0, 2, 2, 2, 0], [0, 2, 1, 2, 0]],
+        4.0,
+    ),
+    # amid a wall, on the ground, half behind a near thing
+    "ground": ([[1.0, 4, 4], [1, 1, 4], [1, 2.0, 2.0]], CORNER, 2.0),
+    # a ground that is beyond most of what the component hides is none
+    "far ground": ([[1.0, 4, 4], [1, 1, 4], [1, 40.0, 40.0]], CORNER, 4.0),
+    # the lower edge of the image cuts it off: a low quantile of the depth ratios around it
+    "outline": ([[4.0, 6, 4], [3, 1, 3.5]], [[0, 0, 0], [0, 1, 0]], 3.0),
+}
 
-    A ground that is beyond most of what the component hides is none.
-    """
-    own = thrice([[0, 0, 0], [0, 1, 0], [0, 0, 0]]) > 0
-    z = thrice([[1.0, 4, 4], [1, 1, 4], [1, ground, ground]])
-    found = scales(z, own, upright=upright)
-    np.testing.assert_allclose(found, np.where(own, scale, 1.0), rtol=1e-12)
+
+@pytest.mark.parametrize(("z", "own", "scale"), CONTACTS.values(), ids=CONTACTS)
+def test_a_component_has_the_depth_of_what_it_touches(z, own, scale):
+    own = thrice(own)
+    found = scales(thrice(z), own)
+    np.testing.assert_allclose(found, np.where(own > 0, scale, 1.0), rtol=1e-12)
+
+
+def test_without_a_vertical_the_longest_contact_comes_first():
+    # which way is down is not known: the wall, which the tall one touches first
+    own = thrice(TOWER_OF)
+    found = scales(thrice(TOWER), own, upright=False)
+    np.testing.assert_allclose(found[own == 2], 8.0, rtol=1e-12)
+    z, own, _ = CONTACTS["ground"]
+    np.testing.assert_allclose(scales(thrice(z), thrice(own), upright=False), 1.0, rtol=1e-12)
 
 
 def test_a_car_has_room_between_its_wheels():
@@ -199,13 +202,6 @@ def test_a_car_has_room_between_its_wheels():
     z = np.array([[9.0] * 5, [9, 1, 1, 1, 9], [9, 1, 3, 1, 9], [2] * 5])
     own = z == 1
     np.testing.assert_allclose(scales(z, own), np.where(own, 2.0, 1.0), rtol=1e-12)
-
-
-def test_a_component_with_nothing_below_it_touches_its_outline():
-    """The lower edge of the image cuts it off: a low quantile of the depth ratios around it."""
-    z = thrice([[4.0, 6, 4], [3, 1, 3.5]])
-    own = z == 1
-    np.testing.assert_allclose(scales(z, own), np.where(own, 3.0, 1.0), rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
-from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.graph import BETA, Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import segment, split_components
 
 FOUR = ((0, 1), (0, -1), (1, 0), (-1, 0))
@@ -51,30 +51,20 @@ def test_superpixels_are_connected_and_numbered(image, method, count):
     assert abs(n - count) <= near
 
 
-@pytest.mark.parametrize("count", [40, 150])
-def test_superpixels_of_noise_are_connected_and_not_tiny(count):
-    labels = segment(noise(60, 80), count, "slic")
-    assert_partition(labels)
-    assert np.median(np.bincount(labels.ravel())) > 0.3 * 60 * 80 / count
+@pytest.mark.parametrize(("size", "count"), [((60, 80), 40), ((60, 80), 150), ((120, 320), 300)])
+def test_fine_texture_does_not_cost_superpixels(size, count):
+    labels = segment(noise(*size), count)
+    assert abs(assert_partition(labels) - count) <= max(1, 0.03 * count)
+    assert np.median(np.bincount(labels.ravel())) > 0.3 * labels.size / count
 
 
-@pytest.mark.parametrize("count", [60, 300])
-def test_fine_texture_does_not_cost_superpixels(count):
-    labels = segment(noise(120, 320), count)
-    assert abs(labels.max() + 1 - count) <= max(1, 0.03 * count)
-
-
-def test_an_image_of_one_colour_is_cut_into_a_grid():
+def test_an_image_of_one_colour_is_cut_into_cells_of_equal_size():
     grey = np.full((48, 64, 3), 90, np.uint8)
-    np.testing.assert_array_equal(segment(grey, 12, "slic"), segment(grey, 12, "grid"))
-    assert assert_partition(segment(grey, 12)) == 12
-
-
-def test_grid_cells_have_equal_size():
-    labels = segment(noise(48, 64), 12, "grid")
+    labels = segment(grey, 12, "grid")
+    np.testing.assert_array_equal(segment(grey, 12, "slic"), labels)
+    assert assert_partition(labels) == 12
     np.testing.assert_array_equal(np.bincount(labels.ravel()), np.full(12, 48 * 64 // 12))
-    assert labels[0, 0] == 0
-    assert labels[-1, -1] == 11
+    assert (labels[0, 0], labels[-1, -1]) == (0, 11)
 
 
 @pytest.mark.parametrize("count", [0, -3, 10**6])
@@ -152,15 +142,10 @@ def test_folded_edges_keep_every_direction(seg):
         assert m == ((i, j) in directed) + ((j, i) in directed)
 
 
-def test_edge_weight_is_equation_2(seg):
-    i, k = seg.edges.T
-    distance = np.linalg.norm(seg.anchors[i] - seg.anchors[k], axis=1)
-    np.testing.assert_allclose(seg.edge_weight, seg.edge_multiplicity * np.exp(-0.02 * distance))
-
-
-@pytest.mark.parametrize("beta", [0.0, 0.3])
-def test_beta_is_the_falloff_per_pixel(image, beta):
-    seg = build_segmentation(segment(image, 20, "grid"), image, neighbours=3, beta=beta)
+@pytest.mark.parametrize("beta", [BETA, 0.0, 0.3])
+def test_edge_weight_is_equation_2(image, beta):
+    own = {} if beta == BETA else {"beta": beta}
+    seg = build_segmentation(segment(image, 20, "grid"), image, neighbours=3, **own)
     i, k = seg.edges.T
     distance = np.linalg.norm(seg.anchors[i] - seg.anchors[k], axis=1)
     np.testing.assert_allclose(seg.edge_weight, seg.edge_multiplicity * np.exp(-beta * distance))
@@ -255,16 +240,13 @@ def test_rim_points_are_extreme_pixels_of_their_superpixel(seg):
             assert np.cos(angle) * ru + np.sin(angle) * rv == pytest.approx(reach.max())
 
 
-@pytest.mark.parametrize("k", [0, 12, 40])
-def test_k_must_be_below_the_number_of_superpixels(k):
+def test_k_must_be_below_the_number_of_superpixels():
     image = noise(48, 64)
-    with pytest.raises(DataError, match=r"segmentation\.neighbours"):
-        build_segmentation(segment(image, 12, "grid"), image, neighbours=k)
-
-
-def test_k_may_be_one_less_than_the_number_of_superpixels():
-    image = noise(48, 64)
-    seg = build_segmentation(segment(image, 12, "grid"), image, neighbours=11)
+    labels = segment(image, 12, "grid")
+    for k in (0, 12, 40):
+        with pytest.raises(DataError, match=r"segmentation\.neighbours"):
+            build_segmentation(labels, image, neighbours=k)
+    seg = build_segmentation(labels, image, neighbours=11)
     assert len(seg.edges) == 12 * 11 // 2
     np.testing.assert_array_equal(seg.edge_multiplicity, 2)
 
