@@ -86,7 +86,7 @@ def clock() -> float:
     return sum(os.times()[:4])
 
 
-WALL_PER_CPU = 4.0
+WALL_PER_CPU = 8.0
 """Limit of the wall time relative to that of the CPU time: other work may slow a run down, and a
 program that waits uses no CPU time."""
 Solver = Callable[[Task], Answer]
