@@ -12,8 +12,8 @@ from types import MappingProxyType
 import numpy as np
 
 from soup_nlp.arrays import Float, Mask
-from soup_nlp.bench.study import Overrides
-from soup_nlp.bench.suites import SUITES, Item
+from soup_nlp.bench.study import Item, Overrides
+from soup_nlp.bench.suites import SUITES
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from soup_nlp.bench.study import Overrides, failures, page_text, provenance, titled
-from soup_nlp.bench.suites import Item
+from soup_nlp.bench.study import Item, Overrides, failures, page_text, provenance, titled
 from soup_nlp.errors import DataError
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import file_frames, find_depths, find_images, scene_frames

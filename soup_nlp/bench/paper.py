@@ -13,8 +13,8 @@ import pandas as pd
 
 from soup_nlp.bench.accuracy import has_depth, scores, solved
 from soup_nlp.bench.studies import DEPARTURES, PAPER, STUDIES, without
-from soup_nlp.bench.study import Cell, Overrides
-from soup_nlp.bench.suites import RENDERED, Item, Options, list_suite, spread
+from soup_nlp.bench.study import Cell, Item, Overrides
+from soup_nlp.bench.suites import RENDERED, Options, list_suite, spread
 from soup_nlp.config.presets import overrides_of
 from soup_nlp.errors import DataError, SoupError
 from soup_nlp.pipeline.record import Run

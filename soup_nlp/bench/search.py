@@ -17,6 +17,7 @@ import pandas as pd
 from soup_nlp.bench.accuracy import measure_pair
 from soup_nlp.bench.study import (
     Cell,
+    Item,
     Measure,
     Overrides,
     failures,
@@ -27,7 +28,6 @@ from soup_nlp.bench.study import (
     pivot,
     provenance,
 )
-from soup_nlp.bench.suites import Item
 from soup_nlp.errors import ConfigError
 from soup_nlp.storage.rows import MeasureRows
 

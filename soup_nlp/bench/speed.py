@@ -18,6 +18,7 @@ from soup_nlp.bench.processes import machine
 from soup_nlp.bench.reference_solver import levenberg_marquardt
 from soup_nlp.bench.study import (
     Cell,
+    Item,
     Overrides,
     failures,
     figure,
@@ -26,7 +27,6 @@ from soup_nlp.bench.study import (
     save,
     titled,
 )
-from soup_nlp.bench.suites import Item
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct

@@ -11,7 +11,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -21,14 +21,55 @@ import numpy as np
 import pandas as pd
 
 from soup_nlp.bench.processes import alone
-from soup_nlp.bench.suites import Item
-from soup_nlp.config.problem import Problem
+from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.storage.atomic import atomic_path
 from soup_nlp.storage.rows import Job, MeasureRows, Row, attempt, reason
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Item:
+    """A pair of a suite with one flow source.
+
+    Attributes:
+        suite: Name of the suite.
+        sequence: Sequence or family, over which tables average first.
+        name: Name, unique in the suite.
+        flow: Flow source.
+        input: Section `input` of the problem.
+        presets: Metric conventions of the scores, the main one first.
+        needs: Files that must exist.
+    """
+
+    suite: str
+    sequence: str
+    name: str
+    flow: str
+    input: Mapping[str, Any] = field(repr=False)
+    presets: tuple[str, ...] = ("paper",)
+    needs: tuple[Path, ...] = field(default=(), repr=False)
+
+    @property
+    def key(self) -> str:
+        """Unique among all suites."""
+        return f"{self.suite}/{self.name}/{self.flow}"
+
+    def scored_by(self, presets: Sequence[str] | None) -> Item:
+        """The item with other metric conventions; unchanged if none are given."""
+        return replace(self, presets=tuple(presets)) if presets else self
+
+    def problem(self, overrides: Sequence[str] = ()) -> Problem:
+        """The problem of the pair with default options and overrides.
+
+        Raises:
+            ConfigError: an override is wrong.
+        """
+        raw = {"name": self.name, "input": dict(self.input), "flow": {"source": self.flow}}
+        return make_problem(raw, overrides, where=self.key)
+
 
 Overrides = tuple[str, ...]
 Measure = Callable[[Item, Overrides, Path | None], Row]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from soup_nlp.config.problem import Problem, make_problem
+from soup_nlp.bench.study import Item
 from soup_nlp.data.datasets.benchmarks import DEFAULT_SCENE
 from soup_nlp.data.scenes.everyday import LAYOUTS
 from soup_nlp.errors import DataError
@@ -26,47 +26,6 @@ SINTEL_FRAMES = MappingProxyType(
 """Number of frames of the paper's sequences."""
 VKITTI_FRAMES = MappingProxyType({"0001": 447, "0002": 233, "0006": 270, "0018": 339})
 """Number of frames of the paper's worlds."""
-
-
-@dataclass(frozen=True)
-class Item:
-    """A pair of a suite with one flow source.
-
-    Attributes:
-        suite: Name of the suite.
-        sequence: Sequence or family, over which tables average first.
-        name: Name, unique in the suite.
-        flow: Flow source.
-        input: Section `input` of the problem.
-        presets: Metric conventions of the scores, the main one first.
-        needs: Files that must exist.
-    """
-
-    suite: str
-    sequence: str
-    name: str
-    flow: str
-    input: Mapping[str, Any] = field(repr=False)
-    presets: tuple[str, ...] = ("paper",)
-    needs: tuple[Path, ...] = field(default=(), repr=False)
-
-    @property
-    def key(self) -> str:
-        """Unique among all suites."""
-        return f"{self.suite}/{self.name}/{self.flow}"
-
-    def scored_by(self, presets: Sequence[str] | None) -> Item:
-        """The item with other metric conventions; unchanged if none are given."""
-        return replace(self, presets=tuple(presets)) if presets else self
-
-    def problem(self, overrides: Sequence[str] = ()) -> Problem:
-        """The problem of the pair with default options and overrides.
-
-        Raises:
-            ConfigError: an override is wrong.
-        """
-        raw = {"name": self.name, "input": dict(self.input), "flow": {"source": self.flow}}
-        return make_problem(raw, overrides, where=self.key)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from helpers_rows import fake_row
 
 from soup_nlp.bench.accuracy import BASELINES, METHODS, measure_pair, moving
 from soup_nlp.bench.accuracy_page import suite_page, write_suite
-from soup_nlp.bench.study import Cell, frame_of
-from soup_nlp.bench.suites import SUITES, Item
+from soup_nlp.bench.study import Cell, Item, frame_of
+from soup_nlp.bench.suites import SUITES
 from soup_nlp.cli import bench_accuracy
 from soup_nlp.cli.main import main
 from soup_nlp.data.pair import Pair, Truth

@@ -13,7 +13,7 @@ import pytest
 from soup_nlp.bench.paper import DATASETS, METHODS, SECTIONS, Sizes, make_plan, measure_paper
 from soup_nlp.bench.paper_page import PICTURES
 from soup_nlp.bench.studies import DEPARTURES, PAPER, STUDIES, default
-from soup_nlp.bench.suites import Item
+from soup_nlp.bench.study import Item
 from soup_nlp.cli import bench_paper
 from soup_nlp.cli.main import main
 from soup_nlp.config.presets import PRESETS, leaves

@@ -22,8 +22,8 @@ from soup_nlp.bench.search import (
     search,
     search_page,
 )
-from soup_nlp.bench.study import Cell, frame_of
-from soup_nlp.bench.suites import Item, Options, list_suite
+from soup_nlp.bench.study import Cell, Item, frame_of
+from soup_nlp.bench.suites import Options, list_suite
 from soup_nlp.cli.bench_all import COMMANDS
 from soup_nlp.cli.main import app, main
 from soup_nlp.errors import ConfigError, DataError

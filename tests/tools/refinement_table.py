@@ -12,7 +12,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from soup_nlp.bench.suites import Item, Options, list_suite
+from soup_nlp.bench.study import Item
+from soup_nlp.bench.suites import Options, list_suite
 from soup_nlp.pipeline.run import run
 
 HEAD = (
