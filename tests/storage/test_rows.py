@@ -1,0 +1,97 @@
+"""Rows of numbers: stored as JSON lines, measured once, here or by worker processes."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_rows import fake_row
+
+from soup_nlp.errors import DataError
+from soup_nlp.storage.rows import Job, append_row, attempt, measure_all, read_rows
+from soup_nlp.storage.versions import code_version
+
+pytestmark = pytest.mark.slow
+
+
+def test_a_row_is_plain_json():
+    row = attempt(lambda: {"a": np.float64(np.nan), "b": [np.int64(3), float("inf")], "c": (1.5,)})
+    assert (row["a"], row["b"], row["c"], row["ok"]) == (None, [3, None], [1.5], True)
+    json.dumps(row, allow_nan=False)
+
+
+def fake_jobs(seed: int = 0, function=fake_row, **options) -> list[Job]:
+    scenes = ("orbit", "street", "sheet", "room")
+    return [Job({"key": s, "seed": seed}, partial(function, s, **options)) for s in scenes]
+
+
+def test_rows_are_kept_and_failed_ones_measured_again(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    seen: list[str] = []
+
+    def counted(scene):
+        seen.append(scene)
+        return fake_row(scene)
+
+    def jobs(seed=0):
+        return fake_jobs(seed, counted)
+
+    rows = measure_all(jobs()[:2], path)
+    assert [r["key"] for r in rows] == ["orbit", "street"]
+    said: list[tuple[int, int]] = []
+    tables: list[int] = []
+    measure_all(
+        jobs(),
+        path,
+        say=lambda done, total, row: said.append((done, total)),
+        after=lambda rows: tables.append(len(rows)),
+    )
+    assert seen == ["orbit", "street", "sheet", "room"]
+    assert said == [(3, 4), (4, 4)]
+    assert tables == [3, 4]
+    measure_all(jobs(), path)
+    assert seen[4:] == ["sheet"]
+    # another name is another row; one whose folder is gone is measured again
+    measure_all(jobs(1)[:1], path)
+    assert seen[5:] == ["orbit"]
+    measure_all([replace(jobs(1)[0], stale=True)], path)
+    assert seen[6:] == ["orbit"]
+
+
+def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    measure_all(fake_jobs()[:2], path)
+    lines = path.read_text().splitlines()
+    old = {**json.loads(lines[0]), "code": "older"}
+    path.write_text(json.dumps(old) + "\n" + lines[1][:40])
+    assert len(read_rows(path)) == 1
+    rows = measure_all(fake_jobs()[:2], path, any_code=True)
+    assert [r["code"] for r in rows] == ["older", code_version()]
+    # nothing was glued to the line that was cut off
+    assert len(read_rows(path)) == 2
+    rows = measure_all(fake_jobs()[:2], path)
+    assert [r["code"] for r in rows] == [code_version()] * 2
+    with pytest.raises(DataError, match="cannot be written"):
+        append_row(tmp_path / "rows.jsonl" / "x.jsonl", {})
+
+
+def test_parallel_processes_and_one_that_dies(tmp_path):
+    # the children must find this module's function
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        [str(Path(__file__).parents[1] / "helpers"), os.environ.get("PYTHONPATH", "")]
+    )
+    path = tmp_path / "rows.jsonl"
+    rows = measure_all(fake_jobs(dies=True), path, workers=2)
+    assert [r["key"] for r in rows] == ["orbit", "street", "sheet", "room"]
+    assert [r["ok"] for r in rows] == [True, True, False, False]
+    assert rows[2]["error"] == "no"
+    assert "process died" in rows[3]["error"]
+    assert len(read_rows(path)) == 4
+    # without the job that dies nothing has to run again
+    rows = measure_all(fake_jobs(1)[:2], path, workers=2)
+    assert [r["ok"] for r in rows] == [True, True]
