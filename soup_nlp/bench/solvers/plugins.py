@@ -113,6 +113,8 @@ CACHED: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     },
 }
 """Functions that a library requests from CasADi, with their outputs."""
+FIRST = ("nlp_grad_f", "nlp_jac")
+"""Beginnings of the names of functions without multipliers."""
 
 
 class _Watch(IterationCallback):
@@ -139,13 +141,15 @@ def plugin(name: str, task: Task) -> Answer:
         "print_time": False,
         "show_eval_warnings": False,
         "error_on_fail": False,
-        "no_nlp_grad": library in CACHED and "nlp_grad" not in CACHED[library],
+        "no_nlp_grad": library in ("ipopt", "sqpmethod"),
     }
     # parameters are replaced by numbers, since bonmin has no parameters
     if library in CACHED:
         x = ca.MX.sym("x", nlp.nx)
         functions = Functions(nlp)
-        f, g = functions.oracle(x, nlp.thetas())
+        # these differentiate f and g when they are made, in spite of cached derivatives
+        symbolic = library in ("bonmin", "uno")
+        f, g = nlp.oracle(x, nlp.p) if symbolic else functions.oracle(x, nlp.thetas())
         common["cache"] = _derivatives(nlp, functions, CACHED[library])
     else:
         x = ca.SX.sym("x", nlp.nx)
@@ -195,7 +199,7 @@ def _derivatives(
     inputs = {"x": x, "p": q, "lam_f": lam_f, "lam_g": lam_g}
     out = {}
     for name, outputs in wanted.items():
-        words = list(inputs) if name in ("nlp_hess_l", "nlp_grad") else ["x", "p"]
+        words = ["x", "p"] if name.startswith(FIRST) else list(inputs)
         values = [known[k] for k in outputs]
         out[name] = ca.Function(name, [inputs[w] for w in words], values, words, list(outputs))
     return out
