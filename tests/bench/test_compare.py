@@ -149,7 +149,7 @@ def test_a_curve_has_the_first_and_the_last_iterate(monkeypatch):
 # --- solvers -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["ipopt-tuned", "bonmin", "fatrop", "pounce", "uno"])
+@pytest.mark.parametrize("name", ["ipopt-tuned", "fatrop", "pounce", "uno"])
 def test_solvers_reach_a_verified_point(name, task, tmp_path):
     if name not in available():
         pytest.skip(f"{name} is not installed")
