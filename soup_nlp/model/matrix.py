@@ -82,25 +82,16 @@ def _add_constraints(b: Builder, layout: MatrixLayout, data: EnergyData, form: F
         row=ray,
         data=data.visibility_ray(form.depth_ratio).reshape(n, -1),
     )
-    b.add_constraint("simplex", x, v.lam / n, every, lower=1.0, upper=1.0, total=True)
-    if form.gauge == "unit-translation":
-        # the length unit: sum_i c_i D_i = 1 (in gauge unit-offset the simplex says it)
-        c = ca.SX.sym("share")
-        b.add_constraint(
-            "unit",
-            x,
-            c * v.lam * x[4],
-            every,
-            lower=1.0,
-            upper=1.0,
-            row=c,
-            data=data.share[:, None],
-            total=True,
-        )
-        tau = ca.SX.sym("tau")
-        index = np.column_stack([every, np.full(n, layout.tau)])
-        body = ca.sumsqr(v.t) - tau**2
-        b.add_constraint("translation", ca.vertcat(x, tau), body, index, lower=0.0, upper=0.0)
+    body = terms.simplex(v, 1 / n)
+    b.add_constraint("simplex", x, body, every, lower=1.0, upper=1.0, total=True)
+    if form.gauge == "unit-offset":
+        return
+    c, tau = ca.SX.sym("share"), ca.SX.sym("tau")
+    body, share = terms.length_unit(v, c, x[4]), data.share[:, None]
+    b.add_constraint("unit", x, body, every, lower=1.0, upper=1.0, row=c, data=share, total=True)
+    index = np.column_stack([every, np.full(n, layout.tau)])
+    body = terms.translation_length(v, tau)
+    b.add_constraint("translation", ca.vertcat(x, tau), body, index, lower=0.0, upper=0.0)
 
 
 def _metric(layout: MatrixLayout, x: Float, data: EnergyData) -> Float:

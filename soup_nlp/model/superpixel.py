@@ -63,17 +63,24 @@ class View:
         """Next-frame point of a reference-frame point."""
         return self.R @ point + self.lam * self.t
 
-    def apart(self, point: ca.SX, other: View, others: ca.SX) -> ca.SX:
-        """`self.move(point) - other.move(others)`, as a sum of small differences."""
-        return self._apart(self.R, point, other, others)
+    def next_gap(self, X: ca.SX, other: View, Y: ca.SX) -> ca.SX:
+        """`self.move(X) - other.move(Y)`, as a sum of small differences."""
+        return self._turned_gap(self.R, X, other, Y)
 
-    def parted(self, point: ca.SX, other: View, others: ca.SX) -> ca.SX:
-        """`self.apart(point, other, others) - (point - others)`, likewise."""
-        return self._apart((self.R0 - ca.DM.eye(3)) + self.turn, point, other, others)
+    def stretch(self, X: ca.SX, other: View, Y: ca.SX) -> ca.SX:
+        """`|X - Y| - |self.move(X) - other.move(Y)|`.
 
-    def _apart(self, turn: ca.SX, point: ca.SX, other: View, others: ca.SX) -> ca.SX:
-        turned = turn @ (point - others) + self.turn_from(other) @ others
-        return turned + self.drift_from(other)
+        From the small difference of both vectors: lengths of what is far away, in units of the
+        depth of something near, have rounding that held the dual infeasibility at 1e-5.
+        """
+        gap = X - Y
+        change = self._turned_gap((self.R0 - ca.DM.eye(3)) + self.turn, X, other, Y)
+        # |X - Y| is smooth wherever two anchors differ, so it needs no slack of its own
+        lengths = [ca.sqrt(ca.sumsqr(v) + 1e-12) for v in (gap, gap + change)]
+        return -ca.dot(change, 2 * gap + change) / (lengths[0] + lengths[1])
+
+    def _turned_gap(self, turn: ca.SX, X: ca.SX, other: View, Y: ca.SX) -> ca.SX:
+        return turn @ (X - Y) + self.turn_from(other) @ Y + self.drift_from(other)
 
     def transfer(self, ray: ca.SX) -> ca.SX:
         """Next-frame ray (3x1, free length) of a reference ray: the homography without K."""

@@ -1,7 +1,12 @@
-"""The energy terms and every constraint, each written once for one element.
+"""The whole nonlinear program in symbols, in the paper's order: every term and every constraint.
 
-A term takes the views of its superpixels and its row of data, and returns its robust norms; see
-`elements` for the columns and `oracle` for the same in numpy.
+    min   E_arap + a1 E_proj + a2 E_cont + a3 E_orient   (+ a4 E_prior + a5 E_depth + E_order)
+    s.t.  R_i in SO(3),   |n_i| = 1,   sum_i lam_i = 1, lam_i > 0,   planes that face the camera
+
+Each function is one element: an edge (a, b) of the K-NN graph, a sampled pixel, a pair (a, b) of
+neighbours, or a superpixel a. A term takes the views of its superpixels and its row of data, and
+returns norms; E is the sum of `weight * ((1 - leak) min(|vector|, sigma) + leak |vector|)` over
+all of them. `elements` has the rows, `oracle` the same energy in numpy.
 """
 
 from __future__ import annotations
@@ -16,6 +21,8 @@ from soup_nlp.model.superpixel import View
 
 Row = Mapping[str, ca.SX]
 
+# --- the energy, equation 7 ----------------------------------------------------------------------
+
 
 def arap(
     a: View, b: View, row: Row, eps: ca.SX, truncated: bool, at_anchors: bool, local: bool
@@ -29,26 +36,16 @@ def arap(
         unit = unit / _nearness(Xa, Xb)
     else:
         length_eps, angle_eps = eps * row["pixel"], eps * row["angle"]
-    gap = a.drift_from(b)
+    rotation = row["turn"] * ca.vec(a.turn_from(b))
+    translation = a.drift_from(b)
     if at_anchors:
-        gap = gap + a.turn_from(b) @ ((Xa + Xb) / 2)
-    # |Xa - Xb| is smooth wherever two anchors differ, so it needs no slack of its own. The lengths'
-    # difference comes from the small one of both vectors: lengths of what is far away, in units of
-    # the depth of something near, have rounding that held the dual infeasibility at 1e-5
-    before, change = Xa - Xb, a.parted(Xa, b, Xb)
-    lengths = [ca.sqrt(ca.sumsqr(v) + 1e-12) for v in (before, before + change)]
-    stretch = -ca.dot(change, 2 * before + change) / (lengths[0] + lengths[1])
+        translation = translation + a.turn_from(b) @ ((Xa + Xb) / 2)
+    distance = a.stretch(Xa, b, Xb)
     return [
-        Norm("rotation", weight, row["turn"] * ca.vec(a.turn_from(b)), angle_eps, sigma, leak=leak),
-        Norm("translation", weight, gap / unit, length_eps, sigma, leak=leak),
-        Norm("distance", weight, stretch / unit, length_eps, sigma, leak=leak),
+        Norm("rotation", weight, rotation, angle_eps, sigma, leak=leak),
+        Norm("translation", weight, translation / unit, length_eps, sigma, leak=leak),
+        Norm("distance", weight, distance / unit, length_eps, sigma, leak=leak),
     ]
-
-
-def _nearness(Xa: ca.SX, Xb: ca.SX) -> ca.SX:
-    """Power mean of the inverse depths of two points, close to that of the nearer point."""
-    a, b = 1 / (Xa[2] * Xa[2]), 1 / (Xb[2] * Xb[2])
-    return ca.sqrt(ca.sqrt((a * a + b * b) / 2))
 
 
 def reprojection(
@@ -76,12 +73,10 @@ def continuity(
     local: bool,
 ) -> list[Norm]:
     """E_cont of a neighbour pair, Eq. 4: boundary gaps in both frames."""
-    before, after = [], []
-    for j in range(samples):
-        ray = row["rays"][3 * j : 3 * j + 3]
-        Xa, Xb = a.point(ray), b.point(ray)
-        before.append(Xa - Xb)
-        after.append(a.apart(Xa, b, Xb))
+    rays = [row["rays"][3 * j : 3 * j + 3] for j in range(samples)]
+    points = [(a.point(ray), b.point(ray)) for ray in rays]
+    before = ca.vertcat(*(Xa - Xb for Xa, Xb in points))
+    after = ca.vertcat(*(a.next_gap(Xa, b, Xb) for Xa, Xb in points))
     f = row["factor"]
     if local:
         f = f * _nearness(a.anchor(row["ray_i"]), b.anchor(row["ray_k"]))
@@ -90,13 +85,13 @@ def continuity(
     sigma_ref = row["sigma_ref"] if ref_truncated else None
     sigma = row["sigma"] if truncated else None
     return [
-        Norm("gap_ref", row["weight"], f * ca.vertcat(*before), eps, sigma_ref),
-        Norm("gap_next", row["weight"], f * ca.vertcat(*after), eps, sigma),
+        Norm("gap_ref", row["weight"], f * before, eps, sigma_ref),
+        Norm("gap_next", row["weight"], f * after, eps, sigma),
     ]
 
 
 def orientation(a: View, b: View, row: Row, eps: ca.SX, truncated: bool) -> list[Norm]:
-    """E_orient of a neighbour pair.
+    """E_orient of a neighbour pair, Eq. 6.
 
     `1 - n_i . n_k = |n_i - n_k|^2 / 2` on the unit sphere; the square is convex off it too.
     """
@@ -130,17 +125,44 @@ def order(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     return [Norm("order", row["weight"], (lack + ca.sqrt(lack**2 + HINGE**2)) / 2, eps)]
 
 
+def _nearness(Xa: ca.SX, Xb: ca.SX) -> ca.SX:
+    """Power mean of the inverse depths of two points, close to that of the nearer point."""
+    a, b = 1 / (Xa[2] * Xa[2]), 1 / (Xb[2] * Xb[2])
+    return ca.sqrt(ca.sqrt((a * a + b * b) / 2))
+
+
+# --- the constraints of equation 7, and visibility -----------------------------------------------
+
+
 def so3(a: View) -> ca.SX:
-    """(6x1) upper triangle of `R^T R - I`; det R = 1 holds at the start (a row breaks LICQ)."""
+    """(6x1) upper triangle of `R^T R - I` = 0; det R = 1 holds at the start (a row breaks LICQ)."""
     gram = a.R.T @ a.R
     return ca.vertcat(*[gram[r, c] - (1 if r == c else 0) for c in range(3) for r in range(c + 1)])
 
 
 def unit_normal(a: View) -> ca.SX:
-    """(1x1) `|n|^2 - 1`."""
+    """(1x1) `|n|^2 - 1` = 0."""
     return ca.sumsqr(a.n) - 1
 
 
+def simplex(a: View, share: ca.SX | float) -> ca.SX:
+    """(1x1) `share * lam`, which adds up to 1 over all superpixels."""
+    return share * a.lam
+
+
 def visibility(a: View, rays: ca.SX, count: int) -> ca.SX:
-    """(count x 1) `-n . r` at the anchor and rim rays; bounded below by c > 0."""
+    """(count x 1) `-n . r` at the anchor and rim rays, at least c > 0."""
     return ca.vertcat(*[-ca.dot(a.n, rays[3 * j : 3 * j + 3]) for j in range(count)])
+
+
+# --- what fixes the gauge of (lam, d, t) where d is a variable -----------------------------------
+
+
+def length_unit(a: View, share: ca.SX, offset: ca.SX) -> ca.SX:
+    """(1x1) `share * lam d`, which adds up to 1: the mean distance of the planes."""
+    return share * a.lam * offset
+
+
+def translation_length(a: View, tau: ca.SX) -> ca.SX:
+    """(1x1) `|t|^2 - tau^2` = 0: all translations of unit scale are equally long."""
+    return ca.sumsqr(a.t) - tau**2

@@ -236,7 +236,7 @@ def test_what_two_views_differ_by_is_the_difference_of_both():
     pairs = [
         (a.turn_from(b), a.R - b.R),
         (a.drift_from(b), a.lam * a.t - b.lam * b.t),
-        (a.apart(points[0], b, points[1]), a.move(points[0]) - b.move(points[1])),
+        (a.next_gap(points[0], b, points[1]), a.move(points[0]) - b.move(points[1])),
     ]
     rng = np.random.default_rng(8)
     turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0].ravel() for _ in range(2)]
