@@ -23,6 +23,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+import casadi as ca
 import matplotlib.pyplot as plt
 
 import soup_nlp
@@ -70,7 +71,6 @@ def solve_by_program(program: str) -> None:
 
 def solve_by_casadi() -> None:
     """Read the .nl file with CasADi, solve it with Ipopt, write the .sol file."""
-    import casadi as ca
     import numpy as np
 
     builder = ca.NlpBuilder()
@@ -99,6 +99,25 @@ if pounce:
 else:
     solve_by_casadi()
 print((exported / "soup.sol").read_text().splitlines()[0])
+
+# %% [markdown]
+# ## The same without a file
+#
+# `soup_nlp.nlp` gives the program as CasADi expressions. Here Ipopt solves it from the
+# initialisation, in tangent coordinates, with less smoothing in every call and the majorant Hessian
+# (theta = 0), whose model lies above every norm.
+
+# %%
+nlp = soup_nlp.nlp(folder / "orbit.yaml", coordinates="tangent", hessian="gauss-newton")
+quiet = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
+solver = ca.nlpsol("s", "ipopt", nlp.problem, {"ipopt.mu_init": 1e-6, **quiet, **nlp.derivatives})
+start = nlp.start
+for eps in (0.3, 0.03, 0.01):
+    p = nlp.parameters(eps=eps, eps_pixel=eps, theta=0.0, ridge=0.0)
+    answer = solver(**{**start, "p": p})
+    start["x0"] = answer["x"]
+soup = nlp.soup(answer["x"])
+print(f"smoothed energy {float(answer['f']):.4f}")
 
 # %% [markdown]
 # ## Check and import

@@ -18,6 +18,7 @@ from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.solve.functions import Functions
 
 Coordinates = Literal["matrix", "tangent"]
 
@@ -31,9 +32,10 @@ class SymbolicNLP:
         record: Kernels, tables, bounds and names.
         layout: Turns x into soups.
         x: (nx,) variables.
-        p: (np,) parameters: smoothing widths, then the data of all elements.
+        p: (nt,) parameters: smoothing widths, theta and ridge.
         f: The smoothed energy, an expression of x and p.
         g: (ng,) constraints, expressions of x and p.
+        functions: The same functions in machine code.
     """
 
     case: Case
@@ -43,6 +45,7 @@ class SymbolicNLP:
     p: ca.MX
     f: ca.MX
     g: ca.MX
+    functions: Functions
 
     @property
     def problem(self) -> dict[str, ca.MX]:
@@ -51,23 +54,22 @@ class SymbolicNLP:
 
     @property
     def derivatives(self) -> dict[str, ca.Function]:
-        """Options of `nlpsol` that spare it the derivation."""
-        nlp = self.record
-        return {"grad_f": nlp.grad_f, "jac_g": nlp.jac_g, "hess_lag": nlp.hess_lag}
+        """Options of `nlpsol` that spare it the derivation, while this object exists."""
+        return {k: getattr(self.functions, k) for k in ("grad_f", "jac_g", "hess_lag")}
 
     @property
     def start(self) -> dict[str, Float]:
         """x0, p and the bounds: what the solver is called with."""
-        names = ("x0", "p", "lbx", "ubx", "lbg", "ubg")
-        return {name: getattr(self.record, name) for name in names}
+        names = ("x0", "lbx", "ubx", "lbg", "ubg")
+        return {"p": self.parameters(), **{name: getattr(self.record, name) for name in names}}
 
     def parameters(self, **theta: float) -> Float:
-        """(np,) values of p with other smoothing: `eps`, `eps_pixel` (pixels), `theta`, `ridge`.
+        """(nt,) values of p with other smoothing: `eps`, `eps_pixel` (pixels), `theta`, `ridge`.
 
         Raises:
             ModelError: another name.
         """
-        return self.record.with_theta(**theta)
+        return self.record.thetas(**theta)
 
     def soup(self, x: ca.DM | Float) -> Soup:
         """Planes and motions of a point."""
@@ -107,5 +109,6 @@ def nlp(
     else:
         made = build_tangent_nlp(case.soup, case.data, case.weights, form)
     record, layout = made
-    x, p = ca.MX.sym("x", record.nx), ca.MX.sym("p", len(record.p))
-    return SymbolicNLP(case, record, layout, x, p, *record.oracle(x, p))
+    x, p = ca.MX.sym("x", record.nx), ca.MX.sym("p", len(record.theta))
+    f, g = record.oracle(x, ca.vertcat(p, record.p[len(record.theta) :]))
+    return SymbolicNLP(case, record, layout, x, p, f, g, Functions(record))
