@@ -25,7 +25,7 @@ from soup_nlp.report.summary import certainty
 from soup_nlp.report.verdict import guess_reason, missed, verdict
 from soup_nlp.sequence.frames import IMAGES
 from soup_nlp.solve.interrupt import interruptible
-from soup_nlp.storage.files import as_path
+from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.folders import default_folder, scratch
 
 SOURCE = "Two images, or a problem file or name (`soup-nlp list`)."
@@ -150,7 +150,8 @@ def _from_file(problem: Path, pair: Mapping[str, Any], changes: Sequence[str]) -
 def _from_images(words: Sequence[Path], pair: Mapping[str, Any], changes: Sequence[str]) -> Problem:
     """The problem of two images, which are words or the options --ref and --next."""
     named = {key: pair[key] for key in ("ref", "next") if key in pair}
-    if len(words) == 2 and not named:
+    images = [word for word in words if word.suffix.lower() in IMAGES or is_file(word)]
+    if len(images) == len(words) == 2 and not named:
         named = {"ref": str(words[0]), "next": str(words[1])}
     elif words or len(named) == 1:
         found = [*map(str, words), *(f"--{key} {image}" for key, image in named.items())]

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import PathLike, as_path, is_file, parse_json
+from soup_nlp.storage.files import PathLike, parse_json, require_file
 from soup_nlp.storage.memory import require_memory
 
 ReadTree: TypeAlias = dict[str, Any]
@@ -142,8 +142,7 @@ def read_digest(path: PathLike) -> str:
 @contextmanager
 def _opened(path: PathLike) -> Iterator[h5py.File]:
     """An open file; errors of h5py in the block become DataErrors."""
-    if not is_file(as_path(path, "result file")):
-        raise DataError("result file does not exist", where=path)
+    require_file(path, "result file")
     try:
         with h5py.File(path, "r") as file:
             yield file

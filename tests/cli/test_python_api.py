@@ -98,7 +98,7 @@ def test_a_stored_result_has_what_its_run_has(run, tmp_path):
     for shown in (run._repr_html_(), stored._repr_html_()):
         assert shown.startswith("<pre>")
         assert 'alt="overview"' in shown
-    with pytest.raises(DataError, match="result file does not exist"):
+    with pytest.raises(DataError, match="result file is missing"):
         soup_nlp.load(tmp_path)
 
 

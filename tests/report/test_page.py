@@ -196,7 +196,7 @@ def test_a_component_whose_depth_is_a_guess_is_striped(shown):
 
 def test_view_of_no_result(tmp_path, capsys):
     assert main(["view", str(tmp_path)]) == 2
-    assert "result file does not exist" in capsys.readouterr().err
+    assert "result file is missing" in capsys.readouterr().err
 
 
 def test_limits_name_what_is_wrong(shown):

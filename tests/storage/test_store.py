@@ -150,7 +150,7 @@ def test_h5_failure_half_way_leaves_the_old_file(tmp_path, monkeypatch):
 
 
 def test_h5_unreadable(tmp_path):
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(DataError, match="is missing"):
         read_h5(tmp_path / "no.h5")
     (tmp_path / "text.h5").write_text("no HDF5")
     with pytest.raises(DataError, match="not a readable"):
