@@ -75,7 +75,7 @@ def compare(
     # load all problems first: a wrong file must not stop after hours of runs
     sets = [path for path in problems if is_family(path)]
     files = [path for path in problems if path not in sets]
-    chosen = [load_problem(path, [*(overrides or []), *own]) for path in files for own in sizes]
+    chosen = [load_problem(path, [*(overrides or []), *size]) for path in files for size in sizes]
     written = (*FILES, *(OF_FAMILY if sets else ()))
     subjects = [f"family {path.absolute()}" for path in sets] + [p.subject for p in chosen]
     subject = ", ".join(dict.fromkeys(subjects))

@@ -194,8 +194,8 @@ def _load(name: str, home: str) -> Any:
     """The command of a module and function such as "solve:solve"."""
     module, _, function = home.partition(":")
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    own = getattr(import_module(f"soup_nlp.cli.{module}"), function)
-    alone.command(name=name, cls=Command)(own)
+    function_of = getattr(import_module(f"soup_nlp.cli.{module}"), function)
+    alone.command(name=name, cls=Command)(function_of)
     return typer.main.get_command(alone)
 
 

@@ -112,9 +112,9 @@ def export(
     several = len(sizes) * len(forms) > 1
     written = set()
     for size, form in product(sizes, forms):
-        own = [] if size is None else [f"segmentation.superpixels={size}"]
-        own += [f"formulation.{k}={v}" for k, v in form.items() if k != "coordinates"]
-        chosen = load_problem(problem, [*(overrides or []), *own])
+        changes = [] if size is None else [f"segmentation.superpixels={size}"]
+        changes += [f"formulation.{k}={v}" for k, v in form.items() if k != "coordinates"]
+        chosen = load_problem(problem, [*(overrides or []), *changes])
         out = out or default_folder(f"export-{chosen.name}", chosen.subject)
         if not several:
             # check the folder before the work

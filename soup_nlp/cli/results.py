@@ -111,8 +111,8 @@ def import_(
             hint=f"soup-nlp check {sol} says what is wrong with it",
         )
     # answers of several solvers do not replace each other
-    own = "result" if sol.stem == "soup" else f"result-{sol.stem}"
-    target = out or folder / own
+    name = "result" if sol.stem == "soup" else f"result-{sol.stem}"
+    target = out or folder / name
     prepare_folder(target, run.problem.input_paths(), overwrite, run.problem.subject)
     text = foreign_verdict(imported)
     write_folder(target, run, dump_problem(run.problem), f"{imported.sol.message}\n{text}\n", text)

@@ -100,11 +100,11 @@ class Case:
 
     def nlp(self, form: Formulation) -> tuple[NLP, MatrixLayout | TangentLayout]:
         """The NLP of a formulation at the case's soup; tangent coordinates are about the start."""
-        own = self.data, self.weights, form
+        energy = self.data, self.weights, form
         if form.coordinates == "matrix":
-            return build_matrix_nlp(self.soup, *own)
+            return build_matrix_nlp(self.soup, *energy)
         base = TangentLayout.about(self.start.soup, self.data, exact_chart(self.data))
-        return build_tangent_nlp(self.soup, *own, layout=base)
+        return build_tangent_nlp(self.soup, *energy, layout=base)
 
 
 def prepare(
@@ -162,8 +162,8 @@ def prepare(
     data, weights = build_energy(problem, pair, seg, start, given)
     stages = solver_options(problem, start)
     larger = None if pair.size == full.size else full
-    own = problem, pair, seg, start, data, weights, start.soup, stages
-    case = Case(*own, seen or pair, larger, given)
+    parts = problem, pair, seg, start, data, weights, start.soup, stages
+    case = Case(*parts, seen or pair, larger, given)
     if not presolve:
         return case
     # one iteration of the constrained NLP is the smallest number that a solve has
@@ -253,8 +253,8 @@ def build_energy(
     if given is not None and given.used:
         # no flow holds slopes where the prior decides: they are held as those that bend
         stiffer = np.where(bends, 1.0, bent.orient / max(e.weights.orient, 1e-12))
-        own = given.log_depth, given.opened, given.error, start.component, free, stiffer
-        data = with_prior(data, *own)
+        known = given.log_depth, given.opened, given.error, start.component, free, stiffer
+        data = with_prior(data, *known)
         # a given depth has steps inside a component as well
         parts = np.arange(len(seg))
     data = at_occlusions(data, start.soup, parts, OCCLUSION_GAP, e.cont_occluded)

@@ -168,6 +168,5 @@ def full_size(full: Pair, small: Pair, result: Reconstruction) -> FullSize:
     shown = np.where(source >= 0, result.labels.ravel()[source], -1).astype(np.int32)
     there = grown_labels(shown, small.image_next, full.image_next)
     depth_next = plane_depth(there, turned, moved, full.K_next)
-    own = {"own": depth_ref.astype(np.float64)}
-    scores = score_depths(full.truth, own)
-    return FullSize(depth_ref, depth_next, labels, scores.get("own"))
+    scores = score_depths(full.truth, {"full": depth_ref.astype(np.float64)})
+    return FullSize(depth_ref, depth_next, labels, scores.get("full"))

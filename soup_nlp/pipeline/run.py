@@ -198,9 +198,9 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         depths["nlp"] = between.depth_ref
     if rigid is not None:
         depths["rigid"] = rigid
-    own = vars(case) | {"soup": solution.soup if refined is None else refined.soup}
+    given = vars(case) | {"soup": solution.soup if refined is None else refined.soup}
     return Run(
-        **own,
+        **given,
         solution=solution,
         start_reconstruction=before,
         reconstruction=after,
@@ -314,10 +314,10 @@ def solve_pair(
     if max_size != Problem.model_fields["max_size"].default:
         # the default is that of the preset
         raw["max_size"] = max_size
-    for key, own in sections.items():
-        if own is not None:
-            dump = getattr(own, "model_dump", None)
-            raw[key] = own if dump is None else dump(exclude_unset=True)
+    for key, section in sections.items():
+        if section is not None:
+            dump = getattr(section, "model_dump", None)
+            raw[key] = section if dump is None else dump(exclude_unset=True)
     raw |= {"name": title(pair.name), "input": {"kind": "memory", "hash": pair_hash(pair)}}
     begin = time.perf_counter()
 

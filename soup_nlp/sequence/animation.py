@@ -36,18 +36,18 @@ class _Buffer:
         raw = np.ascontiguousarray(array).tobytes()
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(raw)})
         self.data += raw + b"\0" * (-len(raw) % 4)
-        own: dict[str, Any] = {
+        accessor: dict[str, Any] = {
             "bufferView": len(self.views) - 1,
             "componentType": UBYTE if array.dtype == np.uint8 else FLOAT,
             "count": len(array),
             "type": kind,
         }
         if array.dtype == np.uint8:
-            own["normalized"] = True
+            accessor["normalized"] = True
         if limits:
             low, high = np.atleast_1d(array.min(axis=0)), np.atleast_1d(array.max(axis=0))
-            own |= {"min": low.tolist(), "max": high.tolist()}
-        self.accessors.append(own)
+            accessor |= {"min": low.tolist(), "max": high.tolist()}
+        self.accessors.append(accessor)
         return len(self.accessors) - 1
 
 
@@ -120,11 +120,10 @@ def _from_first(chain: Chain, track: int, first: int) -> list[RigidMotion]:
     """Motion of a track from its first frame to every frame; it rests before and after."""
     now = RigidMotion(np.eye(3), np.zeros(3))
     poses = [now] * (first + 1)
-    for k, own in enumerate(chain.tracks):
-        if k >= first:
-            label = next((label for label, name in own.items() if name == track), None)
-            now = now if label is None else chain.motion(k, label) @ now
-            poses.append(now)
+    for k in range(first, len(chain.pairs)):
+        label = chain.label(k, track)
+        now = now if label is None else chain.motion(k, label) @ now
+        poses.append(now)
     return poses
 
 

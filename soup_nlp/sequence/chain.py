@@ -16,6 +16,8 @@ from soup_nlp.geometry.superpixels import Labels
 from soup_nlp.sequence.pairs import SolvedPair, carried
 from soup_nlp.sequence.scales import Link, find_links, solve_scales
 
+MADE_BY = "soup_nlp.sequence.pairs.solve_pairs(...)"
+"""Where pairs of a chain come from, for messages."""
 SAME = 0.3
 """Smallest intersection over union of two components of one track."""
 
@@ -89,13 +91,21 @@ class Chain:
     def path(self, track: int) -> dict[int, Float]:
         """Centre (3,) of a track in the world, by frame."""
         out: dict[int, Float] = {}
-        for k, own in enumerate(self.tracks):
-            for label, name in own.items():
-                if name == track:
-                    part = self.pairs[k].result.components[label]
-                    out[k] = self.world_from_camera[k](self.scales[k] * part.centre)
-                    out[k + 1] = self.motion(k, label)(out[k])
+        for k, pair in enumerate(self.pairs):
+            if (label := self.label(k, track)) is not None:
+                centre = pair.result.components[label].centre
+                out[k] = self.world_from_camera[k](self.scales[k] * centre)
+                out[k + 1] = self.motion(k, label)(out[k])
         return out
+
+    @property
+    def track_numbers(self) -> list[int]:
+        """Numbers of the tracks; the background, 0, is none."""
+        return sorted({track for numbers in self.tracks for track in numbers.values()} - {0})
+
+    def label(self, pair: int, track: int) -> int | None:
+        """Label of a track's component in a pair; None where the pair does not show the track."""
+        return next((label for label, t in self.tracks[pair].items() if t == track), None)
 
 
 def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> Chain:
@@ -108,10 +118,12 @@ def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> 
     Raises:
         DataError: the pairs are not consecutive, or share no pixel.
     """
-    for own in (pairs, over):
-        expect(own, (list, tuple), "pairs of a chain", "soup_nlp.sequence.pairs.solve_pairs(...)")
+    for several in (pairs, over):
+        expect(
+            several, (list, tuple), "pairs of a chain", "soup_nlp.sequence.pairs.solve_pairs(...)"
+        )
     for pair in (*pairs, *over):
-        expect(pair, SolvedPair, "pair of a chain", "soup_nlp.sequence.pairs.solve_pairs(...)")
+        expect(pair, SolvedPair, "pair of a chain", MADE_BY)
     if not pairs or [(p.first, p.second) for p in pairs] != [(k, k + 1) for k in range(len(pairs))]:
         raise DataError("pairs of a chain are not consecutive", found=[p.first for p in pairs])
     links = find_links([*pairs, *over])
@@ -163,13 +175,13 @@ def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dic
     out: list[dict[int, int]] = []
     fresh = 1
     for k, count in enumerate(counts):
-        own = {0: 0}
+        numbers = {0: 0}
         back = {new: old for old, new in matches[k - 1].items()} if k else {}
         for label in range(1, count):
             if label in back:
-                own[label] = out[k - 1][back[label]]
+                numbers[label] = out[k - 1][back[label]]
             else:
-                own[label] = fresh
+                numbers[label] = fresh
                 fresh += 1
-        out.append(own)
+        out.append(numbers)
     return out

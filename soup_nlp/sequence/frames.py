@@ -28,6 +28,8 @@ IMAGES = (
     *(".heic", ".heif"),
 )
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
+DEPTHS = (".png", ".npy", ".pfm", ".dpt")
+"""Suffixes of depth maps."""
 PROBED = 3
 """Number of pairs in which points are tracked before a folder is solved."""
 LAYOUT = "frame_*"
@@ -128,11 +130,11 @@ def find_depths(images: list[Path]) -> list[Path]:
     out = []
     for path in images:
         stem = path.stem.replace("frame_", "depth_")
-        own = [path.with_name(stem + suffix) for suffix in (".png", ".npy", ".pfm", ".dpt")]
-        there = [p for p in own if p.is_file() and p != path]
-        if not there:
+        beside = [path.with_name(stem + suffix) for suffix in DEPTHS]
+        depths = [p for p in beside if p.is_file() and p != path]
+        if not depths:
             return []
-        out.append(there[0])
+        out.append(depths[0])
     return out
 
 
@@ -143,8 +145,7 @@ def depth_files(folder: Path) -> list[Path]:
         DataError: there is none.
     """
     folder = as_path(folder, "folder of depth maps")
-    kinds = (".png", ".npy", ".pfm", ".dpt")
-    every = [p for p in folder.glob("*") if p.suffix.lower() in kinds]
+    every = [p for p in folder.glob("*") if p.suffix.lower() in DEPTHS]
     found = [p for p in every if p.name.startswith("depth_")] or every
     if not found:
         raise DataError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,8 +80,7 @@ def fuse(chain: Chain) -> Cloud:
 
 def shown_tracks(chain: Chain) -> list[int]:
     """Tracks that last long enough to be shown."""
-    names = sorted({t for own in chain.tracks for t in own.values()} - {0})
-    return [t for t in names if len(chain.path(t)) >= SHOWN]
+    return [t for t in chain.track_numbers if len(chain.path(t)) >= SHOWN]
 
 
 def movers(chain: Chain, frame: int) -> Cloud:
@@ -93,9 +92,9 @@ def movers(chain: Chain, frame: int) -> Cloud:
         mask = result.sure & (result.components.of_pixel == label)
         if track in shown and mask.any():
             step = max(1, int(np.ceil(np.sqrt(mask.sum() / OF_MOVER))))
-            own = _cloud(chain, pair, mask, step, track)
-            points = own.points if pair == frame else chain.motion(pair, label)(own.points)
-            clouds.append(Cloud(points, own.colours, own.sigma, own.label))
+            cloud = _cloud(chain, pair, mask, step, track)
+            points = cloud.points if pair == frame else chain.motion(pair, label)(cloud.points)
+            clouds.append(replace(cloud, points=points))
     return _joined(clouds)
 
 

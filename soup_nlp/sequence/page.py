@@ -114,9 +114,9 @@ def _jpeg(image: Image, most: int) -> str:
 def _tracks(chain: Chain, tracks: Sequence[Mapping[str, Any]]) -> str:
     """The paths of the 3D view as a table: colour, first and last frame, length."""
     paths = [("camera", "#ffa94d", 0, [pose.t for pose in chain.world_from_camera])]
-    for own in tracks:
-        first = min(chain.path(own["track"]))
-        paths.append((f"track {own['track']}", own["colour"], first, own["path"]))
+    for track in tracks:
+        first = min(chain.path(track["track"]))
+        paths.append((f"track {track['track']}", track["colour"], first, track["path"]))
     rows = []
     for name, colour, first, path in paths:
         long = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())

@@ -127,8 +127,8 @@ def read_pair(first: int, second: int, place: Path) -> SolvedPair:
     """The pair of two frames from its result folder."""
     result = load(place)
     tree = result.tree
-    own = result.components.of_superpixel == 0
-    parallax = float(np.median(tree["start"]["parallax"][own]))
+    static = result.components.of_superpixel == 0
+    parallax = float(np.median(tree["start"]["parallax"][static]))
     # a chain holds many pairs, whose other arrays it does not need
     kept = replace(result, tree={})
     return SolvedPair(first, second, kept, dict(tree.get("truth", {})), parallax)

@@ -52,10 +52,10 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
     one = float(np.median(np.concatenate(ratio)))
     frames = []
     for k, z in depths.items():
-        own = depth_metrics(z, known[k])
+        alone = depth_metrics(z, known[k])
         shared = depth_metrics(one * z, known[k], scale="none")
-        row = {"frame": k, "mre_own_scale": own.mre, "mre_one_scale": shared.mre}
-        frames.append({**row, "own_scale": own.scale, "coverage": own.coverage})
+        row = {"frame": k, "mre_own_scale": alone.mre, "mre_one_scale": shared.mre}
+        frames.append({**row, "own_scale": alone.scale, "coverage": alone.coverage})
     means = {key: float(np.mean([f[key] for f in frames])) for key in _KEYS}
     links = []
     for k, (a, b) in enumerate(pairwise(chain.pairs)):
@@ -114,7 +114,7 @@ def chain_lines(chain: Chain, contents: Mapping[str, Any]) -> list[str]:
     for first, *rest in rows:
         cells = "".join(f"{cell:>{width}}" for cell, width in zip(rest, widths[1:]))
         lines.append(f"{first:<{widths[0]}}{cells}".rstrip())
-    long = [own for own in contents["tracks"] if len(own["path"]) > 2]
+    long = [track for track in contents["tracks"] if len(track["path"]) > 2]
     lines.append(f"tracks      {len(long)} components followed over two pairs or more")
     if contents["score"]:
         lines.append(f"accuracy    {score_text(contents['score'])}")

@@ -175,7 +175,7 @@ def _frames(
             found=len(images),
             expected="more frames, or a smaller stride",
         )
-    images, depths = ([p.absolute() for p in own] for own in (images, depths))
+    images, depths = ([p.absolute() for p in paths] for paths in (images, depths))
     beside = images[0].parent / "K.txt"
     if not camera.keys() & {"intrinsics", "fov"} and os.path.lexists(beside):
         camera = {"intrinsics": str(beside), **camera}
@@ -188,7 +188,7 @@ def _frames(
             return frames
         first = make_problem({"input": frames.pair(0, 1)}, where="sequence").load_pair()
     keep = key_frames(images, first.K_ref, most)
-    images, depths = ([own[k] for k in keep] if own else [] for own in (images, depths))
+    images, depths = ([paths[k] for k in keep] if paths else [] for paths in (images, depths))
     return file_frames(images, camera, depths, depth_scale)
 
 

@@ -64,8 +64,8 @@ def check_chain(folder: Path) -> Iterator[tuple[str, bool]]:
     stored = np.array([row["scale"] for row in contents["scales"]], float)
     yield "scales follow from the pairs", _same(stored, chain.scales)
     poses = np.array(contents["world_from_camera"], float)
-    own = np.array([m.matrix for m in chain.world_from_camera])
-    yield "camera poses follow from pairs and scales", _same(poses, own)
+    recomputed = np.array([m.matrix for m in chain.world_from_camera])
+    yield "camera poses follow from pairs and scales", _same(poses, recomputed)
 
 
 def _same(stored: Float, found: Float) -> bool:

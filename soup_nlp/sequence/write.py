@@ -91,7 +91,6 @@ def _page(chain: Chain, contents: dict[str, Any]) -> tuple[list[Image], str]:
 
 def summary(chain: Chain) -> dict[str, Any]:
     """Scales, links, poses and tracks as plain values."""
-    tracks = sorted({t for own in chain.tracks for t in own.values()} - {0})
     return {
         "frames": len(chain),
         "unit": UNIT,
@@ -112,7 +111,10 @@ def summary(chain: Chain) -> dict[str, Any]:
             for k in chain.links
         ],
         "world_from_camera": [m.matrix for m in chain.world_from_camera],
-        "tracks": [{"track": t, "path": chain.path(t), "pixels": pixels(chain, t)} for t in tracks],
+        "tracks": [
+            {"track": t, "path": chain.path(t), "pixels": pixels(chain, t)}
+            for t in chain.track_numbers
+        ],
     }
 
 
@@ -120,9 +122,8 @@ def pixels(chain: Chain, track: int) -> dict[int, int]:
     """Pixels of a track by frame."""
     return {
         k: chain.pairs[k].result.components[label].pixels
-        for k, own in enumerate(chain.tracks)
-        for label, name in own.items()
-        if name == track
+        for k in range(len(chain.pairs))
+        if (label := chain.label(k, track)) is not None
     }
 
 

@@ -150,9 +150,9 @@ def measure_all(
     known: dict[str, Row] = {}
     stored = [r for r in read_rows(path) if any_code or r.get("code") == code]
     for job, name in zip(jobs, names, strict=True):
-        own = [r for r in stored if not failed(r) and _identity(r, job.name) == name]
-        if own and not job.stale:
-            known[name] = own[-1]
+        rows = [r for r in stored if not failed(r) and _identity(r, job.name) == name]
+        if rows and not job.stale:
+            known[name] = rows[-1]
     todo = {name: job for name, job in zip(names, jobs, strict=True) if name not in known}
 
     def so_far() -> list[Row]:
@@ -171,8 +171,8 @@ def measure_all(
 
 
 def _identity(row: Mapping[str, Any], keys: Mapping[str, Any] | None = None) -> str:
-    own = row if keys is None else {k: row.get(k) for k in keys}
-    return json.dumps(plain(own), sort_keys=True)
+    named = row if keys is None else {k: row.get(k) for k in keys}
+    return json.dumps(plain(named), sort_keys=True)
 
 
 def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]]:

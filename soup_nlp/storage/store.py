@@ -69,12 +69,12 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
     Raises:
         DataError: an array cannot be stored, or the file cannot be written.
     """
-    own = {"schema": SCHEMA, "versions": json.dumps(versions()), "machine": platform.platform()}
+    about = {"schema": SCHEMA, "versions": json.dumps(versions()), "machine": platform.platform()}
     try:
         # written in memory, since HDF5 would end the process on a full disk
         image = BytesIO()
         with h5py.File(image, "w", track_order=True, libver=FORMAT) as file:
-            for key, value in (dict(attrs) | own).items():
+            for key, value in (dict(attrs) | about).items():
                 if value is not None:
                     _write_attribute(file, key, value)
             _write_group(file, tree)
