@@ -83,7 +83,7 @@ BENCH: Mapping[str, tuple[str, str]] = {
     ),
     "search": (
         "bench_accuracy:search",
-        "Search for better defaults and check them on pairs and families that did not choose.",
+        "Search for better defaults and check them on the families that did not choose them.",
     ),
     "paper": (
         "bench_paper:paper",

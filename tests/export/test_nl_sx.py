@@ -211,7 +211,7 @@ def test_expressions_that_cannot_be_written_are_refused(tmp_path):
         write_sx_nl(tmp_path / "a.nl", {"x": x, "f": ca.floor(x) * x})
     with pytest.raises(ExportError, match="not finite"):
         write_sx_nl(tmp_path / "a.nl", {"x": x, "f": x**2 * np.inf})
-    with pytest.raises(DataError, match="folder"):
+    with pytest.raises(DataError, match="cannot be written"):
         write_sx_nl(tmp_path / "none" / "a.nl", {"x": x, "f": x**2})
     assert not list(tmp_path.rglob("*.nl"))
 
