@@ -145,14 +145,14 @@ def _depths(result: object) -> dict[str, Float]:
         stored = tree.get("depth", {})
         require(tree, "depth/ref")
         return {k: require(tree, f"depth/{v}") for k, v in DEPTHS.items() if v in stored}
-    own = getattr(result, "reconstruction", None)
-    if own is None:
+    dense = getattr(result, "reconstruction", None)
+    if dense is None:
         return {"solution": _map(result, "depth")}
     others = {
         name: getattr(getattr(result, f"{name}_reconstruction", None), "depth_ref", None)
         for name in ("nlp", "start")
     }
-    found = {"solution": own.depth_ref, **others, "rigid": getattr(result, "rigid", None)}
+    found = {"solution": dense.depth_ref, **others, "rigid": getattr(result, "rigid", None)}
     return {name: z for name, z in found.items() if z is not None}
 
 

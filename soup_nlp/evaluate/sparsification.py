@@ -49,9 +49,10 @@ def sparsification(error: ArrayLike, uncertainty: ArrayLike) -> Sparsification:
     _, group = np.unique(s, return_inverse=True)
     alike = np.bincount(group, e) / np.bincount(group)
     sums = np.cumsum(alike[np.sort(group)]), np.cumsum(np.sort(e))
-    own, best = (total[last] / (last + 1) for total in sums)
+    mean_error, best = (total[last] / (last + 1) for total in sums)
     whole = float(e.mean())
-    return Sparsification(kept, own, best, float((own - best).mean() / whole) if whole > 0 else 0.0)
+    ause = float((mean_error - best).mean() / whole) if whole > 0 else 0.0
+    return Sparsification(kept, mean_error, best, ause)
 
 
 def coverage(error: ArrayLike, sigma: ArrayLike) -> list[float]:

@@ -59,8 +59,8 @@ def colourise_depth(depth: Float, near: float | None = None, far: float | None =
         far: Depth of the far end; None takes `depth_range`.
     """
     z = np.asarray(depth, np.float64)
-    own = depth_range(z)
-    near, far = own[0] if near is None else near, own[1] if far is None else far
+    nearest, farthest = depth_range(z)
+    near, far = nearest if near is None else near, farthest if far is None else far
     known = np.isfinite(z) & (z > 0)
     safe = np.clip(np.where(known, z, near), near, far)
     return _paint((1 / safe - 1 / far) / (1 / near - 1 / far), known, "turbo")

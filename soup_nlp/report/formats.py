@@ -122,9 +122,9 @@ def _rrd(folder: Path, result: Result) -> list[str]:
             points = result.points[frame] @ pose[:3, :3].T + pose[:3, 3]
             of_pixel = result.components.of_pixel
             for part in result.components:
-                own = result.sure & (of_pixel == part.label)
+                chosen = result.sure & (of_pixel == part.label)
                 name = "background" if part.label == 0 else f"component_{part.label}"
-                cloud = rr.Points3D(points[own], colors=result.images[0][own])
+                cloud = rr.Points3D(points[chosen], colors=result.images[0][chosen])
                 out.log(f"world/{name}", cloud)
         out.flush()
         out.disconnect()

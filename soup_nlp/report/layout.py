@@ -341,7 +341,7 @@ def record_of(digests: Mapping[str, str], summary: str) -> Tree:
 
 def recorded_files(tree: Mapping[str, Any]) -> dict[str, str]:
     """SHA-256 of the files of a result by name, from its record; {} without a record."""
-    own = tree.get(RECORD, {})
-    if not {"files", "sha256"} <= own.keys():
+    record = tree.get(RECORD, {})
+    if not {"files", "sha256"} <= record.keys():
         return {}
-    return dict(zip(map(str, own["files"]), map(str, own["sha256"]), strict=True))
+    return dict(zip(map(str, record["files"]), map(str, record["sha256"]), strict=True))

@@ -45,12 +45,12 @@ SIDE = 1600
 """Larger side of a picture in the page, pixels; larger pictures are resized."""
 
 
-def page(shown: Result, found: Mapping[str, Picture]) -> str:
+def page(result: Result, found: Mapping[str, Picture]) -> str:
     """The page of a result: HTML that holds everything it shows."""
     data = {
         "scene": {
             key: packed(value) if isinstance(value, np.ndarray) else value
-            for key, value in make_scene(shown).items()
+            for key, value in make_scene(result).items()
         },
         "modes": [
             {"name": name, "word": word, "title": found[name].title,
@@ -60,15 +60,15 @@ def page(shown: Result, found: Mapping[str, Picture]) -> str:
     }  # fmt: skip
     images = {name: _data_uri(picture) for name, picture in found.items()}
     parts = {
-        "title": escape(shown.name),
+        "title": escape(result.name),
         "style": web_file("page.css"),
-        "summary": _summary(shown),
+        "summary": _summary(result),
         "gallery": "\n".join(_figure(picture, images[name]) for name, picture in found.items()),
-        "limits": "\n".join(f"<li>{escape(line)}</li>" for line in limits(shown)),
-        "energy": _energy(shown),
-        "accuracy": _accuracy(shown),
-        "components": _components(shown),
-        "verdict": escape(shown.verdict) or "not recorded",
+        "limits": "\n".join(f"<li>{escape(line)}</li>" for line in limits(result)),
+        "energy": _energy(result),
+        "accuracy": _accuracy(result),
+        "components": _components(result),
+        "verdict": escape(result.verdict) or "not recorded",
         "three": web_file("three.js"),
         "script": web_file("page.js"),
         # "<" could end the script element
@@ -167,14 +167,14 @@ def table(head: list[str], rows: list[list[str]]) -> str:
     return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def _summary(shown: Result) -> str:
+def _summary(result: Result) -> str:
     """The most important figures in one line."""
-    s, m = shown.summary, shown.summary["metrics"].get("solution")
+    s, m = result.summary, result.summary["metrics"].get("solution")
     words = ["converged" if s["converged"] else f"not converged ({s['status']})"]
     words.append(f"{s['sizes']['superpixels']} superpixels")
     if m and m["mre"] is not None:
         words.append(f"MRE {m['mre']:.4f} after one {m['scale_rule']} scale")
-    usable = float((np.asarray(shown.array("input/confidence")) > 0).mean())
+    usable = float((np.asarray(result.array("input/confidence")) > 0).mean())
     words.append(f"{usable:.0%} of the flow usable")
     whole = sum(v for k, v in s["seconds"].items() if not k.startswith("nlp_"))
     if whole:
@@ -182,10 +182,10 @@ def _summary(shown: Result) -> str:
     return " &middot; ".join(escape(word) for word in words)
 
 
-def _energy(shown: Result) -> str:
+def _energy(result: Result) -> str:
     """Exact energy by stage, with a bar for each total, or for what the refinement minimises."""
-    refinement = shown.summary.get("refinement")
-    columns, rows = energy_table(shown.summary["energy"], refinement)
+    refinement = result.summary.get("refinement")
+    columns, rows = energy_table(result.summary["energy"], refinement)
     note = ""
     if refinement and "photo" in refinement["end"]:
         note = (
@@ -204,9 +204,9 @@ def _energy(shown: Result) -> str:
     return table(["stage", *columns, ""], cells) + note
 
 
-def _accuracy(shown: Result) -> str:
+def _accuracy(result: Result) -> str:
     """Scores of the solution and of the baselines."""
-    if not shown.metrics:
+    if not result.metrics:
         return "<p>There is no truth to compare with.</p>"
     rows = [
         [
@@ -216,14 +216,14 @@ def _accuracy(shown: Result) -> str:
             "" if np.isnan(gain) else f"{gain:.3f}",
             f"{100 * m.coverage:.1f} %",
         ]
-        for title, m, gain in score_rows(shown.metrics)
+        for title, m, gain in score_rows(result.metrics)
     ]
     return table(["depth", "MRE", "median error", "skill", "coverage"], rows)
 
 
-def _components(shown: Result) -> str:
+def _components(result: Result) -> str:
     """Motions of the largest components, the camera's first."""
-    parts, scale = shown.components, shown.scale
+    parts, scale = result.components, result.scale
     colours = component_colours(len(parts))
     rows = []
     for part in [*parts][:LISTED]:
@@ -235,9 +235,9 @@ def _components(shown: Result) -> str:
         rows.append(
             [
                 f'<i style="background:{_css(colours[part.label])}"></i>{name}',
-                f"{part.pixels / shown.labels.size:.1%}",
+                f"{part.pixels / result.labels.size:.1%}",
                 f"{motion.angle:.2f}&deg;",
-                f"{shift:.3g} {escape(shown.length)}",
+                f"{shift:.3g} {escape(result.length)}",
                 f"{part.residual_px:.2g} px",
             ]
         )

@@ -77,7 +77,7 @@ class Picture:
     legend: Legend | None = None
 
 
-def pictures(shown: Result) -> dict[str, Picture]:
+def pictures(result: Result) -> dict[str, Picture]:
     """All pictures of a result by name, in the order of the overview.
 
     "image_ref", "image_next", "superpixels", "components", "flow", "flow_confidence",
@@ -85,38 +85,38 @@ def pictures(shown: Result) -> dict[str, Picture]:
     Pictures of unknown quantities are left out.
     """
     found = [
-        *_images(shown),
-        *_parts(shown),
-        *_flow(shown),
-        *_depths(shown),
-        *_error(shown),
-        *_sigma(shown),
-        _normals(shown),
+        *_images(result),
+        *_parts(result),
+        *_flow(result),
+        *_depths(result),
+        *_error(result),
+        *_sigma(result),
+        _normals(result),
     ]
     return {picture.name: picture for picture in found}
 
 
-def _images(shown: Result) -> list[Picture]:
-    named = (("ref", "reference frame", shown.images[0]), ("next", "next frame", shown.images[1]))
+def _images(result: Result) -> list[Picture]:
+    named = (("ref", "reference frame", result.images[0]), ("next", "next frame", result.images[1]))
     return [Picture(f"image_{k}", title, image) for k, title, image in named]
 
 
-def _parts(shown: Result) -> list[Picture]:
+def _parts(result: Result) -> list[Picture]:
     """Superpixels and components."""
-    labels, component = shown.labels, shown.components.of_superpixel
-    back = shown.images[0]
-    number, count = len(component), len(shown.components)
+    labels, component = result.labels, result.components.of_superpixel
+    back = result.images[0]
+    number, count = len(component), len(result.components)
     colours = component_colours(count)
     pixels = np.bincount(component[labels].ravel(), minlength=count) / labels.size
     first = [
         ((int(c[0]), int(c[1]), int(c[2])), f"{k}: {share:.1%}")
         for k, (c, share) in enumerate(zip(colours, pixels, strict=True))
     ][:6]
-    kind = "component" if shown.bends.any() else "rigid component"
+    kind = "component" if result.bends.any() else "rigid component"
     word = f"one {kind}" if count == 1 else f"{count} {kind}s, share of the image"
     grey = back.astype(float).mean(axis=2, keepdims=True)
     shaded = colours[component[labels]] * (0.6 + 0.4 * grey / 255)
-    unsure = _unsure(shown, count)
+    unsure = _unsure(result, count)
     stripe = np.add.outer(np.arange(labels.shape[0]), np.arange(labels.shape[1])) % 8 < 3
     shaded[unsure[component[labels]] & stripe] = 255
     if unsure.any():
@@ -127,19 +127,19 @@ def _parts(shown: Result) -> list[Picture]:
     ]
 
 
-def _unsure(shown: Result, count: int) -> Mask:
+def _unsure(result: Result, count: int) -> Mask:
     """(count,) True for components most of whose pixels have a guess as depth, or no sigma."""
-    sigma = shown.array("depth/sigma_ref")
+    sigma = result.array("depth/sigma_ref")
     if sigma is None:
         return np.zeros(count, bool)
-    part = shown.components.of_superpixel[shown.labels].ravel()
+    part = result.components.of_superpixel[result.labels].ravel()
     guess = np.bincount(part, ~(sigma.ravel() <= MOST_SIGMA), minlength=count)
     return np.asarray(guess > 0.5 * np.bincount(part, minlength=count))
 
 
-def _flow(shown: Result) -> list[Picture]:
+def _flow(result: Result) -> list[Picture]:
     """Flow and its confidence."""
-    uv, confidence = shown.array("input/flow"), shown.array("input/confidence")
+    uv, confidence = result.array("input/flow"), result.array("input/confidence")
     if uv is None or confidence is None:
         return []
     sure = np.clip(confidence, 0, 1).astype(float)
@@ -157,29 +157,29 @@ def _flow(shown: Result) -> list[Picture]:
     ]
 
 
-def _depths(shown: Result) -> list[Picture]:
+def _depths(result: Result) -> list[Picture]:
     """Depths of both frames, of the start and of the truth, with one colour scale."""
-    s, truth = shown.scale, shown.array("truth/depth_ref")
-    maps = {k: shown.array(f"depth/{k}") for k in ("ref", "next", "start_ref")}
+    s, truth = result.scale, result.array("truth/depth_ref")
+    maps = {k: result.array(f"depth/{k}") for k in ("ref", "next", "start_ref")}
     delivered = maps["ref"]
     assert delivered is not None
     near, far = depth_range(truth if truth is not None else delivered * s)
     steps = 1 / np.linspace(1 / far, 1 / near, 5)
-    texts = tuple(f"{z:.3g} {shown.length}" if k in (0, 4) else f"{z:.3g}"
+    texts = tuple(f"{z:.3g} {result.length}" if k in (0, 4) else f"{z:.3g}"
                   for k, z in enumerate(steps))  # fmt: skip
     levels = 1 / np.linspace(1 / far, 1 / near, 128)[None]
     bar = Bar(colourise_depth(levels, near, far), texts)
     titles = {
-        "ref": "depth of the reference frame" + _score(shown, "solution"),
+        "ref": "depth of the reference frame" + _score(result, "solution"),
         "next": "depth of the next frame"
-        + _score(shown, "solution_next")
+        + _score(result, "solution_next")
         + "; grey = nothing lands there",
-        "start_ref": "depth of the start" + _score(shown, "start"),
+        "start_ref": "depth of the start" + _score(result, "start"),
     }
     names = {"ref": "depth_ref", "next": "depth_next", "start_ref": "depth_start"}
-    own = {k: _own_scale(shown, k) for k in maps}
+    scales = {k: _scale_to_truth(result, k) for k in maps}
     out = [
-        Picture(names[k], titles[k], colourise_depth(z * own[k], near, far), bar)
+        Picture(names[k], titles[k], colourise_depth(z * scales[k], near, far), bar)
         for k, z in maps.items()
         if z is not None
     ]
@@ -199,26 +199,26 @@ def _enlarged(values: Float) -> Float:
     return np.where(distance < 1.5, values[tuple(nearest)], np.nan)
 
 
-def _own_scale(shown: Result, which: str) -> float:
+def _scale_to_truth(result: Result, which: str) -> float:
     """Scale of a depth map to the truth; that of the solution, except for the start."""
     name = "start" if which == "start_ref" else "solution"
-    found = shown.summary["metrics"].get(name, {}).get("scale")
+    found = result.summary["metrics"].get(name, {}).get("scale")
     return float(found) if found else 1.0
 
 
-def _score(shown: Result, name: str) -> str:
-    m = shown.summary["metrics"].get(name)
+def _score(result: Result, name: str) -> str:
+    m = result.summary["metrics"].get(name)
     return f", MRE {m['mre']:.3f}" if m and m["mre"] is not None else ""
 
 
-def relative_error(shown: Result) -> Float | None:
+def relative_error(result: Result) -> Float | None:
     """(H, W) |z_gt - s z| / z_gt of the reference frame, NaN where unknown; None without truth."""
-    truth, z = shown.array("truth/depth_ref"), shown.array("depth/ref")
-    if truth is None or z is None or "solution" not in shown.summary["metrics"]:
+    truth, z = result.array("truth/depth_ref"), result.array("depth/ref")
+    if truth is None or z is None or "solution" not in result.summary["metrics"]:
         return None
     known = (truth > 0) & (z > 0)
     error = np.full(truth.shape, np.nan)
-    error[known] = np.abs(truth[known] - shown.scale * z[known]) / truth[known]
+    error[known] = np.abs(truth[known] - result.scale * z[known]) / truth[known]
     return error
 
 
@@ -229,8 +229,8 @@ def _share_bar(colourise: Callable[[Float], Image], limit: float, steps: int) ->
     return Bar(colourise(np.linspace(0, limit, 128)[None]), tuple(texts))
 
 
-def _error(shown: Result) -> list[Picture]:
-    error = relative_error(shown)
+def _error(result: Result) -> list[Picture]:
+    error = relative_error(result)
     if error is None:
         return []
     bar = _share_bar(colourise_error, ERROR_LIMIT, 5)
@@ -238,8 +238,8 @@ def _error(shown: Result) -> list[Picture]:
     return [Picture("error", title, colourise_error(_enlarged(error)), bar)]
 
 
-def _sigma(shown: Result) -> list[Picture]:
-    sigma = shown.array("depth/sigma_ref")
+def _sigma(result: Result) -> list[Picture]:
+    sigma = result.array("depth/sigma_ref")
     if sigma is None:
         return []
     bar = _share_bar(colourise_sigma, SIGMA_LIMIT, 4)
@@ -247,8 +247,8 @@ def _sigma(shown: Result) -> list[Picture]:
     return [Picture("confidence", title, colourise_sigma(sigma), bar)]
 
 
-def _normals(shown: Result) -> Picture:
-    n = shown.soup("n")[shown.labels]
+def _normals(result: Result) -> Picture:
+    n = result.soup("n")[result.labels]
     entries = {"faces the camera": (0, 0, -1), "right": (1, 0, 0), "left": (-1, 0, 0),
                "up": (0, -1, 0), "down": (0, 1, 0)}  # fmt: skip
     keys = []

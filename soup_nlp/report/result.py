@@ -256,15 +256,15 @@ def _ending(log: Path) -> str:
         return ""
     lines = [printable(line) for line in read_text(log, "log.txt").splitlines()]
     starts = [k for k, line in enumerate(lines) if line.startswith(("status  ", "solver  "))]
-    own = lines[starts[-1] :] if starts else []
-    return "\n".join(line for line in own if not line.startswith(("files  ", "look  ", "next  ")))
+    last = lines[starts[-1] :] if starts else []
+    return "\n".join(line for line in last if not line.startswith(("files  ", "look  ", "next  ")))
 
 
 def _metrics(row: Mapping[str, Any]) -> DepthMetrics:
     """Scores of summary.json, in which null stands for NaN."""
-    own: dict[str, Any] = {f.name: row[f.name] for f in fields(DepthMetrics)}
-    own |= {k: np.nan for k, v in own.items() if v is None and k != "cap"}
-    return DepthMetrics(**own)
+    scores: dict[str, Any] = {f.name: row[f.name] for f in fields(DepthMetrics)}
+    scores |= {k: np.nan for k, v in scores.items() if v is None and k != "cap"}
+    return DepthMetrics(**scores)
 
 
 def _result(tree: ReadTree, attrs: Mapping[str, Any]) -> Result:

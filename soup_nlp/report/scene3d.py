@@ -19,7 +19,7 @@ MOST_PIXELS = 600_000
 """Larger images are subsampled for the view."""
 
 
-def make_scene(shown: Result) -> dict[str, Any]:
+def make_scene(result: Result) -> dict[str, Any]:
     """The 3D view of a result, in the shown unit and the reference camera's axes.
 
     Returns:
@@ -40,29 +40,29 @@ def make_scene(shown: Result) -> dict[str, Any]:
         "middle", "far", "deepest": median depth, depth beyond which points are hidden at first,
             largest depth.
     """
-    rec = shown.reconstruction
+    rec = result.reconstruction
     step = int(np.ceil(np.sqrt(max(rec.labels.size / MOST_PIXELS, 1.0))))
     every = slice(None, None, step)
-    n, lam, scale = shown.soup("n"), shown.soup("lam"), shown.scale
-    R, T = nearest(shown.soup("R")), scale * lam[:, None] * shown.soup("t")
-    pivot = _pivots(shown)
+    n, lam, scale = result.soup("n"), result.soup("lam"), result.scale
+    R, T = nearest(result.soup("R")), scale * lam[:, None] * result.soup("t")
+    pivot = _pivots(result)
     camera = RigidMotion(np.eye(3), np.zeros(3))
-    if not shown.bending:
-        own = shown.components.camera.inverse
-        camera = RigidMotion(own.R, scale * own.t)
+    if not result.bending:
+        pose = result.components.camera.inverse
+        camera = RigidMotion(pose.R, scale * pose.t)
     z = scale * rec.depth_ref[np.isfinite(rec.depth_ref)]
     far, deepest = _far(z)
-    labels, start = rec.labels[every, every], shown.tree["start"]
-    surface = np.packbits(surface_cells(shown, step), bitorder="little")
+    labels, start = rec.labels[every, every], result.tree["start"]
+    surface = np.packbits(surface_cells(result, step), bitorder="little")
     return {
         "labels": labels.astype(np.uint16),
-        "planes": _single(inverse_depth(n, scale * lam * shown.soup("d"))),
+        "planes": _single(inverse_depth(n, scale * lam * result.soup("d"))),
         "motion": _single(_motion(camera.R @ R, camera(T), pivot)),
         "motionCamera": _single(_motion(R, T, pivot)),
-        "guess": (np.asarray(start["borrowed"], bool) & ~shown.bends).astype(np.uint8),
+        "guess": (np.asarray(start["borrowed"], bool) & ~result.bends).astype(np.uint8),
         "seen": (~hidden(rec)[every, every]).astype(np.uint8),
-        "sigma": _sigma(shown)[every, every],
-        "component": shown.components.of_superpixel.astype(np.uint16),
+        "sigma": _sigma(result)[every, every],
+        "component": result.components.of_superpixel.astype(np.uint16),
         "tie": np.asarray(start["tie"], np.uint8),
         "surface": surface,
         "count": len(n),
@@ -70,13 +70,13 @@ def make_scene(shown: Result) -> dict[str, Any]:
         "size": rec.labels.shape[::-1],
         "grid": labels.shape[::-1],
         "sizeNext": rec.depth_next.shape[::-1],
-        "K": shown.K[0].tolist(),
-        "KNext": shown.K[1].tolist(),
+        "K": result.K[0].tolist(),
+        "KNext": result.K[1].tolist(),
         "camera": camera.matrix.tolist(),
         "middle": float(np.median(z)) if z.size else 1.0,
         "far": far,
         "deepest": deepest,
-        "unit": shown.length,
+        "unit": result.length,
         "ties": TIES,
     }
 
@@ -87,11 +87,11 @@ def _single(values: Float) -> NDArray[np.float32]:
     return np.clip(values, limits.min, limits.max).astype(np.float32)
 
 
-def surface_cells(shown: Result, step: int) -> Mask:
+def surface_cells(result: Result, step: int) -> Mask:
     """(h - 1, w - 1) cells of four shown pixels without a jump of the depth."""
-    rec = shown.reconstruction
+    rec = result.reconstruction
     height, width = rec.labels.shape
-    found = triangles(*shown.surface, np.isfinite(rec.depth_ref), step)
+    found = triangles(*result.surface, np.isfinite(rec.depth_ref), step)
     # every cell has two triangles; the first begins at its upper left pixel
     v, u = np.divmod(found[: len(found) // 2, 0], width)
     out = np.zeros(((height - 1) // step, (width - 1) // step), bool)
@@ -99,11 +99,11 @@ def surface_cells(shown: Result, step: int) -> Mask:
     return out
 
 
-def _sigma(shown: Result) -> NDArray[np.uint8]:
+def _sigma(result: Result) -> NDArray[np.uint8]:
     """(H, W) sigma as a byte, see `make_scene`."""
-    sigma = shown.array("depth/sigma_ref")
+    sigma = result.array("depth/sigma_ref")
     if sigma is None:
-        return np.zeros(shown.labels.shape, np.uint8)
+        return np.zeros(result.labels.shape, np.uint8)
     byte = np.rint(np.clip(sigma / 0.5, 0, 1) * 254)
     return np.where(np.isfinite(sigma), byte, 255).astype(np.uint8)
 
@@ -117,16 +117,16 @@ def _far(z: Float) -> tuple[float, float]:
     return min(float(np.percentile(z, 99.5)), 4.0 * float(np.percentile(z, 70))), deepest
 
 
-def _pivots(shown: Result) -> Float:
+def _pivots(result: Result) -> Float:
     """(N, 3) centre of the component of every superpixel, or of the superpixel if it bends."""
-    parts, rec = shown.components, shown.reconstruction
+    parts, rec = result.components, result.reconstruction
     known = np.isfinite(rec.depth_ref)
     at, count = rec.labels[known], len(parts.of_superpixel)
     sums = [np.bincount(at, x, count) for x in rec.points_ref[known].T]
-    own = np.stack(sums, axis=1) / np.maximum(np.bincount(at, minlength=count), 1)[:, None]
+    centroid = np.stack(sums, axis=1) / np.maximum(np.bincount(at, minlength=count), 1)[:, None]
     common = np.stack([part.centre for part in parts])[parts.of_superpixel]
-    centre = np.where(shown.bends[:, None], own, common)
-    return np.asarray(shown.scale * np.nan_to_num(centre))
+    centre = np.where(result.bends[:, None], centroid, common)
+    return np.asarray(result.scale * np.nan_to_num(centre))
 
 
 def _motion(R: Float, T: Float, pivot: Float) -> Float:

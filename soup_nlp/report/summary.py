@@ -143,12 +143,12 @@ def certainty(run: Run) -> dict[str, float]:
         return float(mask.mean())
 
     given = np.zeros(len(sizes), bool) if run.given is None else run.given.held
-    own = sure & ~given[labels]
+    by_flow = sure & ~given[labels]
     return {
         "determined": share(sure),
-        "flow": share(own & (tie == TIES.index("reference"))),
-        "contact": share(own & (tie == TIES.index("contact below"))),
-        "outline": share(own & (tie > TIES.index("contact below"))),
+        "flow": share(by_flow & (tie == TIES.index("reference"))),
+        "contact": share(by_flow & (tie == TIES.index("contact below"))),
+        "outline": share(by_flow & (tie > TIES.index("contact below"))),
         **({} if run.given is None else {"given": share(sure & given[labels])}),
         "guess": share(~sure),
         **{name: share(mask) for name, mask in guess.items()},

@@ -83,12 +83,12 @@ def facts(run: Run, limit: float | None = None) -> str:
     s, shares = run.solution, certainty(run)
     whole = {k: v for k, v in run.seconds.items() if not k.startswith("nlp_")}
     inner = {k[4:]: v for k, v in run.seconds.items() if k.startswith("nlp_")}
-    own = {k: v for k, v in run.residuals.items() if k not in OF_ANSWER}
+    delivered = {k: v for k, v in run.residuals.items() if k not in OF_ANSWER}
     answer = _numbers({k: s.residuals[k] for k in OF_ANSWER if k in s.residuals}, ".1e")
     sections = {
         "status": _status(run),
         "energy": _energies(run),
-        "residuals": [_numbers(own, ".1e"), *[f"Ipopt's answer: {answer}"] * bool(answer)],
+        "residuals": [_numbers(delivered, ".1e"), *[f"Ipopt's answer: {answer}"] * bool(answer)],
         "depth": depth_words(run, shares),
         "certainty": certainty_lines(shares),
         "accuracy": [protocol(run.metrics), *accuracy(run.metrics)] if run.metrics else [],
@@ -210,13 +210,13 @@ def score_rows(metrics: Mapping[str, DepthMetrics]) -> list[tuple[str, DepthMetr
 
 def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
     """Table of the scores; the next frame is listed where only that one has a truth."""
-    shown = {k: m for k, m in metrics.items() if k != "solution_next" or "constant" not in metrics}
+    listed = {k: m for k, m in metrics.items() if k != "solution_next" or "constant" not in metrics}
     return [
         f"{'':<17}{'MRE':>8}{'median':>9}{'skill':>8}{'coverage':>10}",
         *(
             f"{title:<17}{m.mre:>8.4f}{m.median_relative:>9.4f}"
             f"{'' if np.isnan(gain) else f'{gain:.3f}':>8}{m.coverage:>10.1%}"
-            for title, m, gain in score_rows(shown)
+            for title, m, gain in score_rows(listed)
         ),
     ]
 
@@ -301,16 +301,16 @@ def depth_words(run: Run, shares: Mapping[str, float]) -> list[str]:
     return lines + ([f"try {'; '.join(hints)}"] if hints else [])
 
 
-def limits(shown: Result) -> list[str]:
+def limits(result: Result) -> list[str]:
     """Sentences on the limits of a result and on what to try; at least one."""
-    s, shares, parts = shown.summary, shown.summary.get("certainty", {}), shown.components
-    usable = float((np.asarray(shown.array("input/confidence")) > 0).mean())
-    pixels = np.asarray(shown.tree["segmentation"]["sizes"], float)
-    bends = float(pixels[shown.bends].sum() / pixels.sum())
-    has_parallax = not shown.at_rest and not shown.bending
+    s, shares, parts = result.summary, result.summary.get("certainty", {}), result.components
+    usable = float((np.asarray(result.array("input/confidence")) > 0).mean())
+    pixels = np.asarray(result.tree["segmentation"]["sizes"], float)
+    bends = float(pixels[result.bends].sum() / pixels.sum())
+    has_parallax = not result.at_rest and not result.bending
     guess, flat = shares.get("guess", 0.0), shares.get("flat", 0.0)
     some = "1 component" if len(parts) == 2 else f"{len(parts) - 1} components"
-    moving = 1 - parts.background.pixels / shown.labels.size
+    moving = 1 - parts.background.pixels / result.labels.size
     sentences = (
         (
             not s["converged"] and s["status"] != "Skipped",
@@ -322,13 +322,13 @@ def limits(shown: Result) -> list[str]:
             " surroundings. Try a better flow (flow.source).",
         ),
         (
-            shown.at_rest,
+            result.at_rest,
             "The flow is that of a camera that stands still or only turns: images from one place"
             " hold no depth. What is shown is a guess. Try frames between which the camera moves"
             " aside.",
         ),
         (
-            shown.bending and not shown.at_rest,
+            result.bending and not result.at_rest,
             "Surfaces are taken to bend: without one rigid motion depth follows from the surfaces'"
             " own stretching, and relief is weakly determined.",
         ),

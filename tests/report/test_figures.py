@@ -29,21 +29,43 @@ from soup_nlp.report.figures import (
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 
 
-def turbo(level):
-    return (np.array(matplotlib.colormaps["turbo"](level)[:3]) * 255).round().astype(np.uint8)
+def level(name, k):
+    """Colour number k of a map of matplotlib."""
+    return [round(255 * x) for x in matplotlib.colormaps[name](k)[:3]]
 
 
-def test_depth_colours():
-    z = np.array([[1.0, 4 / 2.5, 4.0], [0.01, 1e6, np.nan], [0.0, -1.0, np.inf]])
-    out = colourise_depth(z, 1.0, 4.0)
-    assert (out.dtype, out.shape) == (np.uint8, (3, 3, 3))
-    np.testing.assert_array_equal(out[0, 0], turbo(255))
-    np.testing.assert_array_equal(out[0, 2], turbo(0))
-    np.testing.assert_array_equal(out[1, 0], turbo(255))
-    np.testing.assert_array_equal(out[1, 1], turbo(0))
-    np.testing.assert_array_equal(out[0, 1], turbo(128))
-    assert (out[1, 2] == UNKNOWN).all()
-    assert (out[2] == UNKNOWN).all()
+GREY, WHITE, BLACK = [UNKNOWN] * 3, [255] * 3, [0] * 3
+NEAR, FAR = level("turbo", 255), level("turbo", 0)
+BRIGHT = level("inferno", 255)
+
+
+@pytest.mark.parametrize(
+    ("colourise", "values", "colours"),
+    [
+        (
+            lambda z: colourise_depth(z, 1.0, 4.0),
+            [1.0, 4 / 2.5, 4.0, 0.01, 1e6, np.nan, 0.0, -1.0, np.inf],
+            [NEAR, level("turbo", 128), FAR, NEAR, FAR, GREY, GREY, GREY, GREY],
+        ),
+        (colourise_error, [0.0, 0.2, 7.0, np.nan], [level("inferno", 0), BRIGHT, BRIGHT, GREY]),
+        (
+            colourise_normals,
+            [[0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0], [np.nan, 0, 0]],
+            [[128, 128, 255], [255, 128, 128], [128, 0, 128], GREY],
+        ),
+        (
+            # red, and darker beyond the limit
+            lambda uv: colourise_flow(uv, 1.0),
+            [[1.0, 0.0], [5.0, 0.0], [0.0, 0.0], [np.nan, np.nan]],
+            [[255, 0, 0], [191, 0, 0], WHITE, BLACK],
+        ),
+    ],
+    ids=["depth", "error", "normals", "flow"],
+)
+def test_colours(colourise, values, colours):
+    out = colourise(np.array([values]))
+    assert out.dtype == np.uint8
+    np.testing.assert_array_equal(out[0], colours)
 
 
 def test_depth_range_is_robust():
@@ -61,22 +83,19 @@ def test_depth_range_is_robust():
 
 def test_flow_wheel():
     assert colour_wheel().shape == (55, 3)
-    right, down, left, up = (
-        colourise_flow(np.array([[uv]], float), 1.0)[0, 0].astype(int)
-        for uv in ((1, 0), (0, 1), (-1, 0), (0, -1))
+    down, left, up = (
+        colourise_flow(np.array([[uv]], float), 1.0)[0, 0] for uv in ((0, 1), (-1, 0), (0, -1))
     )
-    np.testing.assert_array_equal(right, [255, 0, 0])
-    assert down[1] > 200  # yellow
-    assert down[0] > 200
-    assert left[2] > 200  # cyan
-    assert left[1] > 200
-    assert up[2] > 200  # blue to violet
-    assert up[1] < 50
-    assert (colourise_flow(np.zeros((2, 2, 2))) == 255).all()
-    unknown = np.full((1, 2, 2), np.nan)
-    assert not colourise_flow(unknown).any()
-    beyond = colourise_flow(np.array([[[5.0, 0.0]]]), 1.0)[0, 0]
-    np.testing.assert_array_equal(beyond, [191, 0, 0])
+    # yellow, cyan, blue to violet
+    assert min(down[:2]) > 200
+    assert min(left[1:]) > 200
+    assert up[2] > 200 > 50 > up[1]
+    key = wheel_key(65).astype(int)
+    assert (key[0, 0] == 255).all()
+    np.testing.assert_allclose(key[32, 32], 255, atol=4)
+    # motion to the right is red, as in the flow
+    assert key[32, 63][0] > 240
+    assert key[32, 63][1] < 30
 
 
 def test_flow_colour_is_continuous_except_at_the_seam():
@@ -89,13 +108,6 @@ def test_flow_colour_is_continuous_except_at_the_seam():
     assert step.max() <= 43
     assert step[:, :2].max() < 12
     assert np.abs(out[0] - out[-1]).max() < 12
-
-
-def test_error_colours():
-    out = colourise_error(np.array([[0.0, 0.2, 7.0, np.nan]])).astype(int)[0]
-    np.testing.assert_array_equal(out[1], out[2])
-    assert out[1].sum() > out[0].sum()
-    assert (out[3] == UNKNOWN).all()
 
 
 @pytest.mark.parametrize("name", ["turbo", "inferno", "viridis"])
@@ -123,22 +135,6 @@ def test_the_limit_of_a_flow_ignores_outliers():
     uv[0, 0] = (300, 400)
     assert flow_limit(uv) == pytest.approx(15, rel=0.02)
     assert flow_limit(np.full((2, 2, 2), np.nan)) == 1.0
-
-
-def test_wheel_key():
-    key = wheel_key(65).astype(int)
-    assert (key[0, 0] == 255).all()
-    np.testing.assert_allclose(key[32, 32], 255, atol=4)
-    # motion to the right is red, as in the flow
-    assert key[32, 63][0] > 240
-    assert key[32, 63][1] < 30
-
-
-def test_normal_colours():
-    n = np.array([[[0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0], [np.nan, 0, 0]]])
-    np.testing.assert_array_equal(
-        colourise_normals(n)[0], [[128, 128, 255], [255, 128, 128], [128, 0, 128], [UNKNOWN] * 3]
-    )
 
 
 def test_superpixel_boundaries():
