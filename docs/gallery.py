@@ -9,10 +9,11 @@ from PIL import Image
 
 import soup_nlp
 from soup_nlp.report.figures import strip
+from soup_nlp.report.findings import certainty_lines, found_words, hints
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import result_of
 from soup_nlp.report.summary import certainty, summary
-from soup_nlp.report.verdict import certainty_lines, depth_words
+from soup_nlp.report.verdict import sectioned
 
 PAGE = Path(__file__).with_name("gallery.md")
 OPTIONS = ("segmentation.superpixels=300",)
@@ -31,16 +32,13 @@ def made(scene: str) -> str:
     shares = certainty(run)
     scores = (f"{name} {run.metrics[name].mre:.3f}" for name in ("solution", "constant"))
     sections = {
-        "depth": depth_words(run, shares),
+        "found": found_words(run),
         "certainty": certainty_lines(shares),
+        "try": hints(run, shares),
         "MRE": [", ".join(scores)],
         "exit code": [f"{0 if run.good else 1}"],
     }
-    return "".join(
-        f"{'' if k else title:<12}{line}\n"
-        for title, lines in sections.items()
-        for k, line in enumerate(lines)
-    )
+    return sectioned(sections) + "\n"
 
 
 if __name__ == "__main__":

@@ -20,9 +20,10 @@ from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, DataError, SoupError
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run as run_problem
+from soup_nlp.report.findings import guess_reason
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.summary import certainty
-from soup_nlp.report.verdict import guess_reason, missed, verdict
+from soup_nlp.report.verdict import missed, verdict
 from soup_nlp.sequence.frames import IMAGES
 from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.storage.files import as_path, is_file
@@ -88,7 +89,9 @@ def solve(
         bool, typer.Option("--json", help="Print summary.json instead of the verdict.", **OUTPUT)
     ] = False,
     quiet: options.Quiet = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All phases.", **OUTPUT)] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="All phases, and more on the solver.", **OUTPUT)
+    ] = False,
 ) -> None:
     """Solve a pair of frames and write a result folder."""
     if no_refine and no_nlp:
@@ -220,15 +223,19 @@ def solve_problem(
 
         code, why = exit_code(run, mre_at_most)
 
+        said = []
+
         def log_text(files: list[str]) -> str:
             log.stage("files")
-            said = verdict(run, folder, files, mre_at_most)
-            log.lines.append(f"{said}\nexit code   {code}: {why}")
+            for details in (log.verbose, True):
+                told = verdict(run, folder, files, mre_at_most, details)
+                said.append(f"{told}\nexit code   {code}: {why}")
+            log.lines.append(said[-1])
             return "\n".join(log.lines) + "\n"
 
         write_folder(folder, run, dump_problem(chosen), log_text, ipopt_log=ipopt_log)
     summary = folder / "summary.json"
-    print(summary.read_text(encoding="utf-8") if as_json else log.lines[-1])
+    print(summary.read_text(encoding="utf-8") if as_json else said[0])
     return code
 
 

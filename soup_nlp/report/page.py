@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Image
 from soup_nlp.errors import DataError
 from soup_nlp.report.colour import component_colours
+from soup_nlp.report.findings import limits
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.report.result import Result
 from soup_nlp.report.scene3d import make_scene
-from soup_nlp.report.verdict import energy_table, limits, score_rows
+from soup_nlp.report.verdict import energy_table, score_rows
 from soup_nlp.storage.store import plain
 
 MODES = {

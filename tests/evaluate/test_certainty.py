@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR
+from soup_nlp.report.findings import GUESSES, certainty_lines, guess_reason
 from soup_nlp.report.summary import certainty
-from soup_nlp.report.verdict import GUESSES, certainty_lines, guess_reason
 from soup_nlp.start.components import FIXED, TIES
 
 REASONS = GUESSES

@@ -18,13 +18,13 @@ from soup_nlp.config.problem import dump_problem, make_problem
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report import scene3d
+from soup_nlp.report.findings import limits
 from soup_nlp.report.folder import write_folder
 from soup_nlp.report.page import MODES, page
 from soup_nlp.report.pictures import _enlarged, pictures
 from soup_nlp.report.result import result_of
 from soup_nlp.report.scene3d import make_scene, surface_cells
 from soup_nlp.report.summary import summary
-from soup_nlp.report.verdict import limits
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,71 @@
+"""The printed verdict: what was found comes first, what concerns the solver only on request."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soup_nlp.report import findings
+from soup_nlp.report.summary import certainty
+from soup_nlp.report.verdict import energy_table, facts
+
+
+def titles(text):
+    return [line[:12].strip() for line in text.splitlines() if not line.startswith(" ")]
+
+
+def test_the_answers_come_before_the_solver(small_run):
+    short, full = (facts(small_run, 0.5, details=details) for details in (False, True))
+    assert [t for t in titles(short) if t != "try"] == [
+        "status", "found", "certainty", "accuracy", "expected", "seconds",
+    ]  # fmt: skip
+    added = [t for t in titles(full) if t not in titles(short)]
+    assert added == ["flow", "energy", "residuals"]
+    assert set(short.splitlines()) <= set(full.splitlines())
+
+
+def test_what_moves_is_told_with_its_size_length_and_direction(small_run):
+    camera, *moving = findings.found_words(small_run)
+    centre = small_run.metrics["solution"].scale * small_run.camera.centre
+    # the camera of this scene moves sideways
+    way = "to the right" if centre[0] > 0 else "to the left"
+    assert camera.startswith(f"the camera moves by {np.linalg.norm(centre):.3g} m {way}")
+    shares = [part.pixels / small_run.segmentation.labels.size for part in small_run.components]
+    assert [f"{s:.0%} of the image moves" for s in shares[1:] if s >= 0.01] == [
+        line.partition(" by ")[0] for line in moving if "moves by itself" in line
+    ]
+
+
+@pytest.mark.parametrize(
+    ("vector", "way"),
+    [([0, -2, 1], "up"), ([0, 2, 1], "down"), ([0, 0, 3], "ahead"), ([-3, 0, 1], "to the left")],
+)
+def test_a_shift_has_a_length_and_a_direction(vector, way, small_run):
+    length, scale = np.linalg.norm(vector), small_run.metrics["solution"].scale
+    assert findings._shift(small_run, np.array(vector)) == f"{scale * length:.3g} m {way}"
+    # without a truth the length is relative
+    bare = replace(small_run, metrics={})
+    share = length / np.nanmedian(small_run.reconstruction.depth_ref)
+    expected = f"{share:.1%} of the median depth {way}"
+    assert findings._shift(bare, np.array(vector)) == expected
+
+
+def test_hints_name_what_would_help(small_run):
+    shares = {**certainty(small_run), "rest": 0.0, "flat": 0.1, "scale": 0.1}
+    (told,) = findings.hints(small_run, shares)
+    assert "frames farther apart in time" in told
+    assert "--depth-prior" in told
+    (told,) = findings.hints(small_run, {**shares, "rest": 0.9})
+    assert "moves aside" in told
+    assert findings.hints(small_run, dict.fromkeys(shares, 0.0)) == []
+
+
+def test_the_table_of_energies_ends_with_what_the_refinement_lowers():
+    energy = {k: {"total": v, "arap": 1.0} for k, v in zip(("start", "nlp", "solution"), (9, 5, 6))}
+    assert energy_table(energy, None)[0] == ["total", "arap"]
+    stages = {"start": {"total": 90.0}, "begin": {"total": 50.0}}
+    columns, rows = energy_table(energy, {**stages, "end": {"total": 40.0, "photo": 2.0}})
+    assert columns[-1] == "E + E_photo"
+    assert rows == {"start": [9, 1.0, 90.0], "NLP": [5, 1.0, 50.0], "solution": [6, 1.0, 40.0]}
