@@ -26,6 +26,7 @@ COMMANDS = (
     "bench chain -o {out}/accuracy --data {data}",
     "bench paper -o {out}/paper --data {data} --limit 2 --superpixels 500 --analysis 250",
     "bench speed -o {out}/speed --superpixels 500,1000,2000 --neighbours 20",
+    "bench cost -o {out}/speed",
     "family out/matrix --sizes 100 --starts hard",
     "family out/tangent --sizes 100,250 --starts hard --coordinates tangent",
     "compare out/matrix out/tangent -o {out}/solvers --seconds 20 --iterations 500"

@@ -1,4 +1,4 @@
-"""Commands bench speed and bench chain: seconds and growth, one scale of a sequence."""
+"""Commands bench speed, cost and chain: seconds and growth, memory, one scale of a sequence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import pandas as pd
 import typer
 
 from soup_nlp.bench import speed as timing
+from soup_nlp.bench.accuracy import measure_pair
 from soup_nlp.bench.chain import chain_page, measure_chain, sequences
+from soup_nlp.bench.cost import cost_cells, cost_page
 from soup_nlp.bench.study import Cell, measure_cells, show
 from soup_nlp.cli.bench_accuracy import Only, Width
 from soup_nlp.cli.options import Data, Out, Overwrite, Quiet, RowProgress, Set, numbers, words
@@ -73,6 +75,20 @@ def _result_of(row: Row) -> str:
         f" E {row['energy']['total']:.4g}; LM {reference['cpu_seconds']:.1f} CPU s,"
         f" E {reference['energy']['total']:.4g}"
     )
+
+
+def cost(
+    out: Out = Path("out/bench/speed"), overwrite: Overwrite = False, quiet: Quiet = False
+) -> None:
+    """Time and memory of whole solves over N and image size, each in a process of its own."""
+    claim(out, ("cost.md",), overwrite)
+    say = RowProgress(quiet, lambda row: f"{show(row['seconds'], '.0f')} s")
+    run = partial(measure_all, say=say)
+    frame = measure_cells(cost_cells(), measure_pair, out / "cost.jsonl", run, own_process=True)
+    with staged(out) as new:
+        write_text(new / "cost.md", cost_page(frame))
+    print((out / "cost.md").read_text(encoding="utf-8"))
+    raise typer.Exit(1 if _failed(frame) else 0)
 
 
 def chain(

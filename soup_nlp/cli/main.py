@@ -81,6 +81,10 @@ BENCH: Mapping[str, tuple[str, str]] = {
         "bench_speed:speed",
         "Time the solver over N and K, each run in a process of its own; resumes what is stored.",
     ),
+    "cost": (
+        "bench_speed:cost",
+        "Time and memory of whole solves over N and image size, each in a process of its own.",
+    ),
     "search": (
         "bench_accuracy:search",
         "Search for better defaults and check them on the families that did not choose them.",

@@ -218,17 +218,8 @@ def _row(place: str) -> Row | None:
 def result_arrays(run: Run) -> dict[str, Any]:
     """Every array of a run by group and name; records hold more than `TABLE` names."""
     pair, rec, nlp, sure = run.pair, run.reconstruction, run.nlp_reconstruction, run.confidence
-    form, parts, refined = run.problem.formulation, run.components, run.refined
+    form, parts = run.problem.formulation, run.components
     assert pair.flow is not None
-    rounds = () if refined is None else refined.rounds
-    by_round = {
-        key: np.array([getattr(one, key) for one in rounds])
-        for key in ["mrf_energy", "bound", "gap", "moved", "ties", "iterations", "taken", "seconds"]
-    }
-    by_kind = {
-        key: np.array([list(getattr(one, key).values()) for one in rounds])
-        for key in ("proposed", "accepted")
-    }
     return {
         "input": {**vars(pair), "flow": pair.flow.uv, "confidence": pair.flow.confidence},
         "segmentation": vars(run.segmentation),
@@ -241,16 +232,7 @@ def result_arrays(run: Run) -> dict[str, Any]:
         "start": {**vars(run.start.soup), **vars(run.start), "bending": run.start.bending},
         "solution": vars(run.soup),
         "nlp": vars(run.solution.soup),
-        "refine": {
-            **{
-                f"energy_{k}": np.array([one.energy[k] for one in rounds]) for k in rounds[0].energy
-            },
-            **by_round,
-            **by_kind,
-            "kinds": np.array(list(rounds[0].proposed)),
-        }
-        if rounds
-        else {},
+        "refine": _rounds(run),
         "answer": vars(run.answer),
         "multipliers": dict(run.solution.multipliers),
         "iterations": {
@@ -274,6 +256,25 @@ def result_arrays(run: Run) -> dict[str, Any]:
             "borrowed": np.array([c.borrowed for c in parts]),
         },
         "truth": {} if pair.truth is None else vars(pair.truth),
+    }
+
+
+def _rounds(run: Run) -> dict[str, Any]:
+    """The refinement by round, and by kind of particle; empty without rounds."""
+    refined = run.refined
+    if refined is None or not refined.rounds:
+        return {}
+
+    def by_round(key: str) -> list[Any]:
+        return [getattr(one, key) for one in refined.rounds]
+
+    scalars = ["mrf_energy", "bound", "gap", "moved", "ties", "iterations", "taken", "seconds"]
+    kinds = {k: [list(row.values()) for row in by_round(k)] for k in ("proposed", "accepted")}
+    energy = {f"energy_{k}": [one[k] for one in by_round("energy")] for k in refined.energy}
+    columns = {**energy, **{key: by_round(key) for key in scalars}, **kinds}
+    return {
+        **{key: np.array(column) for key, column in columns.items()},
+        "kinds": np.array(list(refined.rounds[0].proposed)),
     }
 
 

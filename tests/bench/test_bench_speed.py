@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers_rows import square
 
+from soup_nlp.bench.cost import cost_cells, cost_page
 from soup_nlp.bench.processes import alone, machine
 from soup_nlp.bench.speed import (
     exponent,
@@ -115,6 +116,17 @@ def test_page_and_picture(tmp_path):
         plot_growth(tmp_path / name, frame_of(shown))
         assert (tmp_path / name).stat().st_size > 5000
     assert "No run" in speed_page(frame_of(rows[-1:]))
+
+
+def test_the_page_of_costs_leaves_rendering_out():
+    cells = cost_cells()
+    stages = {"load": 50.0, "flow": 2.0, "nlp": 7.0, "nlp_presolve": 6.0}
+    result = {"ok": True, "error": None, "code": "c", "cpu_seconds": 60.0, "stages": stages}
+    rows = [{**cell.identity(), **result, "peak_bytes": 2**30} for cell in cells]
+    page = cost_page(frame_of(rows))
+    assert "| street 512 x 218, dis | 9 | 9 | 9 |" in page
+    assert page.count("| 1.0 | 1.0 | 1.0 |") == 3
+    assert [cell.variant for cell in cells[:3]] == ["N = 250", "N = 1000", "N = 2000"]
 
 
 def test_the_reference_solver_ends_at_the_solvers_smoothing():
