@@ -5,7 +5,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from soup_nlp.data.inputs import SceneInput
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.data.scenes.everyday import LAYOUTS
@@ -16,7 +15,6 @@ from soup_nlp.geometry import camera
 
 WIDTH, HEIGHT = 160, 120
 ALL = list(LAYOUTS)
-BENDS = ("handheld", "standing")
 PARALLAX = {"swing": (1, 7), "jam": (0.05, 2), "facade": (1.5, 7), "corridor": (4, 14)}
 """Bounds of the background's median parallax, px at 640 columns."""
 MOVES = {"handheld": (0.03, 0.2), "swing": (0.1, 0.32), "jam": (0.3, 0.65), "standing": (0.05, 0.3)}
@@ -28,42 +26,12 @@ def pair(name: str, seed: int = 0) -> Pair:
     return render_scene(name, seed, WIDTH, HEIGHT)
 
 
-def points(p: Pair) -> np.ndarray:
-    return p.truth.depth_ref[..., None] * camera.rays(p.K_ref, camera.pixel_grid(*p.size))
-
-
 def background_parallax(p: Pair) -> np.ndarray:
     """Flow (N,) of the static background beyond the camera's rotation, px at 640 columns."""
     uv, R = camera.pixel_grid(*p.size), p.truth.motions[0, :3, :3]
     turned = camera.project(p.K_next, camera.rays(p.K_ref, uv) @ R.T) - uv
     left = np.linalg.norm(p.truth.flow - turned, axis=-1)
     return left[p.truth.components == 0] * 640 / WIDTH
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_depth_motion_and_flow_agree(name):
-    p = pair(name)
-    T, uv = p.truth, camera.pixel_grid(*p.size)
-    moved = points(p) + T.scene_flow
-    np.testing.assert_allclose(camera.project(p.K_next, moved), uv + T.flow, rtol=0, atol=1e-6)
-    known = np.isfinite(T.motions).all(axis=(1, 2))
-    assert known.tolist() == [True] + [name not in BENDS] * (len(known) - 1)
-    M = T.motions[T.components]
-    rigid = np.einsum("hwij,hwj->hwi", M[..., :3, :3], points(p)) + M[..., :3, 3]
-    on = known[T.components]
-    np.testing.assert_allclose(rigid[on], moved[on], rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_images_carry_the_flow(name):
-    p = pair(name)
-    T, uv = p.truth, camera.pixel_grid(*p.size)
-    at = np.round(uv + T.flow).astype(int)[~T.occluded]
-    there = p.image_next[at[:, 1], at[:, 0]].astype(float)
-    here = p.image_ref[~T.occluded].astype(float)
-    away = p.image_next[np.roll(at[:, 1], 7), np.roll(at[:, 0], 5 * WIDTH)]
-    assert abs(there - here).mean() < 0.35 * abs(away - here).mean()
-    assert 60 < p.image_ref.mean() < 180
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -119,8 +87,3 @@ def test_an_ellipsoid_by_hand():
     at = np.array([[0.0, 0.0, -3.0], [1.0, 0.0, 0.0], [0.0, np.sqrt(2), 1.5 * np.sqrt(2)]])
     normal = [[0, 0, -1], [1, 0, 0], np.array([0, 3, 2]) / np.sqrt(13)]
     np.testing.assert_allclose(shape.normals(at, 0), normal, atol=1e-12)
-
-
-def test_problem_files_know_every_scene():
-    for name in ALL:
-        assert SceneInput.make({"kind": "scene", "scene": name}).scene == name

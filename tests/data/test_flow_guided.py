@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_flow import texture
 
-from soup_nlp.data.flow import dis
+from soup_nlp.data.flow import dis, guided
 from soup_nlp.data.flow.consistency import confidence_of
 from soup_nlp.data.flow.guided import dominant_homographies, guided_flow
 
@@ -82,3 +82,24 @@ def test_flow_with_and_without_homographies(planes, monkeypatch):
     sure = flow.confidence > 0.5
     assert sure.mean() > 0.3
     assert np.median(np.linalg.norm(flow.uv - truth(ROAD), axis=-1)[sure]) < 0.3
+
+
+@pytest.mark.parametrize(("error", "taken"), [(0.2, False), (0.8, True)])
+def test_a_guided_flow_must_be_better_by_a_margin(monkeypatch, error, taken):
+    """Images without contrast: only the round trip counts, and that of the new flow is exact."""
+    shape = (60, 80)
+    grey = np.full(shape, 128, np.uint8)
+
+    def constant(u: float) -> np.ndarray:
+        return np.full((*shape, 2), (u, 0.0), np.float32)
+
+    def match(a, b):
+        return constant(0.1), constant(-0.1)
+
+    monkeypatch.setattr(guided, "dominant_homographies", lambda *a: [np.eye(3)])
+    monkeypatch.setattr(guided, "_MARGIN", 0.5)
+    first, back = constant(0.0), constant(error)
+    flow, gap = guided_flow(grey, grey, match, first, back, 1)
+    inside = (slice(20, 40), slice(20, 60))
+    np.testing.assert_allclose(flow[inside][..., 0], 0.1 if taken else 0.0, atol=1e-6)
+    np.testing.assert_allclose(gap[inside], 0.0 if taken else error, atol=1e-4)
