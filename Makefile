@@ -45,8 +45,9 @@ docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict --quiet
 
 # lowest and newest packages, Python 3.11 to 3.13, odd surroundings: an hour, most of it installation
-versions:
-	$(PYTHON) tests/tools/versions.py
+versions: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check nox
+	$(BIN)/nox
 
 results: $(VENV)/.optional
 	$(BIN)/soup-nlp bench all --out results --overwrite $(if $(DATA),--data $(DATA))
