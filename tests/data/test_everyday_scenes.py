@@ -8,9 +8,8 @@ import pytest
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.data.scenes.everyday import LAYOUTS
-from soup_nlp.data.scenes.materials import Materials
 from soup_nlp.data.scenes.shapes import Ellipsoid
-from soup_nlp.data.scenes.things import person
+from soup_nlp.data.scenes.things import Materials, person
 from soup_nlp.geometry import camera
 
 WIDTH, HEIGHT = 160, 120

@@ -8,8 +8,7 @@ from helpers_truth import majority
 from scipy import ndimage
 
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.flow.borders import follow_flow
-from soup_nlp.data.flow.robust import fit_affine
+from soup_nlp.data.flow.borders import fit_affine, follow_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.superpixels import segment

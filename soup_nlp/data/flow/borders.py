@@ -2,19 +2,22 @@
 
 SLIC follows colours only. A superpixel that covers two motions cannot fit both: the pixels of its
 smaller part have an unavoidable re-projection error and the depth of the other part. Such pixels
-are moved to the neighbouring superpixel with their flow.
+are moved to the neighbouring superpixel with their flow. The flow of a superpixel is an affine fit.
 """
 
 from __future__ import annotations
+
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from soup_nlp.data.flow.robust import AffineFlow, fit_affine, refit_affine
-from soup_nlp.data.pair import Flow
+from soup_nlp.data.pair import Flow, check_size
+from soup_nlp.errors import DataError
 from soup_nlp.geometry.superpixels import LEAST_PIECE, Labels, split_components
 
+Float = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SCALE_PX = 0.25
@@ -90,3 +93,129 @@ def _nearest(
         better = (residual < least) & (other != own)
         best[better], least[better] = other[better], residual[better]
     return best
+
+
+# --- affine flow of superpixels ---
+
+
+@dataclass(frozen=True)
+class AffineFlow:
+    """An affine flow for every superpixel, which approximates that of a small rigid plane.
+
+    Attributes:
+        coefficients: (N, 3, 2) of (1, (u - u0) / size, (v - v0) / size) -> flow, pixels.
+        centre: (N, 2) u0, v0.
+        size: (N,) square root of the number of pixels with positive confidence.
+        known: (N,) False for superpixels with fewer than six such pixels, whose fit is meaningless.
+    """
+
+    coefficients: Float
+    centre: Float
+    size: Float
+    known: NDArray[np.bool_]
+
+    def basis(self, which: Ints, u: Ints, v: Ints) -> Float:
+        """(P, 3) the three functions at pixels of superpixels `which` (P,)."""
+        du, dv = u - self.centre[which, 0], v - self.centre[which, 1]
+        return np.stack([np.ones(len(which)), du / self.size[which], dv / self.size[which]], axis=1)
+
+    def residual(self, which: Ints, u: Ints, v: Ints, uv: Float) -> Float:
+        """(P,) distance, pixels, of flows (P, 2) from those of superpixels `which` (P,)."""
+        own = np.einsum("pa,pac->pc", self.basis(which, u, v), self.coefficients[which])
+        return np.where(self.known[which], np.linalg.norm(uv - own, axis=1), np.inf)
+
+
+def fit_affine(
+    flow: Flow, labels: NDArray[np.integer], scale_px: float, rounds: int = 8
+) -> tuple[AffineFlow, Float]:
+    """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
+
+    The first weights follow from the distance to the median flow of the superpixel, since plain
+    least squares would fit a slope across two motions without outliers.
+
+    Args:
+        flow: Flow, whose confidence multiplies the weights.
+        labels: (H, W) superpixel labels 0..N-1.
+        scale_px: Smallest residual of an outlier, pixels; s is the larger one of this and the
+            spread of the superpixel (1.48 times the weighted mean absolute residual).
+        rounds: Reweighted fits.
+
+    Returns:
+        The fits, and the last weights (P,) of the pixels with positive confidence.
+
+    Raises:
+        DataError: sizes differ, or the scale is not positive.
+    """
+    check_size("labels and flow", labels.shape, flow.uv.shape, flow.source)
+    if not scale_px > 0:
+        raise DataError("scale of residuals must be positive", found=scale_px, expected="> 0 px")
+    v, u = np.nonzero(flow.confidence > 0)
+    return _fit(flow, labels[v, u].astype(np.int64), u, v, int(labels.max()) + 1, scale_px, rounds)
+
+
+def refit_affine(
+    fit: AffineFlow,
+    flow: Flow,
+    labels: NDArray[np.integer],
+    changed: NDArray[np.bool_],
+    scale_px: float,
+    rounds: int = 8,
+) -> AffineFlow:
+    """The fits of `fit_affine`, recomputed for the superpixels that `changed` (N,) only."""
+    v, u = np.nonzero((flow.confidence > 0) & changed[labels])
+    number = np.cumsum(changed) - 1
+    new, _ = _fit(flow, number[labels[v, u]], u, v, int(changed.sum()), scale_px, rounds)
+    merged = [np.copy(field) for field in astuple(fit)]
+    for field, own in zip(merged, astuple(new), strict=True):
+        field[changed] = own
+    return AffineFlow(*merged)
+
+
+def _fit(
+    flow: Flow, which: Ints, u: Ints, v: Ints, n: int, scale_px: float, rounds: int
+) -> tuple[AffineFlow, Float]:
+    """Fits of n superpixels to pixels (P,) and the last weights, see `fit_affine`."""
+    base = flow.confidence[v, u].astype(np.float64)
+    total = np.maximum(np.bincount(which, base, n), 1e-30)
+    centre = np.stack([np.bincount(which, base * x, n) / total for x in (u, v)], axis=1)
+    count = np.bincount(which, minlength=n)
+    # coordinates are normalised by the size of the superpixel
+    fit = AffineFlow(np.zeros((n, 3, 2)), centre, np.sqrt(np.maximum(count, 1)), count >= 6)
+    X = fit.basis(which, u, v)
+    Y = flow.uv[v, u].astype(np.float64)
+    r = np.linalg.norm(Y - np.stack([_medians(which, y, n) for y in Y.T], axis=1)[which], axis=1)
+    s = np.maximum(1.48 * _medians(which, r, n), scale_px)
+    weight = 1.0 / (1.0 + (r / s[which]) ** 2)
+    C = fit.coefficients
+    for _ in range(rounds):
+        C = _weighted(which, X, Y, base * weight, n)
+        r = np.linalg.norm(Y - np.einsum("pa,pac->pc", X, C[which]), axis=1)
+        mass = np.maximum(np.bincount(which, base * weight, n), 1e-30)
+        spread = 1.48 * np.bincount(which, base * weight * r, n) / mass
+        s = np.maximum(spread, scale_px)
+        weight = 1.0 / (1.0 + (r / s[which]) ** 2)
+    return AffineFlow(C, fit.centre, fit.size, fit.known), weight
+
+
+def _medians(which: Ints, values: Float, n: int) -> Float:
+    """(N,) lower median of the values (P,) of every superpixel; 0 without values."""
+    order = np.lexsort((values, which))
+    count = np.bincount(which, minlength=n)
+    middle = np.cumsum(count) - count + np.maximum(count - 1, 0) // 2
+    if not len(order):
+        return np.zeros(n)
+    return np.where(count > 0, values[order][np.minimum(middle, len(order) - 1)], 0.0)
+
+
+def _weighted(which: Ints, X: Float, Y: Float, w: Float, n: int) -> Float:
+    """(N, 3, 2) weighted affine fits."""
+    A = np.empty((n, 3, 3))
+    for a in range(3):
+        for b in range(a, 3):
+            A[:, a, b] = A[:, b, a] = np.bincount(which, w * X[:, a] * X[:, b], n)
+    right = np.stack(
+        [np.bincount(which, w * X[:, a] * Y[:, c], n) for a in range(3) for c in range(2)], axis=1
+    ).reshape(n, 3, 2)
+    # a small ridge makes the slopes of superpixels with few pixels 0
+    A += np.eye(3) * (1e-6 * A[:, 0, 0] + 1e-12)[:, None, None]
+    return np.asarray(np.linalg.solve(A, right), np.float64)

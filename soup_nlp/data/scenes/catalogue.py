@@ -12,23 +12,27 @@ import numpy as np
 
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes import everyday
-from soup_nlp.data.scenes.materials import (
+from soup_nlp.data.scenes.raycast import Body, Part, Scene, advanced, inverse, render
+from soup_nlp.data.scenes.shapes import Box, Sheet
+from soup_nlp.data.scenes.texture import Panels
+from soup_nlp.data.scenes.things import (
     ASPHALT,
+    BACK,
+    FRONT,
     GLASS,
     SKY,
     Materials,
     Random,
     about,
     backdrop,
+    car,
     floor,
+    furniture,
+    interior,
     placed,
     sign,
     views,
 )
-from soup_nlp.data.scenes.raycast import Body, Part, Scene, advanced, inverse, render
-from soup_nlp.data.scenes.shapes import Box, Sheet
-from soup_nlp.data.scenes.texture import Panels
-from soup_nlp.data.scenes.things import BACK, FRONT, car, furniture, interior
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.schema.limits import check_image_size
 

@@ -9,8 +9,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from soup_nlp.data.scenes.materials import (
+from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse
+from soup_nlp.data.scenes.shapes import Box, Plane
+from soup_nlp.data.scenes.texture import Colour, Panels
+from soup_nlp.data.scenes.things import (
     ASPHALT,
+    BACK,
+    FRONT,
     GLASS,
     PAINTS,
     SKY,
@@ -19,23 +24,16 @@ from soup_nlp.data.scenes.materials import (
     Random,
     about,
     backdrop,
-    floor,
-    placed,
-    sign,
-    views,
-)
-from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse
-from soup_nlp.data.scenes.shapes import Box, Plane
-from soup_nlp.data.scenes.texture import Colour, Panels
-from soup_nlp.data.scenes.things import (
-    BACK,
-    FRONT,
     car,
+    floor,
     furniture,
     interior,
     lorry,
     person,
+    placed,
+    sign,
     tree,
+    views,
 )
 
 GRASS: tuple[Colour, Colour] = ((0.34, 0.46, 0.20), (0.24, 0.36, 0.14))
