@@ -120,17 +120,17 @@ def _families(frame: pd.DataFrame) -> list[str]:
     """Table of the solution by family (sequence) and flow: means, moving pixels, worst pair."""
     if frame.groupby(["sequence", "flow"]).ngroups < 2:
         return []
-    own = frame[["sequence", "flow", "title", "mre", "constant"]].copy()
-    own["median"] = main_metric(frame, name="median_relative")
-    own["d<1.25"] = main_metric(frame, name="delta1")
-    own["skill"] = main_metric(frame, name="skill")
+    shown = frame[["sequence", "flow", "title", "mre", "constant"]].copy()
+    shown["median"] = main_metric(frame, name="median_relative")
+    shown["d<1.25"] = main_metric(frame, name="delta1")
+    shown["skill"] = main_metric(frame, name="skill")
     for column, name in {"moving.mre": "MRE moving", "moving.rest": "MRE of the rest"}.items():
-        own[name] = frame[column].astype(float) if column in frame else np.nan
-    own[list(SURENESS)] = _sureness(frame)
-    groups = own.groupby(["sequence", "flow"], sort=False)
-    means = groups[[c for c in own.columns if c not in ("sequence", "flow", "title")]].mean()
+        shown[name] = frame[column].astype(float) if column in frame else np.nan
+    shown[list(SURENESS)] = _sureness(frame)
+    groups = shown.groupby(["sequence", "flow"], sort=False)
+    means = groups[[c for c in shown.columns if c not in ("sequence", "flow", "title")]].mean()
     means.insert(0, "pairs", groups.size())
-    means["worst pair"] = [own.loc[i, "title"] for i in groups["mre"].idxmax()]
+    means["worst pair"] = [shown.loc[i, "title"] for i in groups["mre"].idxmax()]
     text = (
         "Means over the pairs, each under its own convention. Moving: pixels that move by"
         " themselves, where a mask or the true motion is known. AUSE: area between the"

@@ -103,7 +103,7 @@ class Plan:
         """The table with the measured rows, by section; NaN where not measured."""
         rows = frame.drop_duplicates("key").set_index("key")
         whole = self.table.join(rows.drop(columns=["variant"]), on="key")
-        return {str(name): own for name, own in whole.groupby("section", sort=False)}
+        return {str(name): rows for name, rows in whole.groupby("section", sort=False)}
 
 
 def make_plan(data: Path | None, sizes: Sizes, folder: Path) -> Plan:
@@ -120,10 +120,10 @@ def make_plan(data: Path | None, sizes: Sizes, folder: Path) -> Plan:
     def add(section: str, items: Iterable[Item], n: int = sizes.analysis) -> None:
         for item in items:
             for method, base in METHODS.items():
-                for change, own in _variants(section, method).items():
+                for change, changes in _variants(section, method).items():
                     count = int(change) if section == "superpixels" else n
                     size = f"segmentation.superpixels={count}", *_scaled(PRINTED[method], count)
-                    every = (*base, *size, *sizes.overrides, *_scaled(own, count))
+                    every = (*base, *size, *sizes.overrides, *_scaled(changes, count))
                     maps = None
                     if section == "comparison":
                         name = f"{item.key}-{method}".replace(": ", "_")

@@ -116,18 +116,18 @@ def _comparison(folder: Path, plan: Plan, rows: pd.DataFrame) -> list[str]:
     lines = ["## Mean relative error per dataset", ""]
     entries, bars = {}, {}
     for name, (title, _, cap) in DATASETS.items():
-        own = rows[rows["name"].isin([i.name for i in plan.datasets[name]])]
+        group = rows[rows["name"].isin([i.name for i in plan.datasets[name]])]
         line: dict[str, Any] = {f"{m} (published)": v for m, v in COMPARISON[name].items()}
-        line["pairs here"] = str(own["name"].nunique())
+        line["pairs here"] = str(group["name"].nunique())
         for method in METHODS:
-            here = own[own["method"] == method]
+            here = group[group["method"] == method]
             line[f"{method}: median"] = _mre(here).mean()
             line[f"{method}: best"] = _mre(here, "best").mean()
             line[f"{method}: cap"] = _mre(here, cap).mean() if cap else np.nan
         line["constant depth"] = _mre(here, "paper", "constant").mean()
         line["one rigid motion"] = _mre(here, "paper", "rigid").mean()
         entries[title] = line
-        if len(own):
+        if len(group):
             shown = {"published": line["Superpixel Soup (published)"]}
             shown |= {method: line[f"{method}: median"] for method in METHODS}
             bars[title] = {**shown, "constant depth": line["constant depth"]}
@@ -175,14 +175,14 @@ def _pictures(folder: Path, rows: pd.DataFrame) -> list[str]:
         if cell.keep is not None and cell.keep.is_file():
             with np.load(cell.keep) as file:
                 maps.setdefault(name, {})[method] = dict(file)
-    shown = {name: own for name, own in maps.items() if len(own) == len(METHODS)}
+    shown = {name: by_method for name, by_method in maps.items() if len(by_method) == len(METHODS)}
     heads = ("image", "truth", "paper's start", "preset: paper", "defaults")
     picture = figure(2.0 * len(heads), 1.15 * max(1, len(shown)) + 0.4)
     axes = picture.subplots(max(1, len(shown)), len(heads), squeeze=False)
     for ax in axes.flat:
         ax.set_axis_off()
-    for line, (name, own) in zip(axes, shown.items(), strict=False):
-        paper, ours = own["preset: paper"], own["defaults"]
+    for line, (name, by_method) in zip(axes, shown.items(), strict=False):
+        paper, ours = by_method["preset: paper"], by_method["defaults"]
         truth = paper.get("truth", ours["solution"])
         depths = [truth, paper["start"], paper["solution"], ours["solution"]]
         line[0].imshow(paper["image"])
@@ -205,8 +205,8 @@ def _study(folder: Path, name: str, rows: pd.DataFrame) -> list[str]:
     lines = [f"## {text[0].upper()}{text[1:]}", ""]
     drawn = {}
     for method in METHODS:
-        own = rows[rows["method"] == method].assign(value=_mre(rows))
-        drawn[method] = pivot(own, "value", "name", "change").rename_axis(index="pair")
+        group = rows[rows["method"] == method].assign(value=_mre(rows))
+        drawn[method] = pivot(group, "value", "name", "change").rename_axis(index="pair")
         lines += [f"{method}, MRE after median scale, no cap:", "", *markdown(drawn[method]), ""]
     copied = f"Copied, not measured: {SOURCE}."
     if name == "ablation":
@@ -273,8 +273,8 @@ def _departures(folder: Path, rows: pd.DataFrame) -> list[str]:
     ]
     bars = {}
     for method, text in titles.items():
-        own = rows[rows["method"] == method].assign(value=_mre(rows))
-        values = pivot(own, "value", "change", "name", average=False).dropna(axis=1, how="all")
+        group = rows[rows["method"] == method].assign(value=_mre(rows))
+        values = pivot(group, "value", "change", "name", average=False).dropna(axis=1, how="all")
         ratios = values / values.loc[BASE] if len(values) else values
         mean = np.exp(np.log(ratios).mean(axis=1))
         counts = zip((ratios > 1.01).sum(axis=1), (ratios < 0.99).sum(axis=1), strict=True)

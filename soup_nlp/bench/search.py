@@ -156,11 +156,11 @@ def search(
     for k in range(trials + 1):
         trial = study.ask(dict(space)) if k else None
         chosen = {} if trial is None else trial.params
-        own = tuple(f"{key}={as_yaml(v)}" for key, v in chosen.items())
-        cells = [Cell(i, (*overrides, *own), f"t{k:03d}") for i in items]
+        settings = tuple(f"{key}={as_yaml(v)}" for key, v in chosen.items())
+        cells = [Cell(i, (*overrides, *settings), f"t{k:03d}") for i in items]
         frame = measure_cells(cells, measure, path, measure_rows)
         frame["loss"] = pair_loss(frame)
-        frame["settings"] = " ".join(f"`{o}`" for o in own) or "-"
+        frame["settings"] = " ".join(f"`{o}`" for o in settings) or "-"
         frames.append(frame)
         if trial is not None:
             study.tell(trial, float(frame["loss"].mean()))

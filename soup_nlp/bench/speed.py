@@ -117,15 +117,15 @@ def speed_cells(
         source = {"kind": "scene", "scene": scene, "seed": seed, **size}
         source = {"kind": scene} if scene == "motorcycle" else source
         item = Item("speed", scene, f"{scene}, seed {seed}", "dis", source)
-        own = (
+        settings = (
             f"segmentation.superpixels={n}",
             f"segmentation.neighbours={k}",
             f"seed={seed}",
             "refine.enabled=false",
             *overrides,
         )
-        item.problem(own)
-        cells.append(Cell(item, own, f"N {n}, K {k}"))
+        item.problem(settings)
+        cells.append(Cell(item, settings, f"N {n}, K {k}"))
     return cells
 
 
@@ -248,8 +248,8 @@ def growth(frame: pd.DataFrame) -> pd.DataFrame:
     """Exponent of every cost by pair and K, of those that were run at several sizes."""
     groups = frame.groupby(["sequence", "k"])
     lines = {
-        key: {title: exponent(group["n"], group[column]) for column, title in COSTS.items()}
-        for key, group in groups
+        (pair, str(k)): {t: exponent(group["n"], group[column]) for column, t in COSTS.items()}
+        for (pair, k), group in groups
     }
     table = pd.DataFrame.from_dict(lines, orient="index", columns=list(COSTS.values()))
     return table.rename_axis(["pair", "K"] if lines else None).dropna(how="all")

@@ -113,9 +113,9 @@ def _shared(root: Path, o: Options) -> Entries:
         names = {"ref": f"frame_{k}.png", "next": f"frame_{k + 1}.png", "intrinsics": "K.txt"}
         names |= {"depth": f"depth_{k}.png", "depth_next": f"depth_{k + 1}.png"}
         files = {key: str(track / name) for key, name in names.items()}
-        own = {"kind": "files", **files, "depth_scale": 256.0}
+        source = {"kind": "files", **files, "depth_scale": 256.0}
         needs = (track / names["next"],)
-        yield Entry("kitti_tracking", f"kitti_tracking {k}", own, needs, False)
+        yield Entry("kitti_tracking", f"kitti_tracking {k}", source, needs, False)
     for family, pattern, scale in (("rgbd", "*", 5000.0), ("deepdeform", "pair_*", 1000.0)):
         for path in sorted((root / family).glob(pattern)):
             yield _folder(family, path, depth_scale=scale)
@@ -155,8 +155,8 @@ def _vkitti(root: Path, o: Options) -> Entries:
             folder, name = root / scene / "morning/frames/rgb/Camera_0", "rgb_{:05d}.jpg"
         for frame in spread(frames - 1, 30):
             needs = tuple(folder / name.format(frame + k) for k in (0, 1))
-            own = {**raw, "scene": scene, "frame": frame}
-            yield Entry(f"{world}_morning", f"{world}_morning-{frame:05d}", own, needs)
+            source = {**raw, "scene": scene, "frame": frame}
+            yield Entry(f"{world}_morning", f"{world}_morning-{frame:05d}", source, needs)
 
 
 def _kinect(root: Path, o: Options) -> Entries:

@@ -96,7 +96,7 @@ def test_growth_is_the_exponent_of_a_cost_by_scene_and_neighbours():
     rows = [made("street", n, k) for n in (250, 500, 1000) for k in (10, 20)]
     frame = with_costs(frame_of(rows))
     table = growth(frame)
-    assert table.index.tolist() == [("street", 10), ("street", 20)]
+    assert table.index.tolist() == [("street", "10"), ("street", "20")]
     assert table["NLP, CPU s"].iloc[0] == pytest.approx(EXPONENT)
     assert table["Hessian nonzeros"].iloc[0] == pytest.approx(1.0)
     assert growth(frame.iloc[:1]).empty

@@ -96,8 +96,8 @@ def summary(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
             "tried_by": list(group["solver"].unique()),
             "reached_by": list(group.loc[reached(group), "solver"].unique()),
             "runs": {
-                str(start): {str(row["solver"]): _run(row) for _, row in own.iterrows()}
-                for start, own in group.groupby("start", sort=False)
+                str(start): {str(row["solver"]): _run(row) for _, row in runs.iterrows()}
+                for start, runs in group.groupby("start", sort=False)
             },
         }
         for name, group in frame.groupby(names, sort=False)

@@ -34,8 +34,8 @@ class Plugin(NamedTuple):
 
     def made_for(self, limits: Limits) -> dict[str, Any]:
         """Options of `ca.nlpsol`, for some libraries nested under the name of the library."""
-        own = {**self.options, **{k: getattr(limits, name) for k, name in self.limits.items()}}
-        return {self.library: own} if self.library in NESTED else own
+        options = {**self.options, **{k: getattr(limits, name) for k, name in self.limits.items()}}
+        return {self.library: options} if self.library in NESTED else options
 
 
 CLAIMS = ("Solve_Succeeded", "Solved_To_Acceptable_Level", "SUCCESS", "success", "Converged")

@@ -107,9 +107,9 @@ def reference(task: Task) -> Answer:
     """
     last = task.form.eps
     eps = [*(e for e in EPS if e > last), last]
-    own = task.soup, task.data, task.weights, task.form
+    energy = task.soup, task.data, task.weights, task.form
     begin = clock()
-    record = levenberg_marquardt(*own, eps=eps, seconds=0.8 * WALL_PER_CPU * task.limits.seconds)
+    record = levenberg_marquardt(*energy, eps=eps, seconds=0.8 * WALL_PER_CPU * task.limits.seconds)
     seconds = clock() - begin
     # its history has wall times: convert them to CPU times
     own_seconds = max(float(record.history[-1, 0]), seconds)
@@ -128,8 +128,8 @@ def package(task: Task) -> Answer:
         max_iter=m.iterations,
         max_seconds=0.9 * WALL_PER_CPU * m.seconds,
     )
-    own = task.soup, task.data, task.weights, task.form
-    answer = solve_soup(*own, options)
+    energy = task.soup, task.data, task.weights, task.form
+    answer = solve_soup(*energy, options)
     stage = answer.stages[-1]
     iterations = sum(s.iterations for s in answer.stages)
     seconds = clock() - begin

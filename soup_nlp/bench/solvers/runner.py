@@ -202,9 +202,9 @@ def compare(
 
     jobs = []
     for label, make in tasks:
-        own = {k: label[k] for k in KEY} | {"limits": asdict(limits)}
+        identity = {k: label[k] for k in KEY} | {"limits": asdict(limits)}
         for solver in dict.fromkeys(solvers):
-            jobs.append(Job({**own, "solver": solver}, partial(run, label, make, solver)))
+            jobs.append(Job({**identity, "solver": solver}, partial(run, label, make, solver)))
     return measure_all(jobs, path, say=lambda done, total, row: say(one_line(row)), after=after)
 
 

@@ -47,11 +47,11 @@ class Task:
 
     def point(self, soup: Soup) -> Float:
         """(nx,) vector of a soup, slack variables and switches at their best values."""
-        own = soup, self.data, self.weights, self.form
+        energy = soup, self.data, self.weights, self.form
         if isinstance(self.layout, TangentLayout):
-            nlp, _ = build_tangent_nlp(*own, layout=self.layout)
+            nlp, _ = build_tangent_nlp(*energy, layout=self.layout)
         else:
-            nlp, _ = build_matrix_nlp(*own)
+            nlp, _ = build_matrix_nlp(*energy)
         return np.concatenate([self.layout.pack(soup), nlp.x0[self.layout.size :]])
 
 
