@@ -105,8 +105,8 @@ class Components:
         return self.background.motion
 
     def own_motion(self, label: int) -> RigidMotion:
-        """What a component does by itself: its motion as the reference camera, standing still,
-        would see it. The identity for the background."""
+        """Motion of a component relative to the static scene, as seen by a camera at rest; the
+        identity for the background."""
         return self.camera.inverse @ self[label].motion
 
 

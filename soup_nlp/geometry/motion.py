@@ -48,7 +48,7 @@ class RigidMotion:
         return np.asarray(x @ self.R.T + self.t)
 
     def __matmul__(self, first: RigidMotion) -> RigidMotion:
-        """This motion after another one."""
+        """The composition: the other motion first, then this one."""
         return RigidMotion(self.R @ first.R, self.R @ first.t + self.t)
 
     @property
@@ -60,13 +60,13 @@ class RigidMotion:
 
     @property
     def inverse(self) -> RigidMotion:
-        """The way back."""
+        """The inverse motion."""
         return RigidMotion(self.R.T, -self.R.T @ self.t)
 
     @property
     def centre(self) -> Float:
-        """(3,) the point that it moves to the origin: of next_from_ref, the next camera as the
-        reference frame sees it."""
+        """(3,) the point that this motion maps to the origin: for next_from_ref, the centre of the
+        next camera in the reference frame."""
         return np.asarray(-self.R.T @ self.t)
 
     @property

@@ -75,7 +75,7 @@ class Soup:
         return self.distance.reshape(-1, *[1] * (ray.ndim - 2)) / facing
 
     def depth_across(self, who: Int, ray: Float) -> Float:
-        """(S, P) z of rays (P, 3) on the planes of the superpixels in each row (P, S), as of pairs.
+        """(S, P) z of every ray (P, 3) on the planes of S superpixels, its row of `who` (P, S).
 
         A plane that faces its ray by less than 1e-3 is taken to face it by that.
         """
@@ -113,7 +113,7 @@ class Soup:
         return Soup(self.lam / total, n, d, nearest(self.R), self.t)
 
     def parallax(self, ray: Float) -> Float:
-        """(N, 2) by how much the translations move points seen along rays (N, 3), ray units.
+        """(N, 2) image motion, in ray units, by the translations of points along rays (N, 3).
 
         It is the distance in the next image from where the rotation alone brings them.
         """
@@ -162,7 +162,7 @@ class Reconstruction:
 
     @property
     def normals_next(self) -> Float:
-        """(H, W, 3) unit normals of `points_next`: the same surfaces, turned."""
+        """(H, W, 3) unit normals of `points_next`, which are those of `points_ref` rotated."""
         turned = np.einsum("nij,nj->ni", self.soup.R, self.soup.n)
         return np.asarray(turned[self.labels])
 

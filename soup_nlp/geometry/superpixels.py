@@ -67,7 +67,7 @@ def segment(
 
 
 def _slic(image: Image, clusters: int, sigma: float) -> Labels:
-    """Connected superpixels of SLIC with so many clusters."""
+    """Connected superpixels of SLIC with a given number of clusters."""
     from skimage.segmentation import slic
 
     raw = slic(
@@ -101,7 +101,7 @@ def _as_many(image: Image, labels: Labels, count: int, sigma: float) -> Labels:
 
 
 def _merged(labels: Labels, count: int) -> Labels:
-    """The superpixels of a larger number, of which the smallest join a neighbour."""
+    """Superpixels of a finer segmentation, the smallest merged with a neighbour."""
     sizes = np.sort(np.bincount(labels.ravel()))
     return split_components(labels, int(sizes[-count]))
 

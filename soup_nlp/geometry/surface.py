@@ -33,7 +33,7 @@ def hidden(rec: Reconstruction) -> Mask:
 
 
 def joined(rec: Reconstruction, K: Float, group: NDArray[np.integer]) -> tuple[Mask, Mask]:
-    """Where the surface goes on between neighbouring pixels.
+    """Whether neighbouring pixels lie on one continuous surface.
 
     It does within a superpixel, and between two whose planes meet there and which belong to the
     same group.
@@ -90,7 +90,7 @@ def triangles(right: Mask, below: Mask, keep: Mask, step: int = 1) -> Int:
     height, width = keep.shape
 
     def full(mask: Mask, tall: int, wide: int) -> Mask:
-        """(h, w) whether a mask holds everywhere in windows of tall x wide at every cell."""
+        """(h, w) whether a mask is True in the whole tall x wide window of every cell."""
         total = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), np.int64)
         total[1:, 1:] = (~mask).cumsum(0).cumsum(1)
         v = np.arange(0, height - step, step)[:, None]

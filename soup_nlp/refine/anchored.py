@@ -15,7 +15,7 @@ from soup_nlp.refine.costs import Particles
 
 @dataclass(frozen=True)
 class Local:
-    """States about the anchors; leading shape (N, C).
+    """C states of each of N superpixels, written about its anchor.
 
     Attributes:
         Z: (N, C) depth at the anchor.
@@ -30,23 +30,23 @@ class Local:
     T: Float
 
     def particles(self, anchor_ray: Float) -> Particles:
-        """The same as planes with unit normals."""
+        """These states as particles: planes with unit normals, and motions."""
         n, D = normal_and_distance(about_anchor(self.Z, self.g, anchor_ray[:, None]))
         return Particles(n, D, self.R, self.T)
 
     @classmethod
     def of(cls, soup: Soup, anchor_ray: Float) -> Local:
-        """A soup, C = 1."""
+        """A soup as one state per superpixel, C = 1."""
         Z, g = at_anchor(inverse_depth(soup.n, soup.distance), anchor_ray)
         return cls(Z[:, None], g[:, None], soup.R[:, None], soup.translation[:, None])
 
     def repeated(self, count: int) -> Local:
-        """C = 1 to C = count."""
+        """The one state of every superpixel, `count` times."""
         return Local(*(np.repeat(v, count, axis=1) for v in (self.Z, self.g, self.R, self.T)))
 
 
 def neighbours(edges: Int, anchor_ray: Float) -> Int:
-    """(N, K) neighbours of every superpixel on a graph, nearest first; K the smallest degree.
+    """(N, K) neighbours of every superpixel on a graph, nearest first. K is the smallest degree.
 
     Args:
         edges: (E, 2) undirected edges.

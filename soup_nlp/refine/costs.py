@@ -46,7 +46,7 @@ class Particles:
 
     @classmethod
     def of(cls, soup: Soup) -> Particles:
-        """A soup as one particle each."""
+        """A soup as one particle per superpixel."""
         T = soup.translation[:, None]
         return cls(soup.n[:, None], soup.distance[:, None], soup.R[:, None], T)
 
@@ -58,7 +58,7 @@ class Particles:
         )
 
     def take(self, which: Int) -> Particles:
-        """Particles (N, C) by their numbers for each superpixel."""
+        """The particles that have the numbers `which` (N, C)."""
         rows = np.arange(len(self.D))[:, None]
         return Particles(*(a[rows, which] for a in (self.n, self.D, self.R, self.T)))
 
@@ -67,7 +67,7 @@ class Particles:
         return Particles(self.n[who], self.D[who], self.R[who], self.T[who])
 
     def soup(self, labels: Int, share: Float) -> Soup:
-        """The soup of one label each, with sum(lam) = 1 exactly restored (`Soup.normalised`)."""
+        """The soup of labels (N,), with sum(lam) = 1 exactly restored (`Soup.normalised`)."""
         own = self.take(labels[:, None])
         one = np.ones(len(labels))
         return Soup(one, own.n[:, 0], own.D[:, 0], own.R[:, 0], own.T[:, 0]).normalised(share)
@@ -147,7 +147,7 @@ class PairCosts:
     def tables(
         self, p: Particles, unit: float = 1.0, dtype: type | np.dtype = np.float64
     ) -> Floats:
-        """(E, L, L) weighted sum of every term but E_proj, of every pair of labels.
+        """(E, L, L) weighted sum of all terms but E_proj, by edge and pair of labels.
 
         Args:
             p: (N, L) particles.
@@ -278,7 +278,7 @@ def _leaky(y: Floats, sigma: float, leak: float) -> Floats:
 
 
 class _State:
-    """Components first, so that those of a block of edges lie together: each (c, N, L).
+    """Components are the first axis, (c, N, L), so that a block of edges reads contiguous numbers.
 
     What is subtracted for every pair of labels has the type of the tables.
     """
@@ -300,7 +300,7 @@ class _State:
         self.R, self.shift = _first(p.R.reshape(n_nodes, labels, 9), np.float64), p.T
 
     def factor(self, values: Float) -> Floats:
-        """Numbers of the edges of a block, (b, 1, 1)."""
+        """Values of the edges of a block, (b, 1, 1)."""
         return values.astype(self.dtype)[:, None, None]
 
     def inverse_along(self, who: Int, ray: Float) -> Float:
@@ -329,7 +329,7 @@ class _State:
 
 
 def _nearness(s: _State, i: Int, k: Int, out: Floats) -> Floats:
-    """Inverse depth (b, L, L) of the anchors of a block, mostly of the nearer one."""
+    """(b, L, L) power mean, of exponent 4, of the inverse depths of two anchors."""
     np.add(s.quarter[i][:, :, None], s.quarter[k][:, None, :], out=out)
     np.sqrt(out, out=out)
     return np.sqrt(out, out=out)

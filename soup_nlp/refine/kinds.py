@@ -66,7 +66,7 @@ class Spread:
         return np.asarray(np.exp(self.centre[kind] + self.width * rng.standard_normal(shape)))
 
     def learn(self, kind: str, accepted: Float) -> None:
-        """Move to the accepted steps (M,), pixels, nan for no step; shrink where there are none."""
+        """Move the centre to the accepted steps (M,), pixels or NaN; shrink it without any."""
         accepted = accepted[np.isfinite(accepted)]
         if accepted.size >= 3:
             self.centre[kind] += 0.7 * (float(np.log(accepted).mean()) - self.centre[kind])
@@ -75,7 +75,7 @@ class Spread:
 
 
 def counts(shares: Mapping[str, float], total: int, near: int) -> dict[str, int]:
-    """`total` proposals split by shares, largest remainders first; limits by kind respected.
+    """`total` proposals split by shares, largest remainders first, within the limits of each kind.
 
     Args:
         shares: By kind.
@@ -99,7 +99,7 @@ def counts(shares: Mapping[str, float], total: int, near: int) -> dict[str, int]
 def relearn(
     shares: dict[str, float], proposed: Mapping[str, int], accepted: Mapping[str, int]
 ) -> None:
-    """Give kinds whose proposals were accepted larger shares."""
+    """Increase the shares of kinds whose proposals were accepted, decrease the others."""
     rate = {k: accepted[k] / max(1, proposed[k]) for k in shares}
     mean = sum(rate.values()) / len(rate)
     if mean > 0:

@@ -210,7 +210,7 @@ class _Rounds:
         energy: Mapping[str, float],
         deadline: float,
     ) -> None:
-        """Nothing is drawn yet; `deadline` is a time of `time.perf_counter`."""
+        """Draw nothing yet; `deadline` is a time of `time.perf_counter`."""
         self.costs, self.proposer, self.watch = costs, proposer, watch
         self.best, self.energy, self.deadline = best, energy, deadline
         walks_only = costs.options.proposals == "walks"
@@ -221,7 +221,7 @@ class _Rounds:
         self.agreed = photo is not None and photo.contradicted.mean() < CONTRADICTED
 
     def run(self) -> str:
-        """All rounds; the status of `Refined`."""
+        """Run all rounds; returns the status of `Refined`."""
         o, slow, interrupted = self.costs.options, False, False
         most = min(1, o.rounds) if self.agreed else o.rounds
         while len(self.done) < most and not (slow or interrupted or self._over()):
@@ -256,7 +256,7 @@ class _Rounds:
         return Proposals(fixed.joined(new.particles), kinds, steps)
 
     def _round(self) -> bool:
-        """One round; whether TRW-S was interrupted, after which there is no further round."""
+        """Run one round; returns whether TRW-S was interrupted, which ends the refinement."""
         mark, costs, o = time.perf_counter(), self.costs, self.costs.options
         drawn = self._draw()
         p, edges, none = drawn.particles, costs.pairs.edges, np.zeros(len(self.best), np.int64)
@@ -306,7 +306,7 @@ class _Rounds:
         return interrupted
 
     def _follow(self, mark: float, k: int, bound: float, energy: float, least: float) -> bool:
-        """Report an iteration of TRW-S; whether to stop after it."""
+        """Report an iteration of TRW-S; returns whether to stop after it."""
         if self.watch.listener:
             stage, seconds = f"refine {len(self.done) + 1}", time.perf_counter() - mark
             self.watch.listener(Progress(stage, k - 1, least, 0.0, seconds))

@@ -135,7 +135,7 @@ class Proposer:
     # (no common scale: E hardly depends on the scale of a component, and is lower at wrong depths)
 
     def _common_motion(self, soup: Soup, now: Local, count: int) -> tuple[Local, Float]:
-        """Motions that many share, fitted again to the flow of their superpixels' present planes.
+        """Motions that many superpixels share, fitted again to the flow of their present planes.
 
         A superpixel alone pays for a motion that differs from the one it shares with others;
         together they do not. Every third candidate is the fit itself, the others are steps around
@@ -185,7 +185,7 @@ class Proposer:
         return np.take_along_axis(self.near, order, axis=1)
 
     def _extrapolated(self, soup: Soup, who: Int, local: Local) -> tuple[Float, Float]:
-        """Depth and slope of the planes of others (N, C) at the own anchor."""
+        """Depth and slope, at each anchor, of the planes of other superpixels (N, C)."""
         m = inverse_depth(soup.n, soup.distance)[who]
         inverse = np.einsum("ncj,nj->nc", m, self.data.anchor_ray)
         # a plane that does not meet the anchor's ray in front: its depth is borrowed instead
@@ -222,12 +222,12 @@ class Proposer:
         return Local(Z, g, R, T)
 
     def commonest(self, soup: Soup, count: int) -> tuple[Float, Float]:
-        """(C, 3, 3), (C, 3) few present motions that explain most superpixels, C <= count."""
+        """(C, 3, 3), (C, 3) the present motions that explain most superpixels, C <= count."""
         R, T, _ = self._explaining(soup, Local.of(soup, self.data.anchor_ray), count)
         return R, T
 
     def _explaining(self, soup: Soup, now: Local, count: int) -> tuple[Float, Float, Float]:
-        """Few present motions that move most anchors as their own motions do.
+        """At most `count` present motions under which most anchors move as under their own.
 
         Returns:
             (C, 3, 3), (C, 3), and (N, C) by how many pixels each misses.
@@ -250,7 +250,7 @@ class Proposer:
         return R[kept], T[kept], error[:, kept]
 
     def _mean(self, soup: Soup, now: Local, count: int) -> Local:
-        """Means of the own state and a few neighbours, which the smoothness terms favour."""
+        """Means of a superpixel's state and a few neighbours', which smoothness favours."""
         parts = []
         for c in range(count):
             who = self._some(3 + 2 * (c % 3))
@@ -267,7 +267,7 @@ class Proposer:
         return Local(*(np.concatenate([getattr(p, k) for p in parts], axis=1) for k in "ZgRT"))
 
     def _with_motion(self, now: Local, R: Float, T: Float, slopes: bool) -> Local:
-        """Own plane under given motions: depth (and slope) that explain the flow best.
+        """The present planes with the depth (and slope) that fit the flow under given motions.
 
         Where the flow does not determine a depth under a motion, the own plane stays.
         """

@@ -93,7 +93,7 @@ class Photometric:
         return float(self.costs(Particles.of(soup), self.unit(soup)).sum())
 
     def costs(self, p: Particles, unit: float) -> Float:
-        """(N, L) factor times E_photo's share of every particle, their length unit given."""
+        """(N, L) factor times the contribution of every particle to E_photo, in a length unit."""
         out = np.empty(p.shape)
         step = max(1, BLOCK // (p.shape[1] * self.ray.shape[1]))
         for a in range(0, len(out), step):
@@ -103,7 +103,7 @@ class Photometric:
         return out
 
     def disagreeing(self, soup: Soup, data: EnergyData) -> Mask:
-        """(N,) where there is a flow, and a soup's samples disagree or are mostly not visible."""
+        """(N,) superpixels with flow whose samples disagree, or are mostly not visible."""
         c, seen = self._differences(Particles.of(soup), slice(None), self.unit(soup))
         visible = seen.mean(axis=2)[:, 0]
         mean = np.where(seen, c, 0).mean(axis=2)[:, 0] / np.maximum(visible, 1e-9)
