@@ -74,6 +74,10 @@ def test_an_error_says_where_it_is_and_what_was_expected(text, parts, tmp_path):
 @pytest.mark.parametrize(
     ("override", "parts"),
     [
+        ("solver.max_itr=3", ["unknown key", "solver.max_itr", "did you mean max_iter?"]),
+        ("solver.max_iter=many", ["solver.max_iter", "'many'", "integer"]),
+        ("solver.max_iter=-1", ["greater than or equal to 0"]),
+        ("formulation.gauge=unit_offset", ["unit-offset", "did you mean unit-offset?"]),
         ("solver.eps=[1, -1]", ["--set solver.eps", "key solver.eps"]),
         ("segmentation.boundary_samples=none", ["a valid integer, or all"]),
         ("input.kind.x=3", ["goes below a value", "kind is a section"]),
