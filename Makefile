@@ -49,8 +49,28 @@ versions: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check nox
 	$(BIN)/nox
 
+# every table and picture of results/; a command that fails does not end the others, one that was
+# stopped continues
+SOUP = -$(BIN)/soup-nlp
+PAIRS = --suite rendered $(if $(DATA),--suite shared --data $(DATA))
 results: $(VENV)/.optional
-	$(BIN)/soup-nlp bench all --out results --overwrite $(if $(DATA),--data $(DATA))
+	$(SOUP) solve problems/motorcycle.yaml -o out/motorcycle --overwrite
+	-cp out/motorcycle/overview.png results/motorcycle.png
+	$(SOUP) bench accuracy -o results/accuracy $(PAIRS) --overwrite
+	$(SOUP) bench accuracy -o results/accuracy --name banner --suite rendered --only banner \
+		--seeds 0,1,2,3,4,5 --flow truth --flow dis --overwrite
+	$(SOUP) bench search -o results/accuracy --suite rendered --only street --only room --only orbit \
+		--flow dis --trials 8 --seeds 0 --width 512 --set segmentation.superpixels=300 \
+		--set refine.enabled=false --overwrite
+	$(SOUP) bench chain -o results/accuracy $(if $(DATA),--data $(DATA)) --overwrite
+	$(SOUP) bench paper -o results/paper $(if $(DATA),--data $(DATA)) --limit 2 --superpixels 500 \
+		--analysis 250 --overwrite
+	$(SOUP) bench speed -o results/speed --superpixels 500,1000,2000 --neighbours 20 --overwrite
+	$(SOUP) bench cost -o results/speed --overwrite
+	$(SOUP) family out/matrix --sizes 100 --starts hard --overwrite
+	$(SOUP) family out/tangent --sizes 100,250 --starts hard --coordinates tangent --overwrite
+	$(SOUP) compare out/matrix out/tangent -o results/solvers --seconds 20 --iterations 500 \
+		--solvers ipopt,ipopt-soup,ipopt-lbfgs,sqpmethod,uno,fatrop,pounce,lm,soup-nlp --overwrite
 
 clean:
 	rm -rf $(VENV) out site

@@ -97,10 +97,6 @@ BENCH: Mapping[str, tuple[str, str]] = {
         "bench_speed:chain",
         "What one scale costs on rendered sequences, and on kitti_tracking in the --data folder.",
     ),
-    "all": (
-        "bench_all:everything",
-        "Make every table and picture of results/ in a folder; a run that was stopped goes on.",
-    ),
 }
 """The same for the commands of `soup-nlp bench`."""
 

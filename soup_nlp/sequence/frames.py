@@ -162,7 +162,7 @@ def check_sequence(images: list[Path]) -> None:
     """
     sizes: dict[tuple[int, int], Path] = {}
     for path in images:
-        with suppress(OSError), Image.open(path) as image:
+        with suppress(OSError), Image.open(require_file(path, "image")) as image:
             sizes.setdefault(image.size, path)
     if len(sizes) > 1:
         raise DataError(

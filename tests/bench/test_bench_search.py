@@ -1,8 +1,9 @@
-"""The search for defaults on rows from a formula; the commands of `bench all`."""
+"""The search for defaults on rows from a formula; the commands of `make results`."""
 
 from __future__ import annotations
 
 import math
+import re
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +25,6 @@ from soup_nlp.bench.search import (
 )
 from soup_nlp.bench.study import Cell, Item, frame_of
 from soup_nlp.bench.suites import Options, list_suite
-from soup_nlp.cli.bench_all import COMMANDS
 from soup_nlp.cli.main import app, main
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.storage.rows import measure_all
@@ -153,21 +153,19 @@ def test_command_line_of_the_search(tmp_path, capsys, monkeypatch):
     assert main([*words, "--param", "nonsense"]) == 2
 
 
-@pytest.mark.parametrize("line", COMMANDS)
-def test_every_command_of_bench_all_is_understood(line):
-    words = line.format(out="results", data=Path.cwd()).split()
+def commands() -> list[str]:
+    """Arguments of `soup-nlp` in the recipe that makes everything under results/."""
+    text = (Path(__file__).parents[2] / "Makefile").read_text().replace("\\\n", " ")
+    recipe = re.sub(r"\$\(if .*?\)\)|\$\(PAIRS\)", "--data .", text)
+    return re.findall(r"\t\$\(SOUP\) (.*)", recipe)
+
+
+@pytest.mark.parametrize("line", commands())
+def test_every_command_of_make_results_is_understood(line):
+    words = line.split()
     command = get_command(app)
     context = command.make_context("soup-nlp", words)
     while hasattr(command, "resolve_command"):
         name, command, words = command.resolve_command(context, words)
         context = command.make_context(name, words, parent=context)
     assert not words or context.params
-
-
-def test_bench_all_leaves_out_what_needs_data(capsys):
-    assert main(["bench", "all", "--dry"]) == 0
-    out = capsys.readouterr().out
-    assert "--suite rendered" in out
-    assert "--data" not in out
-    assert main(["bench", "all", "--dry", "--data", "pairs"]) == 0
-    assert "--suite shared --data pairs" in capsys.readouterr().out

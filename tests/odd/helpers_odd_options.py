@@ -179,7 +179,6 @@ BASES = {
     "export": "export {p} -q -o {out}",
     "import": "import {exported} {sol} -o {out}",
     "compare": "compare {p} --solvers no_such_solver -o {out}",
-    "bench all": "bench all --dry -o {out}",
     # those that would run for minutes: their target is a file, which they must refuse first
     "family": "family {odd} --sizes=100 --scenes=orbit",
     "bench accuracy": "bench accuracy --suite=rendered --only=orbit --width=64 {tiny} -q -o {odd}",
@@ -187,7 +186,7 @@ BASES = {
     "demo": "demo -q -o {odd}",
 }
 """A call of every command that ends soon; the other analyses of bench are like `demo`."""
-ENDS = ("view", "check", "convert", "import", "export", "solve", "chain", "compare", "bench all")
+ENDS = ("view", "check", "convert", "import", "export", "solve", "chain", "compare")
 """Commands whose calls end with any folder."""
 SOLVING = ("solve", "chain", "export", "import", "compare")
 """Commands that take a second where a value is good."""
