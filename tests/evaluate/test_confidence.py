@@ -34,8 +34,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.solve import selected_inverse
-from soup_nlp.solve.selected_inverse import BlockCholesky, dissect
+from soup_nlp.solve.selected_inverse import BlockCholesky, layers
 from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.components import TIES
 
@@ -67,11 +66,9 @@ def blocks_of(matrix: np.ndarray, size: int) -> np.ndarray:
     return matrix.reshape(n, size, n, size)[np.arange(n), :, np.arange(n)]
 
 
-@pytest.mark.parametrize("piece", [1, 4, 1000])
-@pytest.mark.parametrize("seed", range(4))
-def test_diagonal_blocks_equal_those_of_a_dense_inverse(monkeypatch, piece, seed):
-    """Random graphs; the third and fourth have parts that nothing couples."""
-    monkeypatch.setattr(selected_inverse, "PIECE", piece)
+@pytest.mark.parametrize("seed", range(6))
+def test_diagonal_blocks_equal_those_of_a_dense_inverse(seed):
+    """Random graphs; the last four have parts that nothing couples."""
     rng = np.random.default_rng(seed)
     n, size = 30, 3
     place = rng.uniform(0, 1, (n, 2))
@@ -83,7 +80,12 @@ def test_diagonal_blocks_equal_those_of_a_dense_inverse(monkeypatch, piece, seed
     np.testing.assert_allclose(solver.inverse_blocks(), blocks_of(inverse, size), rtol=1e-8)
     b = rng.normal(size=(n * size, 2))
     np.testing.assert_allclose(solver.solve(b), inverse @ b, rtol=1e-7, atol=1e-12)
-    assert np.array_equal(np.sort(np.concatenate([f.own for f in solver.fronts])), np.arange(n))
+    order = layers(sparse.csr_matrix(near), place)
+    assert len(order) > 2
+    assert np.array_equal(np.sort(np.concatenate(order)), np.arange(n))
+    for k, own in enumerate(order):
+        beyond = np.concatenate([*order[k + 2 :], np.zeros(0, int)])
+        assert not near[np.ix_(own, beyond)].any()
 
 
 def test_a_matrix_that_is_not_positive_is_refused():
@@ -91,11 +93,6 @@ def test_a_matrix_that_is_not_positive_is_refused():
         BlockCholesky(sparse.csr_matrix(np.diag([1.0, 0.0])), np.zeros((2, 2)))
     with pytest.raises(ArithmeticError, match="positive definite"):
         BlockCholesky(sparse.csr_matrix([[1.0, 2.0], [2.0, 1.0]]), np.array([[0.0, 0], [1, 1]]))
-
-
-def test_superpixels_in_one_place_are_one_piece():
-    fronts = dissect(sparse.csr_matrix(np.ones((40, 40))), np.zeros((40, 2)))
-    assert len(fronts) == 1
 
 
 def test_marginals_are_those_of_a_dense_inverse(small_room, info, dense):
