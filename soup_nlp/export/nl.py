@@ -23,7 +23,6 @@ from soup_nlp.errors import ExportError
 from soup_nlp.export.body import NlBody
 from soup_nlp.export.opcodes import number
 from soup_nlp.export.program import Program, make_program, orders
-from soup_nlp.model.kernel import Group
 from soup_nlp.model.nlp import NLP
 from soup_nlp.storage.atomic import write_bytes, write_text
 from soup_nlp.storage.files import as_path
@@ -68,11 +67,6 @@ class NLFile:
         }
 
 
-Names = Sequence[str]
-AllNames = tuple[Names | None, Names | None, str]
-"""Names of variables, rows and the objective; None writes no file."""
-
-
 Of = Literal["variables", "rows"]
 OF: tuple[Of, Of] = ("variables", "rows")
 
@@ -95,7 +89,7 @@ class Suffix:
 def write_nl(
     path: str | Path,
     nlp: NLP,
-    names: tuple[Names, Names] | None = None,
+    names: tuple[Sequence[str], Sequence[str]] | None = None,
     lam_g: Float | None = None,
     suffixes: Sequence[Suffix] = (),
 ) -> NLFile:
@@ -112,46 +106,19 @@ def write_nl(
         ExportError: an operation has no opcode, a number is not finite, or bounds cross.
         DataError: the folder cannot be written.
     """
-    x_names, g_names = names or (nlp.x_names(), nlp.g_names())
-    theta = nlp.p[: len(nlp.theta)]
-    x, g = (nlp.x0, nlp.lbx, nlp.ubx), (nlp.lbg, nlp.ubg)
     path = as_path(path, "file", error=ExportError)
-    return _write(path, nlp.groups, theta, x, g, (x_names, g_names, "E"), lam_g, suffixes)
-
-
-def _write(
-    path: Path,
-    groups: Sequence[Group],
-    theta: Float,
-    x: tuple[Float, Float, Float],
-    g: tuple[Float, Float],
-    names: AllNames,
-    lam_g: Float | None = None,
-    suffixes: Sequence[Suffix] = (),
-) -> NLFile:
-    """Check and write an NLP.
-
-    Args:
-        path: The file.
-        groups: Kernels with their tables.
-        theta: Numbers that the kernels share.
-        x: Start, lower and upper bounds of the variables.
-        g: Lower and upper bounds of the constraints.
-        names: Of variables, constraints and objective; None for no files of names.
-        lam_g: Multipliers of the start, or None.
-        suffixes: Suffixes of variables and rows.
-    """
-    _check(path, x, g)
-    program = make_program(groups, len(x[0]), len(g[0]), theta)
+    names = names or (nlp.x_names(), nlp.g_names())
+    _check(path, nlp)
+    program = make_program(nlp.groups, nlp.nx, nlp.ng, nlp.thetas())
     variables, rows = orders(program)
     body = NlBody(program, np.argsort(variables), np.argsort(rows))
     J = program.jacobian[rows][:, variables].tocsr()
     J.sort_indices()
     G = program.gradient[:, variables].tocsr()
     G.sort_indices()
-    x0, lbx, ubx = (v[variables] for v in x)
-    lbg, ubg = (v[rows] for v in g)
-    longest = [max(map(len, n or ()), default=0) for n in (names[1], names[0])]
+    x0, lbx, ubx = (v[variables] for v in (nlp.x0, nlp.lbx, nlp.ubx))
+    lbg, ubg = nlp.lbg[rows], nlp.ubg[rows]
+    longest = [max(map(len, n), default=0) for n in (names[1], names[0])]
     lines = chain(
         header(program, (lbg, ubg), longest, body.classes),
         *(suffix_segment(s, variables if s.of == "variables" else rows) for s in suffixes),
@@ -165,7 +132,10 @@ def _write(
     )
     data = ("\n".join(lines) + "\n").encode("ascii")
     write_bytes(path, data)
-    _write_names(path, names, variables, rows)
+    x_names, g_names = ([own[k] for k in order] for own, order in zip(names, (variables, rows)))
+    write_text(path.with_suffix(".col"), "".join(f"{name}\n" for name in x_names))
+    # the objective's name follows those of the rows
+    write_text(path.with_suffix(".row"), "".join(f"{name}\n" for name in [*g_names, "E"]))
     both = program.in_rows & program.in_objective
     return NLFile(
         path=path,
@@ -181,12 +151,12 @@ def _write(
     )
 
 
-def _check(path: Path, x: tuple[Float, Float, Float], g: tuple[Float, Float]) -> None:
+def _check(path: Path, nlp: NLP) -> None:
     """Raise ExportError if the start is not finite or bounds hold for no finite number."""
-    if not np.isfinite(x[0]).all():
-        k = int(np.argmin(np.isfinite(x[0])))
-        raise ExportError("x0 is not finite", where=path, found=f"{x[0][k]} at entry {k}")
-    for name, (lower, upper) in {"x": x[1:], "g": g}.items():
+    if not np.isfinite(nlp.x0).all():
+        k = int(np.argmin(np.isfinite(nlp.x0)))
+        raise ExportError("x0 is not finite", where=path, found=f"{nlp.x0[k]} at entry {k}")
+    for name, lower, upper in (("x", nlp.lbx, nlp.ubx), ("g", nlp.lbg, nlp.ubg)):
         # false for NaN too
         good = (lower <= upper) & (lower < np.inf) & (upper > -np.inf)
         if not good.all():
@@ -196,16 +166,6 @@ def _check(path: Path, x: tuple[Float, Float, Float], g: tuple[Float, Float]) ->
                 where=path,
                 found=f"[{lower[k]}, {upper[k]}] at entry {k}",
             )
-
-
-def _write_names(path: Path, names: AllNames, variables: Int, rows: Int) -> None:
-    """Write the .col and .row files in the order of the .nl file."""
-    if names[0] is not None:
-        write_text(path.with_suffix(".col"), "".join(f"{names[0][k]}\n" for k in variables))
-    if names[1] is not None:
-        # the objective's name follows those of the rows
-        text = "".join(f"{names[1][k]}\n" for k in rows) + f"{names[2]}\n"
-        write_text(path.with_suffix(".row"), text)
 
 
 def header(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from types import FrameType
 from typing import Any
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class interruptible:  # noqa: N801
@@ -19,9 +20,13 @@ class interruptible:  # noqa: N801
 
     Args:
         say: Told what a Ctrl-C does; it is called in a signal handler.
+        numbers: The signals.
     """
 
-    def __init__(self, say: Callable[[str], None] | None = None) -> None:
+    def __init__(
+        self, say: Callable[[str], None] | None = None, numbers: Iterable[int] = SIGNALS
+    ) -> None:
+        self.numbers = numbers
         self.event = threading.Event()
         self.deferred = self.aborted = False
         self._say = say or (lambda line: None)
@@ -29,8 +34,7 @@ class interruptible:  # noqa: N801
 
     def __enter__(self) -> threading.Event:
         if threading.current_thread() is threading.main_thread():
-            numbers = signal.SIGINT, signal.SIGTERM
-            self._old = {number: signal.signal(number, self._set) for number in numbers}
+            self._old = {number: signal.signal(number, self._set) for number in self.numbers}
         return self.event
 
     def _set(self, number: int, frame: FrameType | None) -> None:
@@ -51,33 +55,6 @@ class interruptible:  # noqa: N801
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
-@contextmanager
-def raised_at_the_end(stop: threading.Event) -> Iterator[None]:
-    """Where a signal would raise KeyboardInterrupt, it sets `stop`, and the block's end raises.
-
-    CasADi swallows what is raised in its callbacks. Signals that others handle, such as
-    `interruptible`, are left to them; the second one raises at once.
-
-    Args:
-        stop: Ends the work of the block.
-    """
-    came: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        if came:
-            raise KeyboardInterrupt
-        came.append(number)
-        stop.set()
-
-    main = threading.current_thread() is threading.main_thread()
-    numbers = (signal.SIGINT, signal.SIGTERM) if main else ()
-    own = [n for n in numbers if signal.getsignal(n) is signal.default_int_handler]
-    for number in own:
-        signal.signal(number, note)
-    try:
-        yield
-    finally:
-        for number in own:
-            signal.signal(number, signal.default_int_handler)
-    if came:
-        raise KeyboardInterrupt
+def raising() -> list[int]:
+    """Signals that would raise KeyboardInterrupt, which CasADi swallows in its callbacks."""
+    return [n for n in SIGNALS if signal.getsignal(n) is signal.default_int_handler]

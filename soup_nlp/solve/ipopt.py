@@ -15,7 +15,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.functions import Functions, IterationCallback
-from soup_nlp.solve.interrupt import raised_at_the_end
+from soup_nlp.solve.interrupt import interruptible, raising
 from soup_nlp.storage.progress import Progress, Watch
 
 # few bounds are active, so mu starts near its end (docs/solving.md)
@@ -245,6 +245,8 @@ class Ipopt:
         solver = self._solver(callback, max_iter, tol)
         given = {"p": nlp.thetas() if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
         bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}
-        with raised_at_the_end(callback.signalled):
+        with interruptible(numbers=raising()) as callback.signalled:
             out = solver(x0=x0, **bounds, **{k: v for k, v in given.items() if v is not None})
+        if callback.signalled.is_set():
+            raise KeyboardInterrupt
         return callback.ended(solver.stats(), {k: np.asarray(v).ravel() for k, v in out.items()})

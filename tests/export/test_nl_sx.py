@@ -164,11 +164,10 @@ def test_random_programs_read_back(program, tmp_path_factory):
     same_as_sx(problem, file, at)
 
 
-def test_without_constraints_and_without_names(tmp_path):
+def test_without_constraints(tmp_path):
     x = ca.SX.sym("x", 3)
     file = write_sx_nl(tmp_path / "linear.nl", {"x": x, "f": x[0] - 2 * x[2] + 1})
     assert file.nonlinear == (0, 0, 0)
-    assert not list(tmp_path.glob("*.col"))
     back = ReadBack(file.path)
     assert np.array_equal(back.values([1, 5, 7])[2].full().ravel(), [1, 0, -2])
     assert float(back.values([1, 5, 7])[0]) == -12

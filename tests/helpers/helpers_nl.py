@@ -8,9 +8,9 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from soup_nlp.export import nl
-from soup_nlp.export.nl import NLFile
+from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.model.kernel import Group, Kernel, Table
+from soup_nlp.model.nlp import NLP
 
 
 def write_sx_nl(
@@ -34,14 +34,20 @@ def write_sx_nl(
     def vector(values: np.ndarray | None, size: int, default: float) -> np.ndarray:
         return np.full(size, default) if values is None else np.asarray(values, float)
 
-    return nl._write(
-        path,
+    nlp = NLP(
+        "plain",
         (Group(kernel, table),),
-        np.zeros(0),
-        (vector(x0, n, 0.0), vector(lbx, n, -np.inf), vector(ubx, n, np.inf)),
-        (vector(lbg, m, -np.inf), vector(ubg, m, np.inf)),
-        (x_names, g_names, "f"),
+        x0=vector(x0, n, 0.0),
+        lbx=vector(lbx, n, -np.inf),
+        ubx=vector(ubx, n, np.inf),
+        lbg=vector(lbg, m, -np.inf),
+        ubg=vector(ubg, m, np.inf),
+        theta={},
+        hessian_kind="exact",
+        x_names=lambda: x_names or [f"x[{i}]" for i in range(n)],
+        g_names=lambda: g_names or [f"g[{i}]" for i in range(m)],
     )
+    return write_nl(path, nlp)
 
 
 class ReadBack:
