@@ -88,20 +88,25 @@ def with_prior(
     )
 
 
-def with_order(data: EnergyData, soup: Soup, order: Float, weight: float) -> EnergyData:
+def with_order(
+    data: EnergyData, soup: Soup, order: Float, guessed: Mask, weight: float
+) -> EnergyData:
     """The same data with E_order where occlusion shows which superpixel of a pair is in front.
 
-    The step that is asked for is that of the start, within `STEPS`.
+    Where that is all that gives a scale, the step of the start is asked for, within `STEPS`; else
+    none, only the order.
 
     Args:
         data: Data of the pair.
         soup: Start.
         order: (P,) probability of the order, signed as `EnergyData.order_weight`.
+        guessed: (N,) True where the start has placed a superpixel by that order.
         weight: Of a sure order.
     """
     z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
     step = np.where(order > 0, z[0] / z[1], z[1] / z[0]) - 1
-    return replace(data, order_weight=weight * order, order_step=np.clip(step, *STEPS))
+    step = np.where(guessed[data.pairs].any(axis=1), np.clip(step, *STEPS), 0.0)
+    return replace(data, order_weight=weight * order, order_step=step)
 
 
 def in_noise(data: EnergyData, noise: float) -> EnergyData:

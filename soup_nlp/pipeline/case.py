@@ -45,6 +45,7 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 from soup_nlp.pipeline.still_layer import see_through
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
+from soup_nlp.start.components import TIES
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import in_order
 from soup_nlp.start.propose import Start, propose
@@ -249,7 +250,8 @@ def build_energy(
     data = over_ground(data, start.soup, start.grounded, PRIOR_OVER_GROUND * free)
     parts = start.component
     if start.order is not None:
-        data = with_order(data, start.soup, start.order, start.noise)
+        guessed = start.tie == TIES.index("occlusion")
+        data = with_order(data, start.soup, start.order, guessed, start.noise)
     if given is not None and given.used:
         # no flow holds slopes where the prior decides: they are held as those that bend
         stiffer = np.where(bends, 1.0, bent.orient / max(e.weights.orient, 1e-12))

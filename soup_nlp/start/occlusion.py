@@ -148,7 +148,7 @@ def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
 
     All pairs along the outline of two regions have one order, that of the majority of the pairs
     that tell one. With m of n votes for it the probability is `(m + 1) / (n + 2)`. Pairs that say
-    otherwise, or nothing, and outlines of a probability up to `SURE`, are left out.
+    otherwise, and outlines of a probability up to `SURE`, are left out.
 
     Args:
         contrast: (P,) see `covering`.
@@ -163,8 +163,8 @@ def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
     total = np.bincount(outline, np.abs(says))
     lead = np.bincount(outline, says)
     sure = ((total + np.abs(lead)) / 2 + 1) / (total + 2)
-    holds = (says * lead[outline] > 0) & (sure[outline] > SURE)
-    return np.where(holds, says * turned * sure[outline], 0.0)
+    holds = (a != b) & (says * lead[outline] >= 0) & (sure[outline] > SURE)
+    return np.where(holds, np.sign(lead[outline]) * turned * sure[outline], 0.0)
 
 
 def in_order(start: Start, seg: Segmentation, pair: Pair, o: SeededStart) -> Start:
@@ -184,11 +184,16 @@ def in_order(start: Start, seg: Segmentation, pair: Pair, o: SeededStart) -> Sta
     affine, _ = affine_flow(views)
     jump = flow_jump(affine, views, seg.pairs, rays(pair.K_ref, seg.boundary))
     region = regions(start, views, jump, seg, o)
-    order = vote(covering(seg, pair, views, affine, jump), region, seg)
-    if not order.any():
+    contrast = covering(seg, pair, views, affine, jump)
+    whole = vote(contrast, region, seg)
+    if not whole.any():
         return start
+    order = np.where(np.abs(contrast) > CONTRAST, whole, 0.0)
     factor = placed(start.soup, region, order, start.tie == FIXED, seg, pair.K_ref)
     moved = factor != 1
+    # the scale of what is placed is held along its whole outline
+    held = moved[seg.pairs].any(axis=1) & (jump >= CLOSING_PX)
+    order = np.where(held, whole, order)
     soup = replace(start.soup, lam=start.soup.lam * factor).normalised()
     tie = np.where(moved, TIES.index("occlusion"), start.tie)
     own = np.where(moved & start.bends, len(seg) + region, start.component)

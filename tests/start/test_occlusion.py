@@ -109,6 +109,8 @@ def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
         start.soup.homographies(K, K), before.soup.homographies(K, K), atol=1e-9
     )
     assert len(np.unique(start.component)) == 3
+    # held along the whole outline, upper and lower edges included
+    np.testing.assert_array_equal(start.order != 0, moves[seg.pairs].sum(axis=1) == 1)
 
 
 @pytest.fixture(scope="module")
