@@ -79,7 +79,7 @@ def test_the_runner_judges_an_answer(move, word, folder, tmp_path, capsys):
         "open(sys.argv[1] + '.sol', 'w').write('\\n'.join(text) + '\\n')\n"
     )
     program.chmod(0o755)
-    words = [f"{program} fast=1", "room-unit", "hard", "--folder", str(tmp_path)]
+    words = [f"{program} fast=1", "unit-offset", "hard", "--folder", str(tmp_path)]
     assert run_solver.main(words) == (word == "WRONG")
     out = capsys.readouterr().out
     assert f"SOUP-room-os-100h        {word}" in out
