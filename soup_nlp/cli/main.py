@@ -33,7 +33,7 @@ ABORTED = 130
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "solve": ("solve:solve", "Solve a pair of frames and write a result folder."),
-    "demo": ("demo:demo", "Solve a real pair and a rendered street in which cars move."),
+    "demo": ("solve:demo", "Solve a real pair and a rendered street in which cars move."),
     "view": ("view:view", "Open the page of a result in a browser, or serve it."),
     "check": (
         "results:check",
@@ -44,7 +44,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "Solve the consecutive pairs of a sequence and put them on one scale.",
     ),
     "convert": (
-        "convert:convert",
+        "view:convert",
         "Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions.",
     ),
     "evaluate": ("results:evaluate", "Score a result against a truth file."),

@@ -1,4 +1,4 @@
-"""Command solve: a pair of frames becomes a result folder."""
+"""Commands solve and demo: a pair of frames becomes a result folder."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run as run_problem
 from soup_nlp.report.findings import guess_reason
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
+from soup_nlp.report.result import PAGE
 from soup_nlp.report.summary import certainty
 from soup_nlp.report.verdict import missed, verdict
 from soup_nlp.sequence.frames import IMAGES
@@ -252,3 +253,27 @@ def exit_code(run: Run, mre_at_most: float | None) -> tuple[int, str]:
     if mre_at_most is not None and missed(run):
         return 1, f"the MRE is above the expected {mre_at_most:g}"
     return 0, "solved, and at most half of the image is a guess"
+
+
+PAIRS = {
+    "motorcycle": "a real pair, rigid: here one rigid motion for the whole image is as good",
+    "street": "a rendered street: the camera drives and two cars move",
+}
+"""Problems of the demo with a description."""
+
+
+def demo(
+    out: options.Out = Path("out/demo"),
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Solve a real pair and a rendered street in which cars move."""
+    codes = []
+    for name, text in PAIRS.items():
+        print(f"\n{name}: {text}", flush=True)
+        problem = load_problem(name)
+        log, limit = SolveLog(quiet, problem=problem), problem.expected.mre_at_most
+        codes.append(solve_problem(problem, out / name, log, limit, overwrite=overwrite))
+    pages = " and ".join(str(out / name / PAGE) for name in PAIRS)
+    print(f"\nopen        {pages} in a browser")
+    raise typer.Exit(max(codes))

@@ -1,4 +1,4 @@
-"""Command view: the page of a result in a browser."""
+"""Commands view and convert: a result for a browser, and for other programs."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from typing import Annotated
 
 import typer
 
+from soup_nlp.cli.options import Overwrite
 from soup_nlp.errors import DataError
+from soup_nlp.report.folder import convert as convert_folder
 from soup_nlp.report.folder import renew_page
+from soup_nlp.report.formats import FORMATS
 from soup_nlp.report.result import PAGE
-from soup_nlp.sequence.stored import is_chain
+from soup_nlp.sequence.stored import convert_chain, is_chain
 from soup_nlp.sequence.write import CHAIN_PAGE, renew_chain_page
 
 
@@ -29,19 +32,27 @@ def view(
     ] = False,
 ) -> None:
     """Open the page of a result in a browser, or serve it."""
-    page = CHAIN_PAGE if is_chain(folder) else PAGE
+    page, renewed = (CHAIN_PAGE, renew_chain_page) if is_chain(folder) else (PAGE, renew_page)
     place = folder / page
-    if page != PAGE:
-        if renew or not place.is_file():
-            place = renew_chain_page(folder)
-    elif renew or not place.is_file():
-        place = renew_page(folder)
+    if renew or not place.is_file():
+        place = renewed(folder)
     if serve is None:
         address = place.resolve().as_uri()
         opened = not no_open and webbrowser.open(address)
         print(f"opened      {place}" if opened else f"open        {address}")
         return
-    with _server(folder, serve) as server:
+    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
+    try:
+        server = ThreadingHTTPServer(("127.0.0.1", serve), handler)
+    except (OSError, OverflowError) as error:
+        raise DataError(
+            "port cannot be used",
+            where="--serve",
+            found=f"{serve}: {error}",
+            expected="a free port",
+            hint="--serve 0 chooses one",
+        ) from error
+    with server:
         address = f"http://127.0.0.1:{server.server_address[1]}/{page}"
         print(f"serving     {address} until Ctrl-C", flush=True)
         if not no_open:
@@ -52,21 +63,20 @@ def view(
             print("stopped")
 
 
-def _server(folder: Path, port: int) -> ThreadingHTTPServer:
-    """A server of a folder that only this machine can reach.
+_NAMES = "; ".join(f"{name}: {text}" for name, (_, text) in FORMATS.items())
 
-    Raises:
-        DataError: the port cannot be used.
-    """
-    try:
-        return ThreadingHTTPServer(
-            ("127.0.0.1", port), partial(SimpleHTTPRequestHandler, directory=str(folder))
-        )
-    except (OSError, OverflowError) as error:
-        raise DataError(
-            "port cannot be used",
-            where="--serve",
-            found=f"{port}: {error}",
-            expected="a free port",
-            hint="--serve 0 chooses one",
-        ) from error
+
+def convert(
+    folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain.")],
+    to: Annotated[str, typer.Option("--to", help=f"Comma separated. {_NAMES}.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output folder; default the result's own.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions."""
+    names = [name.strip() for name in to.split(",") if name.strip()]
+    target = folder if out is None else out
+    write = convert_chain if is_chain(folder) else convert_folder
+    for name in write(folder, names, out, overwrite):
+        print(target / name)
