@@ -53,7 +53,7 @@ class SegmentationOptions(Section):
 
 
 class Expected(Section):
-    """What a run should score; solve exits with 1 where it does not."""
+    """The accuracy that a run should reach; solve exits with 1 if it does not."""
 
     mre_at_most: Positive | None = None
     """Largest mean relative error of the solution's depth, after one median scale; null for no
@@ -87,17 +87,17 @@ class Problem(Section):
     """One problem file."""
 
     name: Annotated[str, AfterValidator(_is_title)] = "problem"
-    """For titles."""
+    """Name for titles and folders."""
     preset: Literal["paper"] | None = None
     """Options below the keys of this file: paper, the method as printed (`soup-nlp show --preset
     paper`); null for the defaults."""
     input: Input
-    """What to solve, by its kind."""
+    """The frames to solve, by kind of input."""
     max_size: Positive | None = 1.5
     """Largest reference image that is solved as it is, megapixels. A larger pair is solved at this
     size, and its depth brought to the images' own size along their edges; null for no limit."""
     seed: Seed = 0
-    """Of every random draw."""
+    """Seed of every random draw."""
     segmentation: SegmentationOptions = SegmentationOptions()
     """Superpixels and graphs."""
     flow: FlowOptions = FlowOptions()
@@ -105,7 +105,7 @@ class Problem(Section):
     depth_prior: PriorOptions = PriorOptions()
     """A depth of the reference frame from elsewhere."""
     start: StartOptions = StartOptions()
-    """How the start is made."""
+    """How the initialisation is computed."""
     energy: EnergyOptions = EnergyOptions()
     """Terms, weights, units."""
     formulation: FormulationOptions = FormulationOptions()
@@ -115,7 +115,7 @@ class Problem(Section):
     refine: RefineOptions = RefineOptions()
     """Discrete refinement by particles."""
     expected: Expected = Expected()
-    """What the run should score."""
+    """The accuracy that the run should reach."""
     output: OutputOptions = OutputOptions()
     """What the result folder holds."""
     base: str = "."

@@ -100,7 +100,7 @@ def _explanation(K: Float, size: Size) -> tuple[str, Float]:
         "the order is fx cx fy cy": intrinsics(fx, cx, fy, cy),
         "cx and cy are exchanged": intrinsics(fx, fy, cy, cx),
     }
-    # of which it is the middle; beyond the corner it is of none
+    # scale to this image from the image whose middle the principal point is
     across, down = width / max(2 * cx + 1, 1e-9), height / max(2 * cy + 1, 1e-9)
     # sizes keep their proportions, or the focal lengths show that they do not
     if _ratio(across, down) < ALIKE or _ratio(fx * across, fy * down) < ALIKE:

@@ -41,7 +41,7 @@ class FilesInput(FramesInput):
     """Horizontal field of view of the reference frame as shown, degrees, where `intrinsics` is
     null; the next frame has the same lens unless EXIF names another."""
     intrinsics_next: Camera | str | None = None
-    """The same of the next frame; null for the same camera if `intrinsics` is given."""
+    """Camera of the next frame, in the same forms; null for that of the reference frame."""
     depth: str | None = None
     """True depth of the reference frame, for measuring only (.dpt .npy .pfm .png)."""
     depth_next: str | None = None

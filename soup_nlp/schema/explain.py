@@ -110,7 +110,7 @@ def _number(value: float) -> str:
 
 
 def _tags(model: type[BaseModel]) -> tuple[str, ...]:
-    """Kinds of input that a section is."""
+    """Values of `kind` that a section stands for."""
     kinds: Any = model.model_fields["kind"].annotation
     return tuple(kinds.__args__)
 
@@ -129,7 +129,7 @@ def _words(item: Mapping[str, Any]) -> list[str]:
 
 
 def _range(model: type[BaseModel], tree: Any, place: Place) -> str:
-    """Smallest and largest number that the field at a place allows; "" where it has no such."""
+    """Smallest and largest number that the field at a place allows; empty if it is not bounded."""
     for key in place[:-1]:
         below: Any = model.model_fields[key].annotation if key in model.model_fields else None
         tree = tree.get(key) if isinstance(tree, Mapping) else None

@@ -7,18 +7,18 @@ from soup_nlp.errors import DataError
 MAX_SIDE = 20_000
 """Largest width or height of an image, flow or depth, pixels."""
 MAX_PIXELS = 64_000_000
-"""Most pixels of one; a picture of 8K has half of them."""
+"""Most pixels of an image; an 8K picture has half as many."""
 MAX_ASPECT = 32
-"""Largest ratio of its sides; a panorama has 10."""
+"""Largest ratio of the sides of an image; that of a panorama is up to 10."""
 MAX_SUPERPIXELS = 20_000
 MAX_NEIGHBOURS = 100
 MAX_PARTICLES = 1_000
 MAX_SAMPLES = 10_000
-"""Pixels or boundary points of one superpixel."""
+"""Most pixels or boundary points that are sampled of a superpixel."""
 MAX_ROUNDS = 10_000
-"""Rounds and iterations of any loop."""
+"""Most rounds or iterations of a loop."""
 MAX_SEED = 2**31 - 1
-"""OpenCV's generator takes 32 bits with a sign."""
+"""OpenCV's random generator takes signed integers of 32 bits."""
 LEAST, MOST = 1e-9, 1e9
 """Magnitude of real numbers: products and squares of them stay far from overflow."""
 

@@ -10,7 +10,6 @@ from scipy import ndimage
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.borders import fit_affine, follow_flow
 from soup_nlp.data.pair import Flow
-from soup_nlp.errors import DataError
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.pipeline.case import prepare
 
@@ -88,11 +87,6 @@ def test_flow_without_sense_still_leaves_a_partition():
     n = assert_partition(follow_flow(grid(), flow))
     # no piece below a quarter of the mean area stays
     assert 1 <= n <= 4 * 48
-
-
-def test_labels_of_another_size_are_refused():
-    with pytest.raises(DataError, match="differ in size"):
-        follow_flow(grid()[1:], two_motions())
 
 
 def test_where_all_pixels_scatter_none_of_them_is_suspected():

@@ -38,7 +38,7 @@ class PairInput(Section, ABC):
 
 
 class FramesInput(PairInput):
-    """Base of inputs of image files, which say nothing of their truth and pixels themselves."""
+    """Base of the inputs of image files: options about the truth and the pixels."""
 
     depth_scale: Positive | None = None
     """Values per unit of length of a 16-bit .png depth; null for 1000, with a warning."""

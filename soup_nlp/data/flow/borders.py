@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from soup_nlp.data.pair import Flow, check_size
-from soup_nlp.errors import DataError
+from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.superpixels import LEAST_PIECE, Labels, split_components
 
 Float = NDArray[np.float64]
@@ -45,9 +44,6 @@ def follow_flow(
     Returns:
         (H, W) int32 labels 0..N'-1, each connected (4-neighbourhood) and not empty; N' may differ
         from N.
-
-    Raises:
-        DataError: sizes of labels and flow differ.
     """
     current = labels.astype(np.int64)
     count = int(current.max()) + 1
@@ -142,13 +138,7 @@ def fit_affine(
 
     Returns:
         The fits, and the last weights (P,) of the pixels with positive confidence.
-
-    Raises:
-        DataError: sizes differ, or the scale is not positive.
     """
-    check_size("labels and flow", labels.shape, flow.uv.shape, flow.source)
-    if not scale_px > 0:
-        raise DataError("scale of residuals must be positive", found=scale_px, expected="> 0 px")
     v, u = np.nonzero(flow.confidence > 0)
     return _fit(flow, labels[v, u].astype(np.int64), u, v, int(labels.max()) + 1, scale_px, rounds)
 

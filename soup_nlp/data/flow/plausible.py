@@ -1,7 +1,7 @@
 """Detection of given flows that do not belong to their images, or are in other units.
 
-Of right flows the warped next image differs by at most half as much from the reference image as
-without a flow (16 pairs, rendered and real); of wrong ones as much or more.
+The next image is warped by the flow. With a right flow it differs from the reference image at most
+half as much as without a flow (16 pairs, rendered and real); with a wrong flow, as much or more.
 """
 
 from __future__ import annotations

@@ -132,15 +132,13 @@ class FlowOptions(Section):
         source = str(path(self.source)) if is_path(self.source) else self.source
         if self.is_file() or source.startswith("truth"):
             return resolve_flow(pair, source)
-
-        def compute(pair: Pair) -> Flow:
-            if source == "dis":
-                return dis_flow(pair.image_ref, pair.image_next, self.consistency)
-            return resolve_flow(pair, source)
-
         near = at_common_focal(pair)
-        flow = compute(near)
-        return flow if near is pair else in_own_pixels(flow, near, pair, compute)
+        flow = resolve_flow(near, source, self.consistency)
+        if near is pair:
+            return flow
+        return in_own_pixels(
+            flow, near, pair, lambda pair: resolve_flow(pair, source, self.consistency)
+        )
 
     def _load_with_confidence(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
         """The flow of a file, its confidence from a backward flow and a map."""
@@ -205,26 +203,27 @@ def is_network(source: str) -> bool:
     return Path(source).suffix == ".onnx"
 
 
-METHODS: dict[str, Callable[[Pair], Flow]] = {
-    "dis": lambda pair: dis_flow(pair.image_ref, pair.image_next),
-    "truth": flow_from_truth,
+METHODS: dict[str, Callable[[Pair, bool], Flow]] = {
+    "dis": lambda pair, consistency: dis_flow(pair.image_ref, pair.image_next, consistency),
+    "truth": lambda pair, _: flow_from_truth(pair),
 }
-"""Flow methods of this package by name."""
+"""Flow methods of this package by name: functions of a pair and of `FlowOptions.consistency`."""
 
 
-def resolve_flow(pair: Pair, source: str) -> Flow:
+def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
     """The flow of a pair from a named source.
 
     Args:
         pair: The pair; its `flow` is ignored.
-        source: One of `METHODS` with default options, "truth+noise:SIGMA" (`add_noise`), the name
-            of a plug-in, the path of a network (.onnx) or of a flow file.
+        source: One of `METHODS`, "truth+noise:SIGMA" (`add_noise`), the name of a plug-in, the path
+            of a network (.onnx) or of a flow file.
+        consistency: Whether DIS weights its flow by the forward-backward consistency.
 
     Raises:
         DataError: the source is unknown or fails, or its flow has another size.
     """
     if source in METHODS:
-        return METHODS[source](pair)
+        return METHODS[source](pair, consistency)
     if source.startswith(NOISE):
         return add_noise(flow_from_truth(pair), _noise_level(source))
     if is_network(source):

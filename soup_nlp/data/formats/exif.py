@@ -32,8 +32,8 @@ def estimated_cameras(
 ) -> list[Float]:
     """Intrinsics of pictures, with square pixels and the principal point in the middle.
 
-    Each picture has its own size, orientation and lens. The focal length of one without EXIF is
-    that of another one, relative to the longer side.
+    Each picture has its own size, orientation and lens. A picture without EXIF gets the focal
+    length of another picture, relative to the longer side.
 
     Args:
         paths: The files, whose EXIF is read; None for a picture of no file.
