@@ -94,7 +94,8 @@ def found_words(run: Run) -> list[str]:
     if rest:
         most = max(share for label, share in shares.items() if label not in large[:LISTED])
         size = "below 1%" if most < SHARE / 5 else f"at most {most:.0%}"
-        lines.append(f"{rest} more component{'s' * (rest > 1)} ({size} of the image each)")
+        kind = "more components" if large else "components that move by themselves"
+        lines.append(f"{kind}: {rest} ({size} of the image{' each' * (rest > 1)})")
     if run.given is not None:
         lines.append(str(run.given))
     if run.full is not None:

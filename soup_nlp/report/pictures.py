@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,24 @@ Float = NDArray[np.floating]
 
 DENSE = 0.5
 """If a smaller share of the pixels is known, as with laser points, each is drawn larger."""
+
+
+EMPTY = "; grey = nothing lands there"
+ERROR_TICKS = (0.0, 0.05, 0.1, 0.15, ERROR_LIMIT)
+SIGMA_TICKS = (0.0, 0.1, 0.2, SIGMA_LIMIT)
+"""Values below the legends of error and sigma."""
+DEPTHS = (
+    ("ref", "depth_ref", "depth of the reference frame", "solution", ""),
+    (
+        "next",
+        "depth_next",
+        "depth of the next frame",
+        "solution_next",
+        "; grey = nothing lands there",
+    ),
+    ("start_ref", "depth_start", "depth of the start", "start", ""),
+)
+"""Array, name, title, scores and remark of the pictures of depth."""
 
 
 @dataclass(frozen=True)
@@ -89,10 +107,15 @@ def pictures(result: Result) -> dict[str, Picture]:
         *_parts(result),
         *_flow(result),
         *_depths(result),
-        *_error(result),
-        *_sigma(result),
-        _normals(result),
     ]
+    error, sigma = relative_error(result), result.array("depth/sigma_ref")
+    if error is not None:
+        title = "depth error relative to the truth; grey = no truth"
+        found.append(_shares("error", title, _enlarged(error), colourise_error, ERROR_TICKS))
+    if sigma is not None:
+        title = "expected depth error (1 sigma); bright = a guess"
+        found.append(_shares("confidence", title, sigma, colourise_sigma, SIGMA_TICKS))
+    found.append(_normals(result))
     return {picture.name: picture for picture in found}
 
 
@@ -159,34 +182,27 @@ def _flow(result: Result) -> list[Picture]:
 
 def _depths(result: Result) -> list[Picture]:
     """Depths of both frames, of the start and of the truth, with one colour scale."""
-    s, truth = result.scale, result.array("truth/depth_ref")
-    maps = {k: result.array(f"depth/{k}") for k in ("ref", "next", "start_ref")}
-    delivered = maps["ref"]
+    truth, delivered = result.array("truth/depth_ref"), result.array("depth/ref")
     assert delivered is not None
-    near, far = depth_range(truth if truth is not None else delivered * s)
+    near, far = depth_range(truth if truth is not None else delivered * result.scale)
     steps = 1 / np.linspace(1 / far, 1 / near, 5)
-    texts = tuple(f"{z:.3g} {result.length}" if k in (0, 4) else f"{z:.3g}"
-                  for k, z in enumerate(steps))  # fmt: skip
-    levels = 1 / np.linspace(1 / far, 1 / near, 128)[None]
-    bar = Bar(colourise_depth(levels, near, far), texts)
-    titles = {
-        "ref": "depth of the reference frame" + _score(result, "solution"),
-        "next": "depth of the next frame"
-        + _score(result, "solution_next")
-        + "; grey = nothing lands there",
-        "start_ref": "depth of the start" + _score(result, "start"),
-    }
-    names = {"ref": "depth_ref", "next": "depth_next", "start_ref": "depth_start"}
-    scales = {k: _scale_to_truth(result, k) for k in maps}
-    out = [
-        Picture(names[k], titles[k], colourise_depth(z * scales[k], near, far), bar)
-        for k, z in maps.items()
-        if z is not None
-    ]
+    unit = {0: f" {result.length}", 4: f" {result.length}"}
+    texts = tuple(f"{z:.3g}{unit.get(k, '')}" for k, z in enumerate(steps))
+    bar = Bar(colourise_depth(1 / np.linspace(1 / far, 1 / near, 128)[None], near, far), texts)
+    out = []
+    for array, name, title, scored, more in DEPTHS:
+        z, score = result.array(f"depth/{array}"), result.summary["metrics"].get(scored, {})
+        if z is None:
+            continue
+        # the next frame has the scale of the solution
+        own = score if name == "depth_start" else result.summary["metrics"].get("solution", {})
+        colours = colourise_depth(z * float(own.get("scale") or 1.0), near, far)
+        mre = score.get("mre")
+        said = "" if mre is None else f", MRE {mre:.3f}"
+        out.append(Picture(name, f"{title}{said}{more}", colours, bar))
     if truth is not None:
-        title = "true depth; grey = no truth"
         true = colourise_depth(_enlarged(np.where(truth > 0, truth, np.nan)), near, far)
-        out.append(Picture("depth_true", title, true, bar))
+        out.append(Picture("depth_true", "true depth; grey = no truth", true, bar))
     return out
 
 
@@ -197,18 +213,6 @@ def _enlarged(values: Float) -> Float:
         return values
     distance, nearest = distance_transform_edt(~known, return_indices=True)
     return np.where(distance < 1.5, values[tuple(nearest)], np.nan)
-
-
-def _scale_to_truth(result: Result, which: str) -> float:
-    """Scale of a depth map to the truth; that of the solution, except for the start."""
-    name = "start" if which == "start_ref" else "solution"
-    found = result.summary["metrics"].get(name, {}).get("scale")
-    return float(found) if found else 1.0
-
-
-def _score(result: Result, name: str) -> str:
-    m = result.summary["metrics"].get(name)
-    return f", MRE {m['mre']:.3f}" if m and m["mre"] is not None else ""
 
 
 def relative_error(result: Result) -> Float | None:
@@ -222,37 +226,25 @@ def relative_error(result: Result) -> Float | None:
     return error
 
 
-def _share_bar(colourise: Callable[[Float], Image], limit: float, steps: int) -> Bar:
-    """Legend of shares from 0 to a limit and above, with values at some steps."""
-    texts = [f"{100 * x:.0f} %" for x in np.linspace(0, limit, steps)]
+def _shares(
+    name: str,
+    title: str,
+    values: Float,
+    colourise: Callable[[Float], Image],
+    ticks: Sequence[float],
+) -> Picture:
+    """Picture of shares (H, W) with a legend from 0 to the last tick and above."""
+    limit, texts = ticks[-1], [f"{100 * x:.0f} %" for x in ticks]
     texts[-1] = f"\u2265 {texts[-1]}"
-    return Bar(colourise(np.linspace(0, limit, 128)[None]), tuple(texts))
-
-
-def _error(result: Result) -> list[Picture]:
-    error = relative_error(result)
-    if error is None:
-        return []
-    bar = _share_bar(colourise_error, ERROR_LIMIT, 5)
-    title = "depth error relative to the truth; grey = no truth"
-    return [Picture("error", title, colourise_error(_enlarged(error)), bar)]
-
-
-def _sigma(result: Result) -> list[Picture]:
-    sigma = result.array("depth/sigma_ref")
-    if sigma is None:
-        return []
-    bar = _share_bar(colourise_sigma, SIGMA_LIMIT, 4)
-    title = "expected depth error (1 sigma); bright = a guess"
-    return [Picture("confidence", title, colourise_sigma(sigma), bar)]
+    bar = Bar(colourise(np.linspace(0, limit, 128)[None]), tuple(texts))
+    return Picture(name, title, colourise(values), bar)
 
 
 def _normals(result: Result) -> Picture:
     n = result.soup("n")[result.labels]
     entries = {"faces the camera": (0, 0, -1), "right": (1, 0, 0), "left": (-1, 0, 0),
                "up": (0, -1, 0), "down": (0, 1, 0)}  # fmt: skip
-    keys = []
-    for text, normal in entries.items():
-        r, g, b = (int(x) for x in colourise_normals(np.array(normal, float)[None, None])[0, 0])
-        keys.append(((r, g, b), text))
+    # one pixel for each direction
+    row = colourise_normals(np.array([list(entries.values())], float))[0].tolist()
+    keys = [((r, g, b), text) for (r, g, b), text in zip(row, entries)]
     return Picture("normals", "surface normals", colourise_normals(n), Swatches(tuple(keys)))
