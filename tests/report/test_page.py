@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import dump_problem, make_problem
+from soup_nlp.config.problem import dump_problem
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report import scene3d
@@ -194,11 +194,6 @@ def test_a_component_whose_depth_is_a_guess_is_striped(shown):
     assert 0.3 < white[shown.components.of_superpixel[shown.labels] == 0].mean() < 0.45
 
 
-def test_view_of_no_result(tmp_path, capsys):
-    assert main(["view", str(tmp_path)]) == 2
-    assert "result file is missing" in capsys.readouterr().err
-
-
 def test_limits_name_what_is_wrong(shown):
     good = " ".join(limits(shown))
     assert "did not converge" not in good
@@ -226,12 +221,6 @@ def test_a_result_without_sigma_has_no_such_mode(shown):
     assert "confidence" not in found
     names = [mode["name"] for mode in data_of(page(bare, found))["modes"]]
     assert names == [name for name in MODES if name != "confidence"]
-
-
-def test_problem_files_know_the_switch():
-    scene = {"kind": "scene", "scene": "room"}
-    assert make_problem({"input": scene}).output.page
-    assert not make_problem({"input": scene}, ["output.page=false"]).output.page
 
 
 def test_sparse_truth_is_drawn_larger():

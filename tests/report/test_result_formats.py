@@ -8,13 +8,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from helpers_ply import read_ply
 from helpers_result import BOARD, BOARD_Z, CAMERA, WALL_Z, K, board, small_result
 from scipy.spatial.transform import Rotation
 
 from soup_nlp.data.formats.map_files import read_pfm
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.formats import FORMATS, write_formats
-from soup_nlp.report.ply_glb import surface_mesh
+from soup_nlp.report.ply_glb import surface_mesh, write_ply
 from soup_nlp.report.result import Result
 
 FLOAT32 = 1e-6
@@ -211,3 +212,36 @@ def test_unknown_formats_are_refused(tmp_path, result):
         write_formats(tmp_path, result, [])
     assert not list(tmp_path.iterdir())
     assert set(FORMATS) >= {"ply", "glb", "colmap", "npy", "pfm", "png", "rrd"}
+
+
+def test_bytes_of_one_point(tmp_path):
+    write_ply(tmp_path / "a.ply", [[1.0, 2.0, 3.0]], np.array([[10, 20, 30]], np.uint8))
+    header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
+    assert header.decode().splitlines() == [
+        "ply",
+        "format binary_little_endian 1.0",
+        "element vertex 1",
+        "property float x",
+        "property float y",
+        "property float z",
+        "property uchar red",
+        "property uchar green",
+        "property uchar blue",
+    ]
+    assert body == np.array([1, 2, 3], "<f4").tobytes() + bytes([10, 20, 30])
+
+
+def test_unknown_points_of_a_map_are_dropped(tmp_path):
+    xyz = np.ones((2, 3, 3))
+    xyz[0, 1, 2] = np.nan
+    xyz[1, 2, 0] = np.inf
+    xyz[1, 1, 0] = 1e300  # not a float32
+    rgb = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
+    assert write_ply(tmp_path / "a.ply", xyz, rgb) == 3
+    _, colours, _ = read_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(colours[:, 0], [0, 6, 9])
+
+
+def test_a_cloud_without_points_is_a_file(tmp_path):
+    assert write_ply(tmp_path / "a.ply", np.zeros((0, 3)), np.zeros((0, 3), np.uint8)) == 0
+    assert read_ply(tmp_path / "a.ply")[0].shape == (0, 3)
