@@ -10,7 +10,7 @@ f does not fall.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -87,14 +87,6 @@ class Tangent:
         """Smoothed energy."""
         return self.nlp.value(x, self.theta)
 
-    def gradient(self, x: Float) -> tuple[float, Float]:
-        """Smoothed energy and its gradient (9 N,)."""
-        return self.value(x), self.nlp.gradient(x, self.theta)
-
-    def normal_matrix(self, x: Float) -> sparse.csc_matrix:
-        """(9 N, 9 N) matrix of the reweighted least squares."""
-        return self.nlp.hessian(x, np.zeros(self.nlp.ng), theta=self.theta)
-
     def project(self, x: Float) -> Float:
         """The point clipped to the bounds, its slopes shrunk until every rim pixel is visible."""
         x = np.clip(x, self.nlp.lbx, self.nlp.ubx)
@@ -111,19 +103,18 @@ class Tangent:
 class _Descent:
     """An iterate with its damping; every step either lowers f or raises the damping."""
 
-    def __init__(self, problem: Tangent) -> None:
-        self.problem = problem
+    def __init__(self, problem: Tangent, begin: float) -> None:
+        """An iterate at the start; `path` has the seconds since `begin` of accepted iterates."""
+        self.problem, self.begin = problem, begin
         self.x = problem.project(problem.nlp.x0)
+        self.path = [(time.perf_counter() - begin, self.x)]
         self.damping, self.growth = FIRST_DAMPING, 2.0
 
     def smoothing(self, eps: float) -> None:
-        """Set the smoothing widths for the next steps."""
+        """Set the smoothing widths for the next steps, and lower a damping that steps raised."""
         self.problem.smoothing(eps)
-        self._move(self.x)
-
-    def relax(self) -> None:
-        """Lower the damping again that rejected steps have raised."""
         self.damping, self.growth = min(self.damping, FIRST_DAMPING), 2.0
+        self._move(self.x)
 
     def step(self) -> float | None:
         """Try a step; returns the relative decrease of f, or None if the step is rejected."""
@@ -142,43 +133,38 @@ class _Descent:
             return None
         fall = (self.f - fresh) / abs(self.f)
         self._move(trial)
+        self.path.append((time.perf_counter() - self.begin, trial))
         # Nielsen's update of the damping
         self.damping = max(LEAST_DAMPING, self.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3))
         self.growth = 2.0
         return float(fall)
 
     def _move(self, x: Float) -> None:
-        self.x = x
-        self.f, self.gradient = self.problem.gradient(x)
-        self.H = self.problem.normal_matrix(x)
+        nlp, theta = self.problem.nlp, self.problem.theta
+        self.x, self.f, self.gradient = x, nlp.value(x, theta), nlp.gradient(x, theta)
+        self.H = nlp.hessian(x, np.zeros(nlp.ng), theta=theta)
 
-
-def _descend(
-    descent: _Descent, eps: Sequence[float], iterations: int, end: float, note: Callable[[], None]
-) -> tuple[int, str]:
-    """Descend with every smoothing width in turn until the time `end`; steps and status."""
-    count, status = 0, "Converged"
-    for width in eps:
-        last = width == eps[-1]
-        descent.smoothing(width)
-        steps = small = 0
-        while small < 2:
-            if time.perf_counter() > end:
-                return count, "Time_Limit"
-            if steps == iterations:
-                status = "Iteration_Limit" if last else status
-                break
-            steps, count = steps + 1, count + 1
-            fall = descent.step()
-            if fall is not None:
-                small = small + 1 if fall <= (TOLERANCE if last else STAGNATION) else 0
-                note()
-            elif descent.damping > MOST_DAMPING:
-                # no step length lowers f: the point is optimal for this smoothing width
-                small = 2
-        else:
-            descent.relax()
-    return count, status
+    def run(self, eps: Sequence[float], iterations: int, end: float) -> tuple[int, str]:
+        """Descend with every smoothing width in turn until the time `end`; steps and status."""
+        count, status = 0, "Converged"
+        for width in eps:
+            last = width == eps[-1]
+            self.smoothing(width)
+            steps = small = 0
+            while small < 2:
+                if time.perf_counter() > end:
+                    return count, "Time_Limit"
+                if steps == iterations:
+                    status = "Iteration_Limit" if last else status
+                    break
+                steps, count = steps + 1, count + 1
+                fall = self.step()
+                if fall is not None:
+                    small = small + 1 if fall <= (TOLERANCE if last else STAGNATION) else 0
+                elif self.damping > MOST_DAMPING:
+                    # no step length lowers f: the point is optimal for this smoothing width
+                    small = 2
+        return count, status
 
 
 def levenberg_marquardt(
@@ -207,17 +193,12 @@ def levenberg_marquardt(
         seconds: Limit of the wall time.
     """
     wall, cpu = time.perf_counter(), time.process_time()
-    descent = _Descent(Tangent(start, data, weights, form))
-    path = [(time.perf_counter() - wall, descent.x)]
-
-    def note() -> None:
-        path.append((time.perf_counter() - wall, descent.x))
-
-    count, status = _descend(descent, eps, iterations, wall + seconds, note)
+    descent = _Descent(Tangent(start, data, weights, form), wall)
+    count, status = descent.run(eps, iterations, wall + seconds)
     spent = time.perf_counter() - wall, time.process_time() - cpu
     # computed here, so that the times exclude the exact energies
-    soups = [descent.problem.layout.unpack(x) for _, x in path]
+    soups = [descent.problem.layout.unpack(x) for _, x in descent.path]
     energies = [oracle.energy(soup, data, weights) for soup in soups]
-    history = np.array([(t, energy["total"]) for (t, _), energy in zip(path, energies)])
+    history = np.array([(t, energy["total"]) for (t, _), energy in zip(descent.path, energies)])
     best = int(history[:, 1].argmin())
     return ReferenceSolve(soups[best], energies[best], count, *spent, history, status)

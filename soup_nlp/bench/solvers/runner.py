@@ -55,16 +55,13 @@ def make_tasks(
             "start": "presolve" if presolved else "proposal",
             "energy_limit": ceiling * (1 + ENERGY_SLACK),
         }
-        yield label, _maker(case, form, limits)
 
+        def programs(form: Formulation = form) -> Programs:
+            nlp, layout = case.nlp(form)
+            second, _ = case.nlp(form.replace(hessian="gauss-newton+constraints"))
+            return nlp, second, layout, form
 
-def _maker(case: Case, form: Formulation, limits: Limits) -> Maker:
-    def programs() -> Programs:
-        nlp, layout = case.nlp(form)
-        second, _ = case.nlp(form.replace(hessian="gauss-newton+constraints"))
-        return nlp, second, layout, form
-
-    return task_maker(case, programs, limits)
+        yield label, task_maker(case, programs, limits)
 
 
 def task_maker(case: Case, programs: Callable[[], Programs], limits: Limits) -> Maker:
