@@ -1,5 +1,4 @@
-"""Components: who recedes gains little, edges of two components weigh less, gaps they leave stay
-open."""
+"""Scales of components by contact; weights of the energy across components and occlusions."""
 
 from __future__ import annotations
 
