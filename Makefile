@@ -67,10 +67,10 @@ results: $(VENV)/.optional
 		--analysis 250 --overwrite
 	$(SOUP) bench speed -o results/speed --superpixels 500,1000,2000 --neighbours 20 --overwrite
 	$(SOUP) bench cost -o results/speed --overwrite
-	$(SOUP) family out/matrix --sizes 100 --starts hard --overwrite
 	$(SOUP) family out/tangent --sizes 100,250 --starts hard --coordinates tangent --overwrite
-	$(SOUP) compare out/matrix out/tangent -o results/solvers --seconds 20 --iterations 500 \
-		--solvers ipopt,ipopt-soup,ipopt-lbfgs,sqpmethod,uno,fatrop,pounce,lm,soup-nlp --overwrite
+	$(SOUP) family out/matrix --sizes 100 --starts hard --overwrite
+	$(SOUP) compare out/tangent out/matrix -o results/solvers --seconds 10 --iterations 500 \
+		--solvers ipopt,ipopt-lbfgs,sqpmethod,uno,fatrop,pounce,lm,soup-nlp --overwrite
 
 clean:
 	rm -rf $(VENV) out site

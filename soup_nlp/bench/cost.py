@@ -6,8 +6,15 @@ from itertools import product
 
 import pandas as pd
 
-from soup_nlp.bench.study import Cell, failures, markdown, page_text, pivot, provenance
-from soup_nlp.bench.suites import Item
+from soup_nlp.bench.study import (
+    Cell,
+    Item,
+    failures,
+    markdown,
+    page_text,
+    pivot,
+    provenance,
+)
 
 SIZES = ((512, 218), (1024, 436), (1792, 763))
 """Columns and rows of the images; the largest are just below the limit of the working size."""
