@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
-from soup_nlp.arrays import Float, FloatMap, Image, Int, Labels, Mask
+from soup_nlp.arrays import Float, FloatMap, Image, Int, Labels
 from soup_nlp.geometry.camera import rays
 
 COLOUR = 0.1
@@ -30,7 +31,8 @@ def grown_labels(labels: Labels, small: Image, image: Image) -> Labels:
         (H, W) labels.
     """
     (h, w), (height, width) = labels.shape, image.shape[:2]
-    border = _borders(labels)
+    # where another label is among the 3 x 3 pixels around a pixel
+    border = ndimage.maximum_filter(labels, 3) != ndimage.minimum_filter(labels, 3)
     x = (np.arange(width) + 0.5) * (w / width) - 0.5
     column = np.rint(x).astype(np.int64).clip(0, w - 1)
     out = np.empty((height, width), np.int32)
@@ -65,17 +67,6 @@ def plane_depth(labels: Labels, normal: Float, offset: Float, K: Float) -> Float
         with np.errstate(divide="ignore", invalid="ignore"):
             z = offset[own] / facing
         out[top : top + ROWS] = np.where((own >= 0) & (facing > 1e-6) & (z > 0), z, np.nan)
-    return out
-
-
-def _borders(labels: Labels) -> Mask:
-    """(h, w) whether another label is among the 3 x 3 pixels around a pixel."""
-    out = np.zeros(labels.shape, bool)
-    padded = np.pad(labels, 1, mode="edge")
-    height, width = labels.shape
-    for dv in range(3):
-        for du in range(3):
-            out |= padded[dv : dv + height, du : du + width] != labels
     return out
 
 

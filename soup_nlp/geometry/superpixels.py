@@ -97,11 +97,8 @@ def _as_many(image: Image, labels: Labels, count: int, sigma: float) -> Labels:
             break
         asked = min(image.shape[0] * image.shape[1] // 4, math.ceil(asked * 1.03 * count / n))
         labels = _slic(image, asked, sigma)
-    return _merged(labels, count) if labels.max() + 1 > count + near else labels
-
-
-def _merged(labels: Labels, count: int) -> Labels:
-    """Superpixels of a finer segmentation, the smallest merged with a neighbour."""
+    if labels.max() + 1 <= count + near:
+        return labels
     sizes = np.sort(np.bincount(labels.ravel()))
     return split_components(labels, int(sizes[-count]))
 
