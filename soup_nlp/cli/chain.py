@@ -33,10 +33,10 @@ def chain(
     fov: options.Fov = None,
     undistort: options.Undistort = False,
     stride: Annotated[
-        str, typer.Option(help="Take every so many frames; auto: until there is parallax.")
+        str, typer.Option(help="Take every n-th frame; auto: the next with enough parallax.")
     ] = "1",
     frames: Annotated[
-        int | None, typer.Option(help="Most frames; of a scene 10 unless named.", min=2)
+        int | None, typer.Option(help="Largest number of frames; 10 of a scene by default.", min=2)
     ] = None,
     two_frame: Annotated[
         bool, typer.Option("--two-frame", help="Solve frames k and k + 2 too, for more links.")

@@ -15,7 +15,7 @@ from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
 from soup_nlp.bench.solvers.runner import make_tasks
-from soup_nlp.cli.options import Coordinates, Formulations, Overwrite, Set, Superpixels
+from soup_nlp.cli.options import Coordinates, Formulations, Overwrite, Set, Superpixels, listed
 from soup_nlp.config.problem import load_problem, title
 from soup_nlp.errors import ConfigError, StoppedError
 from soup_nlp.export.artefact import parse_formulations
@@ -63,8 +63,7 @@ def compare(
             where="compare",
             found=f"{seconds:g} s, {iterations} iterations, tol {tol:g}, {memory:g} GiB",
         )
-    wanted = available() if solvers == "all" else [w.strip() for w in solvers.split(",")]
-    names = list(dict.fromkeys(w for w in wanted if w))
+    names = [*available()] if solvers == "all" else listed(solvers)
     if not names:
         raise ConfigError("no solver is named", where="--solvers", found=solvers)
     for name in names:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.cli.options import Coordinates, Overwrite, numbers
+from soup_nlp.cli.options import Coordinates, Overwrite, listed, numbers
 from soup_nlp.errors import DataError
 from soup_nlp.export.artefact import parse_formulations
 from soup_nlp.family.instances import SCENES, SIZES, STANDARD, STARTS, select
@@ -44,18 +44,14 @@ def family(
     ] = None,
     coordinates: Coordinates = "matrix",
     starts: Annotated[
-        str, typer.Option(help="easy (presolved), hard (proposal), cold (constant depth).")
+        str, typer.Option(help="easy (presolved), hard (initialisation), cold (constant depth).")
     ] = _list(STARTS),
     overwrite: Overwrite = False,
 ) -> None:
     """Write the SOUP problem set: .nl files, best known points, index, README, licence."""
     wanted = numbers(sizes, "--sizes")
-    parts = (
-        [word.strip() for word in text.split(",") if word.strip()] for text in (scenes, starts)
-    )
-    names, begins = parts
     forms = ["/".join(form.values()) for form in parse_formulations(formulation, coordinates)]
-    chosen = select(wanted, names, [form or STANDARD for form in forms], begins)
+    chosen = select(wanted, listed(scenes), [form or STANDARD for form in forms], listed(starts))
     if out.is_dir() and any(out.iterdir()) and not (out / "index.json").is_file():
         raise DataError(
             "folder holds other files", where=out, expected="a new or empty folder, or a set"

@@ -29,35 +29,41 @@ Intrinsics = Annotated[
     ),
 ]
 Fov = Annotated[
-    float | None, typer.Option(help="Horizontal field of view, degrees, instead.", **INPUT)
+    float | None,
+    typer.Option(help="Horizontal field of view, degrees, instead of --intrinsics.", **INPUT),
 ]
 Undistort = Annotated[
     bool, typer.Option("--undistort", help="Remove the camera file's distortion.", **INPUT)
 ]
 Wanted = Annotated[
-    int | None, typer.Option("--superpixels", help="Wanted number N; default 1000.", **SIZE)
+    int | None, typer.Option("--superpixels", help="Number N of superpixels; default 1000.", **SIZE)
 ]
 Neighbours = Annotated[int | None, typer.Option(help="K of the K-NN graph; default 15.", **SIZE)]
 MaxSize = Annotated[
-    float | None, typer.Option(help="Megapixels for larger images; default 1.5.", **SIZE)
+    float | None,
+    typer.Option(help="Megapixels to which larger images are reduced; default 1.5.", **SIZE),
 ]
 Set = Annotated[
-    list[str] | None, typer.Option("--set", help="Any key, e.g. solver.max_iter=200.", **METHOD)
+    list[str] | None, typer.Option("--set", help="Set any key, e.g. solver.max_iter=200.", **METHOD)
 ]
 PresetName = Annotated[
     str | None,
     typer.Option(help=f"Options below the problem's own: {', '.join(PRESETS)}.", **METHOD),
 ]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Output folder.", **OUTPUT)]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.", **OUTPUT)]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.", **OUTPUT)]
 Overwrite = Annotated[
     bool,
-    typer.Option("--overwrite", help="Also over other files, or another result.", **OUTPUT),
+    typer.Option(
+        "--overwrite",
+        help="Also over files of others, or the result of another input.",
+        **OUTPUT,
+    ),
 ]
 PROBLEM = "Problem file, or a name that `soup-nlp list` shows."
 Problem = Annotated[Path, typer.Argument(help=PROBLEM)]
 Presolve = Annotated[
-    bool, typer.Option(help="Start where the tangent presolve ends, not at the proposal.")
+    bool, typer.Option(help="Start at the presolve's answer, not at the initialisation.")
 ]
 Formulations = Annotated[
     list[str] | None,
@@ -67,10 +73,12 @@ Formulations = Annotated[
 ]
 Coordinates = Annotated[
     str,
-    typer.Option(help="matrix, or tangent: nine per superpixel about the proposal, without gauge."),
+    typer.Option(
+        help="matrix, or tangent: nine per superpixel about the initialisation, without gauge."
+    ),
 ]
 Superpixels = Annotated[
-    list[int] | None, typer.Option(help="Wanted number, 50 to 2000; may be repeated.")
+    list[int] | None, typer.Option(help="Number of superpixels, 50 to 2000; may be repeated.")
 ]
 Data = Annotated[Path | None, typer.Option(help="Root folder of the dataset.")]
 Workers = Annotated[int, typer.Option(help="Processes of this machine.", min=1)]
@@ -113,13 +121,18 @@ def numbers(text: str, option: str, least: int = 0, most: int = MAX_SEED) -> lis
     return found
 
 
+def listed(text: str) -> list[str]:
+    """Different names of a comma-separated list."""
+    return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+
+
 def words(text: str, option: str, known: list[str]) -> list[str]:
     """Different names of a comma-separated list.
 
     Raises:
         ConfigError: the list is empty, or a name is unknown.
     """
-    names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    names = listed(text)
     wrong = [name for name in names if name not in known]
     if wrong or not names:
         raise ConfigError(

@@ -51,18 +51,20 @@ def solve(
     ] = None,
     undistort: options.Undistort = False,
     flow: Annotated[
-        str | None, typer.Option(help=".flo, KITTI .png, .npy, .onnx or a name; DIS.", **FLOW)
+        str | None,
+        typer.Option(help="File (.flo, KITTI .png, .npy, .onnx) or name; default DIS.", **FLOW),
     ] = None,
     flow_backward: Annotated[
         str | None,
-        typer.Option(help="From next to ref: the round trip is confidence.", **FLOW),
+        typer.Option(help="Flow from next to ref; the consistency is the confidence.", **FLOW),
     ] = None,
     flow_confidence: Annotated[
-        str | None, typer.Option(help="Of --flow: .npy in [0, 1], or a grey picture.", **FLOW)
+        str | None,
+        typer.Option(help="Confidence of --flow: .npy in [0, 1], or a grey picture.", **FLOW),
     ] = None,
     depth_prior: Annotated[
         str | None,
-        typer.Option(help="Depth of ref from elsewhere: .npy .pfm .png, .onnx.", **PRIOR),
+        typer.Option(help="Depth of ref from elsewhere: .npy, .pfm, .png, .onnx.", **PRIOR),
     ] = None,
     depth_prior_kind: Annotated[
         str | None,
@@ -91,7 +93,10 @@ def solve(
     ] = False,
     quiet: options.Quiet = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="All phases, and more on the solver.", **OUTPUT)
+        bool,
+        typer.Option(
+            "--verbose", "-v", help="Print every stage and round, and more on the solver.", **OUTPUT
+        ),
     ] = False,
 ) -> None:
     """Solve a pair of frames and write a result folder."""

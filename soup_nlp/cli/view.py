@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.cli.options import Overwrite
+from soup_nlp.cli.options import Overwrite, listed
 from soup_nlp.errors import DataError
 from soup_nlp.report.folder import convert as convert_folder
 from soup_nlp.report.folder import renew_page
@@ -24,9 +24,9 @@ def view(
     folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain.")],
     serve: Annotated[
         int | None,
-        typer.Option(help="Serve the folder at this port of this machine instead; 0 chooses one."),
+        typer.Option(help="Serve the folder to this machine at a port instead; 0 chooses one."),
     ] = None,
-    renew: Annotated[bool, typer.Option("--renew", help="Make the page anew.")] = False,
+    renew: Annotated[bool, typer.Option("--renew", help="Generate the page again.")] = False,
     no_open: Annotated[
         bool, typer.Option("--no-open", help="Do not open a browser, print the address.")
     ] = False,
@@ -75,8 +75,7 @@ def convert(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions."""
-    names = [name.strip() for name in to.split(",") if name.strip()]
     target = folder if out is None else out
     write = convert_chain if is_chain(folder) else convert_folder
-    for name in write(folder, names, out, overwrite):
+    for name in write(folder, listed(to), out, overwrite):
         print(target / name)

@@ -9,10 +9,11 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import is_file, parse_json, read_bytes
@@ -194,7 +195,7 @@ def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]
         futures: dict[Future[Row], str] = {}
         try:
             # the processes begin here
-            with _environment(ONE_THREAD), suppress(BrokenProcessPool):
+            with mock.patch.dict(os.environ, ONE_THREAD), suppress(BrokenProcessPool):
                 for name in again:
                     futures[pool.submit(left[name].work)] = name
             for future in as_completed(futures):
@@ -210,18 +211,3 @@ def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]
             pool.shutdown(wait=False, cancel_futures=True)
             for child in set(multiprocessing.active_children()) - before:
                 child.kill()
-
-
-@contextmanager
-def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Variables of the environment that processes inherit which begin in the block."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
