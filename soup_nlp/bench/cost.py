@@ -47,14 +47,13 @@ def cost_cells() -> list[Cell]:
 
 def cost_page(frame: pd.DataFrame) -> str:
     """Tables with a line for each size and a column for each N; rendering is left out."""
-    stages = [
-        name
-        for name in frame
-        if name.startswith("stages.") and not name.startswith(("stages.nlp_", "stages.load"))
-    ]
-    costs = {"seconds": frame[stages].sum(axis=1), "GB": frame["peak_bytes"] / 2**30}
-    frame = frame.assign(**costs)
     lines = ["# Time and memory", "", f"{provenance(frame)}. One process with one thread.", ""]
-    for column, (title, form) in TABLES.items():
-        lines += [f"## {title}", "", *markdown(pivot(frame, column, average=False), form), ""]
+    good = frame[frame["ok"].eq(True)]
+    if len(good):
+        left_out = ("stages.nlp_", "stages.load")
+        stages = [c for c in good if c.startswith("stages.") and not c.startswith(left_out)]
+        costs = {"seconds": good[stages].sum(axis=1), "GB": good["peak_bytes"] / 2**30}
+        good = good.assign(**costs)
+        for column, (title, form) in TABLES.items():
+            lines += [f"## {title}", "", *markdown(pivot(good, column, average=False), form), ""]
     return page_text([*lines, *failures(frame)])

@@ -126,6 +126,8 @@ def test_the_page_of_costs_leaves_rendering_out():
     page = cost_page(frame_of(rows))
     assert "| street 512 x 218, dis | 9 | 9 | 9 |" in page
     assert page.count("| 1.0 | 1.0 | 1.0 |") == 3
+    failed = [{**cell.identity(), "ok": False, "error": "no room", "code": "c"} for cell in cells]
+    assert "no room" in cost_page(frame_of([{**row, "cpu_seconds": 1.0} for row in failed]))
     assert [cell.variant for cell in cells[:3]] == ["N = 250", "N = 1000", "N = 2000"]
 
 
