@@ -14,10 +14,8 @@ from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.choice import Choice
-from soup_nlp.start.components import connected_labels
 from soup_nlp.start.views import Views
 
 SYSTEMATIC, LEAST_PX, MOST_PX = 4.0, 0.01, 0.07
@@ -90,51 +88,12 @@ def fit_turn(views: Views, count: int = 3000) -> tuple[Float, Float]:
     ray, target = (v.reshape(-1, 3)[::step] for v in (views.ray, views.target))
     root = np.sqrt(views.weight.ravel()[::step])[:, None]
 
-    def miss(x: Float, ray: Float, target: Float) -> Float:
+    def miss(x: Float) -> Float:
         moved = turned(x, ray)
-        return (moved[..., :2] / moved[..., 2:] - target[..., :2]) * focal
+        return root * (moved[..., :2] / moved[..., 2:] - target[..., :2]) * focal
 
-    x = fit_robustly(lambda x: root * miss(x, ray, target), 4)
-    error = np.linalg.norm(miss(x, views.ray, views.target), axis=2)
-    total = np.maximum(views.weight.sum(axis=1), 1e-9)
-    return rotation.exp(x[:3]), np.sum(views.weight * error, axis=1) / total
-
-
-ABOVE_NOISE, LEAST_SHARE = 10.0, 0.25
-"""Least jump of a flow discontinuity: multiple of the median jump between neighbours (which noise
-and bending cause), and share of `discontinuity_px`."""
-
-
-def surfaces(jump: Float, seg: Segmentation, discontinuity_px: float) -> Int:
-    """(N,) index of the surface of every superpixel; flow discontinuities separate them.
-
-    The size of the jumps varies along an outline, and one small jump would join both sides.
-    Surfaces are therefore first separated along smaller jumps. Two of them are joined again if the
-    flow is continuous along most of their common outline, longest outline first.
-
-    Args:
-        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
-        seg: Superpixels and graphs.
-        discontinuity_px: Jump that certainly is a discontinuity, pixels.
-    """
-    usual = float(np.median(jump)) if len(jump) else 0.0
-    least = np.clip(ABOVE_NOISE * usual, LEAST_SHARE * discontinuity_px, discontinuity_px)
-    surface = connected_labels(jump < least, seg)
-    n, (i, k) = len(seg), seg.pairs.T
-    while True:
-        a, b = surface[i], surface[k]
-        outline = np.flatnonzero(a != b)
-        if not len(outline):
-            return surface
-        a, b = np.minimum(a, b)[outline], np.maximum(a, b)[outline]
-        pairs, which = np.unique(a * n + b, return_inverse=True)
-        length = seg.boundary_length[outline].astype(float)
-        whole = np.bincount(which, length * (jump[outline] < discontinuity_px))
-        total = np.bincount(which, length)
-        join = int(np.argmax(np.where(whole > 0.5 * total, total, 0.0)))
-        if not whole[join] > 0.5 * total[join]:
-            return surface
-        surface = np.where(surface == pairs[join] % n, pairs[join] // n, surface)
+    x = fit_robustly(miss, 4)
+    return rotation.exp(x[:3]), views.distance(turned(x, views.ray))
 
 
 def flow_jump(fit: Float, views: Views, pairs: Int, boundary_ray: Float) -> Float:
@@ -178,8 +137,7 @@ def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Floa
         fit = np.linalg.solve(right @ basis + 1e-9 * np.eye(3), right @ target)
         error = np.linalg.norm(basis @ fit - target, axis=2)
         w = (views.weight + 1e-6) / np.sqrt(error**2 + noise**2)
-    total = np.maximum(views.weight.sum(axis=1), 1e-9)
-    return fit, np.sum(views.weight * error, axis=1) / total
+    return fit, views.mean(error)
 
 
 def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float]:
@@ -208,8 +166,6 @@ def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float
     R = rotation.exp(angle[:, None] * np.array([0.0, 0.0, 1.0]))
     T = b - np.einsum("nij,nj->ni", R, a)
     R, T = turn @ R, T @ turn.T
-    moved = views.ray @ R.transpose(0, 2, 1) + T[:, None]
-    miss = (moved[..., :2] / moved[..., 2:] - views.target[..., :2]) * np.asarray(views.focal)
-    error = np.sum(views.weight * np.linalg.norm(miss, axis=2), axis=1) / total
+    error = views.distance(views.ray @ R.transpose(0, 2, 1) + T[:, None])
     n = np.tile([0.0, 0.0, -1.0], (len(R), 1))
     return Soup(np.ones(len(R)), n, np.ones(len(R)), R, T).normalised(), error

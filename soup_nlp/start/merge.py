@@ -18,6 +18,7 @@ from soup_nlp.start.choice import (
     Choice,
     flow_affinity,
     least_gain,
+    limited_noise,
     smooth_choice,
 )
 from soup_nlp.start.components import connected_labels, connected_pieces
@@ -26,9 +27,13 @@ from soup_nlp.start.motions import fit_translation, refine_motion
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
 
-LEAST_GAIN_PX, LEAST_GAIN = 0.15, 10.0
-"""Least mean error that the main motion leaves of a region with motions of its own: in pixels, and
-in units of the median error of all superpixels; the lower one decides, as flow may be exact."""
+LEAST_GAIN_PX = 0.15
+"""Least mean error that the main motion leaves of a region with motions of its own, pixels."""
+SMALL = 8
+"""Largest number of superpixels of a piece that may be a mixture of the flows around it."""
+MIXED_PX = 2.0
+"""Distance, pixels, of its flow from those around it up to which a piece that its own motion
+explains badly is a mixture."""
 PIXELS = 1500
 """Largest number of pixels of a component to which a motion is fitted."""
 AGREE = 0.7
@@ -67,8 +72,8 @@ def gather(
 def earned(views: Views, choice: Choice, seg: Segmentation, noise: float) -> tuple[Choice, Mask]:
     """The choice without regions whose own motions explain too little.
 
-    A connected region keeps its motions if the main one leaves a larger mean error there, by
-    `LEAST_GAIN_PX` or `LEAST_GAIN`; otherwise it takes the main one.
+    A connected region keeps its motions if the main one leaves a mean error there that is larger by
+    `LEAST_GAIN_PX`; otherwise it takes the main one.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
@@ -90,11 +95,49 @@ def earned(views: Views, choice: Choice, seg: Segmentation, noise: float) -> tup
     moves = choice.label != main
     region = connected_pieces(moves, seg)
     count, total = (np.bincount(region[moves], v, minlength=1) for v in (None, gain[moves]))
-    least = min(LEAST_GAIN_PX, LEAST_GAIN * float(np.median(choice.error)))
-    left = moves & ((total < least * count)[region])
+    left = moves & ((total < LEAST_GAIN_PX * count)[region])
     at = np.flatnonzero(left)
     kept = choice.taking(at, R, t, fit.pick((at, np.zeros(len(at), int))), main)
     return kept, left & (gain > 3 * noise)
+
+
+def mixtures(
+    component: Int, choice: Choice, flow: Float, usable: Mask, views: Views, seg: Segmentation
+) -> Mask:
+    """(N,) True in small pieces of movers whose flow tells of no motion of their own.
+
+    On an outline of depth a superpixel mixes the flows of both sides. A piece of at most `SMALL`
+    superpixels is such a mixture if its flow lies between those of the largest component around it,
+    or near them where its own motion explains it badly and hardly better than the main one does.
+
+    Args:
+        component: (N,) rigid component of every superpixel.
+        choice: Motion and plane of every superpixel.
+        flow: (N, 2) displacement of the anchors, pixels.
+        usable: (N,) True where the flow counts.
+        views: Rays, targets and confidence of every superpixel.
+        seg: Superpixels and graphs.
+    """
+    main, noise = np.argmax(np.bincount(component)), limited_noise(choice.error)
+    first = int(np.argmax(choice.label == main_motion(choice.label)))
+    error = views.fit([Motion(choice.R[first], choice.t[first])]).penalised()[:, 0]
+    i, k = seg.pairs.T
+    piece = connected_labels(component[i] == component[k], seg)
+    mixed = np.zeros(len(seg), bool)
+    for p in np.unique(piece[(component != main) & usable]):
+        at = piece == p
+        if at.sum() > SMALL or usable[at].mean() <= 0.5:
+            continue
+        around = np.concatenate([k[at[i] & ~at[k]], i[at[k] & ~at[i]]])
+        around = around[usable[around] & (component[around] == main)]
+        if not len(around):
+            continue
+        middle, sides = np.median(flow[at], axis=0), flow[around]
+        outside = np.maximum(sides.min(axis=0) - middle, middle - sides.max(axis=0)).max()
+        own = np.median(choice.error[at])
+        badly = own > 2 * noise and np.median(error[at]) < 3 * own and outside < MIXED_PX
+        mixed |= at & (badly or outside < 3 * noise)
+    return mixed
 
 
 def main_motion(label: Int) -> int:

@@ -48,7 +48,7 @@ def fixed_to_camera(
         The mask, and (N,) the mean displacement of every superpixel, pixels.
     """
     none, usable = np.zeros(len(seg), bool), views.weight.mean(axis=1) > 0.5
-    shift = _distance(views, views.ray)
+    shift = views.distance(views.ray)
     may = usable & (shift < STILL_PX)
     if may.sum() < PIECE_SIZE:
         return none, shift
@@ -79,15 +79,8 @@ def _error_under(
     floor = ground(mu, views.anchor, area, known, o.seed)
     least = (1 - BELOW) * floor
     moved = views.ray @ camera.R.T + np.maximum(mu, least)[:, None, None] * camera.t
-    lifted = _distance(views, moved)
+    lifted = views.distance(moved)
     return np.where(mu < least, np.maximum(error, lifted), error)
-
-
-def _distance(views: Views, moved: Float) -> Float:
-    """(N,) mean distance of points (N, S, 3) of the next camera from the flow's targets, pixels."""
-    off = (moved[..., :2] / moved[..., 2:] - views.target[..., :2]) * np.asarray(views.focal)
-    total = np.maximum(views.weight.sum(axis=1), 1e-9)
-    return np.asarray(np.sum(views.weight * np.linalg.norm(off, axis=2), axis=1) / total)
 
 
 def towards_border(core: Mask, seg: Segmentation) -> Mask:

@@ -19,7 +19,6 @@ from soup_nlp.start.bending import (
     constant_depth,
     flow_jump,
     reference_noise,
-    surfaces,
     turn_alone,
 )
 from soup_nlp.start.choice import LEAST_NOISE, Choice, limited_noise, rigid_choice
@@ -34,7 +33,7 @@ from soup_nlp.start.components import (
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import above_ground, floating, ground
 from soup_nlp.start.homographies import unorganised
-from soup_nlp.start.merge import earned, gather
+from soup_nlp.start.merge import earned, gather, mixtures
 from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
 from soup_nlp.start.regions import surface_motions
 from soup_nlp.start.settle import settle
@@ -139,7 +138,8 @@ def propose(
     if np.array_equal(K_ref, K_next):
         fixed, shift = fixed_to_camera(views, seg, jump, o)
     views, poor = views.without(fixed), poor | fixed
-    surface, usable = surfaces(jump, seg, o.discontinuity_px), views.weight.mean(axis=1) > SURE
+    surface = connected_labels(jump < o.discontinuity_px, seg)
+    usable = views.weight.mean(axis=1) > SURE
     centre = np.concatenate([affine[:, 0] / views.focal, np.ones((len(seg), 1))], axis=1)
     motions, bends = surface_motions(views, seg, surface, residual, usable, o)
     bends &= o.bending
@@ -153,8 +153,6 @@ def propose(
         # the flow of bending regions says nothing about the motions of the rest
         views, poor = views.without(bends), poor | bends
         choice, noise = rigid_motions(views, seg, jump, motions, o)
-    else:
-        surface = connected_labels(jump < o.discontinuity_px, seg)
     choice, wrong = earned(views, choice, seg, noise)
     weight = np.where(usable & ~bends, 1.0, 0.0)
     choice = settle(views, choice, centre, weight, limited_noise(residual))
@@ -182,7 +180,10 @@ def propose(
         soup, component, tie, floor = _on_ground(soup, *own_ground)
         grounded = weak & (floor > 0)
     soup = soup.normalised()
-    part = moving_parts(component, views, seg, fixed | bends)
+    moved = (centre - views.anchor)[:, :2] * views.focal
+    mixed = mixtures(component, choice, moved, usable, views, seg) & ~(fixed | bends)
+    largest = np.argmax(np.bincount(component))
+    part = moving_parts(np.where(mixed, largest, component), views, seg, fixed | bends)
     own = soup, error, parallax, weak, label, component, part
     found = *own, motions, surface, tie, grounded, bends
     return Start(*found, wrong & ~bends, noise=limited_noise(error[~bends]))
@@ -270,10 +271,7 @@ def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
     """The paper's initialisation, which has no components: all superpixels are one."""
     soup, borrowed = unorganised(views, seg, o)
     soup = soup.normalised()
-    gap = soup.moved(soup.points(views.ray))
-    gap = (gap[..., :2] / gap[..., 2:] - views.target[..., :2]) * np.asarray(views.focal)
-    total = np.maximum(views.weight.sum(axis=1), 1e-9)
-    error = np.sum(views.weight * np.linalg.norm(gap, axis=2), axis=1) / total
+    error = views.distance(soup.moved(soup.points(views.ray)))
     parallax, whole = _parallax(soup, views), np.zeros(len(seg), np.int64)
     noise = limited_noise(error)
     none = np.zeros(len(seg), bool)

@@ -1,6 +1,6 @@
 """Which surfaces bend: those of which no single rigid motion explains most of the flow.
 
-The flow is continuous within a surface (`start.bending.surfaces`). Of a rigid surface one motion
+The flow is continuous within a surface. Of a rigid surface one motion
 explains the flow of most superpixels, whatever else moves there; of a bending one no motion does.
 The test does not depend on the number of superpixels or of rigid components.
 """

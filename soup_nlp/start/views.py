@@ -44,6 +44,16 @@ class Views:
             R, t, self.ray, self.target, self.weight, self.anchor, self.radius, self.focal
         )
 
+    def distance(self, moved: Float) -> Float:
+        """(N,) mean distance of points (N, S, 3) of the next camera from the targets, pixels."""
+        off = (moved[..., :2] / moved[..., 2:] - self.target[..., :2]) * np.asarray(self.focal)
+        return self.mean(np.linalg.norm(off, axis=2))
+
+    def mean(self, value: Float) -> Float:
+        """(N,) mean of the samples' values (N, S), weighted by confidence; 0 without any."""
+        total = np.maximum(self.weight.sum(axis=1), 1e-9)
+        return np.asarray(np.sum(self.weight * value, axis=1) / total)
+
     def without(self, mask: Mask) -> Views:
         """The same with confidence 0 in the superpixels of a mask (N,)."""
         return replace(self, weight=np.where(mask[:, None], 0.0, self.weight))

@@ -304,6 +304,29 @@ def test_only_a_piece_with_usable_flow_moves():
     np.testing.assert_array_equal(part, expected)
 
 
+@pytest.mark.parametrize(
+    ("shift", "own", "size", "mixed"),
+    [
+        (2.0, 0.0, 2, True),  # between the flows of both sides
+        (5.0, 0.0, 2, False),  # beyond them
+        (5.0, 0.5, 2, True),  # a little beyond, its own motion explains it badly
+        (9.0, 0.5, 2, False),
+        (2.0, 0.0, 12, False),  # too large
+    ],
+)
+def test_a_mixture_of_two_flows_does_not_move(shift, own, size, mixed):
+    """Four rows move by 0, four by 4 px; a piece in the middle column turns by itself."""
+    seg = cells(8, 16)
+    row, column = (seg.anchors // 8).astype(int).T[::-1]
+    piece = np.isin(row, (3, 4)) & (abs(column - 8) < size / 4)
+    views = Turns(np.where(piece, 0.1, 0.0))
+    choice = taken(views, np.where(piece, 0.1 - own / PER_RADIAN, 0.0), piece.astype(int))
+    flow = np.zeros((len(seg), 2))
+    flow[:, 0] = np.where(piece, shift, np.where(row < 4, 0.0, 4.0))
+    found = gathering.mixtures(piece.astype(int), choice, flow, np.ones(128, bool), views, seg)
+    np.testing.assert_array_equal(found, piece & mixed)
+
+
 def test_what_contact_makes_too_fast_comes_a_third_nearer():
     label = np.repeat([0, 1, 2, 3], [6, 3, 3, 3])
     far = np.array([1.0, np.exp(0.9 * FAST), np.exp(2.0 * FAST), 1e3])[label]
