@@ -48,6 +48,7 @@ COLUMNS = {
     "cpu.nlp": ("CPU s", ".1f"),
     "wall.nlp": ("wall s", ".1f"),
     "iterations": ("its", ".0f"),
+    "stages": ("its by stage", ""),
     "energy_start.total": ("E start", ".2f"),
     "energy.total": ("E", ".3f"),
     "reference.energy.total": ("E LM", ".3f"),
@@ -94,6 +95,7 @@ def speed_cells(
     width: int = 1024,
     height: int = 436,
     overrides: Sequence[str] = (),
+    pairs: Sequence[Item] = (),
 ) -> list[Cell]:
     """Timed runs, small sizes first: DIS flow, the NLP without refinement.
 
@@ -105,18 +107,21 @@ def speed_cells(
         width: Columns of the rendered images.
         height: Their rows.
         overrides: Further overrides.
+        pairs: Pairs of a suite, which are timed as well.
 
     Raises:
         ConfigError: an override is wrong.
     """
     cells = []
-    for n, k, scene, seed in product(sorted(sizes), sorted(neighbours), scenes, seeds):
-        if scene == "motorcycle" and seed != seeds[0]:
-            continue
+    items = []
+    for scene, seed in product(scenes, seeds):
         size = {"width": width, "height": height}
         source = {"kind": "scene", "scene": scene, "seed": seed, **size}
         source = {"kind": scene} if scene == "motorcycle" else source
-        item = Item("speed", scene, f"{scene}, seed {seed}", "dis", source)
+        items.append((Item("speed", scene, f"{scene}, seed {seed}", "dis", source), seed))
+    items = [own for own in items if own[0].sequence != "motorcycle" or own[1] == seeds[0]]
+    items += [(pair, seeds[0]) for pair in pairs]
+    for n, k, (item, seed) in product(sorted(sizes), sorted(neighbours), items):
         settings = (
             f"segmentation.superpixels={n}",
             f"segmentation.neighbours={k}",
@@ -134,8 +139,8 @@ def measure_speed(item: Item, overrides: Overrides = (), keep: Path | None = Non
 
     Returns:
         "wall" and "cpu" seconds by stage ("build", "functions" and "linear algebra" are parts of
-        the wall time of "nlp"), "sizes", "iterations", "status", "energy", "error" (MRE by soup),
-        "residuals", "peak_bytes" before the reference solver runs, and "reference" with the
+        the wall time of "nlp"), "sizes", "iterations" in all and by "stages", "status", "energy",
+        "error" (MRE by soup), "residuals", "peak_bytes" before the reference solver runs, and "reference" with the
         energy, iterations and CPU seconds of that solver.
 
     Raises:
@@ -168,6 +173,7 @@ def measure_speed(item: Item, overrides: Overrides = (), keep: Path | None = Non
         "wall": {**wall, **_parts(wall["nlp"], solution)},
         "cpu": {**cpu, **solution.cpu_seconds, "compiler": solution.seconds["compile"]},
         "iterations": sum(s.iterations for s in solution.stages),
+        "stages": " + ".join(str(s.iterations) for s in solution.stages),
         "status": solution.status,
         "converged": solution.converged,
         "energy": dict(solution.energy),

@@ -14,6 +14,7 @@ from soup_nlp.bench.accuracy import measure_pair
 from soup_nlp.bench.chain import chain_page, measure_chain, sequences
 from soup_nlp.bench.cost import cost_cells, cost_page
 from soup_nlp.bench.study import Cell, measure_cells, show
+from soup_nlp.bench.suites import Options, list_suite
 from soup_nlp.cli.bench_accuracy import Only, Width
 from soup_nlp.cli.options import Data, Out, Overwrite, Quiet, RowProgress, Set, numbers, words
 from soup_nlp.data.scenes.catalogue import SCENES
@@ -33,6 +34,10 @@ def speed(
     ] = "250,500,1000,2000",
     neighbours: Annotated[str, typer.Option(help="K of the K-NN graph.")] = "10,15,20",
     seeds: Annotated[str, typer.Option(help="Seeds of the rendered scenes.")] = "0,1",
+    pairs: Annotated[
+        str | None, typer.Option(help="Pairs of the suite shared, comma separated.")
+    ] = None,
+    data: Data = None,
     width: Width = 1024,
     height: Annotated[
         int, typer.Option(help="Rows of rendered scenes.", min=48, max=MAX_SIDE)
@@ -43,6 +48,7 @@ def speed(
     quiet: Quiet = False,
 ) -> None:
     """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
+    chosen = Options(flows=("dis",), only=tuple((pairs or "").split(",")))
     cells = timing.speed_cells(
         words(scenes, "--scenes", [*SCENES, "motorcycle"]),
         numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS),
@@ -51,6 +57,7 @@ def speed(
         width,
         height,
         overrides or [],
+        list_suite("shared", data, chosen).items if pairs else (),
     )
     claim(out, ("table.md", "growth.png"), overwrite)
     run = partial(measure_all, say=RowProgress(quiet, _result_of))
