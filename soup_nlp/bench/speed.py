@@ -140,8 +140,8 @@ def measure_speed(item: Item, overrides: Overrides = (), keep: Path | None = Non
     Returns:
         "wall" and "cpu" seconds by stage ("build", "functions" and "linear algebra" are parts of
         the wall time of "nlp"), "sizes", "iterations" in all and by "stages", "status", "energy",
-        "error" (MRE by soup), "residuals", "peak_bytes" before the reference solver runs, and "reference" with the
-        energy, iterations and CPU seconds of that solver.
+        "error" (MRE by soup), "residuals", "peak_bytes" before the reference solver runs, and
+        "reference" with the energy, iterations and CPU seconds of that solver.
 
     Raises:
         SoupError: the input cannot be used.
