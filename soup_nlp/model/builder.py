@@ -51,18 +51,18 @@ class Builder:
 
     Attributes:
         form: Norm, Hessian and smoothing.
-        own: Variables that are no slack variables.
+        first_slack: Number of variables before the slack variables.
     """
 
     form: Formulation
-    own: int
+    first_slack: int
     groups: list[Group] = field(default_factory=list)
     slacks: list[Block] = field(default_factory=list)
     rows: list[Block] = field(default_factory=list)
 
     def new_slacks(self, label: str, count: int) -> Int:
         """Indices of `count` fresh slack variables, at least 0."""
-        first = self.own + sum(b.size for b in self.slacks)
+        first = self.first_slack + sum(b.size for b in self.slacks)
         self.slacks.append(Block(label, count, 0.0, np.inf))
         return first + np.arange(count)
 
@@ -72,21 +72,23 @@ class Builder:
         self.rows.append(Block(label, count, lower, upper))
         return first + np.arange(count)
 
-    def add_norms(self, name: str, element: Element, view: Callable[..., View], own: int) -> None:
+    def add_norms(
+        self, name: str, element: Element, view: Callable[..., View], stride: int
+    ) -> None:
         """Add an energy term: kernel of its norms in solver form, and its table.
 
         Args:
             name: Of the kernel.
             element: Data columns, indices of variables and the norms.
-            view: Makes a View of local variables (own,) and the data row, by position; the same
+            view: Makes a View of local variables (stride,) and the data row, by position; the same
                 one for the same coordinates.
-            own: Variables per superpixel.
+            stride: Variables per superpixel.
         """
         size = len(element.index)
         if not size:
             return
         fields = tuple(element.fields.items())
-        term = name, element.norms, fields, element.arity, view, own
+        term = name, element.norms, fields, element.arity, view, stride
         kernel, slacks = _kernel(*term, self.form.norm)
         index = [element.index, *(self.new_slacks(f"s_{k}", size)[:, None] for k in slacks)]
         rows = [self.new_rows(f"epigraph_{k}", size, 0.0) for k in slacks]
@@ -147,9 +149,9 @@ class Builder:
 
         Args:
             name: Of the NLP.
-            x0: (own,) start.
-            lbx: (own,) lower bounds.
-            ubx: (own,) upper bounds.
+            x0: (first_slack,) start.
+            lbx: (first_slack,) lower bounds.
+            ubx: (first_slack,) upper bounds.
             names: Makes the names of these variables.
         """
         lower, upper = _bounds(self.slacks)
@@ -180,13 +182,13 @@ def _kernel(
     fields: tuple[tuple[str, int], ...],
     arity: int,
     view: Callable[..., View],
-    own: int,
+    stride: int,
     norm: NormForm,
 ) -> tuple[Kernel, list[str]]:
     """Kernel of a term's norms in solver form, made once, and the names of norms with a slack."""
-    x = ca.SX.sym("x", own * arity)
+    x = ca.SX.sym("x", stride * arity)
     row = {k: ca.SX.sym(k, c) for k, c in fields}
-    views = [view(x[own * a : own * (a + 1)], row, a) for a in range(arity)]
+    views = [view(x[stride * a : stride * (a + 1)], row, a) for a in range(arity)]
     every = norms(views, row, _SYMBOLS[0], _SYMBOLS[1])
     named = [n.name for n in every if norm == "epigraph" and n.kind == "norm"]
     slacks = {k: ca.SX.sym(f"s_{k}") for k in named}

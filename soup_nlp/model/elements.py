@@ -124,16 +124,16 @@ def _proj(data: EnergyData, w: Weights) -> Element:
     truncated = bool(np.isfinite(w.sigma_proj))
     # intrinsics are data, so that kernels compiled once serve every camera
     K = data.K_next[:2]
-    there = np.nonzero(K.T)[::-1]
+    nonzero = np.nonzero(K.T)[::-1]
     columns = {
         "weight": w.proj * data.pixel_weight[used],
         "sigma": _full(count, w.sigma_proj),
         "ray": data.pixel_ray[used],
         "target": data.pixel_target[used],
-        "K": np.tile(K[there], (count, 1)),
+        "K": np.tile(K[nonzero], (count, 1)),
     }
 
-    places = tuple(zip(*(own.tolist() for own in there)))
+    places = tuple(zip(*(index.tolist() for index in nonzero)))
     norms = Norms(terms.reprojection, (places, truncated), in_pixels=True)
     return Element(owner, columns, norms, 1)
 
@@ -157,7 +157,7 @@ def _cont(data: EnergyData, w: Weights) -> Element:
 
 
 def _prior(data: EnergyData, w: Weights) -> Element:
-    ray_i, ray_k = (data.anchor_ray[who] for who in data.edges.T)
+    ray_i, ray_k = (data.anchor_ray[end] for end in data.edges.T)
     columns = {
         "weight": w.prior * data.prior_weight,
         "reach": np.linalg.norm(ray_i - ray_k, axis=1),

@@ -60,9 +60,9 @@ class Kernel:
     def _content(self) -> str:
         args = [self.x, self.row, self.theta]
         parts = {"f": self.objective, "g": self.constraints, "h": self.curvature}
-        there = {k: e for k, e in parts.items() if e is not None}
+        present = {k: e for k, e in parts.items() if e is not None}
         names = ["x", "row", "theta"]
-        function = ca.Function(self.name, args, list(there.values()), names, list(there))
+        function = ca.Function(self.name, args, list(present.values()), names, list(present))
         return str(function.serialize())
 
     @property

@@ -47,26 +47,26 @@ def build_matrix_nlp(
     n = len(data)
     layout = MatrixLayout(data.share, form.gauge)
     b = Builder(form, layout.size)
-    own = layout.stride
+    stride = layout.stride
     for name, element in elements(data, weights, layout).items():
-        b.add_norms(name, element, _views(form.gauge), own)
+        b.add_norms(name, element, _views(form.gauge), stride)
 
     _add_constraints(b, layout, data, form)
     x0 = layout.pack(soup)
     b.add_ridge(_metric(layout, x0, data))
     lbx, ubx = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
-    lbx[np.arange(n) * own] = MIN_SCALE
+    lbx[np.arange(n) * stride] = MIN_SCALE
     if form.gauge == "unit-translation":
-        lbx[np.arange(n) * own + 4] = MIN_SCALE
+        lbx[np.arange(n) * stride + 4] = MIN_SCALE
         lbx[layout.tau] = 1e-8
     return b.finish("soup", x0, lbx, ubx, layout.names), layout
 
 
 def _add_constraints(b: Builder, layout: MatrixLayout, data: EnergyData, form: Formulation) -> None:
     """SO(3), unit normals, visibility, simplex, and the rows that fix the gauge."""
-    n, own = layout.count, layout.stride
+    n, stride = layout.count, layout.stride
     every = layout.of(np.arange(n))
-    x = ca.SX.sym("x", own)
+    x = ca.SX.sym("x", stride)
     v = matrix_view(x, form.gauge, ca.SX(1.0))
     b.add_constraint("so3", x, terms.so3(v), every, lower=0.0, upper=0.0)
     b.add_constraint("normal", x, terms.unit_normal(v), every, lower=0.0, upper=0.0)
@@ -100,15 +100,15 @@ def _metric(layout: MatrixLayout, x: Float, data: EnergyData) -> Float:
     A natural step is: relative 1 in scale and offset, a slope of 1 at the superpixel's rim in the
     normal, one radian in R, one anchor depth in the translation.
     """
-    n, own = layout.count, layout.stride
-    a = x[: n * own].reshape(n, own)
+    n, stride = layout.count, layout.stride
+    a = x[: n * stride].reshape(n, stride)
     s = layout.unpack(x)
     facing = -np.einsum("nc,nc->n", s.n, data.anchor_ray)
-    metric = np.ones((n, own))
+    metric = np.ones((n, stride))
     metric[:, 0] = 1 / a[:, 0] ** 2
     metric[:, 1:4] = (1 / np.maximum(facing * data.radius, 1e-3) ** 2)[:, None]
     if layout.gauge != "unit-offset":
         metric[:, 4] = 1 / a[:, 4] ** 2
     depth = s.depth_at(data.anchor_ray)
     metric[:, -3:] = (a[:, 0] / depth)[:, None] ** 2
-    return np.append(metric.ravel(), np.ones(layout.size - n * own))
+    return np.append(metric.ravel(), np.ones(layout.size - n * stride))

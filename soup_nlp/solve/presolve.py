@@ -249,5 +249,5 @@ class _Program:
 def _rim(nlp: NLP, layout: TangentLayout, stage: Stage) -> Float:
     """(N, V) multipliers of rim visibility, its rows divided by the facing of the anchor."""
     rows = next(g for g in nlp.groups if g.kernel.name == "t_visible").table.rows
-    own = -stage.lam_g[rows]
-    return own if layout.chart == "depth" else own * stage.x[::9, None]
+    multipliers = -stage.lam_g[rows]
+    return multipliers if layout.chart == "depth" else multipliers * stage.x[::9, None]

@@ -21,17 +21,17 @@ RIDGE = 1e-11
 class BlockCholesky:
     """Factorisation of a sparse symmetric positive semidefinite matrix of equal blocks."""
 
-    def __init__(self, matrix: sparse.csr_matrix, place: Float) -> None:
+    def __init__(self, matrix: sparse.csr_matrix, position: Float) -> None:
         """Factorise.
 
         Args:
             matrix: (N B, N B), both triangles. A row with a zero on the diagonal is an error.
-            place: (N, 2) positions of the blocks, for the layers.
+            position: (N, 2) positions of the blocks, for the layers.
 
         Raises:
             ArithmeticError: The matrix is not positive definite, even with `RIDGE`.
         """
-        self.block = matrix.shape[0] // len(place)
+        self.block = matrix.shape[0] // len(position)
         diagonal = matrix.diagonal()
         if not (diagonal > 0).all():
             raise ArithmeticError("a diagonal entry is not positive")
@@ -40,15 +40,15 @@ class BlockCholesky:
         scaled = (scaling @ matrix @ scaling + RIDGE * sparse.eye(len(diagonal))).tocsr()
         # variables of every layer, its factor F, and F^-1 times its coupling to the next layer
         self._layers = [
-            (self.block * own[:, None] + np.arange(self.block)).ravel()
-            for own in layers(_coupled(matrix, self.block), place)
+            (self.block * layer[:, None] + np.arange(self.block)).ravel()
+            for layer in layers(_coupled(matrix, self.block), position)
         ]
         self._factors: list[tuple[Float, bool]] = []
         self._coupling: list[Float] = []
         before = np.zeros((0, 0))
-        for k, own in enumerate(self._layers):
-            rows = scaled[own]
-            F = rows[:, own].toarray()
+        for k, layer in enumerate(self._layers):
+            rows = scaled[layer]
+            F = rows[:, layer].toarray()
             if k:
                 F -= before.T @ self._coupling[-1]
             try:
@@ -62,14 +62,14 @@ class BlockCholesky:
     def solve(self, b: Float) -> Float:
         """The solution (N B, ...) of `matrix x = b`."""
         x = (b.T * self._scale).T
-        for k, own in enumerate(self._layers):
+        for k, layer in enumerate(self._layers):
             if k:
-                x[own] -= self._coupling[k - 1].T @ x[self._layers[k - 1]]
+                x[layer] -= self._coupling[k - 1].T @ x[self._layers[k - 1]]
         for k in reversed(range(len(self._layers))):
-            own = self._layers[k]
-            x[own] = cho_solve(self._factors[k], x[own], check_finite=False)
+            layer = self._layers[k]
+            x[layer] = cho_solve(self._factors[k], x[layer], check_finite=False)
             if k + 1 < len(self._layers):
-                x[own] -= self._coupling[k] @ x[self._layers[k + 1]]
+                x[layer] -= self._coupling[k] @ x[self._layers[k + 1]]
         return np.asarray((x.T * self._scale).T)
 
     def inverse_blocks(self) -> Float:
@@ -77,39 +77,39 @@ class BlockCholesky:
         size = self.block
         out, later = np.empty((len(self._scale) // size, size, size)), np.zeros((0, 0))
         for k in reversed(range(len(self._layers))):
-            own = self._layers[k]
-            Z = cho_solve(self._factors[k], np.eye(len(own)), check_finite=False)
+            layer = self._layers[k]
+            Z = cho_solve(self._factors[k], np.eye(len(layer)), check_finite=False)
             if k + 1 < len(self._layers):
                 Z += self._coupling[k] @ later @ self._coupling[k].T
             later = Z
-            inner = np.arange(len(own)).reshape(-1, size)
-            scale = self._scale[own].reshape(-1, size)
+            inner = np.arange(len(layer)).reshape(-1, size)
+            scale = self._scale[layer].reshape(-1, size)
             blocks = Z[inner[:, :, None], inner[:, None]]
-            out[own[::size] // size] = blocks * scale[:, :, None] * scale[:, None]
+            out[layer[::size] // size] = blocks * scale[:, :, None] * scale[:, None]
         return out
 
 
 def _coupled(matrix: sparse.csr_matrix, block: int) -> sparse.csr_matrix:
     """(N, N) pattern of the blocks of a matrix."""
-    own = matrix.tocoo()
+    entries = matrix.tocoo()
     pattern = sparse.coo_matrix(
-        (np.ones(own.nnz, np.int8), (own.row // block, own.col // block)),
+        (np.ones(entries.nnz, np.int8), (entries.row // block, entries.col // block)),
         (matrix.shape[0] // block,) * 2,
     )
     return pattern.tocsr()
 
 
-def layers(coupled: sparse.csr_matrix, place: Float) -> list[Int]:
+def layers(coupled: sparse.csr_matrix, position: Float) -> list[Int]:
     """Sets of superpixels, each coupled to the set before it and the one after it alone.
 
     They are the numbers of steps in the graph from the superpixels at one end of the image.
 
     Args:
         coupled: (N, N) symmetric pattern.
-        place: (N, 2) positions; layers run across the longer side.
+        position: (N, 2) positions; layers run across the longer side.
     """
-    along = place[:, int(np.argmax(np.ptp(place, axis=0)))]
-    left, out = np.ones(len(place), bool), []
+    along = position[:, int(np.argmax(np.ptp(position, axis=0)))]
+    left, out = np.ones(len(position), bool), []
     while left.any():
         rest = np.flatnonzero(left)
         # as many as stand in a column

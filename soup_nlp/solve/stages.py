@@ -105,8 +105,8 @@ def solve_soup(
     Returns:
         The solution; a solve that fails is a Solution with its status, not an exception.
     """
-    own = form or Formulation(), options or SolverOptions(), watch or Watch()
-    return _Solve(start, data, weights, *own).run()
+    rest = form or Formulation(), options or SolverOptions(), watch or Watch()
+    return _Solve(start, data, weights, *rest).run()
 
 
 class _Laps:
