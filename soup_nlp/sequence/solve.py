@@ -26,7 +26,7 @@ from soup_nlp.sequence.frames import (
 )
 from soup_nlp.sequence.key_frames import MAX_STEP, key_frames
 from soup_nlp.sequence.pairs import solve_pairs
-from soup_nlp.sequence.write import chain_files, write_chain
+from soup_nlp.sequence.write import SINGLE, chain_files, write_chain
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.rows import Say
@@ -93,7 +93,10 @@ def solve_chain(
         camera["fov"] = fov
     if intrinsics is not None:
         camera["intrinsics"] = intrinsics if isinstance(intrinsics, str) else [*intrinsics]
-    found = _frames(frames, folder, camera, _step(stride), most, depth_scale)
+    step = _step(stride)
+    # frames of a video, or of arrays, are written before their number is known
+    claim(folder, SINGLE, overwrite, subject)
+    found = _frames(frames, folder, camera, step, most, depth_scale)
     count = len(found)
     claim(folder, chain_files(count), overwrite, subject)
     which = [(k, k + 1) for k in range(count - 1)]

@@ -38,6 +38,7 @@ from soup_nlp.sequence.score import aligned
 from soup_nlp.sequence.solve import _frames
 from soup_nlp.sequence.stored import COLMAP_POINTS
 from soup_nlp.sequence.write import chain_files, write_chain
+from soup_nlp.storage.folders import staged
 
 pytestmark = pytest.mark.slow
 
@@ -244,6 +245,13 @@ def test_similarities_are_found_exactly():
     assert not np.allclose(aligned(points * [1, 1, -1], target), target)
 
 
+def make_video(path, count):
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
+    for k in range(count):
+        video.write(np.full((48, 64, 3), 50 * k, np.uint8))
+    video.release()
+
+
 def test_frames_of_a_folder_a_pattern_and_a_video(tmp_path):
     for k in (10, 9, 100):
         write_png(tmp_path / f"frame_{k}.png", IMAGE)
@@ -261,12 +269,7 @@ def test_frames_of_a_folder_a_pattern_and_a_video(tmp_path):
     assert own["depth_next"] == str(depths[2])
     with pytest.raises(DataError, match="two images"):
         find_images(tmp_path / "*.jpg")
-    video = cv2.VideoWriter(
-        str(tmp_path / "a.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48)
-    )
-    for k in range(5):
-        video.write(np.full((48, 64, 3), 50 * k, np.uint8))
-    video.release()
+    make_video(tmp_path / "a.avi", 5)
     found = video_frames(tmp_path / "a.avi", tmp_path / "frames", stride=2)
     levels = [cv2.imread(str(p)).mean() for p in found]
     np.testing.assert_allclose(levels, [0, 100, 200], atol=3)
@@ -455,6 +458,19 @@ def test_files_of_the_user_are_left_alone(tmp_path, capsys):
     assert main(["chain", "scene:street", "--out", str(tmp_path)]) == 2
     assert "would be overwritten" in capsys.readouterr().err
     assert (tmp_path / "chain.json").read_text() == "mine"
+
+
+def test_frames_of_another_sequence_are_left_alone(tmp_path, capsys):
+    out = tmp_path / "out"
+    with staged(out, subject="another sequence") as new:
+        (new / "chain.json").write_text("{}")
+    with staged(out / "frames") as new:
+        write_png(new / "0000.png", IMAGE)
+    before = (out / "frames" / "0000.png").read_bytes()
+    make_video(tmp_path / "clip.avi", 3)
+    assert main(["chain", str(tmp_path / "clip.avi"), "-o", str(out)]) == 2
+    assert "something else" in capsys.readouterr().err
+    assert (out / "frames" / "0000.png").read_bytes() == before
 
 
 def moved_images(folder, steps):
