@@ -19,6 +19,7 @@ from soup_nlp.start.bending import (
     constant_depth,
     flow_jump,
     reference_noise,
+    surface_motions,
     turn_alone,
 )
 from soup_nlp.start.choice import LEAST_NOISE, Choice, limited_noise, rigid_choice
@@ -35,7 +36,6 @@ from soup_nlp.start.ground import above_ground, floating, ground
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import earned, gather, mixtures
 from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
-from soup_nlp.start.regions import surface_motions
 from soup_nlp.start.settle import settle
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views

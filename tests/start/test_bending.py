@@ -20,10 +20,9 @@ from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import Case, build_energy, prepare, solver_options
 from soup_nlp.solve.stages import solve_soup
-from soup_nlp.start.bending import constant_depth, fit_turn, turn_alone
+from soup_nlp.start.bending import constant_depth, fit_turn, joined, turn_alone
 from soup_nlp.start.choice import LEAST_NOISE, dominant
 from soup_nlp.start.propose import look, rigid_motions
-from soup_nlp.start.regions import joined
 from soup_nlp.start.start_options import SeededStart
 
 pytestmark = pytest.mark.slow
