@@ -43,7 +43,7 @@ CONTACT = 0.2
 """Standard deviation of the log scale of a component by what it stands on or touches, beside that
 of the marginals: what moves need not touch what is below it in the image."""
 COVERING = 0.5
-"""The same for one that is only known to cover what is behind it (`start.occlusion`)."""
+"""Of the log scale of a component that is placed before what it covers (`start.occlusion`)."""
 USUAL = 0.5
 """Log ratio of displacements relative to the camera up to which what moves is as fast as usual: see
 docs/confidence.md."""
@@ -209,11 +209,12 @@ def scale_by_contact(
     """(N,) standard deviation of log depth by the scales of components.
 
     That of a component which has its scale from contact is the marginal and `CONTACT`, in squares;
-    one that has it from a depth prior has the prior's; to one that is placed in front of what it
-    covers `COVERING` is added.
+    one that has it from a depth prior has the prior's.
     It also moves the mean of the image, to which all depths refer, by the component's area.
     Where contact makes a component move `log_pace` times as far as the scene does, more than is
-    `USUAL`, it may lie anywhere from there to where it moves as far: that ratio is added.
+    `USUAL`, it may lie anywhere from there to where it moves as far: that ratio is added. A
+    component that occlusion has placed is a guess, has at least `COVERING`, and does not count for
+    the mean.
 
     Args:
         own: Marginal variances of the components' scales.
@@ -222,16 +223,17 @@ def scale_by_contact(
         far: (N,) displacement relative to the camera (`start.components.displacement`).
         given: A depth prior.
     """
-    contact = (start.tie != TIES.index("reference")) & (start.tie != FIXED)
+    placed = start.tie == TIES.index("occlusion")
+    contact = (start.tie != TIES.index("reference")) & (start.tie != FIXED) & ~placed
     scale = np.where(contact, np.hypot(np.sqrt(own.component)[start.component], CONTACT), 0.0)
-    scale = np.where(start.tie == TIES.index("occlusion"), np.hypot(scale, COVERING), scale)
     if given is not None:
         by_prior = (start.tie == TIES.index("given depth")) & np.isfinite(given.sigma)
         scale = np.where(by_prior, given.sigma, scale)
     mean = float(np.sum(sizes * np.minimum(scale, SIGMA_PRIOR)) / np.sum(sizes))
     pace = log_pace(far, start.component)[start.component]
-    free = contact & (pace > USUAL) & (start.tie != TIES.index("given depth"))
-    return np.hypot(np.hypot(scale, mean), np.where(free, pace, 0.0))
+    free = (contact | placed) & (pace > USUAL) & (start.tie != TIES.index("given depth"))
+    own_place = np.maximum(np.where(free, pace, 0.0), np.where(placed, COVERING, 0.0))
+    return np.hypot(np.hypot(scale, mean), own_place)
 
 
 def log_pace(far: Float, component: Int) -> Float:
