@@ -77,7 +77,7 @@ def test_a_pixel_without_backward_flow_affects_its_neighbourhood_alone():
     [
         ("still", 256, True),
         ("orbit", 256, False),
-        ("sheet", 512, False),
+        ("sheet", 768, False),
         pytest.param(
             "sheet",
             256,
