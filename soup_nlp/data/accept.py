@@ -14,7 +14,7 @@ from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.formats.camera_files import check_intrinsics, read_intrinsics
 from soup_nlp.data.formats.exif import estimated_cameras
 from soup_nlp.data.formats.images import read_image
-from soup_nlp.data.formats.map_files import read_depth, read_flow
+from soup_nlp.data.formats.map_files import known_depth, read_depth, read_flow
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.limits import check_image_size
@@ -106,15 +106,9 @@ def prior_of(given: object) -> Float:
     if is_path(given):
         return read_depth(Path(str(given)), 1.0)
     value = _array(given, "depth prior", "prior", "numbers (H, W), or a path")
-    if value.ndim != 2 or value.dtype.kind not in "fiu":
-        raise DataError(
-            "depth prior is no map of numbers",
-            where="prior",
-            found=f"{value.dtype} {value.shape}",
-            expected="(H, W)",
-        )
-    value = value.astype(np.float64)
-    return np.where(np.isfinite(value) & (value > 0), value, np.nan)
+    if value.dtype.kind not in "fiu":
+        raise DataError("depth prior holds no numbers", where="prior", found=value.dtype)
+    return known_depth(value, "prior")
 
 
 def flow_of(given: FlowLike, confidence: object, source: str) -> tuple[NDArray[Any], FloatMap, str]:

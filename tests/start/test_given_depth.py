@@ -139,7 +139,7 @@ def test_a_prior_that_cannot_be_one_is_refused(swing):
         resized_prior(swing.depth[:, :100], swing.pair, "a file")
     with pytest.raises(DataError, match="unknown everywhere"):
         resized_prior(np.full((24, 32), np.nan), swing.pair, "a file")
-    with pytest.raises(DataError, match="no map of numbers"):
+    with pytest.raises(DataError, match="wrong shape"):
         Pair(swing.pair.image_ref, swing.pair.image_next, fov=60, depth_prior=np.zeros((2, 2, 2)))
 
 

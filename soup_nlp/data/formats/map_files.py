@@ -236,7 +236,7 @@ def read_confidence(path: PathLike) -> FloatMap:
 # --- depth ----------------------------------------------------------------------------------------
 
 
-def _known_depth(depth: NDArray[Any], path: PathLike) -> Float:
+def known_depth(depth: NDArray[Any], path: PathLike) -> Float:
     """The depth as float64 with NaN where it is not positive and finite."""
     if depth.ndim != 2 or depth.size == 0:
         raise DataError(
@@ -250,7 +250,7 @@ def _known_depth(depth: NDArray[Any], path: PathLike) -> Float:
 
 def read_dpt(path: PathLike) -> Float:
     """Read a Sintel .dpt depth file, in scene units (metres in Sintel)."""
-    return _known_depth(_read_pieh(path, (), "depth file"), path)
+    return known_depth(_read_pieh(path, (), "depth file"), path)
 
 
 def read_pfm(path: PathLike) -> Float:
@@ -277,7 +277,7 @@ def read_pfm(path: PathLike) -> Float:
         )
     size = int(header.group(2)), int(header.group(1))
     order = "<" if scale < 0 else ">"
-    return _known_depth(_raster(content, header.end(), size, order, path, "PFM file")[::-1], path)
+    return known_depth(_raster(content, header.end(), size, order, path, "PFM file")[::-1], path)
 
 
 def read_depth_png16(path: PathLike, scale: float) -> Float:
@@ -295,7 +295,7 @@ def read_depth_png16(path: PathLike, scale: float) -> Float:
             found=repr_of(scale),
             expected="values per unit of length, e.g. 1000 for millimetres",
         )
-    return _known_depth(decode_png16(path, 1, "depth image") / float(scale), path)
+    return known_depth(decode_png16(path, 1, "depth image") / float(scale), path)
 
 
 def read_vkitti_depth(path: PathLike) -> Float:
@@ -325,7 +325,7 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
 
     readers: dict[str, Reader] = {
         ".dpt": read_dpt,
-        ".npy": lambda p: _known_depth(read_npy(p, "depth file"), p),
+        ".npy": lambda p: known_depth(read_npy(p, "depth file"), p),
         ".pfm": read_pfm,
         ".png": by_scale,
     }
