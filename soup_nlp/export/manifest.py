@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError, create_model
 
 from soup_nlp.errors import ExportError
 from soup_nlp.model.formulation import Coordinates
 from soup_nlp.model.layout import GAUGES
+from soup_nlp.model.norms import NormForm
 from soup_nlp.storage.files import read_json
 
 STUB = "soup"
 MANIFEST = "manifest.json"
-NORMS = ("smooth", "epigraph")
+NORMS: tuple[NormForm, ...] = get_args(NormForm)
 FUNCTIONS = ("oracle", "grad_f", "jac_g", "hess_lag")
 """Functions of the NLP in the format casadi."""
 EXPORT_FILES = (

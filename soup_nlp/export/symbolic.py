@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -13,14 +12,13 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.config.problem import Problem, load_problem
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.formulation import Coordinates
 from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import Case, prepare
 from soup_nlp.solve.functions import Functions
-
-Coordinates = Literal["matrix", "tangent"]
 
 
 @dataclass(frozen=True, eq=False)

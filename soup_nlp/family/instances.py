@@ -7,9 +7,9 @@ depend on the processor. Every number of the NLP is therefore rounded to 20 sign
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from itertools import product
 from typing import Any
 
@@ -95,23 +95,20 @@ def parse_name(name: str) -> Instance:
     Raises:
         ConfigError: the name is not one of the family.
     """
-    found = re.fullmatch(r"SOUP-([a-z]+)-([a-z]{2})-(\d+)([a-z])", name)
-    for form, start in product(formulations(), STARTS) if found else ():
-        one = Instance(found[1], form, int(found[3]), start)  # type: ignore[index]
-        if one.short == name and one.scene in SCENES and one.size in SIZES:
-            return one
-    found = re.fullmatch(r"SOUP-([a-z]+)-([a-z-]+)-N(\d+)(?:-([a-z]+))?", name)
-    for form in formulations() if found else ():
-        assert found is not None
-        if found[2] == form.replace("/", "-"):
-            one = Instance(found[1], form, int(found[3]), found[4] or STARTS[0])
-            if one.scene in SCENES and one.size in SIZES and one.start in STARTS:
-                return one
+    if name in _by_name():
+        return _by_name()[name]
     raise ConfigError(
         "no instance of the family",
         found=name,
         expected=f"SOUP-SCENE-GAUGE-NORM-NSIZE-START, such as {example().name}",
     )
+
+
+@cache
+def _by_name() -> dict[str, Instance]:
+    every = select(SIZES, SCENES, formulations())
+    first = {i.problem: i for i in every if i.start == STARTS[0]}
+    return first | {name: i for i in every for name in (i.name, i.short)}
 
 
 def example() -> Instance:
