@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import psutil
+
 from soup_nlp.errors import SolverError, SoupError
 from soup_nlp.storage.folders import scratch
 from soup_nlp.storage.rows import ONE_THREAD, Row, attempt, failure
@@ -128,7 +130,7 @@ def _child(
         os.dup2(log.fileno(), 1)
         os.dup2(log.fileno(), 2)
     if memory is not None:
-        limit = _virtual_bytes() + memory
+        limit = psutil.Process().memory_info().vms + memory
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     if cpu_seconds is not None:
         most = math.ceil(1.2 * cpu_seconds) + 1
@@ -160,15 +162,6 @@ def _reason(error: BaseException) -> str:
     return text[-1] if text else type(error).__name__
 
 
-def _virtual_bytes() -> int:
-    """Bytes of address space of this process; 0 if the system does not report it."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-    except (OSError, ValueError):
-        return 0
-    return pages * resource.getpagesize()
-
-
 def processor() -> str:
     """Name of the processor."""
     try:
@@ -180,13 +173,10 @@ def processor() -> str:
 
 def machine() -> dict[str, str]:
     """Processor, cores, memory, system and versions, as text."""
-    memory = 0.0
-    if "SC_PHYS_PAGES" in os.sysconf_names:
-        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
     return {
         "processor": processor(),
         "cores": str(os.cpu_count()),
-        "memory": f"{memory:.0f} GB" if memory else "unknown",
+        "memory": f"{psutil.virtual_memory().total / 2**30:.0f} GB",
         "system": f"{platform.system()} {platform.machine()}",
         **versions(),
         "code": code_version(),
