@@ -29,8 +29,8 @@ from soup_nlp.start.views import Views
 
 LEAST_GAIN_PX = 0.15
 """Least mean error that the main motion leaves of a region with motions of its own, pixels."""
-SMALL = 8
-"""Largest number of superpixels of a piece that may be a mixture of the flows around it."""
+SMALL = 0.008
+"""Largest share of the superpixels of a piece that may be a mixture of the flows around it."""
 MIXED_PX = 2.0
 """Distance, pixels, of its flow from those around it up to which a piece that its own motion
 explains badly is a mixture."""
@@ -107,7 +107,7 @@ def mixtures(
     """(N,) True in small pieces of movers whose flow tells of no motion of their own.
 
     On an outline of depth a superpixel mixes the flows of both sides. A piece of at most `SMALL`
-    superpixels is such a mixture if its flow lies between those of the largest component around it,
+    of them is such a mixture if its flow lies between those of the largest component around it,
     or near them where its own motion explains it badly and hardly better than the main one does.
 
     Args:
@@ -126,7 +126,7 @@ def mixtures(
     mixed = np.zeros(len(seg), bool)
     for p in np.unique(piece[(component != main) & usable]):
         at = piece == p
-        if at.sum() > SMALL or usable[at].mean() <= 0.5:
+        if at.mean() > SMALL or usable[at].mean() <= 0.5:
             continue
         around = np.concatenate([k[at[i] & ~at[k]], i[at[k] & ~at[i]]])
         around = around[usable[around] & (component[around] == main)]

@@ -315,15 +315,15 @@ def test_only_a_piece_with_usable_flow_moves():
     ],
 )
 def test_a_mixture_of_two_flows_does_not_move(shift, own, size, mixed):
-    """Four rows move by 0, four by 4 px; a piece in the middle column turns by itself."""
-    seg = cells(8, 16)
+    """Eight rows move by 0, eight by 4 px; a piece in the middle column turns by itself."""
+    seg = cells(16, 32)
     row, column = (seg.anchors // 8).astype(int).T[::-1]
-    piece = np.isin(row, (3, 4)) & (abs(column - 8) < size / 4)
+    piece = np.isin(row, (7, 8)) & (abs(column - 16) < size / 4)
     views = Turns(np.where(piece, 0.1, 0.0))
     choice = taken(views, np.where(piece, 0.1 - own / PER_RADIAN, 0.0), piece.astype(int))
     flow = np.zeros((len(seg), 2))
-    flow[:, 0] = np.where(piece, shift, np.where(row < 4, 0.0, 4.0))
-    found = gathering.mixtures(piece.astype(int), choice, flow, np.ones(128, bool), views, seg)
+    flow[:, 0] = np.where(piece, shift, np.where(row < 8, 0.0, 4.0))
+    found = gathering.mixtures(piece.astype(int), choice, flow, np.ones(len(seg), bool), views, seg)
     np.testing.assert_array_equal(found, piece & mixed)
 
 
