@@ -107,7 +107,7 @@ def mixtures(
     """(N,) True in small pieces of movers whose flow tells of no motion of their own.
 
     On an outline of depth a superpixel mixes the flows of both sides. A piece of at most `SMALL`
-    of them is such a mixture if its flow lies between those of the largest component around it,
+    of all superpixels is one if its flow lies between those of the largest component around it,
     or near them where its own motion explains it badly and hardly better than the main one does.
 
     Args:
