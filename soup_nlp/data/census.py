@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Image
-from soup_nlp.data.flow.consistency import FloatMap
+from soup_nlp.arrays import FloatMap, Image
 
 SOFT_GREY = 10.0
 """Difference in grey levels that becomes tanh(1) = 0.76."""

@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from soup_nlp.arrays import Float, Int
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.superpixels import LEAST_PIECE, Labels, split_components
-
-Float = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 SCALE_PX = 0.25
 """Residual, pixels, below which a fit treats a pixel as inlier."""
@@ -75,12 +73,12 @@ def follow_flow(
 def _nearest(
     fit: AffineFlow,
     flow: Flow,
-    own: Ints,
-    sides: list[Ints],
-    u: Ints,
-    v: Ints,
+    own: Int,
+    sides: list[Int],
+    u: Int,
+    v: Int,
     margin_px: float,
-) -> Ints:
+) -> Int:
     """(P,) superpixel with the nearest affine flow, the present one or that of a side."""
     uv = flow.uv[v, u].astype(np.float64)
     best, least = own.copy(), fit.residual(own, u, v, uv) - margin_px
@@ -110,12 +108,12 @@ class AffineFlow:
     size: Float
     known: NDArray[np.bool_]
 
-    def basis(self, which: Ints, u: Ints, v: Ints) -> Float:
+    def basis(self, which: Int, u: Int, v: Int) -> Float:
         """(P, 3) the three functions at pixels of superpixels `which` (P,)."""
         du, dv = u - self.centre[which, 0], v - self.centre[which, 1]
         return np.stack([np.ones(len(which)), du / self.size[which], dv / self.size[which]], axis=1)
 
-    def residual(self, which: Ints, u: Ints, v: Ints, uv: Float) -> Float:
+    def residual(self, which: Int, u: Int, v: Int, uv: Float) -> Float:
         """(P,) distance, pixels, of flows (P, 2) from those of superpixels `which` (P,)."""
         own = np.einsum("pa,pac->pc", self.basis(which, u, v), self.coefficients[which])
         return np.where(self.known[which], np.linalg.norm(uv - own, axis=1), np.inf)
@@ -162,7 +160,7 @@ def refit_affine(
 
 
 def _fit(
-    flow: Flow, which: Ints, u: Ints, v: Ints, n: int, scale_px: float, rounds: int
+    flow: Flow, which: Int, u: Int, v: Int, n: int, scale_px: float, rounds: int
 ) -> tuple[AffineFlow, Float]:
     """Fits of n superpixels to pixels (P,) and the last weights, see `fit_affine`."""
     base = flow.confidence[v, u].astype(np.float64)
@@ -187,7 +185,7 @@ def _fit(
     return AffineFlow(C, fit.centre, fit.size, fit.known), weight
 
 
-def _medians(which: Ints, values: Float, n: int) -> Float:
+def _medians(which: Int, values: Float, n: int) -> Float:
     """(N,) lower median of the values (P,) of every superpixel; 0 without values."""
     order = np.lexsort((values, which))
     count = np.bincount(which, minlength=n)
@@ -197,7 +195,7 @@ def _medians(which: Ints, values: Float, n: int) -> Float:
     return np.where(count > 0, values[order][np.minimum(middle, len(order) - 1)], 0.0)
 
 
-def _weighted(which: Ints, X: Float, Y: Float, w: Float, n: int) -> Float:
+def _weighted(which: Int, X: Float, Y: Float, w: Float, n: int) -> Float:
     """(N, 3, 2) weighted affine fits."""
     A = np.empty((n, 3, 3))
     for a in range(3):

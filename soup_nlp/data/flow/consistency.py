@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import FloatMap
 from soup_nlp.data.pair import Flow
-
-FloatMap = NDArray[np.float32]
 
 SUPPORT = 15
 """Side of the window over which the round-trip error is averaged, pixels: a wrong flow may be

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from soup_nlp.data.flow.consistency import FloatMap, confidence_of
+from soup_nlp.arrays import FloatMap, Image
+from soup_nlp.data.flow.consistency import confidence_of
 from soup_nlp.data.flow.guided import guided_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
-
-Image = NDArray[np.uint8]
 
 MIN_SIDE = 16
 """Smallest image side for DIS, pixels."""

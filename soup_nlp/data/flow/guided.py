@@ -11,12 +11,10 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from soup_nlp.data.flow.consistency import FloatMap, confidence_of, round_trip_error
+from soup_nlp.arrays import Float, FloatMap, Image
+from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
 
-Image = NDArray[np.uint8]
-Float = NDArray[np.float64]
 Match = Callable[[Image, Image], tuple[FloatMap, FloatMap]]
 """Forward and backward flow of two grey images of one size."""
 

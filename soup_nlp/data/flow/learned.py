@@ -8,14 +8,12 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from soup_nlp.data.flow.consistency import FloatMap, checked_flow
+from soup_nlp.arrays import FloatMap, Image
+from soup_nlp.data.flow.consistency import checked_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import is_file
-
-Image = NDArray[np.uint8]
 
 RANGES = {"255": (0.0, 255.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
 """Input values of black and white by the metadata `input_range` of an ONNX file; default "255"."""

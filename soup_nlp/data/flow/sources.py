@@ -12,8 +12,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from soup_nlp.arrays import Image
 from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
 from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.learned import learned_flow
@@ -25,7 +25,6 @@ from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.schema.section import Section
 from soup_nlp.storage.files import PathLike, is_file
 
-Image = NDArray[np.uint8]
 FlowSource = Callable[[Image, Image], Flow]
 
 ENTRY_POINTS = "soup_nlp.flow"
