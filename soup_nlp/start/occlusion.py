@@ -20,6 +20,7 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import affine_flow, fit_turn, flow_jump
 from soup_nlp.start.components import FIXED, TIES, connected_labels, depth_from_inside, quantile
+from soup_nlp.start.merge import SMALL
 from soup_nlp.start.propose import Start, look
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
@@ -185,6 +186,9 @@ def in_order(start: Start, seg: Segmentation, pair: Pair, o: SeededStart) -> Sta
     jump = flow_jump(affine, views, seg.pairs, rays(pair.K_ref, seg.boundary))
     region = regions(start, views, jump, seg, o)
     contrast = covering(seg, pair, views, affine, jump)
+    # the flow of a small piece may be a mixture of those around it, or wrong
+    small = np.bincount(region)[region] <= SMALL * len(seg)
+    contrast[small[seg.pairs].any(axis=1)] = 0.0
     whole = vote(contrast, region, seg)
     if not whole.any():
         return start

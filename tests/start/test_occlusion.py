@@ -16,6 +16,7 @@ from soup_nlp.geometry.superpixels import segment
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.solve.stages import solve_soup
+from soup_nlp.start import occlusion
 from soup_nlp.start.bending import affine_flow, flow_jump
 from soup_nlp.start.components import TIES
 from soup_nlp.start.occlusion import IN_FRONT, SURE, covering, in_order, vote
@@ -142,6 +143,15 @@ def test_what_swings_comes_before_the_wall(swing):
     ratio = start.soup.distance[main] / before.soup.distance[main]
     np.testing.assert_allclose(ratio, ratio[0])
     assert not (start.tie[main] == TIES.index("occlusion")).any()
+
+
+def test_small_pieces_have_no_order(monkeypatch):
+    pair, seg = sliding(True)
+    before = propose(seg, pair.flow, K, K, SeededStart())
+    monkeypatch.setattr(occlusion, "SMALL", 5 / len(seg))
+    assert in_order(before, seg, pair, SeededStart()) is not before
+    monkeypatch.setattr(occlusion, "SMALL", 6 / len(seg))
+    assert in_order(before, seg, pair, SeededStart()) is before
 
 
 def test_an_image_without_discontinuities_keeps_its_start(swing):
