@@ -27,8 +27,9 @@ from soup_nlp.start.motions import fit_translation, refine_motion
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
 
-LEAST_GAIN_PX = 0.15
-"""Least mean error that the main motion leaves of a region with motions of its own, pixels."""
+LEAST_GAIN_PX, LEAST_GAIN = 0.15, 10.0
+"""Least mean error that the main motion leaves of a region with motions of its own: in pixels, and
+in units of the median error of all superpixels; the lower one decides, as flow may be exact."""
 SMALL = 0.008
 """Largest share of the superpixels of a piece that may be a mixture of the flows around it."""
 MIXED_PX = 2.0
@@ -72,8 +73,8 @@ def gather(
 def earned(views: Views, choice: Choice, seg: Segmentation, noise: float) -> tuple[Choice, Mask]:
     """The choice without regions whose own motions explain too little.
 
-    A connected region keeps its motions if the main one leaves a mean error there that is larger by
-    `LEAST_GAIN_PX`; otherwise it takes the main one.
+    A connected region keeps its motions if the main one leaves a larger mean error there, by
+    `LEAST_GAIN_PX` or `LEAST_GAIN`; otherwise it takes the main one.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
@@ -95,7 +96,8 @@ def earned(views: Views, choice: Choice, seg: Segmentation, noise: float) -> tup
     moves = choice.label != main
     region = connected_pieces(moves, seg)
     count, total = (np.bincount(region[moves], v, minlength=1) for v in (None, gain[moves]))
-    left = moves & ((total < LEAST_GAIN_PX * count)[region])
+    least = min(LEAST_GAIN_PX, LEAST_GAIN * float(np.median(choice.error)))
+    left = moves & ((total < least * count)[region])
     at = np.flatnonzero(left)
     kept = choice.taking(at, R, t, fit.pick((at, np.zeros(len(at), int))), main)
     return kept, left & (gain > 3 * noise)

@@ -85,6 +85,18 @@ def taken(views: Turns, angle: np.ndarray, label: np.ndarray) -> Choice:
     return Choice(R, t, views.fit_own(R[:, None], t[:, None]), label)
 
 
+@pytest.mark.parametrize(("error", "kept"), [(0.0, True), (0.05, False)])
+def test_a_small_motion_counts_where_the_flow_is_exact(error, kept):
+    """A block leaves 0.1 px: more than ten median errors of exact flow, less than 0.15 px."""
+    seg = cells(6, 10)
+    block = seg.anchors[:, 0] > 48
+    views = Turns(np.where(block, 0.1 / PER_RADIAN, 0.0))
+    angle = views.true + np.where(np.arange(60) % 2, 1, -1) * error / PER_RADIAN
+    angle[~block] = error / PER_RADIAN
+    choice, _ = gathering.earned(views, taken(views, angle, block.astype(int)), seg, 0.05)
+    np.testing.assert_array_equal(choice.label, block.astype(int) * kept)
+
+
 # --- motions that are worth having ---------------------------------------------------------------
 
 
