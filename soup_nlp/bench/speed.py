@@ -120,7 +120,7 @@ def speed_cells(
         source = {"kind": scene} if scene == "motorcycle" else source
         items.append((Item("speed", scene, f"{scene}, seed {seed}", "dis", source), seed))
     items = [own for own in items if own[0].sequence != "motorcycle" or own[1] == seeds[0]]
-    items += [(pair, seeds[0]) for pair in pairs]
+    items += [(replace(pair, sequence=pair.name), seeds[0]) for pair in pairs]
     for n, k, (item, seed) in product(sorted(sizes), sorted(neighbours), items):
         settings = (
             f"segmentation.superpixels={n}",
