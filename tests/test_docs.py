@@ -239,6 +239,32 @@ def test_scores_are_those_of_the_stored_tables(page):
             assert fits(said, numbers) or (not said and flow == "truth"), (line, numbers)
 
 
+def test_the_table_of_sigma_is_that_of_the_stored_tables():
+    stored = {}
+    for name in ("rendered", "shared"):
+        text = (ROOT / "results" / "accuracy" / f"{name}.md").read_text(encoding="utf-8")
+        text = text[text.index("| sequence | flow | pairs | mre ") :]
+        head, *rows = (
+            [c.strip() for c in line.split("|")[1:-1]]
+            for line in text.partition("\n\n")[0].splitlines()
+        )
+        at = [head.index(key) for key in ("pairs", "AUSE", "guess", "within 1", "within 2")]
+        stored |= {r[0]: [float(r[k]) for k in at] for r in rows if r[1] == "dis"}
+    text = (ROOT / "docs" / "confidence.md").read_text(encoding="utf-8")
+    (table,) = re.findall(
+        r"^\| family \| pairs \| AUSE.*\n\|[-|]+\n((?:\|.*\n)+)", text, re.MULTILINE
+    )
+    said = {}
+    for line in table.splitlines():
+        family, *cells = (c.strip() for c in line.split("|")[1:-1])
+        said[family] = [float(c.rstrip(" %")) / (100 if "%" in c else 1) for c in cells if c]
+    mean = said.pop(f"mean of {len(stored)} families")
+    assert said.keys() == stored.keys()
+    for family, numbers in said.items():
+        np.testing.assert_allclose(numbers, stored[family], atol=0.00501, err_msg=family)
+    np.testing.assert_allclose(mean, np.mean(list(stored.values()), axis=0)[1:], atol=0.00501)
+
+
 def test_the_comparison_of_scores_can_fail():
     assert fits("0.016", ["0.0160"])
     assert not fits("0.016", ["0.0167"])
