@@ -21,6 +21,7 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.choice import Choice, dominant
+from soup_nlp.start.components import connected_labels
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.merge import candidates
 from soup_nlp.start.start_options import SeededStart
@@ -146,6 +147,43 @@ def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Floa
         error = np.linalg.norm(basis @ fit - target, axis=2)
         w = (views.weight + 1e-6) / np.sqrt(error**2 + noise**2)
     return fit, views.mean(error)
+
+
+ABOVE_NOISE, LEAST_JUMP = 10.0, 0.25
+"""Least jump of a flow discontinuity: multiple of the median jump between neighbours (which noise
+and bending cause), and share of `discontinuity_px`."""
+
+
+def surfaces(jump: Float, seg: Segmentation, discontinuity_px: float) -> Int:
+    """(N,) index of the surface of every superpixel; flow discontinuities separate them.
+
+    The size of the jumps varies along an outline, and one small jump would join both sides.
+    Surfaces are therefore first separated along smaller jumps. Two of them are joined again if the
+    flow is continuous along most of their common outline, longest outline first.
+
+    Args:
+        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
+        seg: Superpixels and graphs.
+        discontinuity_px: Jump that certainly is a discontinuity, pixels.
+    """
+    usual = float(np.median(jump)) if len(jump) else 0.0
+    least = np.clip(ABOVE_NOISE * usual, LEAST_JUMP * discontinuity_px, discontinuity_px)
+    surface = connected_labels(jump < least, seg)
+    n, (i, k) = len(seg), seg.pairs.T
+    while True:
+        a, b = surface[i], surface[k]
+        outline = np.flatnonzero(a != b)
+        if not len(outline):
+            return surface
+        a, b = np.minimum(a, b)[outline], np.maximum(a, b)[outline]
+        pairs, which = np.unique(a * n + b, return_inverse=True)
+        length = seg.boundary_length[outline].astype(float)
+        whole = np.bincount(which, length * (jump[outline] < discontinuity_px))
+        total = np.bincount(which, length)
+        join = int(np.argmax(np.where(whole > 0.5 * total, total, 0.0)))
+        if not whole[join] > 0.5 * total[join]:
+            return surface
+        surface = np.where(surface == pairs[join] % n, pairs[join] // n, surface)
 
 
 def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float]:

@@ -20,6 +20,7 @@ from soup_nlp.start.bending import (
     flow_jump,
     reference_noise,
     surface_motions,
+    surfaces,
     turn_alone,
 )
 from soup_nlp.start.choice import LEAST_NOISE, Choice, limited_noise, rigid_choice
@@ -138,7 +139,7 @@ def propose(
     if np.array_equal(K_ref, K_next):
         fixed, shift = fixed_to_camera(views, seg, jump, o)
     views, poor = views.without(fixed), poor | fixed
-    surface = connected_labels(jump < o.discontinuity_px, seg)
+    surface = surfaces(jump, seg, o.discontinuity_px)
     usable = views.weight.mean(axis=1) > SURE
     centre = np.concatenate([affine[:, 0] / views.focal, np.ones((len(seg), 1))], axis=1)
     motions, bends = surface_motions(views, seg, surface, residual, usable, o)
@@ -153,6 +154,8 @@ def propose(
         # the flow of bending regions says nothing about the motions of the rest
         views, poor = views.without(bends), poor | bends
         choice, noise = rigid_motions(views, seg, jump, motions, o)
+    else:
+        surface = connected_labels(jump < o.discontinuity_px, seg)
     choice, wrong = earned(views, choice, seg, noise)
     weight = np.where(usable & ~bends, 1.0, 0.0)
     choice = settle(views, choice, centre, weight, limited_noise(residual))

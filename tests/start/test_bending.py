@@ -20,7 +20,7 @@ from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import Case, build_energy, prepare, solver_options
 from soup_nlp.solve.stages import solve_soup
-from soup_nlp.start.bending import constant_depth, fit_turn, joined, turn_alone
+from soup_nlp.start.bending import constant_depth, fit_turn, joined, surfaces, turn_alone
 from soup_nlp.start.choice import LEAST_NOISE, dominant
 from soup_nlp.start.propose import look, rigid_motions
 from soup_nlp.start.start_options import SeededStart
@@ -300,3 +300,30 @@ def strip(count: int) -> Segmentation:
     v, u = np.mgrid[0:16, 0 : 8 * count]
     labels = (v // 8 * count + u // 8).astype(np.int32)
     return build_segmentation(labels, np.zeros((*labels.shape, 3), np.uint8), neighbours=2)
+
+
+def jumps(seg: Segmentation, column: float, size: np.ndarray, noise: float) -> np.ndarray:
+    """(P,) jump of `size` (rows,) between columns before and after `column`, else noise."""
+    i, k = seg.pairs.T
+    x, row = seg.anchors[:, 0] > column, (seg.anchors[:, 1] > 8).astype(int)
+    return np.where(x[i] != x[k], size[row[i]], noise)
+
+
+def test_a_gap_in_a_discontinuity_does_not_join_two_surfaces():
+    seg = strip(10)
+    left = seg.anchors[:, 0] < 40
+    apart = surfaces(jumps(seg, 40, np.array([2.0, 0.6]), 0.01), seg, 1.0)
+    # one of two rows is whole at 1 px: half of the outline is a discontinuity
+    np.testing.assert_array_equal(apart == apart[0], left)
+    whole = surfaces(jumps(seg, 40, np.array([0.9, 0.6]), 0.01), seg, 1.0)
+    assert (whole == whole[0]).all()
+
+
+def test_noise_does_not_cut_a_surface():
+    seg = strip(10)
+    rng = np.random.default_rng(0)
+    jump = np.where(rng.random(len(seg.pairs)) < 0.3, 0.9, 0.4)
+    assert (surfaces(jump, seg, 1.0) == surfaces(jump, seg, 1.0)[0]).all()
+    # and it does not hide a discontinuity
+    apart = surfaces(np.maximum(jump, jumps(seg, 40, np.array([3.0, 2.0]), 0.0)), seg, 1.0)
+    np.testing.assert_array_equal(apart == apart[0], seg.anchors[:, 0] < 40)
