@@ -88,6 +88,14 @@ def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least,
     assert least <= start.bends.mean() <= most
 
 
+@pytest.mark.parametrize("seed", [1, 5])
+def test_a_rigid_room_does_not_bend_with_its_banner(seed):
+    # surfaces without the cuts at smaller jumps: all of the image bends
+    own = problem("banner", f"input.seed={seed}")
+    start = prepare(own, pair=own.load_pair()).start
+    assert 0.3 < start.bends.mean() < 0.4
+
+
 def test_small_surfaces_join_the_neighbour_with_the_longest_outline():
     seg = strip(30)
     column = (seg.anchors[:, 0] // 8).astype(int)
