@@ -91,7 +91,8 @@ def test_a_pair_that_cannot_be_measured_is_a_row_with_the_reason(tmp_path):
     raw = {"kind": "folder", "path": str(tmp_path)}
     row = row_of(Item("kinect_paper", "s", "p", "dis", raw, ("eigen80", "paper")), QUICK)
     assert not row["ok"]
-    for words in ("pair has no true depth", SUITES["kinect_paper"].layout):
+    suite = SUITES["kinect_paper"]
+    for words in ("pair has no true depth", suite.layout, suite.source):
         assert words in row["error"]
 
 
@@ -105,7 +106,13 @@ def test_a_row_is_identified_by_settings_and_input_without_its_folder(tmp_path):
     assert here["settings"] == final["settings"]
     assert here["input"] != final["input"]
     assert here["settings"] == Cell(item(), ("flow.source=dis",)).identity()["settings"]
+    assert here["settings"] != Cell(item()).identity()["settings"]
     assert here["settings"] != identity("/a", "energy.weights.cont=9.0")["settings"]
+    first, second = (
+        Cell(Item("vkitti", "w", "w", "dis", {"kind": k, "root": "r", "scene": s, "frame": 1}))
+        for k, s in (("vkitti1", "0001"), ("vkitti2", "Scene01"))
+    )
+    assert first.identity()["input"] != second.identity()["input"] != "wrong"
     # a row whose folder is gone is measured again
     stale = [Cell(item(), keep=p).job(measure_pair).stale for p in (None, tmp_path, tmp_path / "x")]
     assert stale == [False, False, True]
@@ -182,6 +189,9 @@ def test_every_pair_is_in_the_details_of_its_own_convention():
     assert "| p, dis |" in detail[0]
     assert "| q, dis |" in detail[1]
     assert "the scale is the median of z_gt / z" in text_of(solved("kitti2015", "eigen80"))
+    # pairs of one name are told apart by their suite
+    text = text_of(solved("kitti2012"), solved("kitti2015"))
+    assert all(f"| kitti{year} p, dis |" in text for year in (2012, 2015))
 
 
 def test_one_rigid_motion_is_compared_on_its_own_pixels():

@@ -109,6 +109,9 @@ def test_crashes_and_errors_are_answers(tmp_path):
 
     ended = isolated(bad, tmp_path, 20, MANY)
     assert (ended.how, ended.value) == ("raised", "SolverError: no licence, found expired")
+    ended = isolated(lambda: int("no"), tmp_path, 20, MANY)
+    assert ended.how == "raised"
+    assert ended.value.startswith("ValueError: invalid literal")
     ended = isolated(die, tmp_path, 20, MANY)
     # the answer of an earlier run is not taken for that of a later one
     assert (ended.how, ended.value) == ("crashed: SIGKILL", None)
@@ -180,6 +183,7 @@ def test_a_reference_solver_returns_a_point_of_the_epigraph_form(tmp_path):
     # with the slack variables of the start it is off the constraints
     stale = np.concatenate([x[:size], task.nlp.x0[size:]])
     assert violations(task.nlp, stale)["rows"].max() > 1e-3
+    assert examine(task.nlp, x, None).residuals.primal < 1e-6
 
 
 def test_names_of_solvers(tmp_path):

@@ -12,7 +12,14 @@ import pytest
 
 from soup_nlp.bench.solvers.page import frame_of_runs
 from soup_nlp.bench.solvers.page import page as page_of
-from soup_nlp.bench.solvers.profiles import cost_table, draw_curves, draw_profiles, profile
+from soup_nlp.bench.solvers.profiles import (
+    _draw_profile,
+    cost_table,
+    draw_curves,
+    draw_profiles,
+    profile,
+)
+from soup_nlp.bench.study import figure
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError
@@ -65,6 +72,13 @@ def test_profiles_by_hand():
     assert share.to_numpy().tolist() == [[0]]
 
 
+def test_a_profile_names_the_solvers_that_solve_nothing():
+    axes = figure(4, 3).subplots()
+    _draw_profile(axes, "seconds", 2, profile(cost_table(frame_of_runs(ROWS), "seconds")))
+    told = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert told == ["one", "two", "none by three"]
+
+
 @pytest.mark.parametrize("rows", [ROWS, [ROWS[2] | {"curve": []}]], ids=["some", "none"])
 def test_pictures_of_runs(rows, tmp_path):
     frame = frame_of_runs(rows)
@@ -88,6 +102,9 @@ def test_a_page_has_problems_solvers_and_runs():
     # one of another content
     other = row("b", "two", 9.0, 2.0) | {"problem_hash": "1"}
     assert "**3 problems" in page([*ROWS, other])
+    cost = cost_table(frame_of_runs([*ROWS, other]), "seconds")
+    assert np.isfinite(cost).sum(axis=1).tolist() == [2, 2, 1]
+    assert "Verified problems by solver: none." in page(ROWS[2:3])
     # a solver without an answer
     nothing = {k: v for k, v in ROWS[0].items() if k not in ("energy", "primal", "curve")}
     text = page([nothing | {"verified": False, "claimed": False, "curve": []}])
