@@ -262,17 +262,18 @@ def test_one_superpixel_is_one_plane(images, tmp_path):
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (["a.png"], "a pair is two images"),
-        (["--ref", "a.png"], "solve REF NEXT"),
-        (["a.png", "b.png", "c.png"], "soup-nlp chain"),
-        (["a.png", "b.png", "--next", "c.png"], "--next c.png"),
-        (["street", "b.png"], "street, b.png"),
-        ([], "nothing to solve"),
-        (["missing.yaml"], "problem file is missing"),
+        ("solve a.png", "a pair is two images"),
+        ("solve --ref a.png", "solve REF NEXT"),
+        ("solve a.png b.png c.png", "soup-nlp chain"),
+        ("solve a.png b.png --next c.png", "--next c.png"),
+        ("solve street b.png", "street, b.png"),
+        ("solve", "nothing to solve"),
+        ("solve missing.yaml", "problem file is missing"),
+        ("check missing", "summary.json is missing"),
     ],
 )
-def test_frames_that_are_no_pair_are_refused(words, part, capsys):
-    assert main(["solve", *words]) == 2
+def test_what_is_no_pair_and_no_result_is_refused(words, part, capsys):
+    assert main(words.split()) == 2
     assert part in capsys.readouterr().err
 
 

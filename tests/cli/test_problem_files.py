@@ -17,11 +17,13 @@ MOTORCYCLE = "input: {kind: motorcycle}\n"
 
 
 @pytest.mark.parametrize("path", PROBLEMS, ids=lambda path: path.stem)
-def test_a_dumped_problem_is_the_same_problem(path, tmp_path):
+def test_a_dumped_problem_is_the_same_problem(path, tmp_path, capsys):
     problem = load_problem(path)
     text = dump_problem(problem)
-    (tmp_path / "again.yaml").write_text(text)
-    assert load_problem(tmp_path / "again.yaml") == problem
+    assert main(["show", str(path)]) == 0
+    for shown in (text, capsys.readouterr().out):
+        (tmp_path / "again.yaml").write_text(shown)
+        assert load_problem(tmp_path / "again.yaml") == problem
     # other readers of YAML understand it too, and every key has its comment
     assert yaml.safe_load(text)["segmentation"]["superpixels"] == problem.segmentation.superpixels
     assert all("  # " in line for line in text.splitlines())
@@ -81,7 +83,9 @@ def test_an_error_says_where_it_is_and_what_was_expected(text, parts, tmp_path):
         ("solver.eps=[1, -1]", ["--set solver.eps", "key solver.eps"]),
         ("segmentation.boundary_samples=none", ["a valid integer, or all"]),
         ("input.kind.x=3", ["goes below a value", "kind is a section"]),
-        ("nonsense", ["override is not key=value"]),
+        ("energy.weights.proj=-1", ["energy.weights.proj"]),
+        ("segmentation.superpixels=0", ["segmentation.superpixels"]),
+        ("nonsense", ["override is not key=value", "--set"]),
         ("seed=[1", ["not YAML", "--set seed=[1"]),
     ],
 )

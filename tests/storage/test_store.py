@@ -78,10 +78,15 @@ def test_atomic_permissions(tmp_path):
         os.umask(umask)
 
 
-@pytest.mark.parametrize("name", ["", "no/a"])
+@pytest.mark.parametrize("name", ["", "no/a", "removed"])
 def test_atomic_bad_targets(name, tmp_path):
-    with pytest.raises(DataError, match="cannot be written"), atomic_path(tmp_path / name):
-        pass
+    def write():
+        with atomic_path(tmp_path / name) as temporary:
+            if name == "removed":
+                temporary.unlink()
+
+    with pytest.raises(DataError, match="cannot be written"):
+        write()
     assert os.listdir(tmp_path) == []
 
 
