@@ -106,8 +106,9 @@ def test_where_all_pixels_scatter_none_of_them_is_suspected():
     assert weight[(labels == 1) & ~lone].min() > 0.9
 
 
-@pytest.mark.slow
-def test_a_problem_has_fewer_mixed_superpixels_with_it_than_without():
+@pytest.fixture(scope="module")
+def mixed_shares() -> dict[float | None, float]:
+    """Share of superpixels of two components in a problem, by the margin; None without a move."""
     scene = {"kind": "scene", "scene": "orbit", "seed": 3, "width": 384, "height": 164}
     share = {}
     for margin in (1.0, None):
@@ -121,4 +122,21 @@ def test_a_problem_has_fewer_mixed_superpixels_with_it_than_without():
             np.testing.assert_array_equal(
                 case.segmentation.labels, segment(case.pair.image_ref, 300)
             )
-    assert share[1.0] < 0.5 * share[None]
+    return share
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "most",
+    [
+        0.5,
+        pytest.param(
+            0.25,
+            marks=pytest.mark.xfail(
+                strict=True, reason="0.35 since N is what was asked: SLIC mixes less"
+            ),
+        ),
+    ],
+)
+def test_a_problem_has_fewer_mixed_superpixels_with_it_than_without(mixed_shares, most):
+    assert mixed_shares[1.0] < most * mixed_shares[None]

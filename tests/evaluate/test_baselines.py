@@ -35,18 +35,31 @@ def made(
     return Pair(image, image, K, K_next, flow), z, R, t
 
 
+def test_recovers_a_rigid_scene(orbit):
+    m = depth_metrics(rigid_depth(orbit), orbit.truth.depth_ref)
+    assert m.mre < 1e-4
+    assert m.coverage == 1.0
+
+
 def test_same_seed_same_answer(orbit):
     a, b = (rigid_depth(orbit, seed=3) for _ in range(2))
     np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize(("fx", "skew", "cx"), [(90, 0, 41), (90, 0, 72), (140, 1.5, 30)])
-def test_exact_flow_gives_exact_depth_whatever_the_second_camera(fx, skew, cx):
+@pytest.mark.parametrize(("dtype", "rtol"), [(np.float32, 5e-3), (np.float64, 1e-6)])
+@pytest.mark.parametrize(
+    ("fx", "fy", "skew", "cx", "cy"),
+    [
+        *((90, fy, 0, cx, 28) for fy in (92, 110) for cx in (41, 72)),
+        (140, 120, 1.5, 30, 35),
+    ],
+)
+def test_exact_flow_gives_exact_depth_whatever_the_second_camera(fx, fy, skew, cx, cy, dtype, rtol):
     """With a flow in double precision nothing but rounding is left."""
-    K_next = np.array([[fx, skew, cx], [0, 110.0, 28.0], [0, 0, 1]])
-    pair, z, _, t = made(K_next, dtype=np.float64)
+    K_next = np.array([[fx, skew, cx], [0, fy, cy], [0, 0, 1.0]])
+    pair, z, _, t = made(K_next, dtype=dtype)
     found = rigid_depth(pair)
-    np.testing.assert_allclose(found * np.linalg.norm(t), z, rtol=1e-6)
+    np.testing.assert_allclose(found * np.linalg.norm(t), z, rtol=rtol)
 
 
 def test_depth_without_parallax_is_unknown():
@@ -113,9 +126,19 @@ def test_dynamic_scene_is_not_rigid():
     assert static.mre < m.mre < 0.05
 
 
+def test_unknown_pixels_take_the_nearest_depth():
+    z = np.array([[1.0, np.nan, np.nan, 4.0]])
+    np.testing.assert_array_equal(fill_nearest(z), [[1, 1, 4, 4]])
+    full = np.ones((2, 2))
+    assert fill_nearest(full) is not full
+
+
 def test_without_flow_or_motion_there_is_no_baseline(orbit, monkeypatch):
     assert rigid_depth(replace(orbit, flow=None)) is None
     none = Flow(orbit.flow.uv, np.zeros_like(orbit.flow.confidence))
     assert rigid_depth(orbit.with_flow(none)) is None
+    still = Flow(np.zeros_like(orbit.flow.uv), np.ones_like(orbit.flow.confidence))
+    found = rigid_depth(orbit.with_flow(still))
+    assert found is None or found.shape == orbit.size
     monkeypatch.setattr("soup_nlp.start.epipolar.estimate", lambda *_: None)
     assert rigid_depth(orbit) is None

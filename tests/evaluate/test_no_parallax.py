@@ -80,6 +80,16 @@ def test_a_pixel_without_backward_flow_affects_its_neighbourhood_alone():
         ("sheet", 768, False),
         pytest.param(
             "sheet",
+            512,
+            False,
+            marks=pytest.mark.xfail(
+                strict=True,
+                reason="strips beyond the sheet are a component of their own: a constant depth"
+                " comes within 0.4994 px, the bound being 0.5",
+            ),
+        ),
+        pytest.param(
+            "sheet",
             256,
             False,
             marks=pytest.mark.xfail(
