@@ -120,18 +120,23 @@ def optimal_slacks(nlp: NLP) -> np.ndarray:
     return x
 
 
+@pytest.mark.parametrize("units", UNITS)
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_the_epigraph_at_its_optimum_is_the_exact_energy_without_truncations(gauge):
-    problem = tiny()
-    weights = PAPER.replace(sigma_cont=np.inf, orient=0.0)
-    nlp, _ = problem.nlp(weights, form(gauge=gauge, norm="epigraph", eps=0.0, eps_pixel=0.0))
-    exact = oracle.energy(problem.soup, problem.data, weights)["total"]
+def test_the_epigraph_at_its_optimum_is_the_exact_energy_without_truncations(gauge, units):
+    problem, w = tiny(units), weights_for(units, truncated=False)
+    weights = w.replace(sigma_cont=np.inf, sigma_orient=np.inf)
+    sharp = form(gauge=gauge, norm="epigraph", eps=0.0, eps_pixel=0.0)
+    nlp, layout = problem.nlp(weights, sharp)
+    exact = oracle.energy(problem.soup, problem.data, weights)
     x = optimal_slacks(nlp)
     f, g = value(nlp, x)
-    assert f == pytest.approx(exact, rel=1e-10)
+    assert f == pytest.approx(exact["total"], rel=1e-10)
     assert np.maximum(nlp.lbg - g, g - nlp.ubg).max() <= 1e-9
+    for term, e in by_term(nlp, x).items():
+        assert e == pytest.approx(exact[term], rel=1e-10), term
     # whatever else the slack variables are, as long as they are feasible, f is not lower
-    rng, slack = np.random.default_rng(0), np.arange(nlp.nx) >= nlp.nx - len(nlp.x0[nlp.lbx == 0])
+    rng, slack = np.random.default_rng(0), np.arange(nlp.nx) >= layout.size
+    assert slack.sum() > 100
     for _ in range(10):
         y = x + slack * rng.exponential(0.1, nlp.nx) * (rng.random(nlp.nx) < 0.5)
         assert nlp.value(y) > f
