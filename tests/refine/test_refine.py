@@ -285,16 +285,16 @@ def test_a_listener_can_end_a_round(what, status, monkeypatch):
         heard.append(str(progress))
         if what == "wait":
             time.sleep(0.55)
+        elif len(heard) == 2 and what == "interrupt":
+            raise KeyboardInterrupt
         elif len(heard) == 2:
             stop.set()
-            if what == "interrupt":
-                stop.clear()
-                raise KeyboardInterrupt
 
     o = FEW.replace(max_seconds=0.5 if what == "wait" else 300.0)
     watch = Watch(listener, stop)
     done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, seed=1, watch=watch)
     assert done.status == status
+    assert stop.is_set() == (what == "stop")
     assert [r.status for r in done.rounds] == ["interrupted"]
     assert done.rounds[0].iterations == len(heard) == (1 if what == "wait" else 2)
     assert heard[0].startswith("refine 1")

@@ -15,6 +15,7 @@ import yaml
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem, make_problem
 from soup_nlp.errors import ConfigError
+from soup_nlp.model.energy_data import PAPER_TERMS
 from soup_nlp.pipeline.run import run
 from soup_nlp.refine.kinds import KINDS
 from soup_nlp.refine.records import RefineOptions
@@ -63,6 +64,7 @@ def test_solve_delivers_the_refined_soup_and_keeps_the_nlps(both):
     assert r["start"]["total"] > r["begin"]["total"]
     assert 0 < r["contradicted"] <= summary["sizes"]["superpixels"]
     assert set(r["rounds"][0]["accepted"]) == set(KINDS)
+    assert r["end"].keys() >= {"total", *PAPER_TERMS, "prior"}
     with h5py.File(both / "result.h5") as file:
         for term in r["end"]:
             values = file[f"refine/energy_{term}"][:]
@@ -132,6 +134,12 @@ def test_without_the_nlp_the_start_is_refined(tmp_path, capsys):
     again = load_problem(tmp_path / "config.yaml")
     assert again.digest() == summary["problem_hash"]
     assert again.refine.from_start
+
+
+@pytest.mark.xfail(strict=True, reason="0.992: the start with settled motions is lower")
+def test_the_refinement_lowers_the_start_by_a_hundredth(tmp_path):
+    r = solve(tmp_path, "--no-nlp")[1]["refinement"]
+    assert r["end"]["total"] < 0.99 * r["begin"]["total"]
 
 
 def test_both_halves_cannot_be_left_out(tmp_path, capsys):

@@ -135,6 +135,9 @@ def test_the_limit_of_a_flow_ignores_outliers():
     uv[0, 0] = (300, 400)
     assert flow_limit(uv) == pytest.approx(15, rel=0.02)
     assert flow_limit(np.full((2, 2, 2), np.nan)) == 1.0
+    # their colours, in that limit
+    assert (colourise_flow(np.zeros((2, 2, 2))) == 255).all()
+    assert not colourise_flow(np.full((2, 2, 2), np.nan)).any()
 
 
 def test_superpixel_boundaries():

@@ -69,11 +69,11 @@ def test_rigid_components_do_not_bend(scene):
 
 
 def test_sheet_bends_and_can_be_told_not_to():
-    assert case("sheet").start.bends.all()
-    c = case("sheet", UNORDERED)
-    assert c.start.bending
-    assert c.start.bends.all()
-    assert c.data.arap_at_anchors
+    for c in (case("sheet"), case("sheet", UNORDERED)):
+        assert c.start.bending
+        assert c.start.bends.all()
+        assert c.data.arap_at_anchors
+    # occlusion alone, which shows the sheet before the wall, gives it another depth
     assert (c.start.component == 0).all()
     np.testing.assert_allclose(c.soup.depth_at(c.data.anchor_ray), 1.0, rtol=1e-9)
     assert not case("sheet", "start.bending=false").start.bending
