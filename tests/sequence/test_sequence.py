@@ -12,7 +12,6 @@ import pytest
 import trimesh
 from helpers_chromium import Chromium, find_chromium
 from helpers_result import CAMERA, small_result
-from PIL import ExifTags, Image
 
 from soup_nlp.bench import chain as chain_study
 from soup_nlp.bench.study import Cell, frame_of
@@ -24,21 +23,14 @@ from soup_nlp.report.figures import write_png
 from soup_nlp.sequence import pairs
 from soup_nlp.sequence.chain import follow, make_chain, number
 from soup_nlp.sequence.frames import (
-    file_frames,
-    find_depths,
-    find_images,
     scene_frames,
-    video_frames,
 )
 from soup_nlp.sequence.fused import fuse, movers
-from soup_nlp.sequence.key_frames import key_frames, parallax
 from soup_nlp.sequence.pairs import SolvedPair, carried
 from soup_nlp.sequence.scales import Link, link, solve_scales
 from soup_nlp.sequence.score import aligned
-from soup_nlp.sequence.solve import _frames
 from soup_nlp.sequence.stored import COLMAP_POINTS
 from soup_nlp.sequence.write import chain_files, write_chain
-from soup_nlp.storage.folders import staged
 
 pytestmark = pytest.mark.slow
 
@@ -151,18 +143,6 @@ def test_the_static_scene_becomes_one_cloud():
     assert len(movers(chain, 0)) == 0 or len(chain.path(1)) >= 3
 
 
-def test_pictures_of_no_sequence_are_refused(tmp_path, capsys):
-    rng = np.random.default_rng(1)
-    for k, size in enumerate(((48, 64), (48, 64), (40, 64))):
-        write_png(tmp_path / f"{k}.png", rng.integers(0, 256, (*size, 3)).astype(np.uint8))
-    assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
-    assert "differ in size: are they one sequence?" in capsys.readouterr().err
-    (tmp_path / "2.png").unlink()
-    assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
-    assert "continues the one before it" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_chain_is_written(tmp_path):
     chain = make_chain(toy_pairs())
     write_chain(tmp_path, chain, "toy & co", ["a.png", "b.png", "</script>"])
@@ -245,97 +225,6 @@ def test_similarities_are_found_exactly():
     assert not np.allclose(aligned(points * [1, 1, -1], target), target)
 
 
-def make_video(path, count):
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
-    for k in range(count):
-        video.write(np.full((48, 64, 3), 50 * k, np.uint8))
-    video.release()
-
-
-def test_frames_of_a_folder_a_pattern_and_a_video(tmp_path):
-    for k in (10, 9, 100):
-        write_png(tmp_path / f"frame_{k}.png", IMAGE)
-        np.save(tmp_path / f"depth_{k}.npy", np.ones((48, 64)))
-    write_png(tmp_path / "other.png", IMAGE)
-    images = find_images(tmp_path)
-    assert [p.name for p in images] == ["frame_9.png", "frame_10.png", "frame_100.png"]
-    assert find_images(tmp_path / "frame_1*.png") == images[1:]
-    depths = find_depths(images)
-    assert [p.name for p in depths] == ["depth_9.npy", "depth_10.npy", "depth_100.npy"]
-    (tmp_path / "depth_9.npy").unlink()
-    assert find_depths(images) == []
-    own = file_frames(images, {"fov": 60}, depths, 256.0).pair(0, 2)
-    assert own["next"] == str(images[2])
-    assert own["depth_next"] == str(depths[2])
-    with pytest.raises(DataError, match="two images"):
-        find_images(tmp_path / "*.jpg")
-    make_video(tmp_path / "a.avi", 5)
-    found = video_frames(tmp_path / "a.avi", tmp_path / "frames", stride=2)
-    levels = [cv2.imread(str(p)).mean() for p in found]
-    np.testing.assert_allclose(levels, [0, 100, 200], atol=3)
-    (tmp_path / "b.mp4").write_bytes(b"no video")
-    with pytest.raises(DataError, match="video"):
-        video_frames(tmp_path / "b.mp4", tmp_path / "frames2")
-
-
-@pytest.mark.parametrize(
-    ("names", "ordered"),
-    [
-        (["IMG_1.jpg", "._IMG_1.jpg", "IMG_2.jpg", ".x.png"], ["IMG_1.jpg", "IMG_2.jpg"]),
-        (["x.jpg", "x.jpg.png", "y.jpg", "y.jpg.mask.png"], ["x.jpg", "y.jpg"]),
-        (["10.png", "9.5.png", "9.25.png", "9.png"], ["9.png", "9.25.png", "9.5.png", "10.png"]),
-        (
-            ["t1305031102175304321.png", "t1305031102175304320.png"],
-            ["t1305031102175304320.png", "t1305031102175304321.png"],
-        ),
-    ],
-)
-def test_files_of_a_folder_that_are_frames(names, ordered, tmp_path):
-    for name in names:
-        write_png(tmp_path / "image.png", IMAGE)
-        (tmp_path / "image.png").rename(tmp_path / name)
-    for source in (tmp_path, tmp_path / "*"):
-        assert [p.name for p in find_images(source)] == ordered
-
-
-def test_a_pattern_may_match_folders(tmp_path):
-    for name in ("10", "9", ".hidden", "[9]"):
-        (tmp_path / name).mkdir()
-        write_png(tmp_path / name / "x.png", IMAGE)
-        write_png(tmp_path / name / "z.png", IMAGE)
-    found = find_images(tmp_path / "*" / "x.png")
-    assert [p.parent.name for p in found] == ["9", "10", "[9]"]
-    # brackets in the name of a folder that exists are no pattern
-    assert [p.name for p in find_images(tmp_path / "[9]" / "*.png")] == ["x.png", "z.png"]
-
-
-@pytest.mark.parametrize("kind", ["damaged", "heic", "turned"])
-def test_an_unreadable_frame_is_found_before_the_first_solve(kind, tmp_path, capsys, monkeypatch):
-    def solve(*args):
-        raise AssertionError("a pair was solved")
-
-    monkeypatch.setattr(pairs, "_solve", solve)
-    for k in range(3):
-        write_png(tmp_path / f"{k}.png", IMAGE)
-    last = tmp_path / "3.png"
-    write_png(last, IMAGE)
-    if kind == "damaged":
-        last.write_bytes(last.read_bytes()[:500])
-    elif kind == "heic":
-        last.unlink()
-        last = tmp_path / "3.heic"
-        last.write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
-    else:
-        exif = Image.Exif()
-        exif[ExifTags.Base.Orientation] = 6
-        Image.fromarray(IMAGE).save(last, exif=exif)
-    camera = ["--intrinsics", "60,60,31.5,23.5"]
-    assert main(["chain", str(tmp_path), *camera, "-o", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err
-    assert last.name in error
-    assert {"damaged": "truncated", "heic": "convert it", "turned": "turned"}[kind] in error
-
-
 @pytest.mark.parametrize("order", [[0, 0, 1, 1, 1, 2], [0, 1, 2, 2], [0, 0]])
 def test_duplicate_frames_are_bridged(order, tmp_path):
     """A recording that starts, pauses or ends at rest."""
@@ -352,12 +241,6 @@ def test_duplicate_frames_are_bridged(order, tmp_path):
     if len(order) == 6:
         assert links[1, 4]["bridge"]
         assert not links[1, 4]["flagged"]
-
-
-def test_frames_of_a_scene_follow_each_other():
-    assert scene_frames("street", 4).pair(2, 3)["frame"] == 2
-    with pytest.raises(DataError):
-        scene_frames("street", 4).pair(0, 2)
 
 
 SMALL = [
@@ -458,51 +341,3 @@ def test_files_of_the_user_are_left_alone(tmp_path, capsys):
     assert main(["chain", "scene:street", "--out", str(tmp_path)]) == 2
     assert "would be overwritten" in capsys.readouterr().err
     assert (tmp_path / "chain.json").read_text() == "mine"
-
-
-def test_frames_of_another_sequence_are_left_alone(tmp_path, capsys):
-    out = tmp_path / "out"
-    with staged(out, subject="another sequence") as new:
-        (new / "chain.json").write_text("{}")
-    with staged(out / "frames") as new:
-        write_png(new / "0000.png", IMAGE)
-    before = (out / "frames" / "0000.png").read_bytes()
-    make_video(tmp_path / "clip.avi", 3)
-    assert main(["chain", str(tmp_path / "clip.avi"), "-o", str(out)]) == 2
-    assert "something else" in capsys.readouterr().err
-    assert (out / "frames" / "0000.png").read_bytes() == before
-
-
-def moved_images(folder, steps):
-    """Images of two textured layers by a camera that moves sideways; nearest depth 2."""
-    rng = np.random.default_rng(0)
-    far, near = (cv2.resize(rng.integers(0, 256, (40, 60), np.uint8), (600, 400)) for _ in range(2))
-    for k, x in enumerate(steps):
-        image = far[100:220, 100 + round(x) : 260 + round(x)].copy()
-        image[60:] = near[160:220, 100 + round(2 * x) : 260 + round(2 * x)]
-        write_png(folder / f"{k:02d}.png", np.repeat(image[..., None], 3, axis=2))
-    return find_images(folder)
-
-
-def test_frames_are_as_far_apart_as_their_parallax_asks(tmp_path):
-    K = np.array([[160, 0, 79.5], [0, 160, 59.5], [0, 0, 1.0]])
-    images = moved_images(tmp_path, [0, 0, 1, 2, 3, 40, 80, 80])
-    one, other = (cv2.imread(str(images[k]), cv2.IMREAD_GRAYSCALE) for k in (0, 4))
-    # layers move by 3 and 6 px; a rotation takes up what they have in common
-    assert 0.5 * 1.5 < 160 * parallax(one, other, K) <= 3
-    assert parallax(one, one, K) == pytest.approx(0, abs=1e-6)
-    assert parallax(one, np.zeros_like(one), K) is None
-    chosen = key_frames(images, K)
-    # 1 % is 1.6 px: frames 1 and 2 are too near; beyond frame 4 nothing is found again
-    assert chosen[0] == 0
-    assert chosen[1] in (3, 4)
-    assert chosen[-3:] == [5, 6, 7]
-    assert key_frames(images, K, most=2) == chosen[:2]
-    own = _frames(images, tmp_path, {"intrinsics": [160, 160, 79.5, 59.5]}, None, 2, None)
-    assert own.names == tuple(str(images[k]) for k in chosen[:2])
-
-
-@pytest.mark.parametrize("stride", ["0", "-1", "often"])
-def test_strides_are_checked(stride, tmp_path, capsys):
-    assert main(["chain", str(tmp_path), "--stride", stride]) == 2
-    assert "auto" in capsys.readouterr().err
