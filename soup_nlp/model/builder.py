@@ -140,7 +140,8 @@ class Builder:
         """
         x, m = ca.SX.sym("x"), ca.SX.sym("metric")
         kernel = Kernel("ridge", x, m, _SYMBOLS, objective=0 * x, curvature=_SYMBOLS[3] * m)
-        self.groups.append(Group(kernel, Table(np.arange(len(metric))[:, None], metric[:, None])))
+        index, none = np.arange(len(metric))[:, None], np.zeros((len(metric), 0), np.int64)
+        self.groups.append(Group(kernel, Table(index, metric[:, None], none)))
 
     def finish(
         self, name: str, x0: Float, lbx: Float, ubx: Float, names: Callable[[], list[str]]

@@ -6,7 +6,7 @@ which variables it reads, which rows of g it adds to, and its data. Nothing here
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Literal, get_args
 
@@ -150,12 +150,13 @@ class Table:
     Attributes:
         index: (E, nx) global variable of every local one.
         data: (E, np) data rows.
-        rows: (E, nc) global constraint row of every local one; rows may repeat (sums).
+        rows: (E, nc) global constraint row of every local one; rows may repeat (sums);
+            (E, 0) without constraints.
     """
 
     index: Int
     data: Float
-    rows: Int = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    rows: Int
 
     def __len__(self) -> int:
         return len(self.index)
@@ -174,14 +175,14 @@ class Group:
 
     def __post_init__(self) -> None:
         k, t = self.kernel, self.table
-        expected = ((len(t), k.nx), (len(t), k.row.numel()))
-        found = (t.index.shape, t.data.shape)
-        if found != expected or (k.nc and t.rows.shape != (len(t), k.nc)):
+        expected = [(len(t), width) for width in (k.nx, k.row.numel(), k.nc)]
+        found = [a.shape for a in (t.index, t.data, t.rows)]
+        if found != expected:
             raise ModelError(
                 "table does not fit its kernel",
                 where=k.name,
-                found=f"index, data {found}, rows {t.rows.shape}",
-                expected=f"index, data {expected}, rows {(len(t), k.nc)}",
+                found=f"index, data, rows {found}",
+                expected=f"index, data, rows {expected}",
             )
         if not np.isfinite(t.data).all():
             raise ModelError("table has NaN or infinite data", where=k.name)

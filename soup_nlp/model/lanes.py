@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float
 from soup_nlp.model.compile import shared_library
 from soup_nlp.model.kernel import Table
-from soup_nlp.model.operations import OPERATIONS, instructions
+from soup_nlp.model.operations import OPERATIONS, input_sizes, instructions
 
 LANES = 8
 
@@ -95,7 +95,7 @@ def c_source(function: ca.Function) -> str:
             term = OPERATIONS[op].c.format(*(f"a{i}" for i in source))
             lines.append(f"a{to[0]} = {term};")
     used = f.sz_w()
-    size = [f.nnz_in(i) if i < f.n_in() else 0 for i in range(5)]
+    size = input_sizes(f)
     head = (
         f"static void {name}(const real *in0, const real *in1, const real *in2,"
         " const real *in3, const real *in4, real *out) {"
@@ -146,9 +146,8 @@ class Lanes:
     @classmethod
     def of(cls, table: Table) -> Lanes:
         """The same table."""
-        # without constraints a table has no rows at all
-        rows = table.rows.reshape(len(table), table.rows.shape[1])
-        return cls(in_lanes(table.index, np.int32), in_lanes(table.data), in_lanes(rows, np.int32))
+        index, rows = (in_lanes(part, np.int32) for part in (table.index, table.rows))
+        return cls(index, in_lanes(table.data), rows)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,10 @@ import numpy as np
 
 
 class Operation(NamedTuple):
-    """One operation.
+    """One operation of a kernel.
 
     Attributes:
-        c: C of it, with {0} and {1} for its operands; see the functions in `lanes`.
+        c: Its C expression, with {0} and {1} for the operands; `lanes` defines its functions.
         numpy: Function of arrays and, last, of the array that takes the result (or None).
     """
 
@@ -81,7 +81,7 @@ OPERATIONS: Mapping[int, Operation] = {
         }.items()
     },
 }
-"""By CasADi's number. A kernel with another one cannot be evaluated."""
+"""Operations by CasADi's number; a kernel with any other one cannot be evaluated."""
 NAMES: Mapping[int, str] = {
     getattr(ca, n): n.removeprefix("OP_").lower() for n in dir(ca) if n.startswith("OP_")
 }
@@ -89,7 +89,14 @@ NAMES: Mapping[int, str] = {
 
 
 class Instruction(NamedTuple):
-    """One of an SX function: operation, where its result goes, operands; or a constant."""
+    """One instruction of an SX function.
+
+    Attributes:
+        operation: CasADi's number of it.
+        output: Register that takes the result; of OP_OUTPUT: output and nonzero of the function.
+        inputs: Registers of the operands; of OP_INPUT: input and nonzero of the function.
+        constant: Value of OP_CONST, else 0.
+    """
 
     operation: int
     output: list[int]
@@ -100,6 +107,11 @@ class Instruction(NamedTuple):
 def instructions(function: ca.Function) -> tuple[Instruction, ...]:
     """What an SX function computes, step by step."""
     return (_of_small if function.n_instructions() < LARGE else _of_large)(function)
+
+
+def input_sizes(function: ca.Function) -> list[int]:
+    """Sizes of x, row, theta, lam_f and lam_c in a function of a kernel; 0 for missing ones."""
+    return [function.nnz_in(i) if i < function.n_in() else 0 for i in range(5)]
 
 
 LARGE = 20_000

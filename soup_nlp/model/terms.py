@@ -117,8 +117,11 @@ def depth(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
 
 
 def order(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
-    """E_order of a neighbour pair whose second superpixel covers the first: smooth hinge of what
-    its inverse depth lacks on their boundary, relative to the anchors'."""
+    """E_order of a neighbour pair whose second superpixel, b, covers the first, a.
+
+    It is a smooth hinge on the amount by which the inverse depth of b on their boundary is below
+    `1 + step` times that of a, relative to the inverse depth of the anchors.
+    """
     near = _nearness(a.anchor(row["ray_i"]), b.anchor(row["ray_k"]))
     behind, front = 1 / a.point(row["ray"])[2], 1 / b.point(row["ray"])[2]
     lack = ((1 + row["step"]) * behind - front) / near

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
 from soup_nlp.model.kernel import Table
-from soup_nlp.model.operations import OPERATIONS, instructions
+from soup_nlp.model.operations import OPERATIONS, input_sizes, instructions
 
 BLOCK = 2048
 """Elements of a block: more cost fewer calls, fewer fit into the cache."""
@@ -35,7 +35,7 @@ class Vectors:
             place: (E, k) where each entry is added.
         """
         size = max(1, min(BLOCK, len(table)))
-        count = [function.nnz_in(i) if i < function.n_in() else 0 for i in range(5)]
+        count = input_sizes(function)
         self._x, self._data = np.empty((count[0], size)), np.empty((count[1], size))
         self._theta, self._lam_f = np.empty(count[2]), np.empty(1)
         self._lam_c, self._out = np.empty((count[4], size)), np.empty((function.nnz_out(0), size))
@@ -44,13 +44,11 @@ class Vectors:
         # the last block is filled with its last element, whose entries are then left out
         blocks = [np.minimum(np.arange(s, s + size), len(table) - 1) for s in starts]
         self._full = len(table) - size * (len(blocks) - 1) if blocks else 0
-        # without constraints a table has no rows at all
-        rows = table.rows.reshape(len(table), table.rows.shape[1])
         self._blocks = [
             (
                 np.ascontiguousarray(table.index[b].T),
                 np.ascontiguousarray(table.data[b].T),
-                np.ascontiguousarray(rows[b].T),
+                np.ascontiguousarray(table.rows[b].T),
             )
             for b in blocks
         ]

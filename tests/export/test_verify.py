@@ -73,7 +73,11 @@ def test_groups_without_elements_are_passed_over():
     groups = []
     for name, index in (("first", [0]), ("empty", []), ("last", [1])):
         kernel = Kernel(name, x, none, ca.SX.sym("theta", 0), objective=ca.sqrt(x))
-        table = Table(np.array(index, int).reshape(-1, 1), np.zeros((len(index), 0)))
+        table = Table(
+            np.array(index, int).reshape(-1, 1),
+            np.zeros((len(index), 0)),
+            np.zeros((len(index), 0), int),
+        )
         groups.append(Group(kernel, table))
     program = make_program(groups, 2, 0, np.zeros(0))
     assert program.in_objective.tolist() == [True, True]

@@ -161,7 +161,7 @@ def test_every_operation_has_casadis_value(every, block, monkeypatch):
     x, data, width = rng.normal(size=count), rng.normal(size=(count, 1)), every.nnz_out(0)
     # two elements share their places
     place = (np.arange(count)[:, None] // 2) * width + np.arange(width)
-    table = Table(np.arange(count)[:, None], data, np.zeros((0, 0), np.int64))
+    table = Table(np.arange(count)[:, None], data, np.zeros((count, 0), np.int64))
     out = np.ones(4 * width + 1)
     if block:
         monkeypatch.setattr(vectors, "BLOCK", block)

@@ -76,7 +76,7 @@ def rosenbrock(n: int, lbx: float = -np.inf, ubx: float = np.inf) -> NLP:
         "valley", x, row, one, objective=row * (x[0] - x[1] ** 2) ** 2 + (one - x[1]) ** 2
     )
     index = np.stack([np.arange(1, n), np.arange(n - 1)], axis=1)
-    table = Table(index, np.full((n - 1, 1), 100.0))
+    table = Table(index, np.full((n - 1, 1), 100.0), np.zeros((n - 1, 0), int))
     return make_nlp([Group(kernel, table)], [0.8] * n, lbx, ubx, [], [])
 
 
@@ -119,7 +119,12 @@ def test_a_multiplier_of_the_wrong_sign_is_no_optimum():
     x, row, one = symbols(1)
     kernel = Kernel("line", x, row, one, objective=-x)
     nlp = make_nlp(
-        [Group(kernel, Table(np.zeros((1, 1), int), np.zeros((1, 0))))], [0.0], 0, np.inf, [], []
+        [Group(kernel, Table(np.zeros((1, 1), int), np.zeros((1, 0)), np.zeros((1, 0), int)))],
+        [0.0],
+        0,
+        np.inf,
+        [],
+        [],
     )
     residual = optimality(nlp, np.zeros(1), np.array([1.0]), np.zeros(0))
     assert max(residual.values()) >= 1
@@ -292,7 +297,7 @@ def test_control_c_ends_a_solve_at_the_next_iteration(number):
 def test_a_nan_in_the_objective_is_a_result_too():
     x, row, one = symbols(1)
     kernel = Kernel("root", x, row, one, objective=ca.sqrt(x - 2))
-    table = Table(np.zeros((1, 1), int), np.zeros((1, 0)))
+    table = Table(np.zeros((1, 1), int), np.zeros((1, 0)), np.zeros((1, 0), int))
     nlp = make_nlp([Group(kernel, table)], [1.0], -np.inf, np.inf, [], [])
     stage = solve(nlp)
     assert not stage.converged
