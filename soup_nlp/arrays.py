@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
+AnyFloat = NDArray[np.floating]
+"""Of any precision."""
 Int = NDArray[np.int64]
 Labels = NDArray[np.int32]
 """(H, W) superpixel of every pixel."""

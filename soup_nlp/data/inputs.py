@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from soup_nlp.arrays import Float
 from soup_nlp.data.datasets.benchmarks import KittiInput, SintelInput, VkittiInput
 from soup_nlp.data.datasets.folders import FolderInput, MotorcycleInput, TumInput
 from soup_nlp.data.datasets.layout import FramesInput, PairInput, Resolve, make_pair
 from soup_nlp.data.formats.camera_files import read_camera, read_intrinsics
 from soup_nlp.data.formats.map_files import read_depth
-from soup_nlp.data.pair import Float, Pair, Truth
+from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError
 from soup_nlp.geometry.camera import intrinsics

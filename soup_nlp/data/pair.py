@@ -100,9 +100,14 @@ class Flow:
                 hint="mark unknown pixels as invalid in the flow file",
             )
 
+    @property
+    def usable(self) -> float:
+        """Share of the pixels whose flow is used."""
+        return float(np.mean(self.confidence > 0))
+
     def __str__(self) -> str:
         h, w = self.confidence.shape
-        return f"Flow({self.source}, {w}x{h}, {np.mean(self.confidence > 0):.1%} usable)"
+        return f"Flow({self.source}, {w}x{h}, {self.usable:.1%} usable)"
 
     __repr__ = __str__
 

@@ -147,20 +147,16 @@ def in_own_pixels(flow: Flow, near: Pair, pair: Pair, compute: Callable[[Pair], 
         DataWarning: the images match as they are, which the focal lengths contradict.
     """
     found = resized_flow(flow, near, pair)
-    if _usable(found) >= FEW:
+    if found.usable >= FEW:
         return found
     plain = compute(pair)
-    if _usable(plain) < 2 * FEW:
+    if plain.usable < 2 * FEW:
         return found
     warnings.warn(
-        f"the images match as they are ({_usable(plain):.0%} of the pixels), but not at their focal"
-        f" lengths, {pair.K_ref[0, 0]:g} and {pair.K_next[0, 0]:g} px ({_usable(found):.0%}): these"
+        f"the images match as they are ({plain.usable:.0%} of the pixels), but not at their focal"
+        f" lengths, {pair.K_ref[0, 0]:g} and {pair.K_next[0, 0]:g} px ({found.usable:.0%}): these"
         " are probably wrong",
         DataWarning,
         stacklevel=2,
     )
     return plain
-
-
-def _usable(flow: Flow) -> float:
-    return float((flow.confidence > 0).mean())

@@ -10,16 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.arrays import AnyFloat, Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import HINGE, EnergyData
 from soup_nlp.model.energy_options import Weights
 
 BLOCK_BYTES = 1 << 18  # one of the half dozen buffers of a block of edges
-Floats = NDArray[np.floating]
 UNARY_BYTES = 1 << 23  # one of the arrays of a block of superpixels
 
 
@@ -146,7 +144,7 @@ class PairCosts:
 
     def tables(
         self, p: Particles, unit: float = 1.0, dtype: type | np.dtype = np.float64
-    ) -> Floats:
+    ) -> AnyFloat:
         """(E, L, L) weighted sum of all terms but E_proj, by edge and pair of labels.
 
         Args:
@@ -166,7 +164,7 @@ class PairCosts:
                 out[at] += add(state, rows[at], unit, buffers[:, : len(at)])
         return out
 
-    def _arap(self, s: _State, rows: Int, unit: float, buffers: Floats) -> Floats:
+    def _arap(self, s: _State, rows: Int, unit: float, buffers: AnyFloat) -> AnyFloat:
         d, w = self.data, self.weights
         i, k = d.edges[rows].T
         total, near, x, y = buffers
@@ -221,7 +219,7 @@ class PairCosts:
             total += x
         return total
 
-    def _cont(self, s: _State, rows: Int, unit: float, buffers: Floats) -> Floats:
+    def _cont(self, s: _State, rows: Int, unit: float, buffers: AnyFloat) -> AnyFloat:
         d, w = self.data, self.weights
         i, k = d.pairs[rows].T
         total, scale, x, y = buffers
@@ -251,7 +249,7 @@ class PairCosts:
             total += self._order(s, rows, x)
         return total
 
-    def _order(self, s: _State, rows: Int, out: Floats) -> Floats:
+    def _order(self, s: _State, rows: Int, out: AnyFloat) -> AnyFloat:
         d = self.data
         i, k = d.pairs[rows].T
         ray, sign = d.boundary_ray[rows].mean(axis=1), np.sign(d.order_weight[rows])
@@ -266,7 +264,7 @@ class PairCosts:
         return lack
 
 
-def _leaky(y: Floats, sigma: float, leak: float) -> Floats:
+def _leaky(y: AnyFloat, sigma: float, leak: float) -> AnyFloat:
     """`(1 - leak) min(y, sigma) + leak y` in place, as (1 - leak) (min(y, sigma) + c y)."""
     if leak >= 1:
         return y
@@ -299,7 +297,7 @@ class _State:
         self.plane = _first(np.concatenate([p.n, p.D[..., None]], axis=2), np.float64)
         self.R, self.shift = _first(p.R.reshape(n_nodes, labels, 9), np.float64), p.T
 
-    def factor(self, values: Float) -> Floats:
+    def factor(self, values: Float) -> AnyFloat:
         """Values of the edges of a block, (b, 1, 1)."""
         return values.astype(self.dtype)[:, None, None]
 
@@ -308,7 +306,7 @@ class _State:
         (*n, D) = self.plane[:, who]
         return np.asarray(-sum(n[c] * ray[:, c, None] for c in range(3)) / D)
 
-    def boundary(self, who: Int, ray: Float) -> tuple[Floats, Floats]:
+    def boundary(self, who: Int, ray: Float) -> tuple[AnyFloat, AnyFloat]:
         """Distances along boundary rays (b, B, 3), and next-frame points.
 
         Returns:
@@ -328,14 +326,14 @@ class _State:
         return depths.astype(self.dtype), points.astype(self.dtype)
 
 
-def _nearness(s: _State, i: Int, k: Int, out: Floats) -> Floats:
+def _nearness(s: _State, i: Int, k: Int, out: AnyFloat) -> AnyFloat:
     """(b, L, L) power mean, of exponent 4, of the inverse depths of two anchors."""
     np.add(s.quarter[i][:, :, None], s.quarter[k][:, None, :], out=out)
     np.sqrt(out, out=out)
     return np.sqrt(out, out=out)
 
 
-def _first(values: Float, dtype: type | np.dtype) -> Floats:
+def _first(values: Float, dtype: type | np.dtype) -> AnyFloat:
     return np.ascontiguousarray(np.moveaxis(values, -1, 0), dtype)
 
 
@@ -345,7 +343,7 @@ def _rows(key: Int, part: Int) -> Int:
     return out
 
 
-def _distance2(a: Floats, b: Floats, out: Floats, buffer: Floats) -> None:
+def _distance2(a: AnyFloat, b: AnyFloat, out: AnyFloat, buffer: AnyFloat) -> None:
     """out[e, x, y] = sum_c (a[c, e, x] - b[c, e, y])^2."""
     for c in range(len(a)):
         target = buffer if c else out

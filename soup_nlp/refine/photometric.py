@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, Mask
+from soup_nlp.arrays import Float, FloatMap, Mask
 from soup_nlp.data.census import census, census_at
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.camera import rays
@@ -29,8 +29,6 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.refine.costs import Particles, unary_costs
 from soup_nlp.refine.records import RefineOptions
-
-Float32 = NDArray[np.float32]
 
 TAU = 0.35
 """A contradiction counts at most this much."""
@@ -66,10 +64,10 @@ class Photometric:
         contradicted: (N,) superpixels whose flow the images contradict.
     """
 
-    ray: Float32
-    own: Float32
-    there: Float32
-    nearest: Float32
+    ray: FloatMap
+    own: FloatMap
+    there: FloatMap
+    nearest: FloatMap
     distance: Float
     K_next: Float
     weight: float
@@ -110,7 +108,7 @@ class Photometric:
         usable = data.pixel_weight.sum(axis=1) > USABLE
         return np.asarray(usable & ((mean > CONTRADICTION) | (visible <= 0.5)))
 
-    def _differences(self, p: Particles, b: slice, unit: float) -> tuple[Float32, Mask]:
+    def _differences(self, p: Particles, b: slice, unit: float) -> tuple[FloatMap, Mask]:
         """Truncated differences of census, and whether the next frame shows a sample: (n, L, S)."""
         u, v, seen = self._seen(p, b, unit)
         flat = u.shape[0] * u.shape[1], u.shape[2]
@@ -120,7 +118,7 @@ class Photometric:
         np.abs(there, out=there)
         return np.minimum(there.sum(axis=(0, 4)) / 16.0, TAU), seen
 
-    def _seen(self, p: Particles, b: slice, unit: float) -> tuple[Float32, Float32, Mask]:
+    def _seen(self, p: Particles, b: slice, unit: float) -> tuple[FloatMap, FloatMap, Mask]:
         """Pixels (u, v) of the next frame, and whether it shows them: (n, L, S) each."""
         n, labels = p.D[b].shape
         ray = self.ray[b].transpose(0, 2, 1)

@@ -9,9 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Image, Mask
-
-Float = NDArray[np.floating]
+from soup_nlp.arrays import AnyFloat, Image, Mask
 
 ERROR_LIMIT = 0.2
 """Relative depth error at the upper end of the colours."""
@@ -31,7 +29,7 @@ VIVID = (
 _WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 
 
-def depth_range(depth: Float) -> tuple[float, float]:
+def depth_range(depth: AnyFloat) -> tuple[float, float]:
     """(near, far) of the colour scale of a depth map: its 2nd and 98th percentile.
 
     Args:
@@ -50,7 +48,7 @@ def depth_range(depth: Float) -> tuple[float, float]:
     return near, far
 
 
-def colourise_depth(depth: Float, near: float | None = None, far: float | None = None) -> Image:
+def colourise_depth(depth: AnyFloat, near: float | None = None, far: float | None = None) -> Image:
     """Depth in colour by even steps of 1/z: near is red, far is blue.
 
     Args:
@@ -66,7 +64,7 @@ def colourise_depth(depth: Float, near: float | None = None, far: float | None =
     return _paint((1 / safe - 1 / far) / (1 / near - 1 / far), known, "turbo")
 
 
-def colourise_error(relative_error: Float) -> Image:
+def colourise_error(relative_error: AnyFloat) -> Image:
     """Relative depth error in colour, from 0 (dark) to `ERROR_LIMIT` and above (bright).
 
     Args:
@@ -75,7 +73,7 @@ def colourise_error(relative_error: Float) -> Image:
     return _paint_up_to(ERROR_LIMIT, np.abs(relative_error), "inferno")
 
 
-def colourise_sigma(sigma: Float) -> Image:
+def colourise_sigma(sigma: AnyFloat) -> Image:
     """Standard deviation of log depth (H, W) in colour, from 0 (dark) to `SIGMA_LIMIT` (bright)."""
     return _paint_up_to(SIGMA_LIMIT, sigma, "viridis")
 
@@ -99,7 +97,7 @@ def wheel_key(size: int = 64) -> Image:
     return out
 
 
-def _paint_up_to(limit: float, value: Float, name: str) -> Image:
+def _paint_up_to(limit: float, value: AnyFloat, name: str) -> Image:
     """(H, W, 3) colours of values (H, W) from 0 to a limit, grey where not finite."""
     known = np.isfinite(value)
     return _paint(np.clip(np.where(known, value, 0.0) / limit, 0.0, 1.0), known, name)
@@ -122,7 +120,7 @@ def colour_wheel() -> NDArray[np.float64]:
     return np.concatenate(parts)
 
 
-def flow_limit(uv: Float) -> float:
+def flow_limit(uv: AnyFloat) -> float:
     """Length, pixels, of full saturation of a flow (H, W, 2), NaN where unknown.
 
     It is the longest, but at most 1.5 times the 99th percentile.
@@ -134,7 +132,7 @@ def flow_limit(uv: Float) -> float:
     return max(float(min(length.max(), 1.5 * np.percentile(length, 99))), 1e-6)
 
 
-def colourise_flow(uv: Float, limit: float | None = None) -> Image:
+def colourise_flow(uv: AnyFloat, limit: float | None = None) -> Image:
     """Flow in the colours of the Middlebury wheel: hue is direction, white is no motion.
 
     Args:
@@ -158,7 +156,7 @@ def colourise_flow(uv: Float, limit: float | None = None) -> Image:
     return np.asarray(out)
 
 
-def colourise_normals(n_map: Float) -> Image:
+def colourise_normals(n_map: AnyFloat) -> Image:
     """Normals in colour: (x, -y, -z) from [-1, 1] to RGB; towards the camera is blue.
 
     Args:

@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 from PIL import Image as Pil
 from PIL import ImageDraw, ImageFont
 
-from soup_nlp.arrays import Image
+from soup_nlp.arrays import AnyFloat, Image
 from soup_nlp.errors import DataError
 from soup_nlp.report.pictures import Bar, Legend, Picture, Swatches, Wheel
 from soup_nlp.storage.atomic import PathLike, write_bytes
-
-Float = NDArray[np.floating]
 
 _DPI = 100
 _HEAD, _CAPTION, _GAP = 42, 28, 8
@@ -165,14 +163,14 @@ def write_png(path: PathLike, rgb: Image) -> None:
     _encode(path, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 
 
-def depth_png_scale(depth: Float) -> float:
+def depth_png_scale(depth: AnyFloat) -> float:
     """Largest power of two at which the 99.9th percentile of the known depths fits 16 bits."""
     known = np.isfinite(depth) & (depth > 0)
     far = float(np.percentile(depth[known], 99.9)) if known.any() else 1.0
     return float(2.0 ** np.floor(np.log2(65535.0) - np.log2(far)))
 
 
-def write_clipped_depth_png16(path: PathLike, depth: Float, scale: float | None = None) -> float:
+def write_clipped_depth_png16(path: PathLike, depth: AnyFloat, scale: float | None = None) -> float:
     """Write a depth map as 16-bit PNG: value = round(depth * scale), 0 where unknown.
 
     Values of known depths are clipped to 1 .. 65535.

@@ -6,10 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from soup_nlp.arrays import Mask
+from soup_nlp.arrays import AnyFloat, Mask
 from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.report.colour import (
     ERROR_LIMIT,
@@ -28,13 +27,8 @@ from soup_nlp.report.colour import (
 )
 from soup_nlp.report.result import Result
 
-Float = NDArray[np.floating]
-
 DENSE = 0.5
 """If a smaller share of the pixels is known, as with laser points, each is drawn larger."""
-
-
-EMPTY = "; grey = nothing lands there"
 ERROR_TICKS = (0.0, 0.05, 0.1, 0.15, ERROR_LIMIT)
 SIGMA_TICKS = (0.0, 0.1, 0.2, SIGMA_LIMIT)
 """Values below the legends of error and sigma."""
@@ -206,7 +200,7 @@ def _depths(result: Result) -> list[Picture]:
     return out
 
 
-def _enlarged(values: Float) -> Float:
+def _enlarged(values: AnyFloat) -> AnyFloat:
     """Numbers (H, W), NaN where unknown; sparse pixels are enlarged to a width of three."""
     known = np.isfinite(values)
     if known.mean() > DENSE or not known.any():
@@ -215,7 +209,7 @@ def _enlarged(values: Float) -> Float:
     return np.where(distance < 1.5, values[tuple(nearest)], np.nan)
 
 
-def relative_error(result: Result) -> Float | None:
+def relative_error(result: Result) -> AnyFloat | None:
     """(H, W) |z_gt - s z| / z_gt of the reference frame, NaN where unknown; None without truth."""
     truth, z = result.array("truth/depth_ref"), result.array("depth/ref")
     if truth is None or z is None or "solution" not in result.summary["metrics"]:
@@ -229,8 +223,8 @@ def relative_error(result: Result) -> Float | None:
 def _shares(
     name: str,
     title: str,
-    values: Float,
-    colourise: Callable[[Float], Image],
+    values: AnyFloat,
+    colourise: Callable[[AnyFloat], Image],
     ticks: Sequence[float],
 ) -> Picture:
     """Picture of shares (H, W) with a legend from 0 to the last tick and above."""

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from soup_nlp.arrays import Mask
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.datasets.layout import (
     PairInput,
     Resolve,
@@ -33,7 +33,7 @@ from soup_nlp.data.formats.map_files import (
     read_vkitti_depth,
     read_vkitti_flow,
 )
-from soup_nlp.data.pair import Float, Pair, Truth, check_size
+from soup_nlp.data.pair import Pair, Truth, check_size
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics, pixel_grid, rays
 from soup_nlp.schema.section import Index, Whole
@@ -88,16 +88,13 @@ VKITTI1_CAMERA = (725.0, 725.0, 620.5, 187.0)
 """fx, fy, cx, cy of every Virtual KITTI 1 image, pixels."""
 VKITTI1_TEXT = "fx,fy,cx,cy 725,725,620.5,187, of its images of 1242 x 375"
 
-
 SINTEL_LAYOUT = (
     "training/{clean,final,albedo}/SCENE/frame_NNNN.png; optional "
     "camdata_left/SCENE/frame_NNNN.cam, depth/SCENE/frame_NNNN.dpt, "
     "flow/SCENE/frame_NNNN.flo, occlusions/SCENE/frame_NNNN.png, invalid/SCENE/frame_NNNN.png"
 )
-
 DEFAULT_CAMERA = (688.00006, 688.00006, 511.5, 217.5)
 """fx, fy, cx, cy of `DEFAULT_SCENE`, pixels; other scenes differ (some have 1120)."""
-
 DEFAULT_SCENE = "alley_1"
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import label
 
+from soup_nlp.arrays import Float
 from soup_nlp.data.datasets.layout import (
     FramesInput,
     PairInput,
@@ -27,7 +28,7 @@ from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_intrinsics
 from soup_nlp.data.formats.images import assumed, read_mask
 from soup_nlp.data.formats.map_files import MILLIMETRES, read_depth, read_flow, read_npz
-from soup_nlp.data.pair import Float, Pair, Truth
+from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Index, Positive, Whole

@@ -13,13 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
+from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.census import census, census_at
-from soup_nlp.data.flow.consistency import FloatMap
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.camera import rays
-
-Image = NDArray[np.uint8]
-Float = NDArray[np.float64]
 
 LEVELS = 64
 """Number of depths that are tried for each kind of plane."""

@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import Float, FloatMap
 
-Float32 = NDArray[np.float32]
 Colour = tuple[float, float, float]
 
 PERIOD = 32
@@ -31,7 +29,7 @@ GOLDEN = 0.6180339887498949
 
 
 @lru_cache(maxsize=64)
-def _lattice(seed: int) -> Float32:
+def _lattice(seed: int) -> FloatMap:
     """Random values in [-1, 1] on a periodic lattice, flat (PERIOD**3,)."""
     rng = np.random.default_rng([seed, 0x50])
     return rng.uniform(-1, 1, PERIOD**3).astype(np.float32)
@@ -45,7 +43,7 @@ def _turn(seed: int) -> Float:
     return Q * np.sign(np.diag(R))
 
 
-def value_noise(points: Float, seed: int) -> Float32:
+def value_noise(points: Float, seed: int) -> FloatMap:
     """Smooth solid noise: quintic interpolation of random values on the integer lattice.
 
     Args:
@@ -70,7 +68,7 @@ def value_noise(points: Float, seed: int) -> Float32:
             left, right = table[base + low[:, 0]], table[base + high[:, 0]]
             rows.append(left + fx * (right - left))
         planes.append(rows[0] + fy * (rows[1] - rows[0]))
-    out: Float32 = planes[0] + fz * (planes[1] - planes[0])
+    out: FloatMap = planes[0] + fz * (planes[1] - planes[0])
     return out
 
 
@@ -82,7 +80,7 @@ def fractal_noise(
     seed: int,
     persistence: float = 0.8,
     octaves: int = 12,
-) -> Float32:
+) -> FloatMap:
     """Sum of octaves of `value_noise`, each octave only where pixels can resolve it.
 
     Args:
@@ -146,7 +144,7 @@ class Panels:
     offset: tuple[float, float] = (0.0, 0.0)
     variation: float = 0.0
 
-    def blend(self, colour: Float32, chart: Float, footprint: Float, seed: int) -> Float32:
+    def blend(self, colour: FloatMap, chart: Float, footprint: Float, seed: int) -> FloatMap:
         """Paint the panels over `colour` (N, 3) at chart positions (N, 2), anti-aliased."""
         grid = (chart - np.asarray(self.offset)) / np.asarray(self.period)
         width = footprint[:, None] / np.asarray(self.period)
@@ -177,7 +175,7 @@ class Texture:
     seed: int = 0
     panels: Panels | None = None
 
-    def colour(self, points: Float, chart: Float, footprint: Float) -> Float32:
+    def colour(self, points: Float, chart: Float, footprint: Float) -> FloatMap:
         """RGB of surface points.
 
         Args:
