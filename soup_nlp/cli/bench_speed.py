@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import pandas as pd
 import typer
@@ -13,7 +14,7 @@ from soup_nlp.bench import speed as timing
 from soup_nlp.bench.accuracy import measure_pair
 from soup_nlp.bench.chain import chain_page, measure_chain, sequences
 from soup_nlp.bench.cost import cost_cells, cost_page
-from soup_nlp.bench.study import Cell, measure_cells, show
+from soup_nlp.bench.study import Cell, Measure, measure_cells, show
 from soup_nlp.bench.suites import Options, list_suite
 from soup_nlp.cli.bench_accuracy import Only, Width
 from soup_nlp.cli.options import Data, Out, Overwrite, Quiet, RowProgress, Set, numbers, words
@@ -90,11 +91,22 @@ def cost(
     """Time and memory of whole solves over N and image size, each in a process of its own."""
     claim(out, ("cost.md",), overwrite)
     say = RowProgress(quiet, lambda row: f"{show(row['seconds'], '.0f')} s")
+    _measure(cost_cells(), measure_pair, say, out / "cost.md", cost_page)
+
+
+def _measure(
+    cells: list[Cell],
+    measure: Measure,
+    say: RowProgress,
+    path: Path,
+    page: Callable[[pd.DataFrame], str],
+) -> NoReturn:
+    """Measure cells in processes of their own, write and print their page, and exit."""
     run = partial(measure_all, say=say)
-    frame = measure_cells(cost_cells(), measure_pair, out / "cost.jsonl", run, own_process=True)
-    with staged(out) as new:
-        write_text(new / "cost.md", cost_page(frame))
-    print((out / "cost.md").read_text(encoding="utf-8"))
+    frame = measure_cells(cells, measure, path.with_suffix(".jsonl"), run, own_process=True)
+    with staged(path.parent) as new:
+        write_text(new / path.name, page(frame))
+    print(path.read_text(encoding="utf-8"))
     raise typer.Exit(1 if _failed(frame) else 0)
 
 
@@ -116,9 +128,4 @@ def chain(
     claim(out, ("chain.md",), overwrite)
     cells = [Cell(item, tuple(overrides or ()), f"{frames} frames") for item in chosen]
     say = RowProgress(quiet, lambda row: f"cost of one scale {show(row['cost'], '+.2%')}")
-    measure, run = partial(measure_chain, frames=frames), partial(measure_all, say=say)
-    frame = measure_cells(cells, measure, out / "chain.jsonl", run, own_process=True)
-    with staged(out) as new:
-        write_text(new / "chain.md", chain_page(frame))
-    print((out / "chain.md").read_text(encoding="utf-8"))
-    raise typer.Exit(1 if _failed(frame) else 0)
+    _measure(cells, partial(measure_chain, frames=frames), say, out / "chain.md", chain_page)

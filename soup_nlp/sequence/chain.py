@@ -119,9 +119,7 @@ def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> 
         DataError: the pairs are not consecutive, or share no pixel.
     """
     for several in (pairs, over):
-        expect(
-            several, (list, tuple), "pairs of a chain", "soup_nlp.sequence.pairs.solve_pairs(...)"
-        )
+        expect(several, (list, tuple), "pairs of a chain", MADE_BY)
     for pair in (*pairs, *over):
         expect(pair, SolvedPair, "pair of a chain", MADE_BY)
     if not pairs or [(p.first, p.second) for p in pairs] != [(k, k + 1) for k in range(len(pairs))]:
