@@ -164,7 +164,7 @@ def room(module: str) -> str:
 def test_the_parser_sees_the_imports():
     # or everything below would pass on nothing
     assert {"geometry.soup", "model.oracle", "model.nlp"} <= INSIDE["solve.stages"]
-    assert "model.energy_data" in INSIDE["start.propose"]
+    assert "model.energy_data" in INSIDE["start.views"]
     assert "casadi" in OUTSIDE["model.kernel"]
     tree = ast.parse("def f():\n    from ..model import nlp\n    from . import costs")
     found = set(imports(tree, "refine.mppbp", False))

@@ -1,4 +1,4 @@
-"""How sure depth is: marginal variances of the whole assembly, calibrated against true depth.
+"""Uncertainty of depth: marginal variances of the whole assembly, calibrated against true depth.
 
 See docs/confidence.md.
 """
@@ -27,26 +27,29 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.start.choice import LEAST_NOISE
-from soup_nlp.start.components import FIXED, TIES, displacement
+from soup_nlp.start.components import FIXED, TIES, displacement, log_pace
 from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
 
 log = logging.getLogger(__name__)
 
 SIGMA_PRIOR = 1.0
-"""Standard deviation of log depth where the pair says nothing: 0.3 in rooms, up to 1.2 outdoors."""
+"""Standard deviation of log depth without any evidence; true scenes have 0.3 (rooms) to 1.2
+(outdoors)."""
 PRIOR_SHARE = 0.001
-"""Factor of E_prior in the information: it holds depth where nothing else does, knowing little."""
+"""Factor of E_prior in the information: it is no evidence, but keeps variances finite where there
+is none."""
 FLOW_SHARE = 0.01
-"""Factor of E_proj in the information without the flow; without any, motions would be free."""
+"""Factor of E_proj in the information without the flow; with 0 motions would be free."""
 CONTACT = 0.2
 """Standard deviation of the log scale of a component by what it stands on or touches, beside that
 of the marginals: what moves need not touch what is below it in the image."""
 COVERING = 0.5
-"""Of the log scale of a component that is placed before what it covers (`start.occlusion`)."""
+"""Standard deviation of the log scale of a component that occlusion places in front of what it
+covers (`start.occlusion`)."""
 USUAL = 0.5
-"""Log ratio of displacements relative to the camera up to which what moves is as fast as usual: see
-docs/confidence.md."""
+"""Log ratio of the displacement of a component to that of the largest one, relative to the camera,
+up to which its scale by contact is credible: see docs/confidence.md."""
 FACTOR, POWER = 7.0, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
 BENDING_FACTOR = 0.5
@@ -57,8 +60,8 @@ from the surface's own stretching and not from parallax."""
 LEAST_SPREAD = 0.1
 """Added in squares to spreads where surfaces bend: errors hardly follow smaller ones."""
 MOST_MISFIT, BENDING_MISFIT = 5.0, 100.0
-"""Pixels beyond which a flow that the answer contradicts is as wrong as any; the latter where
-surfaces bend: what an answer with a motion for every superpixel cannot follow is far off."""
+"""Largest misfit of a pixel, pixels: beyond it the size says nothing. The second where surfaces
+bend: each superpixel has a motion of its own there, and a flow that it cannot follow is far off."""
 OUTLINE, OUTLINE_REACH = 0.5, 0.005
 """Share of a step of log depth that is the standard deviation beside it, and the distance from the
 step up to which it counts, relative to the longer side of the image."""
@@ -68,7 +71,7 @@ MARGIN, LEAST_SEEN = 0.01, 0.3
 """Distance from the border of the next image, relative to its width, below which a pixel leaves it,
 and the least share of a superpixel's pixels that stay."""
 LARGEST = 1e6
-"""Of what is calibrated: anything above is as little."""
+"""Largest standard deviation before the prior is added; beyond it nothing is known in any case."""
 NO_CONFIDENCE = 0.5
 """Sigma from which the confidence, 1 - sigma / `NO_CONFIDENCE`, is 0."""
 MIN_CONFIDENCE = 0.5
@@ -79,19 +82,19 @@ MOST_SIGMA = (1 - MIN_CONFIDENCE) * NO_CONFIDENCE
 
 @dataclass(frozen=True, eq=False)
 class Confidence:
-    """How sure the depth of an answer is.
+    """Uncertainty of the depth of an answer.
 
     Attributes:
         sigma: (H, W) calibrated standard deviation of log depth, the global scale left out.
-        spread: (H, W) standard deviation of log depth by what the flow adds to the terms on shape.
-        marginals: Of the planes and of the components' scales.
-        noise: Of the flow, pixels.
+        spread: (H, W) standard deviation of log depth by what the flow adds to the terms on shape,
+            not calibrated.
+        marginals: Marginal variances of the planes and of the components' scales.
+        noise: Noise of the flow, pixels.
         component_sigma: (C,) standard deviation of the components' log scale.
         misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
         evidence: What the flow says of the depth of every component.
-        added: (H, W) standard deviation of log depth that does not follow the flow's random noise:
-            of scales by contact, of motions left open, of depth without evidence, of mixed
-            superpixels, beside outlines.
+        scale: (N,) standard deviation of log depth by the scales of components, see
+            `scale_by_contact`.
     """
 
     sigma: Float
@@ -101,7 +104,7 @@ class Confidence:
     component_sigma: Float
     misfit: Float
     evidence: Evidence
-    added: Float
+    scale: Float
 
     @property
     def guessed(self) -> float:
@@ -124,7 +127,7 @@ def flow_misfit(rec: Reconstruction, flow: Flow, most: Float | float = MOST_MISF
 
 
 def at_outlines(depth: Float) -> Float:
-    """(H, W) standard deviation of log depth by outlines of surfaces that may be misplaced.
+    """(H, W) standard deviation of log depth because outlines of surfaces may be misplaced.
 
     A pixel beside a step may belong to the surface on its other side. With range(r) the range of
     log depth within r pixels, the step is `2 range(r) - range(2 r)`, 0 on a constant slope.
@@ -174,17 +177,17 @@ def calibrated(
     bends: Mask | bool = False,
     added: Float | float = 0.0,
 ) -> Float:
-    """Standard deviation of log depth that errors keep to.
+    """Calibrated standard deviation of log depth.
 
-    Where surfaces bend every superpixel has a motion of its own, which fits nearly any flow: the
-    spread says little there, and a misfit much.
+    Where surfaces bend every superpixel has a motion of its own, which fits nearly any flow. There
+    the spread says little about errors, and the misfit says much.
 
     Args:
-        spread: What the marginals say.
-        noise: Of the flow, pixels.
+        spread: Standard deviation of log depth by the marginals.
+        noise: Noise of the flow, pixels.
         misfit: Of the same superpixel, pixels; where it is larger than the noise, their geometric
             mean is the noise.
-        prior: Standard deviation before looking; its information is added.
+        prior: Standard deviation without the flow; its information is added.
         bends: Where regions bend; of the same shape, or one for all.
         added: Standard deviation of log depth that does not depend on the flow's random noise:
             of scales by contact, and of what motions leave open; added in squares.
@@ -198,7 +201,7 @@ def calibrated(
 
 
 def with_prior(sigma: Float, prior: Float | float = SIGMA_PRIOR) -> Float:
-    """Standard deviation where the information of the prior is added."""
+    """Standard deviation s with a prior's information added: `1 / s^2 + 1 / prior^2`."""
     sigma = np.minimum(sigma, LARGEST)
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
@@ -208,13 +211,13 @@ def scale_by_contact(
 ) -> Float:
     """(N,) standard deviation of log depth by the scales of components.
 
-    That of a component which has its scale from contact is the marginal and `CONTACT`, in squares;
-    one that has it from a depth prior has the prior's.
-    It also moves the mean of the image, to which all depths refer, by the component's area.
-    Where contact makes a component move `log_pace` times as far as the scene does, more than is
-    `USUAL`, it may lie anywhere from there to where it moves as far: that ratio is added. A
-    component that occlusion has placed is a guess, has at least `COVERING`, and does not count for
-    the mean.
+    A scale from contact has the marginal variance plus `CONTACT` squared; a scale from a depth
+    prior has the prior's standard deviation. An error of a scale also shifts the mean log depth of
+    the image, to which all depths refer, in proportion to the component's area. Where contact makes
+    a component move farther than the largest one does, by a log ratio (`log_pace`) above `USUAL`,
+    the component may be anywhere between there and where both move equally far, and that log ratio
+    is added in squares. A component that occlusion has placed has at least `COVERING`, and does not
+    count for the mean.
 
     Args:
         own: Marginal variances of the components' scales.
@@ -234,13 +237,6 @@ def scale_by_contact(
     free = (contact | placed) & (pace > USUAL) & (start.tie != TIES.index("given depth"))
     own_place = np.maximum(np.where(free, pace, 0.0), np.where(placed, COVERING, 0.0))
     return np.hypot(np.hypot(scale, mean), own_place)
-
-
-def log_pace(far: Float, component: Int) -> Float:
-    """(C,) log ratio of the displacement (N,) of every component to that of the largest one."""
-    median = np.array([np.median(far[component == c]) for c in range(int(component.max()) + 1)])
-    scene = int(np.argmax(np.bincount(component)))
-    return np.log(np.maximum(median, 1e-12)) - np.log(np.maximum(median[scene], 1e-12))
 
 
 def _spread(
@@ -266,7 +262,7 @@ def confidence(
     form: FormulationOptions,
     given: Given | None = None,
 ) -> Confidence:
-    """How sure the depth of an answer is.
+    """The uncertainty of the depth of an answer.
 
     Args:
         rec: The answer.
@@ -312,4 +308,4 @@ def confidence(
     in_image = np.hypot(added[rec.labels], at_outlines(rec.depth_ref))
     sigma = calibrated(spread, noise, misfit[rec.labels], before[rec.labels], bends, in_image)
     component_sigma = with_prior(np.sqrt(own.component))
-    return Confidence(sigma, spread, own, noise, component_sigma, misfit, found, in_image)
+    return Confidence(sigma, spread, own, noise, component_sigma, misfit, found, scale)

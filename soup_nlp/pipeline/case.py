@@ -45,6 +45,7 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 from soup_nlp.pipeline.still_layer import see_through
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
+from soup_nlp.start.bending import FlowFit
 from soup_nlp.start.components import TIES
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import in_order
@@ -152,11 +153,13 @@ def prepare(
     seg = build_segmentation(labels, pair.image_ref, s.neighbours, boundary_samples=samples)
     done("segmentation", seg)
     options = SeededStart(**dict(problem.start), seed=problem.seed)
-    start, given = propose(seg, flow, pair.K_ref, pair.K_next, options), None
+    fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
+    start, given = propose(seg, flow, pair.K_ref, pair.K_next, options, fitted), None
     if problem.energy.weights.order > 0:
-        start = in_order(start, seg, pair, options)
+        start = in_order(start, seg, pair, fitted, options)
     if pair.depth_prior is not None and problem.energy.weights.depth > 0:
-        start, given = by_prior(start, seg, pair, problem.depth_prior.kind, options)
+        kind = problem.depth_prior.kind
+        start, given = by_prior(start, seg, pair, fitted, kind, problem.seed)
         if log:
             log(str(given))
     done("start", start)

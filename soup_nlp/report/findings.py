@@ -10,6 +10,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.result import Result
+from soup_nlp.start.components import largest
 
 SHARES = {
     "flow": "by flow and parallax",
@@ -123,8 +124,9 @@ def _shift(run: Run, shift: Float) -> str:
 
 def flow_words(run: Run) -> list[str]:
     """Usable flow, and how well simpler explanations than depth fit it."""
-    sure, main = run.confidence.evidence, int(np.argmax(np.bincount(run.start.component)))
-    lines = [f"usable at {_usable(run):.0%} of the pixels, noise {sure.noise:.2f} px"]
+    sure, main = run.confidence.evidence, largest(run.start.component)
+    assert run.pair.flow is not None
+    lines = [f"usable at {run.pair.flow.usable:.0%} of the pixels, noise {sure.noise:.2f} px"]
     if np.isfinite(sure.turn[main]):
         lines.append(
             f"error of the largest component: {sure.turn[main]:.2f} px by a turn alone,"
@@ -133,17 +135,11 @@ def flow_words(run: Run) -> list[str]:
     return lines
 
 
-def _usable(run: Run) -> float:
-    """Share of the pixels with usable flow."""
-    assert run.pair.flow is not None
-    return float((run.pair.flow.confidence > 0).mean())
-
-
 def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
     """What would give a better depth; `shares` are those of `certainty`."""
     flow, out = run.pair.flow, []
     assert flow is not None
-    if _usable(run) < USABLE:
+    if flow.usable < USABLE:
         length = np.linalg.norm(flow.uv, axis=-1)[flow.confidence > 0]
         fast = len(length) and np.median(length) > FAST * run.pair.size[1]
         out.append("frames closer in time" if fast else "a better flow (--flow)")
@@ -159,7 +155,7 @@ def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
 def limits(result: Result) -> list[str]:
     """Sentences on the limits of a result and on what to try; at least one."""
     s, shares, parts = result.summary, result.summary.get("certainty", {}), result.components
-    usable = float((np.asarray(result.array("input/confidence")) > 0).mean())
+    usable = float(np.mean(result.flow_confidence > 0))
     pixels = np.asarray(result.tree["segmentation"]["sizes"], float)
     bends = float(pixels[result.bends].sum() / pixels.sum())
     has_parallax = not result.at_rest and not result.bending

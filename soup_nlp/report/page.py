@@ -175,7 +175,7 @@ def _summary(result: Result) -> str:
     words.append(f"{s['sizes']['superpixels']} superpixels")
     if m and m["mre"] is not None:
         words.append(f"MRE {m['mre']:.4f} after one {m['scale_rule']} scale")
-    usable = float((np.asarray(result.array("input/confidence")) > 0).mean())
+    usable = float(np.mean(result.flow_confidence > 0))
     words.append(f"{usable:.0%} of the flow usable")
     whole = sum(v for k, v in s["seconds"].items() if not k.startswith("nlp_"))
     if whole:

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from soup_nlp.arrays import Mask
-from soup_nlp.evaluate.confidence import MOST_SIGMA, scale_by_contact
+from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.evaluate.metrics import component_overlaps, skill
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.pipeline.record import Run
 from soup_nlp.solve.kkt import constraint_residuals
-from soup_nlp.start.components import FIXED, TIES, displacement
+from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.storage.versions import versions
 
 _ROUND = (
@@ -118,8 +118,8 @@ def certainty(run: Run) -> dict[str, float]:
         only turns), "fixed" (stands still in the image though the camera moves, such as the bonnet
         of its car), "unseen" (no usable flow, or hidden in the next frame), "flat" (of a
         component without evidence of depth, see `Evidence.guess`), "scale" (of a component whose
-        scale alone is that uncertain) and "weak". "median_sigma": median over the determined
-        pixels.
+        scale alone is as uncertain as that) and "weak" (anything else). "median_sigma": median of
+        the determined pixels.
     """
     sigma = run.confidence.sigma
     labels, start = run.segmentation.labels, run.start
@@ -129,10 +129,7 @@ def certainty(run: Run) -> dict[str, float]:
     unseen = (run.pair.flow.confidence <= 0) | hidden(run.reconstruction)
     rest, fixed = np.full(labels.shape, start.at_rest), tie == FIXED
     flat = run.confidence.evidence.guess[start.component][labels]
-    sizes = run.segmentation.sizes
-    far = displacement(run.soup, run.data.anchor_ray, start.component)
-    scale = scale_by_contact(run.confidence.marginals, start, sizes, far, run.given)
-    loose = scale[labels] > MOST_SIGMA
+    loose = run.confidence.scale[labels] > MOST_SIGMA
     guess, left = {}, ~sure
     reasons = {"rest": rest, "fixed": fixed, "unseen": unseen, "flat": flat, "scale": loose}
     for name, mask in reasons.items():
@@ -142,7 +139,7 @@ def certainty(run: Run) -> dict[str, float]:
     def share(mask: Mask) -> float:
         return float(mask.mean())
 
-    given = np.zeros(len(sizes), bool) if run.given is None else run.given.held
+    given = np.zeros(len(start.soup), bool) if run.given is None else run.given.held
     by_flow = sure & ~given[labels]
     return {
         "determined": share(sure),

@@ -12,20 +12,23 @@ components.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.choice import Choice, dominant
-from soup_nlp.start.components import connected_labels
+from soup_nlp.start.components import connected_labels, largest
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.merge import candidates
 from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import Views
+from soup_nlp.start.views import Views, look
 
 SYSTEMATIC, LEAST_PX, MOST_PX = 4.0, 0.01, 0.07
 """Systematic error of a dense flow, in units of its noise, and its limits in pixels."""
@@ -63,7 +66,7 @@ def turn_alone(
     Returns:
         The (3, 3) rotation, or None where the camera's translation is seen.
     """
-    at = np.flatnonzero(usable & (component == np.argmax(np.bincount(component))))
+    at = np.flatnonzero(usable & (component == largest(component)))
     if not len(at):
         return None
     turn, error = fit_turn(views.some(at))
@@ -105,6 +108,55 @@ def fit_turn(views: Views, count: int = 3000) -> tuple[Float, Float]:
     return rotation.exp(x[:3]), views.distance(turned(x, views.ray))
 
 
+class FlowFit(NamedTuple):
+    """The flow of every superpixel at sampled pixels, and an affine map fitted to it.
+
+    Attributes:
+        views: Rays, targets and confidence of every superpixel.
+        poor: (N,) True where these are a neighbour's, because too few pixels have a usable flow.
+        fit: (N, 3, 2) affine flow, see `affine_flow`.
+        residual: (N,) its mean error, pixels.
+        jump: (P,) jump of the flow on the boundary of every neighbour pair, see `flow_jump`.
+    """
+
+    views: Views
+    poor: Mask
+    fit: Float
+    residual: Float
+    jump: Float
+
+    @classmethod
+    def of(
+        cls, seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: SeededStart
+    ) -> FlowFit:
+        """Fit a flow; arguments and errors are those of `views.look`."""
+        views, poor = look(seg, flow, K_ref, K_next, o)
+        fit, residual = affine_flow(views)
+        jump = flow_jump(fit, views, seg.pairs, rays(K_ref, seg.boundary))
+        return cls(views, poor, fit, residual, jump)
+
+    @property
+    def centre(self) -> Float:
+        """(N, 3) rays of the next frame to which the anchors move."""
+        moved = self.fit[:, 0] / self.views.focal
+        return np.concatenate([moved, np.ones((len(moved), 1))], axis=1)
+
+
+def followed(fit: Float, views: Views, which: Int, ray: Float) -> Float:
+    """(M, ..., 2) where affine flows bring rays, pixels from the next frame's principal point.
+
+    Args:
+        fit: (N, 3, 2) affine flow of every superpixel, see `affine_flow`.
+        views: Anchors and radii of every superpixel.
+        which: (M,) superpixel whose flow is followed.
+        ray: (M, ..., 3) rays of the reference frame.
+    """
+    wide = (slice(None), *(None,) * (ray.ndim - 2))
+    off = (ray - views.anchor[which][wide])[..., :2] / views.radius[which][(*wide, None)]
+    moved = fit[which, 0][wide] + np.einsum("m...c,mcd->m...d", off, fit[which, 1:])
+    return np.asarray(moved)
+
+
 def flow_jump(fit: Float, views: Views, pairs: Int, boundary_ray: Float) -> Float:
     """(P,) mean difference of the affine flows of two neighbours on their boundary, pixels.
 
@@ -114,13 +166,8 @@ def flow_jump(fit: Float, views: Views, pairs: Int, boundary_ray: Float) -> Floa
         pairs: (P, 2) neighbours.
         boundary_ray: (P, B, 3) rays of the shared boundaries, reference frame.
     """
-
-    def target(j: Int) -> Float:
-        off = (boundary_ray - views.anchor[j][:, None])[..., :2] / views.radius[j][:, None, None]
-        return fit[j][:, None, 0] + off @ fit[j][:, 1:]
-
-    i, k = pairs.T
-    return np.linalg.norm(target(i) - target(k), axis=-1).mean(axis=1)
+    ends = [followed(fit, views, which, boundary_ray) for which in pairs.T]
+    return np.linalg.norm(ends[0] - ends[1], axis=-1).mean(axis=1)
 
 
 def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Float, Float]:

@@ -24,6 +24,11 @@ def connected_labels(hold: Mask, seg: Segmentation) -> Int:
     return connected(seg.pairs[hold], len(seg))
 
 
+def largest(label: Int) -> int:
+    """The most frequent of indices (N,): of components the largest one, the background."""
+    return int(np.argmax(np.bincount(label)))
+
+
 def rigid_components(label: Int, seg: Segmentation) -> Int:
     """Groups that share one scale: all of one dominant motion, or a connected piece without one.
 
@@ -78,6 +83,8 @@ UNKNOWN = np.log(100.0)
 FAST, NEARER = 1.5, 1 / 3
 """Log ratio of displacements from which contact makes a component too fast to be trusted, and the
 share of it by which the component comes nearer."""
+LEAST_DISPLACEMENT = 1e-12
+"""Displacements count as at least this, so that their ratio is finite."""
 TIES = (
     "reference",
     "contact below",
@@ -177,9 +184,9 @@ def contact_scales(
     """
     count = int(label.max()) + 1
     log_scale = np.zeros(count)
-    largest = int(np.argmax(np.bincount(label, minlength=count)))
+    scene = largest(label)
     tie = np.full(count, TIES.index("nothing"))
-    tie[largest] = TIES.index("reference")
+    tie[scene] = TIES.index("reference")
     if count == 1 or not len(seg.pairs):
         return np.ones(len(soup)), tie[label]
     zi, zk = depth_from_inside(soup, label, seg, K_ref)
@@ -195,7 +202,7 @@ def contact_scales(
     ratio, below = ratio[keep], around.below[keep] & upright
     support = np.bincount(a[below], weight[below], minlength=count)
     placed = np.zeros(count, bool)
-    placed[largest] = True
+    placed[scene] = True
     while not placed.all():
         touch = ~placed[a] & placed[b]
         if not touch.any():
@@ -258,7 +265,7 @@ def nearer_where_cut_off(
         usable: (N,) True where the flow is known.
     """
     count = len(log_scale)
-    scene = int(np.argmax(np.bincount(label, minlength=count)))
+    scene = largest(label)
     ends = label[seg.pairs]
     group_of = connected(ends[((ends != scene) & ~fixed[ends]).all(axis=1)], count)
     group, groups = group_of[label], int(group_of.max()) + 1
@@ -292,14 +299,20 @@ def nearer_where_fast(far: Float, label: Int) -> Float:
         far: (N,) displacement relative to the camera (`displacement`).
         label: (N,) index of the component.
     """
-    scene = int(np.argmax(np.bincount(label)))
-    pace = float(np.median(far[label == scene]))
-    nearer = np.zeros(int(label.max()) + 1)
-    for c in range(len(nearer)):
-        own = float(np.median(far[label == c]))
-        if pace > 0 and pace * np.exp(FAST) < own < pace * np.exp(UNKNOWN):
-            nearer[c] = NEARER * np.log(own / pace)
-    return nearer
+    pace = log_pace(far, label)
+    return np.where((pace > FAST) & (pace < UNKNOWN), NEARER * pace, 0.0)
+
+
+def log_pace(far: Float, label: Int) -> Float:
+    """(C,) log ratio of the median displacement of every component to that of the largest one.
+
+    Args:
+        far: (N,) displacement relative to the camera (`displacement`).
+        label: (N,) index of the component.
+    """
+    median = np.array([np.median(far[label == c]) for c in range(int(label.max()) + 1)])
+    median = np.maximum(median, LEAST_DISPLACEMENT)
+    return np.asarray(np.log(median / median[largest(label)]))
 
 
 def displacement(soup: Soup, ray: Float, label: Int) -> Float:
@@ -311,7 +324,7 @@ def displacement(soup: Soup, ray: Float, label: Int) -> Float:
         label: (N,) index of the component.
     """
     point = soup.points(ray)
-    first = int(np.argmax(label == np.argmax(np.bincount(label))))
+    first = int(np.argmax(label == largest(label)))
     moved = np.einsum("nij,nj->ni", soup.R, point) + soup.translation - point @ soup.R[first].T
     return np.linalg.norm(moved, axis=1)
 

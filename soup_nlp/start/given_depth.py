@@ -15,24 +15,23 @@ from scipy import ndimage, stats
 from scipy.spatial import cKDTree
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bending import affine_flow, fit_robustly
+from soup_nlp.start.bending import FlowFit, fit_robustly
 from soup_nlp.start.choice import CLIP, PIECE_SIZE
-from soup_nlp.start.components import FIXED, TIES
+from soup_nlp.start.components import FIXED, TIES, largest
 from soup_nlp.start.edges import follows_edges
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.propose import LEAST_PARALLAX_PX, SURE, Start, look
+from soup_nlp.start.propose import LEAST_PARALLAX_PX, Start
 from soup_nlp.start.settle import (
     MOST_SYSTEMATIC_PX,
     RELIEF,
     SYSTEMATIC,
     most_probable,
 )
-from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
 
 Kind = Literal["metric", "relative", "inverse", "ordinal"]
@@ -102,23 +101,28 @@ class Given:
 
 
 def by_prior(
-    start: Start, seg: Segmentation, pair: Pair, kind: Kind | None, o: SeededStart
+    start: Start,
+    seg: Segmentation,
+    pair: Pair,
+    fitted: FlowFit,
+    kind: Kind | None,
+    seed: int,
 ) -> tuple[Start, Given]:
     """The start with depths and scales of the pair's prior where the flow leaves them open.
 
     Args:
         start: Start without the prior.
         seg: Superpixels and graphs.
-        pair: Images, cameras, flow and depth prior.
+        pair: Images and depth prior.
+        fitted: The flow as affine maps.
         kind: What the values of the prior are; None to find out.
-        o: Numbers of samples, seed.
+        seed: Of the draws that the prior's edges are compared with.
     """
-    prior, flow = pair.depth_prior, pair.flow
+    prior = pair.depth_prior
     assert prior is not None
-    assert flow is not None
-    seen = _Seen.of(start, seg, flow, pair, o)
+    seen = _Seen.of(start, fitted)
     value, known = _at_superpixels(prior, seg)
-    main = int(np.argmax(np.bincount(start.component)))
+    main = largest(start.component)
     none = np.full(len(seg), np.inf), np.zeros(len(seg)), np.full(len(seg), np.inf)
     nowhere = np.zeros(len(seg), bool)
     if not known.any() or np.ptp(value[known]) < 1e-6 * value[known].max():
@@ -132,7 +136,7 @@ def by_prior(
     else:
         whole = np.log(np.where(np.isfinite(prior), prior, value[seg.labels]))
         contradicted = ratio > POSSIBLE and seen.determined(main)
-        if contradicted or not follows_edges(whole, pair.image_ref, seg.labels, o.seed):
+        if contradicted or not follows_edges(whole, pair.image_ref, seg.labels, seed):
             return start, nothing
         sigma = UNCONFIRMED
     placed = _placed(seen, main, log_depth, sigma)
@@ -184,12 +188,10 @@ class _Seen:
     known: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, start: Start, seg: Segmentation, flow: Flow, pair: Pair, o: SeededStart) -> _Seen:
+    def of(cls, start: Start, fitted: FlowFit) -> _Seen:
         """The flow that the start was made of."""
-        views, poor = look(seg, flow, pair.K_ref, pair.K_next, o)
-        fit = affine_flow(views)[0][:, 0] / views.focal
-        usable = (views.weight.mean(axis=1) > SURE) & ~start.wrong & ~start.bends & ~poor
-        return cls(start, views, np.column_stack([fit, np.ones(len(fit))]), usable)
+        usable = fitted.views.usable & ~start.wrong & ~start.bends & ~fitted.poor
+        return cls(start, fitted.views, fitted.centre, usable)
 
     def members(self, c: int) -> Int:
         """Superpixels of a rigid component whose flow is known."""

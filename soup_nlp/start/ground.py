@@ -18,7 +18,7 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import BELOW as DOWN
-from soup_nlp.start.components import GROUND, connected_labels, quantile
+from soup_nlp.start.components import GROUND, connected_labels, largest, quantile
 
 LEVEL = 0.92
 """Least cosine between the normal of the ground and the vertical of the image."""
@@ -107,7 +107,7 @@ def above_ground(
         The soup, and (N,) True in components that were lifted as a whole.
     """
     mu = 1 / soup.depth_at(ray)
-    scene = component == np.argmax(np.bincount(component))
+    scene = component == largest(component)
     lam, t = soup.lam.copy(), soup.t.copy()
     lifted = np.zeros(len(mu), bool)
 

@@ -21,7 +21,7 @@ from soup_nlp.start.choice import (
     limited_noise,
     smooth_choice,
 )
-from soup_nlp.start.components import connected_labels, connected_pieces
+from soup_nlp.start.components import connected_labels, connected_pieces, largest
 from soup_nlp.start.epipolar import Motion, estimate
 from soup_nlp.start.motions import fit_translation, refine_motion
 from soup_nlp.start.start_options import SeededStart
@@ -106,11 +106,12 @@ def earned(views: Views, choice: Choice, seg: Segmentation, noise: float) -> tup
 def mixtures(
     component: Int, choice: Choice, flow: Float, usable: Mask, views: Views, seg: Segmentation
 ) -> Mask:
-    """(N,) True in small pieces of movers whose flow tells of no motion of their own.
+    """(N,) True in small pieces whose flow is a mixture of the flows around them, not a motion.
 
-    On an outline of depth a superpixel mixes the flows of both sides. A piece of at most `SMALL`
-    of all superpixels is one if its flow lies between those of the largest component around it,
-    or near them where its own motion explains it badly and hardly better than the main one does.
+    Along a depth discontinuity the flow of a superpixel mixes those of both sides. A piece of at
+    most `SMALL` of all superpixels is a mixture if its flow lies between those of the superpixels
+    of the largest component around it. If its own motion explains its flow badly and hardly better
+    than the main motion does, a flow near those around it is enough.
 
     Args:
         component: (N,) rigid component of every superpixel.
@@ -120,7 +121,7 @@ def mixtures(
         views: Rays, targets and confidence of every superpixel.
         seg: Superpixels and graphs.
     """
-    main, noise = np.argmax(np.bincount(component)), limited_noise(choice.error)
+    main, noise = largest(component), limited_noise(choice.error)
     first = int(np.argmax(choice.label == main_motion(choice.label)))
     error = views.fit([Motion(choice.R[first], choice.t[first])]).penalised()[:, 0]
     i, k = seg.pairs.T
@@ -144,7 +145,7 @@ def mixtures(
 
 def main_motion(label: Int) -> int:
     """The most frequent motion of indices (N,), one of which is not negative."""
-    return int(np.argmax(np.bincount(label[label >= 0])))
+    return largest(label[label >= 0])
 
 
 def _one_motion_each(

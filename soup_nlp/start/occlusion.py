@@ -1,4 +1,4 @@
-"""Which side of an outline covers the other, and components placed in that order.
+"""Occlusion order along outlines: which side covers the other, and components placed accordingly.
 
 Where two regions move differently, one covers the other along their outline. If they close in on
 each other, pixels of the farther region are covered in the next frame: followed with the flow of
@@ -18,12 +18,18 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bending import affine_flow, fit_turn, flow_jump
-from soup_nlp.start.components import FIXED, TIES, connected_labels, depth_from_inside, quantile
+from soup_nlp.start.bending import FlowFit, fit_turn, followed
+from soup_nlp.start.components import (
+    FIXED,
+    TIES,
+    connected_labels,
+    depth_from_inside,
+    largest,
+    quantile,
+)
 from soup_nlp.start.merge import SMALL
-from soup_nlp.start.propose import Start, look
+from soup_nlp.start.propose import Start
 from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import Views
 
 WIDEST = 8
 """Largest width of a strip beside an outline, pixels."""
@@ -32,19 +38,19 @@ FEWEST = 3
 CLOSING_PX = 1.0
 """Least speed at which two regions close in on each other or part, pixels per frame."""
 CONTRAST = 8.0
-"""Difference of the mean costs of both strips from which it tells the order, grey levels."""
+"""Least difference between the mean costs of both strips that tells the order, grey levels."""
 MOST_GREY = 40.0
 """Limit of the cost of a pixel, grey levels."""
 SURE = 0.8
 """Probability from which the order along an outline counts."""
 LEAST_STEP, IN_FRONT = 0.1, 0.35
-"""Median step of log depth along the outline of a region in order: below the first the order does
-not hold, and the region is placed so that the step is the second, a guess. True steps along such
-outlines have medians of 0.2 to 1.9."""
+"""Steps of log depth across the outline of a region, medians along it. A step below the first does
+not agree with the order; the region is then placed so that the step is the second, a guess. True
+steps along such outlines have medians of 0.2 to 1.9."""
 
 
-def covering(seg: Segmentation, pair: Pair, views: Views, affine: Float, jump: Float) -> Float:
-    """(P,) contrast in grey levels of every neighbour pair: positive where the second covers.
+def covering(seg: Segmentation, pair: Pair, fitted: FlowFit) -> Float:
+    """(P,) contrast, grey levels: positive where the second superpixel of a pair covers the first.
 
     It is 0 without a flow discontinuity, and where too little is visible. With a strip S of each
     superpixel along the boundary, the affine flow u of that superpixel, and the speed
@@ -53,17 +59,15 @@ def covering(seg: Segmentation, pair: Pair, views: Views, affine: Float, jump: F
         v > 1 px:   c_i - c_k   with  c = mean over x in S of |I_ref(x) - I_next(x + u(x))|
         v < -1 px:  c_k - c_i   with  c = mean over y in G of min over x in S |I_next(y) - I_ref(x)|
 
-    where G is what lies between the boundary moved by u_i and moved by u_k in the next frame.
+    where G is the area of the next frame between the boundary moved by u_i and moved by u_k.
 
     Args:
         seg: Superpixels and graphs.
         pair: Images and cameras.
-        views: Anchors and radii of every superpixel.
-        affine: (N, 3, 2) flow of every superpixel, see `affine_flow`.
-        jump: (P,) jump of the flow on every boundary, pixels.
+        fitted: The flow as affine maps.
     """
     out = np.zeros(len(seg.pairs))
-    rows = np.flatnonzero(jump >= CLOSING_PX)
+    rows = np.flatnonzero(fitted.jump >= CLOSING_PX)
     if not len(rows):
         return out
     blurred = [
@@ -73,14 +77,11 @@ def covering(seg: Segmentation, pair: Pair, views: Views, affine: Float, jump: F
     ends, edge = seg.pairs[rows], seg.boundary[rows]
     normal = _normals(edge, seg.anchors[ends[:, 1]] - seg.anchors[ends[:, 0]])
 
-    def target(who: Int, at: Float) -> Float:
-        # (M, ..., 2) pixels of the next frame, by the affine flow of superpixels (M,)
-        wide = (slice(None), *(None,) * (at.ndim - 2))
-        off = (rays(pair.K_ref, at) - views.anchor[who][wide])[..., :2]
-        off = off / views.radius[who][(*wide, None)]
-        return affine[who, 0][wide] + np.einsum("m...c,mcd->m...d", off, affine[who, 1:]) + centre
+    def target(which: Int, at: Float) -> Float:
+        # (M, ..., 2) pixels of the next frame
+        moved = followed(fitted.fit, fitted.views, which, rays(pair.K_ref, at))
+        return moved + pair.K_next[:2, 2]
 
-    centre = pair.K_next[:2, 2]
     landed = [target(ends[:, e], edge) for e in (0, 1)]
     closing = np.einsum("mbc,mc->mb", landed[0] - landed[1], normal).mean(axis=1)
     step = np.arange(1.0, WIDEST + 1)
@@ -145,11 +146,12 @@ def _mean(cost: Float, used: Mask) -> Float:
 
 
 def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
-    """(P,) probability that the order of a pair is right, positive where the second covers, else 0.
+    """(P,) order of every pair with its probability, see `Start.order`.
 
-    All pairs along the outline of two regions have one order, that of the majority of the pairs
-    that tell one. With m of n votes for it the probability is `(m + 1) / (n + 2)`. Pairs that say
-    otherwise, and outlines of a probability up to `SURE`, are left out.
+    A pair along the outline between two regions votes if its contrast is above `CONTRAST`. All
+    pairs of the outline take the order of the majority. With m of n votes for it, its probability
+    is `(m + 1) / (n + 2)`. Pairs that voted against it, and outlines with a probability of at most
+    `SURE`, get 0.
 
     Args:
         contrast: (P,) see `covering`.
@@ -168,24 +170,21 @@ def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
     return np.where(holds, np.sign(lead[outline]) * turned * sure[outline], 0.0)
 
 
-def in_order(start: Start, seg: Segmentation, pair: Pair, o: SeededStart) -> Start:
+def in_order(start: Start, seg: Segmentation, pair: Pair, fitted: FlowFit, o: SeededStart) -> Start:
     """The start with its components in the order that their outlines show.
 
     Only scales that neither flow nor parallax determines change. A region before a camera at rest,
     or one that bends, becomes a component of its own if it is placed.
 
     Args:
-        start: Start without it.
+        start: The start before its components are ordered.
         seg: Superpixels and graphs.
-        pair: Images, cameras and flow.
-        o: Numbers of samples, seed.
+        pair: Images and cameras.
+        fitted: The flow as affine maps.
+        o: Jump of the flow where a surface ends.
     """
-    assert pair.flow is not None
-    views, _ = look(seg, pair.flow, pair.K_ref, pair.K_next, o)
-    affine, _ = affine_flow(views)
-    jump = flow_jump(affine, views, seg.pairs, rays(pair.K_ref, seg.boundary))
-    region = regions(start, views, jump, seg, o)
-    contrast = covering(seg, pair, views, affine, jump)
+    region = regions(start, fitted, seg, o)
+    contrast = covering(seg, pair, fitted)
     # the flow of a small piece may be a mixture of those around it, or wrong
     small = np.bincount(region)[region] <= SMALL * len(seg)
     contrast[small[seg.pairs].any(axis=1)] = 0.0
@@ -196,7 +195,7 @@ def in_order(start: Start, seg: Segmentation, pair: Pair, o: SeededStart) -> Sta
     factor = placed(start.soup, region, order, start.tie == FIXED, seg, pair.K_ref)
     moved = factor != 1
     # the scale of what is placed is held along its whole outline
-    held = moved[seg.pairs].any(axis=1) & (jump >= CLOSING_PX)
+    held = moved[seg.pairs].any(axis=1) & (fitted.jump >= CLOSING_PX)
     order = np.where(held, whole, order)
     soup = replace(start.soup, lam=start.soup.lam * factor).normalised()
     tie = np.where(moved, TIES.index("occlusion"), start.tie)
@@ -206,28 +205,29 @@ def in_order(start: Start, seg: Segmentation, pair: Pair, o: SeededStart) -> Sta
     return replace(start, soup=soup, tie=tie, component=component, part=part, order=order)
 
 
-def regions(start: Start, views: Views, jump: Float, seg: Segmentation, o: SeededStart) -> Int:
-    """(N,) what has one scale by the flow: rigid components; surfaces where these bend.
+def regions(start: Start, fitted: FlowFit, seg: Segmentation, o: SeededStart) -> Int:
+    """(N,) regions with one scale each: rigid components, and surfaces in components that bend.
 
-    Before a camera at rest these are what does not move, and each connected piece of the rest.
+    Before a camera at rest one region is everything that does not move; the others are connected
+    pieces of what does.
     """
     if not start.at_rest:
         return np.where(start.bends, len(seg) + start.surface, start.component)
-    still = fit_turn(views)[1] < o.discontinuity_px
+    still = fit_turn(fitted.views)[1] < o.discontinuity_px
     i, k = seg.pairs.T
-    alike = (still[i] == still[k]) & (jump < o.discontinuity_px)
+    alike = (still[i] == still[k]) & (fitted.jump < o.discontinuity_px)
     return np.where(still, 0, 1 + connected_labels(alike, seg))
 
 
 def placed(
     soup: Soup, region: Int, order: Float, fixed: Mask, seg: Segmentation, K_ref: Float
 ) -> Float:
-    """(N,) factor of the scale of every superpixel, with which regions are in order.
+    """(N,) factor by which the scale of every superpixel is multiplied to bring regions in order.
 
     The largest region stays, and so does what is fixed in the image. The others follow one after
     the other, the one with the most votes against placed regions first. Where the median step of
-    log depth along its outlines is below `LEAST_STEP`, it comes nearer or recedes until it is
-    `IN_FRONT`. A region without an order moves with the one that it touches most.
+    log depth across its outlines is below `LEAST_STEP`, the region comes nearer or recedes until
+    that step is `IN_FRONT`. A region without an order moves with the one that it touches most.
 
     Args:
         soup: Planes.
@@ -240,7 +240,7 @@ def placed(
     region = np.unique(region, return_inverse=True)[1].ravel()
     count = int(region.max()) + 1
     shift, done = np.zeros(count), np.zeros(count, bool)
-    done[[np.argmax(np.bincount(region)), *region[fixed]]] = True
+    done[[largest(region), *region[fixed]]] = True
     across = region[seg.pairs[:, 0]] != region[seg.pairs[:, 1]]
     ends, says = region[seg.pairs[across]], order[across]
     a, b = np.concatenate([ends, ends[:, ::-1]]).T
@@ -254,14 +254,14 @@ def placed(
     free[a[behind != 0]] = False
     while (use := ~done[a] & done[b] & (behind != 0)).any():
         c = int(np.argmax(np.bincount(a[use], np.abs(behind[use]), minlength=count)))
-        # by how much it recedes, as a region that is covered and as one that covers
+        # by how much c recedes: behind what covers it, and (negative) in front of what it covers
         lacks = []
         for sign in (1.0, -1.0):
             some = use & (a == c) & (sign * behind > 0)
             now = sign * (step - shift[b])[some]
             gap = quantile(now, length[some], 0.5) if some.any() else IN_FRONT
             lacks.append(sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0)
-        # no scale is right for both
+        # no scale agrees with both
         shift[c] = sum(lacks) if min(map(abs, lacks)) == 0 else 0.0
         done[c] = True
     follows = free & ~done & (touch.max(axis=1) > 0)

@@ -47,7 +47,7 @@ def fixed_to_camera(
     Returns:
         The mask, and (N,) the mean displacement of every superpixel, pixels.
     """
-    none, usable = np.zeros(len(seg), bool), views.weight.mean(axis=1) > 0.5
+    none, usable = np.zeros(len(seg), bool), views.usable
     shift = views.distance(views.ray)
     may = usable & (shift < STILL_PX)
     if may.sum() < PIECE_SIZE:

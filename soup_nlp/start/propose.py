@@ -8,16 +8,13 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Flow
-from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy_data import sample_pixels
 from soup_nlp.start.bending import (
-    affine_flow,
+    FlowFit,
     constant_depth,
-    flow_jump,
     reference_noise,
     surface_motions,
     surfaces,
@@ -30,6 +27,7 @@ from soup_nlp.start.components import (
     borrow,
     connected_labels,
     contact_scales,
+    largest,
     rigid_components,
 )
 from soup_nlp.start.epipolar import Motion
@@ -39,15 +37,13 @@ from soup_nlp.start.merge import earned, gather, mixtures
 from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
 from soup_nlp.start.settle import settle
 from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import Views
+from soup_nlp.start.views import USABLE, Views
 
 __all__ = ["SeededStart", "Start", "propose"]
 
 
 LEAST_PARALLAX_PX = 0.25
 """Parallax below which the depth of a superpixel is borrowed from its neighbours, pixels."""
-SURE = 0.5
-"""Mean confidence from which the flow of a superpixel counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +111,12 @@ class Start:
 
 
 def propose(
-    seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, options: SeededStart | None = None
+    seg: Segmentation,
+    flow: Flow,
+    K_ref: Float,
+    K_next: Float,
+    options: SeededStart | None = None,
+    fitted: FlowFit | None = None,
 ) -> Start:
     """Rotation, translation, plane and scale of every superpixel from its flow.
 
@@ -125,23 +126,22 @@ def propose(
         K_ref: (3, 3) intrinsics of the reference frame.
         K_next: (3, 3) intrinsics of the next frame.
         options: See SeededStart.
+        fitted: The flow as affine maps; computed without it.
 
     Raises:
         DataError: fewer than 8 pixels have a usable flow.
     """
     o = options or SeededStart()
-    views, poor = look(seg, flow, K_ref, K_next, o)
+    fitted = fitted or FlowFit.of(seg, flow, K_ref, K_next, o)
+    views, poor, _, residual, jump = fitted
     if o.method == "homography":
         return _of_homographies(views, seg, o)
-    affine, residual = affine_flow(views)
-    jump = flow_jump(affine, views, seg.pairs, rays(K_ref, seg.boundary))
     fixed, shift = np.zeros(len(seg), bool), np.zeros(len(seg))
     if np.array_equal(K_ref, K_next):
         fixed, shift = fixed_to_camera(views, seg, jump, o)
     views, poor = views.without(fixed), poor | fixed
     surface = surfaces(jump, seg, o.discontinuity_px)
-    usable = views.weight.mean(axis=1) > SURE
-    centre = np.concatenate([affine[:, 0] / views.focal, np.ones((len(seg), 1))], axis=1)
+    usable, centre = views.usable, fitted.centre
     motions, bends = surface_motions(views, seg, surface, residual, usable, o)
     bends &= o.bending
     choice, noise = rigid_motions(views, seg, jump, motions, o)
@@ -178,15 +178,14 @@ def propose(
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t)
     grounded = np.zeros(len(seg), bool)
     if o.upright and o.ground:
-        known = ~weak & (views.weight.mean(axis=1) > 0.5)
+        known = ~weak & views.usable
         own_ground = views.anchor, seg, K_ref, known, component, tie, o
         soup, component, tie, floor = _on_ground(soup, *own_ground)
         grounded = weak & (floor > 0)
     soup = soup.normalised()
     moved = (centre - views.anchor)[:, :2] * views.focal
     mixed = mixtures(component, choice, moved, usable, views, seg) & ~(fixed | bends)
-    largest = np.argmax(np.bincount(component))
-    part = moving_parts(np.where(mixed, largest, component), views, seg, fixed | bends)
+    part = moving_parts(np.where(mixed, largest(component), component), views, seg, fixed | bends)
     own = soup, error, parallax, weak, label, component, part
     found = *own, motions, surface, tie, grounded, bends
     return Start(*found, wrong & ~bends, noise=limited_noise(error[~bends]))
@@ -258,12 +257,12 @@ def moving_parts(component: Int, views: Views, seg: Segmentation, kept: Mask) ->
         seg: Superpixels and graphs.
         kept: (N,) True in components that stay.
     """
-    main = int(np.argmax(np.bincount(component)))
+    main = largest(component)
     i, k = seg.pairs.T
     same = component[i] == component[k]
     piece = connected_labels(same, seg)
     weight = np.bincount(piece, views.weight.mean(axis=1)) / np.bincount(piece)
-    moves = kept | ((component != main) & (weight >= SURE)[piece])
+    moves = kept | ((component != main) & (weight >= USABLE)[piece])
     beside = np.zeros(len(weight), bool)
     for one, other in ((i, k), (k, i)):
         beside[piece[one[~same & moves[other]]]] = True
@@ -296,7 +295,7 @@ def _on_ground(
 
     What lies below the ground is lifted, and what floats above it is lowered.
     """
-    known = known & (component == np.argmax(np.bincount(component)))
+    known = known & (component == largest(component))
     area = np.bincount(seg.labels.ravel()).astype(float)
     floor = ground(1 / soup.depth_at(anchor), anchor, area, known, o.seed)
     soup, lifted = above_ground(soup, anchor, area, known, component, floor)
@@ -311,61 +310,6 @@ def _on_ground(
     # components are numbered without gaps
     component = np.unique(component, return_inverse=True)[1].ravel()
     return Soup(lam, soup.n, soup.d, soup.R, soup.t), component, tie, floor
-
-
-def look(
-    seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: SeededStart
-) -> tuple[Views, Mask]:
-    """Rays and targets of sampled pixels, and (N,) True where they are those of a neighbour.
-
-    Args:
-        seg: Superpixels and graphs.
-        flow: Flow with confidence.
-        K_ref: (3, 3) intrinsics of the reference frame.
-        K_next: (3, 3) intrinsics of the next frame.
-        o: Samples and seed.
-
-    Raises:
-        DataError: fewer than 8 pixels have a usable flow.
-    """
-    width = seg.labels.shape[1]
-    index, there = sample_pixels(seg.labels, flow, o.samples, o.seed)
-    if there.sum() < 8:
-        raise DataError(
-            "too few pixels have a usable flow",
-            where=f"flow {flow.source}",
-            found=int(there.sum()),
-            expected="at least 8",
-            hint="check the flow file, or lower the confidence threshold",
-        )
-    index, there, poor = _fill_poor(seg, index, there)
-    uv = np.stack([index % width, index // width], axis=-1).astype(float)
-    displacement = flow.uv.reshape(-1, 2)[index].astype(float)
-    weight = np.where(there, flow.confidence.ravel()[index].astype(float), 0.0)
-    ray, target = rays(K_ref, uv), rays(K_next, uv + np.where(there[..., None], displacement, 0.0))
-    anchor = rays(K_ref, seg.anchors)
-    rim = rays(K_ref, seg.rim)
-    radius = np.linalg.norm((rim - anchor[:, None])[..., :2], axis=-1).max(axis=1)
-    radius = np.maximum(radius, 1.0 / K_ref[0, 0])
-    focal = (float(K_next[0, 0]), float(K_next[1, 1]))
-    return Views(ray, target, weight, anchor, radius, focal), poor
-
-
-def _fill_poor(
-    seg: Segmentation, index: Int, there: Mask, least: int = 8
-) -> tuple[Int, Mask, Mask]:
-    """Replace the samples of superpixels with few usable pixels by their nearest neighbour's."""
-    count = there.sum(axis=1)
-    poor = count < least
-    if not poor.any() or poor.all():
-        return index, there, poor
-    from scipy.spatial import cKDTree
-
-    rich = np.flatnonzero(~poor)
-    _, nearest = cKDTree(seg.anchors[rich]).query(seg.anchors[poor])
-    index, there = index.copy(), there.copy()
-    index[poor], there[poor] = index[rich[nearest]], there[rich[nearest]]
-    return index, there, poor
 
 
 def _parallax(soup: Soup, views: Views) -> Float:

@@ -1,4 +1,4 @@
-"""What planes are fitted to: sampled rays and flow targets of every superpixel."""
+"""What planes are fitted to: rays and flow targets of the sampled pixels of every superpixel."""
 
 from __future__ import annotations
 
@@ -7,8 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.data.pair import Flow
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import rays
+from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane_fit import PlaneFit, fit_planes
+from soup_nlp.model.energy_data import sample_pixels
 from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.start_options import SeededStart
+
+USABLE = 0.5
+"""Mean confidence above which the flow of a superpixel counts."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +39,11 @@ class Views:
     anchor: Float
     radius: Float
     focal: tuple[float, float]
+
+    @property
+    def usable(self) -> Mask:
+        """(N,) True where the flow counts: its mean confidence is above `USABLE`."""
+        return np.asarray(self.weight.mean(axis=1) > USABLE)
 
     def fit(self, motions: list[Motion]) -> PlaneFit:
         """Planes of every superpixel under each of M motions."""
@@ -62,3 +76,58 @@ class Views:
         """The entries of superpixels `at`."""
         ray, target, weight = self.ray[at], self.target[at], self.weight[at]
         return Views(ray, target, weight, self.anchor[at], self.radius[at], self.focal)
+
+
+def look(
+    seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: SeededStart
+) -> tuple[Views, Mask]:
+    """Rays and targets of sampled pixels, and (N,) True where they are those of a neighbour.
+
+    Args:
+        seg: Superpixels and graphs.
+        flow: Flow with confidence.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        K_next: (3, 3) intrinsics of the next frame.
+        o: Samples and seed.
+
+    Raises:
+        DataError: fewer than 8 pixels have a usable flow.
+    """
+    width = seg.labels.shape[1]
+    index, there = sample_pixels(seg.labels, flow, o.samples, o.seed)
+    if there.sum() < 8:
+        raise DataError(
+            "too few pixels have a usable flow",
+            where=f"flow {flow.source}",
+            found=int(there.sum()),
+            expected="at least 8",
+            hint="check the flow file, or lower the confidence threshold",
+        )
+    index, there, poor = _fill_poor(seg, index, there)
+    uv = np.stack([index % width, index // width], axis=-1).astype(float)
+    displacement = flow.uv.reshape(-1, 2)[index].astype(float)
+    weight = np.where(there, flow.confidence.ravel()[index].astype(float), 0.0)
+    ray, target = rays(K_ref, uv), rays(K_next, uv + np.where(there[..., None], displacement, 0.0))
+    anchor = rays(K_ref, seg.anchors)
+    rim = rays(K_ref, seg.rim)
+    radius = np.linalg.norm((rim - anchor[:, None])[..., :2], axis=-1).max(axis=1)
+    radius = np.maximum(radius, 1.0 / K_ref[0, 0])
+    focal = (float(K_next[0, 0]), float(K_next[1, 1]))
+    return Views(ray, target, weight, anchor, radius, focal), poor
+
+
+def _fill_poor(
+    seg: Segmentation, index: Int, there: Mask, least: int = 8
+) -> tuple[Int, Mask, Mask]:
+    """Replace the samples of superpixels with few usable pixels by their nearest neighbour's."""
+    count = there.sum(axis=1)
+    poor = count < least
+    if not poor.any() or poor.all():
+        return index, there, poor
+    from scipy.spatial import cKDTree
+
+    rich = np.flatnonzero(~poor)
+    _, nearest = cKDTree(seg.anchors[rich]).query(seg.anchors[poor])
+    index, there = index.copy(), there.copy()
+    index[poor], there[poor] = index[rich[nearest]], there[rich[nearest]]
+    return index, there, poor

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR
+from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR, scale_by_contact
 from soup_nlp.report.findings import GUESSES, certainty_lines, guess_reason
 from soup_nlp.report.summary import certainty
-from soup_nlp.start.components import FIXED, TIES
+from soup_nlp.start.components import FIXED, TIES, displacement
 
 REASONS = GUESSES
 
@@ -20,11 +20,15 @@ def unsure(run, component_variance=None):
     sure = run.confidence
     far = np.full_like(sure.evidence.turn, 9.0)
     seen = replace(sure.evidence, turn=far, constant=far, solution=np.zeros_like(far))
-    own = sure.marginals
+    scale, start = sure.scale, run.start
     if component_variance is not None:
-        own = replace(own, component=np.full_like(own.component, component_variance))
+        own = replace(
+            sure.marginals, component=np.full_like(sure.marginals.component, component_variance)
+        )
+        far = displacement(run.soup, run.data.anchor_ray, start.component)
+        scale = scale_by_contact(own, start, run.segmentation.sizes, far)
     sigma = np.full_like(sure.sigma, SIGMA_PRIOR)
-    return replace(run, confidence=replace(sure, sigma=sigma, marginals=own, evidence=seen))
+    return replace(run, confidence=replace(sure, sigma=sigma, scale=scale, evidence=seen))
 
 
 def test_shares_add_up(small_run):

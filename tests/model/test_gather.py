@@ -18,8 +18,9 @@ from soup_nlp.start.choice import Choice, flow_affinity, smooth_choice
 from soup_nlp.start.components import borrow
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.merge import gather
-from soup_nlp.start.propose import look, propose
+from soup_nlp.start.propose import propose
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import look
 
 WIDTH, HEIGHT = 192, 144
 K = camera.intrinsics(180.0, 180.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)

@@ -202,13 +202,12 @@ def test_view_of_no_result(tmp_path, capsys):
 def test_limits_name_what_is_wrong(shown):
     good = " ".join(limits(shown))
     assert "did not converge" not in good
-    tree = {**shown.tree, "input": dict(shown.tree["input"]), "start": dict(shown.tree["start"])}
-    tree["input"]["confidence"] = np.zeros_like(tree["input"]["confidence"])
+    unusable = np.zeros_like(shown.flow_confidence)
     shares = {"guess": 0.3, "unseen": 0.2, "rest": 0.004, "flat": 0.06, "weak": 0.036}
     told = {
         **shown.summary, "status": "Time_Limit", "converged": False, "certainty": shares
     }  # fmt: skip
-    found = limits(replace(shown, tree=tree, summary=told))
+    found = limits(replace(shown, flow_confidence=unusable, summary=told))
     assert found[0] == "The NLP did not converge (Time_Limit): try a larger solver.max_iter."
     assert "usable at 0% of the pixels" in found[1]
     assert found[2].startswith(

@@ -22,8 +22,9 @@ from soup_nlp.pipeline.case import Case, build_energy, prepare, solver_options
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.bending import constant_depth, fit_turn, joined, surfaces, turn_alone
 from soup_nlp.start.choice import LEAST_NOISE, dominant
-from soup_nlp.start.propose import look, rigid_motions
+from soup_nlp.start.propose import rigid_motions
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import look
 
 pytestmark = pytest.mark.slow
 

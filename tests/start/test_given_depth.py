@@ -18,6 +18,7 @@ from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.report.summary import certainty, summary
+from soup_nlp.start.bending import FlowFit
 from soup_nlp.start.components import TIES
 from soup_nlp.start.edges import follows_edges
 from soup_nlp.start.given_depth import CONFIRMED, Given, by_prior
@@ -42,7 +43,8 @@ class Seen:
 
     def by(self, prior: np.ndarray, kind: str | None = None) -> tuple[Start, Given]:
         pair = replace(self.pair, depth_prior=prior)
-        return by_prior(self.start, self.seg, pair, kind, SeededStart())
+        own = self.seg, pair.flow, pair.K_ref, pair.K_next, SeededStart()
+        return by_prior(self.start, self.seg, pair, FlowFit.of(*own), kind, 0)
 
     def error(self, start: Start) -> np.ndarray:
         """(N,) log depth of the anchors less the true one, one scale left out."""

@@ -17,10 +17,10 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start import occlusion
-from soup_nlp.start.bending import affine_flow, flow_jump
+from soup_nlp.start.bending import FlowFit
 from soup_nlp.start.components import TIES
 from soup_nlp.start.occlusion import IN_FRONT, SURE, covering, in_order, vote
-from soup_nlp.start.propose import look, propose
+from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 
 HEIGHT, WIDTH, CELL = 96, 128, 16
@@ -52,17 +52,18 @@ def sliding(covers: bool) -> tuple[Pair, Segmentation]:
     return pair, build_segmentation(labels, before)
 
 
-def contrasts(pair: Pair, seg: Segmentation) -> np.ndarray:
-    views, _ = look(seg, pair.flow, K, K, SeededStart())
-    affine, _ = affine_flow(views)
-    jump = flow_jump(affine, views, seg.pairs, camera.rays(K, seg.boundary))
-    return covering(seg, pair, views, affine, jump)
+def fitted(pair: Pair, seg: Segmentation) -> FlowFit:
+    return FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
+
+
+def ordered(before: Start, seg: Segmentation, pair: Pair) -> Start:
+    return in_order(before, seg, pair, fitted(pair, seg), SeededStart())
 
 
 @pytest.mark.parametrize("covers", [True, False])
 def test_the_side_that_loses_or_gains_pixels_is_behind(covers):
     pair, seg = sliding(covers)
-    contrast = contrasts(pair, seg)
+    contrast = covering(seg, pair, fitted(pair, seg))
     moves = pair.flow.uv[..., 0].ravel()[np.unique(seg.labels, return_index=True)[1]] != 0
     i, k = seg.pairs.T
     # upper and lower edges slide along each other: neither closes nor opens
@@ -97,7 +98,7 @@ def test_a_vote_needs_several_strips_and_agreement():
 def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
     pair, seg = sliding(covers)
     before = propose(seg, pair.flow, K, K, SeededStart())
-    start = in_order(before, seg, pair, SeededStart())
+    start = ordered(before, seg, pair)
     assert before.at_rest
     z = np.log(start.soup.depth_at(camera.rays(K, seg.anchors)))
     moves = start.tie == TIES.index("occlusion")
@@ -125,7 +126,7 @@ def swing() -> tuple[Pair, Segmentation]:
 def test_what_swings_comes_before_the_wall(swing):
     pair, seg = swing
     before = propose(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
-    start = in_order(before, seg, pair, SeededStart())
+    start = ordered(before, seg, pair)
     u, v = np.rint(seg.anchors).astype(int).T
     truth = np.log(pair.truth.depth_ref[v, u])
     known = start.order != 0
@@ -149,16 +150,16 @@ def test_small_pieces_have_no_order(monkeypatch):
     pair, seg = sliding(True)
     before = propose(seg, pair.flow, K, K, SeededStart())
     monkeypatch.setattr(occlusion, "SMALL", 5 / len(seg))
-    assert in_order(before, seg, pair, SeededStart()) is not before
+    assert ordered(before, seg, pair) is not before
     monkeypatch.setattr(occlusion, "SMALL", 6 / len(seg))
-    assert in_order(before, seg, pair, SeededStart()) is before
+    assert ordered(before, seg, pair) is before
 
 
 def test_an_image_without_discontinuities_keeps_its_start(swing):
     pair, seg = swing
     still = pair.with_flow(Flow(0 * pair.flow.uv, pair.flow.confidence, "zero"))
     start = propose(seg, still.flow, pair.K_ref, pair.K_next, SeededStart())
-    assert in_order(start, seg, still, SeededStart()) is start
+    assert ordered(start, seg, still) is start
 
 
 OPTIONS = ("segmentation.superpixels=48", "segmentation.neighbours=6", "refine.enabled=false")
