@@ -129,6 +129,7 @@ def test_the_functions_that_ipopt_takes_are_those_of_the_graph(case, compiled, n
         assert a.sparsity() == b.sparsity()
         close(a.nonzeros(), b.nonzeros())
     assert fast.hess_lag.nnz_out(0) == nlp.nnzh
+    assert fast.hess_lag.sparsity_out(0).is_triu()
 
 
 @pytest.fixture(scope="module")
