@@ -226,6 +226,17 @@ def test_pfm_errors(tmp_path: Path, content: bytes, match: str) -> None:
         fmt.read_pfm(put(tmp_path / "a.pfm", content))
 
 
+@pytest.mark.parametrize("comment", [b"# made by a program\n", b"# one\n# two\r\n", b""])
+def test_a_pfm_with_comments_is_read(comment: bytes, tmp_path: Path) -> None:
+    depth = np.arange(1, 13, dtype=np.float32).reshape(3, 4)
+    write_pfm(tmp_path / "a.pfm", depth)
+    content = (tmp_path / "a.pfm").read_bytes()
+    for place in (b"Pf\n", b"4 3\n"):
+        head, tail = content.split(place, 1)
+        (tmp_path / "a.pfm").write_bytes(head + place + comment + tail)
+        np.testing.assert_array_equal(fmt.read_depth(tmp_path / "a.pfm"), depth)
+
+
 def test_png16_errors(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
     with raises("16-bit PNG with 1 channel"):
