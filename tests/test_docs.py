@@ -17,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import typer
+from constraint_mutants import MUTANTS
 from helpers_model import PAPER, Tiny
 from pydantic import BaseModel, Field
 from test_layers import ALLOWED
@@ -432,3 +433,8 @@ def test_a_file_becomes_depth_by_another_solver(monkeypatch):
     assert check_folder(result).ok
     assert (result / "depth_ref.png").stat().st_size > 0
     assert len(plt.get_fignums()) == 1
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.what)
+def test_a_mutant_of_a_constraint_changes_one_place_of_the_package(mutant):
+    assert (ROOT / "soup_nlp" / mutant.module).read_text().count(mutant.old) == 1
