@@ -30,6 +30,7 @@ from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.components import FIXED, TIES, displacement, log_pace
 from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
+from soup_nlp.start.settle import RELIEF
 
 log = logging.getLogger(__name__)
 
@@ -298,7 +299,8 @@ def confidence(
     scale = scale_by_contact(own, start, np.bincount(rec.labels.ravel()), far, given)
     rigid = np.hypot(scale, found.sigma)
     added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), rigid)
-    added[found.guess[start.component] | start.at_rest | (start.tie == FIXED)] = LARGEST
+    guess = found.guess[start.component] | start.at_rest | (start.tie == FIXED)
+    added = np.hypot(added, np.where(guess, RELIEF, 0.0))
     before = np.full(len(added), SIGMA_PRIOR)
     if given is not None:
         # a depth that is taken from a prior which no flow confirms is no evidence of the flow

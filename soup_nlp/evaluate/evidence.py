@@ -165,7 +165,10 @@ def _open_motion(soup: Soup, data: EnergyData, at: Int, seen: Mask, error: float
     squared = np.sum(along**2, axis=1) + (error / RELIEF) ** 2
     follow = -np.einsum("ni,nij->nj", along, J) / squared[:, None]
     across = J + along[:, :, None] * follow[:, None]
-    follow = follow - follow[seen].mean(axis=0)
+    # without a common factor of all depths, which what has no parallax does not follow
+    grown = np.sum(along**2, axis=1) / squared
+    share = grown[seen] @ follow[seen] / max(float(grown[seen] @ grown[seen]), 1e-12)
+    follow = follow - np.outer(grown, share)
     information = np.mean(across[seen].transpose(0, 2, 1) @ across[seen], axis=0) / error**2
     information += np.mean(follow[seen][:, :, None] * follow[seen][:, None], axis=0) / RELIEF**2
     if not np.isfinite(information).all():

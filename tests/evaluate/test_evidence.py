@@ -15,13 +15,14 @@ from soup_nlp.geometry.soup import Soup
 NOISE = 0.05
 
 
-def scene(case, depth: float, t: tuple[float, float, float], turn: float = 0.02):
+def scene(case, depth: float, t: tuple[float, float, float], turn: float = 0.02, far: float = 1):
     """A soup of planes that face the camera, and the data with exactly its flow.
 
-    `depth` is the standard deviation of log depth.
+    `depth` is the standard deviation of log depth; every other plane is `far` times as far.
     """
     n = len(case.data)
     lam = np.exp(depth * np.random.default_rng(0).standard_normal(n))
+    lam[::2] *= far
     R = rotation.exp(np.array([0.3 * turn, turn, 0.1 * turn]))
     soup = Soup(
         lam,
@@ -70,6 +71,13 @@ def test_a_turn_is_no_evidence_with_a_wrong_focal_length(small_room):
 def test_less_parallax_leaves_more_open(small_room):
     near, far = (np.median(of(small_room, 0.3, (x, 0.0, 0.0)).sigma) for x in (0.3, 0.06))
     assert far > 3 * near
+
+
+def test_a_far_background_leaves_no_more_open_before_it(small_room):
+    """The ratio of depths before a sky and of the sky is open, but not those of the former."""
+    before, after = (of(small_room, 0.3, (0.3, 0.0, 0.1), far=far).sigma for far in (1, 1e4))
+    assert np.median(before[1::2]) < np.median(after[1::2]) < 0.02
+    assert after[::2].min() > 0.4
 
 
 def test_what_motion_leaves_open_is_that_of_refitted_motions(small_room):
