@@ -30,13 +30,15 @@ from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.components import FIXED, TIES, displacement, log_pace
 from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
-from soup_nlp.start.settle import RELIEF
 
 log = logging.getLogger(__name__)
 
 SIGMA_PRIOR = 1.0
 """Standard deviation of log depth without any evidence; true scenes have 0.3 (rooms) to 1.2
 (outdoors)."""
+GUESSED = 2.0
+"""Added in squares, of log depth, where no flow determines depth: 0.89 with the information of the
+prior, which keeps the order of what the other terms say."""
 PRIOR_SHARE = 0.001
 """Factor of E_prior in the information: it is no evidence, but keeps variances finite where there
 is none."""
@@ -300,7 +302,7 @@ def confidence(
     rigid = np.hypot(scale, found.sigma)
     added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), rigid)
     guess = found.guess[start.component] | start.at_rest | (start.tie == FIXED)
-    added = np.hypot(added, np.where(guess, RELIEF, 0.0))
+    added = np.hypot(added, np.where(guess, GUESSED, 0.0))
     before = np.full(len(added), SIGMA_PRIOR)
     if given is not None:
         # a depth that is taken from a prior which no flow confirms is no evidence of the flow

@@ -14,6 +14,7 @@ from soup_nlp.evaluate.confidence import (
     BENDING_FACTOR,
     BENDING_SIGMA,
     CONTACT,
+    GUESSED,
     LEAST_SPREAD,
     MIXED,
     MOST_SIGMA,
@@ -369,9 +370,14 @@ def test_a_scale_is_open_where_contact_makes_a_component_too_fast(small_room):
     np.testing.assert_array_equal(scale(5.0)[~one], usual[~one])
 
 
-def test_a_camera_at_rest_leaves_everything_a_guess(small_room):
+def test_a_camera_at_rest_leaves_everything_a_guess_that_keeps_its_order(small_room):
     rests = replace(small_room, start=replace(small_room.start, at_rest=True))
-    assert sure_of(rests).guessed == 1.0
+    moving, resting = sure_of(small_room).sigma, sure_of(rests).sigma
+    least = GUESSED / np.hypot(1, GUESSED / SIGMA_PRIOR)
+    assert least <= resting.min() <= resting.max() <= SIGMA_PRIOR
+    known = moving < MOST_SIGMA
+    assert np.all(np.diff(resting[known][np.argsort(moving[known])]) > -1e-9)
+    assert np.unique(resting).size > 1000
 
 
 def test_where_surfaces_bend_nothing_is_surer_than_relief_without_parallax(small_room):
