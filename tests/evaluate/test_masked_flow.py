@@ -1,0 +1,50 @@
+"""Where a part of the flow is missing, depth is sane and unsure, and the rest stays as it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.pair import Flow
+from soup_nlp.pipeline.run import run
+
+SIZE = 320, 136
+
+
+@pytest.fixture(scope="module")
+def problem():
+    width, height = SIZE
+    scene = {"kind": "scene", "scene": "orbit", "seed": 0, "width": width, "height": height}
+    raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 100}}
+    return make_problem(raw | {"refine": {"enabled": False}})
+
+
+@pytest.fixture(scope="module")
+def whole(problem):
+    return run(problem)
+
+
+def relative_error(done) -> np.ndarray:
+    truth, depth = done.pair.truth.depth_ref, done.reconstruction.depth_ref
+    return np.abs(depth * np.median(truth / depth) - truth) / truth
+
+
+@pytest.mark.parametrize("kind", ["block", "side"])
+def test_a_masked_part_is_sane_and_the_rest_stays(problem, whole, kind):
+    """A quarter of the image without flow, MRE there against that of the best constant depth."""
+    width, height = SIZE
+    v, u = np.mgrid[:height, :width]
+    inside = (abs(u - width / 2) < width / 4) & (abs(v - height / 2) < height / 4)
+    mask = inside if kind == "block" else u < width / 4
+    flow, truth = whole.pair.flow, whole.pair.truth.depth_ref
+    uv, confidence = np.where(mask[..., None], 0, flow.uv), np.where(mask, 0, flow.confidence)
+    masked = run(problem, pair=whole.pair.with_flow(Flow(uv, confidence, "masked")))
+    before, error = (relative_error(done) for done in (whole, masked))
+    constant = np.median(truth[mask])
+    assert error[mask].mean() < 1.1 * np.mean(abs(constant - truth[mask]) / truth[mask])
+    assert error[~mask].mean() < before[~mask].mean() + 0.005
+    sigma = masked.reconstruction.sigma_ref
+    assert np.median(sigma[mask]) > 3 * np.median(sigma[~mask])
+    wrong = mask & (error > 0.2)
+    assert np.sum(sigma[wrong] < 0.1) <= 0.15 * wrong.sum()
