@@ -47,6 +47,9 @@ LEAST_STEP, IN_FRONT = 0.1, 0.35
 """Steps of log depth across the outline of a region, medians along it. A step below the first does
 not agree with the order; the region is then placed so that the step is the second, a guess. True
 steps along such outlines have medians of 0.2 to 1.9."""
+STANDING = 0.23
+"""What stands on another region has no step where it touches it. From this median step along its
+upper outline it agrees with the order."""
 
 
 def covering(seg: Segmentation, pair: Pair, fitted: FlowFit) -> Float:
@@ -192,7 +195,7 @@ def in_order(start: Start, seg: Segmentation, pair: Pair, fitted: FlowFit, o: Se
     if not whole.any():
         return start
     order = np.where(np.abs(contrast) > CONTRAST, whole, 0.0)
-    factor = placed(start.soup, region, order, start.tie == FIXED, seg, pair.K_ref)
+    factor = placed(start.soup, region, order, start.tie, seg, pair.K_ref)
     moved = factor != 1
     # the scale of what is placed is held along its whole outline
     held = moved[seg.pairs].any(axis=1) & (fitted.jump >= CLOSING_PX)
@@ -220,27 +223,28 @@ def regions(start: Start, fitted: FlowFit, seg: Segmentation, o: SeededStart) ->
 
 
 def placed(
-    soup: Soup, region: Int, order: Float, fixed: Mask, seg: Segmentation, K_ref: Float
+    soup: Soup, region: Int, order: Float, tie: Int, seg: Segmentation, K_ref: Float
 ) -> Float:
     """(N,) factor by which the scale of every superpixel is multiplied to bring regions in order.
 
     The largest region stays, and so does what is fixed in the image. The others follow one after
     the other, the one with the most votes against placed regions first. Where the median step of
     log depth across its outlines is below `LEAST_STEP`, the region comes nearer or recedes until
-    that step is `IN_FRONT`. A region without an order moves with the one that it touches most.
+    that step is `IN_FRONT`. What stands on a region that it covers stays if the step across its
+    upper outline is `STANDING`. A region without an order moves with the one that it touches most.
 
     Args:
         soup: Planes.
         region: (N,) region of every superpixel.
         order: (P,) see `vote`.
-        fixed: (N,) True where a superpixel stays.
+        tie: (N,) what gives every superpixel its scale, see `components.TIES`.
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
     """
     region = np.unique(region, return_inverse=True)[1].ravel()
     count = int(region.max()) + 1
     shift, done = np.zeros(count), np.zeros(count, bool)
-    done[[largest(region), *region[fixed]]] = True
+    done[[largest(region), *region[tie == FIXED]]] = True
     across = region[seg.pairs[:, 0]] != region[seg.pairs[:, 1]]
     ends, says = region[seg.pairs[across]], order[across]
     a, b = np.concatenate([ends, ends[:, ::-1]]).T
@@ -248,6 +252,10 @@ def placed(
     step = np.log(depth_from_inside(soup, region, seg, K_ref))
     step = np.concatenate([step[0] - step[1], step[1] - step[0]])
     length = np.tile(seg.boundary_length[across], 2).astype(float)
+    middle = np.array([np.median(seg.anchors[region == c, 1]) for c in range(count)])
+    upper = np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) < middle[a]
+    on_ground = tie == TIES.index("contact below")
+    upper &= np.bincount(region[on_ground], minlength=count)[a] > 0
     touch = np.zeros((count, count))
     np.add.at(touch, (a, b), length)
     free = np.ones(count, bool)
@@ -260,6 +268,9 @@ def placed(
             some = use & (a == c) & (sign * behind > 0)
             now = sign * (step - shift[b])[some]
             gap = quantile(now, length[some], 0.5) if some.any() else IN_FRONT
+            if sign < 0 and (high := some & upper).any():
+                stands = quantile((shift[b] - step)[high], length[high], 0.5) >= STANDING
+                gap = IN_FRONT if stands else gap
             lacks.append(sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0)
         # no scale agrees with both
         shift[c] = sum(lacks) if min(map(abs, lacks)) == 0 else 0.0

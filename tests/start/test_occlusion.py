@@ -146,6 +146,23 @@ def test_what_swings_comes_before_the_wall(swing):
     assert not (start.tie[main] == TIES.index("occlusion")).any()
 
 
+def test_what_stands_before_a_near_wall_keeps_its_contact(monkeypatch):
+    pair = render_scene("room", 1, 512, 218)
+    pair = pair.with_flow(flow_from_truth(pair))
+    seg = build_segmentation(segment(pair.image_ref, 300), pair.image_ref)
+    before = propose(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
+    one = fitted(pair, seg)
+
+    def changed() -> int:
+        start = in_order(before, seg, pair, one, SeededStart())
+        return int((start.tie == TIES.index("occlusion")).sum())
+
+    assert changed() == 0
+    # as much as its depth before the wall behind it could be that of something hanging
+    monkeypatch.setattr(occlusion, "STANDING", np.inf)
+    assert changed() > 10
+
+
 def test_small_pieces_have_no_order(monkeypatch):
     pair, seg = sliding(True)
     before = propose(seg, pair.flow, K, K, SeededStart())
