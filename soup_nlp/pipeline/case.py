@@ -45,12 +45,12 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 from soup_nlp.pipeline.still_layer import see_through
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
-from soup_nlp.start.bending import FlowFit
 from soup_nlp.start.components import TIES
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import in_order
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import FlowFit
 from soup_nlp.storage.memory import require_memory
 from soup_nlp.storage.progress import Watch
 

@@ -12,15 +12,12 @@ components.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.choice import Choice, dominant
@@ -28,7 +25,7 @@ from soup_nlp.start.components import connected_labels, largest
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.merge import candidates
 from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import Views, look
+from soup_nlp.start.views import Views
 
 SYSTEMATIC, LEAST_PX, MOST_PX = 4.0, 0.01, 0.07
 """Systematic error of a dense flow, in units of its noise, and its limits in pixels."""
@@ -106,94 +103,6 @@ def fit_turn(views: Views, count: int = 3000) -> tuple[Float, Float]:
 
     x = fit_robustly(miss, 4)
     return rotation.exp(x[:3]), views.distance(turned(x, views.ray))
-
-
-class FlowFit(NamedTuple):
-    """The flow of every superpixel at sampled pixels, and an affine map fitted to it.
-
-    Attributes:
-        views: Rays, targets and confidence of every superpixel.
-        poor: (N,) True where these are a neighbour's, because too few pixels have a usable flow.
-        fit: (N, 3, 2) affine flow, see `affine_flow`.
-        residual: (N,) its mean error, pixels.
-        jump: (P,) jump of the flow on the boundary of every neighbour pair, see `flow_jump`.
-    """
-
-    views: Views
-    poor: Mask
-    fit: Float
-    residual: Float
-    jump: Float
-
-    @classmethod
-    def of(
-        cls, seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: SeededStart
-    ) -> FlowFit:
-        """Fit a flow; arguments and errors are those of `views.look`."""
-        views, poor = look(seg, flow, K_ref, K_next, o)
-        fit, residual = affine_flow(views)
-        jump = flow_jump(fit, views, seg.pairs, rays(K_ref, seg.boundary))
-        return cls(views, poor, fit, residual, jump)
-
-    @property
-    def centre(self) -> Float:
-        """(N, 3) rays of the next frame to which the anchors move."""
-        moved = self.fit[:, 0] / self.views.focal
-        return np.concatenate([moved, np.ones((len(moved), 1))], axis=1)
-
-
-def followed(fit: Float, views: Views, which: Int, ray: Float) -> Float:
-    """(M, ..., 2) where affine flows bring rays, pixels from the next frame's principal point.
-
-    Args:
-        fit: (N, 3, 2) affine flow of every superpixel, see `affine_flow`.
-        views: Anchors and radii of every superpixel.
-        which: (M,) superpixel whose flow is followed.
-        ray: (M, ..., 3) rays of the reference frame.
-    """
-    wide = (slice(None), *(None,) * (ray.ndim - 2))
-    off = (ray - views.anchor[which][wide])[..., :2] / views.radius[which][(*wide, None)]
-    moved = fit[which, 0][wide] + np.einsum("m...c,mcd->m...d", off, fit[which, 1:])
-    return np.asarray(moved)
-
-
-def flow_jump(fit: Float, views: Views, pairs: Int, boundary_ray: Float) -> Float:
-    """(P,) mean difference of the affine flows of two neighbours on their boundary, pixels.
-
-    Args:
-        fit: (N, 3, 2) affine flow of every superpixel, see `affine_flow`.
-        views: Anchors and radii of every superpixel.
-        pairs: (P, 2) neighbours.
-        boundary_ray: (P, B, 3) rays of the shared boundaries, reference frame.
-    """
-    ends = [followed(fit, views, which, boundary_ray) for which in pairs.T]
-    return np.linalg.norm(ends[0] - ends[1], axis=-1).mean(axis=1)
-
-
-def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Float, Float]:
-    """Affine flow of every superpixel, fitted robustly.
-
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        noise: Residual, pixels, below which errors are squared.
-        rounds: Number of re-weighted fits.
-
-    Returns:
-        (N, 3, 2) maps from offsets in radii to targets in pixels, and (N,) their mean error in
-        pixels, which measures the flow's noise whether surfaces bend or not.
-    """
-    off = (views.ray - views.anchor[:, None])[..., :2] / views.radius[:, None, None]
-    basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
-    target = views.target[..., :2] * np.asarray(views.focal)
-    # without confident pixels any affine map will do: the ridge makes it one
-    w = views.weight + 1e-6
-    fit = np.zeros((len(basis), 3, 2))
-    for _ in range(rounds):
-        right = (basis * w[..., None]).transpose(0, 2, 1)
-        fit = np.linalg.solve(right @ basis + 1e-9 * np.eye(3), right @ target)
-        error = np.linalg.norm(basis @ fit - target, axis=2)
-        w = (views.weight + 1e-6) / np.sqrt(error**2 + noise**2)
-    return fit, views.mean(error)
 
 
 ABOVE_NOISE, LEAST_JUMP = 10.0, 0.25
@@ -296,7 +205,8 @@ def surface_motions(
     noise = reference_noise(residual)
     most = systematic_error(noise) + NOISES * noise
     motions = dominant(views, o)
-    choice = nearest(views, motions)
+    fit = views.fit(motions)
+    choice = Choice.of(motions, fit, np.argmin(fit.penalised(), axis=1))
     surface = joined(surface, usable, seg)
     bends = np.zeros(len(seg), bool)
     for c in np.unique(surface[usable]):
@@ -309,14 +219,6 @@ def surface_motions(
         if not bends[at[0]]:
             motions.append(tried[best])
     return motions, bends
-
-
-def nearest(views: Views, motions: list[Motion]) -> Choice:
-    """The motion of a list with the smallest error for every superpixel."""
-    fit = views.fit(motions)
-    label = np.argmin(fit.penalised(), axis=1)
-    R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
-    return Choice(R, t, fit.pick((np.arange(len(label)), label)), label)
 
 
 def joined(surface: Int, usable: Mask, seg: Segmentation) -> Int:

@@ -191,6 +191,12 @@ class Choice:
     fit: PlaneFit
     label: Int
 
+    @classmethod
+    def of(cls, motions: list[Motion], fit: PlaneFit, label: Int) -> Choice:
+        """The motions of indices (N,) and their planes, from those (N, M) under all M motions."""
+        R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
+        return cls(R, t, fit.pick((np.arange(len(label)), label)), label)
+
     @property
     def error(self) -> Float:
         """(N,) penalised re-projection error, pixels."""
@@ -257,5 +263,4 @@ def rigid_choice(
     # beyond 5 pixels one motion is as wrong as another
     cost = np.minimum(cost + prefer, 5.0)
     label = smooth_choice(cost, flow_affinity(jump, o), seg, o.smoothness)
-    R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
-    return Choice(R, t, fit.pick((np.arange(len(seg)), label)), label), noise
+    return Choice.of(motions, fit, label), noise

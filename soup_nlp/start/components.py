@@ -13,10 +13,13 @@ from soup_nlp.geometry.graph import Segmentation, connected
 from soup_nlp.geometry.soup import Soup
 
 
-def connected_pieces(mask: Mask, seg: Segmentation) -> Int:
-    """(N,) component of every superpixel of a mask over the neighbour pairs, -1 outside."""
-    i, k = seg.pairs.T
-    return np.where(mask, connected_labels(mask[i] & mask[k], seg), -1)
+def connected_pieces(mask: Mask, seg: Segmentation, hold: Mask | bool = True) -> Int:
+    """(N,) connected component of every superpixel of a mask (N,), -1 outside.
+
+    Pairs of neighbours join them, if `hold` (P,) marks these pairs.
+    """
+    joined = np.asarray(mask[seg.pairs].all(axis=1) & hold)
+    return np.where(mask, connected_labels(joined, seg), -1)
 
 
 def connected_labels(hold: Mask, seg: Segmentation) -> Int:

@@ -18,21 +18,20 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bending import FlowFit, fit_robustly
+from soup_nlp.start.bending import fit_robustly
 from soup_nlp.start.choice import CLIP, PIECE_SIZE
 from soup_nlp.start.components import FIXED, TIES, largest
 from soup_nlp.start.edges import follows_edges
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.propose import LEAST_PARALLAX_PX, Start
+from soup_nlp.start.propose import Start
 from soup_nlp.start.settle import (
     MOST_SYSTEMATIC_PX,
     RELIEF,
     SYSTEMATIC,
     most_probable,
 )
-from soup_nlp.start.views import Views
+from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit, Views
 
 Kind = Literal["metric", "relative", "inverse", "ordinal"]
 
@@ -300,8 +299,7 @@ def _placed(
             own[at] = np.inf
             continue
         soup, strong = _component(seen, soup, int(c), prior, sigma)
-        moved = np.linalg.norm(soup.parallax(anchor)[at] * seen.views.focal, axis=1)
-        flow = (start.noise / np.maximum(moved, 1e-3)) ** 2
+        flow = (start.noise / np.maximum(seen.views.parallax(soup)[at], 1e-3)) ** 2
         found = np.log(soup.depth_at(anchor)[at])
         off = np.zeros(len(at))
         if strong.any():
@@ -344,25 +342,25 @@ def _component(seen: _Seen, soup: Soup, c: int, prior: Float, sigma: float) -> t
     if len(use) < FEWEST or not rigid or not length > 0:
         return soup, ~start.borrowed[at] if (~start.borrowed[at]).any() else np.ones(len(at), bool)
     _, R, T_prior, _ = seen.motion(use, np.exp(-prior[use]))
-    part, flat = views.some(at), np.zeros((len(at), 2))
     if not seen.determined(c):
         # any depth explains the flow: the prior's, with the motion that belongs to it
-        own = _soup(np.exp(-prior[at]), flat, R, T_prior, part)
-        return soup.taking(_spread(own, at, len(prior)), mask), np.zeros(len(at), bool)
+        own = views.soup(np.exp(-prior), np.zeros((len(prior), 2)), R, T_prior)
+        return soup.taking(own, mask), np.zeros(len(at), bool)
     error = min(SYSTEMATIC * start.noise, MOST_SYSTEMATIC_PX)
     rest = views.anchor[use], seen.centre[use], np.ones(len(use)), views.focal[0], error
     tried = Motion(soup.R[at[0]], T / length), Motion(R, T_prior / np.linalg.norm(T_prior))
     best = most_probable(tried, *rest, prior[use], sigma)
-    planes = part.fit([best])
+    planes = views.fit([best])
     mu, cost = planes.inverse_depth[:, 0], planes.cost[:, 0]
     strong = (mu > 0) & (planes.parallax[:, 0] * mu > LEAST_PARALLAX_PX) & (cost < CLIP)
-    strong &= seen.usable[at]
+    strong &= seen.usable & mask
     if strong.sum() < PIECE_SIZE:
         return soup, np.ones(len(at), bool)
-    middle = np.median(mu[strong] * np.exp(prior[at][strong]))
-    mu = np.where(strong, mu, middle * np.exp(-prior[at]))
-    own = _soup(mu, np.where(strong[:, None], planes.slope[:, 0], flat), best.R, best.t, part)
-    return soup.taking(_spread(own, at, len(prior)), mask), strong
+    middle = np.median(mu[strong] * np.exp(prior[strong]))
+    mu = np.where(strong, mu, middle * np.exp(-prior))
+    slope = np.where(strong[:, None], planes.slope[:, 0], 0.0)
+    own = views.soup(mu, slope, best.R, best.t)
+    return soup.taking(own, mask), strong[at]
 
 
 def _kept(gap: float, sigma: float, stands: float) -> float:
@@ -386,16 +384,3 @@ def _local(place: Float, strong: Mask, residual: Float, sigma: float) -> Float:
     index = cKDTree(place[strong]).query(place, k=near)[1].reshape(len(place), near)
     squared = np.minimum(residual**2, 1.0)[index].sum(axis=1)
     return np.maximum(np.sqrt((HELD * sigma**2 + squared) / (HELD + near)), LEAST_SIGMA)
-
-
-def _spread(part: Soup, at: Int, count: int) -> Soup:
-    """A soup of `count` superpixels whose superpixels `at` are those of a part."""
-    index = np.zeros(count, int)
-    index[at] = np.arange(len(at))
-    return Soup(part.lam[index], part.n[index], part.d[index], part.R[index], part.t[index])
-
-
-def _soup(mu: Float, slope: Float, R: Float, T: Float, views: Views) -> Soup:
-    """Planes under one motion `X' = R X + T`."""
-    n, D = normal_and_distance(about_anchor(1 / mu, slope / views.radius[:, None], views.anchor))
-    return Soup(D, n, np.ones(len(D)), np.tile(R, (len(D), 1, 1)), T / D[:, None])

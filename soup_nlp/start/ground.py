@@ -18,7 +18,7 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import BELOW as DOWN
-from soup_nlp.start.components import GROUND, connected_labels, largest, quantile
+from soup_nlp.start.components import GROUND, connected_pieces, largest, quantile
 
 LEVEL = 0.92
 """Least cosine between the normal of the ground and the vertical of the image."""
@@ -152,9 +152,8 @@ def floating(
     far = 1 / np.maximum(boundary_ray @ plane, 1e-9)
     stands = (floor == 0) | (mu > STANDS * floor)
     near_ground = ~stands & (mu > (1 - BELOW) * floor)
-    link = stands[i] & stands[k] & (component[i] == component[k])
-    link &= np.abs(np.log(depth[0] / depth[1])) < np.log(WHOLE)
-    region = np.where(stands, connected_labels(link, seg), -1)
+    link = np.abs(np.log(depth[0] / depth[1])) < np.log(WHOLE)
+    region = connected_pieces(stands, seg, link & (component[i] == component[k]))
     # every pair in both directions: own side, other side, gap to it and to the ground
     own, other = np.concatenate([seg.pairs, seg.pairs[:, ::-1]]).T
     gap = np.log(np.concatenate([depth[1] / depth[0], depth[0] / depth[1]]))

@@ -161,8 +161,7 @@ def _one_motion_each(
     main = main_motion(choice.label)
     R_main = choice.R[np.argmax(choice.label == main)]
     mover = choice.label != main
-    i, k = seg.pairs.T
-    piece = connected_labels(mover[i] & mover[k] & whole, seg)
+    piece = connected_pieces(mover, seg, whole)
     for c in np.unique(piece[mover]):
         at = np.flatnonzero(mover & (piece == c))
         held = np.unique(choice.label[at])

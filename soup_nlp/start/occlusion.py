@@ -18,7 +18,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bending import FlowFit, fit_turn, followed
+from soup_nlp.start.bending import fit_turn
 from soup_nlp.start.components import (
     FIXED,
     TIES,
@@ -30,6 +30,7 @@ from soup_nlp.start.components import (
 from soup_nlp.start.merge import SMALL
 from soup_nlp.start.propose import Start
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import FlowFit, followed
 
 WIDEST = 8
 """Largest width of a strip beside an outline, pixels."""

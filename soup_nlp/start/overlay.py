@@ -14,11 +14,11 @@ from scipy.spatial import Delaunay
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.start.choice import PIECE_SIZE, dominant
-from soup_nlp.start.components import connected_labels
+from soup_nlp.start.components import connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import BELOW, ground
 from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import Views
+from soup_nlp.start.views import LEAST_PARALLAX_PX, Views
 
 STILL_PX = 1.0
 """Mean displacement up to which a superpixel may stand still, pixels: it may reflect what moves."""
@@ -29,8 +29,6 @@ LEAST_SCENE = 0.6
 still may be the scene."""
 LEAST_SHARE = 0.5
 """Least share of still superpixels in a piece with continuous flow."""
-LEAST_PARALLAX_PX = 0.25
-"""Parallax from which a superpixel counts for the ground, pixels."""
 
 
 def fixed_to_camera(
@@ -94,8 +92,7 @@ def towards_border(core: Mask, seg: Segmentation) -> Mask:
         seg: Superpixels and graphs.
     """
     height, width = seg.labels.shape
-    i, k = seg.pairs.T
-    region = connected_labels(core[i] & core[k], seg)
+    region = connected_pieces(core, seg)
     x, y = seg.anchors.T
     side = np.argmin(np.stack([y, height - 1 - y, x, width - 1 - x]), axis=0)
     lines = seg.labels[0], seg.labels[-1], seg.labels[:, 0], seg.labels[:, -1]

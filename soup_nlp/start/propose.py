@@ -10,10 +10,8 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import (
-    FlowFit,
     constant_depth,
     reference_noise,
     surface_motions,
@@ -26,6 +24,7 @@ from soup_nlp.start.components import (
     TIES,
     borrow,
     connected_labels,
+    connected_pieces,
     contact_scales,
     largest,
     rigid_components,
@@ -37,13 +36,9 @@ from soup_nlp.start.merge import earned, gather, mixtures
 from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
 from soup_nlp.start.settle import settle
 from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import USABLE, Views
+from soup_nlp.start.views import LEAST_PARALLAX_PX, USABLE, FlowFit, Views
 
 __all__ = ["SeededStart", "Start", "propose"]
-
-
-LEAST_PARALLAX_PX = 0.25
-"""Parallax below which the depth of a superpixel is borrowed from its neighbours, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +144,8 @@ def propose(
     turn = turn_alone(views, choice, component, usable, reference_noise(residual))
     if turn is not None or bends.all():
         return _constant(views, surface, choice, limited_noise(residual), turn)
-    free = constant_depth(views) if bends.any() else None
-    if free is not None:
+    free = constant_depth(views)
+    if bends.any():
         # the flow of bending regions says nothing about the motions of the rest
         views, poor = views.without(bends), poor | bends
         choice, noise = rigid_motions(views, seg, jump, motions, o)
@@ -163,17 +158,14 @@ def propose(
     soup, weak = _with_depth(choice, views, poor | wrong, seg)
     label, parallax = choice.label, choice.parallax
     component, error = rigid_components(label, seg), choice.fit.cost[:, 0]
-    if free is not None:
-        soup, error = soup.taking(free[0], bends), np.where(bends, free[1], error)
-        parallax = np.where(bends, _parallax(free[0], views), parallax)
-        label = np.where(bends, -1, label)
-        component = with_regions(component, bends, seg)
-    if fixed.any():
-        at_camera = Soup(soup.lam, soup.n, soup.d, 0 * soup.R + np.eye(3), 0 * soup.t)
-        soup, error = soup.taking(at_camera, fixed), np.where(fixed, shift, error)
-        parallax, label = np.where(fixed, 0.0, parallax), np.where(fixed, -1, label)
-        component = with_regions(component, fixed, seg)
-        wrong |= fixed & (shift > STILL_PX)
+    at_camera = Soup(soup.lam, soup.n, soup.d, 0 * soup.R + np.eye(3), 0 * soup.t)
+    for mask, made, miss in ((bends, *free), (fixed, at_camera, shift)):
+        if mask.any():
+            soup, error = soup.taking(made, mask), np.where(mask, miss, error)
+            parallax = np.where(mask, views.parallax(made), parallax)
+            label = np.where(mask, -1, label)
+            component = with_regions(component, mask, seg)
+    wrong |= fixed & (shift > STILL_PX)
     scale, tie = contact_scales(soup, component, seg, K_ref, o.upright, fixed, usable)
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t)
     grounded = np.zeros(len(seg), bool)
@@ -223,7 +215,7 @@ def _with_depth(choice: Choice, views: Views, poor: Mask, seg: Segmentation) -> 
         length = np.ones(len(seg))
         mu, slope = borrow(mu, slope, choice.label, weak, seg)
     t = choice.t * length[:, None]
-    return _soup(mu, slope, choice.R, t, views.anchor, views.radius), weak
+    return views.soup(mu, slope, choice.R, t), weak
 
 
 def _constant(
@@ -232,15 +224,14 @@ def _constant(
     """Start without relief, where everything bends or the camera is at rest (`turn` is given)."""
     soup, error = constant_depth(views, turn)
     zero, every = np.zeros(len(surface), np.int64), np.ones(len(surface), bool)
-    own = soup, error, _parallax(soup, views), every, zero - 1, zero, zero
+    own = soup, error, views.parallax(soup), every, zero - 1, zero, zero
     found = *own, choice.renumbered()[1], surface, zero, ~every, every
     return Start(*found, ~every, at_rest=turn is not None, noise=noise)
 
 
 def with_regions(component: Int, mask: Mask, seg: Segmentation) -> Int:
     """(N,) components without gaps in their numbers; each connected region of a mask is one."""
-    region = connected_labels(mask[seg.pairs[:, 0]] & mask[seg.pairs[:, 1]], seg)
-    component = np.where(mask, component.max() + 1 + region, component)
+    component = np.where(mask, component.max() + 1 + connected_pieces(mask, seg), component)
     return np.unique(component, return_inverse=True)[1].ravel()
 
 
@@ -274,7 +265,7 @@ def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
     soup, borrowed = unorganised(views, seg, o)
     soup = soup.normalised()
     error = views.distance(soup.moved(soup.points(views.ray)))
-    parallax, whole = _parallax(soup, views), np.zeros(len(seg), np.int64)
+    parallax, whole = views.parallax(soup), np.zeros(len(seg), np.int64)
     noise = limited_noise(error)
     none = np.zeros(len(seg), bool)
     own = soup, error, parallax, borrowed, whole - 1, whole, whole
@@ -310,13 +301,3 @@ def _on_ground(
     # components are numbered without gaps
     component = np.unique(component, return_inverse=True)[1].ravel()
     return Soup(lam, soup.n, soup.d, soup.R, soup.t), component, tie, floor
-
-
-def _parallax(soup: Soup, views: Views) -> Float:
-    """(N,) distance in pixels between the moved and the merely rotated anchor."""
-    return np.linalg.norm(soup.parallax(views.anchor) * np.asarray(views.focal), axis=1)
-
-
-def _soup(mu: Float, slope: Float, R: Float, t: Float, anchor: Float, radius: Float) -> Soup:
-    n, D = normal_and_distance(about_anchor(1 / mu, slope / radius[:, None], anchor))
-    return Soup(D, n, np.ones(len(D)), R.copy(), t / D[:, None])

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.plane_fit import PlaneFit, fit_planes
+from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import sample_pixels
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.start_options import SeededStart
 
 USABLE = 0.5
 """Mean confidence above which the flow of a superpixel counts."""
+LEAST_PARALLAX_PX = 0.25
+"""Parallax from which the flow of a superpixel determines its depth, pixels."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,23 @@ class Views:
         """(N,) mean of the samples' values (N, S), weighted by confidence; 0 without any."""
         total = np.maximum(self.weight.sum(axis=1), 1e-9)
         return np.asarray(np.sum(self.weight * value, axis=1) / total)
+
+    def soup(self, mu: Float, slope: Float, R: Float, T: Float) -> Soup:
+        """Planes with motions `X' = R X + T`, all scales such that `d` is 1.
+
+        Args:
+            mu: (N,) inverse depth at the anchors.
+            slope: (N, 2) relative change of mu over the radius.
+            R: (N, 3, 3) rotations, or (3, 3) of all.
+            T: (N, 3) translations, or (3,) of all.
+        """
+        n, D = normal_and_distance(about_anchor(1 / mu, slope / self.radius[:, None], self.anchor))
+        R = np.broadcast_to(R, (len(D), 3, 3)).copy()
+        return Soup(D, n, np.ones(len(D)), R, T / D[:, None])
+
+    def parallax(self, soup: Soup) -> Float:
+        """(N,) distance in pixels between the moved and the merely rotated anchor."""
+        return np.linalg.norm(soup.parallax(self.anchor) * np.asarray(self.focal), axis=1)
 
     def without(self, mask: Mask) -> Views:
         """The same with confidence 0 in the superpixels of a mask (N,)."""
@@ -124,10 +147,96 @@ def _fill_poor(
     poor = count < least
     if not poor.any() or poor.all():
         return index, there, poor
-    from scipy.spatial import cKDTree
-
     rich = np.flatnonzero(~poor)
     _, nearest = cKDTree(seg.anchors[rich]).query(seg.anchors[poor])
     index, there = index.copy(), there.copy()
     index[poor], there[poor] = index[rich[nearest]], there[rich[nearest]]
     return index, there, poor
+
+
+class FlowFit(NamedTuple):
+    """The flow of every superpixel at sampled pixels, and an affine map fitted to it.
+
+    Attributes:
+        views: Rays, targets and confidence of every superpixel.
+        poor: (N,) True where these are a neighbour's, because too few pixels have a usable flow.
+        fit: (N, 3, 2) affine flow, see `affine_flow`.
+        residual: (N,) its mean error, pixels.
+        jump: (P,) jump of the flow on the boundary of every neighbour pair, see `flow_jump`.
+    """
+
+    views: Views
+    poor: Mask
+    fit: Float
+    residual: Float
+    jump: Float
+
+    @classmethod
+    def of(
+        cls, seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: SeededStart
+    ) -> FlowFit:
+        """Fit a flow; arguments and errors are those of `look`."""
+        views, poor = look(seg, flow, K_ref, K_next, o)
+        fit, residual = affine_flow(views)
+        jump = flow_jump(fit, views, seg.pairs, rays(K_ref, seg.boundary))
+        return cls(views, poor, fit, residual, jump)
+
+    @property
+    def centre(self) -> Float:
+        """(N, 3) rays of the next frame to which the anchors move."""
+        moved = self.fit[:, 0] / self.views.focal
+        return np.concatenate([moved, np.ones((len(moved), 1))], axis=1)
+
+
+def followed(fit: Float, views: Views, which: Int, ray: Float) -> Float:
+    """(M, ..., 2) where affine flows bring rays, pixels from the next frame's principal point.
+
+    Args:
+        fit: (N, 3, 2) affine flow of every superpixel, see `affine_flow`.
+        views: Anchors and radii of every superpixel.
+        which: (M,) superpixel whose flow is followed.
+        ray: (M, ..., 3) rays of the reference frame.
+    """
+    wide = (slice(None), *(None,) * (ray.ndim - 2))
+    off = (ray - views.anchor[which][wide])[..., :2] / views.radius[which][(*wide, None)]
+    moved = fit[which, 0][wide] + np.einsum("m...c,mcd->m...d", off, fit[which, 1:])
+    return np.asarray(moved)
+
+
+def flow_jump(fit: Float, views: Views, pairs: Int, boundary_ray: Float) -> Float:
+    """(P,) mean difference of the affine flows of two neighbours on their boundary, pixels.
+
+    Args:
+        fit: (N, 3, 2) affine flow of every superpixel, see `affine_flow`.
+        views: Anchors and radii of every superpixel.
+        pairs: (P, 2) neighbours.
+        boundary_ray: (P, B, 3) rays of the shared boundaries, reference frame.
+    """
+    ends = [followed(fit, views, which, boundary_ray) for which in pairs.T]
+    return np.linalg.norm(ends[0] - ends[1], axis=-1).mean(axis=1)
+
+
+def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Float, Float]:
+    """Affine flow of every superpixel, fitted robustly.
+
+    Args:
+        views: Rays, targets and confidence of every superpixel.
+        noise: Residual, pixels, below which errors are squared.
+        rounds: Number of re-weighted fits.
+
+    Returns:
+        (N, 3, 2) maps from offsets in radii to targets in pixels, and (N,) their mean error in
+        pixels, which measures the flow's noise whether surfaces bend or not.
+    """
+    off = (views.ray - views.anchor[:, None])[..., :2] / views.radius[:, None, None]
+    basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
+    target = views.target[..., :2] * np.asarray(views.focal)
+    # without confident pixels any affine map will do: the ridge makes it one
+    w = views.weight + 1e-6
+    fit = np.zeros((len(basis), 3, 2))
+    for _ in range(rounds):
+        right = (basis * w[..., None]).transpose(0, 2, 1)
+        fit = np.linalg.solve(right @ basis + 1e-9 * np.eye(3), right @ target)
+        error = np.linalg.norm(basis @ fit - target, axis=2)
+        w = (views.weight + 1e-6) / np.sqrt(error**2 + noise**2)
+    return fit, views.mean(error)

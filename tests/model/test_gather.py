@@ -13,14 +13,13 @@ from soup_nlp.data.scenes.raycast import render
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.mrf.trws import mrf_energy
-from soup_nlp.start.bending import affine_flow, flow_jump
 from soup_nlp.start.choice import Choice, flow_affinity, smooth_choice
 from soup_nlp.start.components import borrow
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.merge import gather
 from soup_nlp.start.propose import propose
 from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import look
+from soup_nlp.start.views import affine_flow, flow_jump, look
 
 WIDTH, HEIGHT = 192, 144
 K = camera.intrinsics(180.0, 180.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)

@@ -18,12 +18,12 @@ from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.report.summary import certainty, summary
-from soup_nlp.start.bending import FlowFit
 from soup_nlp.start.components import TIES
 from soup_nlp.start.edges import follows_edges
 from soup_nlp.start.given_depth import CONFIRMED, Given, by_prior
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import FlowFit
 
 WAVE = np.sin(np.mgrid[0:240, 0:320] / 40.0).prod(axis=0)
 """A smooth map that has nothing to do with a scene."""

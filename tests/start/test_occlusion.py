@@ -17,11 +17,11 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start import occlusion
-from soup_nlp.start.bending import FlowFit
 from soup_nlp.start.components import TIES
 from soup_nlp.start.occlusion import IN_FRONT, SURE, covering, in_order, vote
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import FlowFit
 
 HEIGHT, WIDTH, CELL = 96, 128, 16
 K = camera.intrinsics(120.0, 120.0, 63.5, 47.5)

@@ -10,10 +10,10 @@ import pytest
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.plane_fit import PlaneFit
 from soup_nlp.start import epipolar
-from soup_nlp.start.bending import affine_flow, constant_depth
+from soup_nlp.start.bending import constant_depth
 from soup_nlp.start.epipolar import Motion, estimate, sampson, sampson_slopes
 from soup_nlp.start.motions import fit_translation, refine_motion
-from soup_nlp.start.views import Views
+from soup_nlp.start.views import Views, affine_flow
 
 FOCAL = 200.0
 TURN, SHIFT = np.array([0.02, -0.03, 0.01]), np.array([0.5, 0.1, 0.2])
