@@ -90,6 +90,11 @@ def _full(count: int, value: float) -> Float:
     return np.full(count, value if np.isfinite(value) else 0.0)
 
 
+def _rays(data: EnergyData, ends: Int) -> dict[str, Float]:
+    """Anchor rays of both superpixels of pairs (E, 2)."""
+    return {"ray_i": data.anchor_ray[ends[:, 0]], "ray_k": data.anchor_ray[ends[:, 1]]}
+
+
 def _pixel(data: EnergyData, unit: Float) -> dict[str, Float]:
     """A pixel as a length, and as an angle, where norms are not in pixels: for their smoothing.
 
@@ -109,11 +114,9 @@ def _arap(data: EnergyData, w: Weights) -> Element:
         "turn": data.rotation_scale,
         "sigma": _full(len(e), w.sigma_arap),
         "leak": _full(len(e), w.leak_arap),
-        "ray_i": data.anchor_ray[e[:, 0]],
-        "ray_k": data.anchor_ray[e[:, 1]],
+        **_rays(data, e),
         **_pixel(data, data.edge_unit),
     }
-
     given = truncated, data.arap_at_anchors, data.local_units
     return Element(e, columns, Norms(terms.arap, given), 2)
 
@@ -132,7 +135,6 @@ def _proj(data: EnergyData, w: Weights) -> Element:
         "target": data.pixel_target[used],
         "K": np.tile(K[nonzero], (count, 1)),
     }
-
     places = tuple(zip(*(index.tolist() for index in nonzero)))
     norms = Norms(terms.reprojection, (places, truncated), in_pixels=True)
     return Element(owner, columns, norms, 1)
@@ -146,23 +148,20 @@ def _cont(data: EnergyData, w: Weights) -> Element:
         "factor": data.pair_factor / data.pair_unit,
         "sigma_ref": _full(len(pairs), w.sigma_cont_ref),
         "sigma": _full(len(pairs), w.sigma_cont),
-        "ray_i": data.anchor_ray[pairs[:, 0]],
-        "ray_k": data.anchor_ray[pairs[:, 1]],
+        **_rays(data, pairs),
         "rays": data.boundary_ray.reshape(len(pairs), 3 * samples),
         **_pixel(data, data.pair_unit),
     }
-
     given = samples, *truncated, data.local_units
     return Element(pairs, columns, Norms(terms.continuity, given), 2)
 
 
 def _prior(data: EnergyData, w: Weights) -> Element:
-    ray_i, ray_k = (data.anchor_ray[end] for end in data.edges.T)
+    rays = _rays(data, data.edges)
     columns = {
         "weight": w.prior * data.prior_weight,
-        "reach": np.linalg.norm(ray_i - ray_k, axis=1),
-        "ray_i": ray_i,
-        "ray_k": ray_k,
+        "reach": np.linalg.norm(rays["ray_i"] - rays["ray_k"], axis=1),
+        **rays,
     }
     held = bool(data.prior_relief.any())
     if held:
@@ -176,8 +175,7 @@ def _depth(data: EnergyData, w: Weights) -> Element:
     columns = {
         "weight": w.depth * data.depth_weight[used],
         "change": data.depth_change[used],
-        "ray_i": data.anchor_ray[edges[:, 0]],
-        "ray_k": data.anchor_ray[edges[:, 1]],
+        **_rays(data, edges),
     }
     return Element(edges, columns, Norms(terms.depth), 2)
 
@@ -191,8 +189,7 @@ def _order(data: EnergyData, w: Weights) -> Element:
         "weight": w.order * np.abs(data.order_weight[used]),
         "step": data.order_step[used],
         "ray": data.boundary_ray[used].mean(axis=1),
-        "ray_i": data.anchor_ray[pairs[:, 0]],
-        "ray_k": data.anchor_ray[pairs[:, 1]],
+        **_rays(data, pairs),
     }
     return Element(pairs, columns, Norms(terms.order), 2)
 
@@ -203,7 +200,6 @@ def _orient(data: EnergyData, w: Weights) -> Element:
         "weight": w.orient * data.orient_weight,
         "sigma": _full(len(data.pairs), w.sigma_orient),
     }
-
     return Element(data.pairs, columns, Norms(terms.orientation, (truncated,)), 2)
 
 

@@ -211,8 +211,7 @@ def surface_motions(
     bends = np.zeros(len(seg), bool)
     for c in np.unique(surface[usable]):
         at = np.flatnonzero(usable & (surface == c))
-        R, t = candidates(views, choice, at, motions[0].R, noise, o)
-        tried = [*map(Motion, R, t)]
+        tried = candidates(views, choice, at, motions[0].R, noise, o)
         excess = np.median(views.some(at).fit(tried).cost - residual[at, None], axis=0)
         best = int(np.argmin(excess))
         bends[surface == c] = excess[best] > most

@@ -12,8 +12,7 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane_fit import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.start.components import connected_pieces
-from soup_nlp.start.epipolar import Motion, estimate, repeated
-from soup_nlp.start.motions import fit_translation
+from soup_nlp.start.epipolar import Motion, estimate, fit_translation, repeated
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
 
@@ -102,13 +101,10 @@ def of_pieces(
             break
         own = piece == c
         r, q = views.ray[own].reshape(-1, 3), views.target[own].reshape(-1, 3)
-        w = views.weight[own].ravel()
-        found = estimate(r, q, w, views.focal[0], max(3 * noise, 0.3), o.seed)
-        if found is not None:
-            out.append(found)
-        R = motions[0].R[None]
-        t = fit_translation(R, r[None], q[None], w[None], views.focal[0], max(noise, 0.1))
-        out.append(Motion(motions[0].R, t[0]))
+        flow = r, q, views.weight[own].ravel(), views.focal[0]
+        found = estimate(*flow, max(3 * noise, 0.3), o.seed)
+        out += [] if found is None else [found]
+        out.append(fit_translation(motions[0].R, *flow, max(noise, 0.1)))
     return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +17,9 @@ REFINEMENTS = 5
 
 LEAST_NOISE = 0.01
 """Smallest scale of the robust loss, pixels."""
+NEAR = np.array([0.02] * 3 + [0.3] * 2)
+"""Standard deviations of the change of a motion by `refine_near`: rotation in radians, direction of
+the translation."""
 
 
 @dataclass(frozen=True)
@@ -131,12 +135,7 @@ def refine(
     motion: Motion, r: Float, q: Float, weight: Float, focal: float, threshold: float = 1.0
 ) -> Motion:
     """Motion that minimises the robust (Cauchy), weighted Sampson distance."""
-    root = np.sqrt(weight)
-    basis = np.linalg.svd(motion.t[None])[2][1:]
-
-    def unpack(x: Float) -> Motion:
-        t = motion.t + x[3:] @ basis
-        return Motion(motion.R @ rotation.exp(x[:3]), t / np.linalg.norm(t))
+    root, basis, unpack = np.sqrt(weight), tangent(motion.t), around(motion)
 
     def residual(x: Float) -> Float:
         return root * sampson(unpack(x).essential(), r, q, focal)
@@ -161,6 +160,103 @@ def refine(
             break
         scale = max(noise, LEAST_NOISE)
     return unpack(x)
+
+
+def tangent(t: Float) -> Float:
+    """(2, 3) unit vectors perpendicular to a translation (3,) and to each other."""
+    return np.asarray(np.linalg.svd(t[None])[2][1:])
+
+
+def around(motion: Motion) -> Callable[[Float], Motion]:
+    """Motions near one, by (5,) parameters: a rotation vector, and shifts along `tangent`."""
+    basis = tangent(motion.t)
+
+    def moved(x: Float) -> Motion:
+        t = motion.t + x[3:] @ basis
+        return Motion(motion.R @ rotation.exp(x[:3]), t / np.linalg.norm(t))
+
+    return moved
+
+
+def refine_near(
+    motion: Motion,
+    r: Float,
+    q: Float,
+    weight: Float,
+    focal: float,
+    noise: float,
+    prior: Float = NEAR,
+    rounds: int = 8,
+) -> Motion:
+    """Motion near a given one that lowers the robust Sampson distance.
+
+    Re-weighted Gauss-Newton steps. A prior holds the directions that a small patch does not
+    determine.
+
+    Args:
+        motion: Where to begin.
+        r: (M, 3) reference rays.
+        q: (M, 3) next rays.
+        weight: (M,) confidence.
+        focal: Pixels per ray unit.
+        noise: Flow noise, pixels.
+        prior: (5,) standard deviations of the change, see `NEAR`.
+        rounds: Gauss-Newton steps.
+    """
+    R, t, turn, stiff = motion.R, motion.t, np.zeros(3), prior**-2.0
+    for _ in range(rounds):
+        y, basis = r @ R.T, tangent(t)
+        cross = np.cross(y, q)
+        sides = np.column_stack([np.cross(t, y)[:, :2], np.cross(q, t) @ R[:, :2]])
+        scale = focal / np.maximum(np.linalg.norm(sides, axis=1), 1e-9)
+        by_turn = (y @ t)[:, None] * q - np.sum(y * q, axis=1)[:, None] * t
+        J = np.column_stack([by_turn, cross @ basis.T]) * scale[:, None]
+        e = scale * (cross @ t)
+        w = weight / (1 + (e / noise) ** 2) / noise**2
+        A = J.T @ (w[:, None] * J) + np.diag(stiff)
+        g = J.T @ (w * e) + stiff * np.append(turn, basis @ (t - motion.t))
+        try:
+            step = -np.linalg.solve(A, g)
+        except np.linalg.LinAlgError:
+            # the prior is below the rounding of A (focal lengths of 1e9)
+            step = -np.linalg.pinv(A, hermitian=True) @ g
+        step *= min(1.0, 0.1 / max(np.abs(step).max(), 1e-12))
+        turn = turn + step[:3]
+        R, t = rotation.exp(turn) @ motion.R, t + step[3:] @ basis
+        t = t / np.linalg.norm(t)
+    return _facing(Motion(R, t), r, q, weight)
+
+
+def fit_translation(
+    R: Float, r: Float, q: Float, weight: Float, focal: float, noise: float, rounds: int = 6
+) -> Motion:
+    """Motion with a given rotation whose translation explains correspondences best.
+
+    The epipolar constraint `t . (R r x q) = 0` is linear in t, which is the eigenvector of the
+    re-weighted scatter matrix with the smallest eigenvalue.
+
+    Args:
+        R: (3, 3) rotation.
+        r: (M, 3) reference rays.
+        q: (M, 3) next rays.
+        weight: (M,) confidence.
+        focal: Pixels per ray unit.
+        noise: Flow noise, pixels: errors beyond it are down-weighted.
+        rounds: Reweighting rounds.
+    """
+    normal, w, t = np.cross(r @ R.T, q), weight, np.zeros(3)
+    for _ in range(rounds):
+        t = np.linalg.eigh((normal * w[:, None]).T @ normal)[1][:, 0]
+        spread = np.maximum(np.linalg.norm(np.cross(t, q)[:, :2], axis=1), 1e-6)
+        # Sampson's weight: error in pixels, not the algebraic one
+        w = weight / (1 + (focal * (normal @ t) / spread / noise) ** 2) / spread**2
+    return _facing(Motion(R, t), r, q, weight)
+
+
+def _facing(motion: Motion, r: Float, q: Float, weight: Float) -> Motion:
+    """The motion with the sign of its translation that puts most points in front of the camera."""
+    vote = weight @ np.sign(triangulate(motion, r, q)[0])
+    return motion if vote >= 0 else Motion(motion.R, -motion.t)
 
 
 def repeated(

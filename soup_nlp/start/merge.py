@@ -22,8 +22,7 @@ from soup_nlp.start.choice import (
     smooth_choice,
 )
 from soup_nlp.start.components import connected_labels, connected_pieces, largest
-from soup_nlp.start.epipolar import Motion, estimate
-from soup_nlp.start.motions import fit_translation, refine_motion
+from soup_nlp.start.epipolar import Motion, estimate, fit_translation, refine_near
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
 
@@ -64,9 +63,8 @@ def gather(
         return choice
     gain = least_gain(noise)
     for share in DISCONTINUITIES:
-        choice = _one_motion_each(
-            views, seg, jump < share * o.discontinuity_px, choice, noise, gain, o
-        )
+        whole = jump < share * o.discontinuity_px
+        choice = _one_motion_each(views, seg, whole, choice, noise, gain, o)
     return _spread(views, seg, jump, choice, gain, o)
 
 
@@ -168,24 +166,22 @@ def _one_motion_each(
         # one motion already, and what a few pixels would change in it is not to be trusted
         if len(at) < PIECE_SIZE or (len(held) == 1 and held[0] >= 0):
             continue
-        R, t = candidates(views, choice, at, R_main, noise, o)
-        shape = len(at), len(R)
-        fit = views.some(at).fit_own(
-            np.broadcast_to(R, (*shape, 3, 3)), np.broadcast_to(t, (*shape, 3))
-        )
+        tried = candidates(views, choice, at, R_main, noise, o)
+        fit = views.some(at).fit(tried)
         cost = fit.penalised()
         m = int(np.argmin(np.minimum(cost, CLIP).mean(axis=0)))
         rows = np.flatnonzero(cost[:, m] < choice.error[at] + gain)
         if len(rows) >= AGREE * len(at):
             planes = fit.pick((rows, np.full(len(rows), m)))
-            choice = choice.taking(at[rows], R[m], t[m], planes, int(choice.label.max()) + 1)
+            own = tried[m].R, tried[m].t, planes, int(choice.label.max()) + 1
+            choice = choice.taking(at[rows], *own)
     return choice
 
 
 def candidates(
     views: Views, choice: Choice, at: Int, R_main: Float, noise: float, o: SeededStart
-) -> tuple[Float, Float]:
-    """(C, 3, 3), (C, 3) candidate motions for superpixels `at`, fitted to all their pixels.
+) -> list[Motion]:
+    """Candidate motions for superpixels `at`, fitted to all their pixels.
 
     These are a translation with the main rotation, before and after refinement, the refined present
     motions of these superpixels, and the motion of their own essential matrix.
@@ -193,24 +189,15 @@ def candidates(
     step = max(1, len(at) * views.ray.shape[1] // PIXELS)
     r, q = (v[at].reshape(-1, 3)[::step] for v in (views.ray, views.target))
     w = views.weight[at].ravel()[::step]
-    focal, near = views.focal[0], max(noise, 0.1)
-    t0 = fit_translation(R_main[None], r[None], q[None], w[None], focal, near)
-    start = [Motion(R_main, t0[0])]
+    own = r, q, w, views.focal[0]
+    start = [fit_translation(R_main, *own, max(noise, 0.1))]
     for c in np.unique(choice.label[at]):
         mine = at[choice.label[at] == c]
         some = mine[:1] if c >= 0 else mine[:: max(1, len(mine) // 5)]
         start += [Motion(choice.R[s], choice.t[s]) for s in some]
-    R, t = (np.stack([getattr(m, name) for m in start]) for name in ("R", "t"))
-    rs, qs, ws = (np.broadcast_to(v, (len(start), *v.shape)) for v in (r, q, w))
-    R, t = refine_motion(R, t, rs, qs, ws, focal, near)
-    found = start[:1]
-    own = estimate(r, q, w, focal, max(3 * noise, 0.3), o.seed)
-    if own is not None:
-        found.append(own)
-    return (
-        np.concatenate([R, np.stack([m.R for m in found])]),
-        np.concatenate([t, np.stack([m.t for m in found])]),
-    )
+    found = estimate(*own, max(3 * noise, 0.3), o.seed)
+    refined = [refine_near(m, *own, max(noise, 0.1)) for m in start]
+    return [*refined, start[0], *([] if found is None else [found])]
 
 
 def _spread(

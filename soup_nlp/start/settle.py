@@ -8,15 +8,14 @@ depths vary as scenes do is the most probable.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float
-from soup_nlp.geometry import rotation
 from soup_nlp.start.choice import PIECE_SIZE, Choice
-from soup_nlp.start.epipolar import Motion, sampson, triangulate
+from soup_nlp.start.epipolar import Motion, around, sampson, triangulate
 from soup_nlp.start.views import Views
 
 SYSTEMATIC, MOST_SYSTEMATIC_PX = 1.5, 0.15
@@ -83,20 +82,19 @@ def most_probable(
         spread: Standard deviation of the relief.
     """
     root, found = np.sqrt(weight / weight.sum()), []
-    for begin in motions:
-        basis = np.linalg.svd(begin.t[None])[2][1:]
 
-        def unpack(x: Float, begin: Motion = begin, basis: Float = basis) -> Motion:
-            t = begin.t + x[3:] @ basis
-            return Motion(rotation.exp(x[:3]) @ begin.R, t / np.linalg.norm(t))
+    def residual(own: Motion) -> Float:
+        distance = cauchy(sampson(own.essential(), r, q, focal), CLIP_PX)
+        depth = cauchy(relief(own, r, q, expected), spread)
+        return np.concatenate([root * distance / error, root * depth / spread])
 
-        def residual(x: Float, unpack: Callable[[Float], Motion] = unpack) -> Float:
-            own = unpack(x)
-            distance = cauchy(sampson(own.essential(), r, q, focal), CLIP_PX)
-            depth = cauchy(relief(own, r, q, expected), spread)
-            return np.concatenate([root * distance / error, root * depth / spread])
-
-        end = least_squares(residual, np.zeros(5), x_scale=[0.01] * 3 + [0.1] * 2, max_nfev=30)
+    for unpack in map(around, motions):
+        end = least_squares(
+            lambda x, unpack=unpack: residual(unpack(x)),
+            np.zeros(5),
+            x_scale=[0.01] * 3 + [0.1] * 2,
+            max_nfev=30,
+        )
         found.append((float(end.cost), unpack(end.x)))
     return min(found, key=lambda one: one[0])[1]
 

@@ -56,10 +56,6 @@ class Views:
         shape = (len(self.ray), len(motions))
         R = np.broadcast_to(np.stack([m.R for m in motions]), (*shape, 3, 3))
         t = np.broadcast_to(np.stack([m.t for m in motions]), (*shape, 3))
-        return self.fit_own(R, t)
-
-    def fit_own(self, R: Float, t: Float) -> PlaneFit:
-        """Planes under own motions R (N, C, 3, 3), t (N, C, 3)."""
         return fit_planes(
             R, t, self.ray, self.target, self.weight, self.anchor, self.radius, self.focal
         )

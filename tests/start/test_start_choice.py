@@ -62,14 +62,14 @@ class Turns:
         self.ray = self.target = np.zeros((n, 4, 3))
         self.weight = np.ones((n, 4)) if self.weight is None else self.weight
 
-    def fit_own(self, R: np.ndarray, t: np.ndarray) -> PlaneFit:
+    def planes(self, R: np.ndarray) -> PlaneFit:
         miss = PER_RADIAN * np.abs(rotation.log(R)[..., 2] - self.true[:, None])
         one = np.ones(miss.shape)
         return PlaneFit(one, np.zeros((*miss.shape, 2)), miss, one)
 
     def fit(self, motions: list[Motion]) -> PlaneFit:
         R = np.stack([m.R for m in motions])
-        return self.fit_own(np.broadcast_to(R, (len(self.true), *R.shape)), np.zeros(3))
+        return self.planes(np.broadcast_to(R, (len(self.true), *R.shape)))
 
     def some(self, at: np.ndarray) -> Turns:
         return Turns(self.true[at])
@@ -82,7 +82,7 @@ def turn(angle: float | np.ndarray) -> np.ndarray:
 def taken(views: Turns, angle: np.ndarray, label: np.ndarray) -> Choice:
     """Superpixels that turn by angles (N,)."""
     R, t = turn(angle), np.tile([1.0, 0.0, 0.0], (len(angle), 1))
-    return Choice(R, t, views.fit_own(R[:, None], t[:, None]), label)
+    return Choice(R, t, views.planes(R[:, None]), label)
 
 
 @pytest.mark.parametrize(("error", "kept"), [(0.0, True), (0.05, False)])
@@ -113,7 +113,9 @@ def test_pieces_of_untrusted_flow_have_no_motion(monkeypatch, confidence, found)
     odd = seg.anchors[:, 0] > 24
     views = Turns(np.zeros(24), np.where(odd[:, None], confidence, 1.0) * np.ones((24, 4)))
     monkeypatch.setattr(choosing, "estimate", lambda *a: Motion(np.eye(3), np.array([0, 1.0, 0])))
-    monkeypatch.setattr(choosing, "fit_translation", lambda *a: np.array([[1.0, 0, 0]]))
+    monkeypatch.setattr(
+        choosing, "fit_translation", lambda *a: Motion(np.eye(3), np.array([1.0, 0, 0]))
+    )
     cost = np.where(odd, 3.0, 0.0)[:, None]
     main = [Motion(np.eye(3), np.array([1.0, 0, 0]))]
     assert bool(of_pieces(views, seg, main, cost, 0.05, OPTIONS)) == found
@@ -131,8 +133,8 @@ def across(seg: Segmentation, own: np.ndarray) -> np.ndarray:
 
 def offered(monkeypatch, *angles: float) -> None:
     """Let these motions be what superpixels may share."""
-    R, t = turn(np.array(angles)), np.tile([1.0, 0.0, 0.0], (len(angles), 1))
-    monkeypatch.setattr(gathering, "candidates", lambda *a: (R, t))
+    motions = [Motion(turn(angle), np.array([1.0, 0.0, 0.0])) for angle in angles]
+    monkeypatch.setattr(gathering, "candidates", lambda *a: motions)
 
 
 @pytest.mark.parametrize("enough", [True, False])

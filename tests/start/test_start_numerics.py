@@ -11,8 +11,14 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.plane_fit import PlaneFit
 from soup_nlp.start import epipolar
 from soup_nlp.start.bending import constant_depth
-from soup_nlp.start.epipolar import Motion, estimate, sampson, sampson_slopes
-from soup_nlp.start.motions import fit_translation, refine_motion
+from soup_nlp.start.epipolar import (
+    Motion,
+    estimate,
+    fit_translation,
+    refine_near,
+    sampson,
+    sampson_slopes,
+)
 from soup_nlp.start.views import Views, affine_flow
 
 FOCAL = 200.0
@@ -28,10 +34,10 @@ def rigid(count: int, seed: int = 0, shift: np.ndarray = SHIFT) -> tuple[Motion,
     return m, r, Y / Y[:, 2:]
 
 
-def off(m: Motion, R: np.ndarray, t: np.ndarray) -> tuple[float, float]:
+def off(m: Motion, other: Motion) -> tuple[float, float]:
     """Angles in radians between motions, of rotation and of translation."""
-    turn = float(np.linalg.norm(rotation.log(m.R.T @ R)))
-    return turn, float(np.arctan2(np.linalg.norm(np.cross(m.t, t)), m.t @ t))
+    turn = float(np.linalg.norm(rotation.log(m.R.T @ other.R)))
+    return turn, float(np.arctan2(np.linalg.norm(np.cross(m.t, other.t)), m.t @ other.t))
 
 
 def perturbed(m: Motion, turn: float, tilt: float, seed: int = 1) -> Motion:
@@ -49,10 +55,7 @@ def perturbed(m: Motion, turn: float, tilt: float, seed: int = 1) -> Motion:
 def test_refinement_finds_the_motion_of_exact_rays(seed):
     m, r, q = rigid(200, seed)
     begin = perturbed(m, 0.009, 0.05, seed)
-    R, t = refine_motion(
-        begin.R[None], begin.t[None], r[None], q[None], np.ones((1, 200)), FOCAL, 0.1
-    )
-    turn, tilt = off(m, R[0], t[0])
+    turn, tilt = off(m, refine_near(begin, r, q, np.ones(200), FOCAL, 0.1))
     assert turn < 2e-5
     assert tilt < 1e-4
 
@@ -65,13 +68,10 @@ def test_a_prior_holds_what_the_pixels_hardly_determine(wrong, priors, weight):
     """It pulls towards where the refinement began, however many steps are made."""
     m, r, q = rigid(200)
     begin = perturbed(m, *wrong)
-    moved = []
+    prior, moved = np.repeat(priors, (3, 2)), []
     for rounds in (30, 600):
-        R, t = refine_motion(
-            *(begin.R[None], begin.t[None], r[None], q[None], np.full((1, 200), weight)),
-            *(FOCAL, 5.0, *priors, rounds),
-        )
-        moved.append(sum(off(begin, R[0], t[0])) / sum(wrong))
+        found = refine_near(begin, r, q, np.full(200, weight), FOCAL, 5.0, prior, rounds)
+        moved.append(sum(off(begin, found)) / sum(wrong))
     # the pixels' pull is there, and is not added up
     assert 1e-4 < moved[1] < 0.2
     assert moved[1] == pytest.approx(moved[0], rel=0.1)
@@ -89,20 +89,18 @@ def test_translations_are_weighed_in_pixels_not_in_algebraic_distances():
     many = 300
     noisy = np.tile(Y / Y[:, 2:], (many, 1, 1))
     noisy[..., :2] += rng.normal(0, 0.1 / FOCAL, (many, 60, 2))
-    R, rs = np.tile(m.R, (many, 1, 1)), np.tile(r, (many, 1, 1))
-    t = fit_translation(R, rs, noisy, np.ones((many, 60)), FOCAL, 0.1)
-    normal = np.cross(rs @ m.R.T, noisy)
+    t = [fit_translation(m.R, r, q, np.ones(60), FOCAL, 0.1).t for q in noisy]
+    normal = np.cross(r @ m.R.T, noisy)
     plain = np.linalg.eigh(normal.transpose(0, 2, 1) @ normal)[1][:, :, 0]
     plain *= np.sign(plain @ m.t)[:, None]
-    error, algebraic = (np.median([off(m, m.R, v)[1] for v in ts]) for ts in (t, plain))
+    error, algebraic = (np.median([off(m, Motion(m.R, v))[1] for v in ts]) for ts in (t, plain))
     assert error < 0.7 * algebraic
 
 
 def test_a_translation_puts_points_in_front():
     for sign in (1.0, -1.0):
         m, r, q = rigid(40, shift=sign * SHIFT)
-        t = fit_translation(m.R[None], r[None], q[None], np.ones((1, 40)), FOCAL, 0.1)
-        assert off(m, m.R, t[0])[1] < 1e-6
+        assert off(m, fit_translation(m.R, r, q, np.ones(40), FOCAL, 0.1))[1] < 1e-6
 
 
 # --- motions of the whole image ------------------------------------------------------------------
@@ -115,7 +113,7 @@ def test_what_is_not_confident_does_not_bend_a_motion():
     q = q + np.where(wrong[:, None], [0.0, 0.5 / FOCAL, 0.0], 0.0)
     weight = np.where(wrong, 1e-12, 1.0)
     found = epipolar.refine(perturbed(m, 0.002, 0.01), r, q, weight, FOCAL)
-    turn, tilt = off(m, found.R, found.t)
+    turn, tilt = off(m, found)
     assert turn < 1e-6
     assert tilt < 1e-5
 
@@ -130,7 +128,7 @@ def test_the_essential_matrix_that_explains_most_is_taken(monkeypatch, place):
     found = estimate(r, q, np.ones(100), FOCAL)
     assert found is not None
     assert np.abs(sampson(found.essential(), r, q, FOCAL)).max() < 1e-6
-    assert max(off(m, found.R, found.t)) < 1e-6
+    assert max(off(m, found)) < 1e-6
 
 
 def test_slopes_of_the_sampson_distance_are_its_differences():
