@@ -10,20 +10,10 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import NoReturn
 
 import numpy as np
 
-from soup_nlp.errors import ModelError
-
 _CACHE_BYTES = 1 << 19  # tables handled together: half of a usual second-level cache
-
-
-def fail(
-    what: str, where: object, found: object, expected: object, hint: str | None = None
-) -> NoReturn:
-    """Raise a :class:`ModelError` with the given parts."""
-    raise ModelError(what, where=where, found=found, expected=expected, hint=hint)
 
 
 @dataclass(frozen=True)
@@ -71,34 +61,6 @@ class Level:
     down: Side
 
 
-def check_edges(edges: object, n_nodes: int) -> np.ndarray:
-    """Edges as an (E, 2) int64 array, checked.
-
-    Args:
-        edges: (E, 2) integers, each row two different nodes; empty allowed.
-        n_nodes: Number of nodes N.
-
-    Raises:
-        ModelError: Wrong shape or type, a node out of range, or an edge from a node to itself.
-    """
-    out = np.asarray(edges)
-    if out.size == 0:
-        return np.zeros((0, 2), dtype=np.int64)
-    if out.ndim != 2 or out.shape[1] != 2 or not np.issubdtype(out.dtype, np.integer):
-        found = f"shape {out.shape}, {out.dtype}"
-        fail("The edges are no pairs of nodes.", "edges", found, "shape (E, 2), integers")
-    bad = ((out < 0) | (out >= n_nodes)).any(axis=1) | (out[:, 0] == out[:, 1])
-    if bad.any():
-        fail(
-            "An edge does not join two different nodes of the MRF.",
-            f"edges[{bad.argmax()}]",
-            out[bad.argmax()].tolist(),
-            f"two different numbers from 0 to {n_nodes - 1}",
-            "the diagonal of the table of a loop belongs to the node's unary cost",
-        )
-    return out.astype(np.int64)
-
-
 def colours(n_nodes: int, edges: np.ndarray) -> np.ndarray:
     """Greedy colouring, largest degree first (Welsh and Powell 1967).
 
@@ -107,7 +69,7 @@ def colours(n_nodes: int, edges: np.ndarray) -> np.ndarray:
 
     Args:
         n_nodes: Number of nodes N.
-        edges: (E, 2) checked edges.
+        edges: (E, 2) edges.
 
     Returns:
         (N,) colour of every node, counted from 0.
@@ -128,7 +90,7 @@ def plan_levels(colour: np.ndarray, edges: np.ndarray) -> list[Level]:
 
     Args:
         colour: (N,) from :func:`colours`.
-        edges: (E, 2) checked edges.
+        edges: (E, 2) edges.
     """
     n, count = len(colour), int(colour.max()) + 1
     forwards = colour[edges[:, 0]] < colour[edges[:, 1]]

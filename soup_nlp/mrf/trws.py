@@ -26,7 +26,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from soup_nlp.mrf.levels import Level, Side, Tables, check_edges, colours, fail, plan_levels
+from soup_nlp.errors import ModelError
+from soup_nlp.mrf.levels import Level, Side, Tables, colours, plan_levels
 
 Callback = Callable[[int, float, float, float], bool | None]
 
@@ -97,17 +98,12 @@ def solve_trws(
             ends them with status ``"interrupted"``.
 
     Raises:
-        ModelError: Inputs of the wrong shape, type or range, or not finite.
+        ModelError: A cost is not finite in the working type.
     """
-    work = _working_type(dtype)
-    for name, value in (("max_iter", max_iter), ("patience", patience)):
-        if value < 1:
-            fail("An option of TRW-S is too small.", name, value, "at least 1")
-    costs = _checked_unary(unary)
-    pairs = check_edges(edges, len(costs))
-    begin = None if init_labels is None else _checked_labels(init_labels, costs, "init_labels")
-    table = _finite(_checked_tables(pairwise, pairs, costs), work)
-    solver = _Passes(costs, plan_levels(colours(len(costs), pairs), pairs), Tables(table))
+    costs, begin = np.asarray(unary, np.float64), init_labels
+    with np.errstate(over="ignore"):
+        table = np.ascontiguousarray(pairwise, dtype)
+    solver = _Passes(costs, plan_levels(colours(len(costs), edges), edges), Tables(table))
     first = math.inf if begin is None else mrf_energy(begin, unary, edges, pairwise)
     best = (first, costs.argmin(axis=1) if begin is None else begin, 0)
     rows: list[tuple[float, float, float]] = []
@@ -152,74 +148,10 @@ def mrf_energy(
         unary: (N, L) costs.
         edges: (E, 2) node numbers.
         pairwise: (E, L, L) tables.
-
-    Raises:
-        ModelError: Inputs of the wrong shape, type or range.
     """
-    costs = _checked_unary(unary)
-    pairs = check_edges(edges, len(costs))
-    x = _checked_labels(labels, costs, "labels")
-    table = _checked_tables(pairwise, pairs, costs)
-    paid = table[np.arange(len(pairs)), x[pairs[:, 0]], x[pairs[:, 1]]]
-    return float(costs[np.arange(len(x)), x].sum()) + math.fsum(paid.tolist())
-
-
-def _working_type(dtype: type | np.dtype) -> np.dtype:
-    found: object = repr(dtype)
-    try:
-        found = out = np.dtype(dtype)
-        if out in (np.dtype(np.float32), np.dtype(np.float64)):
-            return out
-    except TypeError:
-        pass  # it names no type at all
-    fail("TRW-S cannot work in this type.", "dtype", found, "float64 or float32")
-
-
-def _checked_unary(unary: np.ndarray) -> np.ndarray:
-    """(N, L) float64 costs."""
-    costs = np.asarray(unary, np.float64)
-    if costs.ndim != 2 or not costs.size:
-        shape = f"shape {costs.shape}"
-        fail("The unary costs are not one row of labels a node.", "unary", shape, "shape (N, L)")
-    wrong = np.flatnonzero(~(costs > -np.inf).all(axis=1) | np.isinf(costs).all(axis=1))
-    if wrong.size:
-        where, expected = f"unary[{wrong[0]}]", "numbers or +inf, at least one finite"
-        fail("A node has costs that cannot be used.", where, costs[wrong[0]], expected)
-    return costs
-
-
-def _checked_labels(labels: object, costs: np.ndarray, name: str) -> np.ndarray:
-    """(N,) int64 copy of labels that fit (N, L) costs."""
-    out, (nodes, count) = np.asarray(labels), costs.shape
-    if out.shape != (nodes,) or not np.issubdtype(out.dtype, np.integer):
-        found = f"shape {out.shape}, {out.dtype}"
-    elif (out < 0).any() or (out >= count).any():
-        found = f"label {out[(out < 0) | (out >= count)][0]}"
-    else:
-        return out.astype(np.int64)
-    expected = f"{nodes} integers from 0 to {count - 1}"
-    fail("The labels do not fit the nodes.", name, found, expected)
-
-
-def _checked_tables(pairwise: np.ndarray, edges: np.ndarray, costs: np.ndarray) -> np.ndarray:
-    """(E, L, L) tables of the edges of nodes with (N, L) costs."""
-    table, shape = np.asarray(pairwise), (len(edges), costs.shape[1], costs.shape[1])
-    if table.shape != shape and (len(edges) or table.size):
-        fail("The tables have the wrong shape.", "pairwise", table.shape, shape)
-    return table.reshape(shape)
-
-
-def _finite(table: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """(E, L, L) tables in the working type, checked to be finite there."""
-    with np.errstate(over="ignore"):  # what a float32 cannot hold becomes infinite
-        table = np.ascontiguousarray(table, dtype)
-    # least and largest entries are not finite where any entry is not, and need no copy
-    bad = ~(np.isfinite(table.min(axis=(1, 2))) & np.isfinite(table.max(axis=(1, 2))))
-    if bad.any():
-        where = f"pairwise[{bad.argmax()}]"
-        hint = "forbid a pair by a large cost, a label by an infinite unary cost"
-        fail("A table is not finite.", where, "nan or infinity", f"finite in {dtype}", hint)
-    return table
+    paid = pairwise[np.arange(len(edges)), labels[edges[:, 0]], labels[edges[:, 1]]]
+    alone = np.asarray(unary, np.float64)[np.arange(len(labels)), labels]
+    return float(alone.sum()) + math.fsum(paid.tolist())
 
 
 class _Passes:
@@ -232,14 +164,12 @@ class _Passes:
     """
 
     def __init__(self, costs: np.ndarray, plan: list[Level], tables: Tables) -> None:
-        dtype, absent = tables.table.dtype, np.isinf(costs)
-        with np.errstate(over="ignore"):
+        dtype = tables.table.dtype
+        with np.errstate(over="ignore", invalid="ignore"):
             self.costs = costs.astype(dtype)
-        if not np.array_equal(np.isinf(self.costs), absent):
-            fail("A unary cost is too large.", "unary", costs[~absent].max(), f"within {dtype}")
-        self.absent, self.plan, self.tables = absent, plan, tables
+            self.min_marginals = self.costs - self.costs.min(axis=1, keepdims=True)
+        self.absent, self.plan, self.tables = np.isinf(costs), plan, tables
         self.messages = np.zeros((len(tables.table), costs.shape[1]), dtype)
-        self.min_marginals = self.costs - self.costs.min(axis=1, keepdims=True)
 
     def sweep(self) -> float:
         """One forward and one backward pass; the lower bound."""
@@ -254,8 +184,13 @@ class _Passes:
                 self.min_marginals[level.nodes] = belief
                 bound += float(least.sum(dtype=np.float64)) + self._send(level.down, level, belief)
         if not math.isfinite(bound):
-            hint = "the tables must be finite; scale the costs down, or work in float64"
-            fail("The messages of TRW-S overflow.", "pairwise", bound, "a finite bound", hint)
+            raise ModelError(
+                "The messages of TRW-S overflow.",
+                where="unary or pairwise",
+                found=bound,
+                expected="a finite bound",
+                hint="smaller weights, so that all costs but those that forbid a label are finite",
+            )
         return bound
 
     def _beliefs(self, level: Level) -> np.ndarray:

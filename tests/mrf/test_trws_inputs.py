@@ -1,4 +1,4 @@
-"""What TRW-S takes and when it ends: forms of tables, options, interruption, wrong inputs."""
+"""What TRW-S takes and when it ends: forms of tables, options, interruption, infinite costs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from soup_nlp.errors import ModelError
 from soup_nlp.mrf.trws import mrf_energy, solve_trws
 
-NO_TABLES = np.zeros((0, 3, 3))
+NO_EDGES, NO_TABLES = np.zeros((0, 2), int), np.zeros((0, 3, 3))
 
 # --- forms of input ---------------------------------------------------------------------------
 
@@ -46,15 +46,15 @@ def test_parallel_edges_add_up_and_keep_the_bound():
 
 def test_no_edges_lone_nodes_and_single_labels():
     unary = [np.array([2.0, 1.0]), np.array([3.0]), np.array([0.5, 0.5, 4.0])]
-    alone = solve_trws(*padded(unary, np.zeros((0, 2), int), []))
+    alone = solve_trws(*padded(unary, NO_EDGES, []))
     assert (alone.energy, alone.lower_bound, alone.status) == (4.5, 4.5, "gap")
     assert alone.labels.tolist() == [1, 0, 0]
     assert (alone.iterations, alone.ties) == (1, 1)
     joined = solve_trws(*padded(unary, np.array([[1, 0]]), [np.array([[5.0, 7.0]])]))
     assert joined.energy == pytest.approx(10.5)
     assert joined.lower_bound == pytest.approx(10.5)
-    assert solve_trws(np.eye(3), [], np.zeros((0, 3, 3))).energy == 0.0
-    assert solve_trws(np.zeros((2, 1)), [[0, 1]], np.ones((1, 1, 1))).energy == 1.0
+    assert solve_trws(np.eye(3), NO_EDGES, NO_TABLES).energy == 0.0
+    assert solve_trws(np.zeros((2, 1)), np.array([[0, 1]]), np.ones((1, 1, 1))).energy == 1.0
 
 
 def test_tables_of_the_working_type_are_not_copied():
@@ -88,12 +88,14 @@ def test_never_worse_than_the_initial_labels():
 def test_initial_labels_return_where_rounding_misled():
     """In float32 the three costs are one, below the exact cost of the initial label."""
     unary = np.array([[3.5, 3.0, 3.9]]) + 1e8
-    result = solve_trws(unary, [], NO_TABLES, init_labels=np.array([1]), dtype=np.float32)
+    result = solve_trws(unary, NO_EDGES, NO_TABLES, init_labels=np.array([1]), dtype=np.float32)
     assert result.energy == 1e8 + 3.0
     assert result.labels.tolist() == [1]
     assert result.ties == 0
     # where float32 does tell them apart it is the best that is taken
-    result = solve_trws(unary - 1e8, [], NO_TABLES, init_labels=np.array([2]), dtype=np.float32)
+    result = solve_trws(
+        unary - 1e8, NO_EDGES, NO_TABLES, init_labels=np.array([2]), dtype=np.float32
+    )
     assert (result.energy, result.labels.tolist()) == (3.0, [1])
 
 
@@ -172,7 +174,7 @@ def test_interruption_in_the_first_pass(monkeypatch):
 
 
 def test_result_is_frozen():
-    result = solve_trws(np.eye(2), [], np.zeros((0, 2, 2)))
+    result = solve_trws(np.eye(2), NO_EDGES, np.zeros((0, 2, 2)))
     with pytest.raises(AttributeError):
         result.energy = 0.0
 
@@ -191,58 +193,29 @@ def test_energy_is_a_plain_sum(seed):
     assert mrf_energy(labels, unary, edges, tables) == pytest.approx(total, abs=1e-12)
 
 
-# --- wrong inputs -----------------------------------------------------------------------------
+# --- costs that are not finite ----------------------------------------------------------------
 
 GOOD = {
     "unary": np.zeros((3, 2)),
     "edges": np.array([[0, 1], [1, 2]]),
-    "tables": np.zeros((2, 2, 2)),
+    "pairwise": np.zeros((2, 2, 2)),
 }
 
 
 @pytest.mark.parametrize(
-    ("change", "where"),
+    "change",
     [
-        ({"unary": np.zeros((0, 2))}, "unary"),
-        ({"unary": np.zeros(3)}, "unary"),
-        ({"unary": np.array([[0, 1], [np.nan, 0], [0, 0]])}, "unary[1]"),
-        ({"unary": np.array([[0, 1], [0, 0], [-np.inf, 0]])}, "unary[2]"),
-        ({"unary": np.array([[0, 1], [0, 0], [np.inf, np.inf]])}, "unary[2]"),
-        ({"unary": np.full((3, 2), 1e300), "dtype": np.float32}, "unary"),
-        ({"edges": np.array([[0, 1], [1, 3]])}, "edges[1]"),
-        ({"edges": np.array([[-1, 1], [1, 2]])}, "edges[0]"),
-        ({"edges": np.array([[0, 1], [2, 2]])}, "edges[1]"),
-        ({"edges": np.array([[0.0, 1.0], [1.0, 2.0]])}, "edges"),
-        ({"edges": np.array([0, 1, 2])}, "edges"),
-        ({"tables": np.zeros((2, 2, 3))}, "pairwise"),
-        ({"tables": np.zeros((1, 2, 2))}, "pairwise"),
-        ({"tables": np.full((2, 2, 2), np.inf)}, "pairwise[0]"),
-        ({"tables": np.full((2, 2, 2), 1e300), "dtype": np.float32}, "pairwise[0]"),
-        ({"tables": np.where(np.arange(2) == 1, np.nan, 0.0) * np.ones((2, 2, 2))}, "pairwise[0]"),
-        ({"dtype": np.int32}, "dtype"),
-        ({"dtype": "text"}, "dtype"),
-        ({"max_iter": 0}, "max_iter"),
-        ({"patience": 0}, "patience"),
-        ({"init_labels": np.array([0, 1, 2])}, "init_labels"),
-        ({"init_labels": np.array([0.0, 1.0, 1.0])}, "init_labels"),
+        {"unary": np.array([[0, 1], [np.nan, 0], [0, 0]])},
+        {"unary": np.array([[0, 1], [0, 0], [-np.inf, 0]])},
+        {"unary": np.array([[0, 1], [0, 0], [np.inf, np.inf]])},
+        {"unary": np.full((3, 2), 1e300), "dtype": np.float32},
+        {"pairwise": np.full((2, 2, 2), np.inf)},
+        {"pairwise": np.full((2, 2, 2), 1e300), "dtype": np.float32},
+        {"pairwise": np.where(np.arange(2) == 1, np.nan, 0.0) * np.ones((2, 2, 2))},
     ],
 )
-def test_wrong_inputs_are_named(change, where):
-    case = {**GOOD, **change}
-    with pytest.raises(ModelError) as caught:
-        solve_trws(case.pop("unary"), case.pop("edges"), case.pop("tables"), **case)
-    assert caught.value.where == where
+def test_costs_that_are_not_finite_are_refused(change):
+    with pytest.raises(ModelError, match="overflow") as caught:
+        solve_trws(**{**GOOD, **change})
     assert caught.value.found is not None
     assert caught.value.expected is not None
-
-
-@pytest.mark.parametrize("shape", [(2, 3, 3), (2, 1, 1), (5, 2, 2)])
-def test_the_energy_of_tables_of_the_wrong_shape_is_refused(shape):
-    with pytest.raises(ModelError) as caught:
-        mrf_energy(np.zeros(3, int), GOOD["unary"], GOOD["edges"], np.zeros(shape))
-    assert caught.value.where == "pairwise"
-
-
-def test_the_energy_of_too_few_labels_is_refused():
-    with pytest.raises(ModelError, match="labels"):
-        mrf_energy(np.zeros(2, int), GOOD["unary"], GOOD["edges"], GOOD["tables"])
