@@ -129,7 +129,7 @@ def _overrides(values: Mapping[str, Any]) -> Overrides:
 
 _WEIGHTS = tuple(f"energy.weights.{w}" for w in ("arap", "proj", "cont", "orient", "sigma_cont"))
 _ADDED = ("prior", "sigma_arap", "leak_arap")
-_PIXELS = {key: default(key) for key in ("energy.units", "energy.rotation_px", *_WEIGHTS)}
+_PIXELS = {key: default(key) for key in ("energy.units", *_WEIGHTS)}
 _HELD = {f"energy.weights.{w}": default(f"energy.weights.{w}") for w in _ADDED}
 _MORE = {"energy.pixel_samples": 64, "segmentation.boundary_samples": 12}
 _SMALL = {"max_size": 0.05}
@@ -207,10 +207,10 @@ DEPARTURES = (
     ),
     Departure(
         "proposals beyond walks, depths within reach",
-        ("refine.proposals", "refine.depth_reach"),
+        ("refine.proposals",),
     ),
     Departure("rounds end early", ("refine.rounds", "refine.stagnation")),
-    Departure("images in the refinement", ("refine.photo", "refine.sweep")),
+    Departure("images in the refinement", ("refine.photo",)),
 )
 """Every departure that options can undo; a test checks for missing ones."""
 

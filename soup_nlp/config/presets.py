@@ -45,7 +45,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "arap_at_anchors": False,
                 "arap_across": 1.0,
                 "cont_occluded": 1.0,
-                "rotation_px": None,
                 "weights": {
                     "arap": 500.0,
                     "proj": 1.0,
@@ -69,10 +68,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "rounds": 5,
                 "particles": 50,
                 "proposals": "walks",
-                "depth_reach": 1e6,
                 "stagnation": 0.0,
                 "photo": 0.0,
-                "sweep": 0,
             },
         }
     }

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from soup_nlp.schema.section import NonNegative, Positive, Samples, Section, Share, Truncation
+from soup_nlp.schema.section import NonNegative, Samples, Section, Share, Truncation
 
 
 class Weights(Section):
@@ -99,8 +99,6 @@ class EnergyOptions(Section):
     paper's."""
     cont_occluded: Share = 0.03
     """Factor of E_cont where one component occludes another; 1 is the paper's."""
-    rotation_px: Positive | None = None
-    """Pixels per radian of rotation difference; null for the focal length."""
     pixel_samples: Samples | Literal["all"] = 16
     """Pixels per superpixel in E_proj, or all."""
     weights: Weights = Weights()

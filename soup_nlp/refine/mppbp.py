@@ -32,12 +32,21 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.refine.anchored import neighbours
 from soup_nlp.refine.costs import PairCosts, Particles, feasible, unary_costs
-from soup_nlp.refine.kinds import COMMON, KINDS, SHARES, WALKS, counts, relearn
 from soup_nlp.refine.particles import Proposals, Proposer
-from soup_nlp.refine.photometric import Photometric
+from soup_nlp.refine.photometric import Photometric, swept
+from soup_nlp.refine.population import (
+    COMMON,
+    KINDS,
+    SHARES,
+    WALKS,
+    conditional_costs,
+    counts,
+    diverse,
+    relearn,
+    spread_of,
+    within_reach,
+)
 from soup_nlp.refine.records import Refined, RefineOptions, Round
-from soup_nlp.refine.select import conditional_costs, diverse, spread_of, within_reach
-from soup_nlp.refine.sweep import swept
 from soup_nlp.storage.progress import Progress, Watch
 
 CURRENT, KEPT = KINDS.index("current"), KINDS.index("kept")
@@ -45,6 +54,11 @@ KEPT_SHARE = 0.25
 """Share of the particles that stays for the next round."""
 TRWS_ITERATIONS, TRWS_GAP = 15, 1e-4
 """Most iterations of TRW-S in a round, and the relative gap at which it stops earlier."""
+DEPTH_REACH = 2.0
+"""A proposed depth is at most this many times the upper quartile of the neighbours' depths, and at
+least their lower quartile over this squared."""
+SWEPT = 6
+"""Planes swept over depth that every superpixel is offered, where images count."""
 CONTRADICTED = 0.06
 """Share of superpixels whose flow the images contradict, below which there is one round: on such
 pairs the MRE after four is that after one."""
@@ -96,8 +110,8 @@ def refine_soup(
     proposer = Proposer(data, neighbours(pair_costs.edges, data.anchor_ray), seed)
     costs = _Costs(data, weights, photo, o, rays, min_facing, pair_costs, proposer.near)
     rounds = _Rounds(costs, proposer, watch or Watch(), best, energy, begin + o.max_seconds)
-    if photo is not None and o.sweep and not rounds.agreed:
-        rounds.kept = swept(best, *proposer.commonest(best, 2), data, photo, o.sweep)
+    if photo is not None and not rounds.agreed:
+        rounds.kept = swept(best, *proposer.commonest(best, 2), data, photo, SWEPT)
     status, done = rounds.run(), tuple(rounds.done)
     return Refined(
         rounds.best,
@@ -140,7 +154,7 @@ class _Costs:
         data: Numbers of the energy.
         weights: Its constants.
         photo: Photometric term; None for the flow alone.
-        options: Precision of the tables, and how far depth may go in a round.
+        options: Kinds of proposals: walks may reach any depth.
         rays: Where visibility is imposed, see `EnergyData.visibility_ray`.
         min_facing: Least facing there.
         pairs: Costs of pairs of particles.
@@ -158,7 +172,7 @@ class _Costs:
 
     def of(self, best: Soup, p: Particles) -> tuple[Float, NDArray[np.floating]]:
         """Unary and pairwise costs of particles; what is not feasible costs infinitely much."""
-        data, o = self.data, self.options
+        data = self.data
         flow = self.photo.costs_of_flow if self.photo else unary_costs
         unary, ahead = flow(p, data, self.weights)
         unit = float(np.sum(data.share * best.distance))
@@ -167,8 +181,10 @@ class _Costs:
             unary -= slope * data.share[:, None] * (p.D - best.distance[:, None]) / unit
         if self.photo is not None:
             unary += self.photo.costs(p, self.photo.unit(best))
-        reached = within_reach(p, best, self.near, data.anchor_ray, o.depth_reach)
-        unary[~(ahead & feasible(p, self.rays, self.min_facing) & reached)] = np.inf
+        allowed = ahead & feasible(p, self.rays, self.min_facing)
+        if self.options.proposals != "walks":
+            allowed &= within_reach(p, best, self.near, data.anchor_ray, DEPTH_REACH)
+        unary[~allowed] = np.inf
         # the current belief is allowed even where it violates a constraint
         lost = ~np.isfinite(unary[:, 0])
         if lost.any():

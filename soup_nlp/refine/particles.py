@@ -21,7 +21,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.refine.anchored import Local, fit_motion
 from soup_nlp.refine.costs import Particles
-from soup_nlp.refine.kinds import COMMON, KINDS, WALKS, Spread
+from soup_nlp.refine.population import COMMON, KINDS, WALKS, Spread
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.schema.limits import MAX_PARTICLES, MOST
+from soup_nlp.schema.limits import MAX_PARTICLES
 from soup_nlp.schema.section import (
     Count,
     NonNegative,
@@ -32,17 +32,12 @@ class RefineOptions(Section):
     particles: Annotated[int, Field(ge=2, le=MAX_PARTICLES)] = 50
     """Labels of every superpixel, the current belief among them."""
     proposals: Literal["all", "walks"] = "all"
-    """all, or walks: steps around the current belief alone, as in the paper."""
-    depth_reach: Annotated[float, Field(ge=1, le=MOST)] = 2.0
-    """A new depth is at most this many times the upper quartile of the neighbours' depths, and
-    at least their lower quartile over this squared."""
+    """all, or walks: steps around the current belief alone, to any depth, as in the paper."""
     stagnation: NonNegative = 1e-2
     """End after a round that lowers the objective by less than this share; 0 never."""
     photo: NonNegative = 10.0
     """Factor of E_photo, which measures how far the images contradict a superpixel's homography
     (`refine.photometric`); 0 leaves the images out."""
-    sweep: Count = 6
-    """Planes swept over depth that every superpixel is offered, where images count."""
     max_seconds: Tolerance = 300.0
     """Time limit of the rounds together."""
 

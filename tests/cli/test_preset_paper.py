@@ -20,7 +20,8 @@ from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.layout import TangentLayout
 from soup_nlp.model.reweighting import in_length
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
-from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.homographies import Matches, fit_homography, in_front, plane_of
@@ -52,7 +53,6 @@ PAPER = {
     "refine.stagnation": 0.0,
     "refine.proposals": "walks",
     "refine.photo": 0.0,
-    "refine.sweep": 0,
 }
 STREET = {"kind": "scene", "scene": "street", "width": 256, "height": 112}
 SMALL = {"input": STREET, "segmentation": {"superpixels": 60, "neighbours": 8}}

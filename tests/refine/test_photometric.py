@@ -20,14 +20,22 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.refine.costs import Particles
 from soup_nlp.refine.mppbp import objective, refine_soup
-from soup_nlp.refine.photometric import BEHIND, SAMPLES, TAU, UNSEEN, Photometric, photometric_term
+from soup_nlp.refine.photometric import (
+    BEHIND,
+    SAMPLES,
+    TAU,
+    UNSEEN,
+    Photometric,
+    common_normals,
+    photometric_term,
+    swept,
+)
 from soup_nlp.refine.records import RefineOptions
-from soup_nlp.refine.sweep import common_normals, swept
 
 HEIGHT, WIDTH = 60, 96
 K = camera.intrinsics(80.0, 80.0, 47.5, 29.5)
 NEAR, FAR, SHIFT = 1.0, 2.0, 0.1  # the near half moves by 8 px, the far one by 4
-OPTIONS = RefineOptions(rounds=3, particles=20, photo=10.0, sweep=6)
+OPTIONS = RefineOptions(rounds=3, particles=20, photo=10.0)
 
 
 def texture(height: int, width: int, seed: int) -> np.ndarray:

@@ -22,9 +22,9 @@ from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.refine import mppbp
 from soup_nlp.refine.anchored import Local, neighbours
 from soup_nlp.refine.costs import Particles, anchor_depth
-from soup_nlp.refine.kinds import BORROWED, COMMON, KINDS, WALKS
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.particles import Proposer
+from soup_nlp.refine.population import BORROWED, COMMON, KINDS, WALKS
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.storage.progress import Watch

@@ -17,7 +17,7 @@ from soup_nlp.config.problem import load_problem, make_problem
 from soup_nlp.errors import ConfigError
 from soup_nlp.model.energy_data import PAPER_TERMS
 from soup_nlp.pipeline.run import run
-from soup_nlp.refine.kinds import KINDS
+from soup_nlp.refine.population import KINDS
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.report.check import check_folder
 
@@ -170,7 +170,7 @@ def test_the_section_mirrors_its_record_and_is_strict():
     assert problem.refine.particles == 50
     for wrong in (
         "refine.particles=1",
-        "refine.depth_reach=0",
+        "refine.proposals=neighbours",
         "refine.round=3",
         "refine.rounds=-1",
     ):

@@ -13,7 +13,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.refine.costs import PairCosts, Particles, anchor_depth, feasible, unary_costs
 from soup_nlp.refine.mppbp import length_slope
-from soup_nlp.refine.select import conditional_costs, diverse, within_reach
+from soup_nlp.refine.population import conditional_costs, diverse, within_reach
 
 
 def cloud(tiny: Tiny, labels: int, seed: int = 3, spread: float = 1.0) -> Particles:

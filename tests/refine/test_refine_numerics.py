@@ -17,11 +17,10 @@ from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.refine import mppbp
 from soup_nlp.refine.anchored import Local, fit_motion, neighbours
 from soup_nlp.refine.costs import PairCosts, Particles
-from soup_nlp.refine.kinds import KINDS, SHARES, relearn
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.particles import Proposer
+from soup_nlp.refine.population import KINDS, SHARES, relearn, spread_of
 from soup_nlp.refine.records import RefineOptions
-from soup_nlp.refine.select import spread_of
 
 
 def test_the_mrf_follows_a_change_of_length_unit():
