@@ -25,8 +25,13 @@ from soup_nlp.cli.options import (
 from soup_nlp.config.presets import PRESETS, dump_preset
 from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
 from soup_nlp.errors import ConfigError, DataError, printable
-from soup_nlp.export.artefact import FORMATS, export_case, form_label, parse_formulations
-from soup_nlp.export.manifest import EXPORT_FILES
+from soup_nlp.export.artefact import (
+    EXPORT_FILES,
+    FORMATS,
+    export_case,
+    form_label,
+    parse_formulations,
+)
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.files import MOST_YAML, is_folder, read_text
 from soup_nlp.storage.folders import claim, default_folder

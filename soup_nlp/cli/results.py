@@ -15,8 +15,8 @@ from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.evaluate.metrics import Scale
 from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
-from soup_nlp.export.residuals import residual_table, table_text
-from soup_nlp.family.results import check_sol
+from soup_nlp.export.verify import residual_table, table_text
+from soup_nlp.family.describe import check_sol
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.verdict import accuracy, protocol

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from soup_nlp.arrays import Int, Mask
-from soup_nlp.export.opcodes import PLUS, SUM, number
 from soup_nlp.export.program import OBJECTIVE, Program
-from soup_nlp.export.template import DEFINED, NUMBER, VARIABLE, Template, Text
+from soup_nlp.export.template import DEFINED, NUMBER, PLUS, SUM, VARIABLE, Template, Text, number
 
 NO_ROW = np.iinfo(np.int64).max
 """Row of a defined variable that no constraint uses."""

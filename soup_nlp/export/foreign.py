@@ -12,12 +12,19 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ExportError
-from soup_nlp.export.artefact import CHOICES, fingerprint
-from soup_nlp.export.manifest import MANIFEST, STUB, read_manifest
+from soup_nlp.export.artefact import CHOICES, MANIFEST, STUB, fingerprint, read_manifest
 from soup_nlp.export.names import readable_names
-from soup_nlp.export.residuals import EQUATIONS, Kind, kind, residual_table
 from soup_nlp.export.sol import Sol, read_sol
-from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine, violations
+from soup_nlp.export.verify import (
+    ENERGY_SLACK,
+    EQUATIONS,
+    Kind,
+    Limits,
+    examine,
+    kind,
+    residual_table,
+    violations,
+)
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout, TangentLayout

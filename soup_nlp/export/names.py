@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from soup_nlp.arrays import Int
-from soup_nlp.errors import ExportError
 from soup_nlp.export.nl import OF, Suffix
 from soup_nlp.model.kernel import Group
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
@@ -42,9 +41,6 @@ def readable_names(nlp: NLP, layout: MatrixLayout | TangentLayout) -> tuple[list
                     g_names[k] = f"{stem}[{label}]"
                 else:
                     g_names[k] = f"{stem}[{label},{c + 1}]"
-    for names in (x_names, g_names):
-        if len(set(names)) < len(names):
-            raise ExportError("names are not unique", where=nlp.name)
     return x_names, g_names
 
 

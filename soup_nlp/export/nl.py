@@ -21,8 +21,8 @@ from scipy import sparse
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ExportError
 from soup_nlp.export.body import NlBody
-from soup_nlp.export.opcodes import number
 from soup_nlp.export.program import Program, make_program, orders
+from soup_nlp.export.template import number
 from soup_nlp.model.nlp import NLP
 from soup_nlp.storage.atomic import write_bytes, write_text
 from soup_nlp.storage.files import as_path
@@ -103,12 +103,11 @@ def write_nl(
         suffixes: Suffixes of variables and rows.
 
     Raises:
-        ExportError: an operation has no opcode, a number is not finite, or bounds cross.
+        ExportError: an operation has no opcode, or a number is not finite.
         DataError: the folder cannot be written.
     """
     path = as_path(path, "file", error=ExportError)
     names = names or (nlp.x_names(), nlp.g_names())
-    _check(path, nlp)
     program = make_program(nlp.groups, nlp.nx, nlp.ng, nlp.thetas())
     variables, rows = orders(program)
     body = NlBody(program, np.argsort(variables), np.argsort(rows))
@@ -149,23 +148,6 @@ def write_nl(
         gradient_nonzeros=int(G.nnz),
         defined=body.classes,
     )
-
-
-def _check(path: Path, nlp: NLP) -> None:
-    """Raise ExportError if the start is not finite or bounds hold for no finite number."""
-    if not np.isfinite(nlp.x0).all():
-        k = int(np.argmin(np.isfinite(nlp.x0)))
-        raise ExportError("x0 is not finite", where=path, found=f"{nlp.x0[k]} at entry {k}")
-    for name, lower, upper in (("x", nlp.lbx, nlp.ubx), ("g", nlp.lbg, nlp.ubg)):
-        # false for NaN too
-        good = (lower <= upper) & (lower < np.inf) & (upper > -np.inf)
-        if not good.all():
-            k = int(np.argmin(good))
-            raise ExportError(
-                f"bounds of {name} hold for no number",
-                where=path,
-                found=f"[{lower[k]}, {upper[k]}] at entry {k}",
-            )
 
 
 def header(

@@ -17,7 +17,8 @@ from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
-from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
 
 

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ExportError
-from soup_nlp.export.opcodes import COMMUTATIVE, OPS, PLUS, SUM, number
 from soup_nlp.model.kernel import Group
 from soup_nlp.model.operations import NAMES, OPERATIONS
 
+PLUS, SUM = "o0", "o54"
+"""Opcodes of a sum of two terms, and of more, which is followed by their number."""
+COMMUTATIVE = frozenset({ca.OP_ADD, ca.OP_MUL, ca.OP_FMIN, ca.OP_FMAX})
 WORTH_NAMING = 4
 """Smallest number of operations and leaves of a defined variable."""
 
@@ -107,7 +109,7 @@ def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
             work[target] = graph.leaf((which, place), values)
         elif op == ca.OP_ASSIGN:
             work[target] = work[inputs[0]]
-        elif op in OPS:
+        elif op in OPERATIONS and OPERATIONS[op].nl:
             work[target] = graph.apply(op, tuple(work[a] for a in inputs))
         else:
             raise ExportError(
@@ -286,6 +288,12 @@ def _expand(graph: _Graph, node: int, names: set[int], lines: list[str]) -> list
     if op == ca.OP_SQ and (args[0] in names or args[0] in graph.variable):
         lines.append("o2")
         return [args[0], args[0]]
-    rule = OPS[op]
-    lines.append(rule.code)
-    return [*(f"n{c}" for c in rule.before), *args, *(f"n{c}" for c in rule.after)]
+    code, *operands = OPERATIONS[op].nl.split()
+    lines.append(code)
+    return [args[int(word[1])] if word.startswith("{") else word for word in operands]
+
+
+def number(value: float) -> str:
+    """Shortest text that reads back as the same double (at most 17 significant digits)."""
+    text = repr(float(value))
+    return text[:-2] if text.endswith(".0") else text

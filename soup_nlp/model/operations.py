@@ -1,4 +1,4 @@
-"""Operations that kernels may have: in C on vectors of elements, and in numpy."""
+"""Operations that kernels may have: in C on vectors of elements, in numpy, and in .nl files."""
 
 from __future__ import annotations
 
@@ -16,10 +16,14 @@ class Operation(NamedTuple):
     Attributes:
         c: Its C expression, with {0} and {1} for the operands; `lanes` defines its functions.
         numpy: Function of arrays and, last, of the array that takes the result (or None).
+        nl: Its prefix text in AMPL's format, with {0} and {1} for the operands; "" where an
+            expression with the operation cannot be written. "o11" and "o12" (min, max) are
+            followed by their argument count.
     """
 
     c: str
     numpy: Callable[..., Any]
+    nl: str = ""
 
     @property
     def operands(self) -> int:
@@ -35,21 +39,25 @@ def _if_else_zero(a: Any, b: Any, out: Any = None) -> Any:
 _ONE = np.array(1.0)
 OPERATIONS: Mapping[int, Operation] = {
     ca.OP_ASSIGN: Operation("{0}", np.positive),
-    ca.OP_ADD: Operation("{0} + {1}", np.add),
-    ca.OP_SUB: Operation("{0} - {1}", np.subtract),
-    ca.OP_MUL: Operation("{0} * {1}", np.multiply),
-    ca.OP_DIV: Operation("{0} / {1}", np.divide),
-    ca.OP_NEG: Operation("-{0}", np.negative),
-    ca.OP_SQ: Operation("{0} * {0}", np.square),
-    ca.OP_TWICE: Operation("{0} + {0}", lambda a, out=None: np.add(a, a, out)),
-    ca.OP_INV: Operation("one / {0}", lambda a, out=None: np.divide(_ONE, a, out)),
-    ca.OP_FABS: Operation("choose({0} < zero, -{0}, {0})", np.abs),
+    ca.OP_ADD: Operation("{0} + {1}", np.add, "o0 {0} {1}"),
+    ca.OP_SUB: Operation("{0} - {1}", np.subtract, "o1 {0} {1}"),
+    ca.OP_MUL: Operation("{0} * {1}", np.multiply, "o2 {0} {1}"),
+    ca.OP_DIV: Operation("{0} / {1}", np.divide, "o3 {0} {1}"),
+    ca.OP_NEG: Operation("-{0}", np.negative, "o16 {0}"),
+    ca.OP_SQ: Operation("{0} * {0}", np.square, "o5 {0} n2"),
+    ca.OP_TWICE: Operation("{0} + {0}", lambda a, out=None: np.add(a, a, out), "o2 n2 {0}"),
+    ca.OP_INV: Operation("one / {0}", lambda a, out=None: np.divide(_ONE, a, out), "o3 n1 {0}"),
+    ca.OP_FABS: Operation("choose({0} < zero, -{0}, {0})", np.abs, "o15 {0}"),
     # an output as third argument is deprecated in these two
     ca.OP_FMAX: Operation(
-        "choose({0} > {1}, {0}, {1})", lambda a, b, out=None: np.maximum(a, b, out=out)
+        "choose({0} > {1}, {0}, {1})",
+        lambda a, b, out=None: np.maximum(a, b, out=out),
+        "o12 2 {0} {1}",
     ),
     ca.OP_FMIN: Operation(
-        "choose({0} < {1}, {0}, {1})", lambda a, b, out=None: np.minimum(a, b, out=out)
+        "choose({0} < {1}, {0}, {1})",
+        lambda a, b, out=None: np.minimum(a, b, out=out),
+        "o11 2 {0} {1}",
     ),
     ca.OP_LT: Operation("choose({0} < {1}, one, zero)", np.less),
     ca.OP_LE: Operation("choose({0} <= {1}, one, zero)", np.less_equal),
@@ -57,28 +65,30 @@ OPERATIONS: Mapping[int, Operation] = {
         "choose({0} == zero, one, zero)", lambda a, out=None: np.equal(a, 0.0, out)
     ),
     ca.OP_IF_ELSE_ZERO: Operation("choose({0} != zero, {1}, zero)", _if_else_zero),
-    ca.OP_SQRT: Operation("root({0})", np.sqrt),
-    ca.OP_POW: Operation("both(pow, {0}, {1})", np.power),
-    ca.OP_CONSTPOW: Operation("both(pow, {0}, {1})", np.power),
-    ca.OP_ATAN2: Operation("both(atan2, {0}, {1})", np.arctan2),
+    ca.OP_SQRT: Operation("root({0})", np.sqrt, "o39 {0}"),
+    ca.OP_POW: Operation("both(pow, {0}, {1})", np.power, "o5 {0} {1}"),
+    ca.OP_CONSTPOW: Operation("both(pow, {0}, {1})", np.power, "o5 {0} {1}"),
+    ca.OP_ATAN2: Operation("both(atan2, {0}, {1})", np.arctan2, "o48 {0} {1}"),
     **{
-        getattr(ca, f"OP_{name.upper()}"): Operation(f"each({name}, {{0}})", function)
-        for name, function in {
-            "exp": np.exp,
-            "log": np.log,
-            "sin": np.sin,
-            "cos": np.cos,
-            "tan": np.tan,
-            "asin": np.arcsin,
-            "acos": np.arccos,
-            "atan": np.arctan,
-            "sinh": np.sinh,
-            "cosh": np.cosh,
-            "tanh": np.tanh,
-            "asinh": np.arcsinh,
-            "acosh": np.arccosh,
-            "atanh": np.arctanh,
-        }.items()
+        getattr(ca, f"OP_{name.upper()}"): Operation(
+            f"each({name}, {{0}})", function, f"o{code} {{0}}"
+        )
+        for name, function, code in (
+            ("exp", np.exp, 44),
+            ("log", np.log, 43),
+            ("sin", np.sin, 41),
+            ("cos", np.cos, 46),
+            ("tan", np.tan, 38),
+            ("asin", np.arcsin, 51),
+            ("acos", np.arccos, 53),
+            ("atan", np.arctan, 49),
+            ("sinh", np.sinh, 40),
+            ("cosh", np.cosh, 45),
+            ("tanh", np.tanh, 37),
+            ("asinh", np.arcsinh, 50),
+            ("acosh", np.arccosh, 52),
+            ("atanh", np.arctanh, 47),
+        )
     },
 }
 """Operations by CasADi's number; a kernel with any other one cannot be evaluated."""

@@ -23,9 +23,8 @@ from soup_nlp.evaluate.information import information
 from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.names import readable_names
-from soup_nlp.export.residuals import kind, residual_table, table_text
 from soup_nlp.export.sol import write_sol
-from soup_nlp.export.verify import Limits, examine, violations
+from soup_nlp.export.verify import Limits, examine, kind, residual_table, table_text, violations
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.stages import solve_soup

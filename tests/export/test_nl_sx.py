@@ -213,25 +213,3 @@ def test_expressions_that_cannot_be_written_are_refused(tmp_path):
     with pytest.raises(DataError, match="cannot be written"):
         write_sx_nl(tmp_path / "none" / "a.nl", {"x": x, "f": x**2})
     assert not list(tmp_path.rglob("*.nl"))
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"x0": [np.nan, 1.0]}, "x0 is not finite"),
-        ({"x0": [1.0, np.inf]}, "x0 is not finite"),
-        ({"lbx": [np.nan, 1.0]}, "bounds of x"),
-        ({"ubx": [np.nan, 1.0]}, "bounds of x"),
-        ({"lbx": [0.0, np.inf]}, "bounds of x"),
-        ({"ubx": [0.0, -np.inf]}, "bounds of x"),
-        ({"lbx": [1.0, 0.0], "ubx": [0.5, 0.0]}, "bounds of x"),
-        ({"lbg": [2.0], "ubg": [1.0]}, "bounds of g"),
-        ({"lbg": [np.nan]}, "bounds of g"),
-    ],
-)
-def test_wrong_starts_and_bounds_are_refused(given, said, tmp_path):
-    x = ca.SX.sym("x", 2)
-    problem = {"x": x, "f": ca.sumsqr(x), "g": x[0] * x[1]}
-    with pytest.raises(ExportError, match=said):
-        write_sx_nl(tmp_path / "a.nl", problem, **given)
-    assert not list(tmp_path.iterdir())

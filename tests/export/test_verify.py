@@ -14,8 +14,8 @@ from scipy import sparse
 from soup_nlp.export import verify
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.program import make_program
-from soup_nlp.export.residuals import kind
 from soup_nlp.export.sol import Sol
+from soup_nlp.export.verify import kind
 from soup_nlp.model.kernel import Group, Kernel, Table
 
 
