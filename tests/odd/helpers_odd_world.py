@@ -17,7 +17,7 @@ import yaml
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.api import run
+from soup_nlp.report.folder import run
 
 SIZE = (48, 64)
 """Height and width of the tiny images."""

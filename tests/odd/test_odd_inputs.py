@@ -6,12 +6,27 @@ it has the cases that solve as well.
 
 from __future__ import annotations
 
+from itertools import chain
+
 import pytest
-from helpers_odd_cases import CASES
+from helpers_odd_api import api_cases
+from helpers_odd_commands import path_cases, text_cases, untrusted_cases
+from helpers_odd_files import array_cases, image_cases, network_cases
+from helpers_odd_options import number_cases, option_cases, preset_cases, solve_cases
+from helpers_odd_results import chain_cases, lost_cases, result_cases
 from helpers_odd_run import Case, fault
 from helpers_odd_world import World
 
 pytestmark = pytest.mark.slow
+
+CASES: list[Case] = list(
+    chain(
+        *(path_cases(), text_cases(), untrusted_cases()),
+        *(number_cases(), solve_cases(), preset_cases(), option_cases()),
+        *(array_cases(), image_cases(), network_cases()),
+        *(result_cases(), lost_cases(), chain_cases(), api_cases()),
+    )
+)
 
 
 def table_of(case: Case) -> str:

@@ -5,54 +5,31 @@ python tests/tools/count_odd.py [WORD ...]     # only cases whose name holds one
 
 from __future__ import annotations
 
-import os
-import resource
-import signal
 import sys
 import tempfile
 import time
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "odd"))
 
-from helpers_odd_cases import CASES
 from helpers_odd_run import Case, fault
 from helpers_odd_world import World
+from test_odd_inputs import CASES
+
+from soup_nlp.bench.processes import isolated
 
 SECONDS = 120
 MEMORY = 6 << 30
 
 
-def isolated(case: Case, world: World, folder: Path) -> str | None:
+def found_in(case: Case, world: World, folder: Path) -> str | None:
     """The fault of a case, found in a child process with limited memory."""
-    read, write = os.pipe()
-    child = os.fork()
-    if not child:
-        os.close(read)
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-        with open(os.devnull, "w") as nothing:
-            os.dup2(nothing.fileno(), 2)
-        os.write(write, (fault(case, world, folder, SECONDS) or "").encode(errors="replace")[:4000])
-        os._exit(0)
-    os.close(write)
-    end = time.monotonic() + SECONDS + 5
-    while True:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            break
-        if time.monotonic() > end:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            os.close(read)
-            return "endless (killed)"
-        time.sleep(0.002)
-    with os.fdopen(read) as pipe:
-        text = pipe.read()
-    if os.WIFSIGNALED(status):
-        return f"crash: signal {os.WTERMSIG(status)}"
-    return text or None
+    beside = folder.parent
+    ended = isolated(partial(fault, case, world, folder, SECONDS), beside, SECONDS, MEMORY)
+    return ended.value if ended.how == "returned" else ended.how
 
 
 def main() -> None:
@@ -66,7 +43,7 @@ def main() -> None:
             folder = Path(scratch) / f"case_{k}"
             folder.mkdir()
             begin = time.perf_counter()
-            found = isolated(case, world, folder)
+            found = found_in(case, world, folder)
             total[case.group] += 1
             if found:
                 bad[case.group] += 1
