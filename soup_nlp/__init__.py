@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from soup_nlp.evaluate.metrics import DepthMetrics, Scale
     from soup_nlp.export.symbolic import nlp
     from soup_nlp.geometry.soup import Reconstruction, Soup
-    from soup_nlp.report.api import WritableRun as Run
-    from soup_nlp.report.api import run, solve_pair
+    from soup_nlp.report.folder import WritableRun as Run
+    from soup_nlp.report.folder import run, solve_pair
     from soup_nlp.report.result import Result, load
     from soup_nlp.sequence.solve import solve_chain as chain
     from soup_nlp.storage.versions import __version__
@@ -51,7 +51,7 @@ _HOMES = {
     "Problem": "config.problem",
     "Reconstruction": "geometry.soup",
     "Result": "report.result",
-    "Run": "report.api:WritableRun",
+    "Run": "report.folder:WritableRun",
     "Soup": "geometry.soup",
     "SoupError": "errors",
     "Truth": "data.pair",
@@ -61,8 +61,8 @@ _HOMES = {
     "load_problem": "config.problem",
     "make_problem": "config.problem",
     "nlp": "export.symbolic",
-    "run": "report.api",
-    "solve_pair": "report.api",
+    "run": "report.folder",
+    "solve_pair": "report.folder",
 }
 """Module of every public name, and its name there if it is another one; imported on first use."""
 

@@ -12,8 +12,8 @@ from hypothesis import settings
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data import inputs
 from soup_nlp.data.scenes import catalogue
-from soup_nlp.pipeline.case import Case, prepare
-from soup_nlp.pipeline.record import Run
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case, Run
 from soup_nlp.pipeline.run import make_run, skipped
 
 # drawn cases are the same in every run

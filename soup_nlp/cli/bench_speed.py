@@ -12,10 +12,9 @@ import typer
 
 from soup_nlp.bench import speed as timing
 from soup_nlp.bench.accuracy import measure_pair
-from soup_nlp.bench.chain import chain_page, measure_chain, sequences
-from soup_nlp.bench.cost import cost_cells, cost_page
 from soup_nlp.bench.study import Cell, Measure, measure_cells, show
 from soup_nlp.bench.suites import Options, list_suite
+from soup_nlp.bench.tables import chain_page, cost_cells, cost_page, measure_chain, sequences
 from soup_nlp.cli.bench_accuracy import Only, Width
 from soup_nlp.cli.options import Data, Out, Overwrite, Quiet, RowProgress, Set, numbers, words
 from soup_nlp.data.scenes.catalogue import SCENES

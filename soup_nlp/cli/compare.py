@@ -9,18 +9,17 @@ from typing import Annotated, Any
 import typer
 
 from soup_nlp.bench.processes import machine
-from soup_nlp.bench.solvers.family_runs import family_tasks, is_family, neutral, summary
-from soup_nlp.bench.solvers.page import by_start, conclusion, frame_of_runs, page
+from soup_nlp.bench.solvers.page import by_start, conclusion, frame_of_runs, neutral, page, summary
 from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
-from soup_nlp.bench.solvers.runner import make_tasks
+from soup_nlp.bench.solvers.runner import family_tasks, is_family, make_tasks
 from soup_nlp.cli.options import Coordinates, Formulations, Overwrite, Set, Superpixels, listed
 from soup_nlp.config.problem import load_problem, title
 from soup_nlp.errors import ConfigError, StoppedError
 from soup_nlp.export.artefact import parse_formulations
 from soup_nlp.export.verify import Limits
-from soup_nlp.family.results import write_results
+from soup_nlp.family.describe import write_results
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import claim, default_folder, scratch, staged

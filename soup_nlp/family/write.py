@@ -25,7 +25,7 @@ from soup_nlp.family.frozen import Frozen, load_frozen
 from soup_nlp.family.instances import VERSION, Instance, build_instance, case_of, problems
 from soup_nlp.family.pages import LICENCE, readme
 from soup_nlp.model.nlp import NLP
-from soup_nlp.pipeline.case import Case
+from soup_nlp.pipeline.record import Case
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.store import write_json
 
@@ -108,7 +108,7 @@ def _solved(
 ) -> Entry:
     """Write the best known point of a problem as .sol; returns entries that all starts share.
 
-    "runs" has what solvers reached, by start and solver, see `bench.solvers.family_runs.summary`.
+    "runs" has what solvers reached, by start and solver, see `bench.solvers.page.summary`.
     """
     nlp = build_instance(case, record, instance.formulation, "best")[0]
     x = nlp.x0

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_flow
+from soup_nlp.data.flow.layers import corrected, still, without_still_layer
 from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.working_size import resized_flow, working_size
 from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
-from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import Labels, segment
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import (
@@ -24,10 +25,6 @@ from soup_nlp.model.energy_options import (
     Weights,
     bending_weights,
 )
-from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout, TangentLayout
-from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.nlp import NLP
 from soup_nlp.model.reweighting import (
     across_components,
     across_discontinuities,
@@ -41,11 +38,11 @@ from soup_nlp.model.reweighting import (
     within_bending,
     without_flow,
 )
-from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
-from soup_nlp.pipeline.still_layer import see_through
+from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.components import TIES
+from soup_nlp.start.epipolar import repeated
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import in_order
 from soup_nlp.start.propose import Start, propose
@@ -59,54 +56,6 @@ PRIOR_OVER_GROUND = 10.0
 the relief of the initialisation."""
 OCCLUSION_GAP = 0.1
 """Relative gap in depth, in the initialisation, from which one component occludes another."""
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """A problem before it is solved.
-
-    Attributes:
-        problem: The merged problem.
-        pair: Images, cameras, flow, truth.
-        segmentation: Superpixels and graphs.
-        start: The unorganised soup.
-        data: Numbers of the energy.
-        weights: Constants of the energy.
-        soup: The best soup so far, where solvers start: the start, or the presolve's answer.
-        options: Stages and limits of the problem.
-        seen: The pair as the photometric term sees it: without a layer that stands still before
-            the scene, where there is one.
-        original: The pair at its own size, where it was larger than `max_size`; else None.
-        given: What was made of a depth prior; None without one.
-    """
-
-    problem: Problem
-    pair: Pair
-    segmentation: Segmentation
-    start: Start
-    data: EnergyData
-    weights: Weights
-    soup: Soup
-    options: SolverOptions
-    seen: Pair
-    original: Pair | None = None
-    given: Given | None = None
-
-    def __len__(self) -> int:
-        return len(self.segmentation)
-
-    def formulation(self, **changes: object) -> Formulation:
-        """The problem's formulation with its smoothing, changed."""
-        options, eps = dict(self.problem.formulation), self.options.eps
-        return Formulation.make({**options, "eps": eps, "eps_pixel": eps, **changes})
-
-    def nlp(self, form: Formulation) -> tuple[NLP, MatrixLayout | TangentLayout]:
-        """The NLP of a formulation at the case's soup; tangent coordinates are about the start."""
-        energy = self.data, self.weights, form
-        if form.coordinates == "matrix":
-            return build_matrix_nlp(self.soup, *energy)
-        base = TangentLayout.about(self.start.soup, self.data, exact_chart(self.data))
-        return build_tangent_nlp(self.soup, *energy, layout=base)
 
 
 def prepare(
@@ -267,8 +216,7 @@ def build_energy(
         apart = start.surface * (int(start.component.max()) + 1) + start.component
         data = across_discontinuities(data, apart, **ACROSS_DISCONTINUITIES)
     if e.units == "pixel":
-        rotation = BENDING_ROTATION_PX if whole else e.rotation_px
-        data = in_pixels(data, start.soup, seg, rotation)
+        data = in_pixels(data, start.soup, seg, BENDING_ROTATION_PX if whole else None)
     else:
         data = in_length(data, start.soup, e.length)
     if whole:
@@ -336,3 +284,54 @@ def check_fits(problem: Problem, pair: Pair) -> None:
     most = max(parts, key=lambda name: parts[name])
     shares = ", ".join(f"{name} {value / 1e9:.3g} GB" for name, value in parts.items())
     require_memory(sum(parts.values()), "this problem", shares, LOWER[most])
+
+
+# --- a layer that stands still before the scene --------------------------------------------------
+
+LEAST_SHARE = 0.003
+"""Share of the pixels that must stand still for a layer to be looked for."""
+LEAST_FLOW = 2.0
+"""Median displacement, pixels, below which the camera may be at rest."""
+PIXELS = 6000
+"""The motion of what moves is fitted to so many."""
+
+
+def see_through(pair: Pair, seed: int = 0) -> Pair | None:
+    """The pair without a still layer, and with the flow of what moves behind it.
+
+    Args:
+        pair: A pair whose flow was computed from its images.
+        seed: Of the sample that the motion is fitted to.
+
+    Returns:
+        Grey images (as RGB) without the layer, and the corrected flow; None where nothing stands
+        still, where all may, or where the images do not contradict what stands still.
+    """
+    flow = pair.flow
+    assert flow is not None
+    at_rest, sure = still(flow), flow.confidence > 0.5
+    if pair.size != pair.image_next.shape[:2] or at_rest.mean() < LEAST_SHARE:
+        return None
+    if np.median(np.linalg.norm(flow.uv[sure], axis=1)) < LEAST_FLOW:
+        return None
+    v, u = np.nonzero(sure & ~at_rest)
+    pick = np.random.default_rng(seed).permutation(len(v))[:PIXELS]
+    place = np.stack([u, v], axis=-1)[pick].astype(float)
+    move = flow.uv[v, u][pick].astype(float)
+    motions = repeated(
+        rays(pair.K_ref, place),
+        rays(pair.K_next, place + move),
+        flow.confidence[v, u][pick].astype(float),
+        float(pair.K_next[0, 0]),
+        count=1,
+        seed=seed,
+    )
+    if not motions:
+        return None
+    ref, nxt = without_still_layer(pair.image_ref, pair.image_next)
+    R, t = motions[0].R, motions[0].t
+    new = corrected(ref, nxt, flow, R, t, pair.K_ref, pair.K_next)
+    if new is None:
+        return None
+    first, second = (np.repeat(image[..., None], 3, axis=2) for image in (ref, nxt))
+    return replace(pair, image_ref=first, image_next=second, flow=new)

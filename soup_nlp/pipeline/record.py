@@ -1,4 +1,4 @@
-"""What a run holds: inputs, solution, refinement, dense 3D and scores."""
+"""What a case holds before its solve and a run after it: inputs, energy, solution, scores."""
 
 from __future__ import annotations
 
@@ -9,20 +9,78 @@ from functools import cached_property
 import numpy as np
 
 from soup_nlp.arrays import Float, FloatMap
+from soup_nlp.config.problem import Problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.confidence import Confidence
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.full_size import Labels, grown_labels, plane_depth
+from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup
 from soup_nlp.model import oracle
-from soup_nlp.model.layout import MatrixLayout
-from soup_nlp.pipeline.case import Case
+from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.model.nlp import NLP
+from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 from soup_nlp.refine.records import Refined
 from soup_nlp.solve.kkt import constraint_residuals
+from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution
+from soup_nlp.start.given_depth import Given
+from soup_nlp.start.propose import Start
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A problem before it is solved.
+
+    Attributes:
+        problem: The merged problem.
+        pair: Images, cameras, flow, truth.
+        segmentation: Superpixels and graphs.
+        start: The unorganised soup.
+        data: Numbers of the energy.
+        weights: Constants of the energy.
+        soup: The best soup so far, where solvers start: the start, or the presolve's answer.
+        options: Stages and limits of the problem.
+        seen: The pair as the photometric term sees it: without a layer that stands still before
+            the scene, where there is one.
+        original: The pair at its own size, where it was larger than `max_size`; else None.
+        given: What was made of a depth prior; None without one.
+    """
+
+    problem: Problem
+    pair: Pair
+    segmentation: Segmentation
+    start: Start
+    data: EnergyData
+    weights: Weights
+    soup: Soup
+    options: SolverOptions
+    seen: Pair
+    original: Pair | None = None
+    given: Given | None = None
+
+    def __len__(self) -> int:
+        return len(self.segmentation)
+
+    def formulation(self, **changes: object) -> Formulation:
+        """The problem's formulation with its smoothing, changed."""
+        options, eps = dict(self.problem.formulation), self.options.eps
+        return Formulation.make({**options, "eps": eps, "eps_pixel": eps, **changes})
+
+    def nlp(self, form: Formulation) -> tuple[NLP, MatrixLayout | TangentLayout]:
+        """The NLP of a formulation at the case's soup; tangent coordinates are about the start."""
+        energy = self.data, self.weights, form
+        if form.coordinates == "matrix":
+            return build_matrix_nlp(self.soup, *energy)
+        base = TangentLayout.about(self.start.soup, self.data, exact_chart(self.data))
+        return build_tangent_nlp(self.soup, *energy, layout=base)
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,8 +36,8 @@ from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
-from soup_nlp.pipeline.case import Case, prepare
-from soup_nlp.pipeline.record import Run, full_size
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case, Run, full_size
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.refine.records import Refined, RefineOptions

@@ -1,4 +1,4 @@
-"""The result folder; it is written whole or not at all."""
+"""The result folder, written whole or not at all; a run that writes and draws itself."""
 
 from __future__ import annotations
 
@@ -6,17 +6,30 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields
+from functools import wraps
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec
 
+from PIL.Image import Image, fromarray
+
+from soup_nlp import pipeline
+from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import DataError
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture
+from soup_nlp.report.figures import (
+    overview,
+    strip,
+    without_gaps,
+    write_clipped_depth_png16,
+    write_picture,
+)
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.layout import record_of, recorded_files, result_tree
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import Picture, pictures
-from soup_nlp.report.result import PAGE, load, result_of
+from soup_nlp.report.result import PAGE, html, load, result_of
 from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
 from soup_nlp.storage.atomic import write_text
@@ -260,3 +273,62 @@ def convert(
     where = extended(folder, overwrite) if out is None else staged(out, overwrite=overwrite)
     with where as new:
         return write_formats(new, result, names)
+
+
+# --- the run that Python gets --------------------------------------------------------------------
+
+Given = ParamSpec("Given")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class WritableRun(pipeline.Run):
+    """A run with its result folder and its overview."""
+
+    def save(
+        self, folder: str | Path, formats: Sequence[str] = (), overwrite: bool = False
+    ) -> list[str]:
+        """Write a result folder, as `soup-nlp solve` does.
+
+        Args:
+            folder: A new or empty folder, or that of an earlier result.
+            formats: Further files for other programs: "glb", "colmap", "npy", "pfm", "rrd" ...
+            overwrite: Overwrite files that the program did not make.
+
+        Returns:
+            Names of the files.
+
+        Raises:
+            ConfigError: a format is not known.
+            DataError: the folder cannot be written, or holds what is not to be overwritten.
+        """
+        none = formats is None or (isinstance(formats, list | tuple) and not formats)
+        names = [] if none else check_formats(formats)
+        in_memory = self.problem.input.kind == "memory"
+        inputs = [] if in_memory else self.problem.input_paths()
+        target = prepare_folder(folder, inputs, overwrite, self.problem.subject)
+        return write_folder(target, self, dump_problem(self.problem), f"{self}\n", formats=names)
+
+    def plot(self) -> Image:
+        """The overview as a picture: notebooks show it, `.save` writes it."""
+        drawn = pictures(result_of(self, summary(self)))
+        return fromarray(strip(without_gaps(drawn), self.problem.name))
+
+    def _repr_html_(self) -> str:
+        """Text and overview, for notebooks."""
+        picture = BytesIO()
+        self.plot().save(picture, format="png")
+        return html(str(self), picture.getvalue())
+
+
+def _writable(solve: Callable[Given, pipeline.Run]) -> Callable[Given, WritableRun]:
+    """The same function with a `WritableRun` as its result."""
+
+    @wraps(solve)
+    def solved(*args: Given.args, **options: Given.kwargs) -> WritableRun:
+        done = solve(*args, **options)
+        return WritableRun(**{field.name: getattr(done, field.name) for field in fields(done)})
+
+    return solved
+
+
+run, solve_pair = _writable(pipeline.run), _writable(pipeline.solve_pair)

@@ -16,7 +16,7 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import SolverError
 from soup_nlp.geometry.soup import Reconstruction
-from soup_nlp.report.api import run
+from soup_nlp.report.folder import run
 from soup_nlp.report.result import Result, load
 from soup_nlp.sequence.frames import Frames, Raw
 from soup_nlp.storage.rows import Job, Row, attempt, failed, measure_all, read_rows

@@ -10,7 +10,8 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from helpers_rows import square
 
-from soup_nlp.bench.cost import cost_cells, cost_page
 from soup_nlp.bench.processes import alone, machine
 from soup_nlp.bench.speed import (
     exponent,
@@ -22,6 +21,7 @@ from soup_nlp.bench.speed import (
     with_costs,
 )
 from soup_nlp.bench.study import Cell, frame_of
+from soup_nlp.bench.tables import cost_cells, cost_page
 from soup_nlp.cli.main import main
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.storage.rows import read_rows

@@ -24,7 +24,8 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError
 from soup_nlp.export.verify import Limits
-from soup_nlp.pipeline.case import Case, prepare
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case
 
 pytestmark = pytest.mark.slow
 

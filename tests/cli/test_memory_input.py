@@ -19,8 +19,8 @@ from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.api import solve_pair
 from soup_nlp.report.check import check_folder
+from soup_nlp.report.folder import solve_pair
 
 pytestmark = pytest.mark.slow
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from soup_nlp.config.problem import make_problem
-from soup_nlp.family import results, write
-from soup_nlp.family.freeze import record_of
+from soup_nlp.family import describe, write
 from soup_nlp.family.frozen import Frozen
-from soup_nlp.family.instances import STANDARD, select
+from soup_nlp.family.instances import STANDARD, record_of, select
 from soup_nlp.family.write import write_family
 from soup_nlp.pipeline.case import prepare
 
@@ -28,7 +27,7 @@ def folder(record, tmp_path_factory):
     """The set of that record, under the names of a published size."""
     out = tmp_path_factory.mktemp("set")
     patch = pytest.MonkeyPatch()
-    for module in (write, results):
+    for module in (write, describe):
         patch.setattr(module, "load_frozen", lambda scene, size: record)
     chosen = select([100], ["room"], [STANDARD]) + select([100], ["room"], [EPIGRAPH], ["hard"])
     lines: list[str] = []

@@ -17,7 +17,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.nl import write_nl
-from soup_nlp.family.describe import degree, rank
+from soup_nlp.family.describe import check_sol, degree, rank, write_results
 from soup_nlp.family.frozen import (
     decoded,
     encoded,
@@ -39,7 +39,6 @@ from soup_nlp.family.instances import (
     rounded,
     select,
 )
-from soup_nlp.family.results import check_sol, write_results
 from soup_nlp.family.write import published
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup

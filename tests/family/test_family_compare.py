@@ -9,14 +9,13 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from soup_nlp.bench.solvers import family_runs
-from soup_nlp.bench.solvers.family_runs import neutral, summary
-from soup_nlp.bench.solvers.page import by_start, frame_of_runs, page, reached
+from soup_nlp.bench.solvers import runner
+from soup_nlp.bench.solvers.page import by_start, frame_of_runs, neutral, page, reached, summary
 from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.export.verify import Limits
-from soup_nlp.family.freeze import record_of
+from soup_nlp.family.instances import record_of
 from soup_nlp.pipeline.case import prepare
 
 STUB = "SOUP-room-unit-offset-smooth-N100"
@@ -93,7 +92,7 @@ def test_a_solver_of_ones_own_is_a_command_line(tmp_path, monkeypatch, capsys):
         "flow": {"source": "truth"},
     }
     record = record_of(prepare(make_problem(own)))
-    monkeypatch.setattr(family_runs, "load_frozen", lambda scene, size: record)
+    monkeypatch.setattr(runner, "load_frozen", lambda scene, size: record)
     entry = {"name": f"{STUB}-hard", "best_known": {"objective": 1.0}}
     (tmp_path / "set").mkdir()
     (tmp_path / "set" / "index.json").write_text(json.dumps({"instances": [entry]}))

@@ -18,7 +18,7 @@ from soup_nlp.model.lanes import LANES, Lanes, Summed, compile_lanes
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
-from soup_nlp.pipeline.case import Case
+from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.ipopt import Ipopt
 

@@ -13,7 +13,7 @@ import trimesh
 from helpers_chromium import Chromium, find_chromium
 from helpers_result import CAMERA, small_result
 
-from soup_nlp.bench import chain as chain_study
+from soup_nlp.bench import tables as chain_study
 from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.cli.main import main
 from soup_nlp.data.scenes.catalogue import render_scene
@@ -22,9 +22,7 @@ from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence import pairs
 from soup_nlp.sequence.chain import follow, make_chain, number
-from soup_nlp.sequence.frames import (
-    scene_frames,
-)
+from soup_nlp.sequence.frames import scene_frames
 from soup_nlp.sequence.fused import fuse, movers
 from soup_nlp.sequence.pairs import SolvedPair, carried
 from soup_nlp.sequence.scales import Link, link, solve_scales

@@ -18,7 +18,8 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.pipeline import case as pipeline_case
-from soup_nlp.pipeline.case import Case, build_energy, prepare, solver_options
+from soup_nlp.pipeline.case import build_energy, prepare, solver_options
+from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.bending import constant_depth, fit_turn, joined, surfaces, turn_alone
 from soup_nlp.start.choice import LEAST_NOISE, dominant

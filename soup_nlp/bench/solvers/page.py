@@ -205,3 +205,51 @@ def _by_start(frame: pd.DataFrame) -> list[str]:
     table = pd.DataFrame(cells).sort_index().rename_axis("solver")
     picture = ["", "![profiles by start and size](profiles.png)"]
     return [text, "", *markdown(table), *picture]
+
+
+# --- records of the family -----------------------------------------------------------------------
+
+CASADI = ("ipopt", "sqpmethod", "uno", "alpaqa", "sleqp", "bonmin", "fatrop")
+
+
+def neutral(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """The runs in the solver-independent form of `family.describe`."""
+    names = {"cpu_seconds": "time", "wall_seconds": "wall_time"}
+    kept = ["solver", "name", "n", "m", "status", "objective", "iterations", "claimed", "verified"]
+    kept += ["primal", "dual", "complementarity"]
+    out = frame[[*kept, *names]].rename(columns=names).astype(object)
+    out = out.where(out.notna(), None)
+    out["reached"], out["time_limit"] = reached(frame), [v["seconds"] for v in frame["limits"]]
+    out["version"] = [
+        versions.get("casadi" if solver in CASADI else "soup_nlp", "unknown")
+        for solver, versions in zip(frame["solver"], frame["versions"], strict=True)
+    ]
+    return [{str(k): v for k, v in row.items()} for row in out.to_dict("records")]
+
+
+def summary(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """Solvers that tried and that reached the best known point, by problem (name without start).
+
+    "runs" has objective, CPU seconds, their limit and whether the point is verified, by start and
+    solver: what `records/published.json` takes for the README of the set.
+    """
+    names = frame["name"].str.rpartition("-")[0]
+    return {
+        str(name): {
+            "tried_by": list(group["solver"].unique()),
+            "reached_by": list(group.loc[reached(group), "solver"].unique()),
+            "runs": {
+                str(start): {str(row["solver"]): _run(row) for _, row in runs.iterrows()}
+                for start, runs in group.groupby("start", sort=False)
+            },
+        }
+        for name, group in frame.groupby(names, sort=False)
+    }
+
+
+def _run(row: pd.Series) -> list[Any]:
+    """Objective or None, CPU seconds, their limit, verified."""
+    objective = float(row["objective"])
+    value = float(f"{objective:.9g}") if np.isfinite(objective) else None
+    limit = float(row["limits"]["seconds"])
+    return [value, round(float(row["cpu_seconds"]), 1), limit, bool(row["verified"])]

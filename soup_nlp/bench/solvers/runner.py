@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,13 +18,17 @@ from soup_nlp.bench.processes import isolated, processor
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import WALL_PER_CPU, Answer, Task, Trace
 from soup_nlp.bench.study import show
+from soup_nlp.errors import DataError
 from soup_nlp.export.artefact import form_label
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
+from soup_nlp.family.frozen import Frozen, load_frozen
+from soup_nlp.family.instances import Instance, build_instance, case_of, parse_name, problems
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.pipeline.case import Case
+from soup_nlp.pipeline.record import Case
+from soup_nlp.storage.files import read_json
 from soup_nlp.storage.rows import Job, Row, measure_all
 from soup_nlp.storage.versions import versions
 
@@ -214,3 +219,53 @@ def one_line(row: Row) -> str:
         f" E {show(row.get('energy'), '.6g'):>9} dual {show(row.get('dual'), '.1e'):>8}"
         f" {row['seconds']:>7.1f} s  {row['status'][:60]}"
     )
+
+
+# --- tasks of the family -------------------------------------------------------------------------
+
+INDEX = "index.json"
+
+
+def is_family(path: Path) -> bool:
+    """Whether `soup-nlp family` wrote a folder."""
+    return (path / INDEX).is_file()
+
+
+def family_tasks(folder: Path, limits: Limits) -> Iterator[list[tuple[Label, Maker]]]:
+    """Labels and makers of the tasks of all instances in a folder, one scene and size at a time.
+
+    Raises:
+        DataError: the index cannot be read.
+    """
+    try:
+        entries = read_json(folder / INDEX, "index of the family")["instances"]
+        best = {e["name"]: float(e["best_known"]["objective"]) for e in entries}
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError("index of the family cannot be read", where=folder, found=error) from error
+    for scene, size, instances in problems([parse_name(name) for name in best]):
+        record = load_frozen(scene, size)
+        case = case_of(record)
+        digest = hashlib.sha256(record.text.encode()).hexdigest()[:12]
+        tasks: list[tuple[Label, Maker]] = []
+        for instance in instances:
+            label = {
+                "problem": f"{scene} {instance.start}",
+                "problem_hash": digest,
+                "superpixels": size,
+                "formulation": instance.formulation,
+                "start": instance.start,
+                "name": instance.name,
+                "best_known": best[instance.name],
+                "energy_limit": float("inf"),
+            }
+            programs = partial(_programs, case, record, instance)
+            tasks.append((label, task_maker(case, programs, limits)))
+        yield tasks
+
+
+def _programs(case: Case, record: Frozen, instance: Instance) -> Programs:
+    """The NLP of an instance with both Hessians, its layout and formulation."""
+    args = case, record, instance.formulation, instance.start
+    nlp, layout, form = build_instance(*args)
+    second, _, _ = build_instance(*args, hessian="gauss-newton+constraints")
+    return nlp, second, layout, form
