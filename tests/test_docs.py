@@ -26,9 +26,8 @@ from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.solvers.task import Task
 from soup_nlp.cli.main import app
 from soup_nlp.config.problem import Problem
-from soup_nlp.data.depth_prior import PriorOptions
 from soup_nlp.data.flow.sources import flow_sources, resolve_flow
-from soup_nlp.data.inputs import Input, PairInput, Resolve
+from soup_nlp.data.inputs import Input, PairInput, PriorOptions, Resolve
 from soup_nlp.data.pair import Pair
 from soup_nlp.export.verify import Limits
 from soup_nlp.geometry.camera import intrinsics

@@ -13,11 +13,10 @@ from soup_nlp.cli import options
 from soup_nlp.cli.options import RowProgress
 from soup_nlp.cli.progress import SolveLog
 from soup_nlp.errors import StoppedError
+from soup_nlp.sequence.folder import CHAIN, SINGLE
 from soup_nlp.sequence.frames import Frames
 from soup_nlp.sequence.score import chain_lines
 from soup_nlp.sequence.solve import AUTO, named, solve_chain
-from soup_nlp.sequence.stored import CHAIN
-from soup_nlp.sequence.write import SINGLE
 from soup_nlp.storage.files import read_json
 from soup_nlp.storage.folders import default_folder
 

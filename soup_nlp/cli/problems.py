@@ -1,4 +1,4 @@
-"""Commands show, list and export: print problems, list them, write them as files for solvers."""
+"""Commands show, list, export and family: problems as text, and as files for other solvers."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from soup_nlp.cli.options import (
     Set,
     Superpixels,
     changed,
+    listed,
+    numbers,
 )
 from soup_nlp.config.presets import PRESETS, dump_preset
 from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
@@ -32,9 +34,11 @@ from soup_nlp.export.artefact import (
     form_label,
     parse_formulations,
 )
+from soup_nlp.family.instances import SCENES, SIZES, STANDARD, STARTS, select
+from soup_nlp.family.write import write_family
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.files import MOST_YAML, is_folder, read_text
-from soup_nlp.storage.folders import claim, default_folder
+from soup_nlp.storage.folders import claim, default_folder, staged
 
 
 def show(
@@ -147,3 +151,55 @@ def export(
                 f" {s['jacobian_nonzeros']} Jacobian nonzeros,"
                 f" {manifest['nl']['bytes'] / 1e6:.1f} MB"
             )
+
+
+QUICK = "100,250"
+"""Default sizes, which take about a minute."""
+
+TABLES = (
+    "index.json",
+    "index.csv",
+    "instancedata.csv",
+    "run.py",
+    "README.md",
+    "LICENSE.txt",
+)
+"""Files of a set beside its instances."""
+
+
+def _list(known: tuple[object, ...]) -> str:
+    return ",".join(map(str, known))
+
+
+def family(
+    out: Annotated[
+        Path, typer.Argument(help="Folder of the set; new, empty or of an earlier one.")
+    ],
+    sizes: Annotated[str, typer.Option(help=f"Superpixels, of {_list(SIZES)}.")] = QUICK,
+    scenes: Annotated[str, typer.Option(help="Rendered scenes.")] = _list(SCENES),
+    formulation: Annotated[
+        list[str] | None,
+        typer.Option("--formulation", help="gauge/norm; may be repeated."),
+    ] = None,
+    coordinates: Coordinates = "matrix",
+    starts: Annotated[
+        str, typer.Option(help="easy (presolved), hard (initialisation), cold (constant depth).")
+    ] = _list(STARTS),
+    overwrite: Overwrite = False,
+) -> None:
+    """Write the SOUP problem set: .nl files, best known points, index, README, licence."""
+    wanted = numbers(sizes, "--sizes")
+    forms = ["/".join(form.values()) for form in parse_formulations(formulation, coordinates)]
+    chosen = select(wanted, listed(scenes), [form or STANDARD for form in forms], listed(starts))
+    if out.is_dir() and any(out.iterdir()) and not (out / "index.json").is_file():
+        raise DataError(
+            "folder holds other files", where=out, expected="a new or empty folder, or a set"
+        )
+    claim(out, TABLES, overwrite)
+    with staged(out, whole=True, overwrite=overwrite) as new:
+        entries = write_family(new, chosen)
+    print(f"{len(entries)} instances; {', '.join(TABLES)} in {out}/")
+    changed = [e["name"] for e in entries if e["published"] is False]
+    if changed:
+        print(f"{len(changed)} are not the published bytes: please report processor and versions")
+    raise typer.Exit(1 if changed else 0)

@@ -1,28 +1,41 @@
-"""Commands check, evaluate and import."""
+"""Commands check, evaluate, import, view and convert: results are verified, shown, written."""
 
 from __future__ import annotations
 
+import webbrowser
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Annotated, cast, get_args
 
 import numpy as np
 import typer
 
-from soup_nlp.cli.options import Overwrite
+from soup_nlp.cli.options import Overwrite, listed
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.formats.map_files import read_depth
-from soup_nlp.errors import ConfigError, ExportError
+from soup_nlp.errors import ConfigError, DataError, ExportError
 from soup_nlp.evaluate.metrics import Scale
 from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
 from soup_nlp.export.verify import residual_table, table_text
 from soup_nlp.family.describe import check_sol
 from soup_nlp.report.check import check_folder
-from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.report.folder import convert as convert_folder
+from soup_nlp.report.folder import prepare_folder, renew_page, write_folder
+from soup_nlp.report.formats import FORMATS
+from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import accuracy, protocol
+from soup_nlp.sequence.folder import (
+    CHAIN_PAGE,
+    check_chain,
+    convert_chain,
+    is_chain,
+    read_chain,
+    renew_chain_page,
+)
 from soup_nlp.sequence.frames import depth_files
 from soup_nlp.sequence.score import score, score_lines
-from soup_nlp.sequence.stored import check_chain, is_chain, read_chain
 from soup_nlp.solve.kkt import LIMITS
 from soup_nlp.storage.files import is_folder
 from soup_nlp.storage.h5_files import read_h5
@@ -145,3 +158,64 @@ def foreign_verdict(imported: Imported) -> str:
         known = f"{best['exact_energy']:.6g} by {best['found_by']}"
         lines.append(f"best known  exact energy {known}, as manifest.json says: not recomputed")
     return "\n".join(lines)
+
+
+def view(
+    folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain.")],
+    serve: Annotated[
+        int | None,
+        typer.Option(help="Serve the folder to this machine at a port instead; 0 chooses one."),
+    ] = None,
+    renew: Annotated[bool, typer.Option("--renew", help="Generate the page again.")] = False,
+    no_open: Annotated[
+        bool, typer.Option("--no-open", help="Do not open a browser, print the address.")
+    ] = False,
+) -> None:
+    """Open the page of a result in a browser, or serve it."""
+    page, renewed = (CHAIN_PAGE, renew_chain_page) if is_chain(folder) else (PAGE, renew_page)
+    place = folder / page
+    if renew or not place.is_file():
+        place = renewed(folder)
+    if serve is None:
+        address = place.resolve().as_uri()
+        opened = not no_open and webbrowser.open(address)
+        print(f"opened      {place}" if opened else f"open        {address}")
+        return
+    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
+    try:
+        server = ThreadingHTTPServer(("127.0.0.1", serve), handler)
+    except (OSError, OverflowError) as error:
+        raise DataError(
+            "port cannot be used",
+            where="--serve",
+            found=f"{serve}: {error}",
+            expected="a free port",
+            hint="--serve 0 chooses one",
+        ) from error
+    with server:
+        address = f"http://127.0.0.1:{server.server_address[1]}/{page}"
+        print(f"serving     {address} until Ctrl-C", flush=True)
+        if not no_open:
+            webbrowser.open(address)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            print("stopped")
+
+
+_NAMES = "; ".join(f"{name}: {text}" for name, (_, text) in FORMATS.items())
+
+
+def convert(
+    folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain.")],
+    to: Annotated[str, typer.Option("--to", help=f"Comma separated. {_NAMES}.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output folder; default the result's own.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions."""
+    target = folder if out is None else out
+    write = convert_chain if is_chain(folder) else convert_folder
+    for name in write(folder, listed(to), out, overwrite):
+        print(target / name)

@@ -17,17 +17,15 @@ from pydantic.fields import FieldInfo
 
 from soup_nlp.config.presets import with_preset
 from soup_nlp.config.yaml_text import Dumper, parse
-from soup_nlp.data.depth_prior import PriorOptions
 from soup_nlp.data.flow.sources import FlowOptions
-from soup_nlp.data.inputs import Input
+from soup_nlp.data.inputs import Input, PriorOptions
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, expect, printable
 from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.refine.records import RefineOptions
-from soup_nlp.schema.explain import Place, explain, nearest
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
-from soup_nlp.schema.section import Positive, Samples, Section, Seed, Share
+from soup_nlp.schema.section import Place, Positive, Samples, Section, Seed, Share, explain, nearest
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.start.start_options import StartOptions
 from soup_nlp.storage.files import as_path, is_file, read_text

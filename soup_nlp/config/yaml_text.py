@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from soup_nlp.errors import ConfigError
-from soup_nlp.schema.explain import Place
+from soup_nlp.schema.section import Place
 from soup_nlp.storage.files import check_length, check_node
 
 

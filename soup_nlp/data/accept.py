@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.formats.camera_files import check_intrinsics, read_intrinsics
-from soup_nlp.data.formats.exif import estimated_cameras
 from soup_nlp.data.formats.images import read_image
 from soup_nlp.data.formats.map_files import known_depth, read_depth, read_flow
 from soup_nlp.errors import DataError
@@ -67,19 +65,6 @@ def image_of(given: ImageLike, where: str) -> Image:
     check_image_size(image.shape[1], image.shape[0], "image", where)
     image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[:, :, :3]
     return np.ascontiguousarray(image)
-
-
-def cameras_without(
-    given: Sequence[ImageLike], images: Sequence[Image], fov: float | None
-) -> list[Float]:
-    """(3, 3) intrinsics of images by a field of view, EXIF, or a guess.
-
-    Args:
-        given: The images as they were given: a file may have EXIF.
-        images: (H, W, 3) their pixels.
-        fov: Horizontal field of view of the first one, degrees; None if it is not known.
-    """
-    return estimated_cameras([Path(g) if is_path(g) else None for g in given], images, fov)
 
 
 def camera_of(given: CameraLike, where: str) -> Float:

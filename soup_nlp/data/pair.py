@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import InitVar, dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,11 +15,12 @@ from soup_nlp.data.accept import (
     FlowLike,
     ImageLike,
     camera_of,
-    cameras_without,
     flow_of,
     image_of,
+    is_path,
     prior_of,
 )
+from soup_nlp.data.formats.cameras import estimated_cameras
 from soup_nlp.errors import DataError, expect, printable, repr_of
 
 SHORTEST = 0.05
@@ -216,7 +218,7 @@ class Pair:
         truth: The truth, or None.
         name: Name for titles and folders.
         depth_prior: (H, W) depth of the reference frame from elsewhere, or an inverse depth or an
-            order (`data.depth_prior`); NaN where unknown. An array or the name of a file.
+            order (`data.inputs.PriorOptions`); NaN where unknown. An array or the name of a file.
 
     Raises:
         DataError: an image has a wrong shape or type, a camera is invalid, or sizes differ.
@@ -253,7 +255,9 @@ class Pair:
         for what in ("image_ref", "image_next"):
             object.__setattr__(self, what, image_of(getattr(self, what), what))
         if self.K_ref is None:
-            cameras = cameras_without(given, (self.image_ref, self.image_next), fov)
+            # a file may have EXIF
+            files = [Path(image) if is_path(image) else None for image in given]
+            cameras = estimated_cameras(files, (self.image_ref, self.image_next), fov)
             object.__setattr__(self, "K_ref", cameras[0])
             if self.K_next is None:
                 object.__setattr__(self, "K_next", cameras[1])

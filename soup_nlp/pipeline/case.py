@@ -48,8 +48,8 @@ from soup_nlp.start.occlusion import in_order
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
-from soup_nlp.storage.memory import require_memory
 from soup_nlp.storage.progress import Watch
+from soup_nlp.storage.system import require_memory
 
 PRIOR_OVER_GROUND = 10.0
 """Factor of E_prior between two superpixels with borrowed depth over a known ground, where it holds

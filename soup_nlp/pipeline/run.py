@@ -21,11 +21,10 @@ from soup_nlp.config.problem import (
     title,
 )
 from soup_nlp.data.accept import prior_of
-from soup_nlp.data.camera_check import check_cameras
-from soup_nlp.data.depth_prior import PriorOptions, resized_prior
 from soup_nlp.data.flow.plausible import check_flow
 from soup_nlp.data.flow.sources import FlowOptions
-from soup_nlp.data.inputs import pair_hash
+from soup_nlp.data.formats.cameras import check_cameras
+from soup_nlp.data.inputs import PriorOptions, pair_hash, resized_prior
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import StoppedError, expect
 from soup_nlp.evaluate.baselines import rigid_depth

@@ -21,9 +21,8 @@ from soup_nlp.evaluate.scoring import DEPTHS, SURE
 from soup_nlp.report.layout import recorded_files, require_layout
 from soup_nlp.solve.kkt import LIMITS
 from soup_nlp.storage.files import as_path, read_json
-from soup_nlp.storage.folders import recover
+from soup_nlp.storage.folders import digest_of, recover
 from soup_nlp.storage.h5_files import DIGEST, RECORD, read_attrs, read_digest, read_h5
-from soup_nlp.storage.mark import digest_of
 from soup_nlp.storage.store import require
 
 Entries = Mapping[str, Any]

@@ -34,9 +34,8 @@ from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.files import as_path
-from soup_nlp.storage.folders import claim, staged
+from soup_nlp.storage.folders import claim, digest_of, files_in, staged
 from soup_nlp.storage.h5_files import RECORD, read_h5
-from soup_nlp.storage.mark import digest_of, files_in
 from soup_nlp.storage.store import replace_group, write_h5, write_json
 
 FULL = {"ref_full": "depth_ref_full.png", "next_full": "depth_next_full.png"}

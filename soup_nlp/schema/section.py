@@ -1,14 +1,177 @@
-"""Base class of every option record and of every section of a problem file."""
+"""Base class of every option record and section of a problem file, and its validation errors.
+
+A validation error becomes a message: where, found, expected, nearest spelling.
+"""
 
 from __future__ import annotations
 
+import difflib
+import re
+import reprlib
 from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from soup_nlp.schema.explain import explain
+from soup_nlp.errors import ConfigError, printable
 from soup_nlp.schema.limits import LEAST, MAX_ROUNDS, MAX_SAMPLES, MAX_SEED, MOST
+
+Place = tuple[str, ...]
+"""Keys that lead to a value, from the top."""
+_SHORT = reprlib.Repr()
+"""Prints values of any size on a short line."""
+_SHORT.maxstring = _SHORT.maxother = 80
+
+
+def explain(
+    error: ValidationError,
+    model: type[BaseModel],
+    tree: Mapping[str, Any],
+    source: str,
+    lines: Mapping[Place, str],
+) -> ConfigError:
+    """The first mistake as a ConfigError, with the number of further ones.
+
+    Args:
+        error: What validation found.
+        model: Model of the whole problem.
+        tree: The problem as it was given, overrides included.
+        source: Name of the file, or "command line".
+        lines: Where a key comes from, by its place: "line 7" or "--set".
+    """
+    by_place: dict[Place, list[Any]] = {}
+    for item in error.errors():
+        by_place.setdefault(_place(item["loc"], tree, item["type"]), []).append(item)
+    place, found = next(iter(by_place.items()))
+    kind, value = found[0]["type"], found[0]["input"]
+    if kind.startswith("union_tag"):
+        place, value = (*place, "kind"), value.get("kind") if isinstance(value, Mapping) else value
+    key = ".".join(place) or "(top)"
+    known = (lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in lines)
+    where = ", ".join(x for x in (source, next(known, ""), f"key {key}") if x)
+    others = len(by_place) - 1
+    more = f" (and {others} more {'mistake' if others == 1 else 'mistakes'})" if others else ""
+    if kind == "extra_forbidden":
+        sections = _sections(model, tree)
+        allowed = sorted(sections.get(place[:-1], []))
+        homes = [".".join((*p, place[-1])) for p, keys in sections.items() if place[-1] in keys]
+        return ConfigError(
+            "unknown key" + more,
+            where=where,
+            found=place[-1],
+            expected="one of " + ", ".join(allowed),
+            hint=nearest(place[-1], allowed) or (f"did you mean {homes[0]}?" if homes else None),
+        )
+    if kind in ("missing", "union_tag_not_found"):
+        hint = None if kind == "missing" else "every input has a kind; soup-nlp list names examples"
+        return ConfigError("missing key" + more, where=where, expected=key, hint=hint)
+    hint = nearest(printable(value, 60), [word for item in found for word in _words(item)])
+    ranges = _range(model, tree, place)
+    if kind == "string_type" and isinstance(value, int | float):
+        hint = f'write it in quotes: "{value}" (YAML drops leading zeros)'
+    return ConfigError(
+        "value does not fit" + more,
+        where=where,
+        found=_SHORT.repr(value),
+        expected=", or ".join(dict.fromkeys(_expected(item, ranges) for item in found)),
+        hint=hint,
+    )
+
+
+def _place(loc: tuple[int | str, ...], tree: Any, kind: str) -> Place:
+    """Keys of the file that a location names; names of types and tags are left out."""
+    if len(loc) > 1 and loc[0] == "input":
+        # the kind of input stands between its section and its key
+        loc = (loc[0], *loc[2:])
+    out: list[str] = []
+    for k, part in enumerate(loc):
+        inside = isinstance(tree, Mapping) and part in tree
+        item = isinstance(tree, list) and isinstance(part, int) and part < len(tree)
+        if inside or item:
+            tree = tree[part]
+            out.append(str(part))
+        elif kind == "missing" and k == len(loc) - 1:
+            out.append(str(part))
+    return tuple(out)
+
+
+def _sections(model: type[BaseModel], tree: Mapping[str, Any]) -> dict[Place, list[str]]:
+    """Keys of every section, by its place."""
+    out: dict[Place, list[str]] = {(): [k for k in model.model_fields if k != "base"]}
+    for key, info in model.model_fields.items():
+        section: Any = info.annotation
+        below = tree.get(key)
+        below = below if isinstance(below, Mapping) else {}
+        if info.discriminator:
+            section = next((m for m in section.__args__ if below.get("kind") in _tags(m)), None)
+        if isinstance(section, type) and issubclass(section, BaseModel):
+            out |= {(key, *place): names for place, names in _sections(section, below).items()}
+    return out
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
+
+
+def _tags(model: type[BaseModel]) -> tuple[str, ...]:
+    """Values of `kind` that a section stands for."""
+    kinds: Any = model.model_fields["kind"].annotation
+    return tuple(kinds.__args__)
+
+
+def nearest(word: str, allowed: list[str]) -> str | None:
+    """A question that offers the nearest spelling, if one is near."""
+    near = difflib.get_close_matches(word.lower(), allowed, 1, 0.6)
+    return f"did you mean {near[0]}?" if near else None
+
+
+def _words(item: Mapping[str, Any]) -> list[str]:
+    """Words that a choice allows."""
+    context = item.get("ctx", {})
+    text = context.get("expected", "") if item["type"] == "literal_error" else ""
+    return re.findall(r"'([^']*)'", str(context.get("expected_tags", text)))
+
+
+def _range(model: type[BaseModel], tree: Any, place: Place) -> str:
+    """Smallest and largest number that the field at a place allows; empty if it is not bounded."""
+    for key in place[:-1]:
+        below: Any = model.model_fields[key].annotation if key in model.model_fields else None
+        tree = tree.get(key) if isinstance(tree, Mapping) else None
+        kinds = [k for k in (below, *getattr(below, "__args__", ())) if isinstance(k, type)]
+        known = [k for k in kinds if issubclass(k, BaseModel)]
+        if len(known) > 1 and isinstance(tree, Mapping):
+            known = [k for k in known if tree.get("kind") in _tags(k)]
+        if not known:
+            return ""
+        model = known[0]
+    info = model.model_fields.get(place[-1]) if place else None
+    if info is None:
+        return ""
+    bounds: dict[str, Any] = {}
+    choices = getattr(info.annotation, "__args__", ())
+    for item in (*info.metadata, *(x for c in choices for x in getattr(c, "__metadata__", ()))):
+        # a field's own bounds, or those of the types that it names
+        for part in (item, *getattr(item, "metadata", ())):
+            found = ((name, getattr(part, name, None)) for name in ("ge", "gt", "le", "lt"))
+            bounds |= {name: value for name, value in found if value is not None}
+    low, high = (bounds.get(a, bounds.get(b)) for a, b in (("ge", "gt"), ("le", "lt")))
+    return f"{_number(low)} to {_number(high)}" if low is not None and high is not None else ""
+
+
+def _expected(item: Mapping[str, Any], ranges: str = "") -> str:
+    """What was allowed, without pydantic's `Input should be`."""
+    if words := _words(item):
+        return ("one of " if len(words) > 1 else "") + ", ".join(words)
+    if item["type"] in ("model_type", "model_attributes_type", "dict_type"):
+        return "a section with keys of its own"
+    if item["type"] == "too_short":
+        return f"a list of {item['ctx']['min_length']} or more"
+    if item["type"] == "too_long":
+        return f"a list of {item['ctx']['max_length']} or fewer"
+    text = str(item["msg"]).removeprefix("Input should be ").removeprefix("Value error, ")
+    bounded = item["type"].startswith(("greater_than", "less_than")) and ranges
+    return f"{text} ({ranges})" if bounded else text
+
 
 Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=LEAST, le=MOST, allow_inf_nan=False)]

@@ -1,4 +1,4 @@
-"""Frames of a sequence: image files, a video, a rendered scene."""
+"""Frames of a sequence, of image files, a video or a rendered scene; key frames by parallax."""
 
 from __future__ import annotations
 
@@ -7,16 +7,22 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import cv2
-from PIL import Image
+import numpy as np
+from PIL import Image as Picture
+from scipy.optimize import least_squares
 
+from soup_nlp.arrays import Float, Image
+from soup_nlp.data.formats.images import read_image
 from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.figures import write_png
-from soup_nlp.sequence.key_frames import continues
 from soup_nlp.storage.files import as_path, require_file
 from soup_nlp.storage.folders import staged
 
@@ -162,7 +168,7 @@ def check_sequence(images: list[Path]) -> None:
     """
     sizes: dict[tuple[int, int], Path] = {}
     for path in images:
-        with suppress(OSError), Image.open(require_file(path, "image")) as image:
+        with suppress(OSError), Picture.open(require_file(path, "image")) as image:
             sizes.setdefault(image.size, path)
     if len(sizes) > 1:
         raise DataError(
@@ -227,3 +233,88 @@ def _by_number(name: str) -> list[Any]:
     """Sort key that orders numbers and decimals by value: 9, 9.5, 10."""
     words = re.split(r"(\d+(?:\.\d+)?)", name)
     return [(1, Decimal(word), "") if k % 2 else (0, 0, word) for k, word in enumerate(words)]
+
+
+# --- key frames -----------------------------------------------------------------------------------
+
+KEY_PARALLAX = 0.01
+"""Median parallax of consecutive key frames, relative to the larger side of the image."""
+MAX_STEP = 10
+"""Largest number of frames from a key frame to the next."""
+SIDE = 640
+"""Larger side of the images in which points are tracked, pixels."""
+MIN_TRACKED = 0.3
+"""Smallest share of the points that must be tracked."""
+MIN_POINTS = 30
+"""Smallest number of tracked points."""
+
+
+def key_frames(images: Sequence[Path], K: Float, most: int | None = None) -> list[int]:
+    """Indices of key frames.
+
+    The next key frame is the first one with a parallax of `KEY_PARALLAX`, or the last one before
+    points are lost or after `MAX_STEP` frames.
+
+    Args:
+        images: All frames in order.
+        K: (3, 3) intrinsics, pixels.
+        most: Largest number of key frames.
+    """
+    read = lru_cache(MAX_STEP + 1)(_small)
+    chosen, last = [0], len(images) - 1
+    while chosen[-1] < last and (most is None or len(chosen) < most):
+        here = chosen[-1]
+        one, scale = read(images[here])
+        camera = np.diag([scale, scale, 1.0]) @ K
+        best = here + 1
+        for there in range(here + 1, min(here + MAX_STEP, last) + 1):
+            found = parallax(one, read(images[there])[0], camera)
+            if found is None:
+                break
+            best = there
+            if found >= KEY_PARALLAX:
+                break
+        chosen.append(best)
+    return chosen
+
+
+def continues(one: Path, other: Path) -> bool:
+    """Whether enough points of an image can be tracked into the other one."""
+    a, b = (_small(path)[0] for path in (one, other))
+    camera = intrinsics(a.shape[1], a.shape[1], a.shape[1] / 2, a.shape[0] / 2)
+    return parallax(a, b, camera) is not None
+
+
+def parallax(one: Image, other: Image, K: Float) -> float | None:
+    """Median displacement of two grey images (H, W) after removal of a camera rotation.
+
+    It is relative to the larger side of the image; None if too few points can be tracked. K (3, 3)
+    are the intrinsics, pixels.
+    """
+    start = cv2.goodFeaturesToTrack(one, 1000, 0.01, 7)
+    if start is None or one.shape != other.shape:
+        return None
+    options = {"winSize": (21, 21), "maxLevel": 4}
+    end, there, _ = cv2.calcOpticalFlowPyrLK(one, other, start, None, **options)
+    again, back, _ = cv2.calcOpticalFlowPyrLK(other, one, end, None, **options)
+    error = np.linalg.norm(start - again, axis=2).ravel()
+    good = (there.ravel() > 0) & (back.ravel() > 0) & (error < 1)
+    if good.sum() < max(MIN_POINTS, MIN_TRACKED * len(good)):
+        return None
+    p, q = (x.reshape(-1, 2)[good].astype(np.float64) for x in (start, end))
+    rays = np.column_stack([p, np.ones(len(p))]) @ np.linalg.inv(K).T
+
+    def left(turn: Float) -> Float:
+        seen = rays @ exp(turn).T @ K.T
+        return np.asarray(seen[:, :2] / seen[:, 2:] - q)
+
+    turn = least_squares(lambda w: left(w).ravel(), np.zeros(3), loss="soft_l1").x
+    return float(np.median(np.linalg.norm(left(turn), axis=1))) / max(one.shape)
+
+
+def _small(path: Path) -> tuple[Image, float]:
+    """An image in grey, reduced to `SIDE`, and its scale."""
+    image = cv2.cvtColor(read_image(path, turn=True), cv2.COLOR_RGB2GRAY)
+    scale = min(1.0, SIDE / max(image.shape))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8), scale

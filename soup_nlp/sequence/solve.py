@@ -13,7 +13,9 @@ from soup_nlp.data.formats.images import DataWarning, read_image
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence.chain import Chain, make_chain
+from soup_nlp.sequence.folder import SINGLE, chain_files, write_chain
 from soup_nlp.sequence.frames import (
+    MAX_STEP,
     VIDEOS,
     Frames,
     Raw,
@@ -21,12 +23,11 @@ from soup_nlp.sequence.frames import (
     file_frames,
     find_depths,
     find_images,
+    key_frames,
     scene_frames,
     video_frames,
 )
-from soup_nlp.sequence.key_frames import MAX_STEP, key_frames
 from soup_nlp.sequence.pairs import solve_pairs
-from soup_nlp.sequence.write import SINGLE, chain_files, write_chain
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.rows import Say

@@ -12,7 +12,7 @@ import numpy as np
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import PathLike, parse_json, require_file
-from soup_nlp.storage.memory import require_memory
+from soup_nlp.storage.system import require_memory
 
 ReadTree: TypeAlias = dict[str, Any]
 """Nested dict of numpy arrays, as `read_h5` returns it."""

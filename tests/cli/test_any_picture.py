@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.formats.exif import GUESS, estimated_cameras
+from soup_nlp.data.formats.cameras import GUESS, estimated_cameras
 from soup_nlp.data.formats.images import DataWarning, read_image
 from soup_nlp.data.formats.map_files import read_flow
 from soup_nlp.data.scenes.catalogue import render_scene

@@ -20,7 +20,7 @@ from soup_nlp.pipeline import case as cases
 from soup_nlp.pipeline.run import run
 from soup_nlp.report import folder as folders
 from soup_nlp.solve.interrupt import interruptible
-from soup_nlp.storage.mark import MARK
+from soup_nlp.storage.folders import MARK
 
 pytestmark = pytest.mark.slow
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from test_flow import texture
 
-from soup_nlp.data.flow import dis, guided
+from soup_nlp.data.flow import dis
 from soup_nlp.data.flow.consistency import confidence_of
-from soup_nlp.data.flow.guided import dominant_homographies, guided_flow
+from soup_nlp.data.flow.dis import dominant_homographies, guided_flow
 
 HEIGHT, WIDTH = 200, 360
 # the road of a driving camera: what is far down comes nearer fast
@@ -96,8 +96,8 @@ def test_a_guided_flow_must_be_better_by_a_margin(monkeypatch, error, taken):
     def match(a, b):
         return constant(0.1), constant(-0.1)
 
-    monkeypatch.setattr(guided, "dominant_homographies", lambda *a: [np.eye(3)])
-    monkeypatch.setattr(guided, "_MARGIN", 0.5)
+    monkeypatch.setattr(dis, "dominant_homographies", lambda *a: [np.eye(3)])
+    monkeypatch.setattr(dis, "_MARGIN", 0.5)
     first, back = constant(0.0), constant(error)
     flow, gap = guided_flow(grey, grey, match, first, back, 1)
     inside = (slice(20, 40), slice(20, 60))

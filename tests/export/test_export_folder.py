@@ -17,7 +17,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.errors import ExportError
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.sol import write_sol
-from soup_nlp.storage.mark import MARK
+from soup_nlp.storage.folders import MARK
 
 pytestmark = pytest.mark.slow
 

@@ -23,8 +23,8 @@ from soup_nlp.report.check import WRITTEN, CheckReport, check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.layout import record_of
 from soup_nlp.storage import store
+from soup_nlp.storage.folders import MARK, digest_of, files_in
 from soup_nlp.storage.h5_files import DIGEST, RECORD, read_digest
-from soup_nlp.storage.mark import MARK, digest_of, files_in
 
 pytestmark = pytest.mark.slow
 

@@ -15,10 +15,11 @@ from soup_nlp.sequence.frames import (
     file_frames,
     find_depths,
     find_images,
+    key_frames,
+    parallax,
     scene_frames,
     video_frames,
 )
-from soup_nlp.sequence.key_frames import key_frames, parallax
 from soup_nlp.sequence.solve import _frames
 from soup_nlp.storage.folders import staged
 

@@ -21,14 +21,14 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence import pairs
-from soup_nlp.sequence.chain import follow, make_chain, number
-from soup_nlp.sequence.frames import scene_frames
+from soup_nlp.sequence.chain import Link, follow, link, make_chain, number, solve_scales
+from soup_nlp.sequence.folder import COLMAP_POINTS, chain_files, write_chain
+from soup_nlp.sequence.frames import (
+    scene_frames,
+)
 from soup_nlp.sequence.fused import fuse, movers
 from soup_nlp.sequence.pairs import SolvedPair, carried
-from soup_nlp.sequence.scales import Link, link, solve_scales
 from soup_nlp.sequence.score import aligned
-from soup_nlp.sequence.stored import COLMAP_POINTS
-from soup_nlp.sequence.write import chain_files, write_chain
 
 pytestmark = pytest.mark.slow
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import soup_nlp
-from soup_nlp.data.depth_prior import PriorOptions, resized_prior
 from soup_nlp.data.flow.sources import flow_from_truth
+from soup_nlp.data.inputs import PriorOptions, resized_prior
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.folders import staged
-from soup_nlp.storage.mark import digest_of, made_files
+from soup_nlp.storage.folders import digest_of, made_files, staged
 from soup_nlp.storage.store import Array, write_h5, write_json
 
 

@@ -15,8 +15,16 @@ import pytest
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.storage import folders
-from soup_nlp.storage.folders import claim, recover, scratch, staged
-from soup_nlp.storage.mark import MARK, digest_of, files_in, made_files
+from soup_nlp.storage.folders import (
+    MARK,
+    claim,
+    digest_of,
+    files_in,
+    made_files,
+    recover,
+    scratch,
+    staged,
+)
 from soup_nlp.storage.system import deferred_signals
 
 

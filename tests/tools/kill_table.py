@@ -34,8 +34,7 @@ from soup_nlp.config.problem import load_problem
 from soup_nlp.export.names import readable_names
 from soup_nlp.export.sol import write_sol
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.storage.folders import recover
-from soup_nlp.storage.mark import digest_of, made_files
+from soup_nlp.storage.folders import digest_of, made_files, recover
 
 TINY = [
     "input.width=64", "input.height=48", "flow.source=truth", "segmentation.superpixels=12",

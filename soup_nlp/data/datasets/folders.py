@@ -33,7 +33,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Index, Positive, Whole
 from soup_nlp.storage.files import PathLike, is_file, read_text
-from soup_nlp.storage.mark import MARK
+from soup_nlp.storage.folders import MARK
 
 LAYOUT = (
     "frame_0.png and frame_1.png (or image_ref.png and image_next.png), K.txt; optional "

@@ -10,15 +10,14 @@ from typing import Annotated, TypeVar
 from pydantic import Field
 
 from soup_nlp.arrays import Float
-from soup_nlp.data.camera_check import check_cameras
 from soup_nlp.data.formats.camera_files import undistorted
-from soup_nlp.data.formats.exif import estimated_cameras
+from soup_nlp.data.formats.cameras import check_cameras, estimated_cameras
 from soup_nlp.data.formats.images import read_images
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.schema.section import Positive, Section
 from soup_nlp.storage.files import PathLike, as_path, is_file, is_folder, read_json
-from soup_nlp.storage.mark import MARK
+from soup_nlp.storage.folders import MARK
 
 T = TypeVar("T")
 Resolve = Callable[[str], Path]
