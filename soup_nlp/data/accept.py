@@ -12,8 +12,14 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.formats.camera_files import check_intrinsics, read_intrinsics
 from soup_nlp.data.formats.images import read_image
-from soup_nlp.data.formats.map_files import known_depth, read_depth, read_flow
-from soup_nlp.errors import DataError
+from soup_nlp.data.formats.map_files import (
+    UNKNOWN_FLOW,
+    flow_layout,
+    known_depth,
+    read_depth,
+    read_flow,
+)
+from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.limits import check_image_size
 
@@ -44,7 +50,8 @@ def image_of(given: ImageLike, where: str) -> Image:
         return read_image(Path(given))
     if hasattr(given, "convert") and getattr(given, "mode", None) in _PICTURES:
         given = given.convert("RGB")
-    image = _array(given, "image", where, "uint8 (H, W, 3) array, path or PIL image")
+    expected = "uint8 (H, W, 3) array, path or PIL image"
+    image = array_of(given, "image", where, expected, kinds="fiub")
     if image.ndim == 2:
         image = image[:, :, None]
     elif image.ndim == 3 and image.shape[0] in (1, 3, 4) and image.shape[2] not in (1, 3, 4):
@@ -90,19 +97,16 @@ def prior_of(given: object) -> Float:
     """
     if is_path(given):
         return read_depth(Path(str(given)), 1.0)
-    value = _array(given, "depth prior", "prior", "numbers (H, W), or a path")
-    if value.dtype.kind not in "fiu":
-        raise DataError("depth prior holds no numbers", where="prior", found=value.dtype)
-    return known_depth(value, "prior")
+    return known_depth(
+        array_of(given, "depth prior", "prior", "numbers (H, W), or a path"), "prior"
+    )
 
 
 def flow_of(given: FlowLike, confidence: object, source: str) -> tuple[NDArray[Any], FloatMap, str]:
     """Displacements (H, W, 2), confidence (H, W) and source of a flow.
 
-    An array is interpreted as (2, H, W) if only its first axis has length 2.
-
     Args:
-        given: Array or file.
+        given: Array, see `flow_layout`, or file.
         confidence: (H, W) in [0, 1]; None for 1 where the flow is finite and 0 elsewhere, with the
             displacement set to 0.
         source: Name of the flow; "unknown" for the name of the file.
@@ -113,55 +117,50 @@ def flow_of(given: FlowLike, confidence: object, source: str) -> tuple[NDArray[A
     if is_path(given):
         source = str(given) if source == "unknown" else source
         given = read_flow(Path(given))
-    uv = _array(given, "flow", source, "numbers (H, W, 2) or (2, H, W) in pixels, or a path")
-    if uv.dtype.kind not in "fiu":
-        raise DataError(
-            "flow does not hold numbers", where=source, found=uv.dtype, expected="real numbers"
-        )
-    if uv.ndim == 3 and uv.shape[0] == 2 and uv.shape[2] != 2:
-        uv = np.moveaxis(uv, 0, 2)
-    if uv.ndim != 3 or uv.shape[2] != 2:
-        batch = uv.ndim == 4 and len(uv) == 1
-        raise DataError(
-            "flow has the wrong shape",
-            where=source,
-            found=uv.shape,
-            expected="(H, W, 2) or (2, H, W)",
-            hint="flow[0] takes it out of its batch" if batch else None,
-        )
+    expected = "numbers (H, W, 2) or (2, H, W) in pixels, or a path"
+    uv = flow_layout(array_of(given, "flow", source, expected), source)
     if not (uv.dtype.kind == "f" and uv.dtype.itemsize >= 4):
         uv = uv.astype(np.float32)
     if confidence is None:
-        # Middlebury's files mark unknown flow by 1e9 and more
-        known = (np.abs(uv) < 1e9).all(axis=2)
+        known = (np.abs(uv) < UNKNOWN_FLOW).all(axis=2)
         return np.where(known[..., None], uv, 0), known.astype(np.float32), source
-    sure = _array(confidence, "flow confidence", source, "numbers (H, W) from 0 to 1")
-    if sure.dtype.kind not in "fiub" or sure.ndim != 2:
-        raise DataError(
-            "flow confidence is no map of numbers",
-            where=source,
-            found=f"{sure.dtype} {sure.shape}",
-            expected="numbers (H, W) from 0 to 1",
-        )
+    expected = "numbers (H, W) from 0 to 1"
+    sure = array_of(confidence, "flow confidence", source, expected, kinds="fiub", axes="(H, W)")
     return uv, sure if sure.dtype.kind == "f" else sure.astype(np.float32), source
 
 
-def _array(given: object, what: str, where: str, expected: str) -> NDArray[Any]:
+def array_of(
+    given: object, what: str, where: str, expected: str, kinds: str = "fiu", axes: str = ""
+) -> NDArray[Any]:
     """An object as NumPy array.
 
+    Args:
+        given: The object.
+        what: Its name for the message.
+        where: Its place.
+        expected: What it should be, for the message.
+        kinds: Kinds of numbers of NumPy that it may have.
+        axes: Its shape, such as "(H, W, 2)"; any shape if empty.
+
     Raises:
-        DataError: it is not an array of numbers.
+        DataError: it is not an array of these numbers or of this shape.
     """
     try:
         array = np.asarray(given)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        array = np.empty(0, object)
+    sizes = axes.strip("()").split(", ") if axes else [str(size) for size in array.shape]
+    fits = array.ndim == len(sizes) and all(
+        str(size) == wanted for size, wanted in zip(array.shape, sizes) if wanted.isdigit()
+    )
+    if array.dtype.kind not in kinds or not fits:
+        plain = array.dtype.kind in "fiub"
         raise DataError(
-            f"{what} is no array",
+            f"{what} is no array of its kind",
             where=where,
-            found=f"{type(given).__name__}: {error}",
+            found=f"{array.dtype} {array.shape}"
+            if plain
+            else f"{type(given).__name__} {printable(repr_of(given), 60)}",
             expected=expected,
-        ) from error
-    if array.dtype == object or array.dtype.kind in "USmM":
-        found = f"{type(given).__name__} {given!r}"[:80]
-        raise DataError(f"{what} is no array", where=where, found=found, expected=expected)
+        )
     return array

@@ -14,6 +14,7 @@ from soup_nlp.data.accept import (
     CameraLike,
     FlowLike,
     ImageLike,
+    array_of,
     camera_of,
     flow_of,
     image_of,
@@ -21,7 +22,7 @@ from soup_nlp.data.accept import (
     prior_of,
 )
 from soup_nlp.data.formats.cameras import estimated_cameras
-from soup_nlp.errors import DataError, expect, printable, repr_of
+from soup_nlp.errors import DataError, expect
 
 SHORTEST = 0.05
 """Smallest focal length relative to the side of the image (168 degrees of view)."""
@@ -159,23 +160,9 @@ class Truth:
             value = getattr(self, name)
             if value is None:
                 continue
-            try:
-                made = np.asarray(value)
-            except (TypeError, ValueError, OverflowError):
-                made = np.empty(0, object)
-            axes = _SHAPES[name].strip("()").split(", ")
-            fits = len(made.shape) == len(axes) and all(
-                str(size) == axis for size, axis in zip(made.shape, axes) if axis.isdigit()
-            )
-            if made.dtype.kind not in kinds or not fits:
-                raise DataError(
-                    "part of the truth is no array of its kind",
-                    where=f"truth.{name}",
-                    found=f"{type(value).__name__} {printable(repr_of(value), 60)}",
-                    expected=f"{_SHAPES[name]} array of "
-                    + ("True and False" if kinds == "b" else "numbers"),
-                    hint="soup_nlp.Truth(depth_ref=array); files are read by a problem's input",
-                )
+            axes = _SHAPES[name]
+            expected = f"{axes} array of {'True and False' if kinds == 'b' else 'numbers'}"
+            made = array_of(value, "part of the truth", f"truth.{name}", expected, kinds, axes)
             if made.dtype.kind == "f":
                 # float32 cannot be compared with what overflows
                 made = made.astype(np.float64)

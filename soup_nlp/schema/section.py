@@ -51,10 +51,11 @@ def explain(
     where = ", ".join(x for x in (source, next(known, ""), f"key {key}") if x)
     others = len(by_place) - 1
     more = f" (and {others} more {'mistake' if others == 1 else 'mistakes'})" if others else ""
+    sections = _sections(model, tree)
     if kind == "extra_forbidden":
-        sections = _sections(model, tree)
-        allowed = sorted(sections.get(place[:-1], []))
-        homes = [".".join((*p, place[-1])) for p, keys in sections.items() if place[-1] in keys]
+        keys = {p: [k for k in s.model_fields if k != "base"] for p, s in sections.items()}
+        allowed = sorted(keys.get(place[:-1], []))
+        homes = [".".join((*p, place[-1])) for p, known in keys.items() if place[-1] in known]
         return ConfigError(
             "unknown key" + more,
             where=where,
@@ -66,7 +67,7 @@ def explain(
         hint = None if kind == "missing" else "every input has a kind; soup-nlp list names examples"
         return ConfigError("missing key" + more, where=where, expected=key, hint=hint)
     hint = nearest(printable(value, 60), [word for item in found for word in _words(item)])
-    ranges = _range(model, tree, place)
+    ranges = _range(sections.get(place[:-1]), place[-1]) if place else ""
     if kind == "string_type" and isinstance(value, int | float):
         hint = f'write it in quotes: "{value}" (YAML drops leading zeros)'
     return ConfigError(
@@ -95,9 +96,9 @@ def _place(loc: tuple[int | str, ...], tree: Any, kind: str) -> Place:
     return tuple(out)
 
 
-def _sections(model: type[BaseModel], tree: Mapping[str, Any]) -> dict[Place, list[str]]:
-    """Keys of every section, by its place."""
-    out: dict[Place, list[str]] = {(): [k for k in model.model_fields if k != "base"]}
+def _sections(model: type[BaseModel], tree: Mapping[str, Any]) -> dict[Place, type[BaseModel]]:
+    """Model of every section, by its place."""
+    out: dict[Place, type[BaseModel]] = {(): model}
     for key, info in model.model_fields.items():
         section: Any = info.annotation
         below = tree.get(key)
@@ -105,7 +106,7 @@ def _sections(model: type[BaseModel], tree: Mapping[str, Any]) -> dict[Place, li
         if info.discriminator:
             section = next((m for m in section.__args__ if below.get("kind") in _tags(m)), None)
         if isinstance(section, type) and issubclass(section, BaseModel):
-            out |= {(key, *place): names for place, names in _sections(section, below).items()}
+            out |= {(key, *place): found for place, found in _sections(section, below).items()}
     return out
 
 
@@ -132,19 +133,9 @@ def _words(item: Mapping[str, Any]) -> list[str]:
     return re.findall(r"'([^']*)'", str(context.get("expected_tags", text)))
 
 
-def _range(model: type[BaseModel], tree: Any, place: Place) -> str:
-    """Smallest and largest number that the field at a place allows; empty if it is not bounded."""
-    for key in place[:-1]:
-        below: Any = model.model_fields[key].annotation if key in model.model_fields else None
-        tree = tree.get(key) if isinstance(tree, Mapping) else None
-        kinds = [k for k in (below, *getattr(below, "__args__", ())) if isinstance(k, type)]
-        known = [k for k in kinds if issubclass(k, BaseModel)]
-        if len(known) > 1 and isinstance(tree, Mapping):
-            known = [k for k in known if tree.get("kind") in _tags(k)]
-        if not known:
-            return ""
-        model = known[0]
-    info = model.model_fields.get(place[-1]) if place else None
+def _range(model: type[BaseModel] | None, key: str) -> str:
+    """Smallest and largest number that a field allows; empty if it is not bounded."""
+    info = model.model_fields.get(key) if model else None
     if info is None:
         return ""
     bounds: dict[str, Any] = {}

@@ -13,7 +13,7 @@ from soup_nlp.arrays import FloatMap, Image
 from soup_nlp.data.flow.consistency import checked_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import is_file
+from soup_nlp.storage.files import require_file
 
 RANGES = {"255": (0.0, 255.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
 """Input values of black and white by the metadata `input_range` of an ONNX file; default "255"."""
@@ -50,8 +50,6 @@ def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
             "a network needs two RGB images of one size",
             found=f"{image_ref.shape} and {image_next.shape}",
         )
-    if not is_file(source):
-        raise DataError("file of a network is missing", where=source)
     network = onnx_network(Path(source))
     forward = _run(network, image_ref, image_next, source)
     backward = _run(network, image_next, image_ref, source)
@@ -69,8 +67,6 @@ def learned_map(source: str, image: Image) -> FloatMap:
     Raises:
         DataError: the library or the file is missing, or the network gives no map.
     """
-    if not is_file(source):
-        raise DataError("file of a network is missing", where=source)
     network = onnx_network(Path(source), images=1)
     outputs, (rows, cols) = _outputs(network, (image,), source)
     maps = [np.squeeze(o) for o in outputs if np.ndim(o) in (3, 4)]
@@ -96,8 +92,9 @@ def onnx_network(path: Path, images: int = 2) -> Network:
     size.
 
     Raises:
-        DataError: onnxruntime is not installed, or the file is no such network.
+        DataError: onnxruntime is not installed, or the file is missing or no such network.
     """
+    require_file(path, "file of a network")
     try:
         import onnxruntime
     except ImportError as error:

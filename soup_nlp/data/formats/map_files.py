@@ -141,17 +141,29 @@ def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> Floa
 # --- flow -----------------------------------------------------------------------------------------
 
 
-def _known_flow(flow: NDArray[Any], path: PathLike) -> Float:
-    """The flow with NaN in both components where either is unknown; (2, H, W) is turned."""
+def flow_layout(flow: NDArray[Any], where: PathLike) -> NDArray[Any]:
+    """A flow (H, W, 2) or (2, H, W) as (H, W, 2); if only its first axis has length 2, it is turned.
+
+    Raises:
+        DataError: it has another shape.
+    """
     if flow.ndim == 3 and flow.shape[0] == 2 and flow.shape[2] != 2:
-        flow = flow.transpose(1, 2, 0)
+        flow = np.moveaxis(flow, 0, 2)
     if flow.ndim != 3 or flow.shape[2] != 2:
+        batch = flow.ndim == 4 and len(flow) == 1
         raise DataError(
             "flow has the wrong shape",
-            where=path,
+            where=where,
             found=flow.shape,
             expected="(H, W, 2) or (2, H, W)",
+            hint="flow[0] takes it out of its batch" if batch else None,
         )
+    return flow
+
+
+def _known_flow(flow: NDArray[Any], path: PathLike) -> Float:
+    """The flow with NaN in both components where either is unknown; see `flow_layout`."""
+    flow = flow_layout(flow, path)
     check_image_size(flow.shape[1], flow.shape[0], "flow", path)
     with np.errstate(over="ignore"):
         out = np.array(flow, dtype=np.float32)
