@@ -97,9 +97,8 @@ def prior_of(given: object) -> Float:
     """
     if is_path(given):
         return read_depth(Path(str(given)), 1.0)
-    return known_depth(
-        array_of(given, "depth prior", "prior", "numbers (H, W), or a path"), "prior"
-    )
+    values = array_of(given, "depth prior", "prior", "numbers (H, W), or a path")
+    return known_depth(values, "prior")
 
 
 def flow_of(given: FlowLike, confidence: object, source: str) -> tuple[NDArray[Any], FloatMap, str]:
@@ -154,13 +153,10 @@ def array_of(
         str(size) == wanted for size, wanted in zip(array.shape, sizes) if wanted.isdigit()
     )
     if array.dtype.kind not in kinds or not fits:
-        plain = array.dtype.kind in "fiub"
+        found = f"{type(given).__name__} {printable(repr_of(given), 60)}"
+        if array.dtype.kind in "fiub":
+            found = f"{array.dtype} {array.shape}"
         raise DataError(
-            f"{what} is no array of its kind",
-            where=where,
-            found=f"{array.dtype} {array.shape}"
-            if plain
-            else f"{type(given).__name__} {printable(repr_of(given), 60)}",
-            expected=expected,
+            f"{what} is no array of its kind", where=where, found=found, expected=expected
         )
     return array

@@ -55,7 +55,7 @@ def explain(
     if kind == "extra_forbidden":
         keys = {p: [k for k in s.model_fields if k != "base"] for p, s in sections.items()}
         allowed = sorted(keys.get(place[:-1], []))
-        homes = [".".join((*p, place[-1])) for p, known in keys.items() if place[-1] in known]
+        homes = [".".join((*p, place[-1])) for p, names in keys.items() if place[-1] in names]
         return ConfigError(
             "unknown key" + more,
             where=where,

@@ -142,7 +142,7 @@ def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> Floa
 
 
 def flow_layout(flow: NDArray[Any], where: PathLike) -> NDArray[Any]:
-    """A flow (H, W, 2) or (2, H, W) as (H, W, 2); if only its first axis has length 2, it is turned.
+    """A flow (H, W, 2), or (2, H, W) whose last axis has another length than 2, as (H, W, 2).
 
     Raises:
         DataError: it has another shape.
