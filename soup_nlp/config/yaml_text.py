@@ -9,7 +9,7 @@ import yaml
 
 from soup_nlp.errors import ConfigError
 from soup_nlp.schema.section import Place
-from soup_nlp.storage.files import check_length, check_node
+from soup_nlp.storage.files import parse_yaml
 
 
 class _Loader(yaml.SafeLoader):
@@ -46,27 +46,14 @@ def parse(text: str, source: str) -> tuple[Any, dict[Place, str]]:
     """The content of a YAML text, and the line of every key."""
     lines: dict[Place, str] = {}
     try:
-        check_length(text)
-        loader = _Loader(text)
-    except (yaml.YAMLError, ValueError) as error:
-        # the loader looks for characters that YAML does not have
-        raise ConfigError("text is not YAML", where=source, found=error) from error
-    try:
-        node = loader.get_single_node()
-        if node is None:
-            return None, lines
-        check_node(node)
-        _locate(node, (), lines, source)
-        return loader.construct_document(node), lines
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
+        return parse_yaml(text, _Loader, lambda node: _locate(node, (), lines, source)), lines
+    except ValueError as error:
+        mark = getattr(error.__cause__, "problem_mark", None)
         raise ConfigError(
             "text is not YAML",
             where=f"{source}, line {mark.line + 1}" if mark else source,
-            found=getattr(error, "problem", None) or error,
+            found=getattr(error.__cause__, "problem", None) or error,
         ) from error
-    finally:
-        loader.dispose()
 
 
 def _locate(node: yaml.Node, place: Place, lines: dict[Place, str], source: str) -> None:

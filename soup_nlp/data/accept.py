@@ -129,7 +129,13 @@ def flow_of(given: FlowLike, confidence: object, source: str) -> tuple[NDArray[A
 
 
 def array_of(
-    given: object, what: str, where: str, expected: str, kinds: str = "fiu", axes: str = ""
+    given: object,
+    what: str,
+    where: str,
+    expected: str,
+    kinds: str = "fiu",
+    axes: str = "",
+    hint: str | None = None,
 ) -> NDArray[Any]:
     """An object as NumPy array.
 
@@ -140,6 +146,7 @@ def array_of(
         expected: What it should be, for the message.
         kinds: Kinds of numbers of NumPy that it may have.
         axes: Its shape, such as "(H, W, 2)"; any shape if empty.
+        hint: What to try, for the message.
 
     Raises:
         DataError: it is not an array of these numbers or of this shape.
@@ -156,7 +163,6 @@ def array_of(
         found = f"{type(given).__name__} {printable(repr_of(given), 60)}"
         if array.dtype.kind in "fiub":
             found = f"{array.dtype} {array.shape}"
-        raise DataError(
-            f"{what} is no array of its kind", where=where, found=found, expected=expected
-        )
+        what = f"{what} is no array of its kind"
+        raise DataError(what, where=where, found=found, expected=expected, hint=hint)
     return array

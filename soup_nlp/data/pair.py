@@ -162,14 +162,16 @@ class Truth:
                 continue
             axes = _SHAPES[name]
             expected = f"{axes} array of {'True and False' if kinds == 'b' else 'numbers'}"
-            made = array_of(value, "part of the truth", f"truth.{name}", expected, kinds, axes)
+            where, what = f"truth.{name}", "part of the truth"
+            hint = "soup_nlp.Truth(depth_ref=array); files are read by a problem's input"
+            made = array_of(value, what, where, expected, kinds, axes, hint)
             if made.dtype.kind == "f":
                 # float32 cannot be compared with what overflows
                 made = made.astype(np.float64)
             if made.dtype.kind == "f" and (abs(made[np.isfinite(made)]) > LARGEST).any():
                 raise DataError(
-                    "part of the truth has numbers whose squares overflow",
-                    where=f"truth.{name}",
+                    f"{what} has numbers whose squares overflow",
+                    where=where,
                     found=f"{np.abs(made[np.isfinite(made)]).max():g}",
                     expected=f"at most {LARGEST:g}",
                     hint="NaN marks what is unknown",

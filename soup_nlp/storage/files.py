@@ -192,7 +192,7 @@ def _plain(value: Any, level: int) -> Any:
     return value
 
 
-def check_node(node: yaml.Node) -> None:
+def _check_node(node: yaml.Node) -> None:
     """Raise ValueError for a YAML document with too many values or nested too deeply."""
     sizes: dict[int, int] = {}
 
@@ -212,28 +212,34 @@ def check_node(node: yaml.Node) -> None:
     size(node, 0)
 
 
-def parse_yaml(text: str) -> Any:
+def parse_yaml(
+    text: str,
+    kind: type[yaml.SafeLoader] = yaml.SafeLoader,
+    see: Callable[[yaml.Node], None] = lambda node: None,
+) -> Any:
     """The value of a YAML text.
 
+    Args:
+        text: The text.
+        kind: Loader.
+        see: Called with the document before its values are made.
+
     Raises:
-        ValueError: it is not YAML, too long, nested too deeply, or has too many values.
+        ValueError: it is not YAML (its cause is the YAML error), too long, nested too deeply, or
+            has too many values.
     """
-    check_length(text)
+    if len(text) > MOST_YAML:
+        raise ValueError(f"{len(text)} characters, at most {MOST_YAML} are read")
     try:
-        loader = yaml.SafeLoader(text)
+        loader = kind(text)
         try:
             node = loader.get_single_node()
             if node is None:
                 return None
-            check_node(node)
+            _check_node(node)
+            see(node)
             return loader.construct_document(node)
         finally:
             loader.dispose()
     except (yaml.YAMLError, RecursionError, TypeError) as problem:
-        raise ValueError(printable(problem)) from None
-
-
-def check_length(text: str) -> None:
-    """Raise ValueError for a YAML text that is too long."""
-    if len(text) > MOST_YAML:
-        raise ValueError(f"{len(text)} characters, at most {MOST_YAML} are read")
+        raise ValueError(printable(problem)) from problem
