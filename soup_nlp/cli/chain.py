@@ -10,8 +10,7 @@ from typing import Annotated
 import typer
 
 from soup_nlp.cli import options
-from soup_nlp.cli.options import RowProgress
-from soup_nlp.cli.progress import SolveLog
+from soup_nlp.cli.options import RowProgress, SolveLog
 from soup_nlp.errors import StoppedError
 from soup_nlp.sequence.folder import CHAIN, SINGLE
 from soup_nlp.sequence.frames import Frames

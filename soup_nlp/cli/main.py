@@ -169,27 +169,27 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 
 BENCH: Mapping[str, tuple[str, str]] = {
     "accuracy": (
-        "bench_accuracy:accuracy",
+        "bench:accuracy",
         "Depth against truth on a suite of pairs; interrupted runs can be continued.",
     ),
     "speed": (
-        "bench_speed:speed",
+        "bench:speed",
         "Time the solver over N and K, each run in a process of its own; resumes what is stored.",
     ),
     "cost": (
-        "bench_speed:cost",
+        "bench:cost",
         "Time and memory of whole solves over N and image size, each in a process of its own.",
     ),
     "search": (
-        "bench_accuracy:search",
+        "bench:search",
         "Search for better defaults and check them on the families that did not choose them.",
     ),
     "paper": (
-        "bench_accuracy:paper",
+        "bench:paper",
         "The paper's tables and figures by `preset: paper` and the defaults; can be continued.",
     ),
     "chain": (
-        "bench_speed:chain",
+        "bench:chain",
         "What one scale costs on rendered sequences, and on kitti_tracking in the --data folder.",
     ),
 }

@@ -12,8 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from soup_nlp.cli import options
-from soup_nlp.cli.options import INPUT, METHOD, OUTPUT, camera, changed, located
-from soup_nlp.cli.progress import SolveLog
+from soup_nlp.cli.options import INPUT, METHOD, OUTPUT, SolveLog, camera, changed, located
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning

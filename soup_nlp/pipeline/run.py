@@ -21,7 +21,7 @@ from soup_nlp.config.problem import (
     title,
 )
 from soup_nlp.data.accept import prior_of
-from soup_nlp.data.flow.plausible import check_flow
+from soup_nlp.data.flow.consistency import check_flow
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.formats.cameras import check_cameras
 from soup_nlp.data.inputs import PriorOptions, pair_hash, resized_prior

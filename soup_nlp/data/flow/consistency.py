@@ -1,13 +1,22 @@
-"""Confidence of a flow from its forward-backward consistency."""
+"""Confidence of a flow from its forward-backward consistency, and plausibility of given flows.
+
+Given flows that do not belong to their images, or are in other units, are detected: the next image
+is warped by the flow. With a right flow it differs from the reference image at most half as much as
+without a flow (16 pairs, rendered and real); with a wrong flow, as much or more.
+"""
 
 from __future__ import annotations
+
+import warnings
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import FloatMap
-from soup_nlp.data.pair import Flow
+from soup_nlp.arrays import Float, FloatMap, Image
+from soup_nlp.data.formats.images import DataWarning
+from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.errors import DataError
 
 SUPPORT = 15
 """Side of the window over which the round-trip error is averaged, pixels: a wrong flow may be
@@ -83,3 +92,111 @@ def confidence_of(gap: FloatMap, support: int = SUPPORT) -> FloatMap:
     confidence = np.exp(-np.square(np.minimum(gap, LIMIT)), dtype=np.float32)
     confidence[~(gap <= LIMIT)] = 0.0
     return np.asarray(confidence, dtype=np.float32)
+
+
+BETTER = 0.8
+"""Ratio of two photometric errors below which the changed flow is clearly better."""
+WORSE = 0.02
+"""Excess over the error without a flow of a flow that is refused, standard deviations of grey."""
+USELESS = 0.9
+"""Ratio to the error without a flow above which a warning is given."""
+
+_BLUR = 2.0  # pixels
+_CAP = 1.0  # standard deviations of grey
+_PIXELS = 250_000  # that are compared
+_LEAST = 0.2  # share of the known pixels that must stay in the image
+_FACTORS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 2, 2, 3, 4)
+
+
+def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
+    """Compare the images along a flow of a pair that was not computed here.
+
+    Args:
+        flow: The flow.
+        pair: Its images.
+        backward: The flow is from the next to the reference image. It may be wrong in parts, which
+            the round trip finds.
+
+    Raises:
+        DataError: the flow is in another order, direction or unit, leads out of the image, or is
+            worse than no flow.
+
+    Warns:
+        DataWarning: the flow is hardly better than no flow.
+    """
+    if backward:
+        pair = Pair(pair.image_next, pair.image_ref, pair.K_next, pair.K_ref)
+    step = 1 + int(np.sqrt(flow.confidence.size / _PIXELS))
+    height, width = pair.size
+    v, u = (x.astype(np.float32) for x in np.mgrid[0:height:step, 0:width:step])
+    uv, known = flow.uv[::step, ::step], flow.confidence[::step, ::step] > 0
+    ref, following = _grey(pair.image_ref)[::step, ::step], _grey(pair.image_next)
+
+    def differences(uv: FloatMap | Float) -> FloatMap:
+        """Difference of every pixel and its target; NaN where unknown or outside."""
+        x, y = (np.asarray(p + uv[..., k], np.float32) for k, p in enumerate((u, v)))
+        inside = (x >= 0) & (y >= 0) & (x < following.shape[1]) & (y < following.shape[0])
+        seen = cv2.remap(following, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.where(known & inside, np.minimum(np.abs(seen - ref), _CAP), np.nan)
+
+    def mean(of: FloatMap, other: FloatMap) -> float:
+        """Mean over the pixels that have both differences; infinite if these are few."""
+        both = np.isfinite(of) & np.isfinite(other)
+        return float(of[both].mean()) if both.sum() > _LEAST * known.sum() else np.inf
+
+    along = differences(uv)
+    # without motion a pixel keeps its ray
+    A = (pair.K_next @ np.linalg.inv(pair.K_ref))[:2]
+    at = np.stack([u, v], axis=-1)
+    without = differences(at @ A[:, :2].T + A[:, 2] - at)
+    own, none = mean(along, along), mean(without, without)
+    cause, least = "", BETTER
+    for name, changed in _changes(uv, pair).items():
+        new = differences(changed)
+        # pixels that leave the image along one flow only say nothing
+        both = [(mean(new, old), mean(old, new)) for old in (along, without)]
+        # images without contrast agree with every flow
+        relative = max((a / b if b > WORSE else 1.0 for a, b in both if a < np.inf), default=np.inf)
+        if relative < least:
+            cause, least = name, relative
+    if cause:
+        problem, hint = "flow does not fit the images", f"it does {cause}"
+    elif own > none + WORSE and not backward:
+        problem = "flow does not fit the images: it is worse than no flow"
+        hint = "is it of these two images, in this order, in pixels?"
+    else:
+        if not backward and none > WORSE and own > USELESS * none:
+            warnings.warn(
+                f"flow {flow.source} explains the images hardly better than no flow"
+                f" ({own:.3f} and {none:.3f}): is it of these images?",
+                DataWarning,
+                stacklevel=2,
+            )
+        return
+    raise DataError(
+        problem,
+        where=flow.source,
+        found=f"difference of the images {own:.3f} along the flow, {none:.3f} without a flow",
+        expected="displacements (u right, v down) in pixels, to the other image",
+        hint=hint,
+    )
+
+
+def _grey(image: Image) -> FloatMap:
+    """(H, W) blurred grey values in standard deviations from their mean."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey = cv2.GaussianBlur(grey, (0, 0), _BLUR)
+    return np.asarray((grey - grey.mean()) / max(float(grey.std()), 1.0), np.float32)
+
+
+def _changes(uv: FloatMap, pair: Pair) -> dict[str, FloatMap | Float]:
+    """Flows that would be right if the given one were wrong in a usual way."""
+    size = np.array(pair.size[::-1], np.float64)
+    return {
+        "with its channels u and v exchanged": uv[..., ::-1],
+        "with both signs changed: it may be of the other direction (backward)": -uv,
+        "with the sign of v changed: its axis may point up": uv * [1.0, -1.0],
+        "times the image's size: it may be relative to it": uv * size,
+        "times half the image's size: it may be relative to it": uv * size / 2,
+        **{f"times {x:.3g}: it may be of another resolution": uv * x for x in _FACTORS},
+    }

@@ -14,10 +14,9 @@ import cv2
 import numpy as np
 
 from soup_nlp.arrays import Image
-from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
+from soup_nlp.data.flow.consistency import check_flow, confidence_of, round_trip_error
 from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.learned import learned_flow
-from soup_nlp.data.flow.plausible import check_flow
 from soup_nlp.data.formats.map_files import read_confidence, read_flow
 from soup_nlp.data.pair import Flow, Pair, check_size
 from soup_nlp.data.working_size import at_common_focal, in_own_pixels

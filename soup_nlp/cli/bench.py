@@ -1,29 +1,42 @@
-"""Commands bench accuracy, search and paper: suites, better defaults, the paper's tables."""
+"""Commands bench: accuracy on suites, better defaults, the paper's tables, time, one scale."""
 
 from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, NoReturn
 
 import pandas as pd
 import typer
 
 from soup_nlp.bench import search as searching
+from soup_nlp.bench import speed as timing
 from soup_nlp.bench.accuracy import measure_pair
 from soup_nlp.bench.accuracy_page import write_suite
 from soup_nlp.bench.paper import ALL_SECTIONS, FAMILIES, Sizes, make_plan, measure_paper
 from soup_nlp.bench.paper_page import FILES, write_page
-from soup_nlp.bench.study import Cell, measure_cells
+from soup_nlp.bench.study import Cell, Measure, measure_cells, show
 from soup_nlp.bench.suites import SUITES, Options, list_suite
-from soup_nlp.cli import options
-from soup_nlp.cli.options import RowProgress, numbers, words
+from soup_nlp.bench.tables import chain_page, cost_cells, cost_page, measure_chain, sequences
+from soup_nlp.cli.options import (
+    AnyCode,
+    Data,
+    Out,
+    Overwrite,
+    Quiet,
+    RowProgress,
+    Set,
+    Workers,
+    numbers,
+    words,
+)
+from soup_nlp.data.scenes.catalogue import SCENES
 from soup_nlp.errors import ConfigError
 from soup_nlp.evaluate.protocols import preset
-from soup_nlp.schema.limits import MAX_SIDE, MAX_SUPERPIXELS
+from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SIDE, MAX_SUPERPIXELS
 from soup_nlp.storage.atomic import write_text
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.rows import Row, measure_all
@@ -47,9 +60,9 @@ def mre_of(row: Row) -> str:
 
 def accuracy(
     suite: SuiteName = None,
-    data: options.Data = None,
-    out: options.Out = Path("out/bench/accuracy"),
-    overrides: options.Set = None,
+    data: Data = None,
+    out: Out = Path("out/bench/accuracy"),
+    overrides: Set = None,
     flow: Flow = None,
     width: Width = 1024,
     seeds: Seeds = "0",
@@ -57,15 +70,15 @@ def accuracy(
     limit: Annotated[
         int | None, typer.Option(help="At most this many pairs a suite.", min=1)
     ] = None,
-    workers: options.Workers = 1,
+    workers: Workers = 1,
     folders: Annotated[Path | None, typer.Option(help="Keep every result folder here.")] = None,
     conventions: Annotated[
         list[str] | None, typer.Option("--preset", help="Metric convention; may be repeated.")
     ] = None,
     name: Annotated[str, typer.Option(help="Name of the files of one suite.")] = "",
-    any_code: options.AnyCode = False,
-    overwrite: options.Overwrite = False,
-    quiet: options.Quiet = False,
+    any_code: AnyCode = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
 ) -> None:
     """Depth against truth on a suite of pairs; interrupted runs can be continued."""
     if not suite:
@@ -112,6 +125,22 @@ def _wanted(
     return Options(flows, width, tuple(dict.fromkeys(seeds)), limit, tuple(only or ()))
 
 
+def _command(
+    name: str, data: Path | None, overrides: list[str] | None, given: Mapping[str, Any]
+) -> str:
+    """A command as text, without the place of its data; an option may have several values."""
+    said = ["--data DIR"] * (data is not None)
+    for key, value in (*given.items(), ("set", overrides)):
+        values = value if isinstance(value, list) else [] if value is None else [value]
+        said += [f"--{key} {shlex.quote(str(item))}" for item in values]
+    return f"soup-nlp bench {name} {' '.join(said)}"
+
+
+def _failed(frame: pd.DataFrame) -> int:
+    """Number of runs that failed."""
+    return int(frame["ok"].ne(True).sum())
+
+
 def _print_page(page: Path) -> None:
     print(page.read_text(encoding="utf-8"))
     print(f"files       {page.parent}/{page.stem}.*")
@@ -119,8 +148,8 @@ def _print_page(page: Path) -> None:
 
 def search(
     suite: SuiteName = None,
-    data: options.Data = None,
-    out: options.Out = Path("out/bench/accuracy"),
+    data: Data = None,
+    out: Out = Path("out/bench/accuracy"),
     params: Annotated[
         list[str] | None,
         typer.Option("--param", help="KEY=log|linear|int:LOW:HIGH or KEY=choice:A:B instead."),
@@ -128,14 +157,14 @@ def search(
     trials: Annotated[int, typer.Option(help="Configurations beside the default.", min=1)] = 24,
     seed: Annotated[int, typer.Option(help="Of the trials.", min=0)] = 0,
     seeds: Seeds = "0,1",
-    overrides: options.Set = None,
+    overrides: Set = None,
     flow: Flow = None,
     width: Width = 512,
     only: Only = None,
-    workers: options.Workers = 1,
-    any_code: options.AnyCode = False,
-    overwrite: options.Overwrite = False,
-    quiet: options.Quiet = False,
+    workers: Workers = 1,
+    any_code: AnyCode = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
 ) -> None:
     """Search for better defaults and check them on the families that did not choose them."""
     wanted = _wanted(flow, width, numbers(seeds, "--seeds"), only)
@@ -153,11 +182,9 @@ def search(
         seed=seed,
         overrides=tuple(overrides or ()),
     )
-    said = [f"--suite {s}" for s in suite or ["rendered"]] + (["--data DIR"] if data else [])
-    said += [f"--trials {trials} --seed {seed} --seeds {seeds} --width {width}"]
-    said += [f"--flow {f}" for f in flow or []] + [f"--only {shlex.quote(o)}" for o in only or []]
-    said += [f"--set {shlex.quote(o)}" for o in overrides or []]
-    command = f"soup-nlp bench search {' '.join(said)}"
+    given = {"suite": suite or ["rendered"], "trials": trials, "seed": seed, "seeds": seeds}
+    given |= {"width": width, "flow": flow, "only": only}
+    command = _command("search", data, overrides, given)
     with staged(out) as new:
         write_text(new / "search.md", searching.search_page(frame, texts, command))
     _print_page(out / "search.md")
@@ -165,8 +192,8 @@ def search(
 
 
 def paper(
-    data: options.Data = None,
-    out: options.Out = Path("results/paper"),
+    data: Data = None,
+    out: Out = Path("results/paper"),
     superpixels: Annotated[
         int, typer.Option(help="Superpixels of the comparison.", min=2, max=MAX_SUPERPIXELS)
     ] = 1000,
@@ -187,11 +214,11 @@ def paper(
         str,
         typer.Option(help=f"Of {', '.join(ALL_SECTIONS)}; the comparison is always there."),
     ] = ",".join(ALL_SECTIONS),
-    overrides: options.Set = None,
-    workers: options.Workers = 1,
-    any_code: options.AnyCode = False,
-    overwrite: options.Overwrite = False,
-    quiet: options.Quiet = False,
+    overrides: Set = None,
+    workers: Workers = 1,
+    any_code: AnyCode = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
 ) -> None:
     """The paper's tables and figures by `preset: paper` and the defaults; can be continued."""
     sizes = Sizes(
@@ -204,15 +231,114 @@ def paper(
         overrides=tuple(overrides or ()),
         sections=tuple(words(sections, "--sections", list(ALL_SECTIONS))),
     )
-    said = [f"--superpixels {superpixels} --analysis {analysis} --families {families}"]
-    said += [f"--width {width} --sections {sections} --departures {departures}"]
-    said += [f"--limit {limit}"] * (limit is not None) + ["--data DIR"] * (data is not None)
-    said += [f"--set {shlex.quote(o)}" for o in sizes.overrides]
+    given = {"superpixels": superpixels, "analysis": analysis, "families": families}
+    given |= {"width": width, "sections": sections, "departures": departures, "limit": limit}
     claim(out, FILES, overwrite)
     plan, progress = make_plan(data, sizes, out), RowProgress(quiet, mre_of)
     run = partial(measure_all, workers=workers, say=progress, any_code=any_code)
     frame = measure_cells(plan.cells(), measure_paper, out / "paper.jsonl", run)
     with staged(out) as new:
-        write_page(new, plan, frame, f"soup-nlp bench paper {' '.join(said)}")
+        write_page(new, plan, frame, _command("paper", data, overrides, given))
     print(f"files       {out}/: {', '.join(FILES)}")
-    raise typer.Exit(0 if frame["ok"].eq(True).all() else 1)
+    raise typer.Exit(1 if _failed(frame) else 0)
+
+
+def speed(
+    scenes: Annotated[
+        str, typer.Option(help="Rendered scenes and motorcycle, comma separated.")
+    ] = "street,room,motorcycle",
+    sizes: Annotated[
+        str, typer.Option("--superpixels", "--sizes", help="Superpixels N.")
+    ] = "250,500,1000,2000",
+    neighbours: Annotated[str, typer.Option(help="K of the K-NN graph.")] = "10,15,20",
+    seeds: Annotated[str, typer.Option(help="Seeds of the rendered scenes.")] = "0,1",
+    pairs: Annotated[
+        str | None, typer.Option(help="Pairs of the suite shared, comma separated.")
+    ] = None,
+    data: Data = None,
+    width: Width = 1024,
+    height: Annotated[
+        int, typer.Option(help="Rows of rendered scenes.", min=48, max=MAX_SIDE)
+    ] = 436,
+    overrides: Set = None,
+    out: Out = Path("out/bench/speed"),
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
+    chosen = Options(flows=("dis",), only=tuple((pairs or "").split(",")))
+    cells = timing.speed_cells(
+        words(scenes, "--scenes", [*SCENES, "motorcycle"]),
+        numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS),
+        numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS),
+        numbers(seeds, "--seeds"),
+        width,
+        height,
+        overrides or [],
+        list_suite("shared", data, chosen).items if pairs else (),
+    )
+    claim(out, ("table.md", "growth.png"), overwrite)
+    run = partial(measure_all, say=RowProgress(quiet, _result_of))
+    frame = measure_cells(cells, timing.measure_speed, out / "table.jsonl", run, own_process=True)
+    with staged(out) as new:
+        write_text(new / "table.md", timing.speed_page(frame))
+        timing.plot_growth(new / "growth.png", frame)
+    bad = _failed(frame)
+    print(f"{len(frame)} runs, {bad} failed, in {out / 'table.md'}")
+    raise typer.Exit(1 if bad else 0)
+
+
+def _result_of(row: Row) -> str:
+    """The result of a run as text for the progress line."""
+    reference = row["reference"]
+    return (
+        f"{row['status']}, {row['cpu']['nlp']:.1f} CPU s, {row['iterations']} iterations,"
+        f" E {row['energy']['total']:.4g}; LM {reference['cpu_seconds']:.1f} CPU s,"
+        f" E {reference['energy']['total']:.4g}"
+    )
+
+
+def cost(
+    out: Out = Path("out/bench/speed"), overwrite: Overwrite = False, quiet: Quiet = False
+) -> None:
+    """Time and memory of whole solves over N and image size, each in a process of its own."""
+    claim(out, ("cost.md",), overwrite)
+    say = RowProgress(quiet, lambda row: f"{show(row['seconds'], '.0f')} s")
+    _measure(cost_cells(), measure_pair, say, out / "cost.md", cost_page)
+
+
+def _measure(
+    cells: list[Cell],
+    measure: Measure,
+    say: RowProgress,
+    path: Path,
+    page: Callable[[pd.DataFrame], str],
+) -> NoReturn:
+    """Measure cells in processes of their own, write and print their page, and exit."""
+    run = partial(measure_all, say=say)
+    frame = measure_cells(cells, measure, path.with_suffix(".jsonl"), run, own_process=True)
+    with staged(path.parent) as new:
+        write_text(new / path.name, page(frame))
+    print(path.read_text(encoding="utf-8"))
+    raise typer.Exit(1 if _failed(frame) else 0)
+
+
+def chain(
+    data: Data = None,
+    only: Only = None,
+    frames: Annotated[int, typer.Option(help="Most frames of a sequence.", min=3)] = 10,
+    overrides: Set = None,
+    out: Out = Path("out/bench/accuracy"),
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """What one scale costs on rendered sequences, and on kitti_tracking in the --data folder."""
+    known = sequences(data)
+    chosen = [i for i in known if not only or any(word in i.name for word in only)]
+    if not chosen:
+        names = ", ".join(i.name for i in known)
+        raise ConfigError("no sequence is left", where="--only", expected=names)
+    claim(out, ("chain.md",), overwrite)
+    cells = [Cell(item, tuple(overrides or ()), f"{frames} frames") for item in chosen]
+    say = RowProgress(quiet, lambda row: f"cost of one scale {show(row['cost'], '+.2%')}")
+    _measure(cells, partial(measure_chain, frames=frames), say, out / "chain.md", chain_page)
