@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import ast
 import errno
 import os
 import re
@@ -16,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -126,72 +128,24 @@ def drop_output() -> None:
 ABORTED = 130
 """Exit code of a command that Ctrl-C ended without a result, as in shells."""
 
-COMMANDS: Mapping[str, tuple[str, str]] = {
-    "solve": ("solve:solve", "Solve a pair of frames and write a result folder."),
-    "demo": ("solve:demo", "Solve a real pair and a rendered street in which cars move."),
-    "view": ("results:view", "Open the page of a result in a browser, or serve it."),
-    "check": (
-        "results:check",
-        "Recompute energy, constraints and metrics of a result, or the constraints of a .sol.",
-    ),
-    "chain": (
-        "chain:chain",
-        "Solve the consecutive pairs of a sequence and put them on one scale.",
-    ),
-    "convert": (
-        "results:convert",
-        "Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions.",
-    ),
-    "evaluate": ("results:evaluate", "Score a result against a truth file."),
-    "show": (
-        "problems:show",
-        "Print the merged problem and its hash; without a problem, the options of a preset.",
-    ),
-    "list": ("problems:list_", "Print the problems that come with the package, or of a folder."),
-    "export": (
-        "problems:export",
-        "Write the NLP for other solvers; several sizes or formulations make a folder each.",
-    ),
-    "import": (
-        "results:import_",
-        "Make a result folder of a foreign solver's answer: depth maps, points, residuals.",
-    ),
-    "family": (
-        "problems:family",
-        "Write the SOUP problem set: .nl files, best known points, index, README, licence.",
-    ),
-    "compare": (
-        "compare:compare",
-        "Run real solvers on problems, verify their claims, write table and profiles.",
-    ),
+COMMANDS: Mapping[str, str] = {
+    "solve": "solve:solve",
+    "demo": "solve:demo",
+    "view": "results:view",
+    "check": "results:check",
+    "chain": "chain:chain",
+    "convert": "results:convert",
+    "evaluate": "results:evaluate",
+    "show": "problems:show",
+    "list": "problems:list_",
+    "export": "problems:export",
+    "import": "results:import_",
+    "family": "problems:family",
+    "compare": "compare:compare",
 }
-"""Module and function under `soup_nlp.cli` and first line of the docstring, by command."""
-
-BENCH: Mapping[str, tuple[str, str]] = {
-    "accuracy": (
-        "bench:accuracy",
-        "Depth against truth on a suite of pairs; interrupted runs can be continued.",
-    ),
-    "speed": (
-        "bench:speed",
-        "Time the solver over N and K, each run in a process of its own; resumes what is stored.",
-    ),
-    "cost": (
-        "bench:cost",
-        "Time and memory of whole solves over N and image size, each in a process of its own.",
-    ),
-    "search": (
-        "bench:search",
-        "Search for better defaults and check them on the families that did not choose them.",
-    ),
-    "paper": (
-        "bench:paper",
-        "The paper's tables and figures by `preset: paper` and the defaults; can be continued.",
-    ),
-    "chain": (
-        "bench:chain",
-        "What one scale costs on rendered sequences, and on kitti_tracking in the --data folder.",
-    ),
+"""Module and function under `soup_nlp.cli`, by command; in this order the help lists them."""
+BENCH: Mapping[str, str] = {
+    name: f"bench:{name}" for name in ("accuracy", "speed", "cost", "search", "paper", "chain")
 }
 """The same for the commands of `soup-nlp bench`."""
 
@@ -274,7 +228,7 @@ class LazyGroup(_Flags, TyperGroup):
         name, command, rest = super().resolve_command(ctx, args)
         homes = BENCH if self.name == "bench" else COMMANDS
         if name is not None and name in homes:
-            command = _load(name, homes[name][0])
+            command = _load(name, homes[name])
         return name, command, rest
 
 
@@ -294,7 +248,21 @@ def _load(name: str, home: str) -> Any:
     return typer.main.get_command(alone)
 
 
-def _group(text: str, commands: Mapping[str, tuple[str, str]], **options: Any) -> typer.Typer:
+@cache
+def _functions(module: str) -> dict[str, str]:
+    """First line of the docstring of every function of a module, which is not imported."""
+    tree = ast.parse(Path(__file__).with_name(f"{module}.py").read_text(encoding="utf-8"))
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+    return {node.name: (ast.get_docstring(node) or "").partition("\n")[0] for node in functions}
+
+
+def first_line(home: str) -> str:
+    """What a command says of itself, for the help; `home` as in `COMMANDS`."""
+    module, _, function = home.partition(":")
+    return _functions(module)[function]
+
+
+def _group(text: str, commands: Mapping[str, str], **options: Any) -> typer.Typer:
     """A group of commands that are imported later."""
     group = typer.Typer(
         cls=LazyGroup,
@@ -304,8 +272,8 @@ def _group(text: str, commands: Mapping[str, tuple[str, str]], **options: Any) -
         context_settings={"help_option_names": ["-h", "--help"]},
         **options,
     )
-    for name, (_, line) in commands.items():
-        group.command(name=name, help=line)(_placeholder)
+    for name, home in commands.items():
+        group.command(name=name, help=first_line(home))(_placeholder)
     return group
 
 

@@ -195,7 +195,7 @@ SOLVING = ("solve", "chain", "export", "import", "compare")
 def option_cases(values: tuple[str, ...] = ODD_VALUES) -> Iterator[Case]:
     """A case for every option that takes a value, and for every argument."""
     for table, head in ((COMMANDS, ""), (BENCH, "bench ")):
-        for name, (home, _) in table.items():
+        for name, home in table.items():
             for parameter in _load(name, home).params:
                 if parameter.name == "help" or getattr(parameter, "is_flag", False):
                     continue
