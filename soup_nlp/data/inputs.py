@@ -22,7 +22,7 @@ from soup_nlp.data.flow.sources import is_network
 from soup_nlp.data.formats.camera_files import read_camera, read_intrinsics
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Pair, Truth
-from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.data.scenes.catalogue import SCENES, render_scene
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.limits import MAX_SIDE
@@ -157,21 +157,7 @@ class SceneInput(PairInput):
 
     kind: Literal["scene"]
     """Kind of input."""
-    scene: Literal[
-        "street",
-        "room",
-        "sheet",
-        "orbit",
-        "still",
-        "banner",
-        "pan",
-        "handheld",
-        "swing",
-        "jam",
-        "facade",
-        "corridor",
-        "standing",
-    ]
+    scene: Literal[tuple(SCENES)]  # type: ignore[valid-type]
     """Which scene."""
     seed: Seed = 0
     """Changes layout, textures and motions."""
