@@ -18,7 +18,7 @@ from soup_nlp.bench.suites import RENDERED, Options, list_suite, spread
 from soup_nlp.config.presets import overrides_of
 from soup_nlp.errors import DataError, SoupError
 from soup_nlp.pipeline.record import Run
-from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.storage.files import atomic_path
 from soup_nlp.storage.rows import Row
 
 METHODS: Mapping[str, Overrides] = MappingProxyType({"preset: paper": PAPER, "defaults": ()})

@@ -22,7 +22,7 @@ import pandas as pd
 
 from soup_nlp.bench.processes import alone
 from soup_nlp.config.problem import Problem, make_problem
-from soup_nlp.storage.atomic import atomic_path
+from soup_nlp.storage.files import atomic_path
 from soup_nlp.storage.rows import Job, MeasureRows, Row, attempt, reason
 
 if TYPE_CHECKING:

@@ -37,7 +37,7 @@ from soup_nlp.data.scenes.catalogue import SCENES
 from soup_nlp.errors import ConfigError
 from soup_nlp.evaluate.protocols import preset
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SIDE, MAX_SUPERPIXELS
-from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.files import write_text
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.rows import Row, measure_all
 

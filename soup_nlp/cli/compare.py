@@ -21,7 +21,7 @@ from soup_nlp.export.artefact import parse_formulations
 from soup_nlp.export.verify import Limits
 from soup_nlp.family.describe import write_results
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.files import write_text
 from soup_nlp.storage.folders import claim, default_folder, scratch, staged
 from soup_nlp.storage.store import write_json
 

@@ -23,8 +23,7 @@ from soup_nlp.model.layout import GAUGES, MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.norms import NormForm
 from soup_nlp.pipeline import Case
-from soup_nlp.storage.atomic import write_text
-from soup_nlp.storage.files import read_json
+from soup_nlp.storage.files import read_json, write_text
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.store import Array, Tree, write_h5, write_json
 from soup_nlp.storage.versions import versions

@@ -24,8 +24,7 @@ from soup_nlp.export.body import NlBody
 from soup_nlp.export.program import Program, make_program, orders
 from soup_nlp.export.template import number
 from soup_nlp.model.nlp import NLP
-from soup_nlp.storage.atomic import write_bytes, write_text
-from soup_nlp.storage.files import as_path
+from soup_nlp.storage.files import as_path, write_bytes, write_text
 
 
 @dataclass(frozen=True)

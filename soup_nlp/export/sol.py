@@ -11,8 +11,7 @@ import numpy as np
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ExportError, printable
 from soup_nlp.export.template import number
-from soup_nlp.storage.atomic import write_text
-from soup_nlp.storage.files import as_path, read_bytes
+from soup_nlp.storage.files import as_path, read_bytes, write_text
 
 N = TypeVar("N", int, float)
 

@@ -20,7 +20,7 @@ from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.storage.atomic import write_bytes
+from soup_nlp.storage.files import write_bytes
 
 
 @dataclass(frozen=True)

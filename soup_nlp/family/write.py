@@ -26,7 +26,7 @@ from soup_nlp.family.instances import VERSION, Instance, build_instance, case_of
 from soup_nlp.family.pages import LICENCE, readme
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.record import Case
-from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.files import write_text
 from soup_nlp.storage.store import write_json
 
 Entry = dict[str, Any]

@@ -14,7 +14,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.figures import write_png
 from soup_nlp.report.result import Result
-from soup_nlp.storage.atomic import write_text
+from soup_nlp.storage.files import write_text
 
 POINTS = 50_000
 """Largest number of points of a model."""

@@ -19,7 +19,7 @@ from PIL import ImageDraw, ImageFont
 from soup_nlp.arrays import AnyFloat, Image
 from soup_nlp.errors import DataError
 from soup_nlp.report.pictures import Bar, Legend, Picture, Swatches, Wheel
-from soup_nlp.storage.atomic import PathLike, write_bytes
+from soup_nlp.storage.files import PathLike, write_bytes
 
 _DPI = 100
 _HEAD, _CAPTION, _GAP = 42, 28, 8

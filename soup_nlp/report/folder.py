@@ -32,8 +32,7 @@ from soup_nlp.report.pictures import Picture, pictures
 from soup_nlp.report.result import PAGE, html, load, result_of
 from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
-from soup_nlp.storage.atomic import write_text
-from soup_nlp.storage.files import as_path
+from soup_nlp.storage.files import as_path, write_text
 from soup_nlp.storage.folders import claim, digest_of, files_in, staged
 from soup_nlp.storage.h5_files import RECORD, read_h5
 from soup_nlp.storage.store import replace_group, write_h5, write_json

@@ -16,7 +16,7 @@ from soup_nlp.report.colmap import write_colmap
 from soup_nlp.report.figures import write_clipped_depth_png16
 from soup_nlp.report.ply_glb import AXES, write_cloud, write_glb
 from soup_nlp.report.result import FRAMES, Result
-from soup_nlp.storage.atomic import atomic_path, write_bytes, write_text
+from soup_nlp.storage.files import atomic_path, write_bytes, write_text
 from soup_nlp.storage.store import write_json
 
 CONVENTIONS = {

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.surface import triangles
 from soup_nlp.report.result import Result
-from soup_nlp.storage.atomic import PathLike, write_bytes
+from soup_nlp.storage.files import PathLike, write_bytes
 
 AXES = "x right, y down, z ahead"
 """Axes of a camera, in words."""

@@ -14,7 +14,7 @@ from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.ply_glb import GLTF
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.fused import Cloud, fuse, movers, shown_tracks
-from soup_nlp.storage.atomic import PathLike, write_bytes
+from soup_nlp.storage.files import PathLike, write_bytes
 
 RATE = 5.0
 """Frames a second, of the video too."""

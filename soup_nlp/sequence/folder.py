@@ -26,8 +26,7 @@ from soup_nlp.sequence.fused import fuse, projected
 from soup_nlp.sequence.page import chain_page
 from soup_nlp.sequence.pairs import read_pair
 from soup_nlp.sequence.score import score
-from soup_nlp.storage.atomic import write_bytes, write_text
-from soup_nlp.storage.files import as_path, is_file, read_json
+from soup_nlp.storage.files import as_path, is_file, read_json, write_bytes, write_text
 from soup_nlp.storage.folders import scratch, staged
 from soup_nlp.storage.store import write_json
 

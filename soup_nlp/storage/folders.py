@@ -24,7 +24,7 @@ from pathlib import Path, PurePosixPath
 import psutil
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.atomic import PathLike, write_text
+from soup_nlp.storage.files import PathLike, write_text
 from soup_nlp.storage.system import deferred_signals
 
 MARK = ".soup_nlp"

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.atomic import PathLike, write_bytes, write_text
-from soup_nlp.storage.files import read_bytes
+from soup_nlp.storage.files import PathLike, read_bytes, write_bytes, write_text
 from soup_nlp.storage.h5_files import DIGEST, contents_digest
 from soup_nlp.storage.versions import versions
 

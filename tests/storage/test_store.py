@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.atomic import atomic_path, write_text
+from soup_nlp.storage.files import atomic_path, write_text
 from soup_nlp.storage.h5_files import read_attrs, read_h5
 from soup_nlp.storage.store import Array, plain, require, write_h5, write_json
 from soup_nlp.storage.versions import versions
