@@ -247,7 +247,7 @@ def parse_yaml(
         raise ValueError(printable(problem)) from problem
 
 
-# --- writing: a file appears whole or not at all ---------------------------------------------------
+# --- writing: a file appears whole or not at all --------------------------------------------------
 
 
 @contextmanager

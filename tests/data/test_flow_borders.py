@@ -75,7 +75,7 @@ def test_a_superpixel_without_flow_attracts_nothing():
     flow.confidence[hole] = 0
     flow.uv[hole] = 50
     np.testing.assert_array_equal(follow_flow(before, flow), before)
-    fit, weight = fit_affine(flow, before, 0.25)
+    fit, weight = fit_affine(flow, before)
     assert not fit.known[before[20, 20]]
     assert fit.known.sum() == 47
     assert len(weight) == (~hole).sum()
@@ -99,7 +99,7 @@ def test_where_all_pixels_scatter_none_of_them_is_suspected():
     lone = (labels == 1) & (rng.random(labels.shape) < 0.02)
     uv = uv + rough + np.where(lone, 2.0, 0.0)[..., None]
     flow = Flow(uv.astype(np.float32), np.ones(labels.shape, np.float32), "test")
-    _, weight = fit_affine(flow, labels, 0.25)
+    _, weight = fit_affine(flow, labels)
     weight = weight.reshape(labels.shape)
     assert np.median(weight[labels == 0]) > 0.4
     assert weight[lone].max() < 0.1

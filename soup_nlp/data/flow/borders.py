@@ -18,7 +18,9 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.superpixels import LEAST_PIECE, Labels, split_components
 
 SCALE_PX = 0.25
-"""Residual, pixels, below which a fit treats a pixel as inlier."""
+"""Smallest residual, pixels, that a fit may treat as that of an outlier."""
+ROUNDS = 5
+"""Re-weighted fits of an affine flow."""
 SWEEPS, REFIT = 24, 8
 """Number of sweeps (a border moves at most one pixel in each), and sweeps between fits."""
 
@@ -45,12 +47,12 @@ def follow_flow(
     """
     current = labels.astype(np.int64)
     count = int(current.max()) + 1
-    fit, _ = fit_affine(flow, current, SCALE_PX, rounds=5)
+    fit, _ = fit_affine(flow, current)
     changed = np.zeros(count, bool)
     near = np.ones(current.shape, bool)
     for sweep in range(SWEEPS):
         if changed.any() and sweep % REFIT == 0:
-            fit = refit_affine(fit, flow, current, changed, SCALE_PX, rounds=5)
+            fit = refit_affine(fit, flow, current, changed)
             changed[:], near[:] = False, True
         framed = np.pad(current, 1, mode="edge")
         sides = (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
@@ -119,49 +121,38 @@ class AffineFlow:
         return np.where(self.known[which], np.linalg.norm(uv - own, axis=1), np.inf)
 
 
-def fit_affine(
-    flow: Flow, labels: NDArray[np.integer], scale_px: float, rounds: int = 8
-) -> tuple[AffineFlow, Float]:
+def fit_affine(flow: Flow, labels: NDArray[np.integer]) -> tuple[AffineFlow, Float]:
     """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
 
-    The first weights follow from the distance to the median flow of the superpixel, since plain
-    least squares would fit a slope across two motions without outliers.
+    s is the larger one of `SCALE_PX` and the spread of the superpixel, 1.48 times the weighted mean
+    absolute residual. The first weights follow from the distance to the median flow of the
+    superpixel, since plain least squares would fit a slope across two motions without outliers.
 
     Args:
         flow: Flow, whose confidence multiplies the weights.
         labels: (H, W) superpixel labels 0..N-1.
-        scale_px: Smallest residual of an outlier, pixels; s is the larger one of this and the
-            spread of the superpixel (1.48 times the weighted mean absolute residual).
-        rounds: Reweighted fits.
 
     Returns:
         The fits, and the last weights (P,) of the pixels with positive confidence.
     """
     v, u = np.nonzero(flow.confidence > 0)
-    return _fit(flow, labels[v, u].astype(np.int64), u, v, int(labels.max()) + 1, scale_px, rounds)
+    return _fit(flow, labels[v, u].astype(np.int64), u, v, int(labels.max()) + 1)
 
 
 def refit_affine(
-    fit: AffineFlow,
-    flow: Flow,
-    labels: NDArray[np.integer],
-    changed: NDArray[np.bool_],
-    scale_px: float,
-    rounds: int = 8,
+    fit: AffineFlow, flow: Flow, labels: NDArray[np.integer], changed: NDArray[np.bool_]
 ) -> AffineFlow:
     """The fits of `fit_affine`, recomputed for the superpixels that `changed` (N,) only."""
     v, u = np.nonzero((flow.confidence > 0) & changed[labels])
     number = np.cumsum(changed) - 1
-    new, _ = _fit(flow, number[labels[v, u]], u, v, int(changed.sum()), scale_px, rounds)
+    new, _ = _fit(flow, number[labels[v, u]], u, v, int(changed.sum()))
     merged = [np.copy(field) for field in astuple(fit)]
     for field, own in zip(merged, astuple(new), strict=True):
         field[changed] = own
     return AffineFlow(*merged)
 
 
-def _fit(
-    flow: Flow, which: Int, u: Int, v: Int, n: int, scale_px: float, rounds: int
-) -> tuple[AffineFlow, Float]:
+def _fit(flow: Flow, which: Int, u: Int, v: Int, n: int) -> tuple[AffineFlow, Float]:
     """Fits of n superpixels to pixels (P,) and the last weights, see `fit_affine`."""
     base = flow.confidence[v, u].astype(np.float64)
     total = np.maximum(np.bincount(which, base, n), 1e-30)
@@ -172,15 +163,15 @@ def _fit(
     X = fit.basis(which, u, v)
     Y = flow.uv[v, u].astype(np.float64)
     r = np.linalg.norm(Y - np.stack([_medians(which, y, n) for y in Y.T], axis=1)[which], axis=1)
-    s = np.maximum(1.48 * _medians(which, r, n), scale_px)
+    s = np.maximum(1.48 * _medians(which, r, n), SCALE_PX)
     weight = 1.0 / (1.0 + (r / s[which]) ** 2)
     C = fit.coefficients
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         C = _weighted(which, X, Y, base * weight, n)
         r = np.linalg.norm(Y - np.einsum("pa,pac->pc", X, C[which]), axis=1)
         mass = np.maximum(np.bincount(which, base * weight, n), 1e-30)
         spread = 1.48 * np.bincount(which, base * weight * r, n) / mass
-        s = np.maximum(spread, scale_px)
+        s = np.maximum(spread, SCALE_PX)
         weight = 1.0 / (1.0 + (r / s[which]) ** 2)
     return AffineFlow(C, fit.centre, fit.size, fit.known), weight
 
