@@ -14,8 +14,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from helpers_files import write_flo
-from helpers_ply import read_ply
+from helpers_files import read_ply, write_flo
 
 from soup_nlp.cli.main import main
 from soup_nlp.cli.solve import exit_code

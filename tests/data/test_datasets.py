@@ -7,12 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import write_cam, write_dpt, write_flo, write_kitti_flow
+from helpers_files import raises, write_cam, write_dpt, write_flo, write_kitti_flow
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.formats.map_files import KITTI_DISPARITY, read_depth_png16
-from soup_nlp.errors import DataError
 
 H, W = 6, 9
 K = np.array([[100.0, 0.0, 4.0], [0.0, 110.0, 3.0], [0.0, 0.0, 1.0]])
@@ -34,10 +33,6 @@ def load(kind: str, where: Path, **options: object):
     key = "path" if kind in ("folder", "tum") else "root"
     own = {} if kind == "motorcycle" else {key: str(where)}
     return make_problem({"input": {"kind": kind, **own, **options}}).input.load(Path)
-
-
-def raises(match: str):
-    return pytest.raises(DataError, match=match)
 
 
 @pytest.fixture

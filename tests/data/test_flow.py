@@ -10,7 +10,7 @@ import cv2
 import helpers_truth
 import numpy as np
 import pytest
-from helpers_files import write_flo, write_kitti_flow
+from helpers_files import raises, write_flo, write_kitti_flow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -24,7 +24,6 @@ from soup_nlp.data.flow.sources import (
     resolve_flow,
 )
 from soup_nlp.data.pair import Flow, Pair, Truth
-from soup_nlp.errors import DataError
 
 K = np.array([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]])
 
@@ -46,10 +45,6 @@ def shifted(height: int, width: int, du: int, dv: int) -> tuple[np.ndarray, np.n
 def pair_of(truth: Truth | None = None, size: tuple[int, int] = (60, 80)) -> Pair:
     first, second = shifted(*size, 3, 1)
     return Pair(first, second, K, K, truth=truth, name="test")
-
-
-def raises(match: str):
-    return pytest.raises(DataError, match=match)
 
 
 @settings(max_examples=15, deadline=None)

@@ -8,14 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import pieh, write_dpt, write_flo, write_kitti_flow, write_pfm
+from helpers_files import pieh, put, raises, write_dpt, write_flo, write_kitti_flow, write_pfm
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from soup_nlp.data.formats import map_files as fmt
 from soup_nlp.data.formats.camera_files import read_kitti_projections
-from soup_nlp.errors import DataError
 
 many = settings(
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -32,15 +31,6 @@ def floats(low: float, high: float) -> st.SearchStrategy[np.ndarray]:
 def flows(low: float, high: float) -> st.SearchStrategy[np.ndarray]:
     number = st.floats(low, high, width=32)
     return shapes.flatmap(lambda s: hnp.arrays(np.float32, (*s, 2), elements=number))
-
-
-def put(path: Path, content: bytes) -> Path:
-    path.write_bytes(content)
-    return path
-
-
-def raises(match: str):
-    return pytest.raises(DataError, match=match)
 
 
 # --- .flo ---------------------------------------------------------------------------------------

@@ -7,21 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import write_cam
+from helpers_files import put, raises, write_cam
 
 from soup_nlp.data.formats import camera_files as fmt
 from soup_nlp.data.formats.images import read_image, read_mask
-from soup_nlp.errors import DataError
-
-
-def put(path: Path, content: bytes) -> Path:
-    path.write_bytes(content)
-    return path
-
-
-def raises(match: str):
-    return pytest.raises(DataError, match=match)
-
 
 # --- cameras ------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Writers of the files that readers are tested with."""
+"""Files that readers are tested with, written by hand; a reader of the PLY files of results."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from soup_nlp.data.formats.map_files import MAGIC
+from soup_nlp.errors import DataError
 
 
 def write_flo(path: Path, flow: np.ndarray) -> None:
@@ -45,3 +47,32 @@ def write_kitti_flow(path: Path, flow: np.ndarray) -> None:
     code = np.rint(np.where(valid[..., None], flow, 0.0) * 64.0 + 2.0**15) * valid[..., None]
     bgr = np.dstack([valid, code[..., 1], code[..., 0]]).astype(np.uint16)
     cv2.imwrite(str(path), bgr)
+
+
+def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """(M, 3) positions, (M, 3) colours, and (M, 3) normals or None, after the file's own header."""
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    lines = [line.split() for line in header.decode("ascii").splitlines()]
+    lines = [line for line in lines if line[0] != "comment"]
+    assert lines[:2] == [["ply"], ["format", "binary_little_endian", "1.0"]]
+    assert lines[2][:2] == ["element", "vertex"]
+    types = {"float": "<f4", "uchar": "u1"}
+    table = np.frombuffer(body, [(name, types[kind]) for _, kind, name in lines[3:]])
+    assert len(table) == int(lines[2][2])
+
+    def columns(*names: str) -> np.ndarray:
+        return np.stack([table[name] for name in names], axis=1)
+
+    normals = columns("nx", "ny", "nz") if "nx" in table.dtype.names else None
+    return columns("x", "y", "z"), columns("red", "green", "blue"), normals
+
+
+def put(path: Path, content: bytes) -> Path:
+    """A file of these bytes."""
+    path.write_bytes(content)
+    return path
+
+
+def raises(match: str):
+    """That a file or an array is refused, with a message that matches."""
+    return pytest.raises(DataError, match=match)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from helpers_ply import read_ply
+from helpers_files import read_ply
 from helpers_result import BOARD, BOARD_Z, CAMERA, WALL_Z, K, board, small_result
 from scipy.spatial.transform import Rotation
 

@@ -23,9 +23,7 @@ from soup_nlp.report.figures import write_png
 from soup_nlp.sequence import pairs
 from soup_nlp.sequence.chain import Link, follow, link, make_chain, number, solve_scales
 from soup_nlp.sequence.folder import COLMAP_POINTS, chain_files, write_chain
-from soup_nlp.sequence.frames import (
-    scene_frames,
-)
+from soup_nlp.sequence.frames import scene_frames
 from soup_nlp.sequence.fused import fuse, movers
 from soup_nlp.sequence.pairs import SolvedPair, carried
 from soup_nlp.sequence.score import aligned

@@ -1,9 +1,11 @@
-"""A full disk causes an error without a crash or temporary files; the earlier result is kept."""
+"""Full disks and kills: an earlier result is kept, and no temporary file."""
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -79,3 +81,19 @@ def test_a_disk_without_any_room(small_disk):
     write(small_disk / "out", 100_000)
     assert whole(small_disk / "out")
     assert os.listdir(small_disk) == ["out"]
+
+
+# --- kills; `tests/tools/kill_table.py --kills 60` makes the whole table ----------------------
+
+
+@pytest.mark.slow
+def test_killed_exports_leave_whole_folders():
+    script = Path(__file__).parents[1] / "tools" / "kill_table.py"
+    words = [sys.executable, str(script), "--kills", "3", "--only", "export"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    assert len(rows) == 4, done.stderr
+    for row in rows:
+        assert not row["broken"], row
+        assert not row.get("left"), row
+    assert done.returncode == 0, done.stdout
