@@ -228,26 +228,22 @@ def contact_scales(
             log_scale[c] = quantile(value[mine], contact[mine], OUTLINE)
             tie[c] = TIES.index("outline")
         placed[c] = True
+    moved = displacement(soup, rays(K_ref, seg.anchors), label)
     if upright:
         usable = np.ones(len(soup), bool) if usable is None else usable
-        nearer = nearer_where_cut_off(soup, label, log_scale, seg, K_ref, at_camera, usable)
+        far = moved * np.exp(log_scale)[label]
+        nearer = nearer_where_cut_off(far, label, seg, at_camera, usable)
         log_scale -= nearer
         tie[nearer > 0] = TIES.index("cut off below")
-    far = displacement(soup, rays(K_ref, seg.anchors), label) * np.exp(log_scale)[label]
     stays = at_camera | (tie == TIES.index("cut off below"))
-    log_scale -= np.where(stays, 0.0, nearer_where_fast(far, label))
+    fast = nearer_where_fast(moved * np.exp(log_scale)[label], label)
+    log_scale -= np.where(stays, 0.0, fast)
     tie[at_camera] = FIXED
     return np.exp(log_scale)[label], tie[label]
 
 
 def nearer_where_cut_off(
-    soup: Soup,
-    label: Int,
-    log_scale: Float,
-    seg: Segmentation,
-    K_ref: Float,
-    fixed: Mask,
-    usable: Mask,
+    far: Float, label: Int, seg: Segmentation, fixed: Mask, usable: Mask
 ) -> Float:
     """(C,) log factor by which components come nearer whose lower end is not seen.
 
@@ -259,16 +255,13 @@ def nearer_where_cut_off(
     touch are treated as one group, since a person may be cut into pieces.
 
     Args:
-        soup: Planes, every motion in its own scale.
+        far: (N,) displacement relative to the camera, by the scales of contact (`displacement`).
         label: (N,) index of the component.
-        log_scale: (C,) scale of every component by contact, in logarithms.
         seg: Superpixels and graphs.
-        K_ref: (3, 3) intrinsics of the reference frame.
         fixed: (C,) True for components that are fixed in the image, which stay where they are.
         usable: (N,) True where the flow is known.
     """
-    count = len(log_scale)
-    scene = largest(label)
+    count, scene = len(fixed), largest(label)
     ends = label[seg.pairs]
     group_of = connected(ends[((ends != scene) & ~fixed[ends]).all(axis=1)], count)
     group, groups = group_of[label], int(group_of.max()) + 1
@@ -281,7 +274,6 @@ def nearer_where_cut_off(
     )
     last = group[seg.labels[-1]]
     cut_off = np.bincount(last, (len(seg.labels) - around.top[last]) ** 2, minlength=groups)
-    far = displacement(soup, rays(K_ref, seg.anchors), label) * np.exp(log_scale)[label]
     pace = np.median(far[label == scene])
     nearer = np.zeros(count)
     for g in np.setdiff1d(

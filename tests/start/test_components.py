@@ -258,9 +258,7 @@ def test_components_cut_off_by_the_image_are_placed_well(scene, seed, count, mon
     case = prepare(problem, pair=pair)
     shipped = cut_errors(case, case.soup)
     with monkeypatch.context() as context:
-        context.setattr(
-            components_module, "nearer_where_cut_off", lambda soup, label, log_scale, *_: 0.0
-        )
+        context.setattr(components_module, "nearer_where_cut_off", lambda *_: 0.0)
         options = SeededStart(**dict(problem.start), seed=problem.seed)
         own = case.segmentation, case.pair.flow, pair.K_ref, pair.K_next
         contact = cut_errors(case, propose(*own, options).soup)
