@@ -69,7 +69,7 @@ OUTLINE, OUTLINE_REACH = 0.5, 0.005
 """Share of a step of log depth that is the standard deviation beside it, and the distance from the
 step up to which it counts, relative to the longer side of the image."""
 MIXED = 0.2
-"""Standard deviation of log depth where half of a superpixel's flow is usable."""
+"""Standard deviation of log depth where at most half of a superpixel's flow is usable."""
 MARGIN, LEAST_SEEN = 0.01, 0.3
 """Distance from the border of the next image, relative to its width, below which a pixel leaves it,
 and the least share of a superpixel's pixels that stay."""
@@ -151,10 +151,10 @@ def at_outlines(depth: Float) -> Float:
 
 
 def of_mixed_flow(flow: Flow, labels: Labels, size: tuple[int, int]) -> Float:
-    """(N,) standard deviation of log depth where only part of a superpixel has a usable flow.
+    """(N,) standard deviation of log depth where part of a superpixel has no usable flow.
 
-    Such a superpixel may contain two surfaces: `MIXED 4 p (1 - p)`, with p the mean confidence of
-    its pixels that do not leave the image.
+    Such a superpixel may contain a surface without flow of its own: `MIXED 4 p (1 - p)`, with p the
+    mean confidence of its pixels that do not leave the image, at least a half.
 
     Args:
         flow: Flow with confidence.
@@ -168,7 +168,8 @@ def of_mixed_flow(flow: Flow, labels: Labels, size: tuple[int, int]) -> Float:
     last = np.array([width, height]) - 1 - margin
     stays = ((end > margin) & (end < last)).all(axis=-1).ravel()
     count, seen = np.bincount(at), np.bincount(at, stays)
-    p = np.bincount(at, np.where(stays, flow.confidence.ravel(), 0.0)) / np.maximum(seen, 1)
+    usable = np.bincount(at, np.where(stays, flow.confidence.ravel(), 0.0))
+    p = np.maximum(usable / np.maximum(seen, 1), 0.5)
     return np.where(seen > LEAST_SEEN * count, MIXED * 4 * p * (1 - p), 0.0)
 
 

@@ -174,7 +174,7 @@ def test_a_superpixel_with_partly_usable_flow_is_less_sure():
     uv = np.where(labels[..., None] == 3, [30.0, 0.0], 0.0)
     flow = Flow(uv.astype(np.float32), confidence.astype(np.float32), "test")
     found = of_mixed_flow(flow, labels.astype(np.int32), (60, 60))
-    np.testing.assert_allclose(found, [0, MIXED, 0, 0], atol=1e-3)
+    np.testing.assert_allclose(found, [0, MIXED, MIXED, 0], atol=1e-3)
 
 
 def test_calibration_is_capped_where_nothing_is_known():
