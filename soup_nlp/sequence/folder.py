@@ -20,10 +20,9 @@ from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.figures import depth_png_scale, write_clipped_depth_png16
 from soup_nlp.report.formats import tum_text
 from soup_nlp.report.ply_glb import AXES, write_ply
-from soup_nlp.sequence.animation import RATE, write_animation
 from soup_nlp.sequence.chain import Chain, make_chain
 from soup_nlp.sequence.fused import fuse, projected
-from soup_nlp.sequence.page import chain_page
+from soup_nlp.sequence.page import RATE, chain_page, write_animation
 from soup_nlp.sequence.pairs import read_pair
 from soup_nlp.sequence.score import score
 from soup_nlp.storage.files import as_path, is_file, read_json, write_bytes, write_text
