@@ -14,7 +14,7 @@ from soup_nlp.bench.accuracy import BASELINES, METHODS, measure_pair, moving
 from soup_nlp.bench.accuracy_page import suite_page, write_suite
 from soup_nlp.bench.study import Cell, Item, frame_of
 from soup_nlp.bench.suites import SUITES
-from soup_nlp.cli import bench_accuracy
+from soup_nlp.cli import bench
 from soup_nlp.cli.main import main
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
@@ -163,7 +163,7 @@ def test_command_line(tmp_path, capsys, monkeypatch):
     assert main(["bench", "accuracy", "--suite", "imagenet"]) == 2
     assert main([*words, "--preset", "eigen"]) == 2
     assert main(["bench", "accuracy", "--suite", "rendered", "--seeds", "a"]) == 2
-    monkeypatch.setattr(bench_accuracy, "measure_pair", broken)
+    monkeypatch.setattr(bench, "measure_pair", broken)
     assert main([*words, "--width", "64", "-q"]) == 1
     assert "image is missing, where: a/0.png, found: nothing" in capsys.readouterr().out
 

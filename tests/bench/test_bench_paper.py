@@ -14,7 +14,7 @@ from soup_nlp.bench.paper import DATASETS, METHODS, SECTIONS, Sizes, make_plan, 
 from soup_nlp.bench.paper_page import PICTURES
 from soup_nlp.bench.studies import DEPARTURES, PAPER, STUDIES, default
 from soup_nlp.bench.study import Item
-from soup_nlp.cli import bench_paper
+from soup_nlp.cli import bench
 from soup_nlp.cli.main import main
 from soup_nlp.config.presets import PRESETS, leaves
 from soup_nlp.config.problem import make_problem
@@ -104,7 +104,7 @@ def dataset(tmp_path: Path) -> Path:
 
 
 def test_a_tiny_dataset_gives_all_sections(dataset, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(bench_paper, "measure_paper", fake)
+    monkeypatch.setattr(bench, "measure_paper", fake)
     out = tmp_path / "out"
     words = ["bench", "paper", "--data", str(dataset), "-o", str(out), "-q", "--width", "128"]
     words += ["--families", "street,kinect_paper,motorcycle"]
