@@ -15,6 +15,9 @@ from soup_nlp.model.oracle import relief
 
 STEPS = 0.05, 0.35
 """Least and largest step of inverse depth that E_order asks for, relative."""
+CREASE = 0.01
+"""1 - cos of the angle between two planes of a depth prior that halves E_orient between them, 8
+degrees: 0.005 and 0.02 differ by at most 0.0006 in the median relative error of robot."""
 
 
 def across_components(data: EnergyData, component: Int, factor: float) -> EnergyData:
@@ -57,6 +60,7 @@ def over_ground(data: EnergyData, soup: Soup, grounded: Mask, weight: Float) -> 
 
 def with_prior(
     data: EnergyData,
+    soup: Soup,
     log_depth: Float,
     opened: Float,
     error: Float,
@@ -68,17 +72,22 @@ def with_prior(
 
     Args:
         data: Data of the pair.
+        soup: Start; where the flow leaves slopes open, its planes are those of the prior.
         log_depth: (N,) log depth of the anchors by the depth prior.
         opened: (N,) how far the flow leaves the shape of a component open, 0 to 1.
         error: (N,) standard deviation of the prior; inf where it does not count.
         component: (N,) group of every superpixel: scales of different ones are open.
         weight: (E,) of E_depth for a difference by one standard deviation.
-        stiffer: (N,) factor of E_orient between superpixels whose slopes the flow leaves open.
+        stiffer: (N,) factor of E_orient between superpixels whose slopes the flow leaves open, less
+            where their planes meet at an angle.
     """
     i, k = data.edges.T
     between = np.where(component[i] == component[k], np.maximum(opened[i], opened[k]), 1.0)
     between = np.where(np.isfinite(error[i] + error[k]), between, 0.0)
     slopes = np.where(opened > 0.5, stiffer, 1.0)[data.pairs].min(axis=1)
+    a, b = data.pairs.T
+    turn = 1 - np.sum(soup.n[a] * soup.n[b], axis=1)
+    slopes = np.where((opened[a] > 0.5) & (opened[b] > 0.5), slopes / (1 + turn / CREASE), slopes)
     return replace(
         data,
         depth_weight=between * weight / np.maximum(error[i], error[k]),

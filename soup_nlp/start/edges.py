@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy import ndimage, stats
 
-from soup_nlp.arrays import Float, FloatMap, Image, Labels
+from soup_nlp.arrays import Float, Image, Labels
 
 SIDE = 320
 """Longer side of the maps that are compared, pixels."""
@@ -19,12 +19,14 @@ TRIALS = 60
 """Shifted and mirrored maps."""
 FARTHEST, NEAREST = 1 / 3, 0.1
 """Largest shift relative to the side, and least one relative to the width if not mirrored."""
+WITHIN = 0.5
+"""Largest share of a map's variance within superpixels: one of independent pixels has nearly 1."""
 LEAST = 3.0
 """Standard deviations by which a right map follows superpixels (counted twice) and edges better
 than the shifted ones; right maps have 3.3 and more, those of other scenes 2.8 and less."""
 
 
-def follows_edges(values: FloatMap, image: Image, labels: Labels, seed: int = 0) -> bool:
+def follows_edges(values: Float, image: Image, labels: Labels, seed: int = 0) -> bool:
     """Whether a map follows the superpixels and the edges of its image better than by chance.
 
     Args:
@@ -61,7 +63,10 @@ def follows_edges(values: FloatMap, image: Image, labels: Labels, seed: int = 0)
         moved = (np.pad(m[:, ::flip], pad, mode="reflect") for m in (small, steps))
         others.append(scores(*(m[a : a + rows, b : b + columns] for m in moved)))
     chance = np.array(others)
-    better = (scores(small, steps) - chance.mean(axis=0)) / np.maximum(chance.std(axis=0), 1e-12)
+    found = scores(small, steps)
+    if -found[0] > WITHIN:
+        return False
+    better = (found - chance.mean(axis=0)) / np.maximum(chance.std(axis=0), 1e-12)
     return bool(better @ [2.0, 1.0] > LEAST)
 
 

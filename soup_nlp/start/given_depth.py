@@ -7,7 +7,9 @@ the flow says nothing, it counts as a guess if its steps lie on edges of the ima
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -17,7 +19,9 @@ from scipy.spatial import cKDTree
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import fit_robustly
 from soup_nlp.start.choice import CLIP, PIECE_SIZE
@@ -51,6 +55,9 @@ RIGHT, WRONG = 0.05, 0.5
 """Standard deviation of the log of such a scale if it is right, and if it is not."""
 HELD, NEAR = 4.0, 15
 """Weight of the whole component's error beside the residuals of so many neighbours."""
+ROUNDS, LEAST_OFF, RIDGE, STEEPEST = 4, 0.005, 1e-6, 0.5
+"""Of the fit of planes to a prior: rounds, least scale of its residuals, ridge, and largest slope
+per mean radius of the superpixel; all relative to the inverse depth."""
 FARTHEST = 50.0
 """Largest depth relative to the median where an inverse depth has a shift."""
 
@@ -126,19 +133,21 @@ def by_prior(
     nowhere = np.zeros(len(seg), bool)
     if not known.any() or np.ptp(value[known]) < 1e-6 * value[known].max():
         return start, Given(np.log(value), *none, kind or "relative", np.nan, nowhere)
-    kind, log_depth, ratio = _calibrated(seen, main, value, known, kind)
+    kind, depth_of, ratio = _calibrated(seen, main, value, known, kind)
+    log_depth = depth_of(value)
+    whole = depth_of(np.where(np.isfinite(prior), prior, value[seg.labels]))
     nothing = Given(log_depth, *none, kind, ratio, nowhere)
     if ratio <= CONFIRMED:
         # the share of the relief that is wrong
         wrong = ratio * _deviation(log_depth[start.component == main])
         sigma = float(np.clip(wrong, LEAST_SIGMA, RELIEF))
     else:
-        whole = np.log(np.where(np.isfinite(prior), prior, value[seg.labels]))
         contradicted = ratio > POSSIBLE and seen.determined(main)
         if contradicted or not follows_edges(whole, pair.image_ref, seg.labels, seed):
             return start, nothing
         sigma = UNCONFIRMED
-    placed = _placed(seen, main, log_depth, sigma)
+    slope = _slopes(whole, np.isfinite(prior), log_depth, pair, seg)
+    placed = _placed(seen, main, log_depth, slope, sigma)
     if placed is None:
         return start, nothing
     soup, log_depth, held, opened, own = placed
@@ -240,34 +249,82 @@ class _Seen:
 
 def _calibrated(
     seen: _Seen, c: int, value: Float, known: Mask, kind: Kind | None
-) -> tuple[Kind, Float, float]:
-    """Kind of a prior, (N,) its log depths, and `Given.ratio` by component c."""
+) -> tuple[Kind, Callable[[Float], Float], float]:
+    """Kind of a prior, log depth as a function of its values, and `Given.ratio` by component c.
+
+    `value` (N,) are those of the superpixels.
+    """
     rank = stats.rankdata(value) / (len(value) + 1)
-    logs: dict[Kind, Float] = {"relative": np.log(value), "inverse": -np.log(value)}
-    logs |= {"metric": logs["relative"], "ordinal": RELIEF * stats.norm.ppf(rank)}
+    rises = np.argsort(value)
+    logs: dict[Kind, Callable[[Float], Float]] = {
+        "metric": np.log,
+        "relative": np.log,
+        "inverse": lambda v: -np.log(v),
+        "ordinal": lambda v: RELIEF * stats.norm.ppf(np.interp(v, value[rises], rank[rises])),
+    }
     relief, floor = seen.relief(c)
     at = seen.members(c)
     at = at[known[at]]
     if len(at) < FEWEST or not relief > seen.tells / 3:
         # what is lower in an image is mostly nearer
-        rises = np.corrcoef(rank, seen.views.anchor[:, 1])[0, 1] > 0
-        kind = kind or ("inverse" if rises else "relative")
+        below = np.corrcoef(rank, seen.views.anchor[:, 1])[0, 1] > 0
+        kind = kind or ("inverse" if below else "relative")
         return kind, logs[kind], np.nan
-    tried: list[tuple[float, Kind, Float]] = []
+    tried: list[tuple[float, Kind, Callable[[Float], Float]]] = []
     for name in (kind,) if kind else ("relative", "inverse"):
-        error, *_, shift = seen.motion(at, np.exp(-logs[name][at]), name == "inverse")
-        log_depth = logs[name]
+        inverse = np.exp(-logs[name](value[at]))
+        error, *_, shift = seen.motion(at, inverse, name == "inverse")
+        tried.append(((error - floor) / relief, name, logs[name]))
         if name == "inverse":
-            near = value + shift
-            log_depth = -np.log(np.maximum(near, np.median(np.abs(near)) / FARTHEST))
-        tried.append(((error - floor) / relief, name, log_depth))
-    ratio, name, log_depth = min(tried, key=lambda one: one[0])
+            least = float(np.median(np.abs(value + shift))) / FARTHEST
+            tried[-1] = (*tried[-1][:2], partial(_shifted, shift=shift, least=least))
+    ratio, name, depth_of = min(tried, key=lambda one: one[0])
     # where neither explains the flow a shift lowers the error of any map
-    return (name, log_depth, ratio) if ratio <= POSSIBLE else (tried[0][1], tried[0][2], ratio)
+    return (name, depth_of, ratio) if ratio <= POSSIBLE else (tried[0][1], tried[0][2], ratio)
+
+
+def _shifted(value: Float, shift: float, least: float) -> Float:
+    """Log depth of inverse depths to which a shift is added, at least `least`."""
+    return np.asarray(-np.log(np.maximum(value + shift, least)))
+
+
+def _slopes(log_depth: Float, known: Mask, middle: Float, pair: Pair, seg: Segmentation) -> Float:
+    """(N, 2) slopes of the relative inverse depth of a prior within superpixels, per ray unit.
+
+    Each is a robust fit of a plane, with Cauchy weights in units of the median residual, so that a
+    step of depth inside a superpixel does not tilt its plane.
+
+    Args:
+        log_depth: (H, W) of the prior.
+        known: (H, W) True where the prior has a value.
+        middle: (N,) log depth of the superpixels.
+        pair: Intrinsics.
+        seg: Superpixels.
+    """
+    v, u = np.nonzero(known)
+    label = seg.labels[v, u]
+    inside = rays(pair.K_ref, np.stack([u, v], axis=1)) - rays(pair.K_ref, seg.anchors)[label]
+    reach = np.sqrt(np.bincount(label, (inside**2).sum(axis=1), len(seg)) / seg.sizes)
+    reach = np.maximum(reach, 1 / pair.K_ref[0, 0])
+    basis = np.column_stack([inside[:, :2] / reach[label, None], np.ones(len(label))])
+    target = np.expm1(np.clip(middle[label] - log_depth[v, u], -1.0, 1.0))
+    plane: Float = np.zeros((len(seg), 3))
+    for _ in range(ROUNDS):
+        off = np.abs(target - np.sum(plane[label] * basis, axis=1))
+        scale = np.asarray(ndimage.median(off, label, np.arange(len(seg))), float)
+        weight = 1 / (1 + (off / np.maximum(scale, LEAST_OFF)[label]) ** 2)
+        weighted = weight[:, None] * basis
+        rows = np.einsum("pa,pb->pab", weighted, np.column_stack([basis, target])).reshape(-1, 12)
+        sums = np.stack([np.bincount(label, x, len(seg)) for x in rows.T], axis=1).reshape(-1, 3, 4)
+        left = sums[..., :3] + RIDGE * np.eye(3)
+        plane = np.asarray(np.linalg.solve(left, sums[..., 3:])[..., 0])
+    slope = plane[:, :2] / (1 + plane[:, 2:])
+    steep = np.linalg.norm(slope, axis=1, keepdims=True)
+    return np.asarray(slope * np.minimum(1.0, STEEPEST / np.maximum(steep, 1e-9)) / reach[:, None])
 
 
 def _placed(
-    seen: _Seen, main: int, prior: Float, sigma: float
+    seen: _Seen, main: int, prior: Float, slope: Float, sigma: float
 ) -> tuple[Soup, Float, Mask, Float, Float] | None:
     """Soup in the unit of a prior, its log depth by component, where the prior decides, how far the
     flow leaves the shape of a component open (0 to 1), and the sigma of the prior; all (N,).
@@ -278,11 +335,13 @@ def _placed(
         seen: The start and its flow.
         main: The largest component, to which scales by contact refer.
         prior: (N,) log depth.
+        slope: (N, 2) slopes of its planes (`_slopes`).
         sigma: Its standard deviation.
     """
     start, anchor = seen.start, seen.views.anchor
     soup, prior, n = start.soup, prior.copy(), len(prior)
     held, opened, own = np.zeros(n, bool), np.ones(n), np.full(n, sigma)
+    tilted = np.zeros(n, bool)
     before = np.log(soup.depth_at(anchor)) - prior
     contact = np.median(before[start.component == main])
     for c in np.unique(start.component):
@@ -291,7 +350,7 @@ def _placed(
         if start.bends[at].all():
             # every superpixel has a motion of its own, which grows with its depth
             soup = soup.taking(replace(soup, lam=soup.lam * np.exp(-before)), mask)
-            held[at] = True
+            held[at] = tilted[at] = True
             continue
         if start.tie[at[0]] == FIXED:
             # it stays where it is relative to the scene: a map of the scene may not know of it
@@ -323,7 +382,10 @@ def _placed(
         # the translation is the component's, whatever the depth of a superpixel
         soup = replace(soup, lam=soup.lam * factor, t=soup.t * (shift / factor)[:, None])
         held[at] |= ~strong
-    return soup, prior, held, opened, own
+        tilted[at] = ~strong
+    normal, D = normal_and_distance(about_anchor(soup.depth_at(anchor), slope, anchor))
+    tilt = Soup(D, normal, np.ones(n), soup.R, soup.translation / D[:, None])
+    return soup.taking(tilt, tilted), prior, held, opened, own
 
 
 def _component(seen: _Seen, soup: Soup, c: int, prior: Float, sigma: float) -> tuple[Soup, Mask]:
