@@ -9,10 +9,9 @@ from PIL import Image
 
 import soup_nlp
 from soup_nlp.report.figures import strip
-from soup_nlp.report.findings import certainty_lines, found_words, hints
+from soup_nlp.report.findings import certainty, certainty_lines, found_words, hints, summary
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import result_of
-from soup_nlp.report.summary import certainty, summary
 from soup_nlp.report.verdict import sectioned
 
 PAGE = Path(__file__).with_name("gallery.md")
@@ -34,7 +33,7 @@ def made(scene: str) -> str:
     sections = {
         "found": found_words(run),
         "certainty": certainty_lines(shares),
-        "try": hints(run, shares),
+        "try": hints(run.pair.flow.uv, run.pair.flow.confidence, shares),
         "MRE": [", ".join(scores)],
         "exit code": [f"{0 if run.good else 1}"],
     }

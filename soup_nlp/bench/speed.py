@@ -30,7 +30,9 @@ from soup_nlp.bench.study import (
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.pipeline import Case, make_run, prepare
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case
+from soup_nlp.pipeline.run import make_run
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup

@@ -19,10 +19,9 @@ from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, DataError, SoupError
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run as run_problem
-from soup_nlp.report.findings import guess_reason
+from soup_nlp.report.findings import certainty, guess_reason
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.result import PAGE
-from soup_nlp.report.summary import certainty
 from soup_nlp.report.verdict import missed, verdict
 from soup_nlp.sequence.frames import IMAGES
 from soup_nlp.solve.interrupt import interruptible

@@ -14,15 +14,14 @@ from scipy import sparse
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.evaluate.information import Information, information
-from soup_nlp.export.names import readable_names, suffixes_of
-from soup_nlp.export.nl import NLFile, write_nl
+from soup_nlp.export.nl import NLFile, readable_names, suffixes_of, write_nl
 from soup_nlp.export.verify import examine
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Coordinates, Formulation
 from soup_nlp.model.layout import GAUGES, MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.norms import NormForm
-from soup_nlp.pipeline import Case
+from soup_nlp.pipeline.record import Case
 from soup_nlp.storage.files import read_json, write_text
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.store import Array, Tree, write_h5, write_json
@@ -126,7 +125,7 @@ def export_case(
         formats: Some of FORMATS; nl is always written, and casadi includes h5.
         presolved: The case starts at the answer of the presolve (for the manifest).
         overwrite: Overwrite files that the program did not make.
-        suffixes: Write the suffixes of `names.suffixes_of`, which CasADi's reader does not accept.
+        suffixes: Write the suffixes of `nl.suffixes_of`, which CasADi's reader does not accept.
 
     Raises:
         ConfigError: a format is unknown.

@@ -13,7 +13,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ExportError
 from soup_nlp.export.artefact import CHOICES, MANIFEST, STUB, fingerprint, read_manifest
-from soup_nlp.export.names import readable_names
+from soup_nlp.export.nl import readable_names
 from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import (
     ENERGY_SLACK,
@@ -29,7 +29,9 @@ from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.pipeline import Case, Run, make_run, prepare
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case, Run
+from soup_nlp.pipeline.run import make_run
 from soup_nlp.solve.ipopt import Stage
 from soup_nlp.solve.kkt import residuals
 from soup_nlp.solve.stages import Solution

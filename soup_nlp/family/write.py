@@ -15,8 +15,7 @@ import casadi as ca
 
 from soup_nlp import __version__
 from soup_nlp.data.pair import Pair
-from soup_nlp.export.names import readable_names
-from soup_nlp.export.nl import NLFile, write_nl
+from soup_nlp.export.nl import NLFile, readable_names, write_nl
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import examine
 from soup_nlp.family import run_solver

@@ -1,4 +1,4 @@
-"""States of superpixels about their anchors, their neighbours, and motions fitted to points."""
+"""States of superpixels: particles, the same about their anchors, and motions fitted to points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,61 @@ from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.plane import about_anchor, at_anchor, inverse_depth, normal_and_distance
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.refine.costs import Particles
+
+
+@dataclass(frozen=True)
+class Particles:
+    """L possible states of each of N superpixels: plane `n . X + D = 0`, motion `X' = R X + T`.
+
+    Attributes:
+        n: (N, L, 3) unit normals that face the camera.
+        D: (N, L) distances of the planes, positive.
+        R: (N, L, 3, 3) rotations.
+        T: (N, L, 3) translations.
+    """
+
+    n: Float
+    D: Float
+    R: Float
+    T: Float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(N, L)."""
+        return self.D.shape[0], self.D.shape[1]
+
+    @classmethod
+    def of(cls, soup: Soup) -> Particles:
+        """A soup as one particle per superpixel."""
+        T = soup.translation[:, None]
+        return cls(soup.n[:, None], soup.distance[:, None], soup.R[:, None], T)
+
+    def joined(self, *others: Particles) -> Particles:
+        """The particles of several sets, concatenated."""
+        every = (self, *others)
+        return Particles(
+            *(np.concatenate([getattr(p, k) for p in every], axis=1) for k in ("n", "D", "R", "T"))
+        )
+
+    def take(self, which: Int) -> Particles:
+        """The particles that have the numbers `which` (N, C)."""
+        rows = np.arange(len(self.D))[:, None]
+        return Particles(*(a[rows, which] for a in (self.n, self.D, self.R, self.T)))
+
+    def of_some(self, who: Int) -> Particles:
+        """The particles of some superpixels (M,)."""
+        return Particles(self.n[who], self.D[who], self.R[who], self.T[who])
+
+    def soup(self, labels: Int, share: Float) -> Soup:
+        """The soup of labels (N,), with sum(lam) = 1 exactly restored (`Soup.normalised`)."""
+        own = self.take(labels[:, None])
+        one = np.ones(len(labels))
+        return Soup(one, own.n[:, 0], own.D[:, 0], own.R[:, 0], own.T[:, 0]).normalised(share)
+
+
+def anchor_depth(p: Particles, anchor_ray: Float) -> Float:
+    """(N, L) depth of every particle's plane at the anchor."""
+    return -p.D / np.einsum("nlc,nc->nl", p.n, anchor_ray)
 
 
 @dataclass(frozen=True)

@@ -7,73 +7,16 @@ products, which avoids cancellation where particles are nearly equal.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from soup_nlp.arrays import AnyFloat, Float, Int, Mask
-from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import HINGE, EnergyData
 from soup_nlp.model.energy_options import Weights
+from soup_nlp.refine.anchored import Particles, anchor_depth
 
 BLOCK_BYTES = 1 << 18  # one of the half dozen buffers of a block of edges
 UNARY_BYTES = 1 << 23  # one of the arrays of a block of superpixels
-
-
-@dataclass(frozen=True)
-class Particles:
-    """L possible states of each of N superpixels: plane `n . X + D = 0`, motion `X' = R X + T`.
-
-    Attributes:
-        n: (N, L, 3) unit normals that face the camera.
-        D: (N, L) distances of the planes, positive.
-        R: (N, L, 3, 3) rotations.
-        T: (N, L, 3) translations.
-    """
-
-    n: Float
-    D: Float
-    R: Float
-    T: Float
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(N, L)."""
-        return self.D.shape[0], self.D.shape[1]
-
-    @classmethod
-    def of(cls, soup: Soup) -> Particles:
-        """A soup as one particle per superpixel."""
-        T = soup.translation[:, None]
-        return cls(soup.n[:, None], soup.distance[:, None], soup.R[:, None], T)
-
-    def joined(self, *others: Particles) -> Particles:
-        """The particles of several sets, concatenated."""
-        every = (self, *others)
-        return Particles(
-            *(np.concatenate([getattr(p, k) for p in every], axis=1) for k in ("n", "D", "R", "T"))
-        )
-
-    def take(self, which: Int) -> Particles:
-        """The particles that have the numbers `which` (N, C)."""
-        rows = np.arange(len(self.D))[:, None]
-        return Particles(*(a[rows, which] for a in (self.n, self.D, self.R, self.T)))
-
-    def of_some(self, who: Int) -> Particles:
-        """The particles of some superpixels (M,)."""
-        return Particles(self.n[who], self.D[who], self.R[who], self.T[who])
-
-    def soup(self, labels: Int, share: Float) -> Soup:
-        """The soup of labels (N,), with sum(lam) = 1 exactly restored (`Soup.normalised`)."""
-        own = self.take(labels[:, None])
-        one = np.ones(len(labels))
-        return Soup(one, own.n[:, 0], own.D[:, 0], own.R[:, 0], own.T[:, 0]).normalised(share)
-
-
-def anchor_depth(p: Particles, anchor_ray: Float) -> Float:
-    """(N, L) depth of every particle's plane at the anchor."""
-    return -p.D / np.einsum("nlc,nc->nl", p.n, anchor_ray)
 
 
 def feasible(p: Particles, visibility_ray: Float, min_facing: float) -> Mask:

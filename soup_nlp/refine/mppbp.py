@@ -30,8 +30,8 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.mrf.trws import solve_trws
-from soup_nlp.refine.anchored import neighbours
-from soup_nlp.refine.costs import PairCosts, Particles, feasible, unary_costs
+from soup_nlp.refine.anchored import Particles, neighbours
+from soup_nlp.refine.costs import PairCosts, feasible, unary_costs
 from soup_nlp.refine.particles import Proposals, Proposer
 from soup_nlp.refine.photometric import Photometric, swept
 from soup_nlp.refine.population import (

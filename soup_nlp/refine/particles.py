@@ -19,8 +19,7 @@ from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.plane_fit import PlaneFit, fit_planes
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.refine.anchored import Local, fit_motion
-from soup_nlp.refine.costs import Particles
+from soup_nlp.refine.anchored import Local, Particles, fit_motion
 from soup_nlp.refine.population import COMMON, KINDS, WALKS, Spread
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.refine.costs import Particles, anchor_depth
+from soup_nlp.refine.anchored import Particles, anchor_depth
 
 WALKS = ("walk_plane", "walk_motion", "walk_pivot", "walk_scale", "walk_all")
 COMMON = ("common_motion",)

@@ -17,7 +17,6 @@ from PIL import Image as Pil
 from PIL import ImageDraw, ImageFont
 
 from soup_nlp.arrays import AnyFloat, Image
-from soup_nlp.errors import DataError
 from soup_nlp.report.pictures import Bar, Legend, Picture, Swatches, Wheel
 from soup_nlp.storage.files import PathLike, write_bytes
 
@@ -195,7 +194,5 @@ def write_clipped_depth_png16(path: PathLike, depth: AnyFloat, scale: float | No
 
 def _encode(path: PathLike, array: NDArray[np.generic]) -> None:
     # files are a third smaller than at the default level
-    good, data = cv2.imencode(".png", array, [cv2.IMWRITE_PNG_COMPRESSION, 2])
-    if not good:
-        raise DataError("image cannot be encoded as PNG", where=path, found=array.shape)
+    _, data = cv2.imencode(".png", array, [cv2.IMWRITE_PNG_COMPRESSION, 2])
     write_bytes(path, data.tobytes())

@@ -1,16 +1,21 @@
-"""What a run found, how sure that is, what limits it and what to try, in words."""
+"""What a run found, how sure that is, what limits it and what to try: in words and as numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import AnyFloat, Float, Mask
 from soup_nlp.evaluate.confidence import MOST_SIGMA
+from soup_nlp.evaluate.metrics import component_overlaps, skill
+from soup_nlp.geometry.surface import hidden
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.result import Result
-from soup_nlp.start.components import largest
+from soup_nlp.solve.kkt import constraint_residuals
+from soup_nlp.start.components import FIXED, TIES, largest
+from soup_nlp.storage.versions import versions
 
 SHARES = {
     "flow": "by flow and parallax",
@@ -135,13 +140,18 @@ def flow_words(run: Run) -> list[str]:
     return lines
 
 
-def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
-    """What would give a better depth; `shares` are those of `certainty`."""
-    flow, out = run.pair.flow, []
-    assert flow is not None
-    if flow.usable < USABLE:
-        length = np.linalg.norm(flow.uv, axis=-1)[flow.confidence > 0]
-        fast = len(length) and np.median(length) > FAST * run.pair.size[1]
+def hints(uv: AnyFloat, confidence: AnyFloat, shares: Mapping[str, float]) -> list[str]:
+    """What would give a better depth.
+
+    Args:
+        uv: (H, W, 2) flow, pixels.
+        confidence: (H, W) of the flow; 0 is unusable.
+        shares: Those of `certainty`.
+    """
+    usable, out = confidence > 0, []
+    if usable.mean() < USABLE:
+        length = np.linalg.norm(uv, axis=-1)[usable]
+        fast = len(length) and np.median(length) > FAST * uv.shape[1]
         out.append("frames closer in time" if fast else "a better flow (--flow)")
     if shares["rest"] > 0.5:
         out.append("frames between which the camera moves aside, not only turns")
@@ -153,56 +163,158 @@ def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
 
 
 def limits(result: Result) -> list[str]:
-    """Sentences on the limits of a result and on what to try; at least one."""
-    s, shares, parts = result.summary, result.summary.get("certainty", {}), result.components
-    usable = float(np.mean(result.flow_confidence > 0))
-    pixels = np.asarray(result.tree["segmentation"]["sizes"], float)
-    bends = float(pixels[result.bends].sum() / pixels.sum())
-    has_parallax = not result.at_rest and not result.bending
-    guess, flat = shares.get("guess", 0.0), shares.get("flat", 0.0)
-    some = "1 component" if len(parts) == 2 else f"{len(parts) - 1} components"
-    moving = 1 - parts.background.pixels / result.labels.size
-    sentences = (
-        (
-            not s["converged"] and s["status"] != "Skipped",
-            f"The NLP did not converge ({s['status']}): try a larger solver.max_iter.",
-        ),
-        (
-            usable < USABLE,
-            f"The flow is usable at {usable:.0%} of the pixels; the rest takes its depth from its"
-            " surroundings. Try a better flow (flow.source).",
-        ),
-        (
-            result.at_rest,
-            "The flow is that of a camera that stands still or only turns: images from one place"
-            " hold no depth. What is shown is a guess. Try frames between which the camera moves"
-            " aside.",
-        ),
-        (
-            result.bending and not result.at_rest,
-            "Surfaces are taken to bend: without one rigid motion depth follows from the surfaces'"
-            " own stretching, and relief is weakly determined.",
-        ),
-        (
-            has_parallax and bends > 0,
-            f"{bends:.0%} of the image bends: its depth follows from the surface's own stretching,"
-            " and its scale from contact.",
-        ),
-        (
-            has_parallax and guess >= SHARE,
-            f"{guess_words({'guess': guess, **shares}, ' of the image')}. What is shown there"
-            " follows from the neighbours.",
-        ),
-        (
-            has_parallax and flat >= SHARE,
-            f"{flat:.0%} of the image lies in components whose flow a turn alone or a constant"
-            " depth explains nearly as well as depth does. Try frames farther apart in time.",
-        ),
-        (
-            len(parts) > 1,
-            f"The scale of {some} beside the background ({moving:.1%} of the image) follows not"
-            " from the images but from what it stands on or touches.",
-        ),
-    )
-    good = "Nothing stands out: flow, parallax and convergence are good."
-    return [text for holds, text in sentences if holds] or [good]
+    """What limits a result and what to try, in the words of the verdict; at least one sentence."""
+    s, uv = result.summary, result.array("input/flow")
+    shares = dict.fromkeys((*SHARES, "guess"), 0.0) | s.get("certainty", {})
+    lines = []
+    if not s["converged"] and s["status"] != "Skipped":
+        lines.append(f"The NLP did not converge ({s['status']}): try a larger solver.max_iter.")
+    if shares["guess"] >= SHARE:
+        lines.append(f"{guess_words(shares, ' of the image')}.")
+    if result.bends.any():
+        share = float(result.bends[result.labels].mean())
+        lines.append(f"{share:.0%} of the image bends: its relief is weakly determined.")
+    if uv is not None:
+        lines += [f"Try {text}." for text in hints(uv, result.flow_confidence, shares)]
+    return lines or ["Nothing stands out: flow, parallax and convergence are good."]
+
+
+# --- summary.json --------------------------------------------------------------------------------
+
+_ROUND = (
+    *("energy", "mrf_energy", "bound", "gap", "taken", "moved", "ties", "iterations", "status"),
+    *("seconds", "proposed", "accepted"),
+)
+"""Entries of a round of the refinement in summary.json."""
+
+
+def summary(run: Run) -> dict[str, Any]:
+    """Contents of summary.json; the keys are stable."""
+    s = run.solution
+    constant = run.metrics["constant"].mre if "constant" in run.metrics else np.nan
+    facing = run.problem.formulation.min_facing
+    return {
+        "name": run.problem.name,
+        "problem_hash": run.problem.digest(),
+        "status": s.status,
+        "converged": s.converged,
+        "delivered": run.delivered,
+        "energy_by_stage": dict(s.ends)
+        | ({"refinement": run.energy["total"]} if run.refined is not None else {}),
+        "energy": {"start": s.energy_start, "nlp": s.energy, "solution": run.energy},
+        "residuals": run.residuals,
+        "nlp_residuals": constraint_residuals(s.soup, run.data.rim_ray, facing),
+        "answer_residuals": constraint_residuals(run.answer, run.data.rim_ray, facing),
+        "refinement": refinement_summary(run),
+        "metrics": {
+            # the constant depth is scored on the reference frame only
+            k: m.as_dict() | ({} if k == "solution_next" else {"skill": skill(m.mre, constant)})
+            for k, m in run.metrics.items()
+        },
+        "components": _components(run),
+        "expected": run.problem.expected.model_dump(),
+        "seconds": run.seconds,
+        "iterations": {stage.name: stage.iterations for stage in s.stages},
+        "sizes": {
+            "superpixels": len(run.segmentation),
+            "knn_edges": len(run.segmentation.edges),
+            "neighbour_pairs": len(run.segmentation.pairs),
+            "width": run.pair.size[1],
+            "height": run.pair.size[0],
+            **s.nlp,
+        },
+        "full_size": _full_size(run),
+        "start": {
+            "motions": len(run.start.motions),
+            "borrowed": int(run.start.borrowed.sum()),
+            "median_error_px": float(np.median(run.start.error)),
+        },
+        "certainty": certainty(run),
+        "evidence": run.confidence.evidence.rows(),
+        **({} if run.given is None else {"depth_prior": run.given.as_dict()}),
+        "flow": str(run.pair.flow),
+        "versions": versions(),
+        "seed": run.problem.seed,
+    }
+
+
+def _full_size(run: Run) -> dict[str, Any] | None:
+    """Size and score of the depth at the size of the images; None if it was solved at that size."""
+    if run.full is None:
+        return None
+    height, width = run.full.depth_ref.shape
+    scores = run.full.metrics
+    return {"width": width, "height": height, "metrics": scores and scores.as_dict()}
+
+
+def _components(run: Run) -> dict[str, Any]:
+    """Number of components, and their overlap with the true ones."""
+    truth = run.pair.truth
+    out: dict[str, Any] = {"count": len(run.components)}
+    if truth is not None and truth.components is not None:
+        found = component_overlaps(run.components.of_pixel, truth.components)
+        out["truth"] = {str(k): {"component": c, "iou": iou} for k, (c, iou) in found.items()}
+    return out
+
+
+def refinement_summary(run: Run) -> dict[str, Any] | None:
+    """Results of the refinement by round; None if it was disabled."""
+    r = run.refined
+    if r is None:
+        return None
+    return {
+        "status": r.status,
+        "seconds": r.seconds,
+        "contradicted": r.contradicted,
+        "start": r.energy_start,
+        "begin": r.energy_begin,
+        "end": r.energy,
+        "rounds": [{key: getattr(one, key) for key in _ROUND} for one in r.rounds],
+    }
+
+
+def certainty(run: Run) -> dict[str, float]:
+    """Shares of the image for summary.json and the verdict.
+
+    Returns:
+        "determined": share with a sigma of log depth of at most `MOST_SIGMA`; the sum of "flow"
+        (pixels of the largest component), "contact" and "outline" (pixels of other components, by
+        the source of their scale), and with a depth prior "given" (depth or scale are the
+        prior's). "guess": the rest; the sum of "rest" (the camera is at rest or
+        only turns), "fixed" (stands still in the image though the camera moves, such as the bonnet
+        of its car), "unseen" (no usable flow, or hidden in the next frame), "flat" (of a
+        component without evidence of depth, see `Evidence.guess`), "scale" (of a component whose
+        scale alone is as uncertain as that) and "weak" (anything else). "median_sigma": median of
+        the determined pixels.
+    """
+    sigma = run.confidence.sigma
+    labels, start = run.segmentation.labels, run.start
+    sure = sigma <= MOST_SIGMA
+    tie = start.tie[labels]
+    assert run.pair.flow is not None
+    unseen = (run.pair.flow.confidence <= 0) | hidden(run.reconstruction)
+    rest, fixed = np.full(labels.shape, start.at_rest), tie == FIXED
+    flat = run.confidence.evidence.guess[start.component][labels]
+    loose = run.confidence.scale[labels] > MOST_SIGMA
+    guess, left = {}, ~sure
+    reasons = {"rest": rest, "fixed": fixed, "unseen": unseen, "flat": flat, "scale": loose}
+    for name, mask in reasons.items():
+        guess[name] = left & mask
+        left = left & ~mask
+
+    def share(mask: Mask) -> float:
+        return float(mask.mean())
+
+    given = np.zeros(len(start.soup), bool) if run.given is None else run.given.held
+    by_flow = sure & ~given[labels]
+    return {
+        "determined": share(sure),
+        "flow": share(by_flow & (tie == TIES.index("reference"))),
+        "contact": share(by_flow & (tie == TIES.index("contact below"))),
+        "outline": share(by_flow & (tie > TIES.index("contact below"))),
+        **({} if run.given is None else {"given": share(sure & given[labels])}),
+        "guess": share(~sure),
+        **{name: share(mask) for name, mask in guess.items()},
+        "weak": share(left),
+        "median_sigma": float(np.median(sigma[sure])) if sure.any() else float("nan"),
+    }

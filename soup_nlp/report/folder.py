@@ -14,9 +14,9 @@ from typing import Any, ParamSpec
 
 from PIL.Image import Image, fromarray
 
-from soup_nlp import pipeline
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import DataError
+from soup_nlp.pipeline import run as pipeline
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.figures import (
     overview,
@@ -25,12 +25,12 @@ from soup_nlp.report.figures import (
     write_clipped_depth_png16,
     write_picture,
 )
+from soup_nlp.report.findings import summary
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.layout import record_of, recorded_files, result_tree
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import Picture, pictures
 from soup_nlp.report.result import PAGE, html, load, result_of
-from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
 from soup_nlp.storage.files import as_path, write_text
 from soup_nlp.storage.folders import claim, digest_of, files_in, staged
@@ -279,7 +279,7 @@ Given = ParamSpec("Given")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class WritableRun(pipeline.Run):
+class WritableRun(Run):
     """A run with its result folder and its overview."""
 
     def save(
@@ -318,7 +318,7 @@ class WritableRun(pipeline.Run):
         return html(str(self), picture.getvalue())
 
 
-def _writable(solve: Callable[Given, pipeline.Run]) -> Callable[Given, WritableRun]:
+def _writable(solve: Callable[Given, Run]) -> Callable[Given, WritableRun]:
     """The same function with a `WritableRun` as its result."""
 
     @wraps(solve)

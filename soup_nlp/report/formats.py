@@ -12,9 +12,8 @@ import numpy as np
 from soup_nlp.errors import ConfigError, DataError, printable, repr_of
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.rotation import log
-from soup_nlp.report.colmap import write_colmap
 from soup_nlp.report.figures import write_clipped_depth_png16
-from soup_nlp.report.ply_glb import AXES, write_cloud, write_glb
+from soup_nlp.report.models import AXES, write_cloud, write_colmap, write_glb
 from soup_nlp.report.result import FRAMES, Result
 from soup_nlp.storage.files import atomic_path, write_bytes, write_text
 from soup_nlp.storage.store import write_json

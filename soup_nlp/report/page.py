@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Image
-from soup_nlp.errors import DataError
 from soup_nlp.report.colour import component_colours
 from soup_nlp.report.findings import limits
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
@@ -110,9 +109,7 @@ def _data_uri(picture: Picture) -> str:
 
 def encoded(image: Image, kind: str, options: list[int] | None = None) -> str:
     """A picture (H, W, 3) as a data URI; `kind` is "jpeg", "png" or "webp"."""
-    good, data = cv2.imencode(f".{kind}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options or [])
-    if not good:
-        raise DataError("image cannot be encoded", where="report.html", found=kind)
+    _, data = cv2.imencode(f".{kind}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options or [])
     return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
 
 

@@ -147,11 +147,6 @@ class Result:
         """Whether the whole image bends; then no component is rigid."""
         return bool(self.bends.all())
 
-    @property
-    def at_rest(self) -> bool:
-        """Whether the initialisation found the camera at rest or only rotating."""
-        return bool(self.tree["start"]["at_rest"])
-
     def array(self, place: str) -> NDArray[Any] | None:
         """The array at "a/b" of the tree; None if there is none."""
         group, name = place.split("/")

@@ -11,9 +11,15 @@ import numpy as np
 from soup_nlp.evaluate.metrics import DepthMetrics, skill
 from soup_nlp.evaluate.scoring import SURE
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.findings import certainty_lines, flow_words, found_words, hints
+from soup_nlp.report.findings import (
+    certainty,
+    certainty_lines,
+    flow_words,
+    found_words,
+    hints,
+    refinement_summary,
+)
 from soup_nlp.report.result import PAGE
-from soup_nlp.report.summary import certainty, refinement_summary
 
 STATUS = {
     "Solve_Succeeded": "converged to the tolerance",
@@ -70,14 +76,15 @@ def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
         limit: Largest MRE that the problem file expects.
         details: Add what concerns the flow and the solver: iterations, energies, residuals.
     """
-    shares = certainty(run)
+    shares, flow = certainty(run), run.pair.flow
+    assert flow is not None
     whole = {k: v for k, v in run.seconds.items() if not k.startswith("nlp_")}
     inner = {k[4:]: v for k, v in run.seconds.items() if k.startswith("nlp_")}
     sections = {
         "status": _status(run),
         "found": found_words(run),
         "certainty": certainty_lines(shares),
-        "try": hints(run, shares),
+        "try": hints(flow.uv, flow.confidence, shares),
         "accuracy": [protocol(run.metrics), *accuracy(run.metrics)] if run.metrics else [],
         "expected": [f"MRE at most {limit:g}: {'missed' if missed(run) else 'met'}"]
         if limit is not None and "solution" in run.metrics

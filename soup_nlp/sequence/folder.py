@@ -15,11 +15,10 @@ import numpy as np
 from soup_nlp.arrays import Float, Image
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.check import check_folder
-from soup_nlp.report.colmap import write_model
 from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.figures import depth_png_scale, write_clipped_depth_png16
 from soup_nlp.report.formats import tum_text
-from soup_nlp.report.ply_glb import AXES, write_ply
+from soup_nlp.report.models import AXES, write_model, write_ply
 from soup_nlp.sequence.chain import Chain, make_chain
 from soup_nlp.sequence.fused import fuse, projected
 from soup_nlp.sequence.page import RATE, chain_page, write_animation

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float, Image
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.colour import colourise_depth
+from soup_nlp.report.models import GLTF
 from soup_nlp.report.page import colour_bar, encoded, packed, table, web_file
 from soup_nlp.report.pictures import Bar
-from soup_nlp.report.ply_glb import GLTF
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.fused import Cloud, fuse, movers, shown_tracks
 from soup_nlp.sequence.score import LINK_HEADS, link_rows, score_text

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR, scale_by_contact
-from soup_nlp.report.findings import GUESSES, certainty_lines, guess_reason
-from soup_nlp.report.summary import certainty
+from soup_nlp.report.findings import GUESSES, certainty, certainty_lines, guess_reason
 from soup_nlp.start.components import FIXED, TIES, displacement
 
 REASONS = GUESSES

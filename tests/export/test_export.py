@@ -22,7 +22,7 @@ from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.evaluate.information import information
 from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.foreign import import_sol
-from soup_nlp.export.names import readable_names
+from soup_nlp.export.nl import readable_names
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, kind, residual_table, table_text, violations
 from soup_nlp.model import oracle

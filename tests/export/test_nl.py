@@ -13,8 +13,7 @@ from helpers_formulation import NORMS
 from helpers_model import GAUGES, PAPER, TRUNCATED, Tiny, value, wiggle
 from helpers_nl import ReadBack, close
 
-from soup_nlp.export.names import readable_names
-from soup_nlp.export.nl import NLFile, write_nl
+from soup_nlp.export.nl import NLFile, readable_names, write_nl
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.nlp import NLP
 

@@ -12,7 +12,7 @@ from helpers_model import PAPER
 from scipy import sparse
 
 from soup_nlp.export import verify
-from soup_nlp.export.names import readable_names
+from soup_nlp.export.nl import readable_names
 from soup_nlp.export.program import make_program
 from soup_nlp.export.sol import Sol
 from soup_nlp.export.verify import kind

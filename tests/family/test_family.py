@@ -15,8 +15,7 @@ from scipy import sparse
 
 from soup_nlp.cli.main import main
 from soup_nlp.errors import ConfigError, DataError
-from soup_nlp.export.names import readable_names
-from soup_nlp.export.nl import write_nl
+from soup_nlp.export.nl import readable_names, write_nl
 from soup_nlp.family.describe import check_sol, degree, rank, write_results
 from soup_nlp.family.frozen import (
     decoded,

@@ -18,7 +18,7 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
-from soup_nlp.refine.costs import Particles
+from soup_nlp.refine.anchored import Particles
 from soup_nlp.refine.mppbp import objective, refine_soup
 from soup_nlp.refine.photometric import (
     BEHIND,

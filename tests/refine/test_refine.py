@@ -20,8 +20,7 @@ from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.refine import mppbp
-from soup_nlp.refine.anchored import Local, neighbours
-from soup_nlp.refine.costs import Particles, anchor_depth
+from soup_nlp.refine.anchored import Local, Particles, anchor_depth, neighbours
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.particles import Proposer
 from soup_nlp.refine.population import BORROWED, COMMON, KINDS, WALKS

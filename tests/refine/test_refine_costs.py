@@ -11,7 +11,8 @@ from helpers_model import Tiny, random_soup, weights_for, with_graph
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
-from soup_nlp.refine.costs import PairCosts, Particles, anchor_depth, feasible, unary_costs
+from soup_nlp.refine.anchored import Particles, anchor_depth
+from soup_nlp.refine.costs import PairCosts, feasible, unary_costs
 from soup_nlp.refine.mppbp import length_slope
 from soup_nlp.refine.population import conditional_costs, diverse, within_reach
 

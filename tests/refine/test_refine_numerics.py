@@ -15,8 +15,8 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.refine import mppbp
-from soup_nlp.refine.anchored import Local, fit_motion, neighbours
-from soup_nlp.refine.costs import PairCosts, Particles
+from soup_nlp.refine.anchored import Local, Particles, fit_motion, neighbours
+from soup_nlp.refine.costs import PairCosts
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.particles import Proposer
 from soup_nlp.refine.population import KINDS, SHARES, relearn, spread_of

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from soup_nlp.data.formats.map_files import read_pfm
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.formats import FORMATS, write_formats
-from soup_nlp.report.ply_glb import surface_mesh, write_ply
+from soup_nlp.report.models import surface_mesh, write_ply
 from soup_nlp.report.result import Result
 
 FLOAT32 = 1e-6
@@ -115,7 +115,7 @@ def test_meshes_have_no_curtains(result):
 
 
 def test_large_meshes_are_thinned(result, monkeypatch):
-    monkeypatch.setattr("soup_nlp.report.ply_glb.CELLS", 60 * 80 // 4)
+    monkeypatch.setattr("soup_nlp.report.models.CELLS", 60 * 80 // 4)
     vertices, faces, pixels = surface_mesh(result, 0)
     assert not (pixels % 2).any()
     assert 0.7 * 60 * 80 / 2 < len(faces) < 60 * 80 / 2

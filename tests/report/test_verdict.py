@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.report import findings
-from soup_nlp.report.summary import certainty
+from soup_nlp.report.findings import certainty
 from soup_nlp.report.verdict import energy_table, facts
 
 
@@ -54,12 +54,13 @@ def test_a_shift_has_a_length_and_a_direction(vector, way, small_run):
 
 def test_hints_name_what_would_help(small_run):
     shares = {**certainty(small_run), "rest": 0.0, "flat": 0.1, "scale": 0.1}
-    (told,) = findings.hints(small_run, shares)
+    flow = small_run.pair.flow.uv, small_run.pair.flow.confidence
+    (told,) = findings.hints(*flow, shares)
     assert "frames farther apart in time" in told
     assert "--depth-prior" in told
-    (told,) = findings.hints(small_run, {**shares, "rest": 0.9})
+    (told,) = findings.hints(*flow, {**shares, "rest": 0.9})
     assert "moves aside" in told
-    assert findings.hints(small_run, dict.fromkeys(shares, 0.0)) == []
+    assert findings.hints(*flow, dict.fromkeys(shares, 0.0)) == []
 
 
 def test_the_table_of_energies_ends_with_what_the_refinement_lowers():

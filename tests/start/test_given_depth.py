@@ -20,7 +20,7 @@ from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.reweighting import with_prior
-from soup_nlp.report.summary import certainty, summary
+from soup_nlp.report.findings import certainty, summary
 from soup_nlp.start.components import TIES
 from soup_nlp.start.edges import follows_edges
 from soup_nlp.start.given_depth import CONFIRMED, Given, _slopes, by_prior

@@ -31,7 +31,7 @@ import numpy as np
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
-from soup_nlp.export.names import readable_names
+from soup_nlp.export.nl import readable_names
 from soup_nlp.export.sol import write_sol
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.folders import digest_of, made_files, recover
