@@ -79,14 +79,22 @@ class Plane(Shape):
 
 
 @dataclass(frozen=True)
-class Box(Shape):
-    """A box centred on the origin.
+class Centred(Shape):
+    """A shape around the origin.
 
     Attributes:
         half: Half sizes along x, y and z, unit of length.
     """
 
     half: tuple[float, float, float]
+
+    def corners(self) -> Float:
+        """See `Shape`."""
+        return _corner_points(self.half)
+
+
+class Box(Centred):
+    """A box."""
 
     def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
         """See `Shape`."""
@@ -109,10 +117,6 @@ class Box(Shape):
         out = np.zeros(points.shape)
         out[rows, face] = np.sign(points[rows, face])
         return out
-
-    def corners(self) -> Float:
-        """See `Shape`."""
-        return _corner_points(self.half)
 
     def chart(self, material: Float) -> Float:
         """See `Shape`; y runs along y on the four sides."""
@@ -150,15 +154,8 @@ class Sphere(Shape):
         return _corner_points((self.radius,) * 3)
 
 
-@dataclass(frozen=True)
-class Ellipsoid(Shape):
-    """An ellipsoid around the origin.
-
-    Attributes:
-        half: Half axes along x, y and z, unit of length.
-    """
-
-    half: tuple[float, float, float]
+class Ellipsoid(Centred):
+    """An ellipsoid, whose half axes are the half sizes."""
 
     def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
         """See `Shape`: a sphere in coordinates divided by the half axes."""
@@ -170,10 +167,6 @@ class Ellipsoid(Shape):
         n = points / np.square(self.half)
         out: Float = n / np.linalg.norm(n, axis=1, keepdims=True)
         return out
-
-    def corners(self) -> Float:
-        """See `Shape`."""
-        return _corner_points(self.half)
 
 
 @dataclass(frozen=True)
