@@ -208,7 +208,7 @@ def build_energy(
         # no flow holds slopes where the prior decides: they are held as those that bend
         stiffer = np.where(bends, 1.0, bent.orient / max(e.weights.orient, 1e-12))
         known = given.log_depth, given.opened, given.error, start.component, free, stiffer
-        data = with_prior(data, start.soup, *known)
+        data = with_prior(data, start.soup, *known, creased=not given.confirmed)
         # a given depth has steps inside a component as well
         parts = np.arange(len(seg))
     data = at_occlusions(data, start.soup, parts, OCCLUSION_GAP, e.cont_occluded)

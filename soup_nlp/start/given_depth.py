@@ -90,10 +90,15 @@ class Given:
     def __str__(self) -> str:
         if not self.used:
             return "the depth prior is not used: flow or edges of the image contradict it"
-        flow = "the flow confirms it" if self.ratio <= CONFIRMED else "no flow confirms it"
+        flow = "the flow confirms it" if self.confirmed else "no flow confirms it"
         return f"depth prior ({self.kind}): {flow}; its sigma is {self.overall:.0%}"
 
     __repr__ = __str__
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the flow confirms the prior."""
+        return self.ratio <= CONFIRMED
 
     @property
     def used(self) -> bool:

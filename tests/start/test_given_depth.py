@@ -115,16 +115,17 @@ def test_orientation_is_held_inside_a_plane_and_released_at_creases(pan):
     data = build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, 4, 0, True)
     free, stiffer = np.ones(len(data.edges)), np.full(len(seg), 100.0)
     known = given.log_depth, given.opened, given.error, start.component, free, stiffer
-    gain = with_prior(data, start.soup, *known).orient_weight / data.orient_weight
+    gain = with_prior(data, start.soup, *known, creased=True).orient_weight / data.orient_weight
     a, b = start.soup.n[data.pairs.T]
     angle = np.degrees(np.arccos(np.clip((a * b).sum(axis=1), -1, 1)))
     assert gain[angle < 1].min() > 90
     assert gain[angle > 30].max() < 10
+    plain = with_prior(data, start.soup, *known, creased=False).orient_weight
+    np.testing.assert_allclose(plain, 100 * data.orient_weight)
     # where the flow determines the slopes nothing changes
     known = given.log_depth, np.zeros(len(seg)), *known[2:]
-    np.testing.assert_array_equal(
-        with_prior(data, start.soup, *known).orient_weight, data.orient_weight
-    )
+    flat = with_prior(data, start.soup, *known, creased=True).orient_weight
+    np.testing.assert_array_equal(flat, data.orient_weight)
 
 
 @pytest.mark.parametrize("wrong", ["constant", "smooth", "upside down", "unknown", "pixels"])
