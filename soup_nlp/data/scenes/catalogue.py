@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes import everyday
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, advanced, inverse, render
@@ -113,6 +114,16 @@ def _street(rng: Random, half_width: float, half_height: float, seed: int) -> Sc
     return Scene(tuple(bodies), *view)
 
 
+def _sideways(rng: Random) -> tuple[Float, Float]:
+    """Poses of a camera in a room that moves to one side and turns back to the middle."""
+    side = sign(rng)
+    return views(
+        placed(0, -1.35, 0, yaw=side, pitch=-9),
+        [side * rng.uniform(0.06, 0.085), rng.uniform(-0.01, 0.01), 0.04],
+        [0.1, -side * rng.uniform(0.2, 0.5), sign(rng) * 0.2],
+    )
+
+
 def _room(rng: Random, half_width: float, half_height: float, seed: int) -> Scene:
     """camera moving sideways, three independently moving objects among furniture"""
     m = Materials(rng)
@@ -127,13 +138,7 @@ def _room(rng: Random, half_width: float, half_height: float, seed: int) -> Scen
             shift[1] = -rng.uniform(0.02, 0.05)  # lifted off the floor
         turn = [0, sign(rng) * rng.uniform(2, 4), 0]
         bodies.append(Body((part,), about(foot, turn, shift)))
-    side = sign(rng)
-    view = views(
-        placed(0, -1.35, 0, yaw=side, pitch=-9),
-        [side * rng.uniform(0.06, 0.085), rng.uniform(-0.01, 0.01), 0.04],
-        [0.1, -side * rng.uniform(0.2, 0.5), sign(rng) * 0.2],
-    )
-    return Scene(tuple(bodies), *view)
+    return Scene(tuple(bodies), *_sideways(rng))
 
 
 def _sheet(rng: Random, half_width: float, half_height: float, seed: int) -> Scene:
@@ -213,13 +218,7 @@ def _banner(rng: Random, half_width: float, half_height: float, seed: int) -> Sc
         Body((*interior(rng, m, half_width), *rest)),
         Body((cloth,), about([x, 0, z], turn, shift)),
     )
-    side = sign(rng)
-    view = views(
-        placed(0, -1.35, 0, yaw=side, pitch=-9),
-        [side * rng.uniform(0.06, 0.085), rng.uniform(-0.01, 0.01), 0.04],
-        [0.1, -side * rng.uniform(0.2, 0.5), sign(rng) * 0.2],
-    )
-    return Scene(bodies, *view)
+    return Scene(bodies, *_sideways(rng))
 
 
 _LAYOUTS: dict[str, tuple[Callable[[Random, float, float, int], Scene], float]] = {
