@@ -85,7 +85,7 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
     )
     nlp, layout = case.nlp(form)
     _require_same_problem(folder, manifest, fingerprint(case, nlp, layout))
-    answer = read_sol(sol, *_orders(folder, nlp, layout))
+    answer = read_sol(sol, *file_orders(folder, nlp, layout))
     # values at an arbitrary point may be infinite or NaN; such an answer is not verified
     with np.errstate(all="ignore"):
         run = foreign_run(case, form, nlp, layout, answer, source=Path(sol).name)
@@ -130,7 +130,7 @@ def sol_table(imported: Imported) -> list[Kind]:
     return rows + [kind(k, v, KKT_LIMIT, False) for k, v in imported.violations.items()]
 
 
-def _orders(folder: Path, nlp: NLP, layout: MatrixLayout | TangentLayout) -> tuple[Any, Any]:
+def file_orders(folder: Path, nlp: NLP, layout: MatrixLayout | TangentLayout) -> tuple[Any, Any]:
     """Orders of variables and rows in the file, from its names."""
     out = []
     for suffix, names in zip((".col", ".row"), readable_names(nlp, layout)):

@@ -16,10 +16,9 @@ from helpers_model import PAPER, Tiny
 
 from soup_nlp.bench.processes import isolated
 from soup_nlp.bench.solvers import runner
-from soup_nlp.bench.solvers.plugins import PLUGINS
+from soup_nlp.bench.solvers.plugins import PLUGINS, Answer, Task, Trace
 from soup_nlp.bench.solvers.registry import available, executable, find_solver, reference
 from soup_nlp.bench.solvers.runner import compare
-from soup_nlp.bench.solvers.task import Answer, Task, Trace
 from soup_nlp.errors import SolverError
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, violations

@@ -21,8 +21,7 @@ from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.evaluate.information import information
 from soup_nlp.export.artefact import parse_formulation
-from soup_nlp.export.foreign import import_sol
-from soup_nlp.export.nl import readable_names
+from soup_nlp.export.foreign import file_orders, import_sol
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, kind, residual_table, table_text, violations
 from soup_nlp.model import oracle
@@ -59,11 +58,7 @@ def problem_of(folder: Path):
     case = prepare(load_problem(folder / "problem.yaml"))
     chosen = {**manifest["formulation"], **manifest["smoothing"]}
     nlp, layout = case.nlp(case.formulation(**chosen, hessian="exact", compiled=False))
-    orders = []
-    for suffix, names in zip((".col", ".row"), readable_names(nlp, layout)):
-        lines = (folder / f"soup{suffix}").read_text().split()
-        orders.append(np.array([names.index(n) for n in lines[: len(names)]]))
-    return case, nlp, layout, orders, manifest
+    return case, nlp, layout, file_orders(folder, nlp, layout), manifest
 
 
 def test_several_sizes_and_formulations_are_exported_and_read_back(tmp_path):

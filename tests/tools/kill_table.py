@@ -31,7 +31,7 @@ import numpy as np
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
-from soup_nlp.export.nl import readable_names
+from soup_nlp.export.foreign import file_orders
 from soup_nlp.export.sol import write_sol
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.folders import digest_of, made_files, recover
@@ -80,12 +80,7 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
         problem = load_problem(root / "exported" / "problem.yaml")
         case = prepare(problem)
         nlp, layout = case.nlp(case.formulation(hessian="exact", compiled=False))
-        orders = []
-        for suffix, own in zip((".col", ".row"), readable_names(nlp, layout)):
-            place = {name: k for k, name in enumerate(own)}
-            lines = (root / "exported" / "soup").with_suffix(suffix).read_text().split()
-            orders.append([place[line] for line in lines[: len(own)]])
-        write_sol(root / "a.sol", nlp.x0, None, *map(np.array, orders))
+        write_sol(root / "a.sol", nlp.x0, None, *file_orders(root / "exported", nlp, layout))
     return [Command(name, words[name], out[name]) for name in names]
 
 

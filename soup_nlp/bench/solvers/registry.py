@@ -15,8 +15,18 @@ import casadi as ca
 import numpy as np
 
 from soup_nlp.bench.reference_solver import EPS, levenberg_marquardt
-from soup_nlp.bench.solvers.plugins import NEAR_START, PLUGINS, TOLERANCES, plugin
-from soup_nlp.bench.solvers.task import WALL_PER_CPU, Answer, Solver, Task, Trace, clock
+from soup_nlp.bench.solvers.plugins import (
+    NEAR_START,
+    PLUGINS,
+    TOLERANCES,
+    WALL_PER_CPU,
+    Answer,
+    Solver,
+    Task,
+    Trace,
+    clock,
+    plugin,
+)
 from soup_nlp.errors import SolverError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import read_sol

@@ -15,16 +15,17 @@ import numpy as np
 
 from soup_nlp.arrays import Float
 from soup_nlp.bench.processes import isolated, processor
+from soup_nlp.bench.solvers.plugins import WALL_PER_CPU, Answer, Task, Trace
 from soup_nlp.bench.solvers.registry import find_solver
-from soup_nlp.bench.solvers.task import WALL_PER_CPU, Answer, Task, Trace
 from soup_nlp.bench.study import show
 from soup_nlp.errors import DataError
 from soup_nlp.export.artefact import form_label
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
-from soup_nlp.family.frozen import Frozen, load_frozen
-from soup_nlp.family.instances import Instance, build_instance, case_of, parse_name, problems
+from soup_nlp.family.frozen import load_frozen
+from soup_nlp.family.instances import build_instance, case_of, parse_name, problems
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.record import Case
@@ -34,7 +35,8 @@ from soup_nlp.storage.versions import versions
 
 Label = Mapping[str, Any]
 Maker = Callable[[Path], Task]
-Programs = tuple[NLP, NLP, MatrixLayout | TangentLayout, Formulation]
+Program = tuple[NLP, MatrixLayout | TangentLayout, Formulation]
+Build = Callable[[Hessian], Program]
 
 CURVE_POINTS = 40
 """Iterates of a trace for which the exact energy is computed."""
@@ -61,27 +63,26 @@ def make_tasks(
             "energy_limit": ceiling * (1 + ENERGY_SLACK),
         }
 
-        def programs(form: Formulation = form) -> Programs:
-            nlp, layout = case.nlp(form)
-            second, _ = case.nlp(form.replace(hessian="gauss-newton+constraints"))
-            return nlp, second, layout, form
+        def build(hessian: Hessian, form: Formulation = form) -> Program:
+            return *case.nlp(form.replace(hessian=hessian)), form
 
-        yield label, task_maker(case, programs, limits)
+        yield label, task_maker(case, build, limits)
 
 
-def task_maker(case: Case, programs: Callable[[], Programs], limits: Limits) -> Maker:
+def task_maker(case: Case, build: Build, limits: Limits) -> Maker:
     """Maker of the task of a case.
 
     Args:
         case: Data and weights.
-        programs: Makes the NLP with the exact and with the Gauss-Newton Hessian, their layout and
-            formulation; the start is that of the NLP.
+        build: Makes the NLP with a Hessian, its layout and formulation; the start is that of the
+            NLP.
         limits: Limits of every solver.
     """
 
     @cache
     def built() -> Task:
-        nlp, second, layout, form = programs()
+        nlp, layout, form = build("exact")
+        second, _, _ = build("gauss-newton+constraints")
         # made here, so that the time of a solver does not include it
         both = nlp.evaluated(), second.evaluated()
         soup = layout.unpack(nlp.x0).retracted()
@@ -258,14 +259,6 @@ def family_tasks(folder: Path, limits: Limits) -> Iterator[list[tuple[Label, Mak
                 "best_known": best[instance.name],
                 "energy_limit": float("inf"),
             }
-            programs = partial(_programs, case, record, instance)
-            tasks.append((label, task_maker(case, programs, limits)))
+            build = partial(build_instance, case, record, instance.formulation, instance.start)
+            tasks.append((label, task_maker(case, build, limits)))
         yield tasks
-
-
-def _programs(case: Case, record: Frozen, instance: Instance) -> Programs:
-    """The NLP of an instance with both Hessians, its layout and formulation."""
-    args = case, record, instance.formulation, instance.start
-    nlp, layout, form = build_instance(*args)
-    second, _, _ = build_instance(*args, hessian="gauss-newton+constraints")
-    return nlp, second, layout, form
