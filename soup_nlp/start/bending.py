@@ -21,8 +21,8 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.choice import Choice, dominant
-from soup_nlp.start.components import connected_labels, largest
-from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.components import connected_labels, connected_pieces, largest
+from soup_nlp.start.epipolar import Motion, essential_motion, refine_near
 from soup_nlp.start.merge import candidates
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import Views
@@ -180,6 +180,12 @@ LEAST_SHARE = 0.06
 """Least share of the superpixels that makes a surface: a smaller one joins a neighbour, because a
 few superpixels with a wrong flow look like a bending one."""
 
+SURELY = 0.5
+"""Share of the limit of a bending surface's excess up to which a motion explains a surface surely,
+so that what it leaves is not an error of the flow."""
+MEDIAN_PIXELS, LEAST_SCALE = 3000, 0.02
+"""Pixels of a fit of the least median error, and the least scale of its refinement, pixels."""
+
 
 def surface_motions(
     views: Views, seg: Segmentation, surface: Int, residual: Float, usable: Mask, o: SeededStart
@@ -188,7 +194,8 @@ def surface_motions(
 
     A surface bends if under every rigid motion the median excess of its superpixels' error over the
     residual of an affine flow of their own is above the flow's systematic error plus `NOISES` times
-    its noise.
+    its noise. Pieces that the best motion does not explain are surfaces of their own if they have
+    `LEAST_SHARE`: a small jump along an outline joins what bends to the rigid rest.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
@@ -207,17 +214,51 @@ def surface_motions(
     motions = dominant(views, o)
     fit = views.fit(motions)
     choice = Choice.of(motions, fit, np.argmin(fit.penalised(), axis=1))
+    whole = surface[seg.pairs[:, 0]] == surface[seg.pairs[:, 1]]
     surface = joined(surface, usable, seg)
     bends = np.zeros(len(seg), bool)
-    for c in np.unique(surface[usable]):
-        at = np.flatnonzero(usable & (surface == c))
+    left = [np.flatnonzero(surface == c) for c in np.unique(surface[usable])]
+    while left:
+        every = left.pop()
+        at = every[usable[every]]
         tried = candidates(views, choice, at, motions[0].R, noise, o)
-        excess = np.median(views.some(at).fit(tried).cost - residual[at, None], axis=0)
-        best = int(np.argmin(excess))
-        bends[surface == c] = excess[best] > most
-        if not bends[at[0]]:
-            motions.append(tried[best])
+        given = len(tried)
+        tried += _least_median(views, at, noise, o)
+        excess = views.some(at).fit(tried).cost - residual[at, None]
+        middle = np.median(excess, axis=0)
+        # where many motions explain half of a surface badly, that of the least median is chance
+        middle[given:][middle[given:] > SURELY * most] = np.inf
+        best = int(np.argmin(middle))
+        bends[every] = middle[best] > most
+        if bends[every[0]]:
+            continue
+        motions.append(tried[best])
+        if middle[best] > SURELY * most:
+            continue
+        # large pieces that it does not explain are surfaces of their own
+        apart = np.zeros(len(seg), bool)
+        apart[at[excess[:, best] > most]] = True
+        piece = connected_pieces(apart, seg, whole)
+        left += [
+            np.flatnonzero(piece == c)
+            for c in np.unique(piece[apart])
+            if np.sum(piece == c) >= LEAST_SHARE * len(seg)
+        ]
     return motions, bends
+
+
+def _least_median(views: Views, at: Int, noise: float, o: SeededStart) -> list[Motion]:
+    """The motion with the least median error on superpixels `at`, refined, if there is one.
+
+    RANSAC has an inlier distance, within which a compromise with what bends has more inliers.
+    """
+    step = max(1, len(at) * views.ray.shape[1] // MEDIAN_PIXELS)
+    r, q = (v[at].reshape(-1, 3)[::step] for v in (views.ray, views.target))
+    found = essential_motion(r, q, views.focal[0], None, o.seed)
+    if found is None:
+        return []
+    weight = views.weight[at].ravel()[::step]
+    return [refine_near(found, r, q, weight, views.focal[0], max(noise, LEAST_SCALE))]
 
 
 def joined(surface: Int, usable: Mask, seg: Segmentation) -> Int:

@@ -81,9 +81,12 @@ def estimate(
 
 
 def essential_motion(
-    r: Float, q: Float, focal: float, threshold: float, seed: int = 0
+    r: Float, q: Float, focal: float, threshold: float | None, seed: int = 0
 ) -> Motion | None:
-    """Motion by RANSAC on the essential matrix and cheirality, or None; see `estimate`."""
+    """Motion by RANSAC on the essential matrix and cheirality, or None; see `estimate`.
+
+    Without a threshold it is the motion with the least median error.
+    """
     if len(r) < 8:
         return None
     cv2.setRNGSeed(seed)
@@ -91,7 +94,12 @@ def essential_motion(
     b = np.ascontiguousarray(q[:, :2])
     try:
         E, _ = cv2.findEssentialMat(
-            a, b, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=threshold / focal
+            a,
+            b,
+            np.eye(3),
+            method=cv2.LMEDS if threshold is None else cv2.RANSAC,
+            prob=0.999,
+            threshold=(threshold or 1.0) / focal,
         )
     except cv2.error:
         return None

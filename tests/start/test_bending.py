@@ -103,6 +103,13 @@ def test_a_rigid_room_does_not_bend_with_its_banner(seed):
     assert 0.3 < start.bends.mean() < 0.4
 
 
+def test_a_banner_without_a_jump_along_its_outline_bends_by_itself():
+    # its outline has no discontinuity, and a motion between both has more inliers than the room's
+    own = problem("banner", "input.seed=3")
+    start = prepare(own, pair=own.load_pair()).start
+    assert 0.25 < start.bends.mean() < 0.4
+
+
 def test_small_surfaces_join_the_neighbour_with_the_longest_outline():
     seg = strip(30)
     column = (seg.anchors[:, 0] // 8).astype(int)
