@@ -26,8 +26,7 @@ from soup_nlp.evaluate.metrics import (
     true_pixels,
 )
 from soup_nlp.evaluate.protocols import Preset, preset
-from soup_nlp.evaluate.scoring import at_truth, surest
-from soup_nlp.evaluate.sparsification import coverage, sparsification
+from soup_nlp.evaluate.scoring import at_truth, coverage, sparsification, surest
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run

@@ -24,9 +24,9 @@ from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import missed, verdict
 from soup_nlp.sequence.frames import IMAGES
-from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.folders import default_folder, scratch
+from soup_nlp.storage.progress import interruptible
 
 SOURCE = "Two images, or a problem file or name (`soup-nlp list`)."
 FLOW: Mapping[str, Any] = {"rich_help_panel": "Flow"}

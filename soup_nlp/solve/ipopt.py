@@ -15,8 +15,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.functions import Functions, IterationCallback
-from soup_nlp.solve.interrupt import interruptible, raising
-from soup_nlp.storage.progress import Progress, Watch
+from soup_nlp.storage.progress import Progress, Watch, interruptible, raising
 
 # few bounds are active, so mu starts near its end (docs/solving.md)
 DEFAULTS: Mapping[str, Any] = {

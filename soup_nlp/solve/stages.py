@@ -21,10 +21,9 @@ from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.ipopt import Ipopt, Stage
-from soup_nlp.solve.kkt import UNMET, feasible, residuals
+from soup_nlp.solve.kkt import UNMET, WARM, feasible, residuals, warm_start
 from soup_nlp.solve.presolve import EXACT, STOPPED, Presolve
 from soup_nlp.solve.solver_options import SolverOptions
-from soup_nlp.solve.warm import WARM, warm_start
 from soup_nlp.storage.progress import Watch
 
 _ENDS = ("start", "presolve", "constrained NLP")

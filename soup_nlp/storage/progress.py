@@ -1,10 +1,13 @@
-"""Progress of a solve: the record of an iteration, its listeners, and the event that stops it."""
+"""Progress of long work: a record of every iteration, its listeners, and what stops it."""
 
 from __future__ import annotations
 
+import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from types import FrameType
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -52,3 +55,55 @@ class Watch:
     stop: threading.Event = field(default_factory=threading.Event)
     say: Callable[[str], None] = lambda line: None
     log_file: str | None = None
+
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class interruptible:  # noqa: N801
+    """Context in which Ctrl-C sets an event instead of raising (main thread only).
+
+    SIGTERM does the same. The second signal raises KeyboardInterrupt, except while `deferred` is
+    set, as during the writing of files. CasADi swallows one that is raised in its callbacks;
+    `aborted` records it.
+
+    Args:
+        say: Told what a Ctrl-C does; it is called in a signal handler.
+        numbers: The signals.
+    """
+
+    def __init__(
+        self, say: Callable[[str], None] | None = None, numbers: Iterable[int] = SIGNALS
+    ) -> None:
+        self.numbers = numbers
+        self.event = threading.Event()
+        self.deferred = self.aborted = False
+        self._say = say or (lambda line: None)
+        self._old: dict[int, Any] = {}
+
+    def __enter__(self) -> threading.Event:
+        if threading.current_thread() is threading.main_thread():
+            self._old = {number: signal.signal(number, self._set) for number in self.numbers}
+        return self.event
+
+    def _set(self, number: int, frame: FrameType | None) -> None:
+        if self.deferred:
+            self._say("interrupt received: the files are being written, this ends then")
+        elif self.event.is_set():
+            self.aborted = True
+            raise KeyboardInterrupt
+        else:
+            self._say(
+                "interrupt received: the best iterate will be kept and every file written;"
+                " without a start this ends after the stage; once more aborts"
+            )
+        self.event.set()
+
+    def __exit__(self, *exc: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+def raising() -> list[int]:
+    """Signals that would raise KeyboardInterrupt, which CasADi swallows in its callbacks."""
+    return [n for n in SIGNALS if signal.getsignal(n) is signal.default_int_handler]

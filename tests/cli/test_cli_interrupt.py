@@ -19,8 +19,8 @@ from soup_nlp.errors import StoppedError
 from soup_nlp.pipeline import case as cases
 from soup_nlp.pipeline.run import run
 from soup_nlp.report import folder as folders
-from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.storage.folders import MARK
+from soup_nlp.storage.progress import interruptible
 
 pytestmark = pytest.mark.slow
 

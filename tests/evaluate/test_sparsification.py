@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.evaluate.sparsification import LAST, STEPS, coverage, sparsification
+from soup_nlp.evaluate.scoring import LAST, STEPS, coverage, sparsification
 
 ERROR = np.linspace(0.0, 1.0, 1001)
 

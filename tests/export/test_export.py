@@ -26,8 +26,8 @@ from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, kind, residual_table, table_text, violations
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
+from soup_nlp.solve.kkt import WARM
 from soup_nlp.solve.stages import solve_soup
-from soup_nlp.solve.warm import WARM
 
 pytestmark = pytest.mark.slow
 

@@ -13,10 +13,9 @@ import pytest
 from soup_nlp.errors import SolverError
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP
-from soup_nlp.solve.interrupt import interruptible
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import optimality
-from soup_nlp.storage.progress import Progress, Watch
+from soup_nlp.storage.progress import Progress, Watch, interruptible
 
 # --- textbook problems as kernels and tables -----------------------------------------------------
 
