@@ -179,7 +179,8 @@ of the noise."""
 LEAST_SHARE = 0.06
 """Least share of the superpixels that makes a surface: a smaller one joins a neighbour, because a
 few superpixels with a wrong flow look like a bending one."""
-
+LEAST_LEFT = 15
+"""Least number of superpixels of such a piece beside a rigid motion: few large ones mix flows."""
 SURELY = 0.5
 """Share of the limit of a bending surface's excess up to which a motion explains a surface surely,
 so that what it leaves is not an error of the flow."""
@@ -195,7 +196,8 @@ def surface_motions(
     A surface bends if under every rigid motion the median excess of its superpixels' error over the
     residual of an affine flow of their own is above the flow's systematic error plus `NOISES` times
     its noise. Pieces that the best motion does not explain are surfaces of their own if they have
-    `LEAST_SHARE`: a small jump along an outline joins what bends to the rigid rest.
+    `LEAST_SHARE`, and `LEAST_LEFT` superpixels: a small jump along an outline joins what bends to
+    the rest.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
@@ -242,7 +244,7 @@ def surface_motions(
         left += [
             np.flatnonzero(piece == c)
             for c in np.unique(piece[apart])
-            if np.sum(piece == c) >= LEAST_SHARE * len(seg)
+            if np.sum(piece == c) >= max(LEAST_SHARE * len(seg), LEAST_LEFT)
         ]
     return motions, bends
 
