@@ -1,33 +1,37 @@
-"""A start by a depth prior: what the flow says of the prior, and what the prior then decides.
+"""A start by a depth prior: the depths, slopes and scales that it decides.
 
-See docs/depth_prior.md. A prior counts where the flow confirms it: the best rigid motion of the
-largest component at the prior's depths must explain the flow better than that at one depth. Where
-the flow says nothing, it counts as a guess if its steps lie on edges of the image.
+See docs/depth_prior.md. It decides what the flow leaves open if the flow confirms it, or, where the
+flow says nothing, if its steps lie on edges of the image (`start.prior_evidence`); its depths are
+guesses then.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from scipy import ndimage, stats
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.pair import Pair
-from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bending import fit_robustly
 from soup_nlp.start.choice import CLIP, PIECE_SIZE
 from soup_nlp.start.components import FIXED, TIES, largest
-from soup_nlp.start.edges import follows_edges
 from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.prior_evidence import (
+    CONFIRMED,
+    FEWEST,
+    POSSIBLE,
+    Kind,
+    Seen,
+    calibrated,
+    follows_edges,
+)
 from soup_nlp.start.propose import Start
 from soup_nlp.start.settle import (
     MOST_SYSTEMATIC_PX,
@@ -35,18 +39,8 @@ from soup_nlp.start.settle import (
     SYSTEMATIC,
     most_probable,
 )
-from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit, Views
+from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit
 
-Kind = Literal["metric", "relative", "inverse", "ordinal"]
-
-CONFIRMED, POSSIBLE = 0.6, 0.85
-"""Error of the flow at the prior's depths relative to that at one depth, above the noise: up to the
-first the flow confirms the prior, above the second it contradicts it."""
-TELLS_PX, TELLS = 0.5, 3.0
-"""Pixels, and multiples of the flow's noise, by which depth must explain the flow of a component
-better than one depth does to be determined; a third of it confirms or contradicts a prior."""
-FEWEST = 8
-"""Least number of superpixels whose flow is compared with a prior."""
 LEAST_SIGMA, UNCONFIRMED = 0.12, 0.35
 """Standard deviation of log depth of a prior: the least, and that of one that no flow confirms."""
 STANDS = {"contact below": 0.7, "ground": 0.7, "outline": 0.4, "cut off below": 0.4}
@@ -58,8 +52,6 @@ HELD, NEAR = 4.0, 15
 ROUNDS, LEAST_OFF, RIDGE, STEEPEST = 4, 0.005, 1e-6, 0.5
 """Of the fit of planes to a prior: rounds, least scale of its residuals, ridge, and largest slope
 per mean radius of the superpixel; all relative to the inverse depth."""
-FARTHEST = 50.0
-"""Largest depth relative to the median where an inverse depth has a shift."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,14 +123,14 @@ def by_prior(
     """
     prior = pair.depth_prior
     assert prior is not None
-    seen = _Seen.of(start, fitted)
+    seen = Seen.of(start, fitted)
     value, known = _at_superpixels(prior, seg)
     main = largest(start.component)
     none = np.full(len(seg), np.inf), np.zeros(len(seg)), np.full(len(seg), np.inf)
     nowhere = np.zeros(len(seg), bool)
     if not known.any() or np.ptp(value[known]) < 1e-6 * value[known].max():
         return start, Given(np.log(value), *none, kind or "relative", np.nan, nowhere)
-    kind, depth_of, ratio = _calibrated(seen, main, value, known, kind)
+    kind, depth_of, ratio = calibrated(seen, main, value, known, kind)
     log_depth = depth_of(value)
     whole = depth_of(np.where(np.isfinite(prior), prior, value[seg.labels]))
     nothing = Given(log_depth, *none, kind, ratio, nowhere)
@@ -182,117 +174,6 @@ def _deviation(value: Float) -> float:
     return float(high - low) / 2
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """The flow at the anchors of a start, to which motions at given depths are compared.
-
-    Attributes:
-        start: Components and noise.
-        views: What planes are fitted to.
-        centre: (N, 3) rays to which the anchors move, by an affine flow.
-        usable: (N,) True where that is known.
-        known: What `relief` has computed, by component.
-    """
-
-    start: Start
-    views: Views
-    centre: Float
-    usable: Mask
-    known: dict[int, tuple[float, float]] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, start: Start, fitted: FlowFit) -> _Seen:
-        """The flow that the start was made of."""
-        usable = fitted.views.usable & ~start.wrong & ~start.bends & ~fitted.poor
-        return cls(start, fitted.views, fitted.centre, usable)
-
-    def members(self, c: int) -> Int:
-        """Superpixels of a rigid component whose flow is known."""
-        return np.flatnonzero((self.start.component == c) & self.usable)
-
-    def motion(
-        self, at: Int, inverse: Float, shifted: bool = False
-    ) -> tuple[float, Float, Float, float]:
-        """The rigid motion of superpixels (M,) with inverse depths (M,), and their shift.
-
-        Returns:
-            Error in pixels without the largest tenth, R and T of `X' = R X + T`, and what is added
-            to all inverse depths, 0 unless `shifted`.
-        """
-        ray, middle = self.views.anchor[at], float(np.median(np.abs(inverse)))
-
-        def miss(x: Float) -> Float:
-            near = inverse / middle + (x[6] if shifted else 0.0)
-            moved = ray @ rotation.exp(x[:3]).T + near[:, None] * x[3:6]
-            gap = moved / np.maximum(moved[:, 2:], 1e-3) - self.centre[at]
-            return gap[:, :2] * self.views.focal
-
-        x = fit_robustly(miss, 7 if shifted else 6)
-        error = np.sort(np.minimum(np.linalg.norm(miss(x), axis=1), CLIP))
-        mean = float(np.mean(error[: int(np.ceil(0.9 * len(error)))]))
-        return mean, rotation.exp(x[:3]), x[3:6] / middle, middle * x[6] if shifted else 0.0
-
-    def relief(self, c: int) -> tuple[float, float]:
-        """Error of the flow of a component at one depth, above the noise, and the noise; pixels."""
-        if c not in self.known:
-            at, noise = self.members(c), self.start.noise
-            if len(at) < FEWEST or self.start.at_rest:
-                return 0.0, noise
-            floor = min(noise, float(np.median(self.start.error[at])))
-            self.known[c] = self.motion(at, np.ones(len(at)))[0] - floor, floor
-        return self.known[c]
-
-    @property
-    def tells(self) -> float:
-        """Pixels of relief that determine depth."""
-        return max(TELLS_PX, TELLS * self.start.noise)
-
-    def determined(self, c: int) -> bool:
-        """Whether the flow determines the depth of a component."""
-        return self.relief(c)[0] > self.tells
-
-
-def _calibrated(
-    seen: _Seen, c: int, value: Float, known: Mask, kind: Kind | None
-) -> tuple[Kind, Callable[[Float], Float], float]:
-    """Kind of a prior, log depth as a function of its values, and `Given.ratio` by component c.
-
-    `value` (N,) are those of the superpixels.
-    """
-    rank = stats.rankdata(value) / (len(value) + 1)
-    rises = np.argsort(value)
-    logs: dict[Kind, Callable[[Float], Float]] = {
-        "metric": np.log,
-        "relative": np.log,
-        "inverse": lambda v: -np.log(v),
-        "ordinal": lambda v: RELIEF * stats.norm.ppf(np.interp(v, value[rises], rank[rises])),
-    }
-    relief, floor = seen.relief(c)
-    at = seen.members(c)
-    at = at[known[at]]
-    if len(at) < FEWEST or not relief > seen.tells / 3:
-        # what is lower in an image is mostly nearer
-        below = np.corrcoef(rank, seen.views.anchor[:, 1])[0, 1] > 0
-        kind = kind or ("inverse" if below else "relative")
-        return kind, logs[kind], np.nan
-    tried: list[tuple[float, Kind, Callable[[Float], Float]]] = []
-    for name in (kind,) if kind else ("relative", "inverse"):
-        inverse = np.exp(-logs[name](value[at]))
-        error, *_, shift = seen.motion(at, inverse, name == "inverse")
-        tried.append(((error - floor) / relief, name, logs[name]))
-        if name == "inverse":
-            least = float(np.median(np.abs(value + shift))) / FARTHEST
-            tried[-1] = (*tried[-1][:2], partial(_shifted, shift=shift, least=least))
-    ratio, name, depth_of = min(tried, key=lambda one: one[0])
-    # where neither explains the flow a shift lowers the error of any map
-    return (name, depth_of, ratio) if ratio <= POSSIBLE else (tried[0][1], tried[0][2], ratio)
-
-
-def _shifted(value: Float, shift: float, least: float) -> Float:
-    """Log depth of inverse depths to which a shift is added, at least `least`."""
-    return np.asarray(-np.log(np.maximum(value + shift, least)))
-
-
 def _slopes(log_depth: Float, known: Mask, middle: Float, pair: Pair, seg: Segmentation) -> Float:
     """(N, 2) slopes of the relative inverse depth of a prior within superpixels, per ray unit.
 
@@ -329,7 +210,7 @@ def _slopes(log_depth: Float, known: Mask, middle: Float, pair: Pair, seg: Segme
 
 
 def _placed(
-    seen: _Seen, main: int, prior: Float, slope: Float, sigma: float
+    seen: Seen, main: int, prior: Float, slope: Float, sigma: float
 ) -> tuple[Soup, Float, Mask, Float, Float] | None:
     """Soup in the unit of a prior, its log depth by component, where the prior decides, how far the
     flow leaves the shape of a component open (0 to 1), and the sigma of the prior; all (N,).
@@ -393,7 +274,7 @@ def _placed(
     return soup.taking(tilt, tilted), prior, held, opened, own
 
 
-def _component(seen: _Seen, soup: Soup, c: int, prior: Float, sigma: float) -> tuple[Soup, Mask]:
+def _component(seen: Seen, soup: Soup, c: int, prior: Float, sigma: float) -> tuple[Soup, Mask]:
     """Soup with the planes and the motion of a rigid component by flow and prior.
 
     Of the motions that explain the flow about as well, it takes that which agrees with the prior.

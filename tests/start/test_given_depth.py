@@ -22,8 +22,8 @@ from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.reweighting import with_prior
 from soup_nlp.report.findings import certainty, summary
 from soup_nlp.start.components import TIES
-from soup_nlp.start.edges import follows_edges
-from soup_nlp.start.given_depth import CONFIRMED, Given, _slopes, by_prior
+from soup_nlp.start.given_depth import Given, _slopes, by_prior
+from soup_nlp.start.prior_evidence import CONFIRMED, follows_edges
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
