@@ -13,9 +13,15 @@ from helpers_formulation import NORMS
 from helpers_model import GAUGES, PAPER, TRUNCATED, Tiny, value, wiggle
 from helpers_nl import ReadBack, close
 
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.export.nl import NLFile, readable_names, write_nl
+from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case
 
 pytestmark = pytest.mark.slow
 
@@ -199,17 +205,13 @@ def _section(tree: dict, name: str) -> dict:
     raise KeyError(name)
 
 
-def test_pounce_agrees(written):
+def pounce_agrees(nlp: NLP, file: NLFile, x: np.ndarray) -> None:
+    """Everything that POUNCE reads equals the NLP at x, after the order of the file."""
     pounce = pytest.importorskip("pounce", reason="pounce-solver is not installed")
-    nlp, layout, file = written
     back = pounce.read_nl(str(file.path))
     v, r = file.variables, file.rows
     assert (back.n, back.m, back.nnz_jac) == (nlp.nx, nlp.ng, nlp.nnzj)
     assert np.array_equal(back.x0, nlp.x0[v])
-    x_names, g_names = readable_names(nlp, layout)
-    assert list(back.var_names) == [x_names[k] for k in v]
-    assert list(back.con_names) == [g_names[k] for k in r]
-    x = wiggle(nlp, layout.size, 3, 0.1)
     f, g = value(nlp, x)
     close(back.objective(x[v]), f)
     close(np.array(back.constraints(x[v])), g[r])
@@ -225,6 +227,16 @@ def test_pounce_agrees(written):
     close(H + np.tril(H, -1).T, nlp.hessian(x, lam, 0.7).toarray()[np.ix_(v, v)])
 
 
+def test_pounce_agrees(written):
+    pounce = pytest.importorskip("pounce", reason="pounce-solver is not installed")
+    nlp, layout, file = written
+    pounce_agrees(nlp, file, wiggle(nlp, layout.size, 3, 0.1))
+    back = pounce.read_nl(str(file.path))
+    x_names, g_names = readable_names(nlp, layout)
+    assert list(back.var_names) == [x_names[k] for k in file.variables]
+    assert list(back.con_names) == [g_names[k] for k in file.rows]
+
+
 def test_scip_reads_it(written):
     scip = pytest.importorskip("pyscipopt", reason="PySCIPOpt is not installed")
     nlp, _, file = written
@@ -238,3 +250,44 @@ def test_scip_reads_it(written):
     at = file.variables.tolist().index(0)
     name = file.path.with_suffix(".col").read_text().split()[at]
     assert named[name].getLbOriginal() == pytest.approx(nlp.lbx[0])
+
+
+# --- terms that only some pairs have -------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def swinging(tmp_path_factory) -> Case:
+    """A box that swings before a room: occlusion shows its order, and its true depth is given."""
+    folder = tmp_path_factory.mktemp("swing")
+    scene = {"kind": "scene", "scene": "swing", "width": 160, "height": 120}
+    np.save(folder / "depth.npy", render_scene("swing", 0, 160, 120).truth.depth_ref)
+    raw = {
+        "input": scene,
+        "flow": {"source": "truth"},
+        "segmentation": {"superpixels": 40, "neighbours": 4},
+        "energy": {"pixel_samples": 4},
+        "depth_prior": {"source": str(folder / "depth.npy")},
+    }
+    return prepare(make_problem(raw))
+
+
+@pytest.mark.parametrize("norm", NORMS)
+def test_two_readers_agree_on_a_pair_with_a_depth_prior_and_an_order(swinging, norm, tmp_path):
+    data, eps = swinging.data, 1e-4
+    form = swinging.formulation(norm=norm, hessian="exact", compiled=False, eps=eps, eps_pixel=eps)
+    nlp, layout = swinging.nlp(form)
+    file = write_nl(tmp_path / "soup.nl", nlp)
+    back = ReadBack(file.path)
+    x = wiggle(nlp, layout.size, 0, 0.02)
+    agrees(nlp, file, back, x, 0)
+    pounce_agrees(nlp, file, x)
+    # at the start the file has both terms, up to their smoothing
+    exact = oracle.energy(swinging.soup, data, swinging.weights)
+    f = float(back.values(nlp.x0[file.variables])[0])
+    for term in ("depth", "order"):
+        weight = getattr(data, f"{term}_weight")
+        less = replace(data, **{f"{term}_weight": np.zeros_like(weight)})
+        other = build_matrix_nlp(swinging.soup, less, swinging.weights, form)[0]
+        within = eps * getattr(swinging.weights, term) * np.abs(weight).sum()
+        assert exact[term] - within <= f - value(other, other.x0)[0] <= exact[term] + 1e-9
+        assert exact[term] > 2 * within
