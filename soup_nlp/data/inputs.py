@@ -220,6 +220,8 @@ def pair_hash(pair: Pair) -> str:
         arrays += [pair.flow.uv, pair.flow.confidence]
     if pair.depth_prior is not None:
         arrays.append(pair.depth_prior)
+    if pair.focal_sigma > 0:
+        arrays.append(np.array(pair.focal_sigma))
     for array in arrays:
         digest.update(f"{array.dtype} {array.shape}\0".encode())
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -208,6 +208,7 @@ class Pair:
         name: Name for titles and folders.
         depth_prior: (H, W) depth of the reference frame from elsewhere, or an inverse depth or an
             order (`data.inputs.PriorOptions`); NaN where unknown. An array or the name of a file.
+        focal_sigma: Standard deviation of the log focal length; 0 where it is given.
 
     Raises:
         DataError: an image has a wrong shape or type, a camera is invalid, or sizes differ.
@@ -222,6 +223,7 @@ class Pair:
     name: str = "pair"
     fov: InitVar[float | None] = None
     depth_prior: Float | None = None
+    focal_sigma: float = 0.0
 
     if TYPE_CHECKING:
 
@@ -236,6 +238,7 @@ class Pair:
             name: str = "pair",
             fov: float | None = None,
             depth_prior: object = None,
+            focal_sigma: float = 0.0,
         ) -> None: ...
 
     def __post_init__(self, fov: float | None) -> None:
@@ -246,12 +249,24 @@ class Pair:
         if self.K_ref is None:
             # a file may have EXIF
             files = [Path(image) if is_path(image) else None for image in given]
-            cameras = estimated_cameras(files, (self.image_ref, self.image_next), fov)
+            pictures = self.image_ref, self.image_next
+            cameras, sigma = estimated_cameras(files, pictures, fov)
+            object.__setattr__(self, "focal_sigma", sigma)
             object.__setattr__(self, "K_ref", cameras[0])
             if self.K_next is None:
                 object.__setattr__(self, "K_next", cameras[1])
         elif fov is not None:
             raise DataError("two cameras are given", found="K_ref and fov", expected="one of them")
+        expect(
+            self.focal_sigma, (int, float), "focal_sigma of the pair", "0 for a known focal length"
+        )
+        if not 0 <= self.focal_sigma < np.inf:
+            raise DataError(
+                "standard deviation of the log focal length is out of range",
+                where="focal_sigma",
+                found=f"{self.focal_sigma:g}",
+                expected="a finite number, at least 0",
+            )
         if self.K_next is None:
             object.__setattr__(self, "K_next", self.K_ref)
         for what in ("K_ref", "K_next"):

@@ -297,7 +297,7 @@ def confidence(
     bends = start.bends[rec.labels]
     most = np.where(bends, BENDING_MISFIT, MOST_MISFIT)
     noise, misfit = start.noise, flow_misfit(rec, pair.flow, most)
-    found = evidence(rec.soup, data, start.component, noise)
+    found = evidence(rec.soup, data, start.component, noise, pair.focal_sigma)
     far = displacement(rec.soup, data.anchor_ray, start.component)
     scale = scale_by_contact(own, start, np.bincount(rec.labels.ravel()), far, given)
     rigid = np.hypot(scale, found.sigma)

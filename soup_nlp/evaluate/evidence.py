@@ -78,7 +78,9 @@ def _known(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def evidence(soup: Soup, data: EnergyData, component: Int, noise: float) -> Evidence:
+def evidence(
+    soup: Soup, data: EnergyData, component: Int, noise: float, focal_sigma: float = 0.0
+) -> Evidence:
     """What the flow says of the depth of every component.
 
     Args:
@@ -86,6 +88,7 @@ def evidence(soup: Soup, data: EnergyData, component: Int, noise: float) -> Evid
         data: Sampled pixels with their flow.
         component: (N,) rigid component of every superpixel.
         noise: Noise of the flow, pixels.
+        focal_sigma: Standard deviation of the log focal length, 0 where it is given.
     """
     seen = data.pixel_weight.sum(axis=1) > 0.25
     moved = soup.moved(soup.points(data.pixel_ray))
@@ -99,7 +102,7 @@ def evidence(soup: Soup, data: EnergyData, component: Int, noise: float) -> Evid
             continue
         errors[:, c] = *_without_depth(data, at), _mean(own[at])
         every = np.flatnonzero(component == c)
-        sigma[every] = _open_motion(soup, data, every, seen[every], OPEN * noise)
+        sigma[every] = _open_motion(soup, data, every, seen[every], OPEN * noise, focal_sigma)
     return Evidence(errors[0], errors[1], errors[2], noise, sigma)
 
 
@@ -136,12 +139,15 @@ def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float
     return error(turned, 4), error(shifted, 6)
 
 
-def _open_motion(soup: Soup, data: EnergyData, at: Int, seen: Mask, error: float) -> Float:
+def _open_motion(
+    soup: Soup, data: EnergyData, at: Int, seen: Mask, error: float, focal_sigma: float
+) -> Float:
     """(K,) standard deviation of log depth by the motion that a systematic error leaves open.
 
     A change of the component's motion moves a superpixel along its epipolar line, which its depth
     follows, and across it, which the flow contradicts. The information on the motion is that of
-    one measurement with the error of the flow, and of relief with the deviation `RELIEF`.
+    one measurement with the error of the flow, and of relief with the deviation `RELIEF`. The focal
+    length is not part of the answer: its whole deviation counts, and the motion follows it.
 
     Args:
         soup: The answer.
@@ -149,6 +155,7 @@ def _open_motion(soup: Soup, data: EnergyData, at: Int, seen: Mask, error: float
         at: (K,) superpixels of the component.
         seen: (K,) True where their flow is known.
         error: Systematic error of the flow, pixels.
+        focal_sigma: Standard deviation of the log focal length.
     """
     ray, focal = data.anchor_ray[at], np.diag(data.K_next)[:2]
     z = soup.depth_at(data.anchor_ray)[at]
@@ -159,7 +166,11 @@ def _open_motion(soup: Soup, data: EnergyData, at: Int, seen: Mask, error: float
     slope[:, 0, 0], slope[:, 1, 1] = focal[0] / depth, focal[1] / depth
     slope[:, :, 2] = -focal * X[:, :2] / depth[:, None] ** 2
     length = max(float(np.median(np.linalg.norm(soup.translation[at], axis=1))), 1e-12)
-    J = np.concatenate([-slope @ rotation.hat(X), slope * length], axis=2)
+    # with a longer focal length the ray of a pixel is closer to the axis, and a ray's pixel farther
+    flat = z[:, None] * ray * [1.0, 1.0, 0.0]
+    longer = focal * X[:, :2] / depth[:, None]
+    longer -= np.einsum("nij,njk,nk->ni", slope, soup.R[at], flat)
+    J = np.concatenate([-slope @ rotation.hat(X), slope * length, longer[..., None]], axis=2)
     along = np.einsum("nij,nj->ni", slope, turned)
     # what a log depth moves, at least what a relief of one deviation needs to be seen
     squared = np.sum(along**2, axis=1) + (error / RELIEF) ** 2
@@ -174,6 +185,7 @@ def _open_motion(soup: Soup, data: EnergyData, at: Int, seen: Mask, error: float
     if not np.isfinite(information).all():
         # numbers that no answer has, as a foreign solver may return
         return np.full(len(at), np.inf)
-    covariance = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
-    motion = np.einsum("ni,ij,nj->n", follow, covariance, follow)
-    return np.sqrt(np.maximum(motion, 0.0) + error**2 / squared)
+    covariance = np.linalg.pinv(information[:6, :6], rcond=1e-12, hermitian=True)
+    motion = np.einsum("ni,ij,nj->n", follow[:, :6], covariance, follow[:, :6])
+    by_focal = focal_sigma * (follow[:, 6] - follow[:, :6] @ (covariance @ information[:6, 6]))
+    return np.sqrt(np.maximum(motion, 0.0) + error**2 / squared + by_focal**2)

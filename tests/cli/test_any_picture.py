@@ -13,9 +13,10 @@ from PIL import ExifTags, Image
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.formats.cameras import GUESS, estimated_cameras
+from soup_nlp.data.formats.cameras import GUESS, GUESS_SIGMA, estimated_cameras
 from soup_nlp.data.formats.images import DataWarning, read_image
 from soup_nlp.data.formats.map_files import read_flow
+from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
 
@@ -25,7 +26,7 @@ SIZE = (160, 120)
 
 
 def camera_of(path, fov=None):
-    return estimated_cameras([path], [read_image(path, turn=True)], fov)[0]
+    return estimated_cameras([path], [read_image(path, turn=True)], fov)[0][0]
 
 
 def picture(path, tags=None):
@@ -59,6 +60,9 @@ def test_focal_length_comes_from_exif_or_a_stated_guess(tags, focal, tmp_path):
     said = "EXIF" if focal != GUESS * 160 else "1.2 times the longer side.*--fov"
     with pytest.warns(DataWarning, match=said):
         K = camera_of(path)
+    with pytest.warns(DataWarning, match=said):
+        pair = Pair(path, path)
+    assert pair.focal_sigma == (0.0 if "EXIF" in said else GUESS_SIGMA)
     assert K[0, 0] == pytest.approx(focal)
     assert K[1, 1] == K[0, 0]
     assert K[:2, 2].tolist() == [79.5, 59.5]
@@ -96,6 +100,7 @@ def test_a_photo_is_turned_as_its_exif_says(orientation, suffix, tmp_path):
     assert (pair.image_next == image).all()
     # 90 degrees over the 160 columns that are shown, principal point in the middle of them
     np.testing.assert_allclose(pair.K_ref, [[80, 0, 79.5], [0, 80, 59.5], [0, 0, 1]])
+    assert pair.focal_sigma == 0
     # axes of a given camera are unclear
     given = {"input": {**source, "intrinsics": [200, 200, 79.5, 59.5]}, "base": str(tmp_path)}
     if orientation == 1:

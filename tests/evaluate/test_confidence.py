@@ -9,6 +9,7 @@ import pytest
 from scipy import sparse
 
 from soup_nlp.config.problem import make_problem
+from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Flow
 from soup_nlp.evaluate.confidence import (
     BENDING_FACTOR,
@@ -293,6 +294,28 @@ def test_the_background_of_a_camera_at_rest_is_a_guess(small_room):
     at_rest = sure_of(still).sigma > MOST_SIGMA
     assert at_rest[~moves].mean() > 0.8
     assert sure_of(small_room).guessed < 0.2
+
+
+def test_a_focal_length_that_was_guessed_wrong_makes_depth_unsure():
+    scene = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
+    raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 100}}
+    problem = make_problem(raw)
+    right = problem.load_pair()
+    longer = np.diag([1.25, 1.25, 1.0])
+    K = right.K_ref.copy()
+    K[:2, :2] *= longer[:2, :2]
+    case = prepare(problem, pair=replace(right, K_ref=K, K_next=K))
+    depth = reconstruct(case.soup, case.segmentation.labels, K, K).depth_ref
+    error = np.log(depth / right.truth.depth_ref)
+    error = np.abs(error - np.median(error))
+    assert error.mean() > 0.05
+
+    def within_two(focal_sigma):
+        sigma = sure_of(replace(case, pair=replace(case.pair, focal_sigma=focal_sigma))).sigma
+        return np.mean(error < 2 * sigma)
+
+    assert within_two(0.0) < 0.5
+    assert within_two(GUESS_SIGMA) > 0.88
 
 
 def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):

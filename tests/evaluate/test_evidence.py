@@ -100,6 +100,15 @@ def test_what_motion_leaves_open_is_that_of_refitted_motions(small_room):
     assert np.sqrt(np.mean(change**2)) < 3 * np.sqrt(np.mean(found.sigma**2))
 
 
+def test_the_uncertain_focal_length_counts_in_squares(small_room):
+    soup, data = scene(small_room, 0.3, (0.3, 0.0, 0.1))
+    component = np.zeros(len(soup), np.int64)
+    given, some, twice = (evidence(soup, data, component, NOISE, x).sigma for x in (0.0, 0.2, 0.4))
+    np.testing.assert_array_equal(given, evidence(soup, data, component, NOISE).sigma)
+    assert np.median(some) > 1.5 * np.median(given)
+    np.testing.assert_allclose(twice**2 - given**2, 4 * (some**2 - given**2), rtol=1e-9)
+
+
 def test_a_component_without_flow_is_a_guess(small_room):
     soup, data = scene(small_room, 0.4, (0.3, 0.0, 0.1))
     component = (np.arange(len(soup)) >= len(soup) - 5).astype(np.int64)

@@ -133,14 +133,16 @@ def make_pair(
     """
     # a given camera may belong to the stored or to the rotated image
     pictures = read_images(images, white, turn=all(K is None for K in cameras))
+    focal_sigma = 0.0
     if any(K is None for K in cameras):
-        estimated = estimated_cameras(images, pictures, fov)
+        estimated, focal_sigma = estimated_cameras(images, pictures, fov)
     own = [estimated[k] if K is None else K for k, K in enumerate(cameras)]
     check_cameras(own, pictures, images, cropped)
     for k, coefficients in enumerate(distortion):
         pictures[k], own[k] = undistorted(pictures[k], own[k], coefficients)
     known = truth if truth.known() else None
-    return Pair(pictures[0], pictures[1], own[0], own[1], truth=known, name=name)
+    images_and_cameras = pictures[0], pictures[1], own[0], own[1]
+    return Pair(*images_and_cameras, truth=known, name=name, focal_sigma=focal_sigma)
 
 
 def is_result(folder: Path) -> bool:
