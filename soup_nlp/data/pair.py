@@ -309,6 +309,17 @@ class Pair:
         """The same pair with another flow."""
         return replace(self, flow=flow)
 
+    def with_focal(self, factor: float, sigma: float) -> Pair:
+        """The same pair with focal lengths times a factor.
+
+        Args:
+            factor: Ratio of the new focal lengths to the present ones.
+            sigma: Standard deviation of the log of the new ones.
+        """
+        longer = np.array([[factor, factor, 1.0]] * 2 + [[1.0] * 3])
+        K_ref, K_next = longer * self.K_ref, longer * self.K_next
+        return replace(self, K_ref=K_ref, K_next=K_next, focal_sigma=sigma)
+
     def __str__(self) -> str:
         h, w = self.size
         return f"Pair({self.name}, {w}x{h}, {self.flow or 'no flow'}, {self.truth or 'no truth'})"

@@ -42,7 +42,7 @@ from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.components import TIES
-from soup_nlp.start.epipolar import repeated
+from soup_nlp.start.epipolar import focal_length, repeated
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import in_order
 from soup_nlp.start.propose import Start, propose
@@ -103,6 +103,15 @@ def prepare(
     done("segmentation", seg)
     options = SeededStart(**dict(problem.start), seed=problem.seed)
     fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
+    if pair.focal_sigma > 0:
+        views = fitted.views
+        found = views.ray.reshape(-1, 3), views.target.reshape(-1, 3), views.weight.ravel()
+        better = focal_length(*found, views.focal[0], pair.focal_sigma, problem.seed)
+        full, pair = full.with_focal(*better), pair.with_focal(*better)
+        seen = None if seen is None else seen.with_focal(*better)
+        fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
+        if log:
+            log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
     start, given = propose(seg, flow, pair.K_ref, pair.K_next, options, fitted), None
     if problem.energy.weights.order > 0:
         start = in_order(start, seg, pair, fitted, options)

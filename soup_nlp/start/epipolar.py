@@ -304,3 +304,54 @@ def repeated(
         out.append(motion)
         left &= ~inlier
     return out
+
+
+FOCAL_FACTORS = np.exp(np.arange(-10, 11) * 0.1)
+"""Focal lengths that are compared, relative to a guess."""
+FOCAL_ERROR, LEAST_FOCAL_ERROR_PX = 0.5, 0.005
+"""Rise of the error by which a focal length is less probable by exp(-1/2), relative to the least
+error, and its lower limit in pixels: distortion and other systematic errors rise as much."""
+LEAST_FOCAL_SIGMA = 0.05
+"""Least standard deviation of a log focal length that is found so: half a step."""
+FOCAL_PIXELS, FOCAL_NOISE_PX = 3000, 0.05
+"""Largest number of correspondences of these fits, and the scale of their robust loss, pixels."""
+
+
+def focal_length(
+    r: Float, q: Float, weight: Float, focal: float, sigma: float, seed: int = 0
+) -> tuple[float, float]:
+    """Factor of a guessed focal length, and the standard deviation of its logarithm.
+
+    If the camera turns and shifts, no rigid motion explains the flow with a wrong focal length.
+    Factor and deviation are those of the density
+    `exp(-((e(x) - min e) / (FOCAL_ERROR min e))^2 / 2 - (x / sigma)^2 / 2)`, with x the log factor
+    and e(x) the median Sampson distance of the best motion. Where e is the same with all focal
+    lengths, they are about 1 and `sigma`.
+
+    Args:
+        r: (M, 3) reference rays with the guess.
+        q: (M, 3) next rays.
+        weight: (M,) confidence.
+        focal: The guess, pixels.
+        sigma: Standard deviation of its logarithm.
+        seed: Of the fits.
+    """
+    use = np.flatnonzero(weight > 0)
+    use = use[:: max(1, len(use) // FOCAL_PIXELS)]
+    error = np.full(len(FOCAL_FACTORS), np.inf)
+    for k, factor in enumerate(FOCAL_FACTORS):
+        a, b = (v[use] / [factor, factor, 1.0] for v in (r, q))
+        motion = essential_motion(a, b, factor * focal, None, seed)
+        if motion is not None:
+            motion = refine_near(motion, a, b, weight[use], factor * focal, FOCAL_NOISE_PX)
+            error[k] = np.median(np.abs(sampson(motion.essential(), a, b, factor * focal)))
+    least = error.min()
+    if not np.isfinite(least):
+        return 1.0, sigma
+    rise = (error - least) / max(FOCAL_ERROR * least, LEAST_FOCAL_ERROR_PX)
+    x = np.log(FOCAL_FACTORS)
+    density = np.exp(-(rise**2 + (x / sigma) ** 2) / 2)
+    density /= density.sum()
+    mean = float(density @ x)
+    found = float(np.sqrt(density @ (x - mean) ** 2))
+    return float(np.exp(mean)), float(np.clip(found, LEAST_FOCAL_SIGMA, sigma))

@@ -79,8 +79,8 @@ def estimated_cameras(
             )
             if not some:
                 text += (
-                    ". A wrong focal length stretches and bends depth (47 % too long raised the"
-                    " relative error of tum_fr1 from 0.096 to 0.113): give --intrinsics or --fov"
+                    ". The flow corrects it where it determines it; a wrong focal length stretches"
+                    " and bends depth: give --intrinsics or --fov"
                 )
             warnings.warn(text, DataWarning, stacklevel=2)
     return out, 0.0 if some or fov is not None else GUESS_SIGMA

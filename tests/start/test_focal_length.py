@@ -1,0 +1,56 @@
+"""A guessed focal length is corrected by the flow where the flow determines it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.formats.cameras import GUESS_SIGMA
+from soup_nlp.geometry import rotation
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.start.epipolar import focal_length
+
+FOCAL = 500.0
+
+
+def correspondences(turn, shift, wrong, noise=0.05):
+    """Rays of both frames with a focal length that is `wrong` times too long."""
+    rng = np.random.default_rng(0)
+    r = np.column_stack([rng.uniform(-0.6, 0.6, (800, 2)), np.ones(800)])
+    X = rng.uniform(2, 6, 800)[:, None] * r @ rotation.exp(np.array(turn)).T + np.array(shift)
+    q = X / X[:, 2:]
+    q[:, :2] += noise / FOCAL * rng.standard_normal((800, 2))
+    return *(v / [wrong, wrong, 1.0] for v in (r, q)), np.ones(800), FOCAL * wrong
+
+
+@pytest.mark.parametrize("wrong", [0.7, 1.25])
+def test_a_turn_with_parallax_determines_the_focal_length(wrong):
+    found = correspondences((0.05, 0.1, 0.02), (0.4, 0.1, 0.2), wrong)
+    factor, sigma = focal_length(*found, GUESS_SIGMA)
+    assert abs(np.log(factor * wrong)) < 0.08
+    assert sigma < 0.15
+
+
+def test_a_shift_without_a_turn_leaves_the_focal_length_as_it_is():
+    """A longer lens and as much deeper a scene have the same flow."""
+    factor, sigma = focal_length(*correspondences((0, 0, 0), (0.4, 0, 0), 1.25), GUESS_SIGMA)
+    assert factor == pytest.approx(1.0, abs=0.05)
+    assert sigma > 0.85 * GUESS_SIGMA
+
+
+def test_only_a_guess_is_corrected():
+    scene = {"kind": "scene", "scene": "orbit", "width": 640, "height": 272}
+    raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 60}}
+    problem = make_problem(raw)
+    right = problem.load_pair()
+    wrong = right.with_focal(1.3, 0.0)
+    kept = prepare(problem, pair=wrong).pair
+    np.testing.assert_array_equal(kept.K_ref, wrong.K_ref)
+    assert kept.focal_sigma == 0
+    found = prepare(problem, pair=replace(wrong, focal_sigma=GUESS_SIGMA)).pair
+    np.testing.assert_allclose(found.K_ref, right.K_ref, rtol=0.08)
+    np.testing.assert_array_equal(found.K_ref[:2, 2], right.K_ref[:2, 2])
+    assert found.focal_sigma < 0.15
