@@ -34,13 +34,16 @@ KEEP: Mapping[str, Any] = {
     # the approximate minimum fill ordering
     "mumps_pivot_order": 2,
     "mumps_mem_percent": 100,
+    "mumps_scaling": 0,  # coordinates in units of their superpixel are scaled already
     "warm_start_init_point": "yes",
     "warm_start_bound_push": PUSH,
     "warm_start_bound_frac": PUSH,
     "warm_start_slack_bound_push": PUSH,
     "warm_start_slack_bound_frac": PUSH,
     "warm_start_mult_bound_push": PUSH,
-    # the filter would take steps that raise f for a smaller violation of nearly linear rows
+    # a filter takes steps that raise f for a smaller violation of nearly linear rows; with these,
+    # f has to fall in every step
+    "delta": 1e-20,
     "theta_min_fact": 1e6,
     "theta_max_fact": 1e8,
 }
