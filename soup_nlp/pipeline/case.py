@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from soup_nlp.config.problem import Problem
-from soup_nlp.data.flow.borders import follow_flow
+from soup_nlp.data.flow.borders import follow_depth, follow_flow
 from soup_nlp.data.flow.layers import corrected, still, without_still_layer
 from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.working_size import resized_flow, working_size
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
-from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.graph import BETA, BETA_COLOUR, Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import Labels, segment
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import (
@@ -99,7 +99,8 @@ def prepare(
     assert flow is not None
     labels = superpixels(problem, pair)
     samples = None if s.boundary_samples == "all" else s.boundary_samples
-    seg = build_segmentation(labels, pair.image_ref, s.neighbours, boundary_samples=samples)
+    graphs = s.neighbours, BETA, BETA_COLOUR, samples
+    seg = build_segmentation(labels, pair.image_ref, *graphs)
     done("segmentation", seg)
     options = SeededStart(**dict(problem.start), seed=problem.seed)
     fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
@@ -112,14 +113,16 @@ def prepare(
         fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
         if log:
             log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
-    start, given = propose(seg, flow, pair.K_ref, pair.K_next, options, fitted), None
-    if problem.energy.weights.order > 0:
-        start = in_order(start, seg, pair, fitted, options)
-    if pair.depth_prior is not None and problem.energy.weights.depth > 0:
-        kind = problem.depth_prior.kind
-        start, given = by_prior(start, seg, pair, fitted, kind, problem.seed)
-        if log:
-            log(str(given))
+    start, given = _begin(problem, pair, seg, fitted)
+    if given is not None and given.inside is not None and s.follow_flow_px is not None:
+        other = build_segmentation(follow_depth(labels, given.inside), pair.image_ref, *graphs)
+        fitted = FlowFit.of(other, flow, pair.K_ref, pair.K_next, options)
+        again = _begin(problem, pair, other, fitted)
+        # a prior near a limit of the tests keeps the superpixels on which it has passed them
+        if again[1] is not None and again[1].used:
+            seg, (start, given) = other, again
+    if given is not None and log:
+        log(str(given))
     done("start", start)
     data, weights = build_energy(problem, pair, seg, start, given)
     stages = solver_options(problem, start)
@@ -133,6 +136,22 @@ def prepare(
     watch = Watch(say=log) if log else None
     answer = solve_soup(start.soup, data, weights, case.formulation(), once, watch=watch)
     return replace(case, soup=answer.soup)
+
+
+def _begin(
+    problem: Problem, pair: Pair, seg: Segmentation, fitted: FlowFit
+) -> tuple[Start, Given | None]:
+    """The start on given superpixels, and what the depth prior of the pair decides, if any."""
+    flow = pair.flow
+    assert flow is not None
+    options = SeededStart(**dict(problem.start), seed=problem.seed)
+    start = propose(seg, flow, pair.K_ref, pair.K_next, options, fitted)
+    weights = problem.energy.weights
+    if weights.order > 0:
+        start = in_order(start, seg, pair, fitted, options)
+    if pair.depth_prior is None or not weights.depth > 0:
+        return start, None
+    return by_prior(start, seg, pair, fitted, problem.depth_prior.kind, problem.seed)
 
 
 def _with_flow(

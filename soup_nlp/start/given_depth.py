@@ -68,6 +68,8 @@ class Given:
             one depth, above the noise; NaN where the flow says nothing.
         held: (N,) True where depth or scale of the start are the prior's.
         overall: Standard deviation of its log depth in the whole image; inf where it is not used.
+        inside: (H, W) its log depth where `held`, NaN elsewhere; None if the flow confirms it, or
+            if it is not used.
     """
 
     log_depth: Float
@@ -78,6 +80,7 @@ class Given:
     ratio: float
     held: Mask
     overall: float = np.inf
+    inside: Float | None = None
 
     def __str__(self) -> str:
         if not self.used:
@@ -154,7 +157,10 @@ def by_prior(
     tie = np.where(held & (start.component != main), TIES.index("given depth"), start.tie)
     made = replace(start, soup=soup.normalised(), tie=tie)
     decides = np.where(held, own, np.inf)
-    return made, Given(log_depth, decides, opened, error, kind, ratio, held, sigma)
+    # superpixels of a confirmed prior keep the borders of the flow, which agrees with it
+    shaped = np.isfinite(decides)[seg.labels] & np.isfinite(prior)
+    inside = None if ratio <= CONFIRMED else np.where(shaped, whole, np.nan)
+    return made, Given(log_depth, decides, opened, error, kind, ratio, held, sigma, inside)
 
 
 def _at_superpixels(prior: Float, seg: Segmentation) -> tuple[Float, Mask]:

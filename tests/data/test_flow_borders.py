@@ -8,7 +8,7 @@ from helpers_truth import majority
 from scipy import ndimage
 
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.flow.borders import fit_affine, follow_flow
+from soup_nlp.data.flow.borders import fit_affine, follow_depth, follow_flow
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.pipeline.case import prepare
@@ -52,6 +52,20 @@ def test_borders_move_to_the_break_and_no_other(noise):
     far = np.ones(WIDTH, bool)
     far[16:40] = False
     np.testing.assert_array_equal(after[:, far], before[:, far])
+
+
+@pytest.mark.parametrize(("step", "split"), [(0.2, 0), (0.03, 6)])
+def test_borders_move_to_a_step_of_depth_where_it_is_known(step, split):
+    before = grid()
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    depth = 0.002 * u + 0.001 * v + step * (u >= EDGE)
+    after = follow_depth(before, depth)
+    assert mixed(after) == split
+    assert assert_partition(after) == 48
+    depth[: HEIGHT // 2] = np.nan
+    below = follow_depth(before, depth)
+    np.testing.assert_array_equal(below[: HEIGHT // 2], before[: HEIGHT // 2])
+    assert mixed(below[HEIGHT // 2 :]) == split // 2
 
 
 @pytest.mark.parametrize(("jump", "margin"), [(0.0, 1.0), (0.9, 1.0), (3.0, 3.1)])

@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 
 import soup_nlp
+from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.inputs import PriorOptions, resized_prior
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
-from soup_nlp.geometry.graph import build_segmentation
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.reweighting import with_prior
+from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.findings import certainty, summary
 from soup_nlp.start.components import TIES
 from soup_nlp.start.given_depth import Given, _slopes, by_prior
@@ -126,6 +128,25 @@ def test_orientation_is_held_inside_a_plane_and_released_at_creases(pan):
     known = given.log_depth, np.zeros(len(seg)), *known[2:]
     flat = with_prior(data, start.soup, *known, creased=True).orient_weight
     np.testing.assert_array_equal(flat, data.orient_weight)
+
+
+def across_steps(seg: Segmentation, depth: np.ndarray) -> float:
+    """Share of pixels whose depth is off the median of their superpixel by more than 20 %."""
+    off = np.abs(np.log(depth) - median_in(depth, seg.labels)[seg.labels])
+    return float((off > 0.2).mean())
+
+
+def test_superpixels_end_at_steps_of_a_prior_that_no_flow_confirms(pan, swing):
+    def cut(seen: Seen, prior: np.ndarray | None) -> Segmentation:
+        raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": 150}}
+        return prepare(make_problem(raw), pair=replace(seen.pair, depth_prior=prior)).segmentation
+
+    before, after = cut(pan, None), cut(pan, pan.depth)
+    assert across_steps(after, pan.depth) < 0.5 * across_steps(before, pan.depth)
+    wrong = cut(pan, np.exp(WAVE))
+    np.testing.assert_array_equal(wrong.labels, before.labels)
+    # the flow has ended them where it confirms the prior
+    np.testing.assert_array_equal(cut(swing, swing.depth).labels, cut(swing, None).labels)
 
 
 @pytest.mark.parametrize("wrong", ["constant", "smooth", "upside down", "unknown", "pixels"])

@@ -1,4 +1,4 @@
-"""Alignment of superpixel borders with discontinuities of the flow.
+"""Alignment of superpixel borders with discontinuities of the flow, and with steps of a depth.
 
 SLIC follows colours only. A superpixel that covers two motions cannot fit both: the pixels of its
 smaller part have an unavoidable re-projection error and the depth of the other part. Such pixels
@@ -23,6 +23,8 @@ ROUNDS = 5
 """Re-weighted fits of an affine flow."""
 SWEEPS, REFIT = 24, 8
 """Number of sweeps (a border moves at most one pixel in each), and sweeps between fits."""
+LEAST_STEP = 0.05
+"""Least reduction of the residual of log depth for which a pixel changes its superpixel."""
 
 
 def follow_flow(
@@ -70,6 +72,25 @@ def follow_flow(
         near[v[moved], u[moved]] = True
         near = ndimage.binary_dilation(near)
     return split_components(current.astype(np.int32), int(LEAST_PIECE * current.size / count))
+
+
+def follow_depth(labels: NDArray[np.integer], log_depth: Float) -> Labels:
+    """Move the borders of superpixels to steps of a depth, as `follow_flow` does for a flow.
+
+    A plane across a step has the depth of one side alone. Log depth in units of `LEAST_STEP`
+    takes the place of the flow.
+
+    Args:
+        labels: (H, W) superpixel labels 0..N-1.
+        log_depth: (H, W) log depth; NaN where borders stay.
+
+    Returns:
+        (H, W) int32 labels as those of `follow_flow`.
+    """
+    known = np.isfinite(log_depth)
+    units = np.where(known, log_depth, 0.0) / LEAST_STEP
+    both = np.stack([units, np.zeros_like(units)], axis=-1)
+    return follow_flow(labels, Flow(both.astype(np.float32), known.astype(np.float32), "depth"))
 
 
 def _nearest(
