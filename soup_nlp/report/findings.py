@@ -38,6 +38,8 @@ SHARE = 0.05
 """Share of the image above which a limit is mentioned."""
 FAST = 0.05
 """Median length of the flow, relative to the image's width, above which motion is fast."""
+UNSURE_FOCAL = 0.2
+"""Standard deviation of the log focal length above which it is called a guess."""
 LISTED = 5
 """Number of moving components that are listed."""
 WAYS = (("to the right", "to the left"), ("down", "up"), ("ahead", "back"))
@@ -102,6 +104,10 @@ def found_words(run: Run) -> list[str]:
         size = "below 1%" if most < SHARE / 5 else f"at most {most:.0%}"
         kind = "more components" if large else "components that move by themselves"
         lines.append(f"{kind}: {rest} ({size} of the image{' each' * (rest > 1)})")
+    if run.pair.focal_sigma > 0:
+        focal, error = run.pair.K_ref[0, 0], run.pair.focal_sigma
+        by = "as the flow has it" if error <= UNSURE_FOCAL else "a guess"
+        lines.append(f"the focal length is {focal:.0f} px, right to {error:.0%} ({by})")
     if run.given is not None:
         lines.append(str(run.given))
     if run.full is not None:
@@ -140,13 +146,16 @@ def flow_words(run: Run) -> list[str]:
     return lines
 
 
-def hints(uv: AnyFloat, confidence: AnyFloat, shares: Mapping[str, float]) -> list[str]:
+def hints(
+    uv: AnyFloat, confidence: AnyFloat, shares: Mapping[str, float], focal_sigma: float = 0.0
+) -> list[str]:
     """What would give a better depth.
 
     Args:
         uv: (H, W, 2) flow, pixels.
         confidence: (H, W) of the flow; 0 is unusable.
         shares: Those of `certainty`.
+        focal_sigma: Standard deviation of the log focal length; 0 where it is given.
     """
     usable, out = confidence > 0, []
     if usable.mean() < USABLE:
@@ -157,6 +166,8 @@ def hints(uv: AnyFloat, confidence: AnyFloat, shares: Mapping[str, float]) -> li
         out.append("frames between which the camera moves aside, not only turns")
     elif shares["flat"] >= SHARE:
         out.append("frames farther apart in time")
+    if focal_sigma > UNSURE_FOCAL and shares["weak"] >= SHARE:
+        out.append("the focal length of the camera (--fov or --intrinsics)")
     if shares["scale"] >= SHARE:
         out.append("a depth from elsewhere (--depth-prior) for what moves")
     return ["; ".join(out)] if out else []
@@ -166,7 +177,7 @@ def limits(result: Result) -> list[str]:
     """What limits a result and what to try, in the words of the verdict; at least one sentence."""
     s, uv = result.summary, result.array("input/flow")
     shares = dict.fromkeys((*SHARES, "guess"), 0.0) | s.get("certainty", {})
-    lines = []
+    lines, focal = [], s.get("focal_sigma", 0.0)
     if not s["converged"] and s["status"] != "Skipped":
         lines.append(f"The NLP did not converge ({s['status']}): try a larger solver.max_iter.")
     if shares["guess"] >= SHARE:
@@ -175,7 +186,7 @@ def limits(result: Result) -> list[str]:
         share = float(result.bends[result.labels].mean())
         lines.append(f"{share:.0%} of the image bends: its relief is weakly determined.")
     if uv is not None:
-        lines += [f"Try {text}." for text in hints(uv, result.flow_confidence, shares)]
+        lines += [f"Try {text}." for text in hints(uv, result.flow_confidence, shares, focal)]
     return lines or ["Nothing stands out: flow, parallax and convergence are good."]
 
 
@@ -235,6 +246,7 @@ def summary(run: Run) -> dict[str, Any]:
         "flow": str(run.pair.flow),
         "versions": versions(),
         "seed": run.problem.seed,
+        "focal_sigma": run.pair.focal_sigma,
     }
 
 

@@ -84,7 +84,7 @@ def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
         "status": _status(run),
         "found": found_words(run),
         "certainty": certainty_lines(shares),
-        "try": hints(flow.uv, flow.confidence, shares),
+        "try": hints(flow.uv, flow.confidence, shares, run.pair.focal_sigma),
         "accuracy": [protocol(run.metrics), *accuracy(run.metrics)] if run.metrics else [],
         "expected": [f"MRE at most {limit:g}: {'missed' if missed(run) else 'met'}"]
         if limit is not None and "solution" in run.metrics

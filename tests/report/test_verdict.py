@@ -61,6 +61,10 @@ def test_hints_name_what_would_help(small_run):
     (told,) = findings.hints(*flow, {**shares, "rest": 0.9})
     assert "moves aside" in told
     assert findings.hints(*flow, dict.fromkeys(shares, 0.0)) == []
+    weak = {**dict.fromkeys(shares, 0.0), "weak": 0.4}
+    assert findings.hints(*flow, weak, 0.1) == []
+    (told,) = findings.hints(*flow, weak, 0.3)
+    assert "--fov" in told
 
 
 def test_the_table_of_energies_ends_with_what_the_refinement_lowers():
