@@ -1,16 +1,26 @@
-"""Make the pictures of gallery.md and the verdicts below them: `python docs/gallery.py`."""
+"""Make the pictures of gallery.md and the verdicts below them, and that of depth_prior.md.
+
+`python docs/gallery.py` makes all, `python docs/gallery.py prior` the latter alone.
+"""
 
 from __future__ import annotations
 
 import re
+import sys
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 from PIL import Image
 
 import soup_nlp
+from soup_nlp.arrays import Float
+from soup_nlp.evaluate.metrics import depth_metrics
+from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.figures import strip
 from soup_nlp.report.findings import certainty, certainty_lines, found_words, hints, summary
-from soup_nlp.report.pictures import pictures
+from soup_nlp.report.pictures import Picture, pictures
 from soup_nlp.report.result import result_of
 from soup_nlp.report.verdict import sectioned
 
@@ -40,7 +50,43 @@ def made(scene: str) -> str:
     return sectioned(sections) + "\n"
 
 
+def warped(depth: Float, share: float) -> Float:
+    """(H, W) depth times a smooth random factor whose log has the standard deviation of a share."""
+    waves = np.random.default_rng(7).standard_normal((5, 7))
+    smooth = cv2.resize(waves, depth.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return depth * np.exp(np.log1p(share) * smooth / smooth.std())
+
+
+def with_prior(scene: str) -> list[Picture]:
+    """True depth of a scene, a prior that is wrong by 20 %, depth without it and with it."""
+    source = {"kind": "scene", "scene": scene, "width": 640, "height": 480}
+    options = "segmentation.superpixels=600", "refine.enabled=false"
+    problem = soup_nlp.make_problem({"name": scene, "input": source}, options)
+    pair = problem.load_pair()
+    true = pair.truth.depth_ref
+    given = warped(true, 0.2)
+    near, far = depth_range(true)
+    found = [Picture("image", scene, pair.image_ref)]
+    for title, depth in (
+        ("true depth", true),
+        ("depth prior, wrong by 20 %", given),
+        ("without a prior", soup_nlp.run(problem, pair=pair)),
+        ("with the prior", soup_nlp.run(problem, pair=replace(pair, depth_prior=given))),
+    ):
+        z = depth.reconstruction.depth_ref if isinstance(depth, soup_nlp.Run) else depth
+        score = depth_metrics(z, true)
+        said = "" if z is true else f", MRE {score.mre:.3f}"
+        found.append(Picture("depth", title + said, colourise_depth(z * score.scale, near, far)))
+    return found
+
+
 if __name__ == "__main__":
+    panels = [picture for scene in ("swing", "pan") for picture in with_prior(scene)]
+    sheet = strip(panels, "", columns=len(panels) // 2, panel_width=270)
+    results = PAGE.parents[1] / "results"
+    Image.fromarray(sheet).save(results / "depth_prior.jpg", quality=80)
+    if sys.argv[1:] == ["prior"]:
+        sys.exit()
     PAGE.with_name("gallery").mkdir(exist_ok=True)
     words = PAGE.read_text(encoding="utf-8")
     words = PLACE.sub(lambda m: f"(gallery/{m[1]}.jpg)\n\n```text\n{made(m[1])}```", words)
