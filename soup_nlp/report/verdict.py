@@ -130,7 +130,7 @@ def _status(run: Run) -> list[str]:
     """Status in words."""
     s = run.solution
     words = STATUS.get(s.status, f"not converged: {s.status}, best iterate kept")
-    far = "the presolve ended far from a minimum: solver.far_iterations limits Ipopt there"
+    far = "the presolve ended before a minimum: solver.far_iterations limits Ipopt there"
     return [f"{words} ({s.status})", *[far] * (s.far and not s.converged)]
 
 

@@ -44,8 +44,8 @@ class SolverOptions(Section):
     max_iter: Count = 30
     """Iteration limit of the constrained NLP."""
     far_iterations: Count = 5
-    """Iteration limit of the constrained NLP if the stages before it ended far from a minimum:
-    Ipopt does not find one from there either, and each of its iterations takes seconds."""
+    """Iteration limit of the constrained NLP if the stage with the exact Hessian ended before a
+    minimum: Ipopt does not find one from there either, and each of its iterations takes seconds."""
     tol: Tolerance = 1e-6
     """Tolerance of the constrained NLP."""
     max_seconds: Tolerance = 600.0

@@ -53,7 +53,7 @@ class Solution:
             compiler in them.
         cpu_seconds: CPU time of this process in the same.
         delivered: What `soup` is: "constrained NLP", "presolve" or "start".
-        far: Whether the presolve ended far from a minimum, so that Ipopt had few iterations.
+        far: Whether the presolve ended before a minimum, so that Ipopt had few iterations.
         ends: Exact energy where the "start", the "presolve" and the "constrained NLP" ended.
     """
 
@@ -132,10 +132,10 @@ def _near(stage: Stage) -> bool:
 
 
 def _far(stages: Sequence[Stage]) -> bool:
-    """Whether the exact Hessian ended, by itself or at its limit, far from a minimum."""
+    """Whether the exact Hessian ended, by itself or at its limit, before a minimum."""
     last = stages[-1] if stages else None
     ended = last is not None and last.name == EXACT and last.status not in STOPPED
-    return ended and not _near(stages[-1])
+    return ended and not stages[-1].converged
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ class _Solve:
         if far:
             limit = min(limit, o.far_iterations)
             self.watch.say(
-                f"far from a minimum: Ipopt has {o.far_iterations} iterations"
+                f"not at a minimum yet: Ipopt has {o.far_iterations} iterations"
                 " (solver.far_iterations)"
             )
         stage = solver(

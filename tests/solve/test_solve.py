@@ -285,7 +285,7 @@ def test_one_iteration_gives_a_whole_solution(room):
 
 
 @pytest.mark.parametrize(("few", "spent"), [(2, 2), (60, 4)])
-def test_far_from_a_minimum_ipopt_has_few_iterations(room, few, spent):
+def test_ipopt_has_few_iterations_where_the_presolve_found_no_minimum(room, few, spent):
     options = OPTIONS.replace(
         presolve_iterations=1,
         exact_iterations=1,
@@ -294,7 +294,7 @@ def test_far_from_a_minimum_ipopt_has_few_iterations(room, few, spent):
         tol=1e-12,
     )
     stages = room.solve(options).stages
-    assert stages[-2].history["inf_du"][-1] > 1
+    assert not stages[-2].converged
     assert stages[-1].iterations == spent
 
 
