@@ -9,7 +9,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.data.scenes.everyday import LAYOUTS
 from soup_nlp.data.scenes.shapes import Ellipsoid
-from soup_nlp.data.scenes.things import Materials, person
+from soup_nlp.data.scenes.things import SceneBuilder
 from soup_nlp.geometry import camera
 
 WIDTH, HEIGHT = 160, 120
@@ -71,8 +71,7 @@ def test_seeds_are_other_scenes(name):
 
 
 def test_limbs_of_a_person_move_differently():
-    rng = np.random.default_rng(0)
-    body = person(rng, Materials(rng), 0, 3, 1.7, 40)
+    body = SceneBuilder(np.random.default_rng(0)).person(0, 3, 1.7, 40)
     assert body.bends
     shifts = [p.motion @ p.scene_from_part @ [0, 0, 0, 1] for p in body.parts]
     shifts = np.array(shifts) - [p.scene_from_part @ [0, 0, 0, 1] for p in body.parts]

@@ -8,6 +8,7 @@ pixel.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -78,7 +79,7 @@ class Body:
         motion: (4, 4) motion in scene coordinates from the reference to the next time.
     """
 
-    parts: tuple[Part, ...]
+    parts: Sequence[Part]
     motion: Float = field(default_factory=lambda: np.eye(4))
 
     @property
@@ -97,7 +98,7 @@ class Scene:
         next_from_scene: (4, 4) camera pose at the next time.
     """
 
-    bodies: tuple[Body, ...]
+    bodies: Sequence[Body]
     ref_from_scene: Float
     next_from_scene: Float
 
@@ -168,8 +169,8 @@ def advanced(scene: Scene, steps: int) -> Scene:
     for body in scene.bodies:
         so_far = np.linalg.matrix_power(body.motion, steps)
         parts = [replace(p, scene_from_part=so_far @ p.scene_from_part) for p in body.parts]
-        bodies.append(replace(body, parts=tuple(parts)))
-    return Scene(tuple(bodies), ref, go_on @ ref)
+        bodies.append(replace(body, parts=parts))
+    return Scene(bodies, ref, go_on @ ref)
 
 
 def _may_hit(shape: Shape, camera_from_part: Float, K: Float, uv: Float) -> Int:

@@ -7,6 +7,7 @@ rigid shapes they are the coordinates of the shape.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,7 +51,7 @@ class Shape(ABC):
         return material[:, :2]
 
 
-def _corner_points(half: tuple[float, float, float]) -> Float:
+def _corner_points(half: Sequence[float] | Float) -> Float:
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
     return signs * np.asarray(half)
 
@@ -86,7 +87,7 @@ class Centred(Shape):
         half: Half sizes along x, y and z, unit of length.
     """
 
-    half: tuple[float, float, float]
+    half: Sequence[float] | Float
 
     def corners(self) -> Float:
         """See `Shape`."""
