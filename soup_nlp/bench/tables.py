@@ -25,7 +25,7 @@ from soup_nlp.bench.study import (
 )
 from soup_nlp.errors import DataError
 from soup_nlp.sequence.chain import make_chain
-from soup_nlp.sequence.frames import file_frames, find_depths, find_images, scene_frames
+from soup_nlp.sequence.frames import Frames, find_depths, find_images, scene_frames
 from soup_nlp.sequence.pairs import ROWS, solve_pairs
 from soup_nlp.sequence.score import score
 from soup_nlp.storage.folders import scratch
@@ -78,7 +78,7 @@ def measure_chain(
     if item.needs:
         images = list(item.needs[:frames])
         camera = {"intrinsics": item.input["intrinsics"]}
-        source = file_frames(images, camera, find_depths(images), 256.0)
+        source = Frames(tuple(map(str, images)), camera, find_depths(images), 256.0)
     with scratch() as folder:
         which = [(k, k + 1) for k in range(len(source) - 1)]
         chain = make_chain(solve_pairs(source, which, folder, overrides))

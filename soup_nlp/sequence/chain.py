@@ -203,7 +203,7 @@ class Chain:
         return self.pairs[pair].result.K[place]
 
     def labels(self, frame: int) -> Labels:
-        """(H, W) components of a frame; -1 where the last one shows what the others do not."""
+        """(H, W) components of a frame; -1 at pixels that only the last frame shows."""
         pair, place = self.seen(frame)
         result = self.pairs[pair].result
         labels = result.components.of_pixel

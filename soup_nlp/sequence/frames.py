@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import lru_cache
 from itertools import pairwise
@@ -44,56 +44,47 @@ LAYOUT = "frame_*"
 
 @dataclass(frozen=True)
 class Frames:
-    """A sequence of frames.
+    """A sequence of frames: image files of one camera, or a rendered scene.
 
     Attributes:
         names: Path or description of every frame.
-        pair: Section `input` of the problem of two frames, by their numbers.
+        camera: Key `intrinsics` or `fov` of an input of files.
+        depths: True depth of every frame, for evaluation only; empty if unknown.
+        depth_scale: Values per unit of length of a 16-bit .png depth.
+        scene: Name of the scene, whose camera and bodies repeat their first motion.
     """
 
     names: tuple[str, ...]
-    pair: Callable[[int, int], Raw]
+    camera: Raw = field(default_factory=dict)
+    depths: Sequence[Path] = ()
+    depth_scale: float | None = None
+    scene: str | None = None
 
     def __len__(self) -> int:
         return len(self.names)
 
+    def pair(self, first: int, second: int) -> Raw:
+        """Section `input` of the problem of two frames, by their numbers.
 
-def file_frames(
-    paths: Sequence[Path],
-    camera: Raw,
-    depths: Sequence[Path] = (),
-    depth_scale: float | None = None,
-) -> Frames:
-    """Image files of one camera as frames.
-
-    Args:
-        paths: Images in order.
-        camera: Key `intrinsics` or `fov` of an input of files.
-        depths: True depth of every frame, for evaluation only; empty if unknown.
-        depth_scale: Values per unit of length of a 16-bit .png depth.
-    """
-
-    def pair(first: int, second: int) -> Raw:
-        out = {"kind": "files", "ref": str(paths[first]), "next": str(paths[second]), **camera}
-        if depths:
-            truth = {"depth": str(depths[first]), "depth_next": str(depths[second])}
-            out.update(truth, depth_scale=depth_scale)
+        Raises:
+            DataError: frames of a scene do not follow each other.
+        """
+        if self.scene is not None:
+            if second != first + 1:
+                raise DataError(
+                    "frames of a scene are solved one after the other", found=second - first
+                )
+            return {"kind": "scene", "frame": first, "scene": self.scene}
+        out = {"kind": "files", "ref": self.names[first], "next": self.names[second], **self.camera}
+        if self.depths:
+            truth = {"depth": str(self.depths[first]), "depth_next": str(self.depths[second])}
+            out.update(truth, depth_scale=self.depth_scale)
         return out
-
-    return Frames(tuple(map(str, paths)), pair)
 
 
 def scene_frames(scene: str, count: int) -> Frames:
-    """Frames of a rendered scene, whose camera and bodies repeat their first motion."""
-
-    def pair(first: int, second: int) -> Raw:
-        if second != first + 1:
-            raise DataError(
-                "frames of a scene are solved one after the other", found=second - first
-            )
-        return {"kind": "scene", "frame": first, "scene": scene}
-
-    return Frames(tuple(f"{scene}: frame {k}" for k in range(count)), pair)
+    """The first frames of a rendered scene."""
+    return Frames(tuple(f"{scene}: frame {k}" for k in range(count)), scene=scene)
 
 
 def find_images(source: Path) -> list[Path]:

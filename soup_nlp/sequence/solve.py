@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from soup_nlp.config.problem import make_problem, title
@@ -20,7 +21,6 @@ from soup_nlp.sequence.frames import (
     Frames,
     Raw,
     check_sequence,
-    file_frames,
     find_depths,
     find_images,
     key_frames,
@@ -183,7 +183,7 @@ def _frames(
     beside = images[0].parent / "K.txt"
     if not camera.keys() & {"intrinsics", "fov"} and os.path.lexists(beside):
         camera = {"intrinsics": str(beside), **camera}
-    frames = file_frames(images, camera, depths, depth_scale)
+    frames = Frames(tuple(map(str, images)), camera, depths, depth_scale)
     # every solve gives these warnings too
     with warnings.catch_warnings(action="ignore", category=DataWarning):
         for image in images:
@@ -192,8 +192,8 @@ def _frames(
             return frames
         first = make_problem({"input": frames.pair(0, 1)}, where="sequence").load_pair()
     keep = key_frames(images, first.K_ref, most)
-    images, depths = ([paths[k] for k in keep] if paths else [] for paths in (images, depths))
-    return file_frames(images, camera, depths, depth_scale)
+    kept = tuple(frames.names[k] for k in keep)
+    return replace(frames, names=kept, depths=[depths[k] for k in keep] if depths else [])
 
 
 def _files(frames: Sequence[ImageLike], folder: Path) -> list[Path]:

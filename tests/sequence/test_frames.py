@@ -12,7 +12,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence import pairs
 from soup_nlp.sequence.frames import (
-    file_frames,
+    Frames,
     find_depths,
     find_images,
     key_frames,
@@ -59,7 +59,7 @@ def test_frames_of_a_folder_a_pattern_and_a_video(tmp_path):
     assert [p.name for p in depths] == ["depth_9.npy", "depth_10.npy", "depth_100.npy"]
     (tmp_path / "depth_9.npy").unlink()
     assert find_depths(images) == []
-    own = file_frames(images, {"fov": 60}, depths, 256.0).pair(0, 2)
+    own = Frames(tuple(map(str, images)), {"fov": 60}, depths, 256.0).pair(0, 2)
     assert own["next"] == str(images[2])
     assert own["depth_next"] == str(depths[2])
     with pytest.raises(DataError, match="two images"):
