@@ -253,7 +253,7 @@ def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
 
 
 def growth(frame: pd.DataFrame) -> pd.DataFrame:
-    """Exponent of every cost by pair and K, of those that were run at several sizes."""
+    """Exponent of every cost by pair and K, for pairs that ran at several sizes."""
     groups = frame.groupby(["sequence", "k"])
     lines = {
         (pair, str(k)): {t: exponent(group["n"], group[column]) for column, t in COSTS.items()}

@@ -97,7 +97,7 @@ class Cell:
         """Entries that identify the row together with the code version."""
         try:
             problem = self.item.problem(self.overrides)
-            settings, source = settings_hash(problem), input_hash(problem)
+            settings, source = _hash(problem, NOT_SETTINGS), _hash(problem.input, PATHS)
         except Exception:
             settings = source = "wrong"
         return {
@@ -120,15 +120,10 @@ class Cell:
         return Job(self.identity(), partial(alone if own_process else attempt, work), stale)
 
 
-def settings_hash(problem: Problem) -> str:
-    """Hash of all options but the input: the same for every pair and folder."""
-    return _hash(problem, {"name", "base", "preset", "input", "expected"})
-
-
-def input_hash(problem: Problem) -> str:
-    """Hash of the input without its paths: the same for a pair in every folder."""
-    places = {"root", "path", "ref", "next", "depth", "depth_next", "intrinsics"}
-    return _hash(problem.input, places)
+NOT_SETTINGS = {"name", "base", "preset", "input", "expected"}
+"""Keys of a problem that its hash leaves out, so that it is the same for every pair and folder."""
+PATHS = {"root", "path", "ref", "next", "depth", "depth_next", "intrinsics"}
+"""Keys of an input that its hash leaves out, so that it is the same for a pair in every folder."""
 
 
 def _hash(section: Any, exclude: set[str]) -> str:
@@ -162,7 +157,10 @@ def frame_of(rows: Sequence[Row]) -> pd.DataFrame:
     `main` is the metric convention of a row, and `mre` and `constant` are the mean relative errors
     of the solution and of a constant depth under it.
     """
-    frame = pd.json_normalize(list(rows)).reindex(columns=_columns(rows))
+    frame = pd.json_normalize(list(rows))
+    # columns that every reader expects come first, and are always there
+    expected = ["ok", "error", "code", "cpu_seconds"]
+    frame = frame.reindex(columns=list(dict.fromkeys([*expected, *frame.columns])))
     if "pair" not in frame:
         return frame
     frame["main"] = [presets[0] for presets in frame["presets"]]
@@ -171,12 +169,6 @@ def frame_of(rows: Sequence[Row]) -> pd.DataFrame:
     frame["title"] = [f"{pair}, {flow}" for pair, flow in zip(name, frame["flow"], strict=True)]
     frame["mre"], frame["constant"] = main_metric(frame), main_metric(frame, "constant")
     return frame
-
-
-def _columns(rows: Sequence[Row]) -> list[str]:
-    """Columns of the frame of some rows; those that every reader expects are always there."""
-    found = list(pd.json_normalize(list(rows)).columns)
-    return list(dict.fromkeys(["ok", "error", "code", "cpu_seconds", *found]))
 
 
 def main_metric(frame: pd.DataFrame, method: str = "solution", name: str = "mre") -> pd.Series:

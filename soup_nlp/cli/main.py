@@ -119,12 +119,6 @@ def prepare_streams() -> None:
                 stream.reconfigure(errors="backslashreplace")
 
 
-def drop_output() -> None:
-    """Discard the rest of the output after a broken pipe."""
-    with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 ABORTED = 130
 """Exit code of a command that Ctrl-C ended without a result, as in shells."""
 
@@ -166,7 +160,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = _run(argv)
         sys.stdout.flush()
     except BrokenPipeError:
-        drop_output()
+        # the rest of the output has no reader
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     return code
 
@@ -208,7 +204,7 @@ class _Flags:
     """A command whose flags show no type in its help."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Options and arguments, with that of the help."""
+        """Options and arguments, `--help` included."""
         params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
         for param in params:
             if getattr(param, "is_flag", False):

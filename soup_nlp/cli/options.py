@@ -271,11 +271,6 @@ class SolveLog(logging.Handler):
         if self.verbose:
             self._print(line)
 
-    def announce(self, line: str) -> None:
-        """Add a line to the log and print it."""
-        self.lines.append(line)
-        self._print(line)
-
     def stage(self, name: str) -> None:
         """End a stage: print its time and result, and begin the next one."""
         now = time.perf_counter()
@@ -312,7 +307,8 @@ class SolveLog(logging.Handler):
     def _announce_once(self, line: str) -> None:
         if line not in self._announced:
             self._announced.add(line)
-            self.announce(line)
+            self.lines.append(line)
+            self._print(line)
 
     def interrupted(self, line: str) -> None:
         """Print a line from a signal handler, where Python's streams cannot be used."""

@@ -60,7 +60,7 @@ class PriorOptions(Section):
 
 
 def resized_prior(prior: Float, pair: Pair, where: str) -> Float:
-    """A prior (H, W) of any size at that of the reference image.
+    """A prior (H, W) resized to the reference image.
 
     Raises:
         DataError: its aspect ratio differs from that of the image, or nothing is known.

@@ -17,14 +17,14 @@ from PIL import Image as Pil
 from PIL import ImageDraw, ImageFont
 
 from soup_nlp.arrays import AnyFloat, Image
-from soup_nlp.report.pictures import Bar, Legend, Picture, Swatches, Wheel
+from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.storage.files import PathLike, write_bytes
 
 _DPI = 100
 _HEAD, _CAPTION, _GAP = 42, 28, 8
 """Height of the title, height of a caption, and space between panels, in pixels."""
-_LEGEND = {Bar: 32, Swatches: 24, Wheel: 62}
-"""Height of a legend, pixels."""
+_LEGEND = {type(None): 0, Bar: 32, Swatches: 24, Wheel: 62}
+"""Height of a legend by its type, pixels."""
 _SPARE = ("depth_start", "normals")
 """Panels that an overview leaves out, in this order, to fill its last row."""
 
@@ -38,7 +38,7 @@ def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: 
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     heights = [
-        max(_height(p, panel_width) for p in row) + max(_legend_height(p.legend) for p in row)
+        max(_height(p, panel_width) for p in row) + max(_LEGEND[type(p.legend)] for p in row)
         for row in rows
     ]
     head = _HEAD if title else _GAP
@@ -62,10 +62,6 @@ def write_picture(path: PathLike, picture: Picture) -> None:
 def _height(picture: Picture, width: int) -> int:
     """Height in pixels of a picture that is drawn with some width."""
     return max(1, round(width * picture.image.shape[0] / picture.image.shape[1]))
-
-
-def _legend_height(legend: Legend | None) -> int:
-    return 0 if legend is None else _LEGEND[type(legend)]
 
 
 def _draw_panel(sheet: Pil.Image, panel: Picture, left: int, top: int, width: int) -> None:

@@ -124,7 +124,7 @@ class Result:
 
     @property
     def scale(self) -> float:
-        """Factor from the unit of length of the result to that of the truth; 1 without truth."""
+        """Units of the truth in one unit of length of the result; 1 without truth."""
         return self.metre if self.metre is not None and np.isfinite(self.metre) else 1.0
 
     @property

@@ -51,7 +51,7 @@ DELIVERED = {
     "start": "the start",
 }
 OF_ANSWER = ("nlp_infeasibility", "dual_infeasibility", "complementarity")
-"""Residuals that are those of Ipopt's answer; the others are those of the delivered soup."""
+"""Residuals of Ipopt's answer; all others are residuals of the delivered soup."""
 PAD = " " * 12
 
 

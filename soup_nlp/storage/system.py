@@ -19,15 +19,6 @@ _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_b
 """Files with the memory limit of a container."""
 
 
-def usable_memory() -> int:
-    """Bytes that this process can still allocate without swapping."""
-    free = [int(psutil.virtual_memory().available)]
-    for name in _LIMITS:
-        with suppress(OSError, ValueError):
-            free.append(int(Path(name).read_text()) - int(psutil.Process().memory_info().rss))
-    return max(0, min(free))
-
-
 def require_memory(size: float, what: str, where: object = None, hint: str | None = None) -> None:
     """Raise DataError if fewer than `size` bytes of memory are usable.
 
@@ -37,7 +28,12 @@ def require_memory(size: float, what: str, where: object = None, hint: str | Non
         where: File or option concerned.
         hint: What to try.
     """
-    usable = usable_memory()
+    free = [int(psutil.virtual_memory().available)]
+    for name in _LIMITS:
+        with suppress(OSError, ValueError):
+            free.append(int(Path(name).read_text()) - int(psutil.Process().memory_info().rss))
+    # bytes that this process can allocate without swapping
+    usable = max(0, min(free))
     if size > usable:
         raise DataError(
             f"{what} would take more memory than this machine has",

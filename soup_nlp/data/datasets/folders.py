@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from skimage.measure import label
 
 from soup_nlp.arrays import Float
@@ -32,7 +31,7 @@ from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Index, Positive, Whole
-from soup_nlp.storage.files import PathLike, is_file, read_text
+from soup_nlp.storage.files import is_file, read_text
 from soup_nlp.storage.folders import MARK
 
 LAYOUT = (
@@ -119,23 +118,20 @@ def _plain_folder(folder: Path, own: FolderInput, usual: float = MILLIMETRES) ->
     K_next = read_if(read_intrinsics, folder / "K_next.txt")
     depth = _find(folder, ("depth", "depth_0", "depth_ref"), _DEPTHS)
     depth_next = _find(folder, ("depth_next", "depth_1"), _DEPTHS)
+    moving = read_if(read_mask, _find(folder, ("moving",), _IMAGES))
     truth = Truth(
         depth_ref=read_if(read_depth, depth, own.depth_scale, usual),
         depth_next=read_if(read_depth, depth_next, own.depth_scale, usual),
         flow=read_if(read_flow, _find(folder, ("flow",), _FLOWS)),
         occluded=read_if(read_mask, _find(folder, ("occluded",), _IMAGES)),
-        components=read_if(_moving_components, _find(folder, ("moving",), _IMAGES)),
+        # connected regions of the pixels that move
+        components=None if moving is None else label(moving, connectivity=2).astype(np.int32),
         points=read_if(_read_points, folder / "points.npz", own.unit),
         unit=own.unit,
     )
     cameras = [K, K if K_next is None else K_next]
     name = folder.resolve().name
     return make_pair(images, cameras, truth, name, own.white, cropped=own.cropped)
-
-
-def _moving_components(path: PathLike) -> NDArray[np.int32]:
-    """(H, W) labels of the connected regions of a mask of moving pixels; 0 elsewhere."""
-    return np.asarray(label(read_mask(path), connectivity=2), np.int32)
 
 
 def _read_points(path: Path, unit: str) -> Float:
