@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from soup_nlp.bench.solvers.page import frame_of_runs
+from soup_nlp.bench.solvers.page import by_start, frame_of_runs, neutral, reached, summary
 from soup_nlp.bench.solvers.page import page as page_of
 from soup_nlp.bench.solvers.profiles import (
     _draw_profile,
@@ -36,14 +36,16 @@ SMALL = [
 ]  # fmt: skip
 
 
-def row(problem: str, solver: str, seconds: float, energy: float, verified: bool = True) -> dict:
+def row(
+    problem: str, solver: str, seconds: float, energy: float, verified: bool = True, **more: object
+) -> dict:
     return {
         "problem": problem, "superpixels": 10, "formulation": "f", "solver": solver,
         "seconds": seconds, "energy": energy, "verified": verified, "claimed": True,
         "energy_start": 9.0, "curve": [[0.1, 5.0], [seconds, energy]], "iterations": 3,
-        "cpu_seconds": 1.0, "peak_bytes": 1 << 20, "status": "a | b", "machine": "m",
-        "versions": {"casadi": "3"}, "code": "1", "problem_hash": "0", "start": "presolve",
-        "primal": 0.0, "limits": asdict(Limits()),
+        "cpu_seconds": 1.0, "wall_seconds": 9.0, "peak_bytes": 1 << 20, "status": "a | b",
+        "machine": "m", "versions": {"casadi": "3"}, "code": "1", "problem_hash": "0",
+        "start": "presolve", "primal": 0.0, "limits": asdict(Limits()), **more,
     }  # fmt: skip
 
 
@@ -116,6 +118,60 @@ def test_runs_that_begin_at_a_solution_are_headed_confirmation():
     text = page([row(start, "one", 1.0, 4.0) | {"start": start} for start in ("hard", "easy")])
     first, second = text.index("## By run"), text.index("## Confirmation")
     assert first < text.index("| hard |", first) < second < text.index("| easy |", second)
+
+
+def test_curves_of_equal_times_are_drawn(tmp_path):
+    """Two times that differ by rounding only leave no room for automatic limits."""
+    for times in ([0.1, np.nextafter(0.1, 1)], [0.0, 0.0], [2.0]):
+        runs = [row("a", "mine", times[-1], 1.0, False, curve=[[t, 1.5] for t in times])]
+        draw_curves(tmp_path / "curves.png", frame_of_runs(runs))
+        assert (tmp_path / "curves.png").stat().st_size
+
+
+# --- runs on the SOUP family ---------------------------------------------------------------------
+
+STUB = "SOUP-room-unit-offset-smooth-N100"
+
+
+def family_row(solver: str, start: str, objective: float, verified: bool = True) -> dict:
+    return row(
+        f"room {start}", solver, 1.0, objective, verified,
+        superpixels=100, objective=objective, start=start, name=f"{STUB}-{start}",
+        best_known=4.0, n=7, m=3, cpu_seconds=3.0 if solver == "two" else 1.0,
+    )  # fmt: skip
+
+
+OF_FAMILY = [
+    family_row("one", "easy", 4.0), family_row("two", "easy", 4.0001),
+    family_row("three", "easy", 3.0, False),
+    family_row("one", "hard", 5.0), family_row("two", "hard", 4.0003),
+]  # fmt: skip
+
+
+def test_a_minimum_is_reached_when_it_is_verified_and_near():
+    assert reached(frame_of_runs(OF_FAMILY)).tolist() == [True, True, False, False, True]
+    # lower than what was known is reached as well
+    assert reached(frame_of_runs([family_row("one", "easy", 3.0)])).all()
+    found = summary(frame_of_runs(OF_FAMILY))[STUB]
+    runs = found.pop("runs")
+    assert found == {"tried_by": ["one", "two", "three"], "reached_by": ["one", "two"]}
+    assert runs["easy"]["two"] == [4.0001, 3.0, 60.0, True]
+    assert runs["hard"] == {"one": [5.0, 1.0, 60.0, True], "two": [4.0003, 3.0, 60.0, True]}
+
+
+def test_rows_belong_to_a_start_and_a_size(tmp_path):
+    frame = frame_of_runs(OF_FAMILY)
+    assert list(by_start(frame)) == ["confirmation, N = 100", "hard, N = 100"]
+    text = page_of(frame, family=True)
+    assert "| one | 1 of 1 (1), 1.0 s | 1 of 1 (0), 1.0 s |" in text
+    assert "| three | 0 of 1 (0) | - |" in text
+    assert text.index("## By start and size") < text.index("## By run")
+    draw_profiles(tmp_path / "p.png", by_start(frame), ("cpu_seconds", "objective"))
+    assert (tmp_path / "p.png").stat().st_size > 5000
+    plain = neutral(frame)[0]
+    # what the README of the set asks for
+    assert {"solver", "name", "n", "m", "status", "objective", "iterations", "time"} <= plain.keys()
+    assert (plain["time"], plain["wall_time"], plain["reached"]) == (1.0, 9.0, True)
 
 
 # --- the command ---------------------------------------------------------------------------------

@@ -1,9 +1,8 @@
-"""Pictures as people have them: no intrinsics, flows of other programs with their confidence."""
+"""Pictures as people have them: turned by EXIF, flows of other programs with their confidence."""
 
 from __future__ import annotations
 
 import json
-import warnings
 
 import cv2
 import numpy as np
@@ -13,68 +12,12 @@ from PIL import ExifTags, Image
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.formats.cameras import GUESS, GUESS_SIGMA, estimated_cameras
-from soup_nlp.data.formats.images import DataWarning, read_image
-from soup_nlp.data.formats.map_files import read_flow
-from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
 
 pytestmark = pytest.mark.slow
 
 SIZE = (160, 120)
-
-
-def camera_of(path, fov=None):
-    return estimated_cameras([path], [read_image(path, turn=True)], fov)[0][0]
-
-
-def picture(path, tags=None):
-    image = Image.new("RGB", SIZE)
-    exif = image.getexif()
-    exif.get_ifd(ExifTags.IFD.Exif).update(tags or {})
-    image.save(path, exif=exif)
-    return path
-
-
-@pytest.mark.parametrize(
-    ("tags", "focal"),
-    [
-        ({ExifTags.Base.FocalLengthIn35mmFilm: 43}, 43 / 36 * 160),
-        # 5 mm of a sensor of 8 mm, stored ten times as large
-        (
-            {
-                ExifTags.Base.FocalLength: 5.0,
-                ExifTags.Base.FocalPlaneXResolution: 2000.0,
-                ExifTags.Base.FocalPlaneResolutionUnit: 3,
-                ExifTags.Base.ExifImageWidth: 1600,
-            },
-            100.0,
-        ),
-        ({ExifTags.Base.FocalLength: 5.0}, GUESS * 160),
-        ({}, GUESS * 160),
-    ],
-)
-def test_focal_length_comes_from_exif_or_a_stated_guess(tags, focal, tmp_path):
-    path = picture(tmp_path / "a.jpg", tags)
-    said = "EXIF" if focal != GUESS * 160 else "1.2 times the longer side.*--fov"
-    with pytest.warns(DataWarning, match=said):
-        K = camera_of(path)
-    with pytest.warns(DataWarning, match=said):
-        pair = Pair(path, path)
-    assert pair.focal_sigma == (0.0 if "EXIF" in said else GUESS_SIGMA)
-    assert K[0, 0] == pytest.approx(focal)
-    assert K[1, 1] == K[0, 0]
-    assert K[:2, 2].tolist() == [79.5, 59.5]
-
-
-def test_a_field_of_view_is_taken_without_a_word(tmp_path):
-    path = picture(tmp_path / "a.jpg", {ExifTags.Base.FocalLengthIn35mmFilm: 43})
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert camera_of(path, 90.0)[0, 0] == pytest.approx(80.0)
-    with pytest.raises(ConfigError, match="0 to 180"):
-        camera_of(path, 180.0)
 
 
 def stored_turned(path, image, orientation):
@@ -110,15 +53,6 @@ def test_a_photo_is_turned_as_its_exif_says(orientation, suffix, tmp_path):
             make_problem(given).load_pair()
 
 
-def test_a_turned_photo_has_the_focal_length_as_shown(tmp_path):
-    image = np.zeros((160, 120, 3), np.uint8)
-    stored_turned(tmp_path / "a.jpg", image, 6)
-    with pytest.warns(DataWarning, match="EXIF"):
-        K = camera_of(tmp_path / "a.jpg")
-    f = 43 / 36 * 160
-    np.testing.assert_allclose(K, [[f, 0, 59.5], [0, f, 79.5], [0, 0, 1]])
-
-
 @pytest.fixture(scope="module")
 def orbit(tmp_path_factory):
     """A rendered pair as files, its flow in both directions, half of it marked unusable."""
@@ -127,7 +61,6 @@ def orbit(tmp_path_factory):
         cv2.imwrite(str(folder / f"{name}.png"), image[..., ::-1])
     flow = pair.truth.flow.astype(np.float32)
     write_flo(folder / "forward.flo", flow)
-    np.save(folder / "turned.npy", flow.transpose(2, 0, 1))
     # wrong on the left by more than the largest error that is tolerated
     back = cv2.calcOpticalFlowFarneback(
         pair.image_next[..., 1], pair.image_ref[..., 1], None, 0.5, 3, 25, 3, 7, 1.5, 0
@@ -144,10 +77,6 @@ def orbit(tmp_path_factory):
 def problem(folder, **flow):
     source = {"kind": "files", "ref": "a.png", "next": "b.png", "fov": 60}
     return make_problem({"input": source, "flow": flow, "base": str(folder)})
-
-
-def test_a_flow_with_two_planes_first_is_turned(orbit):
-    assert (read_flow(orbit / "turned.npy") == read_flow(orbit / "forward.flo")).all()
 
 
 def test_a_backward_flow_or_a_map_is_the_confidence(orbit):

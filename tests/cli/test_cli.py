@@ -176,9 +176,6 @@ def images(tmp_path_factory) -> Path:
     cv2.imwrite(str(folder / "a.png"), pair.image_ref[..., ::-1])
     cv2.imwrite(str(folder / "b.png"), pair.image_next[..., ::-1])
     cv2.imwrite(str(folder / "small.png"), pair.image_next[:50, :50, ::-1])
-    cv2.imwrite(str(folder / "grey16.png"), pair.image_ref[..., 0].astype(np.uint16) * 257)
-    rgba = np.dstack([pair.image_next[..., ::-1], np.full((120, 160), 255, np.uint8)])
-    cv2.imwrite(str(folder / "rgba.png"), rgba)
     cv2.imwrite(str(folder / "flat.png"), np.full((120, 160, 3), 128, np.uint8))
     flow = pair.truth.flow.astype(np.float32)
     write_flo(folder / "true.flo", flow)
@@ -236,13 +233,6 @@ def test_an_unwritable_output_is_refused(images, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert solve_files(images, tmp_path / "file" / "out") == 2
     assert "cannot be written" in capsys.readouterr().err
-
-
-def test_any_kind_of_image_is_read(images, tmp_path):
-    """More kinds, without a solve, in test_any_picture."""
-    changes = {"ref": "grey16.png", "next": "rgba.png"}
-    assert solve_files(images, tmp_path, flow="true.flo", **changes) in (0, 1)
-    assert (tmp_path / "overview.png").exists()
 
 
 def test_zero_flow_gives_a_constant_depth_and_says_so(images, tmp_path):

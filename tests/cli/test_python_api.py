@@ -11,6 +11,7 @@ import pytest
 
 import soup_nlp
 from soup_nlp.config.problem import SegmentationOptions
+from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
@@ -41,6 +42,7 @@ def test_a_camera_is_a_field_of_view_or_guess():
     np.testing.assert_array_equal(pair.K_next, pair.K_ref)
     with pytest.warns(DataWarning, match="no intrinsics; focal length 77 px"):
         pair = soup_nlp.Pair(image, image)
+    assert pair.focal_sigma == GUESS_SIGMA
     # a copy keeps it
     with warnings.catch_warnings():
         warnings.simplefilter("error")

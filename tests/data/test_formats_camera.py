@@ -127,11 +127,6 @@ def test_image_errors(tmp_path: Path) -> None:
         read_image(tmp_path / "none.png")
     with raises(r"cannot be decoded[\s\S]*not an i"):
         read_image(put(tmp_path / "a.png", b"not an image at all"))
-    noise = np.random.default_rng(0).integers(0, 256, (32, 32, 3)).astype(np.uint8)
-    for suffix in (".png", ".jpg"):
-        content = cv2.imencode(suffix, noise)[1].tobytes()
-        with raises("is truncated"):
-            read_image(put(tmp_path / f"t{suffix}", content[: len(content) // 2]))
     cv2.imwrite(str(tmp_path / "f.tiff"), np.zeros((4, 4), np.float32))
     with raises("neither 8-bit nor 16-bit"):
         read_image(tmp_path / "f.tiff")

@@ -74,7 +74,9 @@ def test_flows_are_taken_in_both_layouts_and_from_files(tmp_path):
     known = np.ones((40, 60))
     known[3, 4] = 0
     filled = np.where(known[..., None] > 0, uv, 0)
-    for given in (uv, np.moveaxis(uv, 2, 0), tmp_path / "uv.npy", str(tmp_path / "uv.npy")):
+    np.save(tmp_path / "turned.npy", np.moveaxis(uv, 2, 0))
+    files = tmp_path / "uv.npy", str(tmp_path / "uv.npy"), tmp_path / "turned.npy"
+    for given in (uv, np.moveaxis(uv, 2, 0), *files):
         for flow in (Flow(given), Pair(IMAGE, IMAGE, K, flow=given).flow):
             np.testing.assert_array_equal(flow.uv, filled)
             np.testing.assert_array_equal(flow.confidence, known)

@@ -54,6 +54,8 @@ def test_each_frame_has_its_own_camera(tmp_path: Path) -> None:
             np.testing.assert_allclose((K[0, 0], *K[:2, 2]), np.multiply(numbers, [scale, 1, 1]))
             assert K[1, 1] == K[0, 0]
             assert (name in text) == (fov is None)
+    with pytest.raises(ConfigError, match="0 to 180"):
+        load(tmp_path, "wide.jpg", "tele.jpg", fov=180.0)
 
 
 # --- implausible intrinsics ----------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+import warnings
 import zlib
 from pathlib import Path
 
@@ -13,7 +14,9 @@ import pytest
 from helpers_photos import load, photo, photos, said, texture
 from PIL import Image, features
 
+from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.formats.images import DataWarning, read_image, read_images
+from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 
 
@@ -96,9 +99,22 @@ SENSOR = {"FocalPlaneXResolution": 4438.36, "FocalPlaneResolutionUnit": 2}
         ),
         ({"FocalLengthIn35mmFilm": 9000}, 1.2, "0.2 degrees of view.* is implausible"),
         ({"FocalLengthIn35mmFilm": 1}, 1.2, "is implausible"),
+        # 5 mm of a sensor of 8 mm, stored ten times as large, resolution in centimetres
+        (
+            {
+                "FocalLength": 5.0,
+                "FocalPlaneXResolution": 1200.0,
+                "FocalPlaneResolutionUnit": 3,
+                "ExifImageWidth": 960,
+            },
+            5 / 8,
+            "from EXIF",
+        ),
+        # millimetres alone say nothing
+        ({"FocalLength": 5.0}, 1.2, "1.2 times the longer side.*--fov"),
     ],
 )
-def test_an_absurd_focal_length_is_ignored(
+def test_the_focal_length_is_that_of_exif_if_it_is_plausible(
     tags: dict[str, float], focal: float, word: str, tmp_path: Path
 ) -> None:
     for name in "ab":
@@ -106,6 +122,10 @@ def test_an_absurd_focal_length_is_ignored(
     pair, text = said(tmp_path, "a.jpg", "b.jpg")
     assert re.search(word, text)
     assert pair.K_ref[0, 0] == pytest.approx(focal * 96, rel=1e-3)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
+        made = Pair(tmp_path / "a.jpg", tmp_path / "b.jpg")
+    sigma = 0.0 if word == "from EXIF" else GUESS_SIGMA
+    assert made.focal_sigma == pair.focal_sigma == sigma
 
 
 # --- pictures of more than 8 bits ----------------------------------------------------------------

@@ -12,11 +12,17 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from soup_nlp.bench.solvers import runner
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import make_problem
 from soup_nlp.family import run_solver
-from soup_nlp.family.instances import STANDARD
+from soup_nlp.family.instances import STANDARD, record_of
 from soup_nlp.family.pages import _reached
+from soup_nlp.pipeline.case import prepare
 
 pytestmark = pytest.mark.slow
+
+STUB = "SOUP-room-unit-offset-smooth-N100"
 
 
 def test_what_solvers_reached_is_said_by_start():
@@ -37,7 +43,7 @@ def test_what_solvers_reached_is_said_by_start():
 
 
 def test_casadis_form_is_read_back(folder):
-    text = (folder / "SOUP-room-unit-offset-smooth-N100.casadi").read_text()
+    text = (folder / f"{STUB}.casadi").read_text()
     data = ca.StringDeserializer(text)
     nlp, *vectors = [data.unpack() for _ in range(8)]
     lbx, ubx, lbg, ubg, *starts = (np.array(v).ravel() for v in vectors)
@@ -52,7 +58,7 @@ def test_casadis_form_is_read_back(folder):
 
 def test_casadis_form_is_read_without_casadi(folder):
     reader = pytest.importorskip("casadi_reader")
-    path = folder / "SOUP-room-unit-offset-smooth-N100.casadi"
+    path = folder / f"{STUB}.casadi"
     found = reader.read_casadi(str(path))
     function, *vectors = found["roots"]
     fields = found["objects"][function["$ref"]]["fields"]
@@ -68,12 +74,11 @@ def test_casadis_form_is_read_without_casadi(folder):
 def test_the_runner_judges_an_answer(move, word, folder, tmp_path, capsys):
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     # a solver that returns the best known point, or one off the constraints, and claims success
-    stub = "SOUP-room-unit-offset-smooth-N100"
     program = tmp_path / "mine"
     program.write_text(
         f"#!{sys.executable}\n"
         "import sys\n"
-        f"text = open('{stub}.sol').read().splitlines()\n"
+        f"text = open('{STUB}.sol').read().splitlines()\n"
         "first = text.index('Options') + 9\n"
         f"text[first] = repr(float(text[first]) + {move})\n"
         "open(sys.argv[1] + '.sol', 'w').write('\\n'.join(text) + '\\n')\n"
@@ -99,3 +104,47 @@ def test_the_runner_knows_limits_and_other_minima(tmp_path):
     assert judged(point, 11.0, 0.0, float("nan")) == "differs"
     (tmp_path / "x.sol").write_text("cut off\n\nOptions\n3\n")
     assert run_solver.read_point(tmp_path / "x.sol") is None
+
+
+PROGRAM = """#!{python}
+# a solver that knows one iteration: it returns the start, and claims that it is optimal
+import sys
+stub, flag, *options = sys.argv[1:]
+assert flag == "-AMPL"
+lines = open(stub + ".nl").read().split("\\n")
+n, m = map(int, lines[1].split()[:2])
+first = lines.index(f"x{{n}}") + 1
+values = [line.split()[1] for line in lines[first : first + n]]
+head = ["mine with " + " ".join(options), "", "Options", "3", "0", "1", "0", m, 0, n, n]
+open(stub + ".sol", "w").write("\\n".join(map(str, [*head, *values, "objno 0 0"])) + "\\n")
+"""
+
+
+def test_a_solver_of_ones_own_is_a_command_line(tmp_path, monkeypatch, capsys):
+    program = tmp_path / "mine"
+    program.write_text(PROGRAM.format(python=sys.executable))
+    program.chmod(0o755)
+    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 128, "height": 64}
+    own = {
+        "input": scene,
+        "segmentation": {"superpixels": 20, "neighbours": 4},
+        "energy": {"pixel_samples": 4},
+        "flow": {"source": "truth"},
+    }
+    record = record_of(prepare(make_problem(own)))
+    monkeypatch.setattr(runner, "load_frozen", lambda scene, size: record)
+    entry = {"name": f"{STUB}-hard", "best_known": {"objective": 1.0}}
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "index.json").write_text(json.dumps({"instances": [entry]}))
+    out = tmp_path / "out"
+    words = ["compare", str(tmp_path / "set"), "-o", str(out), "--solvers", f"{program} fast=1"]
+    # a false claim is no verified run
+    assert main(words) == 1
+    assert "-" in capsys.readouterr().out
+    result = json.loads((out / "results.json").read_text())["results"][0]
+    assert result["status"] == "mine with fast=1"
+    assert result["claimed"]
+    assert not result["verified"]
+    assert result["dual"] > 1e-2
+    for name in ("README.md", "profiles.png", "reached.json", "runs.jsonl"):
+        assert (out / name).stat().st_size > 0

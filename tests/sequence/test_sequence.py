@@ -330,10 +330,3 @@ def test_warnings_of_pairs_are_printed_as_one_line(workers, tmp_path, capfd):
     lines = capfd.readouterr().err.splitlines()
     assert [line[:8] for line in lines if "no intrinsics" in line] == ["warning:"]
     assert not any("DataWarning" in line for line in lines)
-
-
-def test_files_of_the_user_are_left_alone(tmp_path, capsys):
-    (tmp_path / "chain.json").write_text("mine")
-    assert main(["chain", "scene:street", "--out", str(tmp_path)]) == 2
-    assert "would be overwritten" in capsys.readouterr().err
-    assert (tmp_path / "chain.json").read_text() == "mine"
