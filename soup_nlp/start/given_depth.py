@@ -143,7 +143,7 @@ def by_prior(
         sigma = float(np.clip(wrong, LEAST_SIGMA, RELIEF))
     else:
         contradicted = ratio > POSSIBLE and seen.determined(main)
-        if contradicted or not follows_edges(whole, pair.image_ref, seg.labels, seed):
+        if contradicted or not follows_edges(whole, pair.image_ref, seed):
             return start, nothing
         sigma = UNCONFIRMED
     slope = _slopes(whole, np.isfinite(prior), log_depth, pair, seg)
