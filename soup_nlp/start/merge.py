@@ -101,15 +101,17 @@ def earned(views: Views, choice: Choice, seg: Segmentation, noise: float) -> tup
     return kept, left & (gain > 3 * noise)
 
 
-def mixtures(
+def unmoved(
     component: Int, choice: Choice, flow: Float, usable: Mask, views: Views, seg: Segmentation
 ) -> Mask:
-    """(N,) True in small pieces whose flow is a mixture of the flows around them, not a motion.
+    """(N,) True in pieces whose flow shows no motion of their own.
 
-    Along a depth discontinuity the flow of a superpixel mixes those of both sides. A piece of at
-    most `SMALL` of all superpixels is a mixture if its flow lies between those of the superpixels
-    of the largest component around it. If its own motion explains its flow badly and hardly better
-    than the main motion does, a flow near those around it is enough.
+    The motion of a piece with more than `SMALL` of all superpixels may be due to a systematic error
+    of the flow if it lowers the mean error by less than the noise. A smaller piece may be a
+    mixture: along a depth discontinuity the flow of a superpixel mixes those of both sides. It is one if its
+    flow lies between those of the superpixels of the largest component around it. If its own motion
+    explains its flow badly and hardly better than the main motion does, a flow near those around it
+    is enough.
 
     Args:
         component: (N,) rigid component of every superpixel.
@@ -122,12 +124,16 @@ def mixtures(
     main, noise = largest(component), limited_noise(choice.error)
     first = int(np.argmax(choice.label == main_motion(choice.label)))
     error = views.fit([Motion(choice.R[first], choice.t[first])]).penalised()[:, 0]
+    gain = np.clip(error - choice.error, 0.0, CLIP) * views.weight.mean(axis=1)
     i, k = seg.pairs.T
     piece = connected_labels(component[i] == component[k], seg)
-    mixed = np.zeros(len(seg), bool)
+    apart, mixed = choice.label != main_motion(choice.label), np.zeros(len(seg), bool)
     for p in np.unique(piece[(component != main) & usable]):
         at = piece == p
-        if at.mean() > SMALL or usable[at].mean() <= 0.5:
+        if at.mean() > SMALL:
+            mixed |= at & (apart[at].any() and gain[at].mean() < noise)
+            continue
+        if usable[at].mean() <= 0.5:
             continue
         around = np.concatenate([k[at[i] & ~at[k]], i[at[k] & ~at[i]]])
         around = around[usable[around] & (component[around] == main)]

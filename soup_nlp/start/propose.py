@@ -32,7 +32,7 @@ from soup_nlp.start.components import (
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import above_ground, floating, ground
 from soup_nlp.start.homographies import unorganised
-from soup_nlp.start.merge import earned, gather, mixtures
+from soup_nlp.start.merge import earned, gather, unmoved
 from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
 from soup_nlp.start.settle import settle
 from soup_nlp.start.start_options import SeededStart
@@ -176,7 +176,7 @@ def propose(
         grounded = weak & (floor > 0)
     soup = soup.normalised()
     moved = (centre - views.anchor)[:, :2] * views.focal
-    mixed = mixtures(component, choice, moved, usable, views, seg) & ~(fixed | bends)
+    mixed = unmoved(component, choice, moved, usable, views, seg) & ~(fixed | bends)
     part = moving_parts(np.where(mixed, largest(component), component), views, seg, fixed | bends)
     own = soup, error, parallax, weak, label, component, part
     found = *own, motions, surface, tie, grounded, bends

@@ -337,8 +337,21 @@ def test_a_mixture_of_two_flows_does_not_move(shift, own, size, mixed):
     choice = taken(views, np.where(piece, 0.1 - own / PER_RADIAN, 0.0), piece.astype(int))
     flow = np.zeros((len(seg), 2))
     flow[:, 0] = np.where(piece, shift, np.where(row < 8, 0.0, 4.0))
-    found = gathering.mixtures(piece.astype(int), choice, flow, np.ones(len(seg), bool), views, seg)
+    found = gathering.unmoved(piece.astype(int), choice, flow, np.ones(len(seg), bool), views, seg)
     np.testing.assert_array_equal(found, piece & mixed)
+
+
+@pytest.mark.parametrize(("gain", "moves"), [(0.04, False), (0.06, True)])
+def test_a_motion_that_explains_little_more_is_none(gain, moves):
+    """The noise of the flow is 0.05 px."""
+    seg = cells(16, 32)
+    row, column = (seg.anchors // 8).astype(int).T[::-1]
+    piece = (row < 8) & (column < 8)
+    views = Turns(np.where(piece, gain / PER_RADIAN, 0.0))
+    choice = taken(views, np.where(piece, gain / PER_RADIAN, 0.0), piece.astype(int))
+    flow = np.where(piece, 9.0, 0.0)[:, None] * [1.0, 0.0]
+    found = gathering.unmoved(piece.astype(int), choice, flow, np.ones(len(seg), bool), views, seg)
+    np.testing.assert_array_equal(found, piece & (not moves))
 
 
 def test_what_contact_makes_too_fast_comes_a_third_nearer():
