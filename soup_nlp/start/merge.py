@@ -108,10 +108,10 @@ def unmoved(
 
     The motion of a piece with more than `SMALL` of all superpixels may be due to a systematic error
     of the flow if it lowers the mean error by less than the noise. A smaller piece may be a
-    mixture: along a depth discontinuity the flow of a superpixel mixes those of both sides. It is one if its
-    flow lies between those of the superpixels of the largest component around it. If its own motion
-    explains its flow badly and hardly better than the main motion does, a flow near those around it
-    is enough.
+    mixture: along a depth discontinuity the flow of a superpixel mixes those of both sides. It is
+    one if its flow lies between those of the superpixels of the largest component around it. If its
+    own motion explains its flow badly and hardly better than the main motion does, a flow near
+    those around it is enough.
 
     Args:
         component: (N,) rigid component of every superpixel.
