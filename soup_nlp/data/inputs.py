@@ -26,7 +26,7 @@ from soup_nlp.data.scenes.catalogue import SCENES, render_scene
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.limits import MAX_SIDE
-from soup_nlp.schema.section import Finite, Index, Positive, Section, Seed
+from soup_nlp.schema.section import Finite, Index, NonNegative, Positive, Section, Seed
 
 SAME_SHAPE = 0.02
 """Largest relative difference of the aspect ratios of a prior and its image."""
@@ -98,6 +98,8 @@ class FilesInput(FramesInput):
     fov: Positive | None = None
     """Horizontal field of view of the reference frame as shown, degrees, where `intrinsics` is
     null; the next frame has the same lens unless EXIF names another."""
+    focal_sigma: NonNegative = 0.0
+    """Standard deviation of the logarithm of the focal length of `fov`, which counts in sigma."""
     intrinsics_next: Camera | str | None = None
     """Camera of the next frame, in the same forms; null for that of the reference frame."""
     depth: str | None = None
@@ -135,6 +137,7 @@ class FilesInput(FramesInput):
             "files",
             self.white,
             fov=self.fov,
+            focal_sigma=self.focal_sigma,
             cropped=self.cropped,
             distortion=[d for _, d in lenses] if self.undistort else (),
         )

@@ -208,7 +208,8 @@ class Pair:
         name: Name for titles and folders.
         depth_prior: (H, W) depth of the reference frame from elsewhere, or an inverse depth or an
             order (`data.inputs.PriorOptions`); NaN where unknown. An array or the name of a file.
-        focal_sigma: Standard deviation of the log focal length; 0 where it is given.
+        focal_sigma: Standard deviation of the log focal length; 0 where it is given. One as large
+            as that of a mere guess (0.4) lets the flow correct the focal length.
 
     Raises:
         DataError: an image has a wrong shape or type, a camera is invalid, or sizes differ.

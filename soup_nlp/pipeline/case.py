@@ -11,6 +11,7 @@ from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_depth, follow_flow
 from soup_nlp.data.flow.layers import corrected, still, without_still_layer
 from soup_nlp.data.flow.sources import is_named
+from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.working_size import resized_flow, working_size
 from soup_nlp.errors import DataError
@@ -104,7 +105,7 @@ def prepare(
     done("segmentation", seg)
     options = SeededStart(**dict(problem.start), seed=problem.seed)
     fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
-    if pair.focal_sigma > 0:
+    if pair.focal_sigma >= GUESS_SIGMA:
         views = fitted.views
         found = views.ray.reshape(-1, 3), views.target.reshape(-1, 3), views.weight.ravel()
         better = focal_length(*found, views.focal[0], pair.focal_sigma, problem.seed)

@@ -8,15 +8,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from soup_nlp.config.problem import make_problem, title
+import numpy as np
+
+from soup_nlp.config.problem import Problem, make_problem, title
 from soup_nlp.data.accept import ImageLike, image_of, is_path
 from soup_nlp.data.formats.images import DataWarning, read_image
 from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence.chain import Chain, make_chain
 from soup_nlp.sequence.folder import SINGLE, chain_files, write_chain
 from soup_nlp.sequence.frames import (
     MAX_STEP,
+    PROBED,
     VIDEOS,
     Frames,
     Raw,
@@ -100,6 +104,7 @@ def solve_chain(
     found = _frames(frames, folder, camera, step, most, depth_scale)
     count = len(found)
     claim(folder, chain_files(count), overwrite, subject)
+    found = one_camera(found, overrides)
     which = [(k, k + 1) for k in range(count - 1)]
     over = [(k, k + 2) for k in range(count - 2)] if two_frame else []
     if begin:
@@ -109,6 +114,46 @@ def solve_chain(
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
         write_chain(new, chain, name, found.names, over)
     return chain
+
+
+def one_camera(frames: Frames, overrides: Sequence[str] = ()) -> Frames:
+    """The frames with one focal length for all, where it is only a guess.
+
+    The flows of up to `PROBED` pairs across the sequence are independent measurements of its
+    logarithm, each with the deviation of the guess as its prior. A known camera is left as it is.
+    """
+    if frames.scene is not None or frames.camera.keys() & {"intrinsics", "fov"}:
+        return frames
+    # every solve gives the warnings of its images
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
+        first = _problem(frames, 0, overrides).load_pair()
+        if not first.focal_sigma > 0:
+            return frames
+        last = len(frames) - 2
+        some = np.unique(np.linspace(0, last, min(last + 1, PROBED)).astype(int))
+        pairs = [prepare(_problem(frames, int(k), overrides)).pair for k in some]
+    guess = first.K_ref[0, 0] / first.size[1]
+    factor = np.array([pair.K_ref[0, 0] / pair.size[1] / guess for pair in pairs])
+    sigmas = np.array([pair.focal_sigma for pair in pairs])
+    prior = first.focal_sigma**-2
+    total = prior + float(np.sum(sigmas**-2 - prior))
+    focal = first.K_ref[0, 0] * float(np.exp(sigmas**-2 @ np.log(factor) / total))
+    # distortion is an error of all pairs: together they are no surer than the surest one
+    sigma = float(sigmas.min())
+    fov = float(np.degrees(2 * np.arctan(first.size[1] / (2 * focal))))
+    warnings.warn(
+        f"{frames.names[0]}: no intrinsics; focal length of all frames by the flow {focal:.0f} px"
+        f" ({fov:.0f} degrees of view horizontally), right to {sigma:.0%}",
+        DataWarning,
+        stacklevel=3,
+    )
+    return replace(frames, camera={**frames.camera, "fov": fov, "focal_sigma": sigma})
+
+
+def _problem(frames: Frames, k: int, overrides: Sequence[str]) -> Problem:
+    """The problem of two frames that follow each other."""
+    raw = {"input": frames.pair(k, k + 1), "base": str(Path.cwd())}
+    return make_problem(raw, overrides, where="sequence")
 
 
 def named(frames: Source, folder: Path | None = None) -> tuple[str, str]:

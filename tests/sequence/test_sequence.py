@@ -16,17 +16,20 @@ from helpers_result import CAMERA, small_result
 from soup_nlp.bench import tables as chain_study
 from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.cli.main import main
+from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.rotation import exp
+from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence import pairs
 from soup_nlp.sequence.chain import Link, follow, link, make_chain, number, solve_scales
 from soup_nlp.sequence.folder import COLMAP_POINTS, chain_files, write_chain
-from soup_nlp.sequence.frames import scene_frames
+from soup_nlp.sequence.frames import Frames, scene_frames
 from soup_nlp.sequence.fused import fuse, movers
 from soup_nlp.sequence.pairs import SolvedPair, carried
 from soup_nlp.sequence.score import aligned
+from soup_nlp.sequence.solve import one_camera
 
 pytestmark = pytest.mark.slow
 
@@ -330,3 +333,22 @@ def test_warnings_of_pairs_are_printed_as_one_line(workers, tmp_path, capfd):
     lines = capfd.readouterr().err.splitlines()
     assert [line[:8] for line in lines if "no intrinsics" in line] == ["warning:"]
     assert not any("DataWarning" in line for line in lines)
+
+
+@pytest.mark.filterwarnings("ignore:.*no intrinsics")
+def test_frames_without_a_camera_get_one_focal_length(tmp_path):
+    names = [str(tmp_path / f"{k}.png") for k in range(3)]
+    for k, name in enumerate(names):
+        pair = render_scene("room", 1, 320, 216, k)
+        write_png(tmp_path / name, pair.image_ref)
+    fast = ["segmentation.superpixels=100"]
+    camera = one_camera(Frames(tuple(names)), fast).camera
+    focal = 160 / np.tan(np.radians(camera["fov"] / 2))
+    assert focal == pytest.approx(pair.K_ref[0, 0], rel=0.1)  # the guess is 1.5 times as long
+    assert 0.05 <= camera["focal_sigma"] < 0.2
+    # the solve of a pair takes it as it is
+    found = prepare(make_problem({"input": Frames(tuple(names), camera).pair(0, 1)}, fast)).pair
+    assert found.K_ref[0, 0] == pytest.approx(focal)
+    assert found.focal_sigma == camera["focal_sigma"]
+    known = Frames(tuple(names), {"fov": 60})
+    assert one_camera(known, fast) is known

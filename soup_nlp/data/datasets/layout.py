@@ -112,6 +112,7 @@ def make_pair(
     white: int | None = None,
     *,
     fov: float | None = None,
+    focal_sigma: float = 0.0,
     cropped: bool = False,
     distortion: Sequence[Float] = (),
 ) -> Pair:
@@ -125,6 +126,7 @@ def make_pair(
         name: Name of the pair.
         white: Value of white in 16-bit images, see `read_images`.
         fov: Horizontal field of view, degrees, if the cameras are not known.
+        focal_sigma: Standard deviation of the log focal length of `fov`.
         cropped: The images are parts of larger ones, see `check_camera`.
         distortion: Coefficients (n,) of both lenses, removed from the images, see `undistorted`.
 
@@ -133,9 +135,9 @@ def make_pair(
     """
     # a given camera may belong to the stored or to the rotated image
     pictures = read_images(images, white, turn=all(K is None for K in cameras))
-    focal_sigma = 0.0
     if any(K is None for K in cameras):
-        estimated, focal_sigma = estimated_cameras(images, pictures, fov)
+        estimated, guessed = estimated_cameras(images, pictures, fov)
+        focal_sigma = max(focal_sigma, guessed)
     own = [estimated[k] if K is None else K for k, K in enumerate(cameras)]
     check_cameras(own, pictures, images, cropped)
     for k, coefficients in enumerate(distortion):
