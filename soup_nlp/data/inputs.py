@@ -99,7 +99,8 @@ class FilesInput(FramesInput):
     """Horizontal field of view of the reference frame as shown, degrees, where `intrinsics` is
     null; the next frame has the same lens unless EXIF names another."""
     focal_sigma: NonNegative = 0.0
-    """Standard deviation of the logarithm of the focal length of `fov`, which counts in sigma."""
+    """Standard deviation of the logarithm of the focal length of `fov`, which counts in sigma. From
+    0.4, that of a guess, the flow also corrects the focal length."""
     intrinsics_next: Camera | str | None = None
     """Camera of the next frame, in the same forms; null for that of the reference frame."""
     depth: str | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.working_size import resized_flow, working_size
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
-from soup_nlp.geometry.graph import BETA, BETA_COLOUR, Segmentation, build_segmentation
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import Labels, segment
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import (
@@ -100,8 +101,10 @@ def prepare(
     assert flow is not None
     labels = superpixels(problem, pair)
     samples = None if s.boundary_samples == "all" else s.boundary_samples
-    graphs = s.neighbours, BETA, BETA_COLOUR, samples
-    seg = build_segmentation(labels, pair.image_ref, *graphs)
+    segmented = partial(
+        build_segmentation, image=pair.image_ref, neighbours=s.neighbours, boundary_samples=samples
+    )
+    seg = segmented(labels)
     done("segmentation", seg)
     options = SeededStart(**dict(problem.start), seed=problem.seed)
     fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
@@ -114,11 +117,11 @@ def prepare(
         fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
         if log:
             log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
-    start, given = _begin(problem, pair, seg, fitted)
+    start, given = _begin(problem, pair, seg, fitted, options)
     if given is not None and given.inside is not None and s.follow_flow_px is not None:
-        other = build_segmentation(follow_depth(labels, given.inside), pair.image_ref, *graphs)
+        other = segmented(follow_depth(labels, given.inside))
         fitted = FlowFit.of(other, flow, pair.K_ref, pair.K_next, options)
-        again = _begin(problem, pair, other, fitted)
+        again = _begin(problem, pair, other, fitted, options)
         # a prior near a limit of the tests keeps the superpixels on which it has passed them
         if again[1] is not None and again[1].used:
             seg, (start, given) = other, again
@@ -140,12 +143,11 @@ def prepare(
 
 
 def _begin(
-    problem: Problem, pair: Pair, seg: Segmentation, fitted: FlowFit
+    problem: Problem, pair: Pair, seg: Segmentation, fitted: FlowFit, options: SeededStart
 ) -> tuple[Start, Given | None]:
     """The start on given superpixels, and what the depth prior of the pair decides, if any."""
     flow = pair.flow
     assert flow is not None
-    options = SeededStart(**dict(problem.start), seed=problem.seed)
     start = propose(seg, flow, pair.K_ref, pair.K_next, options, fitted)
     weights = problem.energy.weights
     if weights.order > 0:

@@ -106,7 +106,7 @@ def found_words(run: Run) -> list[str]:
         lines.append(f"{kind}: {rest} ({size} of the image{' each' * (rest > 1)})")
     if run.pair.focal_sigma > 0:
         focal, error = run.pair.K_ref[0, 0], run.pair.focal_sigma
-        by = "as the flow has it" if error <= UNSURE_FOCAL else "a guess"
+        by = "by the flow" if error <= UNSURE_FOCAL else "a guess"
         lines.append(f"the focal length is {focal:.0f} px, right to {error:.0%} ({by})")
     if run.given is not None:
         lines.append(str(run.given))

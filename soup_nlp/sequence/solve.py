@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import numpy as np
 from soup_nlp.config.problem import Problem, make_problem, title
 from soup_nlp.data.accept import ImageLike, image_of, is_path
 from soup_nlp.data.formats.images import DataWarning, read_image
-from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.errors import ConfigError, DataError, SoupError
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence.chain import Chain, make_chain
@@ -104,11 +105,11 @@ def solve_chain(
     found = _frames(frames, folder, camera, step, most, depth_scale)
     count = len(found)
     claim(folder, chain_files(count), overwrite, subject)
-    found = one_camera(found, overrides)
     which = [(k, k + 1) for k in range(count - 1)]
     over = [(k, k + 2) for k in range(count - 2)] if two_frame else []
     if begin:
         begin(found, len(which) + len(over))
+    found = one_camera(found, overrides)
     pairs = solve_pairs(found, [*which, *over], folder, overrides, workers, say)
     chain = make_chain(pairs[: len(which)], pairs[len(which) :])
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
@@ -120,7 +121,8 @@ def one_camera(frames: Frames, overrides: Sequence[str] = ()) -> Frames:
     """The frames with one focal length for all, where it is only a guess.
 
     The flows of up to `PROBED` pairs across the sequence are independent measurements of its
-    logarithm, each with the deviation of the guess as its prior. A known camera is left as it is.
+    logarithm, each with the deviation of the guess as its prior. A known camera is left as it is,
+    and a pair that cannot be started is left out.
     """
     if frames.scene is not None or frames.camera.keys() & {"intrinsics", "fov"}:
         return frames
@@ -131,7 +133,12 @@ def one_camera(frames: Frames, overrides: Sequence[str] = ()) -> Frames:
             return frames
         last = len(frames) - 2
         some = np.unique(np.linspace(0, last, min(last + 1, PROBED)).astype(int))
-        pairs = [prepare(_problem(frames, int(k), overrides)).pair for k in some]
+        pairs = []
+        for k in some:
+            with suppress(SoupError):
+                pairs.append(prepare(_problem(frames, int(k), overrides)).pair)
+    if not pairs:
+        return frames
     guess = first.K_ref[0, 0] / first.size[1]
     factor = np.array([pair.K_ref[0, 0] / pair.size[1] / guess for pair in pairs])
     sigmas = np.array([pair.focal_sigma for pair in pairs])

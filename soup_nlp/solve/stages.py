@@ -134,8 +134,9 @@ def _near(stage: Stage) -> bool:
 def _far(stages: Sequence[Stage]) -> bool:
     """Whether the exact Hessian ended, by itself or at its limit, before a minimum."""
     last = stages[-1] if stages else None
-    ended = last is not None and last.name == EXACT and last.status not in STOPPED
-    return ended and not stages[-1].converged
+    if last is None or last.name != EXACT or last.status in STOPPED:
+        return False
+    return not last.converged
 
 
 @dataclass(frozen=True)

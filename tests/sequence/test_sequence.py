@@ -352,3 +352,12 @@ def test_frames_without_a_camera_get_one_focal_length(tmp_path):
     assert found.focal_sigma == camera["focal_sigma"]
     known = Frames(tuple(names), {"fov": 60})
     assert one_camera(known, fast) is known
+
+
+@pytest.mark.filterwarnings("ignore:.*no intrinsics")
+def test_a_pair_without_flow_says_nothing_of_the_focal_length(tmp_path):
+    names = [str(tmp_path / f"{k}.png") for k in range(2)]
+    for name in names:
+        write_png(tmp_path / name, np.full((216, 320, 3), 128, np.uint8))
+    flat = Frames(tuple(names))
+    assert one_camera(flat, ["segmentation.superpixels=20"]) is flat

@@ -6,8 +6,6 @@ truth of the rendered pair is in the usual coordinates, those of the reference c
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from soup_nlp.arrays import Float
@@ -179,7 +177,7 @@ def _banner(b: SceneBuilder) -> Scene:
     return Scene(bodies, *_sideways(b))
 
 
-_LAYOUTS: dict[str, tuple[Callable[[SceneBuilder], Scene], float, float]] = {
+_LAYOUTS: everyday.Layouts = {
     "street": (_street, 0.9, 1.0),
     "room": (_room, 0.8, 1.0),
     "sheet": (_sheet, 0.9, 1.0),
@@ -188,8 +186,7 @@ _LAYOUTS: dict[str, tuple[Callable[[SceneBuilder], Scene], float, float]] = {
     "banner": (_banner, 0.8, 1.0),
     **everyday.LAYOUTS,
 }
-"""Layout, focal length (in image widths) and contrast of each scene. The place of a scene in this
-table is part of its seed, so that new ones go last."""
+"""The place of a scene in this table is part of its seed, so that new ones go last."""
 
 SCENES = {name: str(layout.__doc__) for name, (layout, *_) in _LAYOUTS.items()}
 """Description of every scene by name."""

@@ -222,7 +222,9 @@ def _standing(b: SceneBuilder) -> Scene:
     return Scene(bodies, pose, pose)
 
 
-LAYOUTS: dict[str, tuple[Callable[[SceneBuilder], Scene], float, float]] = {
+Layouts = dict[str, tuple[Callable[[SceneBuilder], Scene], float, float]]
+"""Layout, focal length (in image widths) and contrast of each scene."""
+LAYOUTS: Layouts = {
     "pan": (_pan, 0.85, 0.6),
     "handheld": (_handheld, 0.75, 0.6),
     "swing": (_swing, 0.8, 0.6),
@@ -231,4 +233,3 @@ LAYOUTS: dict[str, tuple[Callable[[SceneBuilder], Scene], float, float]] = {
     "corridor": (_corridor, 0.7, 1.0),
     "standing": (_standing, 0.8, 0.6),
 }
-"""Layout, focal length (in image widths) and contrast of each scene."""
