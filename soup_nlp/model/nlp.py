@@ -13,7 +13,7 @@ from scipy import sparse
 from soup_nlp.arrays import Float
 from soup_nlp.errors import ModelError
 from soup_nlp.model.kernel import Group, Hessian
-from soup_nlp.model.pattern import Pattern, hessian_pattern, jacobian_entries
+from soup_nlp.model.pattern import Pattern, hessian_pattern, jacobian_pattern
 from soup_nlp.model.sums import Sum, summed
 from soup_nlp.model.symbolic import Symbolic
 
@@ -95,7 +95,7 @@ class NLP:
             size, own = group.size, group.table
             place = {"f": np.zeros((size, 1), int), "grad": own.index, "con": own.rows}
             if group.kernel.nc:
-                place["jac"] = next(jacobian).reshape(size, -1)
+                place["jac"] = next(jacobian)
             places.append(place)
         functions = [g.kernel.first_order() for g in self.groups]
         return summed(self.groups, functions, places, self._sums(sizes), self.compiled)
@@ -105,7 +105,7 @@ class NLP:
         """The Hessian; by itself, since a start at a KKT point needs none."""
         pattern = self.hessian_pattern
         functions = [g.kernel.second_order(self.hessian_kind) for g in self.groups]
-        places = [{"hess": p.reshape(g.size, -1)} for g, p in zip(self.groups, pattern.places)]
+        places = [{"hess": p} for p in pattern.places]
         sums = self._sums({"hess": len(pattern.rows)})
         every = [{"hess": f} if f else {} for f in functions]
         return summed(self.groups, every, places, sums, self.compiled)
@@ -122,18 +122,12 @@ class NLP:
     @cached_property
     def jacobian_pattern(self) -> Pattern:
         """Of g's Jacobian; places for every group with constraints."""
-        with_rows = [jacobian_entries(g) for g in self.groups if g.kernel.nc]
-        return Pattern.of((self.ng, self.nx), with_rows)
+        return jacobian_pattern(self.groups, self.ng, self.nx)
 
     @cached_property
     def hessian_pattern(self) -> Pattern:
         """Of the Hessian's upper triangle; places for every group."""
         return hessian_pattern(self.groups, self.nx, self.hessian_kind)
-
-    @cached_property
-    def hessian_sparsity(self) -> Pattern:
-        """`hessian_pattern` without places, a third of the work."""
-        return hessian_pattern(self.groups, self.nx, self.hessian_kind, placed=False)
 
     # --- CasADi's graph: what the exports write and `nlpsol` may differentiate ---
 
@@ -188,7 +182,7 @@ class NLP:
     @property
     def nnzh(self) -> int:
         """Nonzeros of the Hessian's upper triangle."""
-        return len(self.hessian_sparsity.rows)
+        return len(self.hessian_pattern.rows)
 
     def thetas(self, **values: float) -> Float:
         """(nt,) values of theta, with other ones for some of its entries."""

@@ -103,7 +103,7 @@ class Functions:
         gradient = Output(ca.Sparsity.dense(nlp.nx, 1), nlp.gradient)
         jacobian = Output(nlp.jacobian_pattern.sparsity(), nlp.jacobian_nonzeros)
         hessian = Output(
-            nlp.hessian_sparsity.sparsity(),
+            nlp.hessian_pattern.sparsity(),
             lambda x, p, lam_f, lam_g: nlp.hessian_nonzeros(x, lam_g, float(lam_f[0]), p),
         )
         self.oracle = Buffered("nlp", at, {"f": f, "g": g})
