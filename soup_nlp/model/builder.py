@@ -190,11 +190,11 @@ def _kernel(
     x = ca.SX.sym("x", stride * arity)
     row = {k: ca.SX.sym(k, c) for k, c in fields}
     views = [view(x[stride * a : stride * (a + 1)], row, a) for a in range(arity)]
-    every = norms(views, row, _SYMBOLS[0], _SYMBOLS[1])
-    named = [n.name for n in every if norm == "epigraph" and n.kind == "norm"]
+    norms_of_term = norms(views, row, _SYMBOLS[0], _SYMBOLS[1])
+    named = [n.name for n in norms_of_term if norm == "epigraph" and n.kind == "norm"]
     slacks = {k: ca.SX.sym(f"s_{k}") for k in named}
     local = ca.vertcat(x, *slacks.values())
-    forms = [solver_form(n, local, _SYMBOLS[2], slacks.get(n.name)) for n in every]
+    forms = [solver_form(n, local, _SYMBOLS[2], slacks.get(n.name)) for n in norms_of_term]
     kernel = Kernel(
         name,
         local,

@@ -23,9 +23,9 @@ FLAGS = ("-O2", "-march=native", "-fPIC", "-shared", "-fno-math-errno")
 
 def cache_dir() -> Path:
     """Folder of compiled kernels: $SOUP_NLP_CACHE, else $XDG_CACHE_HOME or ~/.cache."""
-    own = os.environ.get("SOUP_NLP_CACHE")
-    if own:
-        return Path(own)
+    folder = os.environ.get("SOUP_NLP_CACHE")
+    if folder:
+        return Path(folder)
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(base) / "soup_nlp"
 

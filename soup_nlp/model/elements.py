@@ -163,10 +163,10 @@ def _prior(data: EnergyData, w: Weights) -> Element:
         "reach": np.linalg.norm(rays["ray_i"] - rays["ray_k"], axis=1),
         **rays,
     }
-    held = bool(data.prior_relief.any())
-    if held:
+    with_relief = bool(data.prior_relief.any())
+    if with_relief:
         columns["relief"] = data.prior_relief
-    return Element(data.edges, columns, Norms(terms.prior, (held,)), 2)
+    return Element(data.edges, columns, Norms(terms.prior, (with_relief,)), 2)
 
 
 def _depth(data: EnergyData, w: Weights) -> Element:

@@ -147,12 +147,12 @@ def sample_pixels(
     count = np.bincount(flat[order], minlength=n)
     s = int(count.max(initial=1)) if samples is None else samples
     start = np.concatenate([[0], np.cumsum(count)[:-1]])
-    place = np.arange(s)[None, :]
-    there = place < count[:, None]
+    slot = np.arange(s)[None, :]
+    filled = slot < count[:, None]
     if not len(order):
-        return np.zeros((n, s), np.int64), there
-    take = np.minimum(start[:, None] + np.where(there, place, 0), len(order) - 1)
-    return order[take], there
+        return np.zeros((n, s), np.int64), filled
+    take = np.minimum(start[:, None] + np.where(filled, slot, 0), len(order) - 1)
+    return order[take], filled
 
 
 def build_energy_data(
@@ -176,10 +176,10 @@ def build_energy_data(
         arap_at_anchors: Motion difference taken at the anchors.
     """
     width = seg.labels.shape[1]
-    index, there = sample_pixels(seg.labels, flow, samples, seed)
+    index, filled = sample_pixels(seg.labels, flow, samples, seed)
     uv = np.stack([index % width, index // width], axis=-1).astype(float)
-    confidence = np.where(there, flow.confidence.ravel()[index].astype(float), 0.0)
-    target = uv + np.where(there[..., None], flow.uv.reshape(-1, 2)[index], 0.0)
+    confidence = np.where(filled, flow.confidence.ravel()[index].astype(float), 0.0)
+    target = uv + np.where(filled[..., None], flow.uv.reshape(-1, 2)[index], 0.0)
     anchor = rays(K_ref, seg.anchors)
     rim = rays(K_ref, seg.rim)
     reach = np.linalg.norm((rim - anchor[:, None])[..., :2], axis=-1).max(axis=1)

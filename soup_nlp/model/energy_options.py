@@ -72,16 +72,16 @@ WIDEST_BENDING_EPS = 0.1
 fraction of a pixel, so a wider smoothing would flatten it."""
 
 
-def bending_weights(own: Weights, superpixels: int) -> Weights:
+def bending_weights(weights: Weights, superpixels: int) -> Weights:
     """The constants for surfaces that bend, in proportion to those of rigid surfaces.
 
     On the same relief 1 - cos between neighbours falls as 1 / N, so that E_orient grows with N.
     """
     usual = Weights()
-    out = {k: v * (getattr(own, k) / getattr(usual, k)) for k, v in BENDING_WEIGHTS.items()}
+    out = {k: v * (getattr(weights, k) / getattr(usual, k)) for k, v in BENDING_WEIGHTS.items()}
     out["orient"] *= superpixels / 1000
     out["leak_arap"] = min(1.0, out["leak_arap"])
-    return own.replace(**out)
+    return weights.replace(**out)
 
 
 class EnergyOptions(Section):

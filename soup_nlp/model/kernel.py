@@ -176,12 +176,12 @@ class Group:
     def __post_init__(self) -> None:
         k, t = self.kernel, self.table
         expected = [(len(t), width) for width in (k.nx, k.row.numel(), k.nc)]
-        found = [a.shape for a in (t.index, t.data, t.rows)]
-        if found != expected:
+        shapes = [a.shape for a in (t.index, t.data, t.rows)]
+        if shapes != expected:
             raise ModelError(
                 "table does not fit its kernel",
                 where=k.name,
-                found=f"index, data, rows {found}",
+                found=f"index, data, rows {shapes}",
                 expected=f"index, data, rows {expected}",
             )
         if not np.isfinite(t.data).all():

@@ -96,12 +96,12 @@ class MatrixLayout:
 
     def names(self) -> list[str]:
         """Readable names in order: `lam[17]`, `n[17,2]`, `R[17,2,1]` (row, column from 1)."""
-        own = ["lam[{i}]", *(f"n[{{i}},{c}]" for c in (1, 2, 3))]
+        labels = ["lam[{i}]", *(f"n[{{i}},{c}]" for c in (1, 2, 3))]
         if self.gauge != "unit-offset":
-            own.append("d[{i}]")
-        own += [f"R[{{i}},{r},{c}]" for c in (1, 2, 3) for r in (1, 2, 3)]
-        own += [f"t[{{i}},{c}]" for c in (1, 2, 3)]
-        out = [s.format(i=i) for i in range(self.count) for s in own]
+            labels.append("d[{i}]")
+        labels += [f"R[{{i}},{r},{c}]" for c in (1, 2, 3) for r in (1, 2, 3)]
+        labels += [f"t[{{i}},{c}]" for c in (1, 2, 3)]
+        out = [s.format(i=i) for i in range(self.count) for s in labels]
         return out + (["tau"] if self.gauge == "unit-translation" else [])
 
 
@@ -162,8 +162,8 @@ class TangentLayout:
         """Constants (E, ...) that the views of superpixels (E,) need; R0 by columns."""
         i = superpixel
         R0 = self.R0[i].transpose(0, 2, 1).reshape(-1, 9)
-        own = {"anchor": self.anchor[i], "radius": self.radius[i], "depth": self.depth[i]}
-        return {**own, "R0": R0, "t0": self.t0[i]}
+        constants = {"anchor": self.anchor[i], "radius": self.radius[i], "depth": self.depth[i]}
+        return {**constants, "R0": R0, "t0": self.t0[i]}
 
     def pack(self, soup: Soup) -> Float:
         """Vector (9 N,) of a soup in this length unit; slopes are not clipped here."""
@@ -196,8 +196,8 @@ class TangentLayout:
     def names(self) -> list[str]:
         """Readable names in order."""
         plane = ["lam", "s1", "s2"] if self.chart == "depth" else ["rho", "g1", "g2"]
-        own = [*plane, "w1", "w2", "w3", "q1", "q2", "q3"]
-        return [f"{s}[{i}]" for i in range(self.count) for s in own]
+        labels = [*plane, "w1", "w2", "w3", "q1", "q2", "q3"]
+        return [f"{s}[{i}]" for i in range(self.count) for s in labels]
 
 
 def _turned(a: Float) -> Float:

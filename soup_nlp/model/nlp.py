@@ -92,8 +92,8 @@ class NLP:
         jacobian = iter(self.jacobian_pattern.places)
         places = []
         for group in self.groups:
-            size, own = group.size, group.table
-            place = {"f": np.zeros((size, 1), int), "grad": own.index, "con": own.rows}
+            size, table = group.size, group.table
+            place = {"f": np.zeros((size, 1), int), "grad": table.index, "con": table.rows}
             if group.kernel.nc:
                 place["jac"] = next(jacobian)
             places.append(place)

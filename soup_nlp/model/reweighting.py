@@ -34,8 +34,10 @@ def across_components(data: EnergyData, component: Int, factor: float) -> Energy
         factor: 1 is the paper's energy.
     """
     i, k = data.edges.T
-    held = np.where(component[i] == component[k], 1.0, factor)
-    return replace(data, edge_weight=held * data.edge_weight, prior_weight=held * data.prior_weight)
+    factors = np.where(component[i] == component[k], 1.0, factor)
+    return replace(
+        data, edge_weight=factors * data.edge_weight, prior_weight=factors * data.prior_weight
+    )
 
 
 def over_ground(data: EnergyData, soup: Soup, grounded: Mask, weight: Float) -> EnergyData:

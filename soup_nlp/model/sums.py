@@ -82,16 +82,16 @@ def summed(
     Raises:
         ModelError: a kernel has an unknown operation.
     """
-    for group, own, place in zip(groups, functions, places):
-        for f in own.values():
+    for group, own_functions, own_places in zip(groups, functions, places):
+        for f in own_functions.values():
             unknown = {i.operation for i in instructions(f)} - OPERATIONS.keys() - _OTHERS
             if unknown:
                 raise ModelError("unknown operation", where=f.name(), found=NAMES[min(unknown)])
         library, lanes = None, None
-        if compiled and own:
+        if compiled and own_functions:
             try:
                 # one library per kernel: the cache then still holds the kernels that did not change
-                library, lanes = compile_lanes(list(own.values())), Lanes.of(group.table)
+                library, lanes = compile_lanes(list(own_functions.values())), Lanes.of(group.table)
             except NoCompilerError as error:
                 compiled = False
                 log.info(
@@ -99,11 +99,11 @@ def summed(
                     " longer (a C compiler on the PATH, gcc or clang, is used)",
                     error,
                 )
-        for key, f in own.items():
+        for key, f in own_functions.items():
             term: Summed | Vectors
             if library and lanes:
-                term = Summed.of(library, f, lanes, place[key], sums[key].size)
+                term = Summed.of(library, f, lanes, own_places[key], sums[key].size)
             else:
-                term = Vectors(f, group.table, place[key])
+                term = Vectors(f, group.table, own_places[key])
             sums[key].terms.append(term)
     return sums

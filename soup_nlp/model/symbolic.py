@@ -76,11 +76,11 @@ class Symbolic:
     def _local(self, key: str, functions: Sequence[Mapping[str, ca.Function]]) -> list[ca.MX]:
         """A function of every group that has it over its table, element by element."""
         at, out = self._thetas, []
-        for group, own in zip(self._groups, functions):
+        for group, own_functions in zip(self._groups, functions):
             size, width = group.table.data.shape
             data = ca.reshape(self._p[at : at + size * width], width, size)
             at += size * width
-            if key not in own:
+            if key not in own_functions:
                 continue
             x = ca.reshape(self._x[_list(group.table.index)], group.kernel.nx, size)
             given = [x, data, ca.repmat(self._p[: self._thetas], 1, size)]
@@ -88,7 +88,7 @@ class Symbolic:
                 rows = _list(group.table.rows)
                 lam_c = ca.reshape(self._lam_g[rows], -1, size) if rows else ca.MX(0, size)
                 given += [ca.repmat(self._lam_f, 1, size), lam_c]
-            out.append(ca.vec(own[key].map(size)(*given)))
+            out.append(ca.vec(own_functions[key].map(size)(*given)))
         return out
 
 

@@ -66,20 +66,20 @@ def build_tangent_nlp(
     # "inverse-depth" multiplied by rho: the same set, so that one's solution is the other's
     count = data.rim_ray.shape[1] - 1
     off = (data.rim_ray[:, 1:] - data.rim_ray[:, :1])[..., :2] / layout.radius[:, None, None]
-    plane, place = ca.SX.sym("plane", 2 + (chart != "depth")), ca.SX.sym("off", 2 * count)
+    plane, offsets = ca.SX.sym("plane", 2 + (chart != "depth")), ca.SX.sym("off", 2 * count)
     rho, slope = (ca.SX(1), plane) if chart == "depth" else (plane[0], plane[1:])
     ray, reach = ca.SX.sym("ray", 2), ca.SX.sym("radius")
     facing = ca.norm_2(ca.vertcat(slope / reach, rho - ca.dot(slope, ray) / reach))
     b.add_constraint(
         "t_visible",
         plane,
-        ca.vertcat(*[ca.dot(slope, place[2 * j : 2 * j + 2]) for j in range(count)])
+        ca.vertcat(*[ca.dot(slope, offsets[2 * j : 2 * j + 2]) for j in range(count)])
         + (1 - 1 / form.depth_ratio) * rho
         - form.min_facing * facing,
         np.arange(n)[:, None] * 9 + np.arange(3 - plane.numel(), 3),
         lower=0.0,
         upper=np.inf,
-        row=ca.vertcat(place, ray, reach),
+        row=ca.vertcat(offsets, ray, reach),
         data=np.column_stack([off.reshape(n, -1), layout.anchor[:, :2], layout.radius]),
     )
     b.add_ridge(np.ones(9 * n))
@@ -123,8 +123,8 @@ def _add_simplex(b: Builder, soup: Soup, layout: TangentLayout, slanted: bool) -
         m = ca.vertcat(s / reach, (1 if depth else lam) - ca.dot(s, ray) / reach)
         x, row = ca.vertcat(lam, s), ca.vertcat(part, ray, reach)
         value = part * (lam if depth else 1) / ca.norm_2(m)
-        own = layout.share * layout.depth, layout.anchor[:, :2], layout.radius
-        data = np.column_stack(own)
+        constants = layout.share * layout.depth, layout.anchor[:, :2], layout.radius
+        data = np.column_stack(constants)
     index = np.arange(layout.count)[:, None] * 9 + np.arange(x.numel())
     b.add_constraint(
         "t_simplex", x, value, index, lower=1.0, upper=1.0, row=row, data=data, total=True

@@ -99,14 +99,14 @@ def orientation(a: View, b: View, row: Row, eps: ca.SX, truncated: bool) -> list
     return [Norm("turn", row["weight"], a.n - b.n, eps, sigma, kind="half_square")]
 
 
-def prior(a: View, b: View, row: Row, eps: ca.SX, held: bool) -> list[Norm]:
+def prior(a: View, b: View, row: Row, eps: ca.SX, with_relief: bool) -> list[Norm]:
     """E_prior of an edge: slope of the inverse depth between two anchors, relative to it.
 
     With `held`, a given difference `row["relief"]` costs nothing.
     """
     Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
     change = (1 / Xa[2] - 1 / Xb[2]) / _nearness(Xa, Xb)
-    change = change - row["relief"] if held else change
+    change = change - row["relief"] if with_relief else change
     return [Norm("slope", row["weight"], change / row["reach"], eps)]
 
 

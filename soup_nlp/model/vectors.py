@@ -65,18 +65,18 @@ class Vectors:
         inputs = self._x, self._data, self._theta[:, None], self._lam_f[:, None], self._lam_c
         rows, out = [list(own) for own in inputs], list(self._out)
         work = list(np.empty((f.sz_w(), self._out.shape[1])))
-        held: dict[int, Float] = {}
+        registers: dict[int, Float] = {}
         calls: list[tuple[Callable[..., Any], Any]] = []
         for op, to, source, constant in instructions(f):
             if op == ca.OP_INPUT:
-                held[to[0]] = rows[source[0]][source[1]]
+                registers[to[0]] = rows[source[0]][source[1]]
             elif op == ca.OP_CONST:
-                held[to[0]] = np.array([constant])
+                registers[to[0]] = np.array([constant])
             elif op == ca.OP_OUTPUT:
-                calls.append((np.copyto, (out[to[1]], held[source[0]])))
+                calls.append((np.copyto, (out[to[1]], registers[source[0]])))
             else:
-                given = [held[i] for i in source[: OPERATIONS[op].operands]]
-                held[to[0]] = work[to[0]]
+                given = [registers[i] for i in source[: OPERATIONS[op].operands]]
+                registers[to[0]] = work[to[0]]
                 calls.append((OPERATIONS[op].numpy, (*given, work[to[0]])))
         return calls
 

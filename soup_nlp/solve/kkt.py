@@ -31,9 +31,9 @@ UNMET = "Constraints_Violated"
 
 def feasible(soup: Soup, rim_ray: Float, min_facing: float) -> bool:
     """Whether a soup satisfies its constraints within LIMITS; arguments as below."""
-    found = constraint_residuals(soup, rim_ray, min_facing)
+    violations = constraint_residuals(soup, rim_ray, min_facing)
     # false for NaN too
-    return all(found[name] <= limit for name, limit in LIMITS.items())
+    return all(violations[name] <= limit for name, limit in LIMITS.items())
 
 
 def constraint_residuals(soup: Soup, rim_ray: Float, min_facing: float) -> dict[str, float]:

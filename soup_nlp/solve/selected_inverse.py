@@ -111,9 +111,11 @@ def layers(coupled: sparse.csr_matrix, position: Float) -> list[Int]:
     along = position[:, int(np.argmax(np.ptp(position, axis=0)))]
     left, out = np.ones(len(position), bool), []
     while left.any():
-        rest = np.flatnonzero(left)
+        remaining = np.flatnonzero(left)
         # as many as stand in a column
-        layer = rest[np.argsort(along[rest], kind="stable")[: int(np.ceil(np.sqrt(len(rest))))]]
+        layer = remaining[
+            np.argsort(along[remaining], kind="stable")[: int(np.ceil(np.sqrt(len(remaining))))]
+        ]
         while len(layer):
             out.append(layer)
             left[layer] = False

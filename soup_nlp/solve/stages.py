@@ -165,20 +165,24 @@ class _Solve:
         if self.o.exact_iterations and near and not worse:
             first |= warm_start(nlp, self.data, soup, rim)
         stage = self.ipopt(nlp, first, far)
-        found = {"constrained NLP": layout.unpack(stage.x), "presolve": presolved}
+        candidates = {"constrained NLP": layout.unpack(stage.x), "presolve": presolved}
         if not self.o.presolve:
-            del found["presolve"]
-        found["start"] = self.start
-        ends = {k: s.normalised(self.data.share).retracted() for k, s in found.items()}
-        held = self.held(ends)
-        delivered = min(held, key=lambda k: self.energy(held[k]))
-        last = held.get("constrained NLP")
+            del candidates["presolve"]
+        candidates["start"] = self.start
+        ends = {k: s.normalised(self.data.share).retracted() for k, s in candidates.items()}
+        admissible = self.admissible(ends)
+        delivered = min(admissible, key=lambda k: self.energy(admissible[k]))
+        last = admissible.get("constrained NLP")
         # energies at one minimum differ by what the smoothing hides
-        if stage.converged and last and self.energy(last) <= SAME * self.energy(held[delivered]):
+        if (
+            stage.converged
+            and last
+            and self.energy(last) <= SAME * self.energy(admissible[delivered])
+        ):
             delivered = "constrained NLP"
-        final = held[delivered]
+        final = admissible[delivered]
         # a reported success counts only where the constraints hold
-        broken = stage.converged and "constrained NLP" not in held
+        broken = stage.converged and "constrained NLP" not in admissible
         return Solution(
             soup=final,
             status=UNMET if broken else stage.status,
@@ -246,12 +250,12 @@ class _Solve:
         self._ended(stage)
         return stage
 
-    def held(self, ends: Mapping[str, Soup]) -> dict[str, Soup]:
+    def admissible(self, ends: Mapping[str, Soup]) -> dict[str, Soup]:
         """Soups that satisfy the constraints; if none does, the start with tilted planes."""
         data, facing = self.data, self.form.min_facing
-        held = {k: s for k, s in ends.items() if feasible(s, data.rim_ray, facing)}
-        if held:
-            return held
+        kept = {k: s for k, s in ends.items() if feasible(s, data.rim_ray, facing)}
+        if kept:
+            return kept
         rays = data.visibility_ray(self.form.depth_ratio)
         tilted = tilt_to_camera(self.start, data.anchor_ray, rays, facing)
         return {"start": tilted.normalised(data.share).retracted()}
