@@ -21,7 +21,7 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.choice import Choice, dominant
-from soup_nlp.start.components import connected_labels, connected_pieces, largest
+from soup_nlp.start.components import connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion, essential_motion, refine_near
 from soup_nlp.start.merge import candidates
 from soup_nlp.start.start_options import SeededStart
@@ -44,26 +44,23 @@ def systematic_error(noise: float) -> float:
     return float(np.clip(SYSTEMATIC * noise, LEAST_PX, MOST_PX))
 
 
-def turn_alone(
-    views: Views, choice: Choice, component: Int, usable: Mask, noise: float
-) -> Float | None:
-    """The camera's rotation, if it explains the flow of the largest component without depth.
+def turn_alone(views: Views, choice: Choice, usable: Mask, noise: float) -> Float | None:
+    """The camera's rotation, if it explains the flow of the main motion without depth.
 
     It does if the rigid motion of most superpixels, with depths, has an error that is smaller by no
-    more than the systematic error of the flow: movers that the component took along do not count.
+    more than the systematic error of the flow: movers that it took along do not count.
     The focal length is free in the fit, because a wrong one leaves a residual that depths explain.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
         choice: Rigid motion and plane of every superpixel.
-        component: (N,) rigid component of every superpixel.
         usable: (N,) True where the flow counts.
         noise: See `reference_noise`, pixels.
 
     Returns:
         The (3, 3) rotation, or None where the camera's translation is seen.
     """
-    at = np.flatnonzero(usable & (component == largest(component)))
+    at = np.flatnonzero(usable & (choice.label == 0))
     if not len(at):
         return None
     turn, error = fit_turn(views.some(at))
@@ -215,7 +212,7 @@ def surface_motions(
     most = systematic_error(noise) + NOISES * noise
     motions = dominant(views, o)
     fit = views.fit(motions)
-    choice = Choice.of(motions, fit, np.argmin(fit.penalised(), axis=1))
+    choice = Choice(motions, np.argmin(fit.penalised(), axis=1), fit)
     whole = surface[seg.pairs[:, 0]] == surface[seg.pairs[:, 1]]
     surface = joined(surface, usable, seg)
     bends = np.zeros(len(seg), bool)
@@ -223,7 +220,7 @@ def surface_motions(
     while left:
         every = left.pop()
         at = every[usable[every]]
-        tried = candidates(views, choice, at, motions[0].R, noise, o)
+        tried = candidates(views, choice, at, noise, o)
         given = len(tried)
         tried += _least_median(views, at, noise, o)
         excess = views.some(at).fit(tried).cost - residual[at, None]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -175,23 +174,22 @@ class Choice:
     """Chosen motion and plane of every superpixel.
 
     Attributes:
-        R: (N, 3, 3) rotations.
-        t: (N, 3) unit translations.
+        motions: Motions, the most frequent first (`Choice.of`).
+        label: (N,) index of the motion of every superpixel.
         fit: Planes (N, 1) under these motions.
-        label: (N,) index of each motion, -1 where the superpixel has its own. Superpixels with the
-            same index have the same R and t.
     """
 
-    R: Float
-    t: Float
-    fit: PlaneFit
+    motions: list[Motion]
     label: Int
+    fit: PlaneFit
 
     @classmethod
-    def of(cls, motions: list[Motion], fit: PlaneFit, label: Int) -> Choice:
-        """The motions of indices (N,) and their planes, from those (N, M) under all M motions."""
-        R, t = (np.stack([getattr(m, name) for m in motions])[label] for name in ("R", "t"))
-        return cls(R, t, fit.pick((np.arange(len(label)), label)), label)
+    def of(cls, views: Views, motions: list[Motion], label: Int) -> Choice:
+        """Motions by indices (N,), which are numbered by frequency, and their planes."""
+        used, inverse, count = np.unique(label, return_inverse=True, return_counts=True)
+        order = np.argsort(-count, kind="stable")
+        motions, label = [motions[c] for c in used[order]], np.argsort(order)[inverse.ravel()]
+        return cls(motions, label, views.fit(motions, label))
 
     @property
     def error(self) -> Float:
@@ -203,28 +201,10 @@ class Choice:
         """(N,) pixels that each translation moves the anchor."""
         return self.fit.parallax[:, 0] * np.abs(self.fit.inverse_depth[:, 0])
 
-    def taking(self, at: Int, R: Float, t: Float, fit: PlaneFit, label: Int | int) -> Choice:
-        """A copy in which superpixels `at` (K,) have other motions, planes (K, 1) and indices."""
-
-        def put(old: Any, new: Any) -> Any:
-            out = old.copy()
-            out[at] = new
-            return out
-
-        planes = [put(a, b) for a, b in zip(vars(self.fit).values(), vars(fit).values())]
-        return Choice(put(self.R, R), put(self.t, t), PlaneFit(*planes), put(self.label, label))
-
-    def renumbered(self) -> tuple[Choice, list[Motion]]:
-        """The choice with indices by frequency, and the shared motions in the same order."""
-        shared, first, inverse, count = np.unique(
-            self.label, return_index=True, return_inverse=True, return_counts=True
-        )
-        order = np.argsort(-np.where(shared < 0, 0, count), kind="stable")
-        order = order[shared[order] >= 0]
-        number = np.full(len(shared), -1)
-        number[order] = np.arange(len(order))
-        motions = [Motion(self.R[first[c]], self.t[first[c]]) for c in order]
-        return replace(self, label=number[inverse.ravel()]), motions
+    def gain(self, views: Views) -> Float:
+        """(N,) error, pixels, that the motions save over the first one, times the confidence."""
+        alone = views.fit(self.motions[:1]).penalised()[:, 0]
+        return np.clip(alone - self.error, 0.0, CLIP) * views.weight.mean(axis=1)
 
 
 def rigid_choice(
@@ -259,4 +239,4 @@ def rigid_choice(
     # beyond 5 pixels one motion is as wrong as another
     cost = np.minimum(cost + prefer, 5.0)
     label = smooth_choice(cost, flow_affinity(jump, o), seg, o.smoothness)
-    return Choice.of(motions, fit, label), noise
+    return Choice.of(views, motions, label), noise

@@ -32,23 +32,6 @@ def largest(label: Int) -> int:
     return int(np.argmax(np.bincount(label)))
 
 
-def rigid_components(label: Int, seg: Segmentation) -> Int:
-    """Groups that share one scale: all of one dominant motion, or a connected piece without one.
-
-    Args:
-        label: (N,) index of the dominant motion, -1 where the superpixel has its own motion.
-        seg: Superpixels and graphs.
-
-    Returns:
-        (N,) index of the component.
-    """
-    own = label < 0
-    component = label.copy()
-    piece = connected_pieces(own, seg)[own]
-    component[own] = label.max(initial=-1) + 1 + np.unique(piece, return_inverse=True)[1].ravel()
-    return component
-
-
 def borrow(
     mu: Float, slope: Float, label: Int, weak: Mask, seg: Segmentation
 ) -> tuple[Float, Float]:

@@ -55,12 +55,7 @@ def gather(
         choice: Present choice.
         noise: Flow noise, pixels.
         o: Price of differing neighbours, where a surface ends, and seed.
-
-    Returns:
-        The choice with the adopted motions; its indices no longer refer to a list of motions.
     """
-    if not (choice.label >= 0).any():
-        return choice
     gain = least_gain(noise)
     for share in DISCONTINUITIES:
         whole = jump < share * o.discontinuity_px
@@ -84,20 +79,12 @@ def earned(views: Views, choice: Choice, seg: Segmentation, noise: float) -> tup
         The choice, and (N,) True where the main motion does not explain the flow, so that its depth
         is not known.
     """
-    if not (choice.label >= 0).any():
-        return choice, np.zeros(len(seg), bool)
-    main = main_motion(choice.label)
-    first = int(np.argmax(choice.label == main))
-    R, t = choice.R[first], choice.t[first]
-    fit = views.fit([Motion(R, t)])
-    gain = np.clip(fit.penalised()[:, 0] - choice.error, 0.0, CLIP) * views.weight.mean(axis=1)
-    moves = choice.label != main
+    gain, moves = choice.gain(views), choice.label > 0
     region = connected_pieces(moves, seg)
     count, total = (np.bincount(region[moves], v, minlength=1) for v in (None, gain[moves]))
     least = min(LEAST_GAIN_PX, LEAST_GAIN * float(np.median(choice.error)))
     left = moves & ((total < least * count)[region])
-    at = np.flatnonzero(left)
-    kept = choice.taking(at, R, t, fit.pick((at, np.zeros(len(at), int))), main)
+    kept = Choice.of(views, choice.motions, np.where(left, 0, choice.label))
     return kept, left & (gain > 3 * noise)
 
 
@@ -122,12 +109,11 @@ def unmoved(
         seg: Superpixels and graphs.
     """
     main, noise = largest(component), limited_noise(choice.error)
-    first = int(np.argmax(choice.label == main_motion(choice.label)))
-    error = views.fit([Motion(choice.R[first], choice.t[first])]).penalised()[:, 0]
-    gain = np.clip(error - choice.error, 0.0, CLIP) * views.weight.mean(axis=1)
+    error = views.fit(choice.motions[:1]).penalised()[:, 0]
+    gain = choice.gain(views)
     i, k = seg.pairs.T
     piece = connected_labels(component[i] == component[k], seg)
-    apart, mixed = choice.label != main_motion(choice.label), np.zeros(len(seg), bool)
+    apart, mixed = choice.label > 0, np.zeros(len(seg), bool)
     for p in np.unique(piece[(component != main) & usable]):
         at = piece == p
         if at.mean() > SMALL:
@@ -147,11 +133,6 @@ def unmoved(
     return mixed
 
 
-def main_motion(label: Int) -> int:
-    """The most frequent motion of indices (N,), one of which is not negative."""
-    return largest(label[label >= 0])
-
-
 def _one_motion_each(
     views: Views,
     seg: Segmentation,
@@ -162,31 +143,25 @@ def _one_motion_each(
     o: SeededStart,
 ) -> Choice:
     """Give each piece without the main motion, joined by the pairs `whole` (P,), one motion."""
-    main = main_motion(choice.label)
-    R_main = choice.R[np.argmax(choice.label == main)]
-    mover = choice.label != main
+    motions, label = list(choice.motions), choice.label.copy()
+    mover = label > 0
     piece = connected_pieces(mover, seg, whole)
     for c in np.unique(piece[mover]):
-        at = np.flatnonzero(mover & (piece == c))
-        held = np.unique(choice.label[at])
+        at = np.flatnonzero(piece == c)
         # one motion already, and what a few pixels would change in it is not to be trusted
-        if len(at) < PIECE_SIZE or (len(held) == 1 and held[0] >= 0):
+        if len(at) < PIECE_SIZE or len(np.unique(label[at])) == 1:
             continue
-        tried = candidates(views, choice, at, R_main, noise, o)
-        fit = views.some(at).fit(tried)
-        cost = fit.penalised()
+        tried = candidates(views, choice, at, noise, o)
+        cost = views.some(at).fit(tried).penalised()
         m = int(np.argmin(np.minimum(cost, CLIP).mean(axis=0)))
-        rows = np.flatnonzero(cost[:, m] < choice.error[at] + gain)
-        if len(rows) >= AGREE * len(at):
-            planes = fit.pick((rows, np.full(len(rows), m)))
-            own = tried[m].R, tried[m].t, planes, int(choice.label.max()) + 1
-            choice = choice.taking(at[rows], *own)
-    return choice
+        agrees = cost[:, m] < choice.error[at] + gain
+        if agrees.sum() >= AGREE * len(at):
+            label[at[agrees]] = len(motions)
+            motions.append(tried[m])
+    return Choice.of(views, motions, label)
 
 
-def candidates(
-    views: Views, choice: Choice, at: Int, R_main: Float, noise: float, o: SeededStart
-) -> list[Motion]:
+def candidates(views: Views, choice: Choice, at: Int, noise: float, o: SeededStart) -> list[Motion]:
     """Candidate motions for superpixels `at`, fitted to all their pixels.
 
     These are a translation with the main rotation, before and after refinement, the refined present
@@ -196,11 +171,8 @@ def candidates(
     r, q = (v[at].reshape(-1, 3)[::step] for v in (views.ray, views.target))
     w = views.weight[at].ravel()[::step]
     own = r, q, w, views.focal[0]
-    start = [fit_translation(R_main, *own, max(noise, 0.1))]
-    for c in np.unique(choice.label[at]):
-        mine = at[choice.label[at] == c]
-        some = mine[:1] if c >= 0 else mine[:: max(1, len(mine) // 5)]
-        start += [Motion(choice.R[s], choice.t[s]) for s in some]
+    start = [fit_translation(choice.motions[0].R, *own, max(noise, 0.1))]
+    start += [choice.motions[c] for c in np.unique(choice.label[at])]
     found = estimate(*own, max(3 * noise, 0.3), o.seed)
     refined = [refine_near(m, *own, max(noise, 0.1)) for m in start]
     return [*refined, start[0], *([] if found is None else [found])]
@@ -215,23 +187,16 @@ def _spread(
     change together, for example where half of a region has the camera's motion.
     """
     label = choice.label
-    count = np.bincount(label[label >= 0])
-    main = main_motion(label)
-    large = count >= PIECE_SIZE
-    large[main] = False
-    kept = np.array([main, *np.flatnonzero(large)])
+    large = np.bincount(label) >= PIECE_SIZE
+    large[0] = True
+    kept = np.flatnonzero(large)
     m = len(kept)
     if m == 1:
         return choice
-    first = [np.argmax(label == c) for c in kept]
-    fit = views.fit([Motion(choice.R[a], choice.t[a]) for a in first])
-    cost = np.minimum(fit.penalised(), CLIP)
+    cost = np.minimum(views.fit([choice.motions[c] for c in kept]).penalised(), CLIP)
     cost[:, 0] -= 0.5 * UNEXPLAINED_PX
-    stay = np.where(np.isin(label, kept), np.inf, np.minimum(choice.error, CLIP) + 0.5 * gain)
+    stay = np.where(large[label], np.inf, np.minimum(choice.error, CLIP) + 0.5 * gain)
     # motions of whole regions are more reliable than those of pieces: twice the price
     near = flow_affinity(jump, o)
     new = smooth_choice(np.column_stack([cost, stay]), near, seg, 2 * o.smoothness)
-    numbers = np.append(kept, -1)[new]
-    at = np.flatnonzero((new < m) & (numbers != label))
-    R, t = choice.R[first], choice.t[first]
-    return choice.taking(at, R[new[at]], t[new[at]], fit.pick((at, new[at])), numbers[at])
+    return Choice.of(views, choice.motions, np.where(new < m, np.append(kept, -1)[new], label))

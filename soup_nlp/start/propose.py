@@ -27,7 +27,6 @@ from soup_nlp.start.components import (
     connected_pieces,
     contact_scales,
     largest,
-    rigid_components,
 )
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import above_ground, floating, ground
@@ -140,8 +139,7 @@ def propose(
     motions, bends = surface_motions(views, seg, surface, residual, usable, o)
     bends &= o.bending
     choice, noise = rigid_motions(views, seg, jump, motions, o)
-    component = rigid_components(choice.label, seg)
-    turn = turn_alone(views, choice, component, usable, reference_noise(residual))
+    turn = turn_alone(views, choice, usable, reference_noise(residual))
     if turn is not None or bends.all():
         return _constant(views, surface, choice, limited_noise(residual), turn)
     free = constant_depth(views)
@@ -154,10 +152,9 @@ def propose(
     choice, wrong = earned(views, choice, seg, noise)
     weight = np.where(usable & ~bends, 1.0, 0.0)
     choice = settle(views, choice, centre, weight, limited_noise(residual))
-    choice, motions = choice.renumbered()
     soup, weak = _with_depth(choice, views, poor | wrong, seg)
     label, parallax = choice.label, choice.parallax
-    component, error = rigid_components(label, seg), choice.fit.cost[:, 0]
+    component, error = label, choice.fit.cost[:, 0]
     at_camera = Soup(soup.lam, soup.n, soup.d, 0 * soup.R + np.eye(3), 0 * soup.t)
     for mask, made, miss in ((bends, *free), (fixed, at_camera, shift)):
         if mask.any():
@@ -179,7 +176,7 @@ def propose(
     mixed = unmoved(component, choice, moved, usable, views, seg) & ~(fixed | bends)
     part = moving_parts(np.where(mixed, largest(component), component), views, seg, fixed | bends)
     own = soup, error, parallax, weak, label, component, part
-    found = *own, motions, surface, tie, grounded, bends
+    found = *own, choice.motions, surface, tie, grounded, bends
     return Start(*found, wrong & ~bends, noise=limited_noise(error[~bends]))
 
 
@@ -188,7 +185,7 @@ def rigid_motions(
 ) -> tuple[Choice, float]:
     """One of few rigid motions for every superpixel, and the noise of the flow, pixels."""
     choice, noise = rigid_choice(views, seg, jump, motions, o)
-    return gather(views, seg, jump, choice, noise, o).renumbered()[0], noise
+    return gather(views, seg, jump, choice, noise, o), noise
 
 
 def _with_depth(choice: Choice, views: Views, poor: Mask, seg: Segmentation) -> tuple[Soup, Mask]:
@@ -214,8 +211,8 @@ def _with_depth(choice: Choice, views: Views, poor: Mask, seg: Segmentation) -> 
     else:
         length = np.ones(len(seg))
         mu, slope = borrow(mu, slope, choice.label, weak, seg)
-    t = choice.t * length[:, None]
-    return views.soup(mu, slope, choice.R, t), weak
+    R, t = (np.stack([getattr(m, v) for m in choice.motions])[choice.label] for v in ("R", "t"))
+    return views.soup(mu, slope, R, t * length[:, None]), weak
 
 
 def _constant(
@@ -225,7 +222,7 @@ def _constant(
     soup, error = constant_depth(views, turn)
     zero, every = np.zeros(len(surface), np.int64), np.ones(len(surface), bool)
     own = soup, error, views.parallax(soup), every, zero - 1, zero, zero
-    found = *own, choice.renumbered()[1], surface, zero, ~every, every
+    found = *own, choice.motions, surface, zero, ~every, every
     return Start(*found, ~every, at_rest=turn is not None, noise=noise)
 
 

@@ -43,17 +43,13 @@ def settle(views: Views, choice: Choice, centre: Float, usable: Float, noise: fl
     """
     if not usable.any() or np.median(choice.error[usable > 0]) < EXACT_PX:
         return choice
-    for c in np.unique(choice.label[choice.label >= 0]):
-        at = np.flatnonzero(choice.label == c)
-        seen = at[usable[at] > 0]
-        if len(seen) < PIECE_SIZE:
-            continue
-        motion = Motion(choice.R[at[0]], choice.t[at[0]])
-        own = views.anchor[seen], centre[seen], usable[seen], views.focal[0]
-        found = most_probable([motion], *own, min(SYSTEMATIC * noise, MOST_SYSTEMATIC_PX))
-        fit = views.some(at).fit([found])
-        choice = choice.taking(at, found.R, found.t, fit, int(c))
-    return choice
+    motions = list(choice.motions)
+    for c, motion in enumerate(motions):
+        at = np.flatnonzero((choice.label == c) & (usable > 0))
+        if len(at) >= PIECE_SIZE:
+            own = views.anchor[at], centre[at], usable[at], views.focal[0]
+            motions[c] = most_probable([motion], *own, min(SYSTEMATIC * noise, MOST_SYSTEMATIC_PX))
+    return Choice.of(views, motions, choice.label)
 
 
 def most_probable(

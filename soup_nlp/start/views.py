@@ -51,11 +51,11 @@ class Views:
         """(N,) True where the flow counts: its mean confidence is above `USABLE`."""
         return np.asarray(self.weight.mean(axis=1) > USABLE)
 
-    def fit(self, motions: list[Motion]) -> PlaneFit:
-        """Planes of every superpixel under each of M motions."""
-        shape = (len(self.ray), len(motions))
-        R = np.broadcast_to(np.stack([m.R for m in motions]), (*shape, 3, 3))
-        t = np.broadcast_to(np.stack([m.t for m in motions]), (*shape, 3))
+    def fit(self, motions: list[Motion], label: Int | None = None) -> PlaneFit:
+        """Planes (N, M) under each of M motions, or (N, 1) under that of index `label` (N,)."""
+        each = np.arange(len(motions))[None] if label is None else label[:, None]
+        each = np.broadcast_to(each, (len(self.ray), each.shape[1]))
+        R, t = np.stack([m.R for m in motions])[each], np.stack([m.t for m in motions])[each]
         return fit_planes(
             R, t, self.ray, self.target, self.weight, self.anchor, self.radius, self.focal
         )

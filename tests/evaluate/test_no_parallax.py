@@ -17,7 +17,6 @@ from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.verdict import verdict
-from soup_nlp.start.components import rigid_components
 from soup_nlp.start.propose import propose
 
 pytestmark = pytest.mark.slow
@@ -50,17 +49,6 @@ def test_a_start_without_parallax_borrows_depth_but_fits_flow(tiles, angle):
     error = oracle.reprojection(start.soup, data, Weights())
     assert error.max() < 1e-3
     np.testing.assert_allclose(error, start.error, atol=1e-3)
-
-
-def test_components_without_a_shared_motion_are_numbered_last(tiles):
-    n = len(tiles)
-    own = np.full(n, -1)
-    np.testing.assert_array_equal(rigid_components(own, tiles), np.zeros(n))
-    left = tiles.anchors[:, 0] < 50
-    split = np.where(left, -1, 2)
-    np.testing.assert_array_equal(rigid_components(split, tiles), np.where(left, 3, 2))
-    middle = abs(tiles.anchors[:, 0] - 80) < 15
-    assert set(rigid_components(np.where(middle, 0, -1), tiles)) == {0, 1, 2}
 
 
 def test_a_pixel_without_backward_flow_affects_its_neighbourhood_alone():

@@ -211,12 +211,12 @@ def test_depth_that_explains_the_flow_is_no_turn():
     views, _ = look(c.segmentation, c.pair.flow, c.pair.K_ref, c.pair.K_next, SEEDED)
     still = np.zeros(len(c.segmentation.pairs))
     choice, _ = rigid_motions(views, c.segmentation, still, dominant(views, SEEDED), SEEDED)
-    every, usable = np.zeros(len(c), np.int64), np.ones(len(c), bool)
-    assert turn_alone(views, choice, every, usable, 0.02) is None
+    usable = np.ones(len(c), bool)
+    assert turn_alone(views, choice, usable, 0.02) is None
     # the same flow with the depths taken out of it
-    turned = views.ray @ choice.R[0].T
+    turned = views.ray @ choice.motions[0].R.T
     still = replace(views, target=turned / turned[..., 2:])
-    assert turn_alone(still, choice, every, usable, 0.02) is not None
+    assert turn_alone(still, choice, usable, 0.02) is not None
 
 
 def test_noise_where_surfaces_bend_is_that_of_affine_flows():
