@@ -18,7 +18,7 @@ from soup_nlp.errors import ConfigError, DataError, ExportError
 from soup_nlp.evaluate.metrics import Scale
 from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
-from soup_nlp.export.verify import residual_table, table_text
+from soup_nlp.export.verify import table_text
 from soup_nlp.family.describe import check_sol
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import convert as convert_folder
@@ -36,9 +36,7 @@ from soup_nlp.sequence.folder import (
 )
 from soup_nlp.sequence.frames import depth_files
 from soup_nlp.sequence.score import score, score_lines
-from soup_nlp.solve.kkt import LIMITS
 from soup_nlp.storage.files import is_folder
-from soup_nlp.storage.h5_files import read_h5
 
 
 def check(
@@ -55,10 +53,7 @@ def check(
         good, claim = all(ok for _, ok in claims), "claim"
     elif is_folder(folder) or folder.suffix != ".sol":
         report = check_folder(folder)
-        tree = read_h5(folder / "result.h5")
-        c = float(tree["weights"]["min_facing"])
-        print(table_text(residual_table(tree["solution"], tree["energy"]["rim_ray"], c, LIMITS)))
-        print(f"\n{report}")
+        print(report)
         good, claim = report.ok, "claim"
     elif folder.stem.startswith("SOUP-") and export_ is None:
         verdict = check_sol(folder)
@@ -66,7 +61,7 @@ def check(
         print(verdict)
         good, claim = all(k.ok for k in verdict.kinds), "constraint"
     else:
-        imported = import_sol(export_ or folder.parent, folder, renew=False)
+        imported = import_sol(export_ or folder.parent, folder)
         rows = sol_table(imported)
         print(table_text(rows))
         print(foreign_verdict(imported))
@@ -153,10 +148,6 @@ def foreign_verdict(imported: Imported) -> str:
     if imported.run.metrics:
         lines.append(f"accuracy    {protocol(imported.run.metrics)}")
         lines += [" " * 12 + line for line in accuracy(imported.run.metrics)]
-    best = imported.manifest["best_known"]
-    if best:
-        known = f"{best['exact_energy']:.6g} by {best['found_by']}"
-        lines.append(f"best known  exact energy {known}, as manifest.json says: not recomputed")
     return "\n".join(lines)
 
 

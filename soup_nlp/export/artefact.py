@@ -141,51 +141,35 @@ def export_case(
     nlp, layout = case.nlp(form)
     target = claim(folder, EXPORT_FILES, overwrite, case.problem.subject)
     with staged(target, whole=True, subject=case.problem.subject) as new:
-        return _write_files(new, target, case, form, (nlp, layout), formats, presolved, suffixes)
-
-
-def _write_files(
-    folder: Path,
-    earlier: Path,
-    case: Case,
-    form: Formulation,
-    program: tuple[NLP, MatrixLayout | TangentLayout],
-    formats: Sequence[str],
-    presolved: bool,
-    suffixes: bool,
-) -> dict[str, Any]:
-    """Write an export into an empty folder; best_known is taken from an earlier export."""
-    nlp, layout = program
-    names = readable_names(nlp, layout)
-    duals = examine(nlp, nlp.x0, None) if presolved else None
-    if duals is not None and not duals.residuals.dual <= STATIONARY:
-        # multipliers of a point that is not stationary mislead
-        duals = None
-    kinds, found = suffixes_of(nlp, names)
-    lam_g = None if duals is None else duals.lam_g
-    file = write_nl(folder / f"{STUB}.nl", nlp, names, lam_g, found if suffixes else ())
-    if "casadi" in formats:
-        for function in FUNCTIONS:
-            # the file writer of CasADi ignores a full disk
-            text = ca.StringSerializer()
-            text.pack(getattr(nlp, function))
-            write_text(folder / f"{function}.casadi", text.encode())
-    write_text(folder / "problem.yaml", dump_problem(case.problem))
-    manifest = {
-        **_description(case, form, nlp, layout, file),
-        "start": "presolve" if presolved else "proposal",
-        "initial_duals": duals is not None,
-        "kinds": kinds,
-        "best_known": kept_best(earlier, file.sha256),
-    }
-    # the functions also need parameters, start and bounds
-    if "h5" in formats or "casadi" in formats:
-        attrs = {k: manifest[k] for k in ("name", "problem_hash", "formulation", "smoothing")}
-        info = information(case.soup, case.data, case.weights, form)
-        _write_start_h5(folder / f"{STUB}.h5", nlp, names, attrs, info)
-    files = {path.name for path in folder.iterdir()} - {"problem.yaml"}
-    manifest["files"] = sorted(files, key=EXPORT_FILES.index)
-    write_json(folder / MANIFEST, manifest)
+        names = readable_names(nlp, layout)
+        duals = examine(nlp, nlp.x0, None) if presolved else None
+        if duals is not None and not duals.residuals.dual <= STATIONARY:
+            # multipliers of a point that is not stationary mislead
+            duals = None
+        kinds, found = suffixes_of(nlp, names)
+        lam_g = None if duals is None else duals.lam_g
+        file = write_nl(new / f"{STUB}.nl", nlp, names, lam_g, found if suffixes else ())
+        if "casadi" in formats:
+            for function in FUNCTIONS:
+                # the file writer of CasADi ignores a full disk
+                text = ca.StringSerializer()
+                text.pack(getattr(nlp, function))
+                write_text(new / f"{function}.casadi", text.encode())
+        write_text(new / "problem.yaml", dump_problem(case.problem))
+        manifest = {
+            **_description(case, form, nlp, layout, file),
+            "start": "presolve" if presolved else "proposal",
+            "initial_duals": duals is not None,
+            "kinds": kinds,
+        }
+        # the functions also need parameters, start and bounds
+        if "h5" in formats or "casadi" in formats:
+            attrs = {k: manifest[k] for k in ("name", "problem_hash", "formulation", "smoothing")}
+            info = information(case.soup, case.data, case.weights, form)
+            _write_start_h5(new / f"{STUB}.h5", nlp, names, attrs, info)
+        files = {path.name for path in new.iterdir()} - {"problem.yaml"}
+        manifest["files"] = sorted(files, key=EXPORT_FILES.index)
+        write_json(new / MANIFEST, manifest)
     return manifest
 
 
@@ -280,7 +264,6 @@ def _record(name: str, **kinds: Any) -> type[BaseModel]:
     return create_model(name, __config__=ConfigDict(strict=True), **fields)
 
 
-_Best = _record("Best", exact_energy=FiniteFloat, found_by=str)
 _Manifest = _record(
     "Manifest",
     formulation=_record(
@@ -292,8 +275,6 @@ _Manifest = _record(
     smoothing=_record("Smoothing", eps=FiniteFloat, eps_pixel=FiniteFloat),
     fingerprint=_record("Fingerprint", objective=FiniteFloat, constraints=FiniteFloat),
     exact_energy_at_start=_record("Energy", total=FiniteFloat),
-    nl=_record("File", sha256=str),
-    best_known=_Best | None,
 )
 """Entries that an import needs."""
 
@@ -316,13 +297,3 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             hint="export again",
         ) from None
     return manifest | {key: known[key] for key in ("formulation", "smoothing")}
-
-
-def kept_best(folder: Path, sha256: str) -> dict[str, Any] | None:
-    """best_known of an existing manifest of the same .nl file; None otherwise."""
-    try:
-        old = read_manifest(folder)
-    except ExportError:
-        return None
-    best: dict[str, Any] | None = old["best_known"]
-    return best if old["nl"]["sha256"] == sha256 else None

@@ -12,17 +12,16 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ExportError
-from soup_nlp.export.artefact import CHOICES, MANIFEST, STUB, fingerprint, read_manifest
+from soup_nlp.evaluate import recompute
+from soup_nlp.export.artefact import CHOICES, STUB, fingerprint, read_manifest
 from soup_nlp.export.nl import readable_names
 from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import (
     ENERGY_SLACK,
-    EQUATIONS,
     Kind,
     Limits,
     examine,
     kind,
-    residual_table,
     violations,
 )
 from soup_nlp.model import oracle
@@ -36,8 +35,7 @@ from soup_nlp.solve.ipopt import Stage
 from soup_nlp.solve.kkt import residuals
 from soup_nlp.solve.stages import Solution
 from soup_nlp.storage.files import as_path, read_text
-from soup_nlp.storage.folders import claim, recover, staged
-from soup_nlp.storage.store import write_json
+from soup_nlp.storage.folders import recover
 
 SAME = 1e-7
 """Largest relative difference of the fingerprints of an export and of the present problem."""
@@ -54,7 +52,7 @@ class Imported:
     Attributes:
         run: A run as `pipeline.run` returns it; "converged" means claimed and verified.
         sol: Contents of the .sol file.
-        manifest: Manifest of the export with an updated best_known.
+        manifest: Manifest of the export.
         violations: Violations of bounds (nx,) and rows (ng,).
     """
 
@@ -64,13 +62,12 @@ class Imported:
     violations: Mapping[str, Float]
 
 
-def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Imported:
+def import_sol(folder: str | Path, sol: str | Path) -> Imported:
     """Read a .sol file for an exported problem and recompute energy and residuals.
 
     Args:
         folder: Exported folder.
         sol: The .sol file.
-        renew: Store a better verified answer as best_known in the manifest.
 
     Raises:
         ExportError: a file is missing, or the files do not belong together.
@@ -89,17 +86,6 @@ def import_sol(folder: str | Path, sol: str | Path, renew: bool = True) -> Impor
     # values at an arbitrary point may be infinite or NaN; such an answer is not verified
     with np.errstate(all="ignore"):
         run = foreign_run(case, form, nlp, layout, answer, source=Path(sol).name)
-    best = manifest["best_known"]
-    energy = run.solution.energy["total"]
-    if renew and run.solution.converged and (best is None or energy < best["exact_energy"]):
-        manifest["best_known"] = {
-            "objective": run.solution.stages[-1].objective,
-            "exact_energy": energy,
-            "found_by": answer.headline or Path(sol).name,
-        }
-        # only this entry of the manifest changes
-        with staged(claim(folder, [MANIFEST], overwrite=True)) as new:
-            write_json(new / MANIFEST, manifest)
     return Imported(run, answer, manifest, violations(nlp, answer.x))
 
 
@@ -123,10 +109,10 @@ def sol_table(imported: Imported) -> list[Kind]:
     """Residuals of an answer by kind of constraint, before its retraction."""
     run = imported.run
     state = {k: getattr(run.answer, k) for k in ("lam", "n", "d", "R", "t")}
-    limits = dict.fromkeys(EQUATIONS, KKT_LIMIT)
     facing = run.problem.formulation.min_facing
     with np.errstate(all="ignore"):
-        rows = residual_table(state, run.data.rim_ray, facing, limits)
+        found = recompute.constraints(state, run.data.rim_ray, facing)
+    rows = [kind(k, v, KKT_LIMIT, superpixels=k != "simplex") for k, v in found.items()]
     return rows + [kind(k, v, KKT_LIMIT, False) for k, v in imported.violations.items()]
 
 

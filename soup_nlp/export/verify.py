@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from soup_nlp.arrays import Float
-from soup_nlp.evaluate import recompute
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.kkt import optimality
 
@@ -237,21 +235,6 @@ def kind(name: str, violation: Float, limit: float, superpixels: bool = True) ->
     worst = tuple((int(k), float(v[k])) for k in order if v[k] > 0) if superpixels else ()
     largest = float(v.max(initial=0.0))
     return Kind(name, largest, limit, int((v > limit).sum()), len(v), worst)
-
-
-def residual_table(
-    state: Mapping[str, Any], rim_ray: Float, min_facing: float, limits: Mapping[str, float]
-) -> list[Kind]:
-    """Residuals of a soup by kind of constraint, recomputed from its arrays.
-
-    Args:
-        state: lam, n, d, R, t.
-        rim_ray: (N, V, 3) rays of the visibility constraint.
-        min_facing: c of `-n . r >= c`.
-        limits: Largest violation by kind.
-    """
-    found = recompute.constraints(state, rim_ray, min_facing)
-    return [kind(k, v, limits[k], superpixels=k != "simplex") for k, v in found.items()]
 
 
 def table_text(rows: list[Kind]) -> str:

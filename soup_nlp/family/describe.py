@@ -149,8 +149,6 @@ class Verdict:
         best: Best known objective.
         residuals: Unscaled KKT residuals.
         kinds: Violations of bounds and rows.
-        n: Number of variables.
-        m: Number of rows.
     """
 
     sol: Sol
@@ -158,8 +156,6 @@ class Verdict:
     best: float
     residuals: Residuals
     kinds: list[Kind]
-    n: int
-    m: int
 
     @property
     def verified(self) -> bool:
@@ -204,8 +200,6 @@ def check_sol(path: Path) -> Verdict:
             nlp.value(best),
             examine(nlp, sol.x, sol.lam_g).residuals,
             [kind(k, v, FEASIBLE, False) for k, v in violations(nlp, sol.x).items()],
-            nlp.nx,
-            nlp.ng,
         )
 
 

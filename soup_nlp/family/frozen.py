@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.storage.files import write_bytes
 
 
 @dataclass(frozen=True)
@@ -97,18 +95,6 @@ def _present(raw: Mapping[str, Any], section: Any) -> dict[str, Any]:
     return out
 
 
-def encoded(soup: Soup) -> Float:
-    """(N, 10) numbers of a soup with proper rotations."""
-    R = soup.R
-    trace = R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2]
-    # w > 0, since rotations between two frames are far from 180 degrees
-    w = np.sqrt(1 + trace) / 2
-    turn = np.stack(
-        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1
-    )
-    return np.column_stack([soup.distance, soup.n, turn / (4 * w[:, None]), soup.translation])
-
-
 def decoded(numbers: Float) -> Soup:
     """The soup of (N, 10) numbers, with normals and rotations exact to rounding."""
     D, T = numbers[:, 0], numbers[:, 7:]
@@ -125,28 +111,18 @@ def decoded(numbers: Float) -> Soup:
     return Soup(D, n, np.ones(len(D)), R, T / D[:, None])
 
 
-def save_frozen(path: Path, record: Frozen) -> None:
-    """Write a record, whole or not at all; the same record gives the same bytes."""
-    arrays: dict[str, NDArray[Any]] = {
-        "problem": np.frombuffer(record.text.encode(), np.uint8),
-        # differences along rows are mostly 0
-        "labels": np.diff(record.labels, axis=1, prepend=0).astype(np.int16),
-        "component": record.component.astype(np.int16),
-        "surface": record.surface.astype(np.int16),
-        "error": record.error.astype(np.float32),
-        "bending": np.array(record.bending),
-        "pair_weight": record.pair_weight.astype(np.float64),
-        "prior_weight": record.prior_weight.astype(np.float64),
-        "proposal": record.proposal.astype(np.float32),
-        "minimum": record.minimum.astype(np.float64),
-    }
-    target = io.BytesIO()
-    with zipfile.ZipFile(target, "w", zipfile.ZIP_LZMA) as archive:
-        for name, value in arrays.items():
-            part = io.BytesIO()
-            np.save(part, value, allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), part.getvalue(), zipfile.ZIP_LZMA)
-    write_bytes(path, target.getvalue())
+STORED = {
+    "component": (np.int16, np.int64),
+    "surface": (np.int16, np.int64),
+    "error": (np.float32, np.float64),
+    "bending": (np.bool_, np.bool_),
+    "pair_weight": (np.float64, np.float64),
+    "prior_weight": (np.float64, np.float64),
+    "proposal": (np.float32, np.float64),
+    "minimum": (np.float64, np.float64),
+}
+"""Types of the arrays of a record in its file and in memory. The file also has the text, and the
+labels as differences along rows, which are mostly 0."""
 
 
 def load_frozen(scene: str, size: int) -> Frozen:
@@ -169,14 +145,7 @@ def read_frozen(path: Path) -> Frozen:
             return Frozen(
                 text=a["problem"].tobytes().decode(),
                 labels=np.cumsum(a["labels"].astype(np.int32), axis=1, dtype=np.int32),
-                component=a["component"].astype(np.int64),
-                surface=a["surface"].astype(np.int64),
-                error=a["error"].astype(np.float64),
-                bending=bool(a["bending"]),
-                pair_weight=a["pair_weight"],
-                prior_weight=a["prior_weight"],
-                proposal=a["proposal"].astype(np.float64),
-                minimum=a["minimum"],
+                **{name: a[name].astype(kind) for name, (_, kind) in STORED.items()},
             )
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise DataError("record of the family cannot be read", where=path, found=error) from error

@@ -22,7 +22,6 @@ from soup_nlp.family import run_solver
 from soup_nlp.family.describe import CLASSES, classes, classification, qualification, sizes
 from soup_nlp.family.frozen import Frozen, load_frozen
 from soup_nlp.family.instances import VERSION, Instance, build_instance, case_of, problems
-from soup_nlp.family.pages import LICENCE, readme
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.record import Case
 from soup_nlp.storage.files import write_text
@@ -38,8 +37,12 @@ DIGITS = 9
 
 def published() -> dict[str, Any]:
     """Published data of this version: checksums, and solvers that reached the best known points."""
-    path = files("soup_nlp.family") / "records" / "published.json"
-    return dict(json.loads(path.read_text(encoding="utf-8")))
+    return dict(json.loads(_file("published.json")))
+
+
+def _file(name: str) -> str:
+    """A text that the package holds beside the records."""
+    return (files("soup_nlp.family") / "records" / name).read_text(encoding="utf-8")
 
 
 def write_family(
@@ -84,7 +87,7 @@ def write_family(
     write_text(folder / "instancedata.csv", as_csv([instance_data(e) for e in entries], ";"))
     write_text(folder / "run.py", Path(run_solver.__file__).read_text(encoding="utf-8"))
     write_text(folder / "README.md", readme(entries))
-    write_text(folder / "LICENSE.txt", LICENCE)
+    write_text(folder / "LICENSE.txt", _file("LICENSE.txt"))
     return entries
 
 
@@ -232,3 +235,81 @@ def _flat(entry: Mapping[str, Any], before: str = "") -> Entry:
         else:
             out[before + key] = " ".join(value) if isinstance(value, list) else value
     return out
+
+
+# --- README of the folder -------------------------------------------------------------------------
+
+COLUMNS: Mapping[str, Callable[[Entry], str]] = {
+    "problem": lambda e: e["name"].rpartition("-")[0],
+    "n": lambda e: str(e["variables"]),
+    "m": lambda e: str(e["constraints"]),
+    "Jacobian": lambda e: str(e["jacobian_nonzeros"]),
+    "Hessian": lambda e: str(e["hessian_nonzeros"]),
+    "class": lambda e: e["classification"],
+    "LICQ": lambda e: f"{'holds' if e['licq'] else 'FAILS'} ({e['active_rank']})",
+    "best known": lambda e: f"{e['best_known']['objective']:.8g}",
+    "dual inf.": lambda e: f"{e['best_known']['dual']:.0e}",
+    "found by": lambda e: str(e["best_known"]["found_by"] or "soup_nlp"),
+    "reached by": lambda e: _share(e["best_known"]),
+}
+
+
+def _share(best: Entry) -> str:
+    tried, reached = best["tried_by"], best["reached_by"]
+    return f"{len(reached)} of {len(tried)} solvers" if tried else "not measured"
+
+
+def _reached(entries: Sequence[Entry]) -> list[str]:
+    """What each solver reached from each start: objective above the best known one, CPU seconds."""
+    known = [e for e in entries if e["runs"]]
+    solvers = list(dict.fromkeys(s for e in known for s in e["runs"]))
+    if not solvers:
+        return []
+
+    def cell(entry: Entry, solver: str) -> str:
+        objective, seconds, limit, verified = entry["runs"].get(solver, (None, None, None, False))
+        if seconds is None:
+            return "-"
+        if objective is None:
+            return f"no point, {seconds:g} of {limit:g} s"
+        best = entry["best_known"]["objective"]
+        gap = f"{100 * (objective - best) / abs(best):+.2g} %"
+        return f"{f'**{gap}**' if verified else gap}, {seconds:g} of {limit:g} s"
+
+    rows = [[e["short"], *(cell(e, s) for s in solvers)] for e in known]
+    return [
+        "",
+        "## What solvers reached",
+        "",
+        "Objective above the best known one; bold: the point is verified as an optimum. CPU seconds"
+        " of their limit. Options and machine: results/family of the soup_nlp repository.",
+        "",
+        "| instance | " + " | ".join(solvers) + " |",
+        "|" + "---|" * (len(solvers) + 1),
+        *("| " + " | ".join(row) + " |" for row in rows),
+    ]
+
+
+def readme(entries: Sequence[Entry]) -> str:
+    """README of the folder, for the entries of its index."""
+    scenes = ", ".join(dict.fromkeys(e["scene"] for e in entries))
+    sizes = ", ".join(str(n) for n in sorted({e["size"] for e in entries}))
+    head = _file("README.md").format(
+        scenes=scenes, sizes=sizes, package=__version__, version=VERSION
+    )
+    unique = list({COLUMNS["problem"](e): e for e in entries}.values())
+    lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
+    lines += ["| " + " | ".join(f(e) for f in COLUMNS.values()) + " |" for e in unique]
+    starts = ["", "## Instances", "", "| file | objective at start | MB | SHA-256 |"]
+    starts.append("|---|---|---|---|")
+    starts += [
+        f"| {e['file']} | {e['objective_at_start']:.6g} | {e['bytes'] / 1e6:.1f}"
+        f" | {e['sha256'][:16]}... |"
+        for e in entries
+    ]
+    note = [
+        "",
+        "Nonzeros of the Hessian are of its upper triangle. LICQ: at the best known point, with the"
+        " rank of the active rows in brackets.",
+    ]
+    return head + "\n" + "\n".join([*lines, *note, *_reached(entries), *starts]) + "\n"

@@ -21,9 +21,9 @@ from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.evaluate.information import information
 from soup_nlp.export.artefact import parse_formulation
-from soup_nlp.export.foreign import file_orders, import_sol
+from soup_nlp.export.foreign import file_orders, import_sol, sol_table
 from soup_nlp.export.sol import write_sol
-from soup_nlp.export.verify import Limits, examine, kind, residual_table, table_text, violations
+from soup_nlp.export.verify import Limits, examine, kind, table_text, violations
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.kkt import WARM
@@ -139,12 +139,7 @@ def test_a_foreign_solution_becomes_a_result_folder(exported, optimum, tmp_path,
         assert (out / name).stat().st_size > 0
     assert main(["check", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "worst superpixels" in said
     assert "every claim holds" in said
-    manifest = json.loads((exported / "manifest.json").read_text())
-    assert manifest["best_known"]["found_by"] == "hand made"
-    start = manifest["exact_energy_at_start"]["total"]
-    assert manifest["best_known"]["exact_energy"] < start
 
 
 def test_verified_means_optimal(exported, optimum, tmp_path, capsys):
@@ -159,12 +154,12 @@ def test_verified_means_optimal(exported, optimum, tmp_path, capsys):
     # the point is what counts: multipliers that are wrong, or none, make it no worse
     for given in (None, np.full(nlp.ng, 1e300)):
         write_sol(exported / "x.sol", x, given, v, r, "hand made", 0)
-        assert import_sol(exported, exported / "x.sol", renew=False).run.solution.converged
+        assert import_sol(exported, exported / "x.sol").run.solution.converged
     write_sol(exported / "x.sol", x, lam, v, r, "hand made", 400)
-    assert not import_sol(exported, exported / "x.sol", renew=False).run.solution.converged
+    assert not import_sol(exported, exported / "x.sol").run.solution.converged
     write_sol(exported / "x.sol", x, np.full(nlp.ng, np.nan), v, r, "hand made", 0)
     with pytest.raises(ExportError, match="not finite"):
-        import_sol(exported, exported / "x.sol", renew=False)
+        import_sol(exported, exported / "x.sol")
 
 
 def test_a_point_with_nan_is_not_verified(exported, optimum):
@@ -198,7 +193,7 @@ def test_a_huge_point_is_checked_and_makes_no_result(size, exported, tmp_path, c
 
 def test_a_false_claim_of_success_is_not_verified(exported, tmp_path, capsys):
     sol = answer(exported, "false.sol", move=1e-3)
-    run = import_sol(exported, sol, renew=False).run
+    run = import_sol(exported, sol).run
     assert not run.solution.converged
     assert run.solution.stages[-1].objective != 0
     assert main(["check", str(sol)]) == 1
@@ -217,14 +212,8 @@ def test_the_worst_superpixel_is_named(exported):
     x = nlp.x0.copy()
     x[layout.of(np.array([7]))[0, 5]] += 1e-2
     write_sol(exported / "seven.sol", x, None, v, r)
-    imported = import_sol(exported, exported / "seven.sol", renew=False)
-    state = {k: getattr(imported.run.answer, k) for k in ("lam", "n", "d", "R", "t")}
-    rows = residual_table(
-        state,
-        imported.run.data.rim_ray,
-        1e-3,
-        dict.fromkeys(("so3", "normal", "simplex", "positive", "det", "visible"), 1e-6),
-    )
+    imported = import_sol(exported, exported / "seven.sol")
+    rows = sol_table(imported)
     so3 = next(row for row in rows if row.name == "so3")
     assert so3.worst[0][0] == 7
     assert so3.count == 1

@@ -114,8 +114,6 @@ def small(tmp_path_factory) -> Path:
         ("formulation", {"gauge": "unit-offset", "norm": "rough", "coordinates": "matrix"}),
         ("smoothing", {"eps": None, "eps_pixel": 1.0}),
         ("exact_energy_at_start", {"total": None}),
-        ("nl", []),
-        ("best_known", {"found_by": "me"}),
     ],
 )
 def test_a_broken_manifest_is_refused(key, value, small, tmp_path, capsys):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import pytest
+from freeze_family import record_of
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.family import describe, write
 from soup_nlp.family.frozen import Frozen
-from soup_nlp.family.instances import STANDARD, record_of, select
+from soup_nlp.family.instances import STANDARD, select
 from soup_nlp.family.write import write_family
 from soup_nlp.pipeline.case import prepare
 

@@ -11,6 +11,7 @@ import sys
 import casadi as ca
 import numpy as np
 import pytest
+from freeze_family import encoded, save_frozen
 from scipy import sparse
 
 from soup_nlp.cli.main import main
@@ -19,10 +20,8 @@ from soup_nlp.export.nl import readable_names, write_nl
 from soup_nlp.family.describe import check_sol, degree, rank, write_results
 from soup_nlp.family.frozen import (
     decoded,
-    encoded,
     load_frozen,
     read_frozen,
-    save_frozen,
 )
 from soup_nlp.family.instances import (
     BITS,

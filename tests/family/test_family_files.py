@@ -11,13 +11,14 @@ from functools import partial
 import casadi as ca
 import numpy as np
 import pytest
+from freeze_family import record_of
 
 from soup_nlp.bench.solvers import runner
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.family import run_solver
-from soup_nlp.family.instances import STANDARD, record_of
-from soup_nlp.family.pages import _reached
+from soup_nlp.family.instances import STANDARD
+from soup_nlp.family.write import _reached
 from soup_nlp.pipeline.case import prepare
 
 pytestmark = pytest.mark.slow
