@@ -47,6 +47,7 @@ from soup_nlp.start.components import TIES
 from soup_nlp.start.epipolar import focal_length, repeated
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import in_order
+from soup_nlp.start.prior_evidence import PIECES, judged
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
@@ -117,16 +118,21 @@ def prepare(
         fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
         if log:
             log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
-    start, given = _begin(problem, pair, seg, fitted, options)
-    if given is not None and given.inside is not None and s.follow_flow_px is not None:
-        other = segmented(follow_depth(labels, given.inside))
-        fitted = FlowFit.of(other, flow, pair.K_ref, pair.K_next, options)
-        again = _begin(problem, pair, other, fitted, options)
-        # a prior near a limit of the tests keeps the superpixels on which it has passed them
-        if again[1] is not None and again[1].used:
-            seg, (start, given) = other, again
-    if given is not None and log:
-        log(str(given))
+    given = evidence = None
+    if pair.depth_prior is not None and problem.energy.weights.depth > 0:
+        few = segmented(superpixels(problem, pair, min(PIECES, s.superpixels)))
+        own = FlowFit.of(few, flow, pair.K_ref, pair.K_next, options)
+        first = _begin(problem, pair, few, own, options)
+        evidence = judged(first, few, pair, own, problem.depth_prior.kind)
+        if evidence.used and not evidence.confirmed and s.follow_flow_px is not None:
+            # no flow knows where surfaces end
+            seg = segmented(follow_depth(labels, evidence.log_depth(pair.depth_prior)))
+            fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
+    start = _begin(problem, pair, seg, fitted, options)
+    if evidence is not None:
+        start, given = by_prior(start, seg, pair, fitted, evidence)
+        if log:
+            log(str(given))
     done("start", start)
     data, weights = build_energy(problem, pair, seg, start, given)
     stages = solver_options(problem, start)
@@ -144,17 +150,14 @@ def prepare(
 
 def _begin(
     problem: Problem, pair: Pair, seg: Segmentation, fitted: FlowFit, options: SeededStart
-) -> tuple[Start, Given | None]:
-    """The start on given superpixels, and what the depth prior of the pair decides, if any."""
+) -> Start:
+    """The start on given superpixels, whatever a depth prior says."""
     flow = pair.flow
     assert flow is not None
     start = propose(seg, flow, pair.K_ref, pair.K_next, options, fitted)
-    weights = problem.energy.weights
-    if weights.order > 0:
+    if problem.energy.weights.order > 0:
         start = in_order(start, seg, pair, fitted, options)
-    if pair.depth_prior is None or not weights.depth > 0:
-        return start, None
-    return by_prior(start, seg, pair, fitted, problem.depth_prior.kind, problem.seed)
+    return start
 
 
 def _with_flow(
@@ -188,11 +191,11 @@ def _flow(problem: Problem, full: Pair, pair: Pair) -> Flow:
     return resized_flow(problem.flow.load(full, problem.path), full, pair)
 
 
-def superpixels(problem: Problem, pair: Pair) -> Labels:
-    """The superpixels that a problem asks for, on a pair that carries its flow."""
+def superpixels(problem: Problem, pair: Pair, count: int | None = None) -> Labels:
+    """The superpixels that a problem asks for, or so many, on a pair that carries its flow."""
     assert pair.flow is not None
     s = problem.segmentation
-    labels = segment(pair.image_ref, s.superpixels, s.method)
+    labels = segment(pair.image_ref, count or s.superpixels, s.method)
     return labels if s.follow_flow_px is None else follow_flow(labels, pair.flow, s.follow_flow_px)
 
 
@@ -235,11 +238,11 @@ def build_energy(
     if start.order is not None:
         guessed = start.tie == TIES.index("occlusion")
         data = with_order(data, start.soup, start.order, guessed, start.noise)
-    if given is not None and given.used:
+    if given is not None and given.evidence.used:
         # no flow holds slopes where the prior decides: they are held as those that bend
         stiffer = np.where(bends, 1.0, bent.orient / max(e.weights.orient, 1e-12))
         known = given.log_depth, given.opened, given.error, start.component, free, stiffer
-        data = with_prior(data, start.soup, *known, creased=not given.confirmed)
+        data = with_prior(data, start.soup, *known, creased=not given.evidence.confirmed)
         # a given depth has steps inside a component as well
         parts = np.arange(len(seg))
     data = at_occlusions(data, start.soup, parts, OCCLUSION_GAP, e.cont_occluded)

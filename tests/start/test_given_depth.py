@@ -25,7 +25,7 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.findings import certainty, summary
 from soup_nlp.start.components import TIES
 from soup_nlp.start.given_depth import Given, _slopes, by_prior
-from soup_nlp.start.prior_evidence import CONFIRMED, follows_edges
+from soup_nlp.start.prior_evidence import CONFIRMED, follows_edges, judged
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
@@ -48,8 +48,9 @@ class Seen:
 
     def by(self, prior: np.ndarray, kind: str | None = None) -> tuple[Start, Given]:
         pair = replace(self.pair, depth_prior=prior)
-        own = self.seg, pair.flow, pair.K_ref, pair.K_next, SeededStart()
-        return by_prior(self.start, self.seg, pair, FlowFit.of(*own), kind, 0)
+        fitted = FlowFit.of(self.seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
+        own = self.start, self.seg, pair, fitted
+        return by_prior(*own, judged(*own, kind))
 
     def error(self, start: Start) -> np.ndarray:
         """(N,) log depth of the anchors less the true one, one scale left out."""
@@ -71,15 +72,15 @@ def pan() -> Seen:
 def test_a_confirmed_prior_gives_what_swings_its_scale(swing):
     before = np.abs(swing.error(swing.start)).mean()
     start, given = swing.by(swing.depth * np.exp(0.1 * WAVE))
-    assert given.kind == "relative"
-    assert given.ratio < CONFIRMED
+    assert given.evidence.kind == "relative"
+    assert given.evidence.ratio < CONFIRMED
     assert np.abs(swing.error(start)).mean() < 0.5 * before
     assert TIES.index("given depth") in start.tie
 
 
 def test_inverse_depth_with_a_shift_is_found(swing):
     start, given = swing.by(0.05 + 1 / swing.depth)
-    assert given.kind == "inverse"
+    assert given.evidence.kind == "inverse"
     assert np.abs(swing.error(start)).mean() < 0.1
 
 
@@ -92,15 +93,14 @@ def test_planes_lean_as_the_given_depth_does_inside_superpixels(pan):
     leaning, level = (np.abs(np.log(z / np.median(z))).mean() for z in (planes, flat))
     assert leaning < 0.5 * level
     stepped = np.where(np.arange(320) < 155, 2.0, 5.0) * np.ones((240, 1))
-    slope = _slopes(np.log(stepped), stepped > 0, median_in(stepped, labels), pan.pair, pan.seg)
+    slope = _slopes(1 / stepped, pan.pair, pan.seg)
     u = pan.seg.anchors[:, 0]
     reach = np.sqrt(pan.seg.sizes) / K[0, 0]
     assert np.abs(slope[np.abs(u - 155) > 40]).max() < 1e-6
     assert np.median(np.linalg.norm(slope, axis=1) * reach) < 1e-6
     # 1 / Z falls to the left by a quarter per ray unit
     inclined = 1 / (1 + 0.25 * (np.arange(320) - K[0, 2]) / K[0, 0]) * np.ones((240, 1))
-    own = median_in(inclined, labels)
-    slope = _slopes(np.log(inclined), inclined > 0, own, pan.pair, pan.seg)
+    slope = _slopes(1 / inclined, pan.pair, pan.seg)
     expected = 0.25 / (1 + 0.25 * pan.anchor[:, 0])
     np.testing.assert_allclose(slope[:, 0], expected, rtol=1e-3)
     np.testing.assert_allclose(slope[:, 1], 0, atol=1e-3)
@@ -161,7 +161,7 @@ def test_a_wrong_prior_changes_nothing(swing, pan, wrong):
         }[wrong]
         start, given = seen.by(prior)
         assert start is seen.start, wrong
-        assert not given.used
+        assert not given.evidence.used
         assert np.isinf(given.sigma).all()
         assert "not used" in str(given)
 
@@ -169,7 +169,7 @@ def test_a_wrong_prior_changes_nothing(swing, pan, wrong):
 def test_before_a_camera_that_turns_a_prior_is_a_guess(pan):
     assert pan.start.at_rest
     start, given = pan.by(pan.depth)
-    assert np.isnan(given.ratio)
+    assert np.isnan(given.evidence.ratio)
     assert given.held.all()
     assert (given.sigma > 0.25).all()
     assert np.abs(pan.error(start)).mean() < 0.1 < np.abs(pan.error(pan.start)).mean()
